@@ -141,9 +141,10 @@ def test_a_worker_process_that_is_killed_is_replaced_and_its_trial_ends_the_same
     result = run_study(STUDY, tmp_path, on=Dying(1), results=False)
     assert result.failed == ()
     assert_same_study(result.runs, undisturbed)
-    killed, other = map(attempts_of, tasks_in(tmp_path))
-    assert len(set(killed)) == 2
-    assert len(other) == 1
+    killed, other = tasks_in(tmp_path)
+    assert len(set(attempts_of(killed))) == 2
+    assert len(attempts_of(other)) == 1
+    assert "Resuming from step" in Status(Path(killed.status), killed.name).log.read_text()
 
 
 @pytest.mark.slow

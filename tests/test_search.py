@@ -65,15 +65,20 @@ def a_search(points=12, **how):
     return Search(ONE, {FREEZE: Integers(0, 1000), GAMMA: [0.5, 0.9]}, points=points, **how)
 
 
-def told(result):
-    return [(own.number, own.name, own.value, own.is_repeated) for own in result.points]
+def in_words(result):
+    return [(point.number, point.name, point.value, point.is_repeated) for point in result.points]
+
+
+def searched(search, out, executor=None):
+    """The search, carried out by a counting executor."""
+    return run_search(search, out, on=executor or Counting(), progress=False)
 
 
 @pytest.mark.integration
 def test_points_get_better_and_are_the_same_again(tmp_path, worth):
-    first = run_search(a_search(28), tmp_path / "a", on=Counting(), progress=False)
-    again = run_search(a_search(13), tmp_path / "b", on=Counting(), progress=False)
-    assert told(first)[:12] == told(again)[:12], "three whole batches"
+    first = searched(a_search(28), tmp_path / "a")
+    again = searched(a_search(13), tmp_path / "b")
+    assert in_words(first)[:12] == in_words(again)[:12], "three whole batches"
     by_chance = np.mean([own.value for own in first.points[:10]])
     assert np.mean([own.value for own in first.points[-10:]]) > by_chance + 100
     assert first.ranked[0].value == max(own.value for own in first.points)
@@ -89,27 +94,27 @@ def test_a_search_that_was_stopped_anywhere_runs_the_rest_alone(tmp_path, worth)
                     raise KeyboardInterrupt
 
     whole = Counting()
-    undisturbed = run_search(a_search(), tmp_path / "whole", on=whole, progress=False)
+    undisturbed = searched(a_search(), tmp_path / "whole", whole)
     ran = []
     for most in (1, 5, 3):
         killed = Killed()
         killed.most = most
         with pytest.raises(KeyboardInterrupt):
-            run_search(a_search(), tmp_path / "killed", on=killed, progress=False)
+            searched(a_search(), tmp_path / "killed", killed)
         ran += killed.run_so_far
         for name in (FILE_NAME, JOURNAL, "study.json"):  # nothing but the runs is needed
             (tmp_path / "killed" / name).unlink(missing_ok=True)
     last = Counting()
-    done = run_search(a_search(), tmp_path / "killed", on=last, progress=False)
-    assert told(done) == told(undisturbed)
+    done = searched(a_search(), tmp_path / "killed", last)
+    assert in_words(done) == in_words(undisturbed)
     assert ran + last.run_so_far == whole.run_so_far, "each once, in the same order"
 
 
 @pytest.mark.integration
 def test_more_points_continue_a_search(tmp_path, worth):
-    run_search(a_search(8), tmp_path, on=Counting(), progress=False)
+    searched(a_search(8), tmp_path)
     more = Counting()
-    longer = run_search(a_search(12), tmp_path, on=more, progress=False)
+    longer = searched(a_search(12), tmp_path, more)
     assert len(more.run_so_far) == 4
     assert len(longer.points) == 12
 
@@ -117,7 +122,7 @@ def test_more_points_continue_a_search(tmp_path, worth):
 def test_points_that_come_twice_are_run_once(tmp_path, worth):
     few = Search(ONE, {FREEZE: [30, 50, 80]}, points=12)
     executor = Counting()
-    result = run_search(few, tmp_path, on=executor, progress=False)
+    result = searched(few, tmp_path, executor)
     assert len(executor.run_so_far) == len(set(executor.run_so_far)) <= 3
     assert sum(own.is_repeated for own in result.points) == 12 - len(executor.run_so_far)
     assert {own.value for own in result.points if own.name == "freeze_steps=30"} == {-10.0}
@@ -137,7 +142,7 @@ def test_levels_that_the_experiment_refuses_together_are_kept_with_the_reason_an
     every = {"update_every": [1, 2, 3], STEPS: [20, 30]}  # 3 does not divide 20
     executor = Counting()
     search = Search(PPO_ONE, every, points=12, at_once=12, sampler="random")
-    result = run_search(search, tmp_path, on=executor, progress=False)
+    result = searched(search, tmp_path, executor)
     refused = [own for own in result.points if own.reason]
     assert {own.name for own in refused} == {"update_every=3, rollout_steps=20"}
     assert {own.value for own in refused} == {None}
@@ -159,12 +164,10 @@ def test_a_search_begins_with_the_first_points_that_fit_and_is_refused_where_non
 
     how = {"at_once": 2, "sampler": lambda seed: Proposes()}
     levels = {"update_every": Integers(1, 3), STEPS: [20, 30]}
-    result = run_search(
-        Search(PPO_ONE, levels, points=4, **how), tmp_path / "a", on=Counting(), progress=False
-    )
+    result = searched(Search(PPO_ONE, levels, points=4, **how), tmp_path / "a")
     assert [bool(own.reason) for own in result.points] == [True, True, True, False]
     with pytest.raises(ValueError, match=r"none of the search's 3 points fits; the first, .*must divide"):
-        run_search(Search(PPO_ONE, levels, points=3, **how), tmp_path / "b", on=Counting(), progress=False)
+        searched(Search(PPO_ONE, levels, points=3, **how), tmp_path / "b")
     assert not (tmp_path / "b").exists()
 
 
@@ -178,12 +181,7 @@ def test_a_search_is_refused_only_where_no_levels_fit_together():
 
 def test_named_levels_and_the_lowest_value(tmp_path, worth):
     factors = {"stay out": {"briefly": {FREEZE: 1}, "long": {FREEZE: 500}}, GAMMA: Uniform(0.5, 0.9)}
-    result = run_search(
-        Search(ONE, factors, points=6, direction="minimise", sampler="random"),
-        tmp_path,
-        on=Counting(),
-        progress=False,
-    )
+    result = searched(Search(ONE, factors, points=6, direction="minimise", sampler="random"), tmp_path)
     assert result.ranked[0].value == -460.0
     assert result.ranked[0].name.startswith("stay out=long, gamma=0.")
 
@@ -198,20 +196,20 @@ def test_what_has_failed_is_told_as_failed_and_tried_again_next_time(tmp_path, w
                     yield from super().run([task])
 
     few = Search(ONE, {FREEZE: [30, 50]}, points=8, sampler="random")
-    result = run_search(few, tmp_path, on=Fails(), progress=False)
+    result = searched(few, tmp_path, Fails())
     assert [own.reason for own in result.failed] == ["ValueError: no"]
     assert {own.name: own.value for own in result.points} == {
         "freeze_steps=30": -10.0,
         "freeze_steps=50": None,
     }
     assert [own.name for own in result.ranked] == ["freeze_steps=30"]
-    mended = run_search(few, tmp_path, on=Counting(), progress=False)
+    mended = searched(few, tmp_path)
     assert not mended.failed
     assert {own.value for own in mended.points} == {-10.0}
 
 
 def test_what_is_kept_is_read_by_optunas_own_tools_and_as_a_study(tmp_path, worth):
-    result = run_search(a_search(6), tmp_path, on=Counting(), progress=False)
+    result = searched(a_search(6), tmp_path)
     backend = optuna.storages.journal.JournalFileBackend(str(tmp_path / JOURNAL))
     kept = optuna.load_study(study_name="search", storage=optuna.storages.JournalStorage(backend))
     assert [own.value for own in kept.trials] == [own.value for own in result.points]
@@ -279,8 +277,5 @@ def test_a_sweep_can_be_a_search():
 @pytest.mark.integration
 @pytest.mark.parametrize("sampler", ["random", "gp", lambda seed: optuna.samplers.RandomSampler(seed=seed)])
 def test_other_samplers_propose_the_same_points_again_too(tmp_path, worth, sampler):
-    first, again = (
-        told(run_search(a_search(6, sampler=sampler), tmp_path / name, on=Counting(), progress=False))
-        for name in "ab"
-    )
+    first, again = (in_words(searched(a_search(6, sampler=sampler), tmp_path / name)) for name in "ab")
     assert first == again

@@ -4,7 +4,6 @@ import json
 import os
 import pickle
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -105,36 +104,6 @@ def test_a_trial_that_was_killed_before_its_first_checkpoint_starts_over(first, 
     assert state_of(first.directory) == "unfinished"
     assert run_task(first).state == "finished"
     assert_same(first.directory, undisturbed)
-
-
-KILLED = """
-import sys
-sys.path.insert(0, {tests!r})
-from pathlib import Path
-from test_trials import task
-from cprl.runs.checkpoints import Checkpointer
-from cprl.studies.trials import run_task
-Checkpointer.__init__.__kwdefaults__["every_s"] = 1e-9
-run_task(task(Path({folder!r})))
-"""
-
-
-@pytest.mark.integration
-def test_a_trial_that_is_killed_in_its_training_is_resumed_bit_for_bit(tmp_path, undisturbed):
-    killed = task(tmp_path)
-    code = KILLED.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
-    process = subprocess.Popen([sys.executable, "-W", "ignore", "-c", code])
-    checkpoints = killed.directory / CHECKPOINTS
-    until = time.monotonic() + 60
-    while not any(checkpoints.glob("training-*.pt")) and time.monotonic() < until:
-        time.sleep(0.002)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert state_of(killed.directory) == "unfinished"
-    assert any(checkpoints.glob("training-*.pt"))
-    assert run_task(killed).worked
-    assert "Resuming from step" in Status(Path(killed.status), killed.name).log.read_text()
-    assert_same(killed.directory, undisturbed)
 
 
 @pytest.mark.integration
@@ -429,23 +398,6 @@ def test_studies_may_share_their_runs(tmp_path):
     assert not (tmp_path / "b" / "runs").exists()
 
 
-@pytest.mark.integration
-def test_a_condition_that_fails_does_not_end_the_study(tmp_path, monkeypatch):
-    from cprl.training import running
-
-    usual = running.evaluate_population
-
-    def fails(experiment, *arguments, **how):
-        if experiment.game.rules.freeze_steps == 5:
-            raise RuntimeError("broken")
-        return usual(experiment, *arguments, **how)
-
-    monkeypatch.setattr(running, "evaluate_population", fails)
-    result = run_study(STUDY, tmp_path, results=False)
-    assert [(own.reason, own.state) for own in result.failed] == [("RuntimeError: broken", "failed")]
-    assert state_of(tmp_path / "runs" / result.trials[1].name) == "finished"
-
-
 def test_a_part_of_a_study_is_chosen_by_whole_levels_and_not_by_parts_of_them():
     cells = "agents.*.algorithm.settings.hidden_cells"
     trials = trials_of(Study(TINY, {cells: [(32, 32), (32, 8, 32), (8, 32)], FREEZE: [2, 5]}))
@@ -464,13 +416,6 @@ def test_a_part_of_a_study_is_chosen_by_whole_levels_and_not_by_parts_of_them():
     for part in ("32", "8, 32)", "", ", "):
         with pytest.raises(ValueError, match="allowed: a condition or levels of some"):
             trials_with(trials, [part])
-
-
-@pytest.mark.parametrize("how", [{"only": ["none"]}, {"last": 5}, {"on": 3}], ids=str)
-def test_nothing_is_written_where_a_study_is_refused(how, tmp_path):
-    with pytest.raises(ValueError, match=next(iter(how))):
-        run_study(STUDY, tmp_path / "x", **how)
-    assert not (tmp_path / "x").exists()
 
 
 @pytest.mark.integration
