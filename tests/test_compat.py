@@ -203,17 +203,12 @@ def q_actor():
     return QValueActor(nn.Linear(2, 3), spec=None, action_space="categorical")
 
 
-def q_loss():
+def q_loss(kind=DQNLoss):
     """Of an agent with values of three actions for what it sees, two numbers."""
-    loss = DQNLoss(q_actor(), delay_value=True, action_space="categorical")
+    loss = kind(q_actor(), delay_value=True, action_space="categorical")
     loss.make_value_estimator(ValueEstimators.TD0, gamma=0.5)
-    return loss
-
-
-def conservative_loss():
-    loss = DiscreteCQLLoss(q_actor(), delay_value=True, action_space="categorical")
-    loss.make_value_estimator(ValueEstimators.TD0, gamma=0.5)
-    compat.bootstrap_from_target(loss.value_estimator)
+    if kind is DiscreteCQLLoss:
+        compat.bootstrap_from_target(loss.value_estimator)
     return loss
 
 
@@ -246,9 +241,9 @@ def test_a_loss_refuses_updaters_of_torchrl_by_the_names_of_its_targets():
             SoftUpdate(loss, eps=0.9)
 
 
-@pytest.mark.parametrize("make_loss", [q_loss, conservative_loss])
-def test_a_loss_computes_with_whatever_weights_are_put_in_now(make_loss):
-    batch, losses, function = transitions(5), [make_loss(), make_loss()], make_loss()
+@pytest.mark.parametrize("kind", [DQNLoss, DiscreteCQLLoss])
+def test_a_loss_computes_with_whatever_weights_are_put_in_now(kind):
+    batch, losses, function = transitions(5), [q_loss(kind), q_loss(kind)], q_loss(kind)
     for loss in (*losses, function):
         compat.promise_targets(loss)
         loss.reduction = "none"
@@ -264,7 +259,7 @@ def test_a_loss_computes_with_whatever_weights_are_put_in_now(make_loss):
 
 def test_conservative_q_learning_bootstraps_from_its_target():
     # loss = half the mean of (Q - (r + gamma max_a Q'(s', a)))^2, with r = 1 and gamma = 0.5
-    loss, batch = conservative_loss(), transitions(6)
+    loss, batch = q_loss(DiscreteCQLLoss), transitions(6)
     compat.promise_targets(loss)
     target = layer(loss.target_value_network_params)
     for weight in target:

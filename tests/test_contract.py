@@ -12,6 +12,7 @@ from test_population import (
     ALGORITHMS,
     FOUR,
     GAME,
+    REPLAY,
     assert_all_weights_move_and_replicas_learn_apart,
     assert_goes_on_bit_for_bit,
     population,
@@ -25,8 +26,10 @@ from test_teams import TEAMS
 
 import cprl
 from cprl import Experiment
+from cprl.algorithms import DQN, Tabular, TabularSettings
 from cprl.evaluation import crossplay, evaluate_run
 from cprl.learners import trial
+from cprl.learners.preferences import InequityAversion
 from cprl.population import Frozen, Learning, Scripted, Team
 
 
@@ -118,9 +121,16 @@ def test_every_engine_learns_what_a_list_of_torchrls_losses_does(name, way, monk
 
 BESIDE = Learning(ALGORITHMS["DQN"])
 ALONE = [Scripted("greedy"), Scripted()]
+SEVERAL = replace(REPLAY, n_steps=3, tau=0.05, updates_per_step=2, optimizer="rmsprop")
 STOPPED = {
     "GRU and LSTM by rollouts": [Learning(RECURRENT["PPO"]), Learning(RECURRENT["PPO, LSTM"]), *ALONE],
     "GRU and LSTM by replay": [Learning(DQNS["GRU"]), Learning(DQNS["LSTM, double, log-cosh"]), *ALONE],
+    "tables and who is averse to inequity": [
+        Learning(Tabular(settings=TabularSettings(epsilon_hold_steps=10, epsilon_decay_steps=200))),
+        Learning(ALGORITHMS["PPO"], reward=InequityAversion(alpha=5, beta=0.05, smoothing=0.9)),
+        *ALONE,
+    ],
+    "returns of several steps": [Learning(DQN(settings=SEVERAL)), *ALONE, Scripted()],
     "team of GRUs": [Team(RECURRENT["MAPPO"], (0, 1), reward="team"), *ALONE],
     **{name: [Team(TEAMS[name], (0, 1, 2), reward="team"), BESIDE] for name in ("QMIX", "MAPPO", "MADDPG")},
     **{f"shared {name}": [shared(ALGORITHMS[name], (0, 1, 2)), BESIDE] for name in ("DQN", "PPO")},

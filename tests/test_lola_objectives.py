@@ -129,33 +129,31 @@ def test_the_value_of_tit_for_tat_and_of_defection_is_as_by_hand():
     assert iterated_value(both, DILEMMA, gamma=0.5).tolist() == pytest.approx([-2, -2])
 
 
-@pytest.mark.slow
-def test_exact_lola_finds_cooperation_in_the_iterated_dilemma_and_naive_learning_does_not():
+def ends(payoffs, gamma):
+    """Mean payoffs a turn of 1000 pairs after 200 updates, [1000, 2], of naive learners and of LOLA."""
     generator = torch.Generator().manual_seed(1)
     start = [[torch.randn(1000, 5, generator=generator)] for _ in range(2)]
-    objective = losses_of(DILEMMA, 0.96)
-    means = {}
-    for rate in (0.0, 1.0):
-        end = descended(objective, start, updates=200, step=1.0, rate=rate)
-        means[rate] = -objective(end).mean(-1) * (1 - 0.96)
+    objective = losses_of(payoffs, gamma)
+    return [
+        -objective(descended(objective, start, updates=200, step=1.0, rate=rate)) * (1 - gamma)
+        for rate in (0.0, 1.0)
+    ]
+
+
+@pytest.mark.slow
+def test_exact_lola_finds_cooperation_in_the_iterated_dilemma_and_naive_learning_does_not():
+    naive, lola = (values.mean(-1) for values in ends(DILEMMA, 0.96))
     # Published -1.98 (0.14) and -1.06 (0.19) over 50 runs each; these are 20 times 50.
-    assert means[0.0].mean() < -1.9
-    assert means[1.0].mean() > -1.15
-    assert (means[1.0] > -1.2).float().mean() >= 0.85
+    assert naive.mean() < -1.9
+    assert lola.mean() > -1.15
+    assert (lola > -1.2).float().mean() >= 0.85
 
 
 @pytest.mark.slow
 def test_exact_lola_and_naive_learning_stay_near_zero_in_matching_pennies():
-    generator = torch.Generator().manual_seed(1)
-    start = [[torch.randn(1000, 5, generator=generator)] for _ in range(2)]
-    objective = losses_of(PENNIES, 0.9)
-    spread = {}
-    for rate in (0.0, 1.0):
-        end = descended(objective, start, updates=200, step=1.0, rate=rate)
-        values = -objective(end) * (1 - 0.9)
-        assert values.mean(0).abs().max() < 0.05, "published: 0 for both"
-        spread[rate] = float(values[:, 0].std())
-    assert spread[1.0] < spread[0.0] / 2, "LOLA comes to the equilibrium, where each run has 0"
+    naive, lola = ends(PENNIES, 0.9)
+    assert max(values.mean(0).abs().max() for values in (naive, lola)) < 0.05, "published: 0 for both"
+    assert lola[:, 0].std() < naive[:, 0].std() / 2, "LOLA comes to the equilibrium, where each run has 0"
 
 
 T, GAMMA = 3, 0.9
@@ -210,7 +208,7 @@ BASELINE = torch.tensor([-3.0, -2.0, -1.0], dtype=torch.float64)[:, None].expand
 """Of the return from each turn on: far off, since it must not matter."""
 
 
-def estimate(rollouts, kind):
+def estimate(rollouts, kind, baseline=BASELINE):
     """Losses [lanes, 2] by parameters [lanes, 5] of each agent."""
     seen, action, paid = rollouts
 
@@ -220,9 +218,9 @@ def estimate(rollouts, kind):
         logit = logits.gather(-1, at).unflatten(-1, seen.shape[1:]).movedim(1, -1)
         taken = nn.functional.logsigmoid(torch.where(action == 0, logit, -logit))
         if kind == "loaded":
-            value = loaded_dice(taken, to_go(paid) - BASELINE, gamma=GAMMA)
+            value = loaded_dice(taken, to_go(paid) - baseline, gamma=GAMMA)
         else:
-            of = {} if kind == "plain" else {"baseline": BASELINE.expand_as(paid)}
+            of = {} if kind == "plain" else {"baseline": baseline.expand_as(paid)}
             value = dice_objective(taken, paid, gamma=GAMMA, **of)
         return -value.mean(-2)
 
@@ -262,28 +260,15 @@ def test_dice_estimates_first_and_mixed_second_derivatives_without_bias(kind):
 
 
 def test_a_baseline_that_fits_takes_variance_from_second_derivatives_too():
-    seen, action, paid = sampled(1000, 25, seed=4)
-    fits = to_go(paid).mean((0, 1), keepdim=True).expand_as(paid)
-    spread = {}
-    for name, baseline in (("none", torch.zeros_like(paid)), ("mean", fits)):
-        logits = of_lanes(1000)
-        (x,), (y,) = logits
-
-        def losses(parameters, baseline=baseline):
-            return _with(baseline, seen, action, paid, parameters)
-
-        (step,) = torch.autograd.grad(losses(logits)[..., 1].sum(), y, create_graph=True)
+    rollouts = sampled(1000, 25, seed=4)
+    returns, spread = to_go(rollouts[-1]), {}
+    for name, baseline in (("none", torch.zeros(T, 2)), ("mean", returns.mean((0, 1)))):
+        (x,), (y,) = logits = of_lanes(1000)
+        losses = estimate(rollouts, "baseline", baseline.double())(logits)
+        (step,) = torch.autograd.grad(losses[..., 1].sum(), y, create_graph=True)
         (mixed,) = torch.autograd.grad(step.sum(), x)
         spread[name] = mixed.std(0).mean()
     assert spread["mean"] < 0.6 * spread["none"]
-
-
-def _with(baseline, seen, action, paid, parameters):
-    logits = torch.stack([parameters[0][0], parameters[1][0][..., SEEN_BY_SECOND]], 1)
-    at = seen.flatten(1).unsqueeze(1).expand(-1, 2, -1)
-    logit = logits.gather(-1, at).unflatten(-1, seen.shape[1:]).movedim(1, -1)
-    taken = nn.functional.logsigmoid(torch.where(action == 0, logit, -logit))
-    return -dice_objective(taken, paid, gamma=GAMMA, baseline=baseline).mean(-2)
 
 
 @pytest.mark.integration
