@@ -14,7 +14,6 @@ from test_population import (
     GAME,
     REPLAY,
     assert_all_weights_move_and_replicas_learn_apart,
-    assert_goes_on_bit_for_bit,
     population,
     trained,
     weights,
@@ -25,12 +24,14 @@ from test_recurrent_replay import DQNS
 from test_teams import TEAMS
 
 import cprl
-from cprl import Experiment
+from cprl import CommonsEnv, Experiment
 from cprl.algorithms import DQN, Tabular, TabularSettings
 from cprl.evaluation import crossplay, evaluate_run
 from cprl.learners import trial
 from cprl.learners.preferences import InequityAversion
 from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.runs.checkpoints import Checkpointer, checkpoints_in
+from cprl.training import train
 
 
 def shared(algorithm, agents=FOUR):
@@ -141,7 +142,46 @@ STOPPED = {
 }
 
 
+class StopError(Exception):
+    """A training is stopped."""
+
+
+class Stopping:
+    def __init__(self, at):
+        self.turns_left = at
+
+    def on_step(self, batch):
+        self.turns_left -= 1
+        if self.turns_left == 0:
+            raise StopError
+
+
+class AtSteps(Checkpointer):
+    def after_step(self, training):
+        if training.steps in (20, 45):
+            self.save(training)
+
+
 @pytest.mark.integration
 @pytest.mark.parametrize("name", STOPPED)
 def test_a_training_that_was_stopped_within_an_episode_and_a_rollout_goes_on_bit_for_bit(name, tmp_path):
-    assert_goes_on_bit_for_bit(STOPPED[name], tmp_path, episodes=7)
+    def ends(folder, *, stop_at=0):
+        agents = population(STOPPED[name])
+        (tmp_path / folder).mkdir(exist_ok=True)
+        with AtSteps(tmp_path / folder) as checkpoints:
+            train(
+                CommonsEnv(GAME, 2, seed=3),
+                agents.learners,
+                others=agents.others,
+                episodes=7,
+                callbacks=[Stopping(stop_at)],
+                checkpointer=checkpoints,
+            )
+        return weights(agents)
+
+    whole = ends("whole")
+    with pytest.raises(StopError):
+        ends("stopped", stop_at=47)
+    assert checkpoints_in(tmp_path / "stopped" / "checkpoints")
+    for key, value in ends("stopped").items():
+        assert torch.equal(value, whole[key]), key
