@@ -17,6 +17,7 @@ def test_a_family_of_algorithms_learns_what_it_did(family, tmp_path):
     assert {name: case["differs after a stop"] for name, case in found.items()} == {
         name: [] for name in found
     }
+    assert_held("weights", {name: case.pop("weights") for name, case in found.items()}, tolerance=1e-4)
     assert_held("training", found)
 
 

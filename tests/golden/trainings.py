@@ -4,13 +4,13 @@ python tests/golden/trainings.py FAMILY FOLDER               writes to found.jso
 python tests/golden/trainings.py FAMILY compiled FOLDER      ... how far compiled ones end from eager ones
 """
 
-import hashlib
 import json
 import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from golden import columns
 
 EPISODES, REPLICAS = 3, 2
@@ -167,27 +167,37 @@ def experiments() -> dict[str, dict[str, object]]:
     }
 
 
-def weights(run: Path) -> dict[str, str]:
-    """A checksum of the weights of each lane that does not depend on names or the order of layers."""
+def weights(run: Path) -> dict[str, list[np.ndarray]]:
+    """The weights of each lane."""
     import cprl
 
-    sums = {}
-    for lane, network in cprl.load(run).networks.items():
-        values = [value.detach().cpu().numpy().tobytes() for value in network.state_dict().values()]
-        digests = [int.from_bytes(hashlib.sha256(value).digest()[:8], "big") for value in values]
-        sums[lane] = f"{sum(digests) % 2**64:016x}"
-    return sums
+    return {
+        lane: [value.detach().cpu().numpy() for value in network.state_dict().values()]
+        for lane, network in cprl.load(run).networks.items()
+    }
 
 
-def outcome(run: Path) -> dict[str, object]:
-    """What a run says of its training: weights, table of episodes, evaluation."""
+def sums(lane: list[np.ndarray]) -> list[float]:
+    """The number of weights, the sum of their sizes, and one in which neighbours count unlike.
+
+    They do not depend on names or on the order of layers, and may be compared with a tolerance.
+    """
+    sizes = [np.abs(layer.astype(np.float64).ravel()) for layer in lane]
+    return [
+        sum(map(len, sizes)),
+        sum(float(size.sum()) for size in sizes),
+        sum(float(size @ (np.arange(len(size)) % 7 + 1)) for size in sizes),
+    ]
+
+
+def tables(run: Path) -> dict[str, object]:
+    """What a run says of its training: its table of episodes, and its evaluation."""
     import pyarrow.parquet as pq
 
-    tables = {"episodes": "episodes.parquet"} | {
+    paths = {"episodes": "episodes.parquet"} | {
         name: f"evaluation/{name}.parquet" for name in ("trained", "random")
     }
-    found = {name: columns(pq.read_table(run / path)) for name, path in tables.items()}
-    return {"weights": weights(run), **found}
+    return {name: columns(pq.read_table(run / path)) for name, path in paths.items()}
 
 
 def train(experiment: object, out: Path) -> dict[str, object]:
@@ -195,11 +205,20 @@ def train(experiment: object, out: Path) -> dict[str, object]:
     import cprl
 
     quiet = {"watch": "off", "figures": False}
-    whole = outcome(cprl.run(experiment, out / "whole", **quiet))
+    whole = cprl.run(experiment, out / "whole", **quiet)
     cprl.run(replace(experiment, episodes=1), out / "halves", **quiet)
-    halves = outcome(cprl.run(experiment, out / "halves", resume=True, **quiet))
-    differing = [name for name in whole if whole[name] != halves[name]]
-    return {**whole, "differs after a stop": differing}
+    halves = cprl.run(experiment, out / "halves", resume=True, **quiet)
+    found, again = tables(whole), tables(halves)
+    learned, learned_again = weights(whole), weights(halves)
+    differing = [name for name in found if found[name] != again[name]]
+    differing += [
+        lane for lane in learned if not all(map(np.array_equal, learned[lane], learned_again[lane]))
+    ]
+    return {
+        **found,
+        "weights": {lane: sums(layers) for lane, layers in learned.items()},
+        "differs after a stop": differing,
+    }
 
 
 COMPILED = {
@@ -223,12 +242,12 @@ def distances(family: str, folder: Path) -> dict[str, float]:
             experiment = replace(experiments()[family][name], engine=engine, episodes=1)
             out = folder / engine / name.replace(" ", "_").replace(",", "")
             cprl.run(experiment, out, watch="off", figures=False)
-            ends.append(cprl.load(out).networks)
-        compiled, eager = ({lane: network.state_dict() for lane, network in end.items()} for end in ends)
+            ends.append(weights(out))
+        compiled, eager = ends
         found[name] = max(
-            float((weights - eager[lane][layer]).abs().max())
+            float(np.abs(one - other).max())
             for lane, layers in compiled.items()
-            for layer, weights in layers.items()
+            for one, other in zip(layers, eager[lane], strict=True)
         )
     return found
 
