@@ -64,9 +64,6 @@ class Algorithm:
 
     Agents with equal algorithms learn as lanes of one stacked update, so an algorithm must be a frozen
     dataclass.
-
-    Raises:
-        ValueError: if a value is not allowed; the message names the field, the value and what is allowed.
     """
 
     settings: Any
@@ -283,10 +280,6 @@ def network_of(
         settings: the hyperparameters.
         network: the architecture; None for fully connected layers of `settings.hidden_cells`.
         outputs: the number of outputs.
-        how: see `new_network`.
-
-    Raises:
-        ValueError: if `settings.hidden_cells` is set together with a network; and see `new_network`.
     """
     if network is not None and settings.hidden_cells != DEFAULT_HIDDEN_CELLS:
         raise ValueError(

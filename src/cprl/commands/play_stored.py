@@ -407,7 +407,6 @@ def check_files(out: Path | None = None, figure: Path | None = None) -> None:
 
     Raises:
         FileExistsError: if a file exists.
-        ValueError: if the name of the figure does not end in .png.
     """
     if out is not None:
         refuse_to_write_over(out)

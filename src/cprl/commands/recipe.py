@@ -165,8 +165,6 @@ def parse(
     """The experiment that a command line, script first, asks for, and how it is to be run.
 
     Raises:
-        ValueError: where the experiment refuses a value, or an argument of the recipe's own has the name of
-            a field of the experiment.
         SystemExit: for `--help`, and for an argument that is unknown or of another type.
     """
     return parse_with(make_experiment, command[1:], _OPTIONS, program=program_of(command[0]))

@@ -413,7 +413,6 @@ def carry_out(what: "Study | Search", options: StudyOptions, command: Sequence[s
         The study's directory.
 
     Raises:
-        ValueError: for whatever does not fit, before anything is written.
         SystemExit: with code 1 where trials have failed, and 130 or 143 where it was interrupted.
     """
     from cprl.studies import Search, run_search, run_study

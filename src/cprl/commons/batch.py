@@ -64,7 +64,6 @@ class Batch:
         driver: The driver; CPU threads by default.
 
     Raises:
-        ValueError: If `worlds`, `seed`, `first_world` or `threads` is out of range.
         MemoryError: If the worlds do not fit into memory.
     """
 
@@ -149,9 +148,6 @@ class Batch:
         Args:
             output: Arrays made by `new_output`.
             which: bool [B], the worlds that begin; None for all. Of a new batch, all worlds begin.
-
-        Raises:
-            ValueError: If an array has the wrong form, or worlds of a new batch are left out.
         """
         if which is None:
             which = self._all_worlds
@@ -171,10 +167,6 @@ class Batch:
             output: Arrays made by `new_output`.
             decisions: int64 [B, N], contiguous, where agents decide something, see `Game.decisions`; read of
                 worlds in the first turn of an episode alone. None for the first option of all agents.
-
-        Raises:
-            ValueError: If an action or a decision is out of range, an array has the wrong form, or the worlds
-                have not begun; no world has changed.
         """
         self.check(actions)
         if decisions is not None:
@@ -231,9 +223,6 @@ class Batch:
         Args:
             state: Arrays as returned by `state`, for the same number of worlds of the same game.
             output: Arrays made by `new_output`.
-
-        Raises:
-            ValueError: If the game cannot be in this state; no world has changed.
         """
         checked, arrays = states.checked(state, worlds=self.size, game=self.game), self._state_arrays()
         for name, values in checked.items():

@@ -93,9 +93,6 @@ def machine_code(function: Any, *arguments: Any) -> Callable[..., Any]:
 
     Numba's own call looks at the types of all arguments each time; this one looks at none, so the caller
     must. `Dispatcher.compile` returns it, which Numba does not document.
-
-    Raises:
-        ValueError: where NUMBA_DISABLE_JIT leaves functions as they are.
     """
     if _SETTINGS.DISABLE_JIT:
         raise ValueError(

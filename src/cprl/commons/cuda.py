@@ -35,7 +35,6 @@ class CudaThreads:
     neighbouring words. Step outputs are stored row-major, as in torch.
 
     Raises:
-        ValueError: If Numba finds no GPU.
         MemoryError: If the worlds do not fit into its memory.
     """
 

@@ -33,12 +33,7 @@ def names(game: Game) -> tuple[str, ...]:
 
 
 def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
-    """Returns a state as arrays, after checking that the game can be in it.
-
-    Raises:
-        ValueError: If the game cannot be in this state; the message names the entry, its value and what is
-            allowed.
-    """
+    """Returns a state as arrays, after checking that the game can be in it."""
     empty = empty_worlds(worlds=worlds, agents=game.agents, sites=len(game.map.sites))
     expected = {name: getattr(empty, name) for name in names(game)}
     if game.institutions:

@@ -269,11 +269,7 @@ class CommonsEnv(LeanStepEnv):
         return self._as_tensordict(self._tensors, reward.unsqueeze(-1))
 
     def _check_stepped(self, stepped: Tensor) -> None:
-        """That the worlds that a "_step" mask, bool [B], leaves out have all ended.
-
-        Raises:
-            ValueError: for one that has not: all worlds play each turn.
-        """
+        """That the worlds that a "_step" mask, bool [B], leaves out have all ended."""
         playing = self.worlds.driver.read(self.worlds.now.ended)[:, 0] == PLAYING
         left_out = playing & ~stepped.numpy(force=True)
         if left_out.any():
@@ -283,11 +279,7 @@ class CommonsEnv(LeanStepEnv):
             )
 
     def _chosen(self, tensordict: TensorDictBase, name: str) -> Tensor:
-        """("agents", "action") or ("agents", "decision"), int64 on the device of the worlds.
-
-        Raises:
-            ValueError: if it is missing or holds no integers.
-        """
+        """("agents", "action") or ("agents", "decision"), int64 on the device of the worlds."""
         try:
             actions: Tensor = keys.entry(keys.entry(tensordict, keys.AGENTS), name)
         except (KeyError, AttributeError):

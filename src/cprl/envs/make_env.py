@@ -158,11 +158,7 @@ OF_CPRL: Final[tuple[type[Any], ...]] = (Game, MatrixGame, TakingGame)
 
 
 def stored_game(game: object) -> object:
-    """As a recipe holds it: a game of the user's by the name of its class.
-
-    Raises:
-        ValueError: for a game that a recipe cannot hold; says what it can.
-    """
+    """As a recipe holds it: a game of the user's by the name of its class."""
     if isinstance(game, TakingGame) and not isinstance(game.sharing.worth, PowerWorth):
         raise ValueError(
             f"experiment.game.sharing.worth is a {type(game.sharing.worth).__name__}, which a recipe cannot "

@@ -64,11 +64,7 @@ class MatrixGame(StageGame):
 
 
 def _table(payoffs: Any) -> tuple[Any, ...]:
-    """Payoffs as nested tuples of Python's floats.
-
-    Raises:
-        ValueError: for another shape, and for what is no finite number.
-    """
+    """Payoffs as nested tuples of Python's floats."""
     name = "MatrixGame.payoffs"
     table = arguments.floats(name, payoffs)
     *actions, agents = table.shape or (0,)

@@ -68,10 +68,6 @@ class StageEnv(LeanStepEnv):
         device: "cpu" or "cuda".
         first_world: the number of the first world: its episodes are as long as those of that world in a
             larger batch.
-
-    Raises:
-        ValueError: for another number of worlds, seed or device, and in `step` for actions that are missing
-            or of another form, or out of range; then nothing changes.
     """
 
     batch_locked = True

@@ -27,11 +27,7 @@ def env_state(env: EnvBase) -> dict[str, Any]:
 
 
 def load_env_state(env: EnvBase, state: Mapping[str, Any]) -> None:
-    """Puts an environment, made with the same arguments, where `env_state` found it.
-
-    Raises:
-        ValueError: if the state is of another form, or a commons or a transform cannot be in it.
-    """
+    """Puts an environment, made with the same arguments, where `env_state` found it."""
     commons = commons_of(env)
     if commons is None:
         base_env(env).load_state_dict(state["worlds"])
@@ -56,9 +52,6 @@ def transforms_state(env: EnvBase) -> dict[str, Any]:
 def load_transforms_state(env: EnvBase, state: Mapping[str, Any]) -> None:
     """Gives the transforms of an environment what those of another had; what they keep of its own worlds
     stays.
-
-    Raises:
-        ValueError: if a transform cannot be in this state.
     """
     if isinstance(env, TransformedEnv):
         _load(env, {name: value for name, value in state.items() if not _is_of_worlds(env, name)})

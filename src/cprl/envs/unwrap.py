@@ -20,11 +20,7 @@ def commons_of(env: EnvBase) -> CommonsEnv | None:
 
 
 def agent_count(env: EnvBase) -> int:
-    """The number of agents N of an environment of batch size [B].
-
-    Raises:
-        ValueError: where the environment has another batch size, or no reward [B, N, 1] of the agents.
-    """
+    """The number of agents N of an environment of batch size [B]."""
     size = tuple(env.batch_size)
     if len(size) != 1:
         raise ValueError(f"the environment has batch size {list(size)}; allowed: [B], B worlds")

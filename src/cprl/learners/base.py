@@ -80,8 +80,6 @@ class BaseLearner:
         reward_kind: what they want, see `cprl.learners.preferences`.
 
     Raises:
-        ValueError: for agents that the spaces do not have, a number of replicas that there cannot be, and a
-            preference that compares an agent with others in a game of one.
         TooLargeError: for more replicas than there is memory for, whatever they learn by.
     """
 

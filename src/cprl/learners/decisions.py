@@ -33,9 +33,6 @@ class Bandit:
     `step_size`. The first numbers are thus plain means; later ones follow what others learn meanwhile.
 
     Source: Sutton and Barto, "Reinforcement Learning" (2nd edition, 2018), sections 2.4 and 2.5.
-
-    Raises:
-        ValueError: if a value is out of range; names it and says what is allowed.
     """
 
     step_size: float = 0.1

@@ -86,11 +86,7 @@ class FunctionalLoss:
 
 
 def own_targets(loss: LossModule) -> None:
-    """Marks the targets of a loss as updated, by the engine, so that TorchRL does not warn.
-
-    Raises:
-        ValueError: if the loss already has a `SoftUpdate` or `HardUpdate`, which would have no effect.
-    """
+    """Marks the targets of a loss as updated, by the engine, so that TorchRL does not warn."""
     if any(f"target_{name}_params" in groups_of(loss) for name in updated_weights(loss)):
         raise ValueError(_NO_UPDATER.format(type(loss).__name__))
     promise_targets(loss)
@@ -102,9 +98,6 @@ def total(out: Any, loss: LossModule) -> Tensor:
     Args:
         out: what the loss returned.
         loss: named in the error.
-
-    Raises:
-        ValueError: if it is no TensorDict, or has no such entry.
     """
     entries = dict(out.items()) if is_tensor_collection(out) else {}
     losses = [value for name, value in entries.items() if name.startswith("loss")]
@@ -164,12 +157,7 @@ class Stacked(NamedTuple):
 
 
 def stacked(networks: Sequence[nn.Module], make_loss: MakeLoss, *, lane_axis: bool) -> Stacked:
-    """One loss for the networks of all lanes; the weights are copied.
-
-    Raises:
-        ValueError: with a lane axis: if the networks cannot be stacked, if the loss has weights of its own,
-            which all lanes would share, or if the loss adds an axis of its own before the lane axis.
-    """
+    """One loss for the networks of all lanes; the weights are copied."""
     made = [stack_lanes(networks)] if lane_axis else list(networks)
     losses = [make_loss(network) for network in made]
     if lane_axis and (shared := _single_weights(losses[0])):

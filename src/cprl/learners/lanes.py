@@ -79,9 +79,6 @@ class Lanes:
         start_from: the weights with which the acting networks of lanes start, see `StartFrom`.
         share_parameters: whether the agents of a replica share one network, initialised as that of the first.
         sees_peers: whether a lane's stored action is that of all N agents, see `transitions.joint_actions`.
-
-    Raises:
-        ValueError: if agents observe entries that networks do not read.
     """
 
     member_shape: tuple[int, ...] = ()
@@ -184,7 +181,6 @@ class Lanes:
 
         Raises:
             TooLargeError: if the device has less memory than training all of them takes.
-            ValueError: if agents that share a network would start from different weights.
         """
         first, *others = self.agent_seeds(purpose)[:: self.sharing]
         networks = [init_network(self.make_network, first)]
@@ -309,7 +305,6 @@ class Teams(Lanes):
         [R, S] and team rewards [R], or with `own_rewards` those of each member, [R, S].
 
         Args:
-            batch: see `lane_turn`.
             rewards: of all agents, [R, N]; those of a team without `own_rewards` all the same.
         """
         turn = self.rollout_turn(batch, rewards)

@@ -267,7 +267,6 @@ class LOLALearner(LaneLearner):
         start_from: the weights with which actors start, by the lane's name; critics are new.
 
     Raises:
-        ValueError: if the networks are not "actor" and "critic", or cannot be stacked.
         TooLargeError: if the device has less memory than rollouts and networks take.
     """
 
@@ -329,12 +328,7 @@ class LOLALearner(LaneLearner):
         self.engine.play(None)
 
     def store(self, batch: TensorDictBase) -> None:
-        """Stores one step of every replica, as the collector yields it.
-
-        Raises:
-            ValueError: if the rollout is full: call `update` after each step, or after a number of steps that
-                divides `rollout_steps`; and if the dtype of observations is not that of the spaces.
-        """
+        """Stores one step of every replica, as the collector yields it."""
         refuse_full(self._size, self.rollout_steps)
         turn = self._lanes.rollout_turn(batch, wanted_in(self.wants, batch))
         write_turn(self._rollouts, (self._phase, self._size), turn)

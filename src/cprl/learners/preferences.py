@@ -45,9 +45,6 @@ class InequityAversion:
         beta: the dislike of being ahead (advantageous inequity), 0..1e6; 0.05 is usual.
         smoothing: the share of smoothed rewards that lasts into the next turn, 0..1; gamma x lambda of the
             source. With 0 only the rewards of the turn are compared, with 1 the returns so far.
-
-    Raises:
-        ValueError: for a number outside its range, in particular a negative dislike.
     """
 
     alpha: float
@@ -73,9 +70,6 @@ class SocialValueOrientation:
         angle: the proportion that it likes, radians in -pi..pi: 0 is for itself alone, pi / 4 for both
             alike, pi / 2 for others alone, negative against others.
         weight: reward lost per radian, 0..1e6.
-
-    Raises:
-        ValueError: for a number outside its range, e.g. an angle in degrees.
     """
 
     angle: float
@@ -97,9 +91,6 @@ class Exchange:
 
     Args:
         share: 0..1: 0 is the agent's own reward, 1 that of the others alone.
-
-    Raises:
-        ValueError: for a number outside its range.
     """
 
     share: float
@@ -128,9 +119,6 @@ def check_preference(name: str, preference: Any, agents: int) -> None:
         name: what it is called in messages.
         preference: a value of `Preference`.
         agents: the number of agents N of the game.
-
-    Raises:
-        ValueError: says what came and what is allowed.
     """
     checked(name, preference, PREFERENCE)
     if agents < 2 and not isinstance(preference, str):
@@ -162,9 +150,6 @@ def wanted_rewards(
     Returns:
         The wanted rewards, [B, N]: "individual" those given, as they are; else float32, computed in float64.
         And what is to be remembered, float64 [B, N], for `InequityAversion`; None for all others.
-
-    Raises:
-        ValueError: for a comparison with others where there are none.
     """
     check_preference("preference", preference, rewards.shape[1])
     with np.errstate(all="ignore"):  # rewards that are not finite are found and named elsewhere
@@ -228,9 +213,6 @@ class WantedRewards:
 
     Args:
         preferences: what all agents want; or a preference for each of the N agents.
-
-    Raises:
-        ValueError: for what is no preference.
     """
 
     def __init__(self, preferences: Preference | Sequence[Preference]) -> None:
@@ -270,9 +252,6 @@ class WantedRewards:
 
         Returns:
             The wanted rewards, [B, N], a numpy array or a tensor as `rewards`.
-
-        Raises:
-            ValueError: for another number of agents, or of worlds than before.
         """
         if rewards.shape[1] != self._agents:
             self.check_agents(rewards.shape[1])
@@ -322,11 +301,7 @@ class WantedRewards:
         return {"smoothed": torch.stack(kept)} if kept else {}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Continues from a state that `state_dict` returned.
-
-        Raises:
-            ValueError: if it is that of other preferences.
-        """
+        """Continues from a state that `state_dict` returned."""
         remember = [own for own in self._columns if isinstance(own, InequityAversion)]
         kept = state.get("smoothed")
         if kept is not None and (kept.ndim != 3 or len(kept) != len(remember)):
@@ -351,10 +326,6 @@ class PreferenceTransform(Transform):
         preferences: what all agents want; or a preference for each of the N agents.
         in_key: the environment's rewards, float [..., N, 1].
         out_key: where the wanted ones are written, float32 [..., N, 1]; by default in their place.
-
-    Raises:
-        ValueError: for what is no preference, and once it is in an environment, for rewards of another shape
-            and preferences that its number of agents does not allow.
     """
 
     remembers_worlds: ClassVar[bool] = True
@@ -396,11 +367,7 @@ class PreferenceTransform(Transform):
         return reward_spec
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Not for replay buffers, whose turns need not follow each other.
-
-        Raises:
-            ValueError: always.
-        """
+        """Not for replay buffers, whose turns need not follow each other."""
         raise ValueError(
             "PreferenceTransform is called outside an environment; allowed: TransformedEnv(env, "
             "PreferenceTransform(...)), where every turn follows the one before"
@@ -424,9 +391,6 @@ class PreferenceWrapper(BaseParallelWrapper[str, Any, Any]):
     Args:
         env: the environment, e.g. `cprl.envs.parallel_env(game)`.
         preferences: what all agents want; or a preference for each of `env.possible_agents`.
-
-    Raises:
-        ValueError: for what is no preference, and for preferences that the number of agents does not allow.
     """
 
     def __init__(

@@ -388,11 +388,7 @@ def _check_buffers(lanes: Lanes, settings: DQNSettings, device: torch.device) ->
 
 
 def _transformed(batch: TensorDict, transforms: Sequence[Custom]) -> TensorDict:
-    """A copy of a batch after the transforms of a replay buffer.
-
-    Raises:
-        ValueError: if a transform cannot be constructed or applied; names it.
-    """
+    """A copy of a batch after the transforms of a replay buffer."""
     for custom in transforms:
         transform = custom.make()
         if not callable(transform):

@@ -97,11 +97,6 @@ class ReplayLearner(LaneLearner):
         share_parameters: whether the agents of a replica share one network, which learns from all of them.
         sees_peers: whether transitions have the actions of all agents, see `transitions.joint_actions`.
         device: the torch device of networks, buffers and updates.
-
-    Raises:
-        ValueError: for a loss that needs the latest steps of the current policy (see
-            `cprl.learners.rollouts`), and for settings of targets if it has none; for a recurrent network
-            without sequences, or of a team, and for sequences without such a network.
     """
 
     settings: DQNSettings

@@ -209,7 +209,6 @@ class Ring:
         noise_shape: of the uniform numbers that the loss reads with each transition: the entry "noise",
             float32 [L, b, *noise_shape]; () for none.
         noise_seeds: the seed of the numbers of each lane; by default `seeds`.
-        observation_dtype: see `Spaces.observation_dtype`.
         horizon: steps and discount of n-step returns, sampled in place of rewards; None for single steps.
         state_cells: the numbers K of the state of a lane's recurrent network; 0 for one without.
         sequence_steps: turns of sampled sequences; 1 for transitions.
@@ -297,11 +296,7 @@ class Ring:
         return _at_least(self._oldest, self._written - self.capacity), self._written
 
     def write(self, turn: LaneTurn) -> None:
-        """Writes the next transition of every lane, numpy arrays if the ring is on the CPU.
-
-        Raises:
-            ValueError: if observations have another dtype than the ring; they would be rounded.
-        """
+        """Writes the next transition of every lane, numpy arrays if the ring is on the CPU."""
         arrays, place, row = self._arrays, self._written % self.capacity, self._next_row
         for seen in (turn.observation, turn.next_observation):
             refuse_other_dtype(seen.dtype, arrays["observation"].dtype)

@@ -41,11 +41,7 @@ _SMALL: Final = 1e-8
 
 
 def states_in(network: nn.Module) -> dict[str, tuple[int, ...]]:
-    """The shapes of the states of an agent's actor and critic by their entries; empty for networks without.
-
-    Raises:
-        ValueError: if one of them is recurrent and the other one is not.
-    """
+    """The shapes of the states of actor and critic by their entries; empty for networks without."""
     parts = list(parts_of(network).items())[:2]
     shapes = [state_shape_of(part) for _, part in parts]
     if all(shape is None for shape in shapes):
@@ -184,7 +180,6 @@ class RolloutLearner(LaneLearner):
             members, see `cprl.algorithms.teams`; a lane is then the team of a replica.
 
     Raises:
-        ValueError: if the networks are not "actor" and "critic".
         TooLargeError: if the device has less memory than rollouts and networks take.
     """
 
@@ -283,12 +278,7 @@ class RolloutLearner(LaneLearner):
             self._states.forget()
 
     def store(self, batch: TensorDictBase) -> None:
-        """Stores one step of every replica, as the collector yields it.
-
-        Raises:
-            ValueError: if the rollout is full: call `update` after each step, or after a number of steps that
-                divides `rollout_steps`; and if the dtype of observations is not that of the spaces.
-        """
+        """Stores one step of every replica, as the collector yields it."""
         refuse_full(self._size, self.rollout_steps)
         if self._states is not None and not self._size:
             self._states.begin(batch)
@@ -453,11 +443,7 @@ def refuse_full(stored: int, steps: int) -> None:
 
 
 def write_turn(fields: Mapping[str, Tensor], at: tuple[int, ...], turn: LaneTurn) -> None:
-    """Writes a step of all lanes at a place of `rollout_fields`.
-
-    Raises:
-        ValueError: if the dtype of observations is not that of the fields.
-    """
+    """Writes a step of all lanes at a place of `rollout_fields`."""
     for name, field in fields.items():
         column = torch.as_tensor(getattr(turn, name))
         if name in ("observation", "next_observation"):

@@ -61,9 +61,6 @@ class DQNSettings(Exploring):
 
     Source: M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement Learning" (2019), appendix A,
     and, for fields marked [run], the program of the study.
-
-    Raises:
-        ValueError: if a value is out of range; names the field, its value and the allowed values.
     """
 
     buffer_size: int = 100_000
@@ -129,11 +126,7 @@ class DQNSettings(Exploring):
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutSettings:
-    """Hyperparameters of one independent on-policy agent. The study has none; the defaults are ours.
-
-    Raises:
-        ValueError: if a value is out of range; names the field, its value and the allowed values.
-    """
+    """Hyperparameters of one independent on-policy agent. The study has none; the defaults are ours."""
 
     rollout_steps: int = 250
     """Steps T collected between updates."""
@@ -175,11 +168,7 @@ class RolloutSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class TabularSettings(Exploring):
-    """Hyperparameters of one tabular agent. The study gives none; the defaults are ours.
-
-    Raises:
-        ValueError: if a value is out of range; names the field, its value and the allowed values.
-    """
+    """Hyperparameters of one tabular agent. The study gives none; the defaults are ours."""
 
     gamma: float = 0.995
     """Discount factor per step, as `DQNSettings.gamma`."""
@@ -267,9 +256,6 @@ _TABULAR: Final[dict[str, Check]] = {
 class LOLASettings:
     """Hyperparameters of the members of a team that learns by LOLA. The study has none; the defaults are
     ours.
-
-    Raises:
-        ValueError: if a value is out of range; names the field, its value and the allowed values.
     """
 
     rollout_steps: int = 250

@@ -133,11 +133,7 @@ class TabularLearner(BaseLearner):
         return torch.from_numpy(self.tables.values[rows].max(1)).view(self.replicas, len(self.agents))
 
     def networks(self) -> dict[str, nn.Module]:
-        """A copy of each lane's current table as a network, by "replica_0/agent_0" and so on.
-
-        Raises:
-            ValueError: see `Tabular.make_network`.
-        """
+        """A copy of each lane's current table as a network, by "replica_0/agent_0" and so on."""
         made: dict[str, nn.Module] = {}
         for name, own in self._network_states().items():
             made[name] = table_network(self.spaces)

@@ -75,9 +75,6 @@ def fitting_engine(networks: Sequence[nn.Module], make_loss: MakeLoss, trial: Te
         networks: the networks of some lanes; the trial uses copies.
         make_loss: makes a lane's loss from its network.
         trial: a synthetic batch of these lanes.
-
-    Raises:
-        ValueError: if the loss reads an entry that batches do not have; names the entry.
     """
     try:
         reference = _tried("list", networks, make_loss, trial)
@@ -177,7 +174,6 @@ def trial_rollout(
     """A synthetic batch of a rollout, from synthetic transitions.
 
     Args:
-        transitions: see `trial_batch`.
         actions: their number A, for a batch with logits.
         states: the shapes of the states of recurrent networks by their entries; every third step is an init.
     """

@@ -65,9 +65,6 @@ def dilemma(restrained: Values, greedy: Values) -> Dilemma:
     Args:
         restrained: R(k), float [R, N]: of each of R replicas, for k = 0 to N - 1 others that are restrained.
         greedy: G(k), likewise. Replicas are paired.
-
-    Raises:
-        ValueError: for other shapes, and a single agent.
     """
     if restrained.ndim != 2 or restrained.shape != greedy.shape or restrained.shape[1] < 2:
         raise ValueError(

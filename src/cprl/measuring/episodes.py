@@ -390,11 +390,7 @@ def decisions_of(env: EnvBase) -> tuple[str, ...]:
 
 
 def _widths_in(tensordict: TensorDictBase) -> dict[str, int]:
-    """The last axes of "counts" and "in_force" of a batch.
-
-    Raises:
-        ValueError: if it has other counts than `cprl.institutions.COUNTS`.
-    """
+    """The last axes of "counts" and "in_force" of a batch."""
     places: dict[str, Any] = {"counts": ("next", *keys.COUNTS), "in_force": ("next", keys.IN_FORCE)}
     found = {name: tensordict.get(place, None) for name, place in places.items()}
     widths = {name: values.shape[-1] for name, values in found.items() if values is not None}
@@ -413,7 +409,6 @@ class _TurnReader:
         reported: the optional entries that the game reports, see `cprl.measuring.metrics`.
         worlds: the number of worlds B of a batch.
         agents: the number of agents N of each world.
-        widths: see `_widths_in`.
     """
 
     def __init__(
@@ -430,9 +425,6 @@ class _TurnReader:
         """All entries as arrays, [B, ...] or [B, T, ...], without a copy if the batch is on the CPU.
 
         "had_ended", the worlds that had ended before the turn, is included only if a world has ended now.
-
-        Raises:
-            ValueError: if the batch lacks an entry, or has a wrong shape.
         """
         try:
             turns = self._arrays(tensordict)

@@ -27,9 +27,6 @@ def evaluate(env: EnvBase, policy: Policy, *, explore: bool = False) -> list[Epi
 
     Returns:
         B episodes, in the order of worlds.
-
-    Raises:
-        ValueError: if the environment's batches lack entries or have wrong shapes, see `EpisodeTracker`.
     """
     worlds = env.batch_size.numel()
     is_commons = isinstance(env, CommonsEnv)

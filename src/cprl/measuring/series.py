@@ -26,9 +26,6 @@ def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence
         episode: the episode.
         learning: the numbers of learning in it, by agent index: `agent_0/loss` and so on.
         agents: the agents' names, which replace `agent_0` and so on.
-
-    Raises:
-        ValueError: for something else than numbers by name in `learning`, as a callback may write there.
     """
     numbers = {f"social/{name}": value for name, value in social_metrics(episode).items()}
     for agent, value in zip(agents, episode.return_, strict=True):

@@ -54,12 +54,7 @@ class Recurrent:
         glorot_uniform: bool = False,
         shape: Sequence[int] | None = None,
     ) -> "RecurrentNetwork":
-        """A new network.
-
-        Raises:
-            ValueError: if the encoder cannot read observations, and for `relu_on_outputs` or
-                `glorot_uniform`.
-        """
+        """A new network."""
         for name, value in {"relu_on_outputs": relu_on_outputs, "glorot_uniform": glorot_uniform}.items():
             if value:
                 raise ValueError(f"settings.{name} is True; allowed with a recurrent network: False")
@@ -155,9 +150,6 @@ class StackedRecurrent(nn.Module):
 
     Args:
         networks: the networks of the lanes, of one architecture; their weights are copied.
-
-    Raises:
-        ValueError: if the networks differ in architecture.
     """
 
     def __init__(self, networks: Sequence[RecurrentNetwork]) -> None:
@@ -222,7 +214,6 @@ def _outputs(
         weights: of L lanes.
         features: of one step, or of sequences if `is_init` is given.
         state: before each step.
-        is_init: see `RecurrentNetwork.forward`.
         size: L, the sequences of each lane or -1, and the steps of each.
     """
     lanes, _, steps = size

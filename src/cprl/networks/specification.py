@@ -38,10 +38,6 @@ def new_network(
         glorot_uniform: whether its weights are initialised Glorot-uniform and its biases to zero.
         shape: the shape of its input if that is not one observation: (S, *observation_shape) for the central
             critic of S agents. A network of your own gets it as `spaces.observation_shape`.
-
-    Raises:
-        ValueError: if agents observe entries that networks do not read, if the network cannot read the
-            observation, or if it does not support `relu_on_outputs` or `glorot_uniform`.
     """
     refuse_unseen(spaces)
     if not isinstance(network, Custom):

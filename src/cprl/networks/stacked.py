@@ -23,9 +23,6 @@ class StackedMLP(nn.Module):
 
     Args:
         networks: the networks of the lanes, of one architecture; their weights are copied.
-
-    Raises:
-        ValueError: if the networks differ in architecture.
     """
 
     def __init__(self, networks: Sequence[MLPNetwork]) -> None:
@@ -71,9 +68,6 @@ class StackedModules(nn.Module):
 
     Args:
         networks: the networks of the lanes, with the attribute `observation_dims`; their weights are copied.
-
-    Raises:
-        ValueError: if the networks have buffers or differ in architecture.
     """
 
     def __init__(self, networks: Sequence[nn.Module]) -> None:
@@ -130,12 +124,7 @@ def through_layers(
 
 
 def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
-    """One network with the parameters of all lanes along a lane axis; copies.
-
-    Raises:
-        ValueError: if the networks cannot be stacked: a user's network without the attribute
-            `observation_dims`, the number of axes of an observation, or with buffers.
-    """
+    """One network with the parameters of all lanes along a lane axis; copies."""
     first: Any = networks[0]
     if hasattr(first, "stacked"):
         itself: nn.Module = first.stacked(networks)

@@ -62,9 +62,6 @@ class TeamNetwork(nn.Module):
 
     Args:
         networks: the members' networks, of one architecture; their weights are copied.
-
-    Raises:
-        ValueError: if the networks differ in architecture.
     """
 
     def __init__(self, networks: Sequence[MLPNetwork]) -> None:

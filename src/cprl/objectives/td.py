@@ -47,7 +47,6 @@ class LogCoshDQNLoss(ReshapedLoss, DQNLoss):
     log-cosh is even: it is that of the absolute error, which `DQNLoss` computes for `loss_function="l1"`.
 
     Args:
-        value_network: see `DQNLoss`, as of the others.
         delay_value: whether there is a target network.
         double_dqn: whether the network itself chooses the action whose value bootstraps.
         action_space: "categorical" for actions as integers, or "one-hot".

@@ -35,10 +35,6 @@ class AgentPolicies(TensorDictModuleBase):
     `in_keys` name, e.g. "stock_gauge"; writes ("agents", "action"), int64 [B, N].
     Where actors are recurrent it also reads "recurrent_state" and writes it and "recurrent_state_before".
     With decisions it also reads "ballots_due", and writes ("agents", "decision"), int64 [B, N].
-
-    Raises:
-        ValueError: if an agent has no actor or several; when called, for another number of worlds than actors
-            play.
     """
 
     in_keys: tuple[Any, ...] = (keys.OBSERVATION,)
@@ -125,9 +121,6 @@ class AgentPolicies(TensorDictModuleBase):
     def _begin_states(self, agents: TensorDictBase, observation: Tensor, dim: int) -> None:
         """Notes the states that actors read in this turn, zeros where there are none; makes room for those
         that they write.
-
-        Raises:
-            ValueError: for states of other networks than these.
         """
         size = *observation.shape[: dim + 1], self._state_cells
         before = agents.get("recurrent_state", None)

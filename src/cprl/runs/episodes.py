@@ -55,7 +55,6 @@ class EpisodeTable:
 
     Raises:
         FileExistsError: if the table exists and is not to be resumed; nothing is ever overwritten.
-        ValueError: if the table to be resumed is damaged.
     """
 
     def __init__(
@@ -166,7 +165,6 @@ def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
 
     Raises:
         FileNotFoundError: if there are none.
-        ValueError: if the file is damaged, see `cprl.runs.files`, or a newer cprl wrote it.
     """
     path = Path(run_directory) / FILE_NAME
     recipe = path.with_name("recipe.json")  # with the format of the journal, which has none of its own
@@ -186,7 +184,6 @@ def read_table(path: str | os.PathLike[str]) -> pa.Table:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is damaged or no parquet file; names it.
     """
     path = Path(path)
     refuse_special(path)

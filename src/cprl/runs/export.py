@@ -39,7 +39,6 @@ def export_results(run: Path, folder: Path, *, weights: bool = True) -> Path:
         returns are float32, and rows are sorted by replica, episode and agent.
 
     Raises:
-        ValueError: if there is no run, a file of it is damaged or lost, or the folder holds another run.
         FileNotFoundError: if the run has not ended.
     """
     run, folder = Path(run), Path(folder)

@@ -91,7 +91,6 @@ def read_json(path: Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it cannot be read, is nested too deeply or is not an object; names the file.
     """
     refuse_special(path)
     try:
@@ -220,7 +219,6 @@ class RunLock:
 
     Raises:
         RunLockedError: names the process that holds the lock.
-        ValueError: if a symbolic link leads out of the directory, see `cprl.runs.files.refuse_links`.
     """
 
     def __init__(self, run: Path, *, take_over: bool = False) -> None:

@@ -104,7 +104,6 @@ def read_journal(path: Path) -> Content:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is damaged; says behind how many rows.
     """
     refuse_special(path)
     data = path.read_bytes()

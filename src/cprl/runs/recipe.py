@@ -57,7 +57,6 @@ def start_run(
     Raises:
         FileExistsError: if `out` is not empty.
         RunLockedError: if another process is just starting a run there.
-        ValueError: if the name cannot be that of a directory.
     """
     if Path(name).name != name or "\0" in name:
         raise ValueError(f"name is {shown(name)}; allowed: the name of a directory, without slashes")

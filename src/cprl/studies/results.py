@@ -45,7 +45,6 @@ def write_results(
         The table. What is no part of it is named in it and in the summary.
 
     Raises:
-        ValueError: for what does not fit, before anything is written.
         OSError: where it cannot be written; each file is then whole, an old one or a new one.
     """
     out, folder = Path(out), Path(runs)

@@ -231,11 +231,7 @@ def run_search(
     last: int = LAST,
     again: str = "",
 ) -> SearchResult:
-    """Runs a search; may be stopped at any moment, and called again, with more points too.
-
-    Args:
-        last: see `cprl.studies.run_study`; what the search itself looks at is in `Search`.
-    """
+    """Runs a search; may be stopped at any moment, and called again, with more points too."""
     check_executor(on)
     check_comparison(last)
     optuna = _optuna()

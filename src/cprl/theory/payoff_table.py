@@ -54,11 +54,7 @@ def compositions(agents: int, strategies: int) -> Counts:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PayoffTable:
-    """What agents get by how many play each strategy; see the docstring of this module.
-
-    Raises:
-        ValueError: names the field, what came and what is allowed.
-    """
+    """What agents get by how many play each strategy; see the docstring of this module."""
 
     agents: int
     """The number of agents N, at least 2."""
@@ -161,9 +157,6 @@ class PayoffTable:
 
         Args:
             mixture: the shares of the strategies, float [S], that sum to 1.
-
-        Raises:
-            ValueError: for anything else.
         """
         return self.against_shares(mixture_of(mixture, self.strategies))
 
@@ -220,11 +213,7 @@ def sharing_table(game: SharingGame, levels: ArrayLike) -> PayoffTable:
 
 
 def mixture_of(mixture: ArrayLike, strategies: int) -> Values:
-    """Shares of strategies, float64 [S], that sum to 1.
-
-    Raises:
-        ValueError: for anything else.
-    """
+    """Shares of strategies, float64 [S], that sum to 1."""
     shares = np.asarray(mixture, np.float64)
     is_mixture = shares.shape == (strategies,) and (shares >= 0).all() and abs(shares.sum() - 1) < _SUM
     if not is_mixture:

@@ -73,11 +73,7 @@ class Worth(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class PowerWorth:
-    """v(A) = top - factor A^power, and 0 where that is negative.
-
-    Raises:
-        ValueError: names the field, what came and what is allowed.
-    """
+    """v(A) = top - factor A^power, and 0 where that is negative."""
 
     top: float = 10.0
     """v(0), above 0."""
@@ -111,13 +107,7 @@ class PowerWorth:
 
 @dataclass(frozen=True, kw_only=True)
 class CallableWorth:
-    """A function of your own: positive below `most`, falling there to 0, and never less steeply.
-
-    Raises:
-        ValueError: names the field, what came and what is allowed; also where the function, at one of 64
-            totals, fails, rises, becomes less steep or is not positive, where it is not 0 at `most`, to a
-            thousandth of its highest value, and where the derivative is none of this function.
-    """
+    """A function of your own: positive below `most`, falling there to 0, and never less steeply."""
 
     function: Callable[[float], float]
     """v(A), from a total to what a unit is worth."""
@@ -177,9 +167,6 @@ class SharingGame:
     """n agents share what is worth v(X) a unit when they take X in all; see the module for the formulas.
 
     Totals, payoffs and costs are numbers of Python, in units of one's own.
-
-    Raises:
-        ValueError: names the field, what came and what is allowed.
     """
 
     agents: int
@@ -289,9 +276,6 @@ def herders(agents: int, *, worth: Worth | None = None, cost: float = 1.0) -> Sh
         agents: n.
         worth: v; by default 10 - A^2.
         cost: c, of an animal.
-
-    Raises:
-        ValueError: see `SharingGame`.
     """
     return SharingGame(agents=agents, worth=PowerWorth() if worth is None else worth, cost=cost)
 
@@ -319,9 +303,6 @@ def appropriation(
         outside: w, what a token earns outside.
         linear: of F.
         quadratic: of F.
-
-    Raises:
-        ValueError: names the argument, what came and what is allowed.
     """
     worth = PowerWorth(top=linear, factor=quadratic, power=1.0)
     check_arguments(_OF_APPROPRIATION, tokens=tokens, outside=outside)

@@ -314,7 +314,6 @@ def train(
     """Plays so many episodes of every replica; each learner stores every turn and then updates.
 
     Args:
-        env: see `Training`, also for all that is not said here.
         episodes: how many to play.
         others: the actors of the agents that do not learn.
         decisions: what all agents decide, where the game asks them.
@@ -328,7 +327,6 @@ def train(
         The training, which is over.
 
     Raises:
-        ValueError: see `Training`; with a checkpointer also for what has no state to resume from.
         NotFiniteError: where a number is not finite, before a checkpoint holds it.
     """
     training = Training(

@@ -165,7 +165,6 @@ def windows_of(source: Source, window: int) -> Iterator[Windows]:
     `window=1`.
 
     Raises:
-        ValueError: for a damaged file, and for episodes that are there twice or not at all.
         FileNotFoundError: if a part is missing.
     """
     for part, table_name in PARTS.items():
