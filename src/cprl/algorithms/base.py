@@ -117,7 +117,6 @@ class Algorithm:
 
         Args:
             spaces: the shape and dtype of observations, and the number of actions A.
-            agents: their indices.
             engine: how they are updated.
             how: `replicas`, `seed`, `first_replica`, `reward_kind`, `device` and, if the algorithm
                 `can_share_parameters`, `share_parameters`; see `cprl.learners.replay.ReplayLearner`.
@@ -276,8 +275,6 @@ def network_of(
     """A new network of one agent.
 
     Args:
-        spaces: what agents observe.
-        settings: the hyperparameters.
         network: the architecture; None for fully connected layers of `settings.hidden_cells`.
         outputs: the number of outputs.
     """

@@ -55,7 +55,6 @@ class Batch:
     """B worlds of a game, played a turn at a time.
 
     Args:
-        game: The game.
         worlds: The number of worlds B, at least 1.
         seed: 0 to 2**64 - 1. Random numbers are a function of the seed, the index of the world, the episode
             and the step alone.

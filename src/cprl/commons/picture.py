@@ -156,7 +156,6 @@ def agent_sprite(agent: int, heading: int, size: int) -> NDArray[np.uint8]:
     A number too large for the cell is left out; from eleven pixels on, numbers below 100 fit.
 
     Args:
-        agent: its index.
         heading: 0 up, 1 right, 2 down, 3 left.
         size: The size of a cell in pixels, without lines between cells.
     """

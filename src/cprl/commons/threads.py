@@ -32,7 +32,6 @@ class CpuThreads:
     """A driver of B worlds in numpy arrays.
 
     Args:
-        game: The game.
         worlds: The number of worlds B.
         threads: The number of threads that share the worlds; None uses all cores where that is faster.
     """
@@ -90,7 +89,6 @@ class CpuThreads:
         """Runs a loop over all worlds; the calling thread takes the last share.
 
         Args:
-            loop: The loop.
             worlds: The state of the worlds.
             argument: The loop's own argument.
             output: The arrays that the loop writes.

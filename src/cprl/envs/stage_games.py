@@ -62,7 +62,6 @@ class StageEnv(LeanStepEnv):
     follow from seed, world and episode alone.
 
     Args:
-        game: the game.
         worlds: B.
         seed: of the lengths of episodes, where they have chance; None draws one from torch's generator.
         device: "cpu" or "cuda".

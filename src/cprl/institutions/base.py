@@ -54,7 +54,6 @@ def check_no_election(institution: Institution, elects: str) -> None:
     """Checks that an institution without an election says nothing about how one is held.
 
     Args:
-        institution: the institution.
         elects: what it would have to be for an election, in words.
     """
     for field in fields(institution):

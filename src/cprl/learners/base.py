@@ -73,7 +73,6 @@ class BaseLearner:
 
     Args:
         spaces: the shape and dtype of observations, and the number of actions A.
-        settings: the hyperparameters.
         agents: the indices of the agents that learn.
         replicas: the number of replicas R; each is one world of the environment.
         seed: the seed of the run.

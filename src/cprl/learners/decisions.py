@@ -179,7 +179,6 @@ def stored_decisions(
 
     Args:
         values: float64 [C] by agent and replica, see `BanditDecider.learned`; None for agents by chance.
-        game: the game.
         replicas: the numbers of the replicas.
         worlds: how many worlds of each replica are played side by side.
         seed: what random numbers follow from, with the replica and the agent.

@@ -238,7 +238,6 @@ def change_weights(
     """One step of all lanes, in place.
 
     Args:
-        name: the optimiser.
         weights: [L, ...] each.
         gradients: of each weight.
         means: running means of gradients; empty if the optimiser has none.
@@ -328,7 +327,6 @@ class ListEngine(Engine):
         make_loss: makes a lane's loss from its network.
         target_networks: networks with the initial target weights; by default targets start as copies.
         optimizer: the name of the optimiser of `torch.optim`.
-        learning_rate: its step size.
         adam_eps: its epsilon, if it has one.
         tau: the fraction by which targets move towards the weights after each update; None for hard updates
             by `copy_to_targets` alone.
@@ -446,7 +444,6 @@ class FunctionalEngine(Engine):
         make_loss: makes a lane's loss from its network.
         target_networks: networks with the initial target weights; by default targets start as copies.
         optimizer: the name of the optimiser of `torch.optim`.
-        learning_rate: its step size.
         adam_eps: its epsilon, if it has one.
         loss_share: a factor of each loss.
         max_grad_norm: the norm to which each lane's gradient is clipped; None for no clipping.

@@ -38,9 +38,6 @@ class Steps:
 
     Args:
         parameters: of each member.
-        name: the optimiser.
-        learning_rate: its step size.
-        eps: its epsilon.
         max_grad_norm: the norm to which the gradient of each member of each replica is clipped, or None.
     """
 
@@ -145,7 +142,6 @@ class LOLANetworks:
         networks: `AgentNetworks` of "actor" and "critic" for each lane, replica by replica.
         members: the number of members S.
         make_loss: makes the loss from an `nn.ModuleList` of the members' networks.
-        settings: the hyperparameters.
     """
 
     def __init__(

@@ -143,7 +143,6 @@ def wanted_rewards(
     """The rewards that agents want who all have the same preference, in one turn; a pure function.
 
     Args:
-        preference: what they want.
         rewards: float [B, N], what the environment gives each of N agents in each of B worlds.
         smoothed: float64 [B, N], what the turn before left to remember; None at an episode's first turn.
 

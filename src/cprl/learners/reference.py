@@ -99,8 +99,6 @@ class StockBuffers:
     """A `TensorDictReplayBuffer` for each agent, of a `LazyTensorStorage`.
 
     Args:
-        lanes: the agents.
-        settings: the hyperparameters.
         make_sampler: makes an agent's sampler.
         noise_shape: of the numbers that the loss reads with each transition; () for none.
         device: the torch device of the buffers.

@@ -37,11 +37,7 @@ from cprl.policies.lanes import LaneActor
 
 
 class Pace:
-    """When learners from replay update: from `learning_starts` steps on, after every `steps_per_update`.
-
-    Args:
-        settings: the hyperparameters.
-    """
+    """When learners from replay update: from `learning_starts` steps on, after every `steps_per_update`."""
 
     def __init__(self, settings: DQNSettings) -> None:
         self._settings = settings
@@ -74,7 +70,6 @@ class ReplayLearner(LaneLearner):
         spaces: the shape and dtype of observations, and the number of actions A.
         agents: the indices of the agents that learn.
         replicas: the number of replicas R; each is one world of the environment.
-        settings: the hyperparameters.
         make_network: makes a lane's network. It draws weights from torch's generator, which is seeded for
             each lane.
         make_loss: makes a lane's loss from its network.

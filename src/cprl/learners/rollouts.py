@@ -74,7 +74,6 @@ class States:
 
     Args:
         shapes: of the states of one lane, see `states_in`.
-        lanes: the lanes.
         sequence: turns T' of a minibatch.
         device: where.
     """

@@ -233,7 +233,6 @@ def refuse_for_replay(loss: LossModule, settings: DQNSettings, batch: TensorDict
 
     Args:
         loss: the loss of one lane; it is called if `n_steps` is above 1.
-        settings: the hyperparameters.
         batch: synthetic transitions of one lane, [b].
     """
     refuse_on_policy(loss)

@@ -23,7 +23,6 @@ def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence
     """The numbers of an episode, by the names of docs/metrics.md; NaN where undefined.
 
     Args:
-        episode: the episode.
         learning: the numbers of learning in it, by agent index: `agent_0/loss` and so on.
         agents: the agents' names, which replace `agent_0` and so on.
     """

@@ -31,7 +31,6 @@ def new_network(
     That of a `GRU` or an `LSTM` also reads and returns a state, see `cprl.networks.recurrent`.
 
     Args:
-        network: the architecture.
         spaces: the shape, dtype and largest value of observations.
         outputs: the number of outputs. The network gets the attributes `outputs` and `observation_dims`.
         relu_on_outputs: whether its outputs pass through ReLU.

@@ -104,7 +104,6 @@ class Decider(nn.Module):
         """Learns from an episode of a replica that has ended.
 
         Args:
-            replica: its index.
             decision: int64 [N], what the agents had decided.
             returns: float64 [N], what each of them wants to be high.
         """
@@ -157,7 +156,6 @@ def decider_by_chance(game: Game, seeds: Sequence[Sequence[int]], *, worlds: int
     """Agents of a game who choose by chance, all choices equally likely; None where nothing is decided.
 
     Args:
-        game: the game.
         seeds: of each lane, lane = replica x N + agent.
         worlds: the number of worlds of each replica.
     """

@@ -245,7 +245,6 @@ def choose(
         frame: The layout of the framed window.
         numbers: float64 [NUMBERS], uniform random numbers in [0, 1).
         settings: The properties of the game.
-        scratch: Working memory.
     """
     if policy == RANDOM:
         return int(numbers[WHICH] * settings.actions)
@@ -288,7 +287,6 @@ def choose_all(
         frame: The layout of all framed windows.
         numbers: float64 [n, NUMBERS], uniform random numbers in [0, 1).
         settings: The properties of the game.
-        scratch: Working memory.
         chosen: int64 [n], receives the actions.
     """
     for n in range(roles.shape[0]):

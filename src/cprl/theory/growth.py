@@ -52,8 +52,6 @@ def yield_bounds(board: Map, rules: Rules, *, nodes: int = NODES) -> YieldBounds
     T x `at_most`.
 
     Args:
-        board: the map.
-        rules: its rules.
         nodes: how long the search goes on: more bring the bounds together. The result follows from it alone,
             not from the machine's speed.
     """

@@ -189,7 +189,6 @@ def replicator_ends(table: PayoffTable, *, starts: int = STARTS, seed: int = 0) 
     """Where replicator dynamics end that start anywhere, with all shares above 0.
 
     Args:
-        table: the game.
         starts: so many mixtures, drawn uniformly.
         seed: the seed of these draws.
 
