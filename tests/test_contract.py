@@ -116,7 +116,7 @@ def test_every_engine_learns_what_a_list_of_torchrls_losses_does(name, way, monk
 
     ours = learned(lambda *given: found.append(fitting(*given)) or way)
     for key, value in learned(lambda *_: "list").items():
-        torch.testing.assert_close(ours[key], value, rtol=1e-3, atol=1e-5, msg=key)
+        torch.testing.assert_close(ours[key], value, rtol=1e-3 if name in TEAMS else 1e-4, atol=1e-5, msg=key)
     assert found == [way] or name not in TEAMS, "this is the way that is found"
 
 

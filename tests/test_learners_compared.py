@@ -14,7 +14,7 @@ BOARDS = ("two_complex", "commons")
 
 @pytest.fixture
 def recipe(monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "recipes" / "learners")
+    monkeypatch.syspath_prepend(ROOT / "recipes" / "study" / "learners")
     yield import_module
     for name in ("ways", *(f"comparison_{board}" for board in BOARDS)):
         sys.modules.pop(name, None)

@@ -197,7 +197,7 @@ def test_the_command_prints_the_dilemma(tmp_path, monkeypatch, capsys):
 
 
 def test_the_recipe_leaves_out_diagrams_of_trained_agents_that_are_not_there(tmp_path, monkeypatch, capsys):
-    path = Path(__file__).parents[1] / "recipes" / "theory" / "schelling.py"
+    path = Path(__file__).parents[1] / "recipes" / "study" / "theory" / "schelling.py"
     spec = importlib.util.spec_from_file_location("schelling_recipe", path)
     recipe = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(recipe)

@@ -57,6 +57,13 @@ def step(env, carried, *actions):
     return env.step_and_maybe_reset(carried)
 
 
+def rewards(game, *actions):
+    """What joint actions pay, one in each world, [B][N]."""
+    env = make_env(game, worlds=len(actions))
+    now, _ = step(env, env.reset(), *actions)
+    return now["next", "agents", "reward"][..., 0].tolist()
+
+
 @EITHER_GAME
 def test_a_game_of_one_turn_shows_the_number_one_and_terminates(game):
     env = make_env(replace(game, turns=1), worlds=2)

@@ -22,7 +22,6 @@ REFERENCE: Final = {
     "keys": "the TensorDict entries",
     "envs": "TorchRL, PettingZoo, Gymnasium",
     "institutions": "rules that people make",
-    "preferences": "what agents want",
     "theory": "games with a known answer",
     "custom": "code of your own in a recipe",
     "networks": "from observations to numbers",
@@ -42,12 +41,12 @@ REFERENCE: Final = {
 """A page each, in reading order, and what it is about."""
 
 _MODULES: Final = {
-    "envs": ("games",),
-    "commons": ("maps", "observation", "rules", "game", "spaces", "state", "playing"),
-    "learners": ("settings",),
+    "commons": ("maps", "observation", "rules", "game", "spaces", "state"),
+    "envs": ("make_env",),
+    "learners": ("settings", "preferences"),
     "measuring": ("social", "phases", "statistics"),
     "policies": ("scripted", "assignment"),
-    "training": ("callbacks",),
+    "training": ("training",),
     "viewer": ("callback",),
 }
 """Modules of a package that its page shows too, beside what the package exports."""

@@ -8,6 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cprl.checks import shown
 from cprl.custom import Custom, made
 from cprl.envs.state import transforms_state
 from cprl.envs.unwrap import agent_names
@@ -129,6 +130,8 @@ def run(
     out = None if out is None else Path(out)
     check_watch(watch)
     check_linger(linger, watch)
+    if at_end is not None and not callable(at_end):  # found out after hours otherwise
+        raise ValueError(f"at_end is {shown(at_end)}; allowed: a function")
     for logger in experiment.loggers:
         check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
     prepare_process(experiment.seed)
