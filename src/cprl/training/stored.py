@@ -159,7 +159,7 @@ class LoadedRun:
         return self.game if isinstance(self.game, Game) else self.spaces
 
     def episodes(self) -> pa.Table:
-        """The table of episodes; see `cprl.runs.read_episodes`."""
+        """The table of episodes; see `cprl.runs.episodes.read_episodes`."""
         return read_episodes(self.path)
 
 

@@ -42,7 +42,7 @@ _FINISH_THERE: Final = "finish the run with the version that began it (its recip
 
 @runtime_checkable
 class SavesTraining(Protocol):
-    """What saves the state of a training, as `cprl.runs.Checkpointer` does."""
+    """What saves the state of a training, as `cprl.runs.checkpoints.Checkpointer` does."""
 
     def restore(self, training: Any) -> None:
         """Puts a new training where the last one was."""
