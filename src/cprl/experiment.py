@@ -8,7 +8,19 @@ from typing import Any, Final, Literal, get_args
 
 from cprl.algorithms import Tabular
 from cprl.algorithms.base import TeamAlgorithm, TrainingEngine
-from cprl.checks import DIRECTORY_NAME, Check, check_fields, checked, count, instance, is_count, one_of, shown
+from cprl.checks import (
+    DIRECTORY_NAME,
+    NONE,
+    Check,
+    check_fields,
+    checked,
+    count,
+    either,
+    instance,
+    is_count,
+    one_of,
+    shown,
+)
 from cprl.commons.game import Game
 from cprl.config import custom_targets, differences, fields_from_config, fields_to_config
 from cprl.custom import Custom
@@ -58,6 +70,8 @@ class Experiment:
     """Of chance, weights, exploration and replay; 0 to 2**64 - 2."""
     evaluation_episodes: int = 20
     """Fresh episodes of each replica after training, and of the random policy."""
+    evaluate_every: int | None = None
+    """Episodes after which agents play as many fresh episodes greedily, again and again; None for never."""
     update_every: int = 1
     """Environment steps k after which agents learn, then k times."""
     transforms: tuple[Custom, ...] = ()
@@ -167,6 +181,7 @@ _CHECKS: Final[dict[str, Check]] = {
     "replicas": count(1, 2**20),
     "seed": Check(lambda value: is_count(value, 0, MOST_SEED), "an integer in 0..2**64 - 2"),
     "evaluation_episodes": count(1, 2**20),
+    "evaluate_every": either(NONE, count(1)),
     "update_every": count(1),
     **dict.fromkeys(("transforms", "callbacks", "loggers"), _TUPLE),
     "device": DEVICE,
