@@ -8,6 +8,10 @@ import psutil
 import pyarrow.parquet as pq
 import torch
 
+from cprl.studies import study_table
+from cprl.studies.study import STATUS
+from cprl.studies.trials import Status, trials_of
+
 CHECKPOINT = re.compile(r"(?:training|ending)-(\d{12})-[0-9a-f]{32}\.pt")
 LEARNED = ("steps", "played", "env", "learners", "others", "tracker", "torch")
 """What two states of a training share; the rest holds times."""
@@ -16,13 +20,34 @@ LEARNED = ("steps", "played", "env", "learners", "others", "tracker", "torch")
 def differences(run, twin):
     """What is not the same in two finished runs, bit for bit, and what is left that should not be there."""
     there, wanted = files(run), files(twin)
-    found = [f"{name} is missing" for name in sorted(wanted.keys() - there.keys())]
-    found += [f"{name} is left" for name in sorted(there.keys() - wanted.keys())]
+    lines = [f"{name} is missing" for name in sorted(wanted.keys() - there.keys())]
+    lines += [f"{name} is left" for name in sorted(there.keys() - wanted.keys())]
     for name in sorted(wanted.keys() & there.keys()):
         read = reader(name)
         if read is not None and not is_same(read(there[name]), read(wanted[name])):
-            found.append(f"{name} differs")
-    return found
+            lines.append(f"{name} differs")
+    return lines
+
+
+def assert_same_study(study, runs, undisturbed):
+    """The runs of a study equal those that nobody disturbed, and so does its table."""
+    names = [trial.name for trial in trials_of(study)]
+    assert {name: differences(runs / name, undisturbed / name) for name in names} == {
+        name: [] for name in names
+    }
+    # Marks say under which commit a run was made, which others may change meanwhile.
+    tables = [study_table(study, folder).rows.drop_columns(["marks"]) for folder in (runs, undisturbed)]
+    assert repr(tables[0].to_pylist()) == repr(tables[1].to_pylist())
+
+
+def log_of(out, trial):
+    """What a trial of the study in a directory printed."""
+    return Status(out / STATUS, trial.name).log.read_text()
+
+
+def attempts_of(out, trial):
+    """How often a process was started for a trial."""
+    return log_of(out, trial).count("$ ")
 
 
 def files(run):
@@ -50,8 +75,8 @@ def rows(path):
 
 def state(path):
     """Weights, or the part of a checkpoint that holds no times."""
-    kept = torch.load(path, weights_only=True)
-    return {name: kept[name] for name in LEARNED} if CHECKPOINT.fullmatch(path.name) else kept
+    stored = torch.load(path, weights_only=True)
+    return {name: stored[name] for name in LEARNED} if CHECKPOINT.fullmatch(path.name) else stored
 
 
 def is_same(one, other):

@@ -80,7 +80,7 @@ def write_run(run, experiment, apples, *, random=4.0, equality=None, is_finished
     return run
 
 
-def write_study(study, runs, apples, *, but=(), **how):
+def write_study(study, runs, apples, *, but=(), **options):
     """The runs of a study, but for those of some conditions.
 
     Args:
@@ -88,7 +88,7 @@ def write_study(study, runs, apples, *, but=(), **how):
         runs: the directory of its runs.
         apples: gives the harvest of an episode from condition, replica of the study, and episode.
         but: names of conditions.
-        how: see `write_run`.
+        options: see `write_run`.
     """
     for trial in trials_of(study):
         if trial.condition.name not in but:
@@ -97,7 +97,7 @@ def write_study(study, runs, apples, *, but=(), **how):
             def of(replica, number, first=first, condition=condition):
                 return apples(condition, first + replica, number)
 
-            write_run(runs / trial.name, trial.experiment, of, **how)
+            write_run(runs / trial.name, trial.experiment, of, **options)
     return runs
 
 

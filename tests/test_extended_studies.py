@@ -22,8 +22,8 @@ def run_of(study, runs, place=0):
     return runs / trials_of(study)[place].name
 
 
-def ran(study, out, runs, **how):
-    result = run_study(study, out, runs=runs, progress=False, results=False, **how)
+def ran(study, out, runs, **options):
+    result = run_study(study, out, runs=runs, progress=False, results=False, **options)
     assert not result.failed
     return result
 
@@ -47,7 +47,7 @@ def test_what_is_extended_equals_what_was_longer_from_the_first_episode_on(tmp_p
             one, other = (repr(read_table(run / name).to_pydict()) for run in (extended, whole))  # with NaN
             assert one == other, name
     assert files_of(run_of(short, pool)) == before
-    assert [own.name for own in pool.iterdir() if own.name.startswith(".")] == []
+    assert [path.name for path in pool.iterdir() if path.name.startswith(".")] == []
 
 
 def test_it_goes_on_from_the_longest_and_keeps_its_own_state_only_if_asked(tmp_path):
@@ -57,8 +57,8 @@ def test_it_goes_on_from_the_longest_and_keeps_its_own_state_only_if_asked(tmp_p
     ran(study_of(4), tmp_path / "study", pool, only=["freeze_steps=2"])
     assert (run_of(study_of(4), pool) / "evaluation-3").is_dir()
     ran(study_of(5), tmp_path / "study", pool, only=["freeze_steps=2"])
-    found = sorted(own.name for own in run_of(study_of(5), pool).glob("evaluation-*"))
-    assert found == ["evaluation-2", "evaluation-3"], "the one of 4 episodes kept no state"
+    evaluations = sorted(path.name for path in run_of(study_of(5), pool).glob("evaluation-*"))
+    assert evaluations == ["evaluation-2", "evaluation-3"], "the one of 4 episodes kept no state"
 
 
 def test_runs_that_kept_nothing_or_differ_are_no_beginning(tmp_path):
@@ -78,11 +78,11 @@ def test_a_trial_that_somebody_else_begins_meanwhile_is_left_to_them(tmp_path, m
     trial = trials_of(long)[0]
     copy = shutil.copytree
 
-    def overtaken(source, target, *more, **how):
+    def overtaken(source, target, *more, **options):
         if not (pool / trial.name).exists():
             (pool / trial.name).mkdir()
             (pool / trial.name / "recipe.json").write_text("{}")
-        return copy(source, target, *more, **how)
+        return copy(source, target, *more, **options)
 
     monkeypatch.setattr(shutil, "copytree", overtaken)
     recipe = trial.experiment.to_recipe(pool / trial.name)
@@ -110,14 +110,14 @@ def test_a_copy_that_was_cut_off_is_made_anew(tmp_path, monkeypatch):
     pool, long = tmp_path / "pool", study_of(4)
     ran(study_of(2), tmp_path / "short", pool, keep_checkpoints=True)
 
-    def cut_off(*given, **how):
+    def cut_off(*given, **options):
         Path(given[1]).mkdir()
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched:
         patched.setattr(shutil, "copytree", cut_off)
         failed = run_study(long, tmp_path / "long", runs=pool, progress=False, results=False).failed
-    assert [own.reason for own in failed] == ["OSError: [Errno 28] No space left on device"] * 2
+    assert [outcome.reason for outcome in failed] == ["OSError: [Errno 28] No space left on device"] * 2
     assert len(list(pool.iterdir())) == 2
     ran(long, tmp_path / "long", pool)
     assert (run_of(long, pool) / "evaluation-2").is_dir()

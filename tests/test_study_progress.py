@@ -1,9 +1,11 @@
 """How far the trials of a study are: from their directories and what they say of themselves."""
 
 import io
+import json
 import sys
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -11,9 +13,9 @@ from tiny_study import FREEZE, TINY
 
 from cprl import Study, run_study
 from cprl.runs.files import write_json
-from cprl.studies import progress
+from cprl.studies import progress, trials
 from cprl.studies.progress import Overview, Progress, table_of
-from cprl.studies.trials import Outcome, Status, trials_of
+from cprl.studies.trials import Outcome, Status, StatusFile, trials_of
 
 TRIALS = trials_of(Study(replace(TINY, episodes=10, replicas=2), {FREEZE: [2, 5, 9]}))
 
@@ -34,7 +36,7 @@ def says(tmp_path):
 @pytest.fixture
 def look(tmp_path, says):
     """Looks at all trials; gives the snapshot, and its row of a trial."""
-    overview = Overview(TRIALS, runs=tmp_path / "runs", status=tmp_path / "status")
+    overview = Overview(TRIALS, tmp_path / "runs", tmp_path / "status")
 
     def look(place=0):
         snapshot = overview.look()
@@ -43,30 +45,41 @@ def look(tmp_path, says):
     return look
 
 
-def test_speed_is_measured_without_compiling_and_gives_the_time_left(says, look):
-    says(0, beat=1, episodes=0, steps=0, running_s=0.1, compiling_s=0.0)
-    says(1, beat=1, episodes=0, steps=0, running_s=0.1, compiling_s=0.0)
+def test_the_time_left_is_that_of_the_speed_at_which_trials_say_they_play(says, look):
+    says(0, beat=1, episodes=0, steps=0, compiling_s=0.0)
+    says(1, beat=9, episodes=0, steps=0)
     look()
-    says(0, beat=9, episodes=0, steps=3, running_s=31.0, compiling_s=30.0)
-    says(1, beat=9, episodes=0, steps=0, running_s=31.0, compiling_s=31.0, is_compiling=True)
+    says(1, beat=10, episodes=0, steps=0, compiling_s=31.0, is_compiling=True)
     snapshot, row = look(1)
     assert (row.state, row.note) == ("compiling", "for 31 s")
     assert snapshot.left_s is None, "nothing is known yet"
-    says(0, beat=19, episodes=5, steps=99, running_s=41.0, compiling_s=30.0)
+    says(0, beat=19, episodes=5, steps=99, episodes_per_s=0.5)
     snapshot, row = look(0)
-    # 5 episodes in 10 s; 15 of this trial are left, and with those of the other two 55
+    # 15 of this trial are left, and with those of the other two 55
     assert (row.state, row.note) == ("running", "30 s left")
-    assert (row.left_s, snapshot.left_s) == pytest.approx((30.0, 110.0))
+    assert snapshot.left_s == pytest.approx(110.0)
     assert snapshot.line == (
         "0 of 3 trials finished, 2 running, 5 of 60 episodes, 1 compiling, 2 min left"
     )  # 110 s in words
 
 
-def test_what_a_resumed_trial_had_done_before_is_not_its_speed(says, look):
-    for beat, episodes, running_s in ((1, 0, 0.0), (2, 10, 2.0), (4, 12, 4.0)):
-        says(0, beat=beat, episodes=episodes, steps=20 * episodes, running_s=running_s, compiling_s=0.0)
-        _, row = look()
-    assert row.left_s == pytest.approx(8.0)  # 8 episodes at 1 a second
+def test_a_trial_says_its_speed_without_compiling_and_what_it_had_done_before(tmp_path, monkeypatch):
+    now = SimpleNamespace(s=0.0)
+    monkeypatch.setattr(trials, "time", SimpleNamespace(monotonic=lambda: now.s))
+    monkeypatch.setattr(trials, "CLOCK", SimpleNamespace(total_s=0.0, is_running=False))
+    file = StatusFile(Status(tmp_path, "trial"), TRIALS[0].experiment)
+
+    def speed():
+        file.write()
+        return json.loads((tmp_path / "trial.json").read_text())["episodes_per_s"]
+
+    now.s = 5.0
+    file.on_start(SimpleNamespace(steps=200, episodes_played=10))
+    assert speed() is None
+    now.s, trials.CLOCK.total_s = 39.0, 30.0
+    for _ in range(2):
+        file.on_episode(None, {})
+    assert speed() == pytest.approx(0.5), "2 episodes in 4 s of work"
 
 
 def test_a_trial_runs_while_it_says_something_new_whatever_the_clock_says(says, look, monkeypatch):
@@ -87,14 +100,14 @@ def test_failures_have_their_reason_and_stand_before_those_that_are_missing(look
     Status(tmp_path / "status", TRIALS[2].name).fail("ValueError: of | chance", "trace")
     snapshot, row = look(2)
     assert snapshot.rows[0] is row
-    assert row.reason == "ValueError: of | chance"
+    assert row.note == "ValueError: of | chance"
 
 
 @pytest.mark.integration
 def test_a_table_is_never_higher_than_a_screen_and_counts_the_rest(tmp_path):
-    trials = trials_of(Study(TINY, {FREEZE: range(1, 101)}))
-    failures = {trials[77].name: "ValueError: no"}
-    snapshot = Overview(trials, runs=tmp_path, status=tmp_path, failures=failures).look()
+    many = trials_of(Study(TINY, {FREEZE: range(1, 101)}))
+    Status(tmp_path, many[77].name).fail("ValueError: no", "")
+    snapshot = Overview(many, tmp_path, tmp_path).look()
     screen = Console(file=io.StringIO(), width=80, height=24)
     screen.print(table_of(snapshot, title="mine", most=16))
     lines = screen.file.getvalue().splitlines()
@@ -106,11 +119,12 @@ def test_a_table_is_never_higher_than_a_screen_and_counts_the_rest(tmp_path):
 
 def test_what_trials_print_does_not_disturb_it(tmp_path, capsys, monkeypatch):
     printed = io.StringIO()
-    with Progress(TRIALS, runs=tmp_path, status=tmp_path, title="mine") as shown:
+    with Progress(TRIALS, tmp_path, tmp_path, title="mine") as table:
         monkeypatch.setattr(sys, "stdout", printed)
         print("noise")
-        shown.ended(Outcome(TRIALS[0].name, "failed", "ValueError: no", True))
-        shown.ended(Outcome(TRIALS[1].name, "finished"))
+        Status(tmp_path, TRIALS[0].name).fail("ValueError: no", "")
+        table.ended(Outcome(TRIALS[0].name, "failed", "ValueError: no", True))
+        table.ended(Outcome(TRIALS[1].name, "finished"))
     assert printed.getvalue() == "noise\n"
     assert capsys.readouterr().out.splitlines() == [
         "mine: 0 of 3 trials finished, 0 of 60 episodes",
@@ -122,7 +136,7 @@ def test_what_trials_print_does_not_disturb_it(tmp_path, capsys, monkeypatch):
 def test_lines_come_while_trials_run(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("cprl.studies.progress._TABLE_PERIOD_S", 0.01)
     monkeypatch.setattr("cprl.studies.progress._LINE_PERIOD_S", 0.05)
-    with Progress(TRIALS, runs=tmp_path, status=tmp_path, title="mine"):
+    with Progress(TRIALS, tmp_path, tmp_path, title="mine"):
         time.sleep(0.5)
     assert 3 <= len(capsys.readouterr().out.splitlines()) <= 14
 

@@ -20,7 +20,7 @@ from cprl.commands.studies import sweep as sweep_words
 from cprl.runs.files import RunLockedError
 from cprl.runs.recipe import start_run
 from cprl.studies import InProcess, Processes, Ray, read_study
-from cprl.studies.run import as_driver
+from cprl.studies.run import Driver
 from cprl.studies.trials import trials_of
 from cprl.system.shipped import cprl_here
 
@@ -118,7 +118,7 @@ def test_a_part_of_a_study_is_run_by_the_levels_that_its_conditions_have(here, c
     assert "freeze_steps=25" not in said
     assert not Path("here").exists()
     sweep(f'{line} --only "gamma=0.5, freeze_steps=2" --only "freeze_steps=25, gamma=0.55"')
-    states = {own.condition.name: own.state(Path("here/runs")) for own in trials_of(read_study("here"))}
+    states = {trial.condition.name: trial.state(Path("here/runs")) for trial in trials_of(read_study("here"))}
     assert [name for name, state in states.items() if state == "finished"] == [
         "freeze_steps=2, gamma=0.5",
         "freeze_steps=25, gamma=0.55",
@@ -137,10 +137,10 @@ def test_a_failed_condition_does_not_end_the_study_and_is_listed_with_what_tries
 ):
     from cprl.training import running
 
-    def fails_at_5(experiment, *arguments, **how):
+    def fails_at_5(experiment, *arguments, **options):
         if experiment.game.rules.freeze_steps == 5:
             raise RuntimeError("out of luck")
-        return run(experiment, *arguments, **how)
+        return run(experiment, *arguments, **options)
 
     run = running.run
     monkeypatch.setattr(running, "run", fails_at_5)
@@ -257,7 +257,7 @@ def test_a_study_has_a_command_line(capsys):
 def test_a_study_is_run_with_fewer_episodes_unless_they_are_what_it_varies():
     out = study_main(STUDY, ["recipes/mine.py", "--episodes", "1", "--no-figures", "--out", "short"])
     assert read_study(out).experiment.episodes == 1
-    assert [own.experiment.episodes for own in read_study(out).all_conditions] == [1, 1]
+    assert [condition.experiment.episodes for condition in read_study(out).all_conditions] == [1, 1]
     varied = Study(TINY, {"episodes": [2, 3]}, name="tiny_study")
     with pytest.raises(SystemExit, match=r"--episodes is 1, and the study's condition .* says 2"):
         study_main(varied, ["recipes/mine.py", "--episodes", "1", "--out", "varied"])
@@ -280,7 +280,7 @@ def test_what_a_study_refuses_is_said_in_a_line():
 
 
 @pytest.mark.parametrize(
-    ("how", "expected"),
+    ("options", "expected"),
     [
         ({}, InProcess()),
         ({"jobs": 1}, InProcess()),
@@ -288,8 +288,8 @@ def test_what_a_study_refuses_is_said_in_a_line():
         ({"jobs": 1, "on": "processes"}, Processes(1)),
     ],
 )
-def test_where_trials_are_run_is_said_by_jobs_and_on(how, expected):
-    assert executor_of(StudyOptions(**how)) == expected
+def test_where_trials_are_run_is_said_by_jobs_and_on(options, expected):
+    assert executor_of(StudyOptions(**options)) == expected
 
 
 def test_ray_is_asked_for_by_name():
@@ -309,8 +309,8 @@ def test_ray_is_asked_for_by_name():
 def test_what_continues_a_study_can_be_typed_here_and_its_summary_names_no_place(
     command, typed, published, monkeypatch, capsys
 ):
-    def interrupted(what, out, **how):
-        summary.append(how["again"])
+    def interrupted(study, out, *, again, **options):
+        summary.append(again)
         raise KeyboardInterrupt
 
     summary = []
@@ -332,10 +332,10 @@ def test_a_study_that_is_interrupted_says_what_is_kept_and_how_to_continue(numbe
         "import cprl\n"
         "from cprl.training import running\n"
         "run = running.run\n"
-        "def stopped(experiment, *given, **how):\n"
+        "def stopped(experiment, *given, **options):\n"
         "    if experiment.game.rules.freeze_steps == 5 and os.environ.get('STOP'):\n"
         "        os.kill(os.getpid(), int(os.environ['STOP']))\n"
-        "    return run(experiment, *given, **how)\n"
+        "    return run(experiment, *given, **options)\n"
         "running.run = stopped\n"
         "cprl.study_main(cprl.Study(TINY, {FREEZE: [2, 5]}, name='short'))\n"
     )
@@ -344,7 +344,7 @@ def test_a_study_that_is_interrupted_says_what_is_kept_and_how_to_continue(numbe
     command = [sys.executable, "study.py", "--out", "kept"]
     stopped = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100)
     assert stopped.returncode == 128 + number, stopped.stderr
-    assert "1 of 2 trials are finished and 0 begun; all of it is kept in kept/runs" in stopped.stdout
+    assert "1 of 2 trials are finished and 1 begun; all of it is kept in kept/runs" in stopped.stdout
     assert f"To continue: {shlex.join(command)}" in stopped.stdout
     assert json.loads(Path("kept/study.json").read_text())["name"] == "short"
     assert study_main(STUDY, ["study.py", "--out", "kept"]) == Path("kept")
@@ -363,7 +363,7 @@ cprl.run_study(study, out, results=False)
 
 
 @pytest.mark.integration
-def test_the_same_study_is_shared_and_another_one_is_refused_while_anybody_runs_it(tmp_path):
+def test_the_same_study_is_shared_and_another_one_is_refused_while_anybody_runs_it(tmp_path, capsys):
     out = tmp_path / "out"
 
     def beside(*levels):
@@ -373,8 +373,8 @@ def test_the_same_study_is_shared_and_another_one_is_refused_while_anybody_runs_
 
     study = Study(TINY, {FREEZE: [2, 5]}, name="short")
     with ExitStack() as stack:
-        driver = stack.enter_context(driven(study, out))
-        assert not driver.others
+        stack.enter_context(driven(study, out))
+        assert capsys.readouterr().out == ""
         before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
         refused = beside(2, 9)
         assert refused.returncode == 1
@@ -383,13 +383,13 @@ def test_the_same_study_is_shared_and_another_one_is_refused_while_anybody_runs_
         shared = beside(2, 5)
         assert f"is run by somebody else too, process {os.getpid()} on" in shared.stdout
         assert "2 of 2 trials finished" in shared.stdout
-        second = stack.enter_context(driven(study, out))
-        assert second.others
+        stack.enter_context(driven(study, out))
+        assert "is run by somebody else too" in capsys.readouterr().out
     assert beside(2, 9).returncode == 0, "nobody runs it now"
     assert not (out / "run.lock").exists()
 
 
-def test_who_shares_a_study_keeps_another_one_out_when_the_first_has_left(tmp_path):
+def test_who_shares_a_study_keeps_another_one_out_when_the_first_has_left(tmp_path, capsys):
     study, other = (Study(TINY, {FREEZE: [2, level]}, name="short") for level in (5, 9))
     first = ExitStack()
     first.enter_context(driven(study, tmp_path))
@@ -397,16 +397,17 @@ def test_who_shares_a_study_keeps_another_one_out_when_the_first_has_left(tmp_pa
         first.close()
         with pytest.raises(RunLockedError, match=str(tmp_path)), driven(other, tmp_path):
             raise AssertionError
-    with driven(other, tmp_path) as driver:
-        assert not driver.others
+    capsys.readouterr()
+    with driven(other, tmp_path):
+        assert capsys.readouterr().out == ""
 
 
-def test_where_nothing_can_be_locked_nobody_else_is_said_to_run_a_study(tmp_path, monkeypatch):
+def test_where_nothing_can_be_locked_nobody_else_is_said_to_run_a_study(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("cprl.runs.files.fcntl", None)
-    with driven(Study(TINY, {FREEZE: [2, 5]}, name="short"), tmp_path) as driver:
-        assert not driver.others
+    with driven(Study(TINY, {FREEZE: [2, 5]}, name="short"), tmp_path):
+        assert capsys.readouterr().out == ""
 
 
 def driven(study, out):
-    """A driver of a study."""
-    return as_driver(study, trials_of(study), out, out / "runs", allow=(), progress=False)
+    """In which a study is run."""
+    return Driver(out, out / "runs", InProcess()).running(study)

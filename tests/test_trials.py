@@ -2,17 +2,15 @@
 
 import json
 import os
-import pickle
 import shutil
-import subprocess
 import sys
-import time
 from dataclasses import replace
 from importlib import invalidate_caches
-from pathlib import Path
+from types import SimpleNamespace
 
 import pyarrow.compute as pc
 import pytest
+from same_runs import differences
 from study_runs import EXPERIMENT, TIME_OUT, write_run
 from tiny_study import FREEZE, TINY
 
@@ -22,31 +20,26 @@ from cprl.runs.checkpoints import FOLDER as CHECKPOINTS
 from cprl.runs.episodes import read_episodes
 from cprl.runs.files import LOCK_FILE, RunLock, RunLockedError
 from cprl.runs.recipe import changed_circumstances, start_run
-from cprl.studies import read_study, trials
+from cprl.studies import Processes, read_study, run, trials
 from cprl.studies.results import write_results
 from cprl.studies.run import trials_with
-from cprl.studies.trials import Outcome, Status, run_task, state_of, task_of, trials_of
+from cprl.studies.trials import Outcome, Status, Task, state_of, trials_of
+from cprl.training import running
 
 STUDY = Study(TINY, {FREEZE: [5, 25]})
 
 
-def task(tmp_path, study=STUDY, nth=0):
-    return task_of(trials_of(study)[nth], runs=tmp_path / "runs", status=tmp_path / "status")
+def task_in(folder, study=STUDY, place=0):
+    trial = trials_of(study)[place]
+    return Task(trial=trial, runs=folder / "runs", status=Status(folder / "status", trial.name))
 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
     """The run of the first trial."""
-    first = task(tmp_path_factory.mktemp("undisturbed"))
-    assert run_task(first).worked
+    first = task_in(tmp_path_factory.mktemp("undisturbed"))
+    assert first.run_here().worked
     return first.directory
-
-
-def assert_same(run, other):
-    assert read_episodes(run).equals(read_episodes(other))
-    for name in ("trained", "random"):
-        path = f"evaluation/{name}.parquet"
-        assert (run / path).read_bytes() == (other / path).read_bytes()
 
 
 def written_at(folder):
@@ -57,35 +50,24 @@ def written_at(folder):
 @pytest.fixture
 def first(tmp_path):
     """The first trial, whose directory is there."""
-    first = task(tmp_path)
+    first = task_in(tmp_path)
     first.directory.mkdir(parents=True)
+    first.status.folder.mkdir()
     return first
-
-
-@pytest.fixture
-def status(first):
-    """Where the first trial says how far it is."""
-    status = Status(Path(first.status), first.name)
-    status.folder.mkdir(parents=True)
-    return status
 
 
 @pytest.mark.integration
 def test_a_missing_trial_is_run_and_says_how_far_it_is_and_a_finished_one_is_left_as_it_is(tmp_path, capsys):
-    missing = task(tmp_path)
-    assert state_of(missing.directory) == "missing"
-    done = run_task(missing)
-    assert (done.name, done.state, done.worked) == (missing.name, "finished", True)
+    missing = task_in(tmp_path)
+    assert missing.run_here() == Outcome(missing.name, "finished", worked=True)
     assert capsys.readouterr().out == ""
-    status = Status(Path(missing.status), missing.name)
-    assert "tiny, 1 replicas, 2 episodes" in status.log.read_text()
-    said = status.read()
-    assert (said["episodes"], said["of"], said["steps"], said["pid"]) == (2, 2, 40, os.getpid())
-    assert said["peak_bytes"] > 10**7
+    assert "tiny, 1 replicas, 2 episodes" in missing.status.log.read_text()
+    status = missing.status.read()
+    assert (status["episodes"], status["of"], status["steps"], status["pid"]) == (2, 2, 40, os.getpid())
+    assert status["peak_bytes"] > 10**7
     assert not list(tmp_path.rglob("*.partial"))
     before = written_at(missing.directory)
-    again = run_task(missing)
-    assert (again.state, again.worked) == ("finished", False)
+    assert missing.run_here() == Outcome(missing.name, "finished", worked=False)
     assert written_at(missing.directory) == before
 
 
@@ -93,8 +75,8 @@ def test_a_missing_trial_is_run_and_says_how_far_it_is_and_a_finished_one_is_lef
 def test_what_a_killed_process_left_before_its_recipe_is_no_obstacle(first, undisturbed):
     (first.directory / "recipe.json.0123abcd.partial").write_text("{")
     (first.directory / LOCK_FILE).write_text("")
-    assert run_task(first).state == "finished"
-    assert_same(first.directory, undisturbed)
+    assert first.run_here().state == "finished"
+    assert differences(first.directory, undisturbed) == []
 
 
 @pytest.mark.integration
@@ -102,135 +84,136 @@ def test_a_trial_that_was_killed_before_its_first_checkpoint_starts_over(first, 
     ended = ("report.json", "manifest.json", "episodes.parquet", CHECKPOINTS, "evaluation")
     shutil.copytree(undisturbed, first.directory, ignore=shutil.ignore_patterns(*ended), dirs_exist_ok=True)
     assert state_of(first.directory) == "unfinished"
-    assert run_task(first).state == "finished"
-    assert_same(first.directory, undisturbed)
+    assert first.run_here().state == "finished"
+    assert differences(first.directory, undisturbed) == []
 
 
 @pytest.mark.integration
-def test_a_failure_is_noted_with_its_reason_and_forgotten_when_it_is_mended(first, status, monkeypatch):
+def test_a_failure_is_noted_with_its_reason_and_forgotten_when_it_is_mended(first, monkeypatch):
     with monkeypatch.context() as patched:
-        patched.setattr("cprl.training.running.evaluate_population", lambda *_, **__: 1 / 0)
-        failed = run_task(first)
+        patched.setattr(running, "evaluate_population", lambda *_, **__: 1 / 0)
+        failed = first.run_here()
     assert (failed.state, failed.reason) == ("failed", "ZeroDivisionError: division by zero")
-    assert status.failure() == "ZeroDivisionError: division by zero"
-    assert "evaluate_population" in status.failed.read_text()
-    assert run_task(first).state == "finished"
-    assert status.failure() is None
-
-
-SAID = {"episodes": 3, "of": 4}
-"""What the process says that runs a trial."""
-
-
-@pytest.mark.parametrize("is_begun", [False, True])
-def test_a_trial_waits_while_another_process_runs_it(first, status, undisturbed, monkeypatch, is_begun):
-    if is_begun:
-        shutil.copy(undisturbed / "recipe.json", first.directory)
-    lock = RunLock(first.directory)
-    lock.__enter__()
-    waited = []
-    status.path.write_text(json.dumps(SAID))
-
-    def finished_elsewhere(seconds):
-        waited.append(seconds)
-        assert status.read() == SAID
-        lock.__exit__(None, None, None)
-        shutil.copytree(undisturbed, first.directory, dirs_exist_ok=True)
-
-    monkeypatch.setattr(trials.time, "sleep", finished_elsewhere)
-    assert run_task(first).state == "finished"
-    assert len(waited) == 1
+    assert first.status.failure() == "ZeroDivisionError: division by zero"
+    assert "evaluate_population" in first.status.failed.read_text()
+    assert first.run_here().state == "finished"
+    assert first.status.failure() is None
 
 
 @pytest.mark.integration
 @pytest.mark.parametrize("is_begun", [False, True])
-def test_a_task_that_does_not_wait_leaves_a_trial_to_the_process_that_runs_it(
-    first, status, undisturbed, is_begun
-):
-    impatient = replace(first, waits=False)
+def test_a_trial_that_another_process_runs_is_left_to_it_as_long_as_it_does(first, undisturbed, is_begun):
     if is_begun:
         shutil.copy(undisturbed / "recipe.json", first.directory)
-    status.path.write_text(json.dumps(SAID))
+    first.status.path.write_text('{"episodes": 3}')
     with RunLock(first.directory):
         before = sorted(first.directory.iterdir())
-        assert run_task(impatient) == Outcome(first.name, "elsewhere")
+        assert first.run_here() == Outcome(first.name, "elsewhere")
         assert sorted(first.directory.iterdir()) == before
-    assert status.read() == SAID
-    assert run_task(impatient).worked, "as soon as nobody else runs it"
+    assert first.status.read() == {"episodes": 3}
+    assert first.run_here().worked, "as soon as nobody else runs it"
 
 
 @pytest.mark.integration
-def test_a_trial_that_another_process_runs_does_not_hold_up_the_others(tmp_path, monkeypatch, capsys):
-    first, second = (own.name for own in trials_of(STUDY))
-    lock = RunLock(tmp_path / "runs" / first)
-    (tmp_path / "runs" / first).mkdir(parents=True)
+@pytest.mark.parametrize("on", [None, Processes(2)], ids=["here", "processes"])
+def test_a_trial_that_another_process_runs_does_not_hold_up_the_others(on, tmp_path, monkeypatch, capsys):
+    first, second = (tmp_path / "runs" / trial.name for trial in trials_of(STUDY))
+    first.mkdir(parents=True)
+    lock = RunLock(first)
     lock.__enter__()
+    waited = []
 
-    class Clock:
-        monotonic = time.monotonic
-
-        @staticmethod
-        def sleep(_):
-            assert state_of(tmp_path / "runs" / second) == "finished", "before it waits for the first"
+    def wait(seconds):
+        assert state_of(second) == "finished", "before it waits for the first"
+        waited.append(seconds)
+        if len(waited) == 2:
             lock.__exit__(None, None, None)
 
-    monkeypatch.setattr(trials, "time", Clock)
-    result = run_study(STUDY, tmp_path, results=False)
+    monkeypatch.setattr(run, "time", SimpleNamespace(sleep=wait))
+    result = run_study(STUDY, tmp_path, on=on, results=False)
     assert not result.failed
-    assert state_of(tmp_path / "runs" / first) == "finished"
+    assert state_of(first) == "finished"
+    assert len(waited) == 2
     assert "elsewhere" not in capsys.readouterr().out
 
 
 @pytest.mark.integration
-def test_the_lock_of_another_host_is_taken_over_once_its_trial_is_silent(first, undisturbed, monkeypatch):
-    shutil.copy(undisturbed / "recipe.json", first.directory)
+def test_the_lock_of_another_host_is_taken_over_once_its_trial_is_silent(tmp_path, undisturbed, monkeypatch):
+    study, directory = Study(TINY, {FREEZE: [5]}), tmp_path / "runs" / undisturbed.name
+    directory.mkdir(parents=True)
+    shutil.copy(undisturbed / "recipe.json", directory)
     holder = {"host": "a-node-that-died", "pid": 1, "started": "2026-01-01T00:00:00+00:00"}
-    (first.directory / LOCK_FILE).write_text(json.dumps(holder))
-    monkeypatch.setattr(trials, "PATIENCE_S", 0.3)
-    monkeypatch.setattr(trials, "_POLL_S", 0.05)
-    looks = []
-    before = trials.is_silent
+    (directory / LOCK_FILE).write_text(json.dumps(holder))
+    (tmp_path / "status").mkdir()
+    status = Status(tmp_path / "status", directory.name)
+    clock = SimpleNamespace(now=0.0, episodes=0)
 
-    def watched(status, patience_s):
-        for is_silent in before(status, patience_s):
-            looks.append((is_silent, status.read()))
-            yield is_silent
+    def wait(seconds):
+        assert state_of(directory) == "unfinished"
+        clock.now += 10.0
+        if clock.now < 50:  # its last signs of life
+            status.path.write_text(json.dumps({"episodes": clock.now}))
 
-    monkeypatch.setattr(trials, "is_silent", watched)
-    began = time.monotonic()
-    assert run_task(first).state == "finished"
-    assert time.monotonic() - began > 0.3
-    assert looks == [*[(False, {})] * (len(looks) - 1), (True, {})], "who waits says nothing"
-    assert_same(first.directory, undisturbed)
+    monkeypatch.setattr(run, "time", SimpleNamespace(sleep=wait))
+    monkeypatch.setattr(trials, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    assert not run_study(study, tmp_path, progress=False, results=False).failed
+    assert clock.now == 40 + trials.PATIENCE_S
+    assert differences(directory, undisturbed) == []
 
 
 @pytest.mark.integration
 def test_a_run_that_another_study_began_under_another_name_is_gone_on_with(tmp_path, undisturbed):
-    other = task(tmp_path, Study(replace(TINY, name="other"), {FREEZE: [5]}))
+    other = task_in(tmp_path, Study(replace(TINY, name="other", on_nan="continue"), {FREEZE: [5]}))
     other.directory.mkdir(parents=True)
     shutil.copy(undisturbed / "recipe.json", other.directory)
-    assert run_task(other).state == "finished"
-    assert json.loads((other.directory / "recipe.json").read_text())["recipe"] == "tiny"
+    assert other.run_here().state == "finished"
+    recipe = json.loads((other.directory / "recipe.json").read_text())
+    assert (recipe["recipe"], recipe["experiment"]["on_nan"]) == ("tiny", "continue")
 
 
-def test_a_trial_in_the_directory_of_another_is_a_failure_by_name_and_stays_as_it_is(tmp_path):
+@pytest.mark.parametrize("is_finished", [True, False])
+@pytest.mark.parametrize(
+    ("changes", "place"),
+    [
+        ({}, "freeze_steps"),
+        ({"seed": 1000}, "seed"),
+        ({"replicas": 1}, "replicas"),
+        ({"episodes": 50}, "episodes"),
+        ({"evaluation_episodes": 9}, "evaluation_episodes"),
+    ],
+    ids=["condition", "seed", "replicas", "longer", "evaluation"],
+)
+def test_a_trial_in_whose_directory_another_run_is_is_a_failure_by_name_and_no_part_of_the_table(
+    changes, place, is_finished, tmp_path
+):
     study = Study(EXPERIMENT, {TIME_OUT: [5, 25]})
     first, second = trials_of(study)
-    run = write_run(tmp_path / "runs" / first.name, second.experiment, lambda *_: 1)
-    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    other = replace(first.experiment, **changes) if changes else second.experiment
+    directory = write_run(tmp_path / "runs" / first.name, other, lambda *_: 1, is_finished=is_finished)
+    assert first.state(tmp_path / "runs") == "refused"
+    before = written_at(directory)
     result = run_study(study, tmp_path, only=["freeze_steps=5"], progress=False)
     (failed,) = result.failed
     assert failed.name == first.name
-    assert "freeze_steps" in failed.reason
-    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+    assert place in failed.reason
+    assert written_at(directory) == before
     assert result.table is None
+
+
+def test_a_finished_run_with_fewer_episodes_is_another_trial_and_an_unfinished_one_is_continued(tmp_path):
+    (trial,) = trials_of(Study(EXPERIMENT))
+    shorter = replace(trial.experiment, episodes=30)
+    for state in ("finished", "unfinished"):
+        write_run(tmp_path / state / trial.name, shorter, lambda *_: 1, is_finished=state == "finished")
+    assert trial.state(tmp_path / "finished") == "refused"
+    assert trial.state(tmp_path / "unfinished") == "unfinished"
 
 
 def test_a_finished_trial_that_lost_a_file_of_its_manifest_is_a_failure_by_that_file(tmp_path):
     study = Study(EXPERIMENT)
     (trial,) = trials_of(study)
-    run = write_run(tmp_path / "runs" / trial.name, trial.experiment, lambda *_: 1)
-    (run / "evaluation" / "trained.parquet").unlink()
+    directory = write_run(tmp_path / "runs" / trial.name, trial.experiment, lambda *_: 1)
+    (directory / "evaluation" / "trained.parquet").unlink()
     (failed,) = run_study(study, tmp_path, progress=False, results=False).failed
     assert "evaluation/trained.parquet" in failed.reason
 
@@ -305,7 +288,7 @@ def test_a_study_runs_anew_what_was_made_with_other_code_and_keeps_what_was_ther
     study = Study(OWN_CODE)
     write_module("class Callback: ...")
     first = run_study(study, tmp_path / "study", on=Written(study, 1.0), results=False)
-    kept = read_episodes(first.runs / only_name(study))
+    before = read_episodes(first.runs / only_name(study))
     same = Written(study, 2.0)
     write_module("class Callback: ...")
     run_study(study, tmp_path / "study", on=same, results=False)
@@ -318,7 +301,7 @@ def test_a_study_runs_anew_what_was_made_with_other_code_and_keeps_what_was_ther
     rows = table.rows.filter(pc.field("metric") == "collective_return")
     assert set(rows["value"].to_pylist()) == {2.0, 4.0}, "4 of random play"
     (earlier,) = (tmp_path / "study" / "runs-earlier").iterdir()
-    assert read_episodes(earlier).equals(kept)
+    assert read_episodes(earlier).equals(before)
     assert str(earlier) in capsys.readouterr().out
 
 
@@ -327,7 +310,8 @@ def test_a_trial_that_another_process_makes_with_other_code_is_refused_by_its_di
 ):
     study = Study(OWN_CODE)
     write_module("class Callback: ...")
-    run = write_run(tmp_path / "runs" / only_name(study), study.experiment, lambda *_: 1.0, is_finished=False)
+    name = only_name(study)
+    run = write_run(tmp_path / "runs" / name, study.experiment, lambda *_: 1.0, is_finished=False)
     write_module("class Callback: apples = 2")
     with RunLock(run), pytest.raises(RunLockedError, match=only_name(study)):
         run_study(study, tmp_path, progress=False)
@@ -404,31 +388,26 @@ def test_a_part_of_a_study_is_chosen_by_whole_levels_and_not_by_parts_of_them():
 
     def chosen(*only):
         return [
-            (own.condition.levels[cells], own.condition.levels[FREEZE]) for own in trials_with(trials, only)
+            (trial.condition.levels[cells], trial.condition.levels[FREEZE])
+            for trial in trials_with(trials, only)
         ]
 
     assert chosen("hidden_cells=(32, 32)") == [((32, 32), 2), ((32, 32), 5)]
     assert chosen("freeze_steps=5, hidden_cells=(32, 8, 32)") == [((32, 8, 32), 5)]
     assert chosen("hidden_cells=(8, 32), freeze_steps=2") == [((8, 32), 2)]
     named = trials_of(Study(TINY, conditions={"a (b, c": {}, "d), e": {FREEZE: 3}}))
-    assert [own.condition.name for own in trials_with(named, ["a (b, c"])] == ["a (b, c"]
-    assert [own.condition.name for own in trials_with(named, ["e"])] == ["d), e"]
+    assert [trial.condition.name for trial in trials_with(named, ["a (b, c"])] == ["a (b, c"]
+    assert [trial.condition.name for trial in trials_with(named, ["e"])] == ["d), e"]
     for part in ("32", "8, 32)", "", ", "):
         with pytest.raises(ValueError, match="allowed: a condition or levels of some"):
             trials_with(trials, [part])
 
 
 @pytest.mark.integration
-def test_a_study_varies_code_of_ones_own_and_a_process_that_knows_nothing_of_it_runs_it(tmp_path):
+def test_a_study_varies_code_of_ones_own_and_processes_import_it_from_where_this_one_does(tmp_path):
     fatigue = Custom("one_road_parts:Fatigue", arguments={"per_step": 0.5})
     study = Study(replace(TINY, transforms=(fatigue,)), {"transforms.0.arguments.per_step": [0.0, 0.5]})
-    code = (
-        "import pickle, sys; from cprl.studies.trials import run_task; "
-        "print(run_task(pickle.load(sys.stdin.buffer)))"
-    )
-    sent = pickle.dumps(task(tmp_path, study, 1))
-    command = [sys.executable, "-W", "ignore", "-c", code]
-    told = subprocess.run(command, input=sent, capture_output=True, cwd="/", check=True).stdout.decode()
-    assert "state='finished'" in told, told
-    recipe = json.loads(next((tmp_path / "runs").glob("*/recipe.json")).read_text())
+    result = run_study(study, tmp_path, on=Processes(1), only=["per_step=0.5"], results=False)
+    assert not result.failed
+    recipe = json.loads(next(result.runs.glob("*/recipe.json")).read_text())
     assert recipe["experiment"]["transforms"][0]["arguments"] == {"per_step": 0.5}

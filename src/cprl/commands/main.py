@@ -5,7 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -51,6 +51,7 @@ def run(
     watch: str = "file",
     linger: bool = False,
     allow: Allow = (),
+    trial: Path | None = None,
 ) -> None:
     """Trains the experiment of a recipe or of a run anew, or resumes a run that was stopped.
 
@@ -67,6 +68,8 @@ def run(
         watch: "file", or live as well: "serve", "spawn"; "off" for no recording.
         linger: keep the recording served after the run, until Ctrl-C; with --watch serve or spawn.
         allow: code of your own, module:Class, that the recipe may import; may be repeated.
+        trial: the file in which the run says every second how far it is, where a study started it: it draws
+            no figure and ends with the process that has its standard input.
     """
     refuse_unknown(recipe)
     if take_over and not resume:
@@ -82,17 +85,25 @@ def run(
         out = directory
     if episodes is not None:
         experiment = replace(experiment, episodes=episodes)
-    done = run_experiment(
-        experiment,
-        out,
-        resume=resume,
-        take_over=take_over,
-        keep_checkpoint=keep_checkpoint,
-        watch=watch,
-        linger=linger,
-        allow=allow,
-        command=sys.argv,
-    )
+    with ExitStack() as stack:
+        callbacks: tuple[object, ...] = ()
+        if trial is not None:
+            from cprl.studies.trials import process_of_trial
+
+            callbacks = (stack.enter_context(process_of_trial(trial, experiment)),)
+        done = run_experiment(
+            experiment,
+            out,
+            resume=resume,
+            take_over=take_over,
+            keep_checkpoint=keep_checkpoint,
+            watch=watch,
+            linger=linger,
+            allow=allow,
+            command=sys.argv if trial is None else None,
+            callbacks=callbacks,
+            figures=trial is None,
+        )
     say(done)
 
 

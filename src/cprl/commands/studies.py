@@ -462,7 +462,7 @@ def _list(what: "Study | Search", options: StudyOptions) -> Path:
         return out
     trials = trials_with(trials_of(study), options.only)
     runs = out / RUNS if options.runs is None else options.runs
-    overview = Overview(trials, runs=runs, status=out / STATUS)
+    overview = Overview(trials, runs, out / STATUS)
     now = overview.look()
     if now.counts["unfinished"]:  # those that run say something new within a second
         time.sleep(1.5 * BEAT_S)
@@ -489,7 +489,6 @@ def _say_best(result: "SearchResult") -> None:
 
 def _say_failed(result: "StudyResult | SearchResult", again: str) -> None:
     """Lists the trials that failed, where to look, and what to do."""
-    from cprl.studies.progress import label_of
     from cprl.studies.study import STATUS
     from cprl.studies.trials import Status
 
@@ -499,7 +498,7 @@ def _say_failed(result: "StudyResult | SearchResult", again: str) -> None:
     for name, outcome in outcomes.items():
         status = Status(result.out / STATUS, name)
         where = status.failed if status.failed.exists() else status.log
-        lines += [f"  {label_of(trials[name])}: {outcome.reason}", f"    {where}"]
+        lines += [f"  {trials[name].label}: {outcome.reason}", f"    {where}", f"    {outcome.command}"]
     say("\n".join([*lines, f"To try them again: {again}"]))
 
 

@@ -2,12 +2,13 @@
 
 import hashlib
 import json
+import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Final
 
 from cprl.arguments import integer, refusal
 from cprl.runs.files import LOCK_FILE, StudyLock, remove_partial
@@ -16,7 +17,20 @@ from cprl.studies.progress import Progress
 from cprl.studies.study import RUNS, STATUS, Study, directory_of, levels_in, write_study
 from cprl.studies.tables.comparing import LAST
 from cprl.studies.tables.table import WINDOW, StudyTable
-from cprl.studies.trials import Outcome, Task, Trial, move_aside, task_of, trials_of
+from cprl.studies.trials import (
+    PATIENCE_S,
+    Outcome,
+    Status,
+    Task,
+    Trial,
+    is_silent,
+    move_aside,
+    trials_of,
+)
+from cprl.system.output import say
+
+_POLL_S: Final = 1.0
+"""Seconds between two looks at whether other processes have ended their trials."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,38 +92,34 @@ def run_study(
     folder = out / RUNS if runs is None else Path(runs)
     trials = trials_of(study)
     chosen = trials_with(trials, only)
-    check_executor(on)
     check_comparison(last)
-    with as_driver(
-        study, trials, out, folder, allow=allow, keep_checkpoints=keep_checkpoints, progress=progress
-    ) as driver:
-        failed = driver.run(chosen, on or InProcess())
-        how: Any = {"last": last, "again": again}
-        table = results_of(study, trials, out, folder, **how) if results else None
+    driver = Driver(out, folder, on or InProcess(), allow, keep_checkpoints, progress)
+    with driver.running(study):
+        failed = driver.run(chosen, study.name)
+        table = results_of(study, out, folder, last=last, again=again) if results else None
     return StudyResult(study, out, folder, tuple(trials), failed, table)
 
 
 def trials_with(trials: Sequence[Trial], only: Sequence[str]) -> list[Trial]:
     """The trials of conditions that have one of some names, or its levels; without any, all of them."""
-    wanted = [set(levels_in(levels)) for levels in only]
     names = list(dict.fromkeys(trial.condition.name for trial in trials))
-    for levels, text in zip(wanted, only, strict=True):
-        if not any(levels <= set(levels_in(name)) for name in names):
+    chosen = set()
+    for text in only:
+        levels = set(levels_in(text))
+        matching = {name for name in names if levels <= set(levels_in(name))}
+        if not matching:
             raise refusal("only", text, f"a condition or levels of some: {'; '.join(names)}")
-    if not wanted:
-        return [*trials]
-    return [
-        trial for trial in trials if any(levels <= set(levels_in(trial.condition.name)) for levels in wanted)
-    ]
+        chosen |= matching
+    return [trial for trial in trials if not only or trial.condition.name in chosen]
 
 
-def results_of(study: Study, trials: Sequence[Trial], out: Path, runs: Path, **how: Any) -> StudyTable | None:
+def results_of(study: Study, out: Path, runs: Path, *, last: int, again: str) -> StudyTable | None:
     """Writes table, summary and figures of what has finished, see `write_results`; None if nothing has."""
-    if all(trial.state(runs) != "finished" for trial in trials):
+    if all(trial.state(runs) != "finished" for trial in trials_of(study)):
         return None
     from cprl.studies.results import write_results  # with matplotlib
 
-    return write_results(study, out, runs, **how)
+    return write_results(study, out, runs, last=last, again=again)
 
 
 def check_comparison(last: int) -> None:
@@ -117,28 +127,43 @@ def check_comparison(last: int) -> None:
     integer("last", last, WINDOW, allowed=f"an integer >= {WINDOW}, the episodes of a window of the table")
 
 
-def check_executor(on: object) -> None:
-    """Raises a ValueError for what runs no trials."""
-    if on is not None and (isinstance(on, type) or not isinstance(on, Executor)):
-        raise refusal("on", on, "InProcess(), Processes(jobs), Ray(), another Executor, or None")
-
-
-@dataclass(kw_only=True)
+@dataclass(frozen=True)
 class Driver:
-    """What runs trials of a study whose directory is there; made by `as_driver`."""
+    """What runs trials of a study.
 
-    status: Path
+    Args:
+        out: the study's directory.
+        runs: that of its runs.
+        executor: where trials are run.
+        allow: see `run_study`, as the others.
+    """
+
+    out: Path
     runs: Path
-    title: str
-    progress: bool
-    how: Mapping[str, Any]
-    """Of the tasks, see `task_of`."""
-    others: str = ""
-    """Who runs the study too, in a sentence."""
+    executor: Executor
+    allow: Sequence[str] = ()
+    keep_checkpoints: bool = False
+    progress: bool = True
 
-    def run(
-        self, trials: Sequence[Trial], executor: Executor, *, title: str | None = None
-    ) -> tuple[Outcome, ...]:
+    @contextmanager
+    def running(self, study: Study) -> Iterator[None]:
+        """Makes the study's directory, and locks it together with all who run the same study.
+
+        Raises:
+            RunLockedError: where another study is run there.
+        """
+        self.out.mkdir(parents=True, exist_ok=True)
+        content = json.dumps(study.to_config(self.out), sort_keys=True).encode()
+        with StudyLock(self.out, hashlib.blake2b(content, digest_size=6).hexdigest()) as lock:
+            if lock.is_alone:
+                remove_partial(self.out, self.out / STATUS, self.out / "figures")
+            elif self.progress:
+                say(_others(self.out))
+            self.runs.mkdir(parents=True, exist_ok=True)
+            write_study(study, self.out)
+            yield
+
+    def run(self, trials: Sequence[Trial], title: str) -> tuple[Outcome, ...]:
         """Runs trials, shows how far they are, and returns those that failed.
 
         Those that another process runs come last: all others first, then it waits for these. Those that were
@@ -147,27 +172,21 @@ class Driver:
         Raises:
             RunLockedError: where another process runs such a trial.
         """
-        failed: list[Outcome] = []
         moved = [aside for trial in trials if (aside := move_aside(self.runs / trial.name)) is not None]
-        shown = Progress(
-            trials, runs=self.runs, status=self.status, title=title or self.title, is_shown=self.progress
-        )
-        if self.others:
-            shown.say(self.others)
-        if moved:
-            kept = f"{moved[0]}{f' and {len(moved) - 1} more' if moved[1:] else ''}"
+        if moved and self.progress:
+            places = f"{moved[0]}{f' and {len(moved) - 1} more' if moved[1:] else ''}"
             anew = f"{len(moved)} of {len(trials)} trials are run anew, as the user's own code has changed"
-            shown.say(f"{anew}; what was there is kept: {kept}")
-        tasks = [task_of(trial, runs=self.runs, status=self.status, **self.how) for trial in trials]
-        with shown:
+            say(f"{anew}; what was there is kept: {places}")
+        tasks = [self._task(trial) for trial in trials]
+        for task in tasks:
+            task.status.tidy_up()
+        progress = Progress(trials, self.runs, self.out / STATUS, title=title, is_shown=self.progress)
+        failed = []
+        with progress, closing(_outcomes(tasks, self.executor)) as outcomes:
             try:
-                for waits in (False, True):
-                    ended = _round(executor, [replace(task, waits=waits) for task in tasks], shown)
-                    failed += [outcome for outcome in ended if outcome.state == "failed"]
-                    elsewhere = {outcome.name for outcome in ended if outcome.state == "elsewhere"}
-                    if not elsewhere:
-                        break
-                    tasks = [task for task in tasks if task.name in elsewhere]
+                for outcome in outcomes:
+                    progress.ended(outcome)
+                    failed += [outcome] if outcome.state == "failed" else []
             except BaseException as error:
                 states = Counter(trial.state(self.runs) for trial in trials)
                 error.add_note(
@@ -177,52 +196,33 @@ class Driver:
                 raise
         return tuple(failed)
 
-
-def _round(executor: Executor, tasks: Sequence[Task], shown: Progress) -> list[Outcome]:
-    """Runs tasks once, and shows how those ended that are not run elsewhere."""
-    ended = []
-    outcomes = executor.run(tasks)
-    with ExitStack() as stack:
-        stack.callback(getattr(outcomes, "close", lambda: None))  # stops what it started
-        for outcome in outcomes:
-            if outcome.state != "elsewhere":
-                shown.ended(outcome)
-            ended.append(outcome)
-    return ended
+    def _task(self, trial: Trial) -> Task:
+        return Task(
+            trial=trial,
+            runs=self.runs,
+            status=Status(self.out / STATUS, trial.name),
+            allow=tuple(self.allow),
+            keep_checkpoint=self.keep_checkpoints,
+        )
 
 
-@contextmanager
-def as_driver(
-    study: Study,
-    trials: Sequence[Trial],
-    out: Path,
-    runs: Path,
-    *,
-    allow: Sequence[str],
-    progress: bool,
-    keep_checkpoints: bool = False,
-) -> Iterator[Driver]:
-    """Checks all that is asked for, then makes a study's directory, and locks it with all who run the same
-    study.
-
-    Raises:
-        RunLockedError: where another study is run there.
-    """
-    how = {"allow": allow, "keep_checkpoint": keep_checkpoints}
-    driver = Driver(status=out / STATUS, runs=runs, title=study.name, progress=progress, how=how)
-    for trial in trials:
-        task_of(trial, runs=runs, status=driver.status, allow=allow)
-    out.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as stack:
-        content = json.dumps(study.to_config(out), sort_keys=True).encode()
-        lock = stack.enter_context(StudyLock(out, hashlib.blake2b(content, digest_size=6).hexdigest()))
-        if lock.is_alone:
-            remove_partial(out, out / STATUS, out / "figures")
-        else:
-            driver.others = _others(out)
-        runs.mkdir(parents=True, exist_ok=True)
-        write_study(study, out)
-        yield driver
+def _outcomes(tasks: Sequence[Task], executor: Executor) -> Generator[Outcome, None, None]:
+    """Runs all trials, those that other processes run as soon as these have ended or are silent."""
+    silences = {task.name: is_silent(task.status, PATIENCE_S) for task in tasks}
+    left = ready = list(tasks)
+    while left:
+        ended = set()
+        with closing(executor.run(ready)) as outcomes:  # which stops what it started
+            for outcome in outcomes:
+                if outcome.state != "elsewhere":
+                    ended.add(outcome.name)
+                    yield outcome
+        left = [task for task in left if task.name not in ended]
+        ready = []
+        while left and not ready:
+            time.sleep(_POLL_S)
+            left = [replace(task, take_over=next(silences[task.name])) for task in left]
+            ready = [task for task in left if not task.is_elsewhere]
 
 
 def _others(out: Path) -> str:

@@ -27,7 +27,7 @@ from cprl.runs.episodes import read_table
 from cprl.runs.files import write_json
 from cprl.studies.executors import Executor, InProcess
 from cprl.studies.factors import Distribution, Factor, Integers, LogUniform, levels_of
-from cprl.studies.run import Driver, as_driver, check_comparison, check_executor, results_of
+from cprl.studies.run import Driver, check_comparison, results_of
 from cprl.studies.study import RUNS, Study, directory_of, level_text, named, short_names, write_study
 from cprl.studies.tables.comparing import LAST
 from cprl.studies.tables.table import StudyTable
@@ -232,7 +232,6 @@ def run_search(
     again: str = "",
 ) -> SearchResult:
     """Runs a search; may be stopped at any moment, and called again, with more points too."""
-    check_executor(on)
     check_comparison(last)
     optuna = _optuna()
     asked = _Asked(search, optuna)
@@ -241,19 +240,19 @@ def run_search(
     out = directory_of(study, out)
     folder = out / RUNS if runs is None else Path(runs)
     failed: list[Outcome] = []
-    with as_driver(study, trials_of(study), out, folder, allow=allow, progress=progress) as driver:
+    driver = Driver(out, folder, on or InProcess(), allow, progress=progress)
+    with driver.running(study):
         while batch:
-            failed += _run_batch(search, batch, driver, on or InProcess(), of=asked)
+            failed += _run_batch(search, batch, driver, of=asked)
             asked.tell([value_of(search, own, folder) for own in batch])
             study = search.study_of(asked.points)
             write_study(study, out)
             write_json(out / FILE_NAME, _as_table(search, asked.points))
             _write_journal(optuna, asked.study, out / JOURNAL)
             batch = asked.next_batch()
-        trials = trials_of(study)
-        how: Any = {"last": last, "again": again}
-        table = results_of(study, trials, out, folder, **how) if results else None
-    return SearchResult(search, study, out, folder, tuple(asked.points), tuple(trials), tuple(failed), table)
+        table = results_of(study, out, folder, last=last, again=again) if results else None
+    trials = tuple(trials_of(study))
+    return SearchResult(search, study, out, folder, tuple(asked.points), trials, tuple(failed), table)
 
 
 class _Asked:
@@ -326,9 +325,7 @@ def _space_of(search: Search, optuna: Any) -> dict[str, Any]:
     return found
 
 
-def _run_batch(
-    search: Search, batch: Sequence[Point], driver: Driver, executor: Executor, *, of: _Asked
-) -> tuple[Outcome, ...]:
+def _run_batch(search: Search, batch: Sequence[Point], driver: Driver, *, of: _Asked) -> tuple[Outcome, ...]:
     new = [own for own in batch if not own.is_repeated and not own.reason]
     if not new:
         return ()
@@ -336,7 +333,7 @@ def _run_batch(
     best = max(values, default=None) if search.direction == "maximise" else min(values, default=None)
     so_far = "" if best is None else f", best {search.metric} so far {best:.6g}"
     numbers = f"points {batch[0].number + 1} to {batch[-1].number + 1} of {search.points}"
-    return driver.run(trials_of(search.study_of(new)), executor, title=f"{search.name}: {numbers}{so_far}")
+    return driver.run(trials_of(search.study_of(new)), f"{search.name}: {numbers}{so_far}")
 
 
 def _sampler(optuna: Any, search: Search, number: int) -> Any:

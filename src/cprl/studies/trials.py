@@ -1,20 +1,22 @@
 """Trials: runs of a study, one for each condition and block of replicas, each in a directory of its own.
 
-The truth of a study lies in these directories. `run_task` makes of any of them a finished run, whatever was
-there: nothing, a run that was killed at any moment, or a finished one, of which it does nothing.
+The truth of a study lies in these directories. A trial is begun when its recipe is written there; from then
+on `cprl run DIRECTORY --resume` makes a finished run of it, in a process of its own, whatever was there:
+nothing but the recipe, or a run that was killed at any moment. `Task` is that process, from its command line
+to what came of it; `process_of_trial` is what goes on within it.
 """
 
 import json
 import os
 import shutil
+import signal
 import socket
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import count
 from pathlib import Path
 from threading import Event, Thread
@@ -29,16 +31,34 @@ from cprl.measuring.episodes import Episode
 from cprl.population import Frozen, with_stored
 from cprl.runs.checkpoints import FOLDER, REPORT, checkpoints_in, depends_on_episodes, is_ending
 from cprl.runs.files import LOCK_FILE, RunLock, RunLockedError, refuse_missing, remove_partial, write_json
-from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, recipe_config
+from cprl.runs.recipe import (
+    RECIPE_FILE,
+    changed_code,
+    read_recipe,
+    recipe_config,
+    start_run,
+    write_on_nan,
+)
+from cprl.runs.weights import partners_of
 from cprl.studies.study import Block, Condition, Study
 from cprl.system.compile_clock import CLOCK
+from cprl.system.output import printed
 from cprl.system.process import cpu
+from cprl.system.shipped import cprl_here
 from cprl.training import Training
 
 State = Literal["missing", "unfinished", "finished", "refused"]
 PATIENCE_S: Final = 60.0
 """Seconds without a sign of life after which a trial is taken over that another host has locked."""
-_POLL_S: Final = 1.0
+BEAT_S: Final = 1.0
+"""Seconds between two signs of life."""
+ATTEMPTS: Final = 5
+"""How often a trial is tried whose process dies."""
+LOCKED: Final = 75
+"""The exit code of a process whose trial another one runs; EX_TEMPFAIL of sysexits.h."""
+_STOPPED: Final = (128 + signal.SIGINT, 128 + signal.SIGTERM)
+_FREE: Final = {"name": "", "on_nan": ""}
+"""Fields that may differ between runs of the same trial."""
 
 
 class Status:
@@ -56,14 +76,16 @@ class Status:
     def read(self) -> dict[str, Any]:
         """What the trial said last; empty if it has said nothing."""
         try:
-            found = json.loads(self.path.read_bytes())
+            table = json.loads(self.path.read_bytes())
         except (OSError, ValueError):
             return {}
-        return found if isinstance(found, dict) else {}
+        return table if isinstance(table, dict) else {}
 
     def fail(self, reason: str, trace: str) -> None:
         """Notes why the trial failed."""
-        self.failed.write_text(f"{reason}\n\n{trace}", encoding="utf-8", errors="replace")
+        with suppress(OSError):  # of a full disk, say; then the reason is in the outcome alone
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self.failed.write_text(f"{reason}\n\n{trace}", encoding="utf-8", errors="replace")
 
     def failure(self) -> str | None:
         """The error of the last attempt in a line; None if it did not fail."""
@@ -92,64 +114,70 @@ class Trial:
         """The name of its directory: the condition's checksum, the seed and the number of replicas."""
         return f"{self.condition.checksum}-s{self.experiment.seed}-r{self.experiment.replicas}"
 
+    @property
+    def label(self) -> str:
+        """Its condition, and which replicas of it, for people."""
+        first, last = self.block.first, self.block.first + self.block.replicas - 1
+        numbers = f"replica {first}" if first == last else f"replicas {first}-{last}"
+        return f"{self.condition.name}, {numbers}"
+
     def state(self, runs: Path) -> State:
-        """What its directory holds; "refused" is a finished run of another trial."""
+        """What its directory holds; "refused" is a run of another trial, or of none that can be read."""
         run = runs / self.name
         state = state_of(run)
-        if state == "finished":
-            try:
-                refuse_another(run, self.experiment.to_recipe(run))
-            except ValueError:
-                return "refused"
+        try:
+            if state != "missing":
+                self.refuse_another(run)
+        except ValueError:
+            return "refused"
         return state
+
+    def refuse_another(self, run: Path) -> None:
+        """Refuses a run that is not this trial, e.g. one that was renamed or restored from a backup.
+
+        One that has not finished may have fewer episodes: a shorter run, copied to be continued.
+        """
+        stored = recipe_config(read_recipe(run))
+        wanted = self.experiment.to_recipe(run)["experiment"]
+        episodes = stored.get("episodes")
+        may_grow = state_of(run) != "finished" and isinstance(episodes, int) and episodes < wanted["episodes"]
+        free = {**_FREE, "episodes": 0} if may_grow else _FREE
+        if differ := differences({**stored, **free}, {**wanted, **free}, "experiment", Experiment):
+            raise ValueError(
+                f"{run} was started as another trial than its name says: {differ[0]}; give it back its name, "
+                "or move it away"
+            )
 
 
 def trials_of(study: Study) -> list[Trial]:
     """Every trial of a study: the first blocks of all conditions, then their second ones, and so on."""
     return [
-        Trial(
-            condition,
-            block,
-            replace(
-                condition.experiment,
-                seed=block.seed,
-                replicas=block.replicas,
-                agents=tuple(with_stored(own, partial(_of_block, block)) for own in agents),
-            ),
-        )
+        Trial(condition, block, _experiment_of(condition, block))
         for block in study.blocks
         for condition in study.all_conditions
-        for agents in (condition.experiment.agents,)
     ]
 
 
-def _of_block(block: Block, stored: Frozen) -> Frozen:
-    """A stored agent in the replicas of a block, which a run numbers from 0 again."""
+def _experiment_of(condition: Condition, block: Block) -> Experiment:
+    """The experiment of a block; stored agents play in its replicas, which a run numbers from 0 again."""
     last = block.first + block.replicas
-    if isinstance(stored.replica, tuple):
-        return replace(stored, replica=stored.replica[block.first : last])
-    if stored.replica is None and block.first:
-        return replace(stored, replica=tuple(range(block.first, last)))
-    return stored
+
+    def in_block(stored: Frozen) -> Frozen:
+        if isinstance(stored.replica, tuple):
+            return replace(stored, replica=stored.replica[block.first : last])
+        if stored.replica is None and block.first:
+            return replace(stored, replica=tuple(range(block.first, last)))
+        return stored
+
+    agents = tuple(with_stored(spec, in_block) for spec in condition.experiment.agents)
+    return replace(condition.experiment, seed=block.seed, replicas=block.replicas, agents=agents)
 
 
-def refuse_another(run: Path, recipe: Mapping[str, Any]) -> None:
-    """Refuses a finished run that is not the trial whose name its directory has, e.g. since it was renamed.
-
-    Args:
-        recipe: what `Experiment.to_recipe` gives for the trial and this directory.
-    """
-    stored, trial = recipe_config(read_recipe(run)), recipe["experiment"]
-    differ = differences({**stored, **_FREE}, {**trial, **_FREE}, "experiment", Experiment)
-    if differ:
-        raise ValueError(
-            f"{run} was started as another trial than its name says: {differ[0]}; give it back its name, or "
-            "move it away"
-        )
-
-
-_FREE: Final = {"name": "", "on_nan": ""}
-"""Fields that may differ between runs of the same trial."""
+def state_of(run: Path) -> State:
+    """What the directory of a run holds; a finished run has a report."""
+    if (run / REPORT).exists():
+        return "finished"
+    return "unfinished" if (run / RECIPE_FILE).exists() else "missing"
 
 
 def move_aside(run: Path) -> Path | None:
@@ -177,157 +205,199 @@ def move_aside(run: Path) -> Path | None:
     return aside
 
 
-def state_of(run: Path) -> State:
-    """What the directory of a run holds; a finished run has a report."""
-    if (run / REPORT).exists():
-        return "finished"
-    return "unfinished" if (run / RECIPE_FILE).exists() else "missing"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Task:
-    """What a process has to know to run a trial: plain values, which any executor can send."""
-
-    name: str
-    """Of the trial, and of its directory."""
-    runs: str
-    """The directory in which the trial's is."""
-    status: str
-    """The directory in which it says how far it is."""
-    recipe: Mapping[str, Any]
-    """What `Experiment.to_recipe` gave for the trial's directory."""
-    allow: tuple[str, ...] = ()
-    """Targets of `Custom` that may be imported."""
-    paths: tuple[str, ...] = ()
-    """Directories from which they are imported."""
-    keep_checkpoint: bool = False
-    """Whether the finished run keeps the state of its training, so that a longer trial can go on from it."""
-    command: tuple[str, ...] = ("cprl", "sweep")
-    """The command line of the study, which the recipe keeps."""
-    waits: bool = True
-    """Whether it waits while another process runs the trial, and takes it over where that one has died."""
-
-    @property
-    def directory(self) -> Path:
-        """Of the trial."""
-        return Path(self.runs) / self.name
-
-
 class Outcome(NamedTuple):
     """How a trial ended."""
 
     name: str
     state: Literal["finished", "failed", "elsewhere"]
-    """"elsewhere" if another process runs it, and the task does not wait."""
+    """"elsewhere" while another process runs it."""
     reason: str = ""
     """Of a failure: the error in a line."""
     worked: bool = False
     """Whether anything had to be done."""
+    command: str = ""
+    """Of a failure: the command line that repeats the trial by hand."""
 
 
-def task_of(
-    trial: Trial, *, runs: Path, status: Path, allow: Sequence[str] = (), keep_checkpoint: bool = False
-) -> Task:
-    """The task of a trial.
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """A trial in its directory, and the process that makes a finished run of it."""
 
-    Classes of the user's own that the experiment itself has are allowed: it was made with them.
+    trial: Trial
+    runs: Path
+    """The directory in which the trial's is."""
+    status: Status
+    allow: tuple[str, ...] = ()
+    """Further targets of `Custom` that may be imported, those of stored runs that agents come from."""
+    keep_checkpoint: bool = False
+    """Whether the finished run keeps the state of its training, so that a longer trial can go on from it."""
+    take_over: bool = False
+    """Whether the lock is taken that a process on another host left behind."""
 
-    Args:
-        runs: the directory in which its own is.
-        allow: further targets of `Custom`, those of stored runs that agents come from.
-        keep_checkpoint: whether its run keeps the state of its training.
-    """
-    recipe = trial.experiment.to_recipe(runs / trial.name)
-    targets = tuple(dict.fromkeys([*custom_targets(recipe["experiment"]), *allow]))
-    return Task(
-        name=trial.name,
-        runs=str(runs),
-        status=str(status),
-        recipe=recipe,
-        allow=targets,
-        paths=tuple(map(os.path.abspath, sys.path)) if targets else (),
-        keep_checkpoint=keep_checkpoint,
-        command=tuple(sys.argv),
-    )
+    @property
+    def name(self) -> str:
+        """Of the trial, and of its directory."""
+        return self.trial.name
 
+    @property
+    def directory(self) -> Path:
+        """Of the trial."""
+        return self.runs / self.name
 
-def run_task(task: Task) -> Outcome:
-    """Makes a trial a finished one; may be called any number of times, anywhere.
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """What the trial's directory says that it is."""
+        return self.trial.experiment.to_recipe(self.directory)
 
-    What is there is kept: a finished trial is left as it is, an unfinished one is resumed, and one that is
-    not there goes on from a shorter one if that can be, see `cprl.studies.trials`; a run of another
-    experiment, or one that lost results, is a failure. For what happens while another process runs it see
-    `Task.waits`.
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """The user's own code that it may import; what the experiment itself has it was made with."""
+        return tuple(dict.fromkeys([*custom_targets(self.recipe["experiment"]), *self.allow]))
 
-    What it prints is in `log.txt` beside its status, and why it failed in `failed.txt`.
-    """
-    run, status = task.directory, Status(Path(task.status), task.name)
-    was_finished = state_of(run) == "finished"
-    sys.path += [path for path in task.paths if path not in sys.path]
-    sys.argv = list(task.command)  # that of a worker process would name its machine's directories
-    status.folder.mkdir(parents=True, exist_ok=True)
-    try:
-        if was_finished:
-            refuse_another(run, task.recipe)
-            refuse_missing(run)
-            ended = True
-        else:
-            with _printing_into(status.log):
-                ended = _run(task, run, status)
-    except Exception as error:
-        status.fail(f"{type(error).__name__}: {error}", traceback.format_exc())
-        return Outcome(task.name, "failed", f"{type(error).__name__}: {error}", True)
-    if not ended:
-        return Outcome(task.name, "elsewhere")
-    status.tidy_up()
-    return Outcome(task.name, "finished", worked=not was_finished)
+    @property
+    def words(self) -> list[str]:
+        """What stands after `cprl` on the command line that runs it."""
+        allow = [word for target in self.targets for word in ("--allow", target)]
+        keep = "--keep-checkpoint" if self.keep_checkpoint else "--no-keep-checkpoint"
+        episodes = str(self.trial.experiment.episodes)
+        directory = os.path.abspath(self.directory)
+        return ["run", directory, "--resume", "--episodes", episodes, "--watch", "off", keep, *allow]
 
+    @property
+    def command(self) -> str:
+        """The same to be copied, to repeat the trial by hand."""
+        return printed([*cprl_here(), *self.words])
 
-def _run(task: Task, run: Path, status: Status) -> bool:
-    """Runs or resumes a trial as soon as nobody else does; False if it does not wait for that."""
-    from cprl.training.running import run as run_experiment
+    @property
+    def arguments(self) -> list[str]:
+        """What stands after Python on the command line of its process."""
+        return ["-m", "cprl", *self.words, "--trial", os.path.abspath(self.status.path)]
 
-    silent = is_silent(status, PATIENCE_S)
-    while state_of(run) != "finished":
-        experiment = Experiment.from_recipe(task.recipe, allow=task.allow, directory=run)
-        if not run.exists():
-            begin_from_shorter(run, experiment, task.recipe)
-        is_begun, take_over = state_of(run) == "unfinished", next(silent)
+    @property
+    def variables(self) -> dict[str, str]:
+        """Variables of its process, which imports what this one does from where this one does."""
+        return {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path)), "OMP_NUM_THREADS": "1"}
+
+    @property
+    def is_elsewhere(self) -> bool:
+        """Whether another process runs it now."""
+        outcome = self.settled()
+        return outcome is not None and outcome.state == "elsewhere"
+
+    def settled(self) -> Outcome | None:
+        """What there is to say of a trial that cannot be run now; None of one that can.
+
+        A finished one is left as it is. Refused are one in whose directory another trial's run is, and a
+        finished one that lost a file.
+        """
+        return self._tried(self._check)
+
+    def begin(self) -> Outcome | None:
+        """Make the directory ready for `cprl run`; an outcome where there is nothing to be run.
+
+        A trial that is not there goes on from a shorter one if that can be, see `begin_from_shorter`.
+        """
+        return self._tried(self._check) or self._tried(self._prepare)
+
+    def _tried(self, step: Callable[[], Outcome | None]) -> Outcome | None:
         try:
-            if is_begun:
-                with RunLock(run, take_over=take_over):
-                    pass  # refused while another process runs it, whose status stays as it is
-                # Another study may have begun it, under another name.
-                experiment = replace(experiment, name=str(read_recipe(run)["experiment"]["name"]))
-            else:
-                _clear(run, take_over=take_over)
-            with StatusFile(status, experiment) as shown:
-                run_experiment(
-                    experiment,
-                    run,
-                    resume=is_begun,
-                    take_over=take_over,
-                    keep_checkpoint=task.keep_checkpoint,
-                    watch="off",
-                    figures=False,
-                    allow=task.allow,
-                    callbacks=(StatusCallback(shown),),
-                )
-        except (RunLockedError, FileExistsError):  # somebody else began it
+            return step()
+        except RunLockedError:
+            return Outcome(self.name, "elsewhere")
+        except Exception as error:
+            return self.failed(f"{type(error).__name__}: {error}", traceback.format_exc())
+
+    def _check(self) -> Outcome | None:
+        run, state = self.directory, state_of(self.directory)
+        if state != "missing":
+            self.trial.refuse_another(run)
+        if state == "finished":
+            refuse_missing(run)
+            self.status.tidy_up()
+            return Outcome(self.name, "finished")
+        if run.exists():
+            with RunLock(run, take_over=self.take_over):
+                pass
+        return None
+
+    def _prepare(self) -> Outcome | None:
+        run, experiment = self.directory, self.trial.experiment
+        self.status.folder.mkdir(parents=True, exist_ok=True)
+        self.status.tidy_up()
+        with open(self.status.log, "a", encoding="utf-8") as log:
+            log.write(f"$ {self.command}\n")
+        if not run.exists():
+            begin_from_shorter(run, experiment, self.recipe)
+        if run.exists():
+            with RunLock(run, take_over=self.take_over):
+                if state_of(run) == "missing":
+                    remove_partial(run)  # of a process that was killed before it had written a recipe
+                else:
+                    write_on_nan(run, experiment.on_nan)
+        if state_of(run) != "missing":
+            return None
+        partners = sorted({spec.run for spec in experiment.agents if isinstance(spec, Frozen)})
+        try:
+            start_run(run, experiment.name, lambda run: {**self.recipe, **partners_of(run, partners)})
+        except FileExistsError:
             if state_of(run) == "missing" and not (run / LOCK_FILE).exists():
                 raise
-            if not task.waits:
-                return False
-            time.sleep(_POLL_S)
-    return True
+            return Outcome(self.name, "elsewhere")  # somebody else has begun it
+        return None
 
+    def ended(self, code: int) -> Outcome | None:
+        """The outcome where its process ended with an exit code; None where it died or was stopped."""
+        if state_of(self.directory) == "finished":
+            self.status.tidy_up()
+            return Outcome(self.name, "finished", worked=True)
+        if code == LOCKED:
+            return Outcome(self.name, "elsewhere")
+        if code < 0 or code in _STOPPED:
+            return None
+        reason = self.status.failure()
+        if reason is not None:
+            return self.failed(reason)
+        lines = self.status.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        return self.failed(f"{lines[-1].strip()} (exit code {code})", "\n".join(lines[-100:]))
 
-def _clear(run: Path, *, take_over: bool) -> None:
-    """Removes what a process left that was killed before it had written a recipe."""
-    if not run.exists():
-        return
-    with RunLock(run, take_over=take_over):
-        remove_partial(run)
+    def given_up(self) -> Outcome:
+        """The outcome where its process died at every attempt."""
+        reason = (
+            f"its process died, {ATTEMPTS} times; one that is killed is often one for which memory was short"
+        )
+        return self.failed(reason, f"What it printed is in {self.status.log}.")
+
+    def failed(self, reason: str, trace: str = "") -> Outcome:
+        """The outcome of a failure, noted beside the trial's status unless that was done."""
+        if trace:
+            self.status.fail(reason, trace)
+        return Outcome(self.name, "failed", reason, worked=True, command=self.command)
+
+    def run_here(self) -> Outcome:
+        """Run the trial in this process, as `cprl run` does in one of its own."""
+        from cprl.training.running import run
+
+        outcome, experiment = self.begin(), self.trial.experiment
+        if outcome is not None:
+            return outcome
+        try:
+            with _printing_into(self.status.log), StatusFile(self.status, experiment) as status:
+                recipe = read_recipe(self.directory)  # whose name may be that of another study
+                run(
+                    replace(experiment, name=str(recipe["experiment"]["name"])),
+                    self.directory,
+                    resume=True,
+                    keep_checkpoint=self.keep_checkpoint,
+                    watch="off",
+                    figures=False,
+                    allow=self.targets,
+                    callbacks=(status,),
+                )
+        except RunLockedError:
+            return Outcome(self.name, "elsewhere")
+        except Exception:
+            return self.failed(self.status.failure() or "")
+        return Outcome(self.name, "finished", worked=True)
 
 
 @contextmanager
@@ -341,73 +411,104 @@ def _printing_into(log: Path) -> Iterator[None]:
         yield
 
 
-BEAT_S: Final = 1.0
-"""Seconds between two signs of life."""
+@contextmanager
+def process_of_trial(path: Path, experiment: Experiment) -> Iterator["StatusFile"]:
+    """Make this process one that a study started: it says how far it is, stops when the study asks it to,
+    ends when the study's process has died, and says by its exit code that another process runs the trial.
+
+    Args:
+        path: the file of its status; its standard input is a pipe from the study's process.
+    """
+    Thread(target=_obey, args=(sys.stdin.fileno(),), daemon=True).start()
+    with StatusFile(Status(path.parent, path.stem), experiment) as status:
+        try:
+            yield status
+        except RunLockedError as error:
+            sys.stderr.write(f"{error}\n")
+            sys.exit(LOCKED)
+
+
+def _obey(pipe: int) -> None:
+    """Gives this process SIGTERM when it is asked to stop; ends it when there is nobody left to ask."""
+    while os.read(pipe, 1):
+        if sys.platform == "win32":  # where os.kill ends the process at once, without its handler
+            signal.raise_signal(signal.SIGTERM)
+        else:
+            os.kill(os.getpid(), signal.SIGTERM)
+    os._exit(1)
 
 
 class StatusFile:
-    """Writes the status of a trial every second; a context manager."""
+    """Writes every second how far a trial is, and why it failed; a context manager around the run, and
+    a callback of `cprl.training`."""
+
+    is_extendable = True
 
     def __init__(self, status: Status, experiment: Experiment) -> None:
         self._status = status
-        self.said: dict[str, Any] = {
+        self._table: dict[str, Any] = {
             "pid": os.getpid(),
             "host": socket.gethostname(),
             "cpu": cpu(),
             "episodes": 0,
             "of": experiment.episodes * experiment.replicas,
             "steps": 0,
+            "beat": 0,
         }
         self._began, self._compiled_s = time.monotonic(), CLOCK.total_s
-        self._beat, self._is_over = 0, Event()
+        self._first: tuple[int, float] | None = None
+        """Episodes and seconds of work when this process began to train."""
+        self._is_over = Event()
         self._thread = Thread(target=self._write_on, daemon=True)
 
-    def _write_on(self) -> None:
-        while not self._is_over.wait(BEAT_S):
-            self._write()
-
-    def _write(self) -> None:
-        self._beat += 1
-        now = {
-            "beat": self._beat,
-            "running_s": round(time.monotonic() - self._began, 1),
-            "compiling_s": round(CLOCK.total_s - self._compiled_s, 1),
-            "is_compiling": CLOCK.is_running,
-            "peak_bytes": peak_bytes(),
-        }
-        with suppress(OSError):  # of a full disk the run itself says more
-            write_json(self._status.path, {**self.said, **now})
-
     def __enter__(self) -> Self:
-        self._write()
+        self.write()
         self._thread.start()
         return self
 
-    def __exit__(self, kind: object, error: object, traceback: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._is_over.set()
         self._thread.join()
-        self._write()
+        self.write()
+        if error is None:
+            self._status.tidy_up()
+        elif isinstance(error, Exception) and not isinstance(error, RunLockedError):
+            lines = traceback.format_exception(error)
+            self._status.fail(f"{type(error).__name__}: {error}", "".join(lines))
 
+    def _write_on(self) -> None:
+        while not self._is_over.wait(BEAT_S):
+            self.write()
 
-class StatusCallback:
-    """Counts the steps and episodes of a training for its `StatusFile`; a callback of `cprl.training`."""
-
-    is_extendable = True
-
-    def __init__(self, file: StatusFile) -> None:
-        self._said = file.said
+    def write(self) -> None:
+        """Write how far the trial is now."""
+        self._table["beat"] += 1
+        running_s, compiling_s = time.monotonic() - self._began, CLOCK.total_s - self._compiled_s
+        episodes, work_s = self._first or (self._table["episodes"], 0.0)
+        played, worked_s = self._table["episodes"] - episodes, running_s - compiling_s - work_s
+        times = {
+            "running_s": round(running_s, 1),
+            "compiling_s": round(compiling_s, 1),
+            "is_compiling": CLOCK.is_running,
+            "episodes_per_s": round(played / worked_s, 4) if played and worked_s > 0 else None,
+            "peak_bytes": peak_bytes(),
+        }
+        with suppress(OSError):  # of a full disk the run itself says more
+            write_json(self._status.path, {**self._table, **times})
 
     def on_start(self, training: Training) -> None:
         """Continues counting where the training does."""
-        self._said.update(steps=training.steps, episodes=training.episodes_played)
+        self._table.update(steps=training.steps, episodes=training.episodes_played)
+        work_s = time.monotonic() - self._began - (CLOCK.total_s - self._compiled_s)
+        self._first = training.episodes_played, work_s
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Counts a step of every world."""
-        self._said["steps"] += 1
+        self._table["steps"] += 1
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Counts an episode."""
-        self._said["episodes"] += 1
+        self._table["episodes"] += 1
 
 
 def is_silent(status: Status, patience_s: float) -> Iterator[bool]:
@@ -417,9 +518,9 @@ def is_silent(status: Status, patience_s: float) -> Iterator[bool]:
     """
     last, since = status.read(), time.monotonic()
     while True:
-        now = status.read()
-        if now != last:
-            last, since = now, time.monotonic()
+        table = status.read()
+        if table != last:
+            last, since = table, time.monotonic()
         yield time.monotonic() - since >= patience_s
 
 
@@ -431,10 +532,6 @@ def peak_bytes() -> int:
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak
-
-
-_FREE_TO_EXTEND: Final = {"episodes": 0, "name": "", "on_nan": ""}
-"""What may differ: how long it is, and what changes no number."""
 
 
 def begin_from_shorter(run: Path, experiment: Experiment, recipe: Mapping[str, Any]) -> Path | None:
@@ -452,25 +549,26 @@ def begin_from_shorter(run: Path, experiment: Experiment, recipe: Mapping[str, A
     Returns:
         The run that was copied; None if there is none such.
     """
-    callbacks = [own.resolve() for own in experiment.callbacks]
-    if any(not isinstance(own, type) or depends_on_episodes(own) for own in callbacks):
+    callbacks = [callback.resolve() for callback in experiment.callbacks]
+    if any(not isinstance(callback, type) or depends_on_episodes(callback) for callback in callbacks):
         return None
-    wanted = recipe["experiment"]
-    found: list[tuple[int, Path]] = []
-    for other in sorted(run.parent.glob(f"*/{RECIPE_FILE}")):
-        own = _experiment_of(other.parent)
-        if (
-            own is not None
-            and own["episodes"] < wanted["episodes"]
-            and not differences(
-                {**own, **_FREE_TO_EXTEND}, {**wanted, **_FREE_TO_EXTEND}, "experiment", Experiment
-            )
-            and any(map(is_ending, checkpoints_in(other.parent / FOLDER)))
-        ):
-            found.append((own["episodes"], other.parent))
-    if not found:
+    free = {**_FREE, "episodes": 0}
+    wanted, beginnings = {**recipe["experiment"], **free}, []
+    for other in sorted(path.parent for path in run.parent.glob(f"*/{RECIPE_FILE}")):
+        with suppress(ValueError, KeyError, TypeError):  # of a recipe that cannot be read
+            stored = read_recipe(other)
+            before = recipe_config(stored)
+            if (
+                state_of(other) == "finished"
+                and not differences({**before, **free}, wanted, "experiment", Experiment)
+                and before["episodes"] < experiment.episodes
+                and not changed_code(stored)
+                and any(map(is_ending, checkpoints_in(other / FOLDER)))
+            ):
+                beginnings.append((before["episodes"], other))
+    if not beginnings:
         return None
-    _, shorter = max(found)
+    _, shorter = max(beginnings)
     copying = run.with_name(f".{run.name}.copying-{os.getpid()}")
     shutil.rmtree(copying, ignore_errors=True)
     try:
@@ -483,15 +581,3 @@ def begin_from_shorter(run: Path, experiment: Experiment, recipe: Mapping[str, A
     finally:
         shutil.rmtree(copying, ignore_errors=True)
     return shorter
-
-
-def _experiment_of(run: Path) -> dict[str, Any] | None:
-    """The experiment of a finished run; None for any other directory, and one made with other code."""
-    if not (run / REPORT).exists():
-        return None
-    try:
-        recipe = read_recipe(run)
-        found: dict[str, Any] = recipe["experiment"]
-        return found if isinstance(found["episodes"], int) and not changed_code(recipe) else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None

@@ -1,0 +1,372 @@
+"""Executors: where the trials of a study are run: in this process, in processes of this machine, or by Ray.
+
+Each makes finished runs of the same directories by the same `cprl run`, so a study may go on elsewhere than
+where it began. What is done and what is not is read from the directories, never from an executor.
+"""
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from abc import ABC, abstractmethod
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.util import find_spec
+from threading import current_thread, main_thread
+from types import FrameType
+from typing import Any, Final, NoReturn, Protocol, Self
+
+from cprl.arguments import integer, refusal
+from cprl.runs.checkpoints import interruption
+from cprl.studies.trials import ATTEMPTS, Outcome, Status, Task
+from cprl.system.output import console
+
+MOST_JOBS: Final = 4096
+_LOOK_S: Final = 0.1
+"""Seconds between two looks at which processes have ended, and at whether this one was asked to stop."""
+
+
+class Executor(Protocol):
+    """Runs trials; an outcome is yielded as soon as one has ended, in whatever order.
+
+    It stops what it started when its generator is closed. At the first SIGINT or SIGTERM of the process that
+    iterates, every running trial finishes its step and saves a checkpoint, and `KeyboardInterrupt` or
+    `SystemExit` with code 143 is raised; the same line again continues.
+    """
+
+    def run(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
+        """Runs every trial; they begin in order."""
+
+
+@dataclass(frozen=True)
+class InProcess:
+    """One trial after the other, in this process, which imports and compiles once: for tiny trainings."""
+
+    def run(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
+        for task in tasks:
+            yield task.run_here()
+
+
+class Stopping:
+    """Counts how often this process was asked to stop; a context manager.
+
+    The handlers only count: what is done about it is up to the loop that looks at `asked`. Python handles
+    signals in the main thread only; in other threads handlers stay as they are.
+    """
+
+    def __init__(self) -> None:
+        self.asked = self._heard = 0
+        self._number: int = signal.SIGINT
+        self._usual: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        if current_thread() is main_thread():
+            signals = (signal.SIGINT, signal.SIGTERM)
+            self._usual = {number: signal.signal(number, self._ask) for number in signals}
+        return self
+
+    def __exit__(self, kind: object, error: object, traceback: object) -> None:
+        for number, usual in self._usual.items():
+            signal.signal(number, usual)
+
+    def is_asked_again(self) -> bool:
+        """Whether this process was asked since the last call."""
+        is_news, self._heard = self.asked > self._heard, self.asked
+        return is_news
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        self.asked += 1
+        self._number = number
+        if self.asked == 1:
+            console().print(
+                "Stopping: each trial finishes its step and saves a checkpoint; signal again to kill them.",
+                soft_wrap=True,
+            )
+
+    def end(self, left: int) -> NoReturn:
+        """Say how many trials are left, and raise what `interruption` makes of the signal."""
+        trials = "1 trial is" if left == 1 else f"{left} trials are"
+        console().print(f"Stopped; {trials} left. The same line again continues the study.", soft_wrap=True)
+        raise interruption(self._number)
+
+
+class Process(Protocol):
+    """The process of a trial, wherever it is."""
+
+    def poll(self) -> int | None:
+        """Its exit code; None while it runs."""
+
+    def stop(self, *, kill: bool) -> None:
+        """Asks it to save a checkpoint and end; or ends it at once."""
+
+
+class _SideBySide(ABC):
+    """Runs trials in processes of their own, some at a time.
+
+    One whose process dies is tried again, up to `ATTEMPTS` times, and resumed from its checkpoint; the others
+    are not disturbed.
+    """
+
+    @abstractmethod
+    def places(self) -> int:
+        """How many trials may run at a time."""
+
+    @abstractmethod
+    def start(self, task: Task) -> Process:
+        """Starts the process of a trial."""
+
+    def ready(self) -> AbstractContextManager[object]:
+        """In which processes are started."""
+        return nullcontext()
+
+    def run(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
+        """Runs every trial; they begin in order.
+
+        Raises:
+            KeyboardInterrupt: after SIGINT, when every process has saved a checkpoint.
+            SystemExit: with code 143 after SIGTERM, likewise.
+        """
+        waiting: deque[Task] = deque()
+        for task in tasks:
+            outcome = task.settled()
+            if outcome is None:
+                waiting.append(task)
+            else:
+                yield outcome
+        if waiting:
+            with self.ready(), Stopping() as stopping:  # Ray sets handlers of its own
+                yield from self._run(waiting, stopping)
+
+    def _run(self, waiting: deque[Task], stopping: Stopping) -> Generator[Outcome, None, None]:
+        running: dict[str, tuple[Task, Process]] = {}
+        tried = Counter[str]()
+        try:
+            while (waiting and not stopping.asked) or running:
+                while waiting and len(running) < self.places() and not stopping.asked:
+                    task = waiting.popleft()
+                    outcome = task.begin()
+                    if outcome is None:
+                        running[task.name] = task, self.start(task)
+                        tried[task.name] += 1
+                    else:
+                        yield outcome
+                for task, code in _ended(running, stopping):
+                    outcome = task.ended(code)
+                    if outcome is None and tried[task.name] >= ATTEMPTS and not stopping.asked:
+                        outcome = task.given_up()
+                    if outcome is None:
+                        waiting.appendleft(task)
+                    else:
+                        yield outcome
+            if waiting:
+                stopping.end(len(waiting))
+        finally:
+            stopping.asked = max(1, stopping.asked)
+            while running:
+                _ended(running, stopping)
+
+
+def _ended(running: dict[str, tuple[Task, Process]], stopping: Stopping) -> list[tuple[Task, int]]:
+    """Waits a moment, and returns what has ended, with exit codes; asks the others to stop, as this process
+    was asked."""
+    time.sleep(_LOOK_S)
+    ended, is_asked = [], stopping.is_asked_again()
+    for task, process in list(running.values()):
+        code = process.poll()
+        if code is not None:
+            del running[task.name]
+            ended.append((task, code))
+        elif is_asked:
+            process.stop(kill=stopping.asked > 1)
+    return ended
+
+
+@dataclass(frozen=True)
+class Processes(_SideBySide):
+    """Processes on this machine, one for each trial, each with one thread of torch.
+
+    Each has the trial's log as its output, and ends at once if the process that runs the study dies.
+
+    Args:
+        jobs: how many trials run at a time, 1 to 4,096; as many cores and the memory of as many runs.
+    """
+
+    jobs: int
+
+    def __post_init__(self) -> None:
+        integer("Processes.jobs", self.jobs, 1, MOST_JOBS)
+
+    def places(self) -> int:
+        return self.jobs
+
+    def start(self, task: Task) -> Process:
+        return _LocalProcess(task)
+
+
+class _LocalProcess:
+    """A process of this machine; it reads from a pipe that it shall stop."""
+
+    def __init__(self, task: Task) -> None:
+        with open(task.status.log, "ab") as log:
+            self._process = subprocess.Popen(
+                [sys.executable, *task.arguments],
+                stdin=subprocess.PIPE,
+                stdout=log,
+                stderr=log,
+                env={**os.environ, **task.variables},
+                start_new_session=True,  # Ctrl-C is the business of the process that runs the study
+            )
+
+    def poll(self) -> int | None:
+        code = self._process.poll()
+        if code is not None and self._process.stdin is not None:
+            self._process.stdin.close()
+        return code
+
+    def stop(self, *, kill: bool) -> None:
+        assert self._process.stdin is not None
+        if kill:
+            self._process.kill()
+        else:
+            with suppress(OSError):  # it has ended
+                os.write(self._process.stdin.fileno(), b"!")
+
+
+_STORE_BYTES: Final = 80 * 2**20
+"""Of Ray's store of objects, which holds nothing of ours; Ray wants at least 75 MiB."""
+_AHEAD: Final = 2
+"""Tasks that wait in Ray for a free core, so that a cluster that can grow knows that it should."""
+_BYTES: Final = 1_000_000_000
+"""What a trial asks for while nobody knows more: torch, Numba, the game and the networks take 850 MB."""
+
+
+@dataclass(frozen=True)
+class Ray(_SideBySide):
+    """Tasks of Ray, each of which runs a trial in a process of its own, on one core.
+
+    A study that is killed with all of Ray continues when it is started again. On a cluster every node has the
+    same Python, Ray, cprl and dependencies, and the study's directory is on a file system that all nodes
+    share, under the same path. What a dead node has locked is taken over after
+    `cprl.studies.trials.PATIENCE_S` seconds without a sign of life.
+
+    Args:
+        address: of a cluster: "auto" for the one that this machine belongs to, or "host:port". None for a
+            Ray of this machine, which is started for the study and ends with it. Where this process has
+            called `ray.init` already, that Ray is used, and left as it is.
+        jobs: how many trials run at a time, at most; None for one per core.
+        memory_bytes: what each trial asks for; None for a tenth more than any trial of the study has taken
+            so far, and 1 GB while that is less.
+    """
+
+    address: str | None = None
+    jobs: int | None = field(default=None, kw_only=True)
+    memory_bytes: int | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        if self.address is not None and not self.address.strip():
+            raise refusal("Ray.address", self.address, '"auto", "host:port", or None')
+        if self.jobs is not None:
+            integer("Ray.jobs", self.jobs, 1, MOST_JOBS)
+        if self.memory_bytes is not None:
+            integer("Ray.memory_bytes", self.memory_bytes, 1)
+        if find_spec("ray") is None:
+            raise ModuleNotFoundError('Ray is not installed; run pip install "cprl[ray]"', name="ray")
+
+    @contextmanager
+    def ready(self) -> Iterator[None]:
+        """Connected to Ray; afterwards as it was before."""
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to Ray's makers
+        os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's own is 15: a tenth of a busy machine
+        ray: Any = import_module("ray")
+        if ray.is_initialized():
+            yield
+            return
+        options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+        if self.address is None:
+            cores = min(self.jobs or MOST_JOBS, os.cpu_count() or 1)
+            options |= {"num_cpus": cores, "include_dashboard": False, "object_store_memory": _STORE_BYTES}
+        ray.init(self.address or "local", **options)
+        try:
+            yield
+        finally:
+            ray.shutdown()
+
+    def places(self) -> int:
+        ray: Any = import_module("ray")
+        return self.jobs or max(1, int(ray.cluster_resources().get("CPU", 1))) + _AHEAD
+
+    def start(self, task: Task) -> Process:
+        ray: Any = import_module("ray")
+        nodes = [int(node["Resources"].get("memory", 0)) for node in ray.nodes() if node["Alive"]]
+        memory = self.memory_bytes or bytes_of(task)
+        if any(nodes):
+            memory = min(memory, max(nodes))  # more than any node has would wait forever
+        work = ray.remote(num_cpus=1, memory=memory, max_retries=0)(_work())
+        return _RayTask(
+            ray, work.remote(task.arguments, os.path.abspath(task.status.log), task.variables), task
+        )
+
+
+def bytes_of(task: Task) -> int:
+    """What a trial is expected to take, a tenth more than any of its study has taken so far."""
+    folder = task.status.folder
+    peaks = [Status(folder, path.stem).read().get("peak_bytes", 0) for path in folder.glob("*.json")]
+    return max(_BYTES, round(1.1 * max(peaks, default=0)))
+
+
+class _RayTask:
+    """A task of Ray that waits for the process of a trial."""
+
+    def __init__(self, ray: Any, reference: Any, task: Task) -> None:
+        self._ray, self._reference, self._task = ray, reference, task
+
+    def poll(self) -> int | None:
+        errors = self._ray.exceptions
+        if not self._ray.wait([self._reference], timeout=0)[0]:
+            return None
+        try:
+            return int(self._ray.get(self._reference))
+        except errors.TaskCancelledError:
+            return 128 + signal.SIGTERM
+        except (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError):
+            return -9  # as after SIGKILL
+        except errors.RayError as error:  # e.g. the node does not have the study's directory
+            lines = str(error).strip().splitlines() or [""]
+            self._task.status.fail(f"{type(error).__name__}: {lines[-1].strip()}", "\n".join(lines))
+            return 1
+
+    def stop(self, *, kill: bool) -> None:
+        self._ray.cancel(self._reference, force=kill)
+
+
+def _work() -> Callable[[list[str], str, Mapping[str, str]], int]:
+    """What Ray's workers do; defined within, so that it is sent whole and they need not import cprl."""
+
+    def work(arguments: list[str], log: str, variables: Mapping[str, str]) -> int:
+        import os
+        import subprocess
+        import sys
+
+        with open(log, "ab") as file:
+            process = subprocess.Popen(
+                [sys.executable, *arguments],
+                stdin=subprocess.PIPE,
+                stdout=file,
+                stderr=file,
+                env={**os.environ, **variables},
+            )
+        assert process.stdin is not None
+        while True:
+            try:
+                return process.wait(0.1)
+            except subprocess.TimeoutExpired:
+                pass
+            except KeyboardInterrupt:  # Ray's way of asking
+                os.write(process.stdin.fileno(), b"!")
+
+    return work
