@@ -104,7 +104,7 @@ def test_a_mask_of_another_form_is_refused_before_the_kernel_reads_it(which):
 def test_worlds_that_have_not_begun_are_not_played():
     batch = Batch(GAME, 2)
     with pytest.raises(ValueError, match="have not begun"):
-        batch.play(np.zeros((2, 1), np.int64), batch.new_output())
+        batch.check(np.zeros((2, 1), np.int64))
     with pytest.raises(ValueError, match="which leaves worlds out"):
         batch.begin(batch.new_output(), np.array([True, False]))
 

@@ -157,19 +157,3 @@ def test_as_run_a_state_may_have_two_agents_on_a_cell():
     state["row"][:], state["col"][:] = 3, 3
     batch.load(state, output)
     assert batch.now.row.tolist() == [[3, 3]]
-
-
-def test_arrays_of_the_wrong_form_are_refused():
-    batch = Batch(GAME, 2)
-    output = batch.new_output()
-    for wrong in (
-        {"harvest": output.harvest.astype(np.float64)},
-        {"stock": output.stock[:1]},
-        {"observation": np.asfortranarray(output.observation)},
-    ):
-        with pytest.raises(ValueError, match=r"output\.\w+ is .*; allowed: "):
-            batch.begin(output._replace(**wrong))
-    batch.begin(output)
-    with pytest.raises(ValueError, match=r"int64 \[2, 2\] is not contiguous"):
-        batch.play(np.zeros((2, 4), np.int64)[:, ::2], output)
-    assert batch.now.step.sum() == 0

@@ -168,7 +168,7 @@ def test_a_pair_is_worked_by_hand():
     rules = Rules(regrow_prob=(0.0, 0.5), regrow_before_bites=True)
     assert exact_yield(pair, rules).per_step == pytest.approx(0.5)
     both = yield_bounds(pair, rules)
-    assert (both.at_least, both.at_most, both.is_exact, both.kept.sum()) == (0.5, 0.5, True, 1)
+    assert (both.at_least, both.at_most, both.is_exact, both.stock.sum()) == (0.5, 0.5, True, 1)
     # Without growth in the turn of the bite a site is full, empty and perhaps full again: 0.5 / 1.5.
     late = Rules(regrow_prob=(0.0, 0.5))
     assert exact_yield(pair, late).per_step == pytest.approx(1 / 3)

@@ -111,14 +111,14 @@ class Algorithm:
         raise NotImplementedError(f"{type(self).__name__} must define make_loss(network)")
 
     def make_learner(
-        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
+        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **options: Any
     ) -> Learner:
         """The learner of these agents in every replica.
 
         Args:
             spaces: the shape and dtype of observations, and the number of actions A.
             engine: how they are updated.
-            how: `replicas`, `seed`, `first_replica`, `reward_kind`, `device` and, if the algorithm
+            options: `replicas`, `seed`, `first_replica`, `reward_kind`, `device` and, if the algorithm
                 `can_share_parameters`, `share_parameters`; see `cprl.learners.replay.ReplayLearner`.
 
         Raises:
@@ -160,9 +160,9 @@ class OffPolicy(Algorithm):
         return q_network_of(spaces, self.settings, self.network)
 
     def make_learner(
-        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
+        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **options: Any
     ) -> Learner:
-        how |= {
+        options |= {
             "agents": agents,
             "settings": self.settings,
             "make_network": lambda: self.make_network(spaces),
@@ -172,9 +172,9 @@ class OffPolicy(Algorithm):
             "noise_numbers": self.noise_numbers,
         }
         if engine == "torchrl":
-            _refuse_sharing(how)
-            return TorchRLReplayLearner(spaces, **how)
-        return ReplayLearner(spaces, compile=engine == "compiled", **how)
+            _refuse_sharing(options)
+            return TorchRLReplayLearner(spaces, **options)
+        return ReplayLearner(spaces, compile=engine == "compiled", **options)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,18 +196,18 @@ class OnPolicy(Algorithm):
         return actor_and_critic(spaces, self.settings, self.network)
 
     def make_learner(
-        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
+        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **options: Any
     ) -> Learner:
-        how |= {
+        options |= {
             "agents": agents,
             "settings": self.settings,
             "make_network": lambda: self.make_network(spaces),
             "make_loss": self.make_loss,
         }
         if engine == "torchrl":
-            _refuse_sharing(how)
-            return TorchRLRolloutLearner(spaces, **how)
-        return RolloutLearner(spaces, compile=engine == "compiled", **how)
+            _refuse_sharing(options)
+            return TorchRLRolloutLearner(spaces, **options)
+        return RolloutLearner(spaces, compile=engine == "compiled", **options)
 
 
 class TeamAlgorithm(Algorithm):
@@ -229,18 +229,18 @@ class TeamAlgorithm(Algorithm):
         raise NotImplementedError(f"{type(self).__name__} must define make_team(members, spaces)")
 
     def make_learner(
-        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
+        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **options: Any
     ) -> Learner:
         self._refuse_torchrl(engine)
-        self._check_team(len(agents), how.get("reward_kind", "individual"))
+        self._check_team(len(agents), options.get("reward_kind", "individual"))
         if isinstance(self, OffPolicy):
-            how["own_rewards"] = not self.shares_reward
+            options["own_rewards"] = not self.shares_reward
         return super().make_learner(
             spaces,
             agents=agents,
             engine=engine,
             make_team=lambda members: self.make_team(members, spaces),
-            **how,
+            **options,
         )
 
     def _check_team(self, members: int, reward: Preference) -> None:
@@ -257,8 +257,8 @@ class TeamAlgorithm(Algorithm):
             )
 
 
-def _refuse_sharing(how: dict[str, Any]) -> None:
-    if how.pop("share_parameters", False):
+def _refuse_sharing(options: dict[str, Any]) -> None:
+    if options.pop("share_parameters", False):
         raise ValueError(
             'share_parameters is True; allowed with engine="torchrl", which trains independent agents: False'
         )
@@ -270,7 +270,7 @@ def network_of(
     network: Network | Custom | None,
     *,
     outputs: int,
-    **how: Any,
+    **options: Any,
 ) -> nn.Module:
     """A new network of one agent.
 
@@ -285,7 +285,7 @@ def network_of(
         )
     made = MLP(hidden_cells=settings.hidden_cells) if network is None else network
     glorot_uniform = isinstance(settings, DQNSettings) and settings.glorot_uniform
-    return new_network(made, spaces, outputs, glorot_uniform=glorot_uniform, **how)
+    return new_network(made, spaces, outputs, glorot_uniform=glorot_uniform, **options)
 
 
 def q_network_of(spaces: Spaces, settings: DQNSettings, network: Network | Custom | None) -> nn.Module:

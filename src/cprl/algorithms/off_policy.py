@@ -161,8 +161,8 @@ class CQL(OffPolicy):
 class _WeightedCQLLoss(DiscreteCQLLoss):
     """`DiscreteCQLLoss` with a weight for the conservative term."""
 
-    def __init__(self, actor: QValueActor, *, weight: float, **how: Any) -> None:
-        super().__init__(actor, **how)
+    def __init__(self, actor: QValueActor, *, weight: float, **options: Any) -> None:
+        super().__init__(actor, **options)
         self._weight = weight
 
     def cql_loss(self, tensordict: TensorDictBase) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
@@ -330,10 +330,10 @@ class Tabular(Algorithm):
         return table_network(spaces)
 
     def make_learner(
-        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **how: Any
+        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **options: Any
     ) -> Learner:
         # Tables are neither compiled nor on a GPU.
         self._refuse_torchrl(engine)
         self.make_network(spaces)
-        how.pop("device", None)
-        return TabularLearner(spaces, agents=agents, settings=self.settings, **how)
+        options.pop("device", None)
+        return TabularLearner(spaces, agents=agents, settings=self.settings, **options)

@@ -65,10 +65,10 @@ class Reinforce(OnPolicy):
         return loss
 
 
-def _loss(network: nn.Module, kind: Callable[..., LossModule], **how: object) -> LossModule:
+def _loss(network: nn.Module, kind: Callable[..., LossModule], **options: object) -> LossModule:
     assert isinstance(network, AgentNetworks)
     critic = module_of(network["critic"], "state_value", state="critic_recurrent_state")
-    return kind(policy(network["actor"]), critic, **how)
+    return kind(policy(network["actor"]), critic, **options)
 
 
 def clipped_loss(network: nn.Module, kind: Callable[..., LossModule], algorithm: Any) -> LossModule:

@@ -128,7 +128,7 @@ class IPPO(TeamAlgorithm, OnPolicy):
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
         of_each: Sequence[Any] = members
         return AgentNetworks(
-            {name: _team([own[name] for own in of_each], spaces) for name in ("actor", "critic")}
+            {name: _team([member[name] for member in of_each], spaces) for name in ("actor", "critic")}
         )
 
     def make_loss(self, network: nn.Module) -> LossModule:
@@ -203,9 +203,10 @@ class MADDPG(TeamAlgorithm, OffPolicy):
             ]
             encoders = team_network(each, observation_dims=dims)
         names = "relu_on_outputs", "glorot_uniform"
-        how = {name: getattr(self.settings, name) for name in names}
+        options = {name: getattr(self.settings, name) for name in names}
         heads = [
-            MLPNetwork((features + joint,), 1, hidden_cells=cells, highest=1.0, **how) for _ in range(members)
+            MLPNetwork((features + joint,), 1, hidden_cells=cells, highest=1.0, **options)
+            for _ in range(members)
         ]
         return JointCritics(
             team_network(heads, observation_dims=1),
@@ -264,13 +265,13 @@ class LOLA(TeamAlgorithm):
     def make_loss(self, network: nn.Module) -> LossModule:
         """The loss of a team, from `make_team`."""
         of_members: Any = network
-        actors = [policy(own["actor"]) for own in of_members]
-        how: dict[str, Any] = {
+        actors = [policy(member["actor"]) for member in of_members]
+        options: dict[str, Any] = {
             "look_ahead_rate": self.settings.look_ahead_rate,
             "gamma": self.settings.gamma,
             "entropy_coeff": self.entropy_coeff,
         }
-        return LOLADiCELoss(actors, **how) if self.estimator == "dice" else LOLALoss(actors, **how)
+        return LOLADiCELoss(actors, **options) if self.estimator == "dice" else LOLALoss(actors, **options)
 
     def make_learner(
         self,
@@ -279,7 +280,7 @@ class LOLA(TeamAlgorithm):
         agents: Sequence[int],
         engine: TrainingEngine = "compiled",
         reward_kind: Preference = "individual",
-        **how: Any,
+        **options: Any,
     ) -> Learner:
         self._refuse_torchrl(engine)
         self._check_team(len(agents), reward_kind)
@@ -291,5 +292,5 @@ class LOLA(TeamAlgorithm):
             make_loss=self.make_loss,
             reward_kind=reward_kind,
             compile=engine == "compiled",
-            **how,
+            **options,
         )

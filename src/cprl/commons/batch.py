@@ -46,8 +46,6 @@ class Driver(Protocol):
         argument: NDArray[Any],
         output: StepOutput,
         law: Law | None = None,
-        *,
-        checked: bool = False,
     ) -> None: ...
 
 
@@ -123,23 +121,15 @@ class Batch:
         shapes = output_forms(self.game, self.size)
         return output_of([self.driver.empty(*form) for form in shapes.values()])
 
-    def _run(
-        self,
-        loop: Loop,
-        argument: NDArray[Any],
-        output: Any,
-        decisions: Actions | None = None,
-        *,
-        checked: bool = False,
-    ) -> None:
+    def _run(self, loop: Loop, argument: NDArray[Any], output: Any, decisions: Actions | None = None) -> None:
         """Runs a loop of the game, with its institutions if it has any."""
         if self.memory is None:
-            self.driver.run(loop, self.now, argument, output, checked=checked)
+            self.driver.run(loop, self.now, argument, output)
             return
         turn, payments = output
         decided = self._no_decisions if decisions is None else decisions
         law = Law(self.driver.rules, self.memory, decided, payments)
-        self.driver.run(loop, self.now, argument, turn, law, checked=checked)
+        self.driver.run(loop, self.now, argument, turn, law)
 
     def begin(self, output: Output, which: Bools | None = None) -> Output:
         """Begins the next episode of some worlds and writes their rows of `output`.
@@ -151,7 +141,7 @@ class Batch:
         if which is None:
             which = self._all_worlds
         else:
-            arguments.array("which", which, (self.size,), np.bool_)
+            _check_form("which", which, (self.size,), np.bool_)
             if not self._has_begun and not self.driver.read(which).all():
                 raise ValueError("which leaves worlds out; allowed at first: None, so that all worlds begin")
         self._run("begin_worlds", which, output)
@@ -159,7 +149,10 @@ class Batch:
         return output
 
     def play(self, actions: Actions, output: Output, decisions: Actions | None = None) -> Output:
-        """Plays one turn of every world and writes its output.
+        """Play one turn of every world and write its output.
+
+        Nothing is checked, which would take as long as a turn of one world: `check` says whether actions of
+        unknown origin can be played, `check_decisions` whether decisions can.
 
         Args:
             actions: int64 [B, N], contiguous.
@@ -167,28 +160,18 @@ class Batch:
             decisions: int64 [B, N], contiguous, where agents decide something, see `Game.decisions`; read of
                 worlds in the first turn of an episode alone. None for the first option of all agents.
         """
-        self.check(actions)
-        if decisions is not None:
-            self.check_decisions(decisions)
         self._run("play_worlds", actions, output, decisions)
-        return output
-
-    def play_checked(self, actions: Actions, output: Output, decisions: Actions | None = None) -> Output:
-        """`play` without checks, which take as long as a turn of one world: `actions` are contiguous and have
-        passed `check`, decisions likewise, and `output` has the form of `new_output`."""
-        self._run("play_worlds", actions, output, decisions, checked=True)
         return output
 
     def boards(self, output: Output) -> Bytes:
         """The current boards: uint8 [B, H, W], classes of `cprl.commons.colours`."""
         boards = self.driver.empty((self.size, self.game.map.height, self.game.map.width), np.uint8)
-        self.driver.run("show_worlds", self.now, boards, turn_of(output), checked=True)
+        self.driver.run("show_worlds", self.now, boards, turn_of(output))
         return boards
 
     def show(self, output: Output, *, world: int = 0) -> Shown:
         """A copy of one world for display; `output` holds its latest observation."""
         output = turn_of(output)
-        world = arguments.integer("world", world, 0, self.size - 1)
         read, now = self.driver.read, self.now
         return Shown(
             observation=read(output.observation[world]),
@@ -232,14 +215,14 @@ class Batch:
 
     def check(self, actions: Actions) -> None:
         """Checks actions for `play`."""
-        arguments.array("actions", actions, (self.size, self.game.agents), np.int64)
+        _check_form("actions", actions, (self.size, self.game.agents), np.int64)
         if not self._has_begun:
             raise ValueError("the worlds have not begun; allowed: reset() or load() before the first step")
         self._check_known("action", actions, len(self.game.actions), self.game.actions)
 
     def check_decisions(self, decisions: Actions) -> None:
         """Checks decisions for `play`."""
-        arguments.array("decisions", decisions, (self.size, self.game.agents), np.int64)
+        _check_form("decisions", decisions, (self.size, self.game.agents), np.int64)
         self._check_known("decision", decisions, max(1, self.game.decisions))
 
     def _check_known(self, what: str, chosen: Actions, known: int, names: tuple[str, ...] = ()) -> None:
@@ -251,6 +234,14 @@ class Batch:
             raise ValueError(
                 f"{what} {came} of agent {agent} in world {world} is unknown; allowed: {allowed}"
             )
+
+
+def _check_form(name: str, array: NDArray[Any], shape: tuple[int, ...], dtype: Any) -> None:
+    """Raise a ValueError unless an array, on the CPU or a GPU, has this shape and dtype."""
+    if array.shape != shape or array.dtype != dtype:
+        raise ValueError(
+            f"{name} is {array.dtype} {list(array.shape)}; allowed: {np.dtype(dtype)} {list(shape)}"
+        )
 
 
 def turn_of(output: Output) -> StepOutput:

@@ -95,11 +95,9 @@ class CudaThreads:
         argument: NDArray[Any],
         output: StepOutput,
         law: Law | None = None,
-        *,
-        checked: bool = False,
     ) -> None:
-        """Starts a loop over all worlds on the default stream and returns before it has finished. Arguments
-        are those of `CpuThreads.run`; nothing is checked."""
+        """Start a loop over all worlds on the default stream, as `CpuThreads.run`; returns before it has
+        finished."""
         launch = _blocks(len(argument)), THREADS_PER_BLOCK
         arguments = worlds, self.tables, argument, output, self._scratch
         if law is None:
@@ -153,12 +151,12 @@ def _find_unknown(first_unknown: Callable[..., int]) -> Callable[..., Any]:
     """Thread b checks the actions of world b."""
 
     @cuda.jit
-    def kernel(actions, known, found):  # type: ignore[no-untyped-def]
+    def kernel(actions, known, lowest):  # type: ignore[no-untyped-def]
         b = cuda.grid(1)
         if b < actions.shape[0]:
             at = first_unknown(actions[b], known)
             if at >= 0:
-                cuda.atomic.min(found, 0, b * actions.shape[1] + at)
+                cuda.atomic.min(lowest, 0, b * actions.shape[1] + at)
 
     launched: Callable[..., Any] = kernel
     return launched

@@ -21,8 +21,10 @@ def classes_seen(game: Game, windows: Bytes) -> Bytes:
     """
     windows = windows[:, :, : len(game.cell_channels)]
     if game.observation.encoding == "one_hot":
-        shown = classes_shown(game.observation, agents=game.agents, hides=game.rules.walls_block_sight)
-        classes: Bytes = np.take(np.array(shown, np.uint8), windows.argmax(2))
+        classes_drawn = classes_shown(
+            game.observation, agents=game.agents, hides=game.rules.walls_block_sight
+        )
+        classes: Bytes = np.take(np.array(classes_drawn, np.uint8), windows.argmax(2))
         return classes
     packed = windows.astype(np.uint32)
     keys = packed[:, :, 0] | packed[:, :, 1] << 8 | packed[:, :, 2] << 16

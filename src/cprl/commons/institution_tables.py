@@ -108,12 +108,12 @@ def _boundary_tables(institutions: Sequence[Institution], board: Map, tables: Ta
         for agent in range(board.agents):
             may_use[(number, agent, *inside)] = np.isin(signs, [OPEN, *boundary.signs_of(agent)])
     return {
-        "own": may_use.reshape(len(boundaries), board.agents, tables.background.size),
+        "may_use": may_use.reshape(len(boundaries), board.agents, tables.background.size),
         "bite_stopped": _bools([boundary.bite_fine is None for boundary in boundaries]),
         "bite_fine": _floats([_fine(boundary.bite_fine) for boundary in boundaries]),
         "step_is_violation": _bools([boundary.step_fine is not None for boundary in boundaries]),
         "step_fine": _floats([_fine(boundary.step_fine) for boundary in boundaries]),
-        "own_shown": _bools([boundary.observed for boundary in boundaries]),
+        "may_use_shown": _bools([boundary.observed for boundary in boundaries]),
     }
 
 

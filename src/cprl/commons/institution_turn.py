@@ -150,11 +150,11 @@ def is_shown_forbidden(
     world: Worlds, memory: Memory, tables: Tables, rules: InstitutionTables, i: int, window_cell: int
 ) -> bool:
     """Whether agent i sees that a bite on a cell of its window would break a rule about places."""
-    own = 0 if tables.sees_all else cell_of(world.row[i], world.col[i], tables)
+    origin = 0 if tables.sees_all else cell_of(world.row[i], world.col[i], tables)
     heading = world.heading[i]
-    if tables.walls_block_sight and not tables.in_sight[own, heading, window_cell]:
+    if tables.walls_block_sight and not tables.in_sight[origin, heading, window_cell]:
         return False
-    cell = own + tables.window_cells[heading, window_cell]
+    cell = origin + tables.window_cells[heading, window_cell]
     return is_known_forbidden(memory, rules, i, cell, tables.site_at[cell])
 
 

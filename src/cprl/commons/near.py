@@ -44,7 +44,7 @@ def neighbours(board: Map, rules: Rules) -> tuple[Ints, Indices]:
     is_near = np.zeros((2 * board.height - 1, 2 * board.width - 1), np.bool_)
     middle = board.height - 1, board.width - 1
     is_near[tuple((offsets + middle).T)] = True
-    counts, found = [], []
+    counts, sites_near = [], []
     near: NDArray[np.bool_]
     others: NDArray[Any]
     at_once = max(1, _PAIRS_AT_ONCE // max(1, min(len(sites), len(offsets))))
@@ -60,6 +60,6 @@ def neighbours(board: Map, rules: Rules) -> tuple[Ints, Indices]:
             others = np.sort(np.where(inside, others, -1), 1)
             near = np.asarray(others >= 0)
         counts.append(near.sum(1))
-        found.append(others[near].astype(np.uint32))
+        sites_near.append(others[near].astype(np.uint32))
     first_of = np.cumsum(np.concatenate([[0], *counts]), dtype=np.int32)
-    return first_of, np.concatenate(found)
+    return first_of, np.concatenate(sites_near)

@@ -69,16 +69,16 @@ def board_image(
     return image
 
 
-def world_image(board: Map, shown: Shown, *, cell_pixels: int = 24) -> Bytes:
+def world_image(board: Map, world: Shown, *, cell_pixels: int = 24) -> Bytes:
     """An image of the current state of one world, without agents out of play; see `board_image`."""
     return board_image(
         board,
-        shown.stock,
-        shown.row,
-        shown.col,
-        shown.heading,
-        in_play=shown.in_play,
-        beams=shown.board == BEAM,
+        world.stock,
+        world.row,
+        world.col,
+        world.heading,
+        in_play=world.in_play,
+        beams=world.board == BEAM,
         cell_pixels=cell_pixels,
     )
 

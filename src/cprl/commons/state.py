@@ -6,7 +6,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.arguments import array
 from cprl.checks import shown
 from cprl.commons.game import Game
 from cprl.commons.world import COL_STEP, PLAYING, ROW_STEP, TRUNCATED, Worlds, empty_worlds
@@ -48,7 +47,12 @@ def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
         )
     arrays = {name: _as_array(name, state[name]) for name in expected}
     for name, form in expected.items():
-        array(f"state[{name!r}]", arrays[name], form.shape, form.dtype)
+        array = arrays[name]
+        if array.shape != form.shape or array.dtype != form.dtype:
+            raise ValueError(
+                f"state[{name!r}] is {array.dtype} {list(array.shape)}; allowed: {form.dtype} "
+                f"{list(form.shape)}"
+            )
     _check_ranges(arrays, game)
     _check_places(arrays, game)
     if game.institutions:

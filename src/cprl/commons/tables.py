@@ -200,11 +200,11 @@ def build_tables(board: Map, rules: Rules, observation: Observation, *, highest:
     def cells(places: tuple[tuple[int, ...], ...]) -> list[int]:
         return [(place[0] + rim) * stride + place[1] + rim for place in places]
 
-    shown = classes_shown(observation, agents=agents, hides=rules.walls_block_sight)
+    drawn = classes_shown(observation, agents=agents, hides=rules.walls_block_sight)
     classes = range(FIRST_AGENT + (agents if observation.agents_apart else 0))
     paints = np.array(list(map(_paint, classes)), np.int32)
     channel_of = np.full(len(classes), -1, np.int32)
-    channel_of[list(shown)] = range(len(shown))
+    channel_of[list(drawn)] = range(len(drawn))
     background = np.full((board.height + 2 * rim, stride), paints[WALL], np.int32)
     background[rim:-rim, rim:-rim] = paints[GROUND]
     background.reshape(-1)[cells(board.walls)] = paints[WALL]

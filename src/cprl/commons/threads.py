@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from cprl import arguments
 from cprl.commons.compiled import entry_for_cpu, rules_for_cpu
-from cprl.commons.game import Game, output_forms
+from cprl.commons.game import Game
 from cprl.commons.loops import Loop
 from cprl.commons.tables import Tables
 from cprl.commons.world import Actions, Arrays, StepOutput, Worlds, empty_scratch
@@ -44,8 +44,6 @@ class CpuThreads:
         self.threads = min(limit, worlds if threads else -(-worlds // WORLDS_PER_THREAD))
         self.tables: Tables = game.tables
         self.rules = game.institution_tables if game.institutions else None
-        self._expected = tuple(output_forms(game, worlds).values())
-        self._output: StepOutput | None = None
         self._scratch = [
             empty_scratch(
                 agents=game.agents,
@@ -83,23 +81,16 @@ class CpuThreads:
         argument: NDArray[Any],
         output: StepOutput,
         law: Law | None = None,
-        *,
-        checked: bool = False,
     ) -> None:
-        """Runs a loop over all worlds; the calling thread takes the last share.
+        """Run a loop over all worlds; the calling thread takes the last share.
+
+        Nothing is checked: all arrays are contiguous and have the form that the game gives them.
 
         Args:
-            worlds: The state of the worlds.
-            argument: The loop's own argument.
-            output: The arrays that the loop writes.
-            law: What the institutions of the game need, arrays that are written included.
-            checked: Whether the caller has checked the form of `argument` and `output`.
+            argument: the loop's own argument.
+            output: the arrays that the loop writes.
+            law: what the institutions of the game need, arrays that are written included.
         """
-        if not checked:
-            _check_contiguous(argument)
-            if law is not None:
-                _check_contiguous(law.decisions)
-            self._check(output, law)
         size = len(argument)
         arguments = worlds, self.tables, argument, output, law
         whole = *arguments, self._scratch[0], 0, size
@@ -114,24 +105,3 @@ class CpuThreads:
         entry(*arguments, *last_share)
         for share in shares:
             share.result()
-
-    def _check(self, output: StepOutput, law: Law | None) -> None:
-        """Checks the arrays of an output, because the compiled loops do not; see `entry_for_cpu`."""
-        if output is self._output:
-            return
-        arrays: dict[str, NDArray[Any]] = output._asdict() | ({} if law is None else law.payments._asdict())
-        for (name, array), (shape, dtype) in zip(arrays.items(), self._expected, strict=True):
-            arguments.array(f"output.{name}", array, shape, dtype)
-            if not array.flags.carray:
-                raise ValueError(
-                    f"output.{name} is read-only or not contiguous; allowed: contiguous, writeable"
-                )
-        self._output = output
-
-
-def _check_contiguous(array: NDArray[Any]) -> None:
-    """Checks that an array is contiguous, because the compiled loops do not."""
-    if not array.flags.c_contiguous:
-        raise ValueError(
-            f"an array {array.dtype} {list(array.shape)} is not contiguous; allowed: contiguous arrays"
-        )

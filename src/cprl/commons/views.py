@@ -39,8 +39,8 @@ def mark_cell(world: Worlds, tables: Tables, i: int) -> int:
 def paint_mark(world: Worlds, tables: Tables, i: int, picture: Ints) -> None:
     """Paints the heading mark of agent i: on ground only, under `paint_over` on anything but a wall."""
     cell = mark_cell(world, tables, i)
-    shown = class_of(picture[cell])
-    if shown == GROUND or (tables.paint_over and shown != WALL):
+    kind = class_of(picture[cell])
+    if kind == GROUND or (tables.paint_over and kind != WALL):
         picture[cell] = tables.paints[MARK]
 
 
@@ -49,8 +49,8 @@ def paint_beam(world: Worlds, tables: Tables, shooter: int, picture: Ints) -> No
     for side in range(-tables.beam_half_width, tables.beam_half_width + 1):
         for ahead in range(1, beam_reach(world, tables, shooter, side) + 1):
             cell = beam_cell(world, tables, shooter, ahead, side)
-            shown = class_of(picture[cell])
-            if tables.paint_over or shown in (GROUND, MARK):
+            kind = class_of(picture[cell])
+            if tables.paint_over or kind in (GROUND, MARK):
                 picture[cell] = tables.paints[BEAM]
 
 
@@ -97,13 +97,13 @@ def paint(world: Worlds, tables: Tables, picture: Ints) -> None:
 def look(world: Worlds, tables: Tables, i: int, scratch: Scratch) -> None:
     """Writes the paints that agent i sees into `scratch.seen`: farthest row first, leftmost column first."""
     heading = world.heading[i]
-    own = 0 if tables.sees_all else cell_of(world.row[i], world.col[i], tables)
+    origin = 0 if tables.sees_all else cell_of(world.row[i], world.col[i], tables)
     to_cell = tables.window_cells[heading]
     for n in range(to_cell.shape[0]):
-        scratch.seen[n] = scratch.picture[np.uint64(own + to_cell[n])]
+        scratch.seen[n] = scratch.picture[np.uint64(origin + to_cell[n])]
     if tables.walls_block_sight:
         for n in range(to_cell.shape[0]):
-            if not tables.in_sight[own, heading, n]:
+            if not tables.in_sight[origin, heading, n]:
                 scratch.seen[n] = tables.paints[HIDDEN]
 
 
@@ -135,12 +135,12 @@ def draw_windows(world: Worlds, tables: Tables, scratch: Scratch, observation: B
     picture = scratch.picture
     paint(world, tables, picture)
     for i in range(world.row.shape[0]):
-        own = cell_of(world.row[i], world.col[i], tables)
-        as_others_see_it = picture[own]
-        picture[own] = tables.paints[SELF]
+        cell = cell_of(world.row[i], world.col[i], tables)
+        as_others_see_it = picture[cell]
+        picture[cell] = tables.paints[SELF]
         cut_window(world, tables, i, scratch, observation[i])
         if not tables.self_paint_stays:
-            picture[own] = as_others_see_it
+            picture[cell] = as_others_see_it
 
 
 def draw_board(world: Worlds, tables: Tables, scratch: Scratch, board: Bytes) -> None:

@@ -250,8 +250,8 @@ class CommonsEnv(LeanStepEnv):
         check_memory(
             f"images of {batch.size:,} worlds", 6 * pixels, "one world (world=0) or fewer cell_pixels"
         )
-        shown = (batch.show(self.output, world=number) for number in range(batch.size))
-        return np.stack([world_image(board, one, cell_pixels=cell_pixels) for one in shown])
+        states = (batch.show(self.output, world=number) for number in range(batch.size))
+        return np.stack([world_image(board, one, cell_pixels=cell_pixels) for one in states])
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         actions = self._as_array(self._chosen(tensordict, "action").contiguous())
@@ -264,7 +264,7 @@ class CommonsEnv(LeanStepEnv):
         if stepped is not None:
             self._check_stepped(stepped.reshape(-1))
         self._show_in(*self._fresh())
-        self.worlds.play_checked(actions, self._whole, decisions)
+        self.worlds.play(actions, self._whole, decisions)
         reward = self._tensors["reward"] if self._is_governed else self._tensors["harvest"].clone()
         return self._as_tensordict(self._tensors, reward.unsqueeze(-1))
 

@@ -152,7 +152,7 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
             for name, action in zip(self.possible_agents, actions, strict=True)
         ]
         output, decisions = self.batch.new_output(), self._decisions if self.game.decisions else None
-        self._show_in(self.batch.play_checked(np.array([row], np.int64), output, decisions))
+        self._show_in(self.batch.play(np.array([row], np.int64), output, decisions))
 
     def observation(self, agent: int) -> Observed:
         """The observation of an agent, an element of its `observation_space`."""

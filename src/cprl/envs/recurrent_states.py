@@ -28,5 +28,5 @@ def begin_states(
     if isinstance(began, TensorDictBase):
         began = began["next"][keys.DONE]
     none = torch.zeros_like(states)
-    kept = none if began is None else torch.where(began.reshape(-1, 1, 1), none, states)
-    keys.put(keys.entry(carried, keys.AGENTS), _NAME, kept)
+    carried_on = none if began is None else torch.where(began.reshape(-1, 1, 1), none, states)
+    keys.put(keys.entry(carried, keys.AGENTS), _NAME, carried_on)

@@ -72,8 +72,8 @@ def _all_of_transforms(env: EnvBase) -> dict[str, Any]:
     """Also what transforms keep of the worlds, once these have been reset."""
     if not isinstance(env, TransformedEnv):
         return {}
-    kept = env.transform.state_dict(keep_vars=True)
-    sound = {name: value for name, value in kept.items() if not is_lazy(value)}
+    state = env.transform.state_dict(keep_vars=True)
+    sound = {name: value for name, value in state.items() if not is_lazy(value)}
     return {name: value.detach() if isinstance(value, Tensor) else value for name, value in sound.items()}
 
 

@@ -134,8 +134,8 @@ class TakingEnv(StageEnv):
     def pay(self, action: Tensor) -> tuple[Tensor, Tensor]:
         total, most = action.sum(-1, keepdim=True), self.game.levels - 1
         paid = self._amounts[action] * self._gains[total] + self.game.sharing.payment
-        own, of_all = action / most, total / (most * self.game.agents)
-        turn = torch.stack((torch.ones_like(own), own, of_all.expand_as(own)), -1).float()
+        share, of_all = action / most, total / (most * self.game.agents)
+        turn = torch.stack((torch.ones_like(share), share, of_all.expand_as(share)), -1).float()
         return paid.float(), turn.clamp(0, 1)
 
     def observe(self, memory: Tensor) -> Tensor:

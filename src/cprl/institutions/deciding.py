@@ -43,12 +43,12 @@ def elected_choice(tables: InstitutionTables, ballot: int, decisions: Longs, wor
             most, tied = votes, 1
         elif votes == most:
             tied += 1
-    nth = np.int64(word % np.uint64(tied))
+    ties_left = np.int64(word % np.uint64(tied))
     for choice in range(tables.ballot_options[ballot]):
         if votes_for(tables, ballot, decisions, choice) == most:
-            if nth == 0:
+            if ties_left == 0:
                 return choice
-            nth -= 1
+            ties_left -= 1
     return 0
 
 

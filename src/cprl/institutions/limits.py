@@ -50,8 +50,8 @@ def is_above_quota(memory: Memory, q: int, i: int, apples: int) -> bool:
 
 def stops_bite(memory: Memory, tables: InstitutionTables, i: int, cell: int, site: int, turn: int) -> bool:
     """Whether agent i cannot harvest this site in this turn."""
-    for boundary in range(tables.own.shape[0]):
-        if tables.bite_stopped[boundary] and not tables.own[boundary, i, cell]:
+    for boundary in range(tables.may_use.shape[0]):
+        if tables.bite_stopped[boundary] and not tables.may_use[boundary, i, cell]:
             return True
     for season in range(tables.season_steps.shape[0]):
         if tables.season_stopped[season] and is_season_closed(tables, season, turn):
@@ -78,8 +78,8 @@ def add_to_patch(memory: Memory, tables: InstitutionTables, site: int, apples: i
 def note_bite(memory: Memory, tables: InstitutionTables, i: int, cell: int, site: int, turn: int) -> None:
     """Counts a bite of agent i, and notes the rules that it breaks."""
     add_to_patch(memory, tables, site, -1)
-    for boundary in range(tables.own.shape[0]):
-        if tables.own[boundary, i, cell]:
+    for boundary in range(tables.may_use.shape[0]):
+        if tables.may_use[boundary, i, cell]:
             memory.counts[i, OWN_BITES] += 1
         else:
             violate(memory, i, FOREIGN_BITES, tables.bite_fine[boundary])
@@ -98,8 +98,8 @@ def note_bite(memory: Memory, tables: InstitutionTables, i: int, cell: int, site
 
 def note_step(memory: Memory, tables: InstitutionTables, i: int, cell: int) -> None:
     """Notes that agent i, in play, ends its move on a cell."""
-    for boundary in range(tables.own.shape[0]):
-        if not tables.own[boundary, i, cell]:
+    for boundary in range(tables.may_use.shape[0]):
+        if not tables.may_use[boundary, i, cell]:
             if tables.step_is_violation[boundary]:
                 violate(memory, i, TRESPASSES, tables.step_fine[boundary])
             else:
@@ -124,7 +124,7 @@ def close_patches(memory: Memory, tables: InstitutionTables) -> None:
 def is_known_forbidden(memory: Memory, tables: InstitutionTables, i: int, cell: int, site: int) -> bool:
     """Whether a bite of agent i on a cell would break a rule about places that it observes; `site`: -1 for
     none."""
-    for boundary in range(tables.own.shape[0]):
-        if tables.own_shown[boundary] and not tables.own[boundary, i, cell]:
+    for boundary in range(tables.may_use.shape[0]):
+        if tables.may_use_shown[boundary] and not tables.may_use[boundary, i, cell]:
             return True
     return tables.patch_shown and site >= 0 and is_patch_closed(memory, tables, site)

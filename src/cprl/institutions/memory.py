@@ -111,7 +111,7 @@ DETECTED, MARK, MAY_FIRE, IN_FORCE, IS_ELECTED = range(5, 10)
 class InstitutionTables(NamedTuple):
     """All institutions of a game as parameters; a kind that the game does not have has arrays of length 0."""
 
-    own: Bools
+    may_use: Bools
     """bool [boundaries, N, cells], whether the agent may use the cell."""
     bite_stopped: Bools
     """bool [boundaries], whether bites in others' regions do not happen."""
@@ -121,7 +121,7 @@ class InstitutionTables(NamedTuple):
     """bool [boundaries]."""
     step_fine: Numbers
     """float64 [boundaries]."""
-    own_shown: Bools
+    may_use_shown: Bools
     """bool [boundaries], whether agents are shown where it forbids bites."""
 
     quota_unit: Numbers

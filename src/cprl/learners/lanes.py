@@ -17,7 +17,7 @@ from cprl.learners.transitions import LaneTurn, array_of, joint_actions, lane_tu
 from cprl.networks.agent import acting_part
 from cprl.networks.recurrent import state_cells_of
 from cprl.networks.specification import refuse_unseen
-from cprl.policies.lanes import LaneActor, actor_of_lanes
+from cprl.policies.lanes import LaneActor
 from cprl.system.memory import check_memory
 
 WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION, EXHIBITION, NOISE = range(7)
@@ -221,9 +221,9 @@ class Lanes:
         return actor
 
     def _actor(self, members: Acts, purpose: int, *, worlds: int = 1, compile: bool = False) -> LaneActor:
-        return actor_of_lanes(
+        return LaneActor(
             members.outputs,
-            self.spaces,
+            self.spaces.actions,
             seeds=self.agent_seeds(purpose),
             agents=len(self.agents),
             worlds=worlds,

@@ -159,8 +159,8 @@ def chosen(joint: Tensor, action: Tensor) -> Tensor:
         Float [...].
     """
     actions = joint.shape[-1]
-    own, peers = action[..., :1], action[..., 1:]
-    pairs = joint.flatten(-2).gather(-1, (own * actions + peers).unsqueeze(-1))
+    action_of_agent, peers = action[..., :1], action[..., 1:]
+    pairs = joint.flatten(-2).gather(-1, (action_of_agent * actions + peers).unsqueeze(-1))
     return pairs.sum((-2, -1))
 
 

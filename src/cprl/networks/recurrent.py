@@ -136,7 +136,7 @@ class RecurrentNetwork(nn.Module):
         Returns:
             The outputs [..., A] or [..., T, A], and the states after each step, as `state`.
         """
-        weights = _Weights(*(own[None] for own in _layers(self)))
+        weights = _Weights(*(layer[None] for layer in _layers(self)))
         steps = 1 if is_init is None else is_init.shape[-1]
         return _outputs(weights, self.encoder(observation), state, is_init, (1, -1, steps))
 
@@ -155,12 +155,15 @@ class StackedRecurrent(nn.Module):
     def __init__(self, networks: Sequence[RecurrentNetwork]) -> None:
         super().__init__()
         first = networks[0]
-        forms = {(*own.cell.weight_ih.shape, *own.cell.weight_hh.shape, own.outputs) for own in networks}
+        forms = {
+            (*network.cell.weight_ih.shape, *network.cell.weight_hh.shape, network.outputs)
+            for network in networks
+        }
         if len(forms) != 1:
             raise ValueError(f"the networks of the lanes have {len(forms)} architectures; allowed: 1")
         self.lanes, self.outputs = len(networks), first.outputs
         self.observation_dims, self.state_shape = first.observation_dims, first.state_shape
-        self.encoder = stack_lanes([own.encoder for own in networks])
+        self.encoder = stack_lanes([network.encoder for network in networks])
         layers = zip(*map(_layers, networks), strict=True)
         self.weights = nn.ParameterList(
             [torch.stack([one.detach() for one in lanes]).contiguous() for lanes in layers]
@@ -168,15 +171,15 @@ class StackedRecurrent(nn.Module):
 
     def lane_state(self, lane: int) -> dict[str, Tensor]:
         """Copies of the weights of one lane, as the state dict of its `RecurrentNetwork`."""
-        own = _Weights(*(weight[lane].detach() for weight in self.weights))
+        layers = _Weights(*(weight[lane].detach() for weight in self.weights))
         state = {f"encoder.{name}": value for name, value in lane_state(self.encoder, lane).items()}
         return state | {
-            "cell.weight_ih": own.input.T.clone(),
-            "cell.weight_hh": own.state.T.clone(),
-            "cell.bias_ih": own.input_bias[0].clone(),
-            "cell.bias_hh": own.state_bias[0].clone(),
-            "head.weight": own.head.T.clone(),
-            "head.bias": own.head_bias[0].clone(),
+            "cell.weight_ih": layers.input.T.clone(),
+            "cell.weight_hh": layers.state.T.clone(),
+            "cell.bias_ih": layers.input_bias[0].clone(),
+            "cell.bias_hh": layers.state_bias[0].clone(),
+            "head.weight": layers.head.T.clone(),
+            "head.bias": layers.head_bias[0].clone(),
         }
 
     def forward(

@@ -43,8 +43,8 @@ def new_network(
         return network.make(
             spaces, outputs, relu_on_outputs=relu_on_outputs, glorot_uniform=glorot_uniform, shape=shape
         )
-    asked = {"relu_on_outputs": relu_on_outputs, "glorot_uniform": glorot_uniform}
-    for name, value in asked.items():
+    switches = {"relu_on_outputs": relu_on_outputs, "glorot_uniform": glorot_uniform}
+    for name, value in switches.items():
         if value:
             raise ValueError(
                 f"settings.{name} is True; allowed with a network of your own, {network.target}: False; "

@@ -105,7 +105,9 @@ class StackedModules(nn.Module):
 
         if recurrent:
             apart = self.lanes, *((-1,) if len(leading) == 1 else leading[1:])
-            by_lane = [own.reshape(*apart, *own.shape[len(leading) :]) for own in (observation, *recurrent)]
+            by_lane = [
+                entry.reshape(*apart, *entry.shape[len(leading) :]) for entry in (observation, *recurrent)
+            ]
             each = torch.vmap(output)(list(self.weights), *by_lane)
             return tuple(given.reshape(*leading, *given.shape[len(apart) :]) for given in each)
         given = torch.vmap(output)(list(self.weights), observation.reshape(self.lanes, -1, *shape))
@@ -133,8 +135,8 @@ def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
         stack: Any = deepcopy(networks[0])
         stack.network = stack_lanes([network.network for network in networks])  # type: ignore[misc]
         for name, _ in first.named_parameters(recurse=False):
-            own = torch.stack([getattr(network, name).detach() for network in networks])
-            setattr(stack, name, nn.Parameter(own))
+            weights = torch.stack([getattr(network, name).detach() for network in networks])
+            setattr(stack, name, nn.Parameter(weights))
         return stack  # type: ignore[no-any-return]
     if all(isinstance(network, AgentNetworks) for network in networks):
         parts = zip(*(network.values() for network in networks), strict=True)  # type: ignore[operator]
@@ -152,12 +154,12 @@ def lane_state(stack: nn.Module, lane: int) -> dict[str, Tensor]:
     """Copies of the weights of one lane of an acting network that `stack_lanes` made, as the state dict of
     the lane's network."""
     if isinstance(stack, _OVER_ANOTHER):
-        own = {f"network.{name}": value for name, value in lane_state(stack.network, lane).items()}
+        inner = {f"network.{name}": value for name, value in lane_state(stack.network, lane).items()}
         weights = {
             name: value[lane].detach().clone() for name, value in stack.named_parameters(recurse=False)
         }
         buffers = {name: value.clone() for name, value in stack.named_buffers(recurse=False)}
-        return {**weights, **buffers, **own}
+        return {**weights, **buffers, **inner}
     state: dict[str, Tensor] = stack.lane_state(lane)  # type: ignore[operator]
     return state
 

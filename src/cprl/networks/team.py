@@ -40,9 +40,9 @@ class RecurrentTeam(nn.Module):
         """As `RecurrentNetwork.forward`: observations [..., S, *shape], states [..., S, K] and `is_init`
         [..., T] to outputs [..., S, A] and states."""
         seen = observation.movedim(-self.observation_dims, 0)
-        own = state.movedim(-2, 0)
+        states = state.movedim(-2, 0)
         begins = None if is_init is None else is_init.expand(len(seen), *is_init.shape)
-        outputs, after = self.members(seen, own, begins)
+        outputs, after = self.members(seen, states, begins)
         return outputs.movedim(0, -2), after.movedim(0, -2)
 
     def member_state(self, state: dict[str, Tensor], member: int) -> dict[str, Tensor]:
@@ -146,11 +146,13 @@ class ModuleTeam(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         """[..., S, *shape] to [..., S, A]."""
         seen = observation.unbind(self._axis)
-        return torch.stack([member(own) for member, own in zip(self.members, seen, strict=True)], -2)
+        return torch.stack(
+            [member(observed) for member, observed in zip(self.members, seen, strict=True)], -2
+        )
 
     def member_state(self, state: dict[str, Tensor], member: int) -> dict[str, Tensor]:
-        mine = f"members.{member}."
-        return {name.removeprefix(mine): value for name, value in state.items() if name.startswith(mine)}
+        prefix = f"members.{member}."
+        return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
 
 
 def team_network(
@@ -236,7 +238,7 @@ class JointCritics(nn.Module):
 
     def stacked(self, critics: Sequence["JointCritics"]) -> "JointCritics":
         """The critics of many teams, with their parameters along a first axis; copies."""
-        heads, encoders = ([getattr(own, name) for own in critics] for name in ("heads", "encoders"))
+        heads, encoders = ([getattr(critic, name) for critic in critics] for name in ("heads", "encoders"))
         return JointCritics(
             stack_lanes(heads),
             None if self.encoders is None else stack_lanes(encoders),

@@ -63,12 +63,12 @@ def lola_gradients(
     flat, owners = _flat(parameters)
     flat = tuple(value.detach() for value in flat)
     agents = range(len(parameters))
-    followed = [(i, p) for i in agents for p, own in enumerate(owners) if factor == "both" or own == i]
+    followed = [(i, p) for i in agents for p, owner in enumerate(owners) if factor == "both" or owner == i]
     estimates: list[Any] = [
-        torch.func.vjp(_slopes(own, owners, followed), *flat, has_aux=True) for own in objectives
+        torch.func.vjp(_slopes(objective, owners, followed), *flat, has_aux=True) for objective in objectives
     ]
     slopes: list[_Slopes] = [aux[0] for _, _, aux in estimates]
-    gradients = [_mean([own[i, p] for own in slopes]) for p, i in enumerate(owners)]
+    gradients = [_mean([slope[i, p] for slope in slopes]) for p, i in enumerate(owners)]
     for one, (_, pull, _) in enumerate(estimates if rate else ()):
         others = slopes[:one] + slopes[one + 1 :] or slopes
         for i in agents:
@@ -125,10 +125,12 @@ def look_ahead_losses(
         steps: how many steps they take, 1..1000.
     """
     losses = []
-    for i, own in enumerate(outer):
-        mine = [list(of) if j == i else [value.detach() for value in of] for j, of in enumerate(parameters)]
-        ahead = looked_ahead(inner, mine, rate=rate, steps=steps, still=i)
-        losses.append(own(ahead)[..., i])
+    for i, objective in enumerate(outer):
+        attached = [
+            list(of) if j == i else [value.detach() for value in of] for j, of in enumerate(parameters)
+        ]
+        ahead = looked_ahead(inner, attached, rate=rate, steps=steps, still=i)
+        losses.append(objective(ahead)[..., i])
     return torch.stack(losses, -1)
 
 
@@ -167,7 +169,7 @@ def _weights(
         first = estimates[0][j, p]
         if i == owners[p] or i != j != owners[p]:
             return torch.zeros_like(first)
-        return _mean([own[i if j == owners[p] else owners[p], p] for own in estimates]).detach()
+        return _mean([slopes[i if j == owners[p] else owners[p], p] for slopes in estimates]).detach()
 
     return tuple(weight(j, p) for j, p in followed)
 
@@ -184,7 +186,7 @@ def _flat(parameters: Parameters) -> tuple[_Flat, list[int]]:
 
 def _by_agent(values: Sequence[Tensor], owners: list[int]) -> list[list[Tensor]]:
     return [
-        [value for value, own in zip(values, owners, strict=True) if own == agent]
+        [value for value, owner in zip(values, owners, strict=True) if owner == agent]
         for agent in range(owners[-1] + 1)
     ]
 
@@ -339,8 +341,8 @@ class _OfPolicies(LossModule):
 
         def losses(parameters: list[list[Tensor]]) -> Tensor:
             taken = [
-                self._policy(agent, own, rollouts).log_prob(action.select(rollouts.batch_dims, agent))
-                for agent, own in enumerate(parameters)
+                self._policy(agent, weights, rollouts).log_prob(action.select(rollouts.batch_dims, agent))
+                for agent, weights in enumerate(parameters)
             ]
             gained = loaded_dice(torch.stack(taken, -1), advantage, gamma=self.gamma, done=done)
             return -gained.mean(-2)
@@ -350,9 +352,9 @@ class _OfPolicies(LossModule):
     def _losses(self, objective: Tensor, rollouts: TensorDictBase) -> TensorDict:
         """The output of `forward`, whose entropies are those of the present policies."""
         parameters = self._weights()
-        each = [self._policy(agent, own, rollouts).entropy() for agent, own in enumerate(parameters)]
+        each = [self._policy(agent, weights, rollouts).entropy() for agent, weights in enumerate(parameters)]
         lanes = rollouts.batch_dims - 2
-        entropy = torch.stack([own.flatten(lanes).mean(-1) for own in each], -1)
+        entropy = torch.stack([entropy.flatten(lanes).mean(-1) for entropy in each], -1)
         loss = -self.entropy_coeff * entropy.sum()
         return TensorDict({"loss_objective": objective, "loss_entropy": loss, "entropy": entropy.detach()})
 
@@ -451,8 +453,8 @@ class LOLADiCELoss(_OfPolicies):
             rate=self.look_ahead_rate,
         )
         return [
-            TensorDict({key: value.detach() for key, value in zip(keys, own, strict=True)}, [])
-            for keys, own in zip(self._learned, ahead, strict=True)
+            TensorDict({key: value.detach() for key, value in zip(keys, values, strict=True)}, [])
+            for keys, values in zip(self._learned, ahead, strict=True)
         ]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -462,7 +464,7 @@ class LOLADiCELoss(_OfPolicies):
         now, *each = tensordict.unbind(tensordict.batch_dims - 3)
         losses = look_ahead_losses(
             self._objective(now),
-            [self._objective(own) for own in each],
+            [self._objective(rollouts) for rollouts in each],
             self._weights(),
             rate=self.look_ahead_rate,
         )

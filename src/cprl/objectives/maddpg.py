@@ -135,9 +135,9 @@ class MADDPGLoss(TDLoss):
     ) -> Tensor:
         """Of each member, [.., S]: in row i of the joint actions member i takes an action of its current
         policy, the others those of the batch."""
-        own = torch.eye(taken.shape[-2], dtype=taken.dtype, device=taken.device).unsqueeze(-1)
+        of_member = torch.eye(taken.shape[-2], dtype=taken.dtype, device=taken.device).unsqueeze(-1)
         sampled = straight_through(logits, noise)
-        joint = own * sampled.unsqueeze(-3) + (1 - own) * taken.unsqueeze(-3)
+        joint = of_member * sampled.unsqueeze(-3) + (1 - of_member) * taken.unsqueeze(-3)
         values = self._values(tensordict, joint, self.critic_network_params.detach())
         return self.logit_penalty * logits.square().mean(-1) - values.squeeze(-1)
 
@@ -174,7 +174,7 @@ class MADDPGLoss(TDLoss):
     def _values(self, tensordict: TensorDictBase, joint: Tensor, weights: TensorDictBase) -> Tensor:
         """Of joint actions [.., S, S, A] by the critic of each member, [.., S, 1]."""
         key = self.tensor_keys.joint_action
-        seen = tensordict.select(*(own for own in self.critic_network.in_keys if own != key))
+        seen = tensordict.select(*(entry for entry in self.critic_network.in_keys if entry != key))
         seen.set(key, joint)
         with weights.to_module(self.critic_network, preserve_module_state=False):
             values: Tensor = self.critic_network(seen).get(self.tensor_keys.state_action_value)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from cprl import keys
 from cprl.policies.decisions import Decider
-from cprl.policies.lanes import LaneActor, RecurrentLaneActor
+from cprl.policies.lanes import LaneActor
 from cprl.system.compat import unchecked_tensordict
 
 AgentIndices: TypeAlias = int | tuple[int, ...]
@@ -109,10 +109,9 @@ class AgentPolicies(TensorDictModuleBase):
 
     def _choose(self, actor: nn.Module, agents: TensorDictBase, index: Any, batch_size: torch.Size) -> Tensor:
         """One actor's actions for the agents at an index, None for all; passes the entries it reads."""
-        if isinstance(actor, RecurrentLaneActor):
-            return self._choose_with(actor, agents, index)
         if isinstance(actor, LaneActor):  # the same as its forward, without a TensorDict
-            return actor.choose(_at(agents, "observation", index))
+            observation = _at(agents, "observation", index)
+            return self._choose_with(actor, agents, index) if actor.state_cells else actor.choose(observation)
         names = getattr(actor, "in_keys", ("observation",))
         view = unchecked_tensordict({name: _at(agents, name, index) for name in names}, batch_size)
         action: Tensor = actor(view).get("action")
@@ -134,7 +133,7 @@ class AgentPolicies(TensorDictModuleBase):
         keys.put(agents, "recurrent_state_before", before)
         keys.put(agents, "recurrent_state", torch.zeros_like(before))
 
-    def _choose_with(self, actor: RecurrentLaneActor, agents: TensorDictBase, index: Any) -> Tensor:
+    def _choose_with(self, actor: LaneActor, agents: TensorDictBase, index: Any) -> Tensor:
         """A recurrent actor's actions; writes its states."""
         index = () if index is None else index
         before = _at(agents, "recurrent_state_before", index)[..., : actor.state_cells]

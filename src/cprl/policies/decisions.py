@@ -122,16 +122,16 @@ class Decider(nn.Module):
     def best(self) -> Longs:
         """The choice with the highest value on each ballot, int64 [R, N, V]."""
         of_ballots = np.split(self.values, np.cumsum(self.sizes)[:-1], axis=-1)
-        return np.stack([own.argmax(-1) for own in of_ballots], -1)
+        return np.stack([values.argmax(-1) for values in of_ballots], -1)
 
     def _numbers(self, worlds: Longs) -> Doubles:
         """Two uniform numbers in 0..1 for each of these worlds, agent and ballot, [worlds, N, V, 2]."""
         numbers = np.empty((len(worlds), self.agents, len(self.sizes), 2))
         together = np.stack([worlds // self.worlds, self._decided[worlds]], 1)
-        for replica, nth in np.unique(together, axis=0).tolist():
-            at = np.flatnonzero((together == (replica, nth)).all(1))
+        for replica, decided in np.unique(together, axis=0).tolist():
+            at = np.flatnonzero((together == (replica, decided)).all(1))
             for agent in range(self.agents):
-                seed = np.random.SeedSequence((*self._seeds[replica * self.agents + agent], nth))
+                seed = np.random.SeedSequence((*self._seeds[replica * self.agents + agent], decided))
                 drawn = np.random.Generator(np.random.Philox(seed)).random((self.worlds, len(self.sizes), 2))
                 numbers[at, agent] = drawn[worlds[at] % self.worlds]
         self._decided[worlds] += 1

@@ -21,20 +21,20 @@ class LaneActor(TensorDictModuleBase):
 
     Args:
         values: maps observations [L, k, C, X, Y] to action values [L, k, A], with lane = replica x S + agent;
-            None for agents that always act at random.
+            None for agents that always act at random. Recurrent networks also read states [L, k, H], and give
+            those afterwards.
         stochastic: whether `values` returns the logits of a policy from which exploring agents sample, with
             no epsilon; else exploring agents are epsilon-greedy.
         actions: the number of actions A.
         seeds: the exploration seed of each lane.
         agents: the number of agents S of each replica.
         worlds: the number of worlds k of each replica that are played at once, consecutive in the batch.
+        state_cells: the numbers H of a recurrent state; 0 for networks without one.
         compile: whether torch compiles exploration; if that fails, the actor warns once and runs uncompiled.
-    """
 
-    in_keys: tuple[str, ...] = ("observation",)
-    out_keys: tuple[str, ...] = ("action",)
-    state_cells = 0
-    """The numbers of a recurrent state of each agent that it reads and writes."""
+    Reads "observation" [R x k, S, C, X, Y], writes "action" int64 [R x k, S]; with a state also reads and
+    writes "recurrent_state", float32 [R x k, S, H].
+    """
 
     def __init__(
         self,
@@ -45,11 +45,15 @@ class LaneActor(TensorDictModuleBase):
         agents: int,
         worlds: int = 1,
         stochastic: bool = False,
+        state_cells: int = 0,
         compile: bool = False,
     ) -> None:
         super().__init__()
         self.values, self.stochastic, self.actions = values, stochastic, actions
         self.agents, self.worlds, self.replicas = agents, worlds, len(seeds) // agents
+        self.state_cells = 0 if values is None else state_cells
+        states = ("recurrent_state",) if self.state_cells else ()
+        self.in_keys, self.out_keys = ("observation", *states), ("action", *states)
         # A tensor, because compiled code treats other numbers as constants.
         self._chance = 0.0 if stochastic else 1.0
         self._epsilon = torch.tensor(self._chance, dtype=torch.float64)
@@ -67,14 +71,14 @@ class LaneActor(TensorDictModuleBase):
         self.explore_with(chance)
 
     def explore_with(self, chance: float) -> None:
-        """Sets `epsilon` of agents that have one; faster than through attributes of a module."""
+        """Set `epsilon` of agents that have one; faster than through attributes of a module."""
         if chance != self._chance and not self.stochastic:
             self._epsilon.fill_(chance)
             object.__setattr__(self, "_chance", float(chance))
 
     def of_first_replica(self) -> "LaneActor":
-        """An actor of the first replica's agents alone, with the same weights and exploration, and their own
-        random numbers from the start."""
+        """Return an actor of the first replica's agents alone, with the same weights and exploration, and
+        their own random numbers from the start."""
         values, replicas, agents = self.values, self.replicas, self.agents
 
         def of_first(*seen: Tensor) -> Any:
@@ -83,60 +87,66 @@ class LaneActor(TensorDictModuleBase):
             given = values(*(each.repeat(replicas, *[1] * (each.ndim - 1)) for each in seen))
             return tuple(each[:agents] for each in given) if isinstance(given, tuple) else given[:agents]
 
-        lanes = {"seeds": self._seeds[:agents], "agents": agents, "worlds": self.worlds}
-        actor = self._alike(None if values is None else of_first, **lanes)
+        actor = LaneActor(
+            None if values is None else of_first,
+            self.actions,
+            seeds=self._seeds[:agents],
+            agents=agents,
+            worlds=self.worlds,
+            stochastic=self.stochastic,
+            state_cells=self.state_cells,
+        )
         actor.epsilon = self.epsilon
         return actor
 
-    def _alike(self, values: Callable[..., Any] | None, **lanes: Any) -> "LaneActor":
-        """An actor for other lanes that chooses as this one does."""
-        return LaneActor(values, self.actions, stochastic=self.stochastic, **lanes)
-
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes "action", int64 [R x k, S], for "observation" [R x k, S, C, X, Y]."""
-        return tensordict.set("action", self.choose(tensordict.get("observation")))
+        chosen = self.choose_with(*(tensordict.get(name) for name in self.in_keys))
+        for name, value in zip(self.out_keys, chosen, strict=True):
+            tensordict.set(name, value)
+        return tensordict
 
     def choose(self, observation: Tensor) -> Tensor:
-        """Actions, int64 [R x k, S], for observations [R x k, S, C, X, Y]."""
+        """Return actions, int64 [R x k, S], for observations [R x k, S, C, X, Y]; for actors without a
+        state."""
+        return self.choose_with(observation)[0]
+
+    def choose_with(self, *seen: Tensor) -> list[Tensor]:
+        """Return actions, int64 [R x k, S], and of recurrent networks the states afterwards.
+
+        Args:
+            seen: observations [R x k, S, C, X, Y], and, if there are any, states before this turn
+                [R x k, S, H].
+        """
+        device = seen[0].device
         if self.values is None:
-            return self._by_replica(self._random(self.rng.next().to(observation.device)))
+            return [self._by_replica(self._random(self.rng.next().to(device)))]
         if exploration_type() not in (ExplorationType.RANDOM, None):
-            return self._by_replica(self._best(observation))
-        device = observation.device
-        arguments = observation, self.rng.next().to(device), self._epsilon.to(device)
-        chosen: Tensor = self._explore((observation.shape, observation.dtype), self, *arguments)
+            values, *after = self._outputs(*seen)
+            return [self._by_replica(values.argmax(-1)), *after]
+        form = tuple((entry.shape, entry.dtype) for entry in seen)
+        numbers = self.rng.next().to(device), self._epsilon.to(device)
+        chosen: list[Tensor] = self._explore(form, self, *numbers, *seen)
         return chosen
 
-    def _explored(self, observation: Tensor, numbers: Tensor, epsilon: Tensor) -> Tensor:
-        """Exploring actions, int64 [R x k, S]."""
-        return self._by_replica(self._chosen(self._values(observation), numbers, epsilon))
-
-    def _chosen(self, values: Tensor, numbers: Tensor, epsilon: Tensor) -> Tensor:
-        """Sampled actions of a stochastic policy, else epsilon-greedy actions; int64 [L, k]."""
+    def _explored(self, numbers: Tensor, epsilon: Tensor, *seen: Tensor) -> list[Tensor]:
+        """Exploring actions, and of recurrent networks the states afterwards."""
+        values, *after = self._outputs(*seen)
         if self.stochastic:
-            return self._sampled(values, numbers)
-        explores = numbers.view(-1, self.worlds, 2)[..., 0] < epsilon
-        return torch.where(explores, self._random(numbers), values.argmax(-1))
+            chosen = self._sampled(values, numbers)
+        else:
+            explores = numbers.view(-1, self.worlds, 2)[..., 0] < epsilon
+            chosen = torch.where(explores, self._random(numbers), values.argmax(-1))
+        return [self._by_replica(chosen), *after]
 
-    def _random(self, numbers: Tensor) -> Tensor:
-        """Random actions of each lane, int64 [L, k]."""
-        return (numbers.view(-1, self.worlds, 2)[..., 1] * self.actions).long()
+    def preferences(self, *seen: Tensor) -> Tensor | None:
+        """Return what it chooses by: the probabilities of a stochastic policy, else the action values; float
+        [R x k, S, A], None for agents that act at random.
 
-    def _by_replica(self, actions: Tensor) -> Tensor:
-        """Reshapes [L, k, ...] to [R x k, S, ...]."""
-        more = actions.shape[2:]
-        chosen = actions.view(self.replicas, self.agents, self.worlds, *more).transpose(1, 2)
-        return chosen.reshape(-1, self.agents, *more)
-
-    def preferences(self, observation: Tensor, state: Tensor | None = None) -> Tensor | None:
-        """What it chooses by: the probabilities of a stochastic policy, else the action values, for
-        observations [R x k, S, C, X, Y]; float [R x k, S, A], None for agents that act at random.
-
-        It draws nothing, so the actions that follow stay the same.
+        It draws nothing, so the actions that follow stay the same. Arguments are those of `choose_with`.
         """
         if self.values is None:
             return None
-        values = self._by_replica(self._values(observation))
+        values = self._by_replica(self._outputs(*seen)[0])
         return values.softmax(-1) if self.stochastic else values
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -144,12 +154,15 @@ class LaneActor(TensorDictModuleBase):
         return self.rng.state_dict()
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Continues from that state."""
+        """Continue from that state."""
         self.rng.load_state_dict(state)
 
-    def _best(self, observation: Tensor) -> Tensor:
-        """The greedy actions of each lane, int64 [L, k]."""
-        return self._values(observation).argmax(-1)
+    def _outputs(self, *seen: Tensor) -> list[Tensor]:
+        """The outputs of each lane's network [L, k, A], and the states afterwards [R x k, S, H]."""
+        assert self.values is not None
+        with torch.no_grad():
+            given = self.values(*map(self._by_lane, seen))
+        return [given[0], self._by_replica(given[1])] if self.state_cells else [given]
 
     def _sampled(self, logits: Tensor, numbers: Tensor) -> Tensor:
         """Actions sampled from each lane's policy, int64 [L, k], by inverting the cumulative distribution at
@@ -158,18 +171,19 @@ class LaneActor(TensorDictModuleBase):
         drawn = numbers.view(-1, self.worlds, 2)[..., 1:]
         return (drawn >= shares[..., :-1]).sum(-1)
 
-    def _values(self, observation: Tensor) -> Tensor:
-        """The outputs of each lane's network, [L, k, A]."""
-        assert self.values is not None
-        with torch.no_grad():
-            values: Tensor = self.values(self._by_lane(observation))
-        return values
+    def _random(self, numbers: Tensor) -> Tensor:
+        """Random actions of each lane, int64 [L, k]."""
+        return (numbers.view(-1, self.worlds, 2)[..., 1] * self.actions).long()
+
+    def _by_replica(self, values: Tensor) -> Tensor:
+        """Reshape [L, k, ...] to [R x k, S, ...]."""
+        by_replica = values.view(self.replicas, self.agents, self.worlds, *values.shape[2:]).transpose(1, 2)
+        return by_replica.reshape(-1, *by_replica.shape[2:])
 
     def _by_lane(self, seen: Tensor) -> Tensor:
-        """Reshapes [R x k, S, ...] to [L, k, ...]."""
-        shape = seen.shape[2:]
-        by_lane = seen.view(self.replicas, self.worlds, self.agents, *shape).transpose(1, 2)
-        return by_lane.reshape(-1, self.worlds, *shape)
+        """Reshape [R x k, S, ...] to [L, k, ...]."""
+        by_lane = seen.view(self.replicas, self.worlds, *seen.shape[1:]).transpose(1, 2)
+        return by_lane.reshape(-1, *by_lane.shape[2:])
 
 
 def random_agents(
@@ -186,84 +200,6 @@ def random_lanes(
     """An actor of agents that act uniformly at random, given how many actions there are or the spaces."""
     count = actions.actions if isinstance(actions, Spaces) else actions
     return LaneActor(None, count, seeds=seeds, agents=agents, worlds=worlds)
-
-
-class RecurrentLaneActor(LaneActor):
-    """Chooses actions by recurrent networks; other arguments are those of `LaneActor`.
-
-    Args:
-        values: maps observations [L, k, ...] and states [L, k, H] to logits or action values [L, k, A] and
-            the states afterwards.
-        actions: the number of actions A.
-        state_cells: the numbers H of a state.
-
-    Reads "observation" and "recurrent_state", float32 [R x k, S, H]; writes "action" and "recurrent_state".
-    """
-
-    in_keys = ("observation", "recurrent_state")
-    out_keys = ("action", "recurrent_state")
-
-    def __init__(self, values: Callable[..., Any], actions: int, *, state_cells: int, **how: Any) -> None:
-        super().__init__(values, actions, **how)
-        self.state_cells = state_cells
-        is_compiled = bool(how.get("compile", False))
-        self._explore = Compiled(type(self)._explored_with, what="agents act", enabled=is_compiled)
-
-    def _alike(self, values: Callable[..., Any] | None, **lanes: Any) -> LaneActor:
-        assert values is not None
-        how: dict[str, Any] = {"state_cells": self.state_cells, "stochastic": self.stochastic}
-        return RecurrentLaneActor(values, self.actions, **how, **lanes)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes "action", int64 [R x k, S], and "recurrent_state", from the turn's entries."""
-        chosen, after = self.choose_with(tensordict.get("observation"), tensordict.get("recurrent_state"))
-        return tensordict.set("action", chosen).set("recurrent_state", after)
-
-    def choose_with(self, observation: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions, int64 [R x k, S], and states afterwards, float32 [R x k, S, H].
-
-        Args:
-            observation: [R x k, S, ...].
-            state: before this turn, [R x k, S, H].
-        """
-        if exploration_type() not in (ExplorationType.RANDOM, None):
-            values, after = self._step(observation, state)
-            return self._by_replica(values.argmax(-1)), after
-        device = observation.device
-        given = observation, state, self.rng.next().to(device), self._epsilon.to(device)
-        form = observation.shape, observation.dtype, state.shape
-        chosen, after = self._explore(form, self, *given)
-        return chosen, after
-
-    def preferences(self, observation: Tensor, state: Tensor | None = None) -> Tensor | None:
-        """As of `LaneActor`, with the states before the turn, [R x k, S, H]."""
-        assert state is not None
-        values = self._by_replica(self._step(observation, state)[0])
-        return values.softmax(-1) if self.stochastic else values
-
-    def _explored_with(
-        self, observation: Tensor, state: Tensor, numbers: Tensor, epsilon: Tensor
-    ) -> list[Tensor]:
-        """Exploring actions, and the states afterwards."""
-        values, after = self._step(observation, state)
-        return [self._by_replica(self._chosen(values, numbers, epsilon)), after]
-
-    def _step(self, observation: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Outputs of each lane's network [L, k, A], and the states afterwards [R x k, S, H]."""
-        assert self.values is not None
-        with torch.no_grad():
-            values, after = self.values(self._by_lane(observation), self._by_lane(state))
-        return values, self._by_replica(after)
-
-
-def actor_of_lanes(
-    values: Callable[..., Any] | None, spaces: Spaces, *, state_cells: int = 0, **how: Any
-) -> LaneActor:
-    """The actor for networks with states of so many numbers, or without: a `RecurrentLaneActor` or a
-    `LaneActor`."""
-    if not state_cells or values is None:
-        return LaneActor(values, spaces.actions, **how)
-    return RecurrentLaneActor(values, spaces.actions, state_cells=state_cells, **how)
 
 
 class RandomActor(TensorDictModuleBase):

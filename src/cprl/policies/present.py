@@ -69,17 +69,17 @@ class PresentPolicy:
         device: torch.device | None = None,
     ) -> None:
         self._decisions = decisions
-        own_decisions = None if decisions is None else decisions[0]
+        present_decisions = None if decisions is None else decisions[0]
         first: dict[AgentIndices, nn.Module] = {}
         pairs: list[tuple[Any, Any]] = []
-        for agents, (own, training) in learned.items():
-            if isinstance(own, LaneActor):
-                own = own.of_first_replica()
-            first[agents] = own if isinstance(own, LaneActor) else FirstReplica(own, replicas)
-            pairs.append((own, training))
-        self._policy = AgentPolicies({**first, **others}, decisions=own_decisions)
+        for agents, (present, training) in learned.items():
+            if isinstance(present, LaneActor):
+                present = present.of_first_replica()
+            first[agents] = present if isinstance(present, LaneActor) else FirstReplica(present, replicas)
+            pairs.append((present, training))
+        self._policy = AgentPolicies({**first, **others}, decisions=present_decisions)
         self._pairs = [pair for pair in pairs if _has_epsilon(pair[0])]
-        self._evaluation = [own.epsilon for own, _ in self._pairs]
+        self._evaluation = [present.epsilon for present, _ in self._pairs]
         self._devices = [device] if device is not None and device.type == "cuda" else []
         self.is_trained = False
         """Whether the training is over; agents then explore as in evaluation."""
@@ -87,12 +87,12 @@ class PresentPolicy:
     @property
     def epsilons(self) -> list[float]:
         """The probabilities with which agents now act at random, ascending; empty for agents without any."""
-        return sorted({float(own.epsilon) for own, _ in self._pairs})
+        return sorted({float(present.epsilon) for present, _ in self._pairs})
 
     def explore_as_now(self) -> None:
         """Sets each agent's exploration to what it is now."""
-        for (own, training), evaluation in zip(self._pairs, self._evaluation, strict=True):
-            own.epsilon = evaluation if self.is_trained else training.epsilon
+        for (actor, training), evaluation in zip(self._pairs, self._evaluation, strict=True):
+            actor.epsilon = evaluation if self.is_trained else training.epsilon
         if self._decisions is not None:
             present, trained = self._decisions
             present.epsilon[:] = 0.0 if self.is_trained else trained.epsilon[:1]

@@ -54,8 +54,8 @@ class LaneRng:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continues from a state that `state_dict` returned."""
-        for chance, own in zip(self._chance, state["chance"], strict=True):
-            chance.bit_generator.state = _arrays(own)
+        for chance, generator in zip(self._chance, state["chance"], strict=True):
+            chance.bit_generator.state = _arrays(generator)
         self._numbers, self._used = state["numbers"].clone(), int(state["used"])
 
 

@@ -211,7 +211,7 @@ def _frame(game: Game) -> tuple[int, Frame]:
     cells = np.add.outer((np.arange(rows) + rim) * stride, np.arange(columns) + rim)
     return rim, Frame(
         stride=stride,
-        own=int(cells[-1, columns // 2]),
+        middle=int(cells[-1, columns // 2]),
         cells=cells.reshape(-1).astype(np.int32),
         neighbours=np.array([-stride, -1, 1, stride], np.int32),
         near=np.array(near, np.int32),

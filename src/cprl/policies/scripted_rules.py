@@ -7,7 +7,7 @@ sees, their distance in steps, and the first step; then what it does. `cprl.poli
 plain functions.
 """
 
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ class Frame(NamedTuple):
 
     stride: int
     """The number of cells per row, frame included."""
-    own: int
+    middle: int
     """The index of the agent's cell."""
     cells: Ints
     """int32 [X * Y], the indices of the window's cells in reading order."""
@@ -70,8 +70,8 @@ def spread(roles: Bytes, frame: Frame, blocked: Bools, steps: Ints, queue: Ints,
 def count_own_steps(roles: Bytes, frame: Frame, scratch: Scratch) -> None:
     """Computes the distance of each cell from the agent."""
     scratch.steps[:] = -1
-    scratch.steps[frame.own] = 0
-    scratch.queue[0] = frame.own
+    scratch.steps[frame.middle] = 0
+    scratch.queue[0] = frame.middle
     spread(roles, frame, scratch.blocked, scratch.steps, scratch.queue, 1)
 
 
@@ -192,14 +192,14 @@ def walk_to(
     cell = step_to(frame, goal, scratch)
     if is_beside_an_agent(roles, frame, cell) and number < WAIT_PROB:
         return settings.actions - 1
-    if cell == frame.own - 1:
+    if cell == frame.middle - 1:
         return LEFT
-    return RIGHT if cell == frame.own + 1 else FORWARD
+    return RIGHT if cell == frame.middle + 1 else FORWARD
 
 
 def wander(roles: Bytes, frame: Frame, number: float, scratch: Scratch) -> int:
     """Walks forward with WALK_ON_PROB if the cell ahead is free; otherwise turns left or right."""
-    ahead = frame.own - frame.stride
+    ahead = frame.middle - frame.stride
     if roles[ahead] <= APPLE and not scratch.blocked[ahead]:
         if number < WALK_ON_PROB:
             return FORWARD
@@ -210,7 +210,7 @@ def wander(roles: Bytes, frame: Frame, number: float, scratch: Scratch) -> int:
 def has_target(roles: Bytes, frame: Frame, settings: Settings, guards: bool) -> bool:
     """Whether a beam would cover a visible agent; with `guards`, one that is near a visible apple."""
     for side in range(-settings.beam_half_width, settings.beam_half_width + 1):
-        cell = frame.own + side
+        cell = frame.middle + side
         for _ in range(settings.beam_length):
             cell -= frame.stride
             if roles[cell] == WALL:
@@ -227,8 +227,8 @@ def pursue(roles: Bytes, frame: Frame, number: float, settings: Settings, scratc
     goal = nearest(frame, scratch)
     if goal < 0:
         return -1
-    middle = frame.own % frame.stride
-    ahead, side = frame.own // frame.stride - goal // frame.stride, goal % frame.stride - middle
+    middle = frame.middle % frame.stride
+    ahead, side = frame.middle // frame.stride - goal // frame.stride, goal % frame.stride - middle
     if abs(side) > ahead:
         return TURN_RIGHT if side > 0 else TURN_LEFT
     return walk_to(roles, frame, goal, number, settings, scratch)
@@ -292,25 +292,3 @@ def choose_all(
     for n in range(roles.shape[0]):
         explores = numbers[n, EXPLORES] < epsilon
         chosen[n] = choose(RANDOM if explores else policy, roles[n], frame, numbers[n], settings, scratch)
-
-
-FUNCTIONS: Final[tuple[Any, ...]] = (
-    spread,
-    count_own_steps,
-    count_others_steps,
-    nearest,
-    step_to,
-    is_beside_an_agent,
-    apples_near,
-    target_apples,
-    exclude_apple,
-    exclude_sparse_apples,
-    exclude_apples_nearer_to_others,
-    walk_to,
-    wander,
-    has_target,
-    pursue,
-    choose,
-    choose_all,
-)
-"""All functions, each after those it calls."""

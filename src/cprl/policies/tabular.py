@@ -41,8 +41,8 @@ class QTables:
 
     def find(self, states: Sequence[bytes], lanes: Sequence[int]) -> NDArray[np.int64]:
         """The row of each state in the table of its lane, int64 [n]; NEVER_MET if it has none."""
-        found = [self.rows[lane].get(state, NEVER_MET) for state, lane in zip(states, lanes, strict=True)]
-        return np.array(found, np.int64)
+        rows = [self.rows[lane].get(state, NEVER_MET) for state, lane in zip(states, lanes, strict=True)]
+        return np.array(rows, np.int64)
 
     def find_or_add(self, states: Sequence[bytes], lanes: Sequence[int]) -> NDArray[np.int64]:
         """As `find`, but adds a row for each state that has none.
@@ -56,17 +56,17 @@ class QTables:
         return rows
 
     def _add(self, state: bytes, lane: int) -> int:
-        own = self.rows[lane]
-        if len(own) >= self.max_states:
+        rows = self.rows[lane]
+        if len(rows) >= self.max_states:
             raise MemoryError(
-                f"lane {lane} has met {len(own):,} states, as many as max_states allows, and meets another; "
+                f"lane {lane} has met {len(rows):,} states, as many as max_states allows, and meets another; "
                 "use a smaller board or a smaller observation, or raise TabularSettings.max_states"
             )
         if self.size == len(self.values):
             self.values = np.concatenate([self.values, np.zeros_like(self.values)])
             self.visits = np.concatenate([self.visits, np.zeros_like(self.visits)])
-        own[state], self.size = self.size, self.size + 1
-        return own[state]
+        rows[state], self.size = self.size, self.size + 1
+        return rows[state]
 
     def add_lane(self, lane: int, states: NDArray[np.uint8], values: NDArray[np.float64]) -> None:
         """Adds n states, uint8 [n, bytes], with their values [n, A] to the table of a lane.
@@ -85,7 +85,9 @@ class QTables:
 
     def state_dict(self) -> dict[str, Tensor]:
         """All tables as tensors, one row per state, in the order in which the states were met."""
-        known = sorted((row, lane, state) for lane, own in enumerate(self.rows) for state, row in own.items())
+        known = sorted(
+            (row, lane, state) for lane, rows in enumerate(self.rows) for state, row in rows.items()
+        )
         states = np.frombuffer(b"".join(state for _, _, state in known), np.uint8).copy()
         return {
             "states": torch.from_numpy(states.reshape(len(known), -1) if known else states.reshape(0, 0)),
@@ -169,15 +171,15 @@ class TableNetwork(nn.Module):
 
 
 def _resize_to_stored_states(
-    network: TableNetwork, state_dict: Mapping[str, Tensor], prefix: str, *how: Any
+    network: TableNetwork, state_dict: Mapping[str, Tensor], prefix: str, *_hook: Any
 ) -> None:
     for name in ("states", "values"):
-        own, stored = getattr(network, name), state_dict.get(prefix + name)
-        if stored is not None and stored.shape[1:] == own.shape[1:]:
-            setattr(network, name, own.new_zeros(stored.shape))
+        buffer, stored = getattr(network, name), state_dict.get(prefix + name)
+        if stored is not None and stored.shape[1:] == buffer.shape[1:]:
+            setattr(network, name, buffer.new_zeros(stored.shape))
 
 
-def _find_them_again(network: TableNetwork, *how: Any) -> None:
+def _find_them_again(network: TableNetwork, *_hook: Any) -> None:
     network._rows = {state.tobytes(): row for row, state in enumerate(network.states.numpy(force=True))}
 
 

@@ -35,7 +35,7 @@ class YieldBounds:
 
     at_least: float
     at_most: float
-    kept: NDArray[np.bool_]
+    stock: NDArray[np.bool_]
     """bool [K], a stock to keep: who harvests all other sites as soon as they grow gets `at_least`."""
 
     @property
@@ -62,12 +62,12 @@ def yield_bounds(board: Map, rules: Rules, *, nodes: int = NODES) -> YieldBounds
     highest = np.maximum.accumulate(probs[counts])
     lowest = np.minimum.accumulate(probs[counts][::-1])[::-1]
     kept_rate = lowest if rules.regrow_before_bites else lowest / (1 + lowest)
-    kept, bound = _best_stock(around, kept_rate, nodes)
+    stock, bound = _best_stock(around, kept_rate, nodes)
     if not np.array_equal(kept_rate, highest):
         _, bound = _best_stock(around, highest, nodes)
     # A stock that is kept has the growth of its own counts, also where more apples near mean less.
-    at_least = _growth(kept, around, probs[counts] if rules.regrow_before_bites else kept_rate)
-    return YieldBounds(at_least=at_least, at_most=max(bound, at_least), kept=kept)
+    at_least = _growth(stock, around, probs[counts] if rules.regrow_before_bites else kept_rate)
+    return YieldBounds(at_least=at_least, at_most=max(bound, at_least), stock=stock)
 
 
 def _growth(stock: NDArray[np.bool_], around: list[NDArray[np.int64]], rate: Floats) -> float:
@@ -87,8 +87,8 @@ def _best_stock(around: list[NDArray[np.int64]], rate: Floats, nodes: int) -> tu
     stock, bound = np.zeros(len(around), np.bool_), 0.0
     for patch in range(count):
         sites = np.flatnonzero(patch_of == patch)
-        own = [np.searchsorted(sites, around[site]) for site in sites]
-        stock[sites], most = _best_of_patch(own, rate, nodes)
+        around_patch = [np.searchsorted(sites, around[site]) for site in sites]
+        stock[sites], most = _best_of_patch(around_patch, rate, nodes)
         bound += most
     return stock, bound
 
@@ -114,19 +114,23 @@ def _best_of_patch(
     if not gain.any():
         return np.zeros(sites, np.bool_), 0.0
     cells: dict[tuple[int, int], float] = {}
-    for nth, (site, count) in enumerate(steps):
-        unless_full, where_near = 2 * nth, 2 * nth + 1
-        cells |= {(unless_full, sites + nth): 1.0, (unless_full, site): 1.0, (where_near, sites + nth): count}
+    for step, (site, count) in enumerate(steps):
+        unless_full, where_near = 2 * step, 2 * step + 1
+        cells |= {
+            (unless_full, sites + step): 1.0,
+            (unless_full, site): 1.0,
+            (where_near, sites + step): count,
+        }
         cells |= {(where_near, int(other)): -1.0 for other in around[site]}
     rows, columns = np.array(list(cells), np.int64).reshape(-1, 2).T
     matrix = csr_array((list(cells.values()), (rows, columns)), shape=(2 * len(steps), len(gain)))
-    found = milp(
+    best = milp(
         -gain,
         constraints=LinearConstraint(matrix, ub=np.tile([1.0, 0.0], len(steps))) if steps else (),
         integrality=np.ones(len(gain)),
         bounds=Bounds(0, 1),
         options={"node_limit": nodes},
     )
-    if found.x is None:
+    if best.x is None:
         raise RuntimeError(f"no stock was found in {nodes:,} nodes; allowed: more nodes")
-    return found.x[:sites] > 0.5, float(rate[0]) * sites - float(found.mip_dual_bound)
+    return best.x[:sites] > 0.5, float(rate[0]) * sites - float(best.mip_dual_bound)

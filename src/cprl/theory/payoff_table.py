@@ -104,7 +104,7 @@ class PayoffTable:
     @cached_property
     def rows(self) -> dict[tuple[int, ...], int]:
         """The rows by their counts."""
-        return {tuple(own): row for row, own in enumerate(self.counts.tolist())}
+        return {tuple(counts): row for row, counts in enumerate(self.counts.tolist())}
 
     @cached_property
     def deviations(self) -> Values:
@@ -115,26 +115,28 @@ class PayoffTable:
         return np.array(
             [
                 [
-                    self.payoffs[self.rows[tuple((own + step).tolist())], strategy]
+                    self.payoffs[self.rows[tuple((counts + step).tolist())], strategy]
                     for strategy, step in enumerate(steps)
                 ]
-                for own in others
+                for counts in others
             ]
         )
 
     @cached_property
     def pairs(self) -> Values:
         """float64 [S, S]: entry [i, j] is what one agent gets who plays i, where all others play j."""
-        alone = [self.rows[tuple(own.tolist())] for own in self.counts if own.max() >= self.agents - 1]
-        found = np.empty((self.strategies, self.strategies))
+        alone = [
+            self.rows[tuple(counts.tolist())] for counts in self.counts if counts.max() >= self.agents - 1
+        ]
+        pairs = np.empty((self.strategies, self.strategies))
         for row in alone:
-            own, payoffs = self.counts[row], self.payoffs[row]
-            for focal in np.flatnonzero(own):
-                rest = own.copy()
+            counts, payoffs = self.counts[row], self.payoffs[row]
+            for focal in np.flatnonzero(counts):
+                rest = counts.copy()
                 rest[focal] -= 1
                 if rest.max() == self.agents - 1:
-                    found[focal, rest.argmax()] = payoffs[focal]
-        return found
+                    pairs[focal, rest.argmax()] = payoffs[focal]
+        return pairs
 
     @property
     def reduced(self) -> "PayoffTable":
@@ -163,34 +165,34 @@ class PayoffTable:
     def against_shares(self, shares: Values) -> Values:
         """`against`, of float64 [S] that is known to be shares."""
         others, ways = self._others
-        found: Values = (ways * np.prod(shares**others, axis=1)) @ self.deviations
-        return found
+        values: Values = (ways * np.prod(shares**others, axis=1)) @ self.deviations
+        return values
 
     @cached_property
     def _others(self) -> tuple[Counts, Values]:
         """What the N - 1 others may play, and in how many ways, [C', S] and [C']."""
         others = compositions(self.agents - 1, self.strategies)
-        return others, np.array([_ways(own) for own in others.tolist()])
+        return others, np.array([_ways(counts) for counts in others.tolist()])
 
     @property
     def pure_equilibria(self) -> list[tuple[int, ...]]:
         """The counts of the compositions in which no agent gains if it alone plays another strategy, but for
         rounding."""
         most = _ROUNDING * float(np.nanmax(self.payoffs) - np.nanmin(self.payoffs))
-        return [own for own in self.rows if all(gain <= most for gain in self._gains(own))]
+        return [counts for counts in self.rows if all(gain <= most for gain in self._gains(counts))]
 
-    def _gains(self, own: Sequence[int]) -> list[float]:
+    def _gains(self, counts: Sequence[int]) -> list[float]:
         """What an agent gains by another strategy, for every strategy that is played."""
-        found = []
-        for played in np.flatnonzero(own):
+        gains = []
+        for played in np.flatnonzero(counts):
             for other in range(self.strategies):
                 if other != played:
-                    there = list(own)
+                    there = list(counts)
                     there[played] -= 1
                     there[other] += 1
                     got = self.payoffs[self.rows[tuple(there)], other]
-                    found.append(float(got - self.payoffs[self.rows[tuple(own)], played]))
-        return found
+                    gains.append(float(got - self.payoffs[self.rows[tuple(counts)], played]))
+        return gains
 
 
 def sharing_table(game: SharingGame, levels: ArrayLike) -> PayoffTable:
@@ -206,8 +208,8 @@ def sharing_table(game: SharingGame, levels: ArrayLike) -> PayoffTable:
     taken = np.asarray(levels, np.float64)
     counts = compositions(game.agents, len(taken))
     payoffs = np.zeros(counts.shape)
-    for row, own in enumerate(counts):
-        played = np.repeat(np.arange(len(taken)), own)
+    for row, players in enumerate(counts):
+        played = np.repeat(np.arange(len(taken)), players)
         payoffs[row, played] = game.payoffs(taken[played])
     return PayoffTable(agents=game.agents, payoffs=payoffs)
 

@@ -225,10 +225,10 @@ class SharingGame:
     @property
     def price_of_anarchy(self) -> float:
         """The surplus at the optimum over that in equilibrium, at least 1; 1 where nothing can be gained."""
-        best, found = self.surplus(self.optimum_total), self.surplus(self.nash_total)
+        best, reached = self.surplus(self.optimum_total), self.surplus(self.nash_total)
         if best <= 0:
             return 1.0
-        return best / found if found > 0 else inf
+        return best / reached if reached > 0 else inf
 
     @property
     def rent_share(self) -> float:
@@ -242,8 +242,8 @@ class SharingGame:
         """
         worth = self.worth
 
-        def gain(own: float) -> float:
-            return worth.at(own + others) + own * worth.slope(own + others) - self.cost
+        def gain(taken: float) -> float:
+            return worth.at(taken + others) + taken * worth.slope(taken + others) - self.cost
 
         return _root(gain, min(self._limit, max(worth.most - others, 0.0)))
 

@@ -83,13 +83,13 @@ def equilibria(table: PayoffTable) -> tuple[Equilibrium, ...]:
     if table.strategies > MOST_STRATEGIES:
         raise ValueError(f"table has {table.strategies} strategies; allowed: at most {MOST_STRATEGIES}")
     nashpy = extra("nashpy")
-    own = table.normalised.pairs + 1.0  # above 0, or the polytopes have no end
-    found: dict[tuple[float, ...], Equilibrium] = {}
-    for first, second in nashpy.Game(own, own.T).vertex_enumeration():
+    payoffs = table.normalised.pairs + 1.0  # above 0, or the polytopes have no end
+    equilibria_of: dict[tuple[float, ...], Equilibrium] = {}
+    for first, second in nashpy.Game(payoffs, payoffs.T).vertex_enumeration():
         sides = sorted((tuple(np.round(side, 6) + 0.0) for side in (first, second)), reverse=True)
         key = (*sides[0], *sides[1])
-        found.setdefault(key, Equilibrium(first=np.array(sides[0]), second=np.array(sides[1])))
-    return tuple(found[key] for key in sorted(found, reverse=True))
+        equilibria_of.setdefault(key, Equilibrium(first=np.array(sides[0]), second=np.array(sides[1])))
+    return tuple(equilibria_of[key] for key in sorted(equilibria_of, reverse=True))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -124,11 +124,11 @@ def alpha_rank(table: PayoffTable) -> AlphaRank:
         )
     of_profiles = _long_run(table)
     played = np.array(np.unravel_index(np.arange(profiles), (table.strategies,) * table.agents)).T
-    found = np.zeros(len(table.counts))
+    shares = np.zeros(len(table.counts))
     for profile, chance in zip(played, of_profiles, strict=True):
         counts = np.bincount(profile, minlength=table.strategies)
-        found[table.rows[tuple(counts.tolist())]] += chance
-    return AlphaRank(compositions=found, shares=found @ table.counts / table.agents)
+        shares[table.rows[tuple(counts.tolist())]] += chance
+    return AlphaRank(compositions=shares, shares=shares @ table.counts / table.agents)
 
 
 def _long_run(table: PayoffTable) -> Values:
@@ -143,8 +143,8 @@ def _long_run(table: PayoffTable) -> Values:
     raise last
 
 
-def _shares(found: Any) -> Values:
-    shares: Values = np.maximum(np.asarray(found, dtype=np.float64), 0.0)
+def _shares(measured: Any) -> Values:
+    shares: Values = np.maximum(np.asarray(measured, dtype=np.float64), 0.0)
     whole: Values = shares / shares.sum()
     return whole
 
@@ -169,8 +169,8 @@ def replicator(table: PayoffTable, mixture: ArrayLike) -> Values:
         ModuleNotFoundError: if OpenSpiel is not installed.
     """
     shares = mixture_of(mixture, table.strategies)
-    found = extra("open_spiel.python.egt.dynamics").replicator(shares, table.against(shares))
-    return np.asarray(found, dtype=np.float64)
+    flow = extra("open_spiel.python.egt.dynamics").replicator(shares, table.against(shares))
+    return np.asarray(flow, dtype=np.float64)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -196,15 +196,15 @@ def replicator_ends(table: PayoffTable, *, starts: int = STARTS, seed: int = 0) 
         ModuleNotFoundError: if OpenSpiel is not installed.
     """
     rng = np.random.default_rng(seed)
-    reached = [_end(table, own) for own in rng.dirichlet(np.ones(table.strategies), starts)]
-    settled = [own for own in reached if own is not None]
+    reached = [_end(table, mixture) for mixture in rng.dirichlet(np.ones(table.strategies), starts)]
+    settled = [mixture for mixture in reached if mixture is not None]
     groups: list[list[Values]] = []
-    for own in settled:
-        near = [group for group in groups if np.abs(group[0] - own).max() < _SAME_END]
+    for mixture in settled:
+        near = [group for group in groups if np.abs(group[0] - mixture).max() < _SAME_END]
         if near:
-            near[0].append(own)
+            near[0].append(mixture)
         else:
-            groups.append([own])
+            groups.append([mixture])
     groups.sort(key=len, reverse=True)
     return Ends(
         mixtures=np.array([np.mean(group, axis=0) for group in groups]).reshape(-1, table.strategies),
@@ -223,8 +223,8 @@ def _end(table: PayoffTable, start: Values) -> Values | None:
     scaled, flow = table.normalised, extra("open_spiel.python.egt.dynamics").replicator
 
     def shares_of(cells: Values) -> Values:
-        kept = np.maximum(cells, 0.0)
-        whole: Values = kept / kept.sum()
+        positive = np.maximum(cells, 0.0)
+        whole: Values = positive / positive.sum()
         return whole
 
     def speed(_: float, cells: Values) -> Values:

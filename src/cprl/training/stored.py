@@ -26,7 +26,7 @@ from cprl.networks.recurrent import state_cells_of
 from cprl.networks.stacked import stack_lanes
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import ballot_sizes
-from cprl.policies.lanes import actor_of_lanes
+from cprl.policies.lanes import LaneActor
 from cprl.policies.scripted import scripted_lanes
 from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, specs_by_agent
 from cprl.runs.checkpoints import FOLDER
@@ -290,9 +290,9 @@ def stored_actor(
     _, stochastic, epsilon, _ = kind
     spaces = playing.spaces if isinstance(playing, Game) else playing
     networks: list[Any] = [lane.network for lane in lanes]
-    actor = actor_of_lanes(
+    actor = LaneActor(
         _side_by_side(networks, stacks=stacks),
-        spaces,
+        spaces.actions,
         seeds=seeds,
         agents=agents,
         worlds=worlds,

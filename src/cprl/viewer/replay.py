@@ -83,10 +83,10 @@ class Decisions:
         values = np.full((len(self._names), len(self._actions)), np.nan)
         for agents, actor in self._actors:
             if isinstance(actor, LaneActor):
-                state = None
+                seen = [observation[:, list(agents)]]
                 if actor.state_cells:
-                    state = batch[keys.RECURRENT_STATE_BEFORE][:, list(agents), : actor.state_cells]
-                found = actor.preferences(observation[:, list(agents)], state)
+                    seen.append(batch[keys.RECURRENT_STATE_BEFORE][:, list(agents), : actor.state_cells])
+                found = actor.preferences(*seen)
                 if found is not None:
                     values[list(agents)] = found[0].double().numpy(force=True)
         self._rows.append((values, batch[keys.ACTION][0].numpy(force=True).copy()))
