@@ -13,7 +13,7 @@ from torchrl.objectives import DQNLoss, ValueEstimators
 from cprl import presets
 from cprl.algorithms import CQL, DQN, IQL, MADDPG, PR2, SAC, DQNSettings
 from cprl.learners.engine import change_weights, torch_optimizer
-from cprl.networks.agent import JointNetwork, JointValues
+from cprl.networks.agent import JointNetwork, OtherOutputs
 from cprl.objectives import LogCoshDQNLoss, PR2Loss, log_cosh
 from cprl.objectives.td import DISTANCES, distance
 from cprl.system.compat import promise_targets
@@ -192,7 +192,9 @@ def test_pr2_takes_log_cosh_too():
     )
     found = {}
     for name in ("l1", "log_cosh"):
-        loss = PR2Loss(JointValues(network), temperature=1.0, loss_function=name, reduction="none")
+        loss = PR2Loss(
+            OtherOutputs(network, "joint_values"), temperature=1.0, loss_function=name, reduction="none"
+        )
         promise_targets(loss.make_value_estimator(ValueEstimators.TD0, gamma=0.9))
         found[name] = loss(batch)["loss"]
     torch.testing.assert_close(found["log_cosh"], found["l1"].cosh().log())

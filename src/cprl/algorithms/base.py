@@ -117,13 +117,8 @@ class Algorithm:
 
         Args:
             spaces: the shape and dtype of observations, and the number of actions A.
-            engine: how they are updated.
             options: `replicas`, `seed`, `first_replica`, `reward_kind`, `device` and, if the algorithm
                 `can_share_parameters`, `share_parameters`; see `cprl.learners.replay.ReplayLearner`.
-
-        Raises:
-            ValueError: if the settings have the wrong class, the algorithm does not support these agents,
-                or the engine is unknown or does not support the algorithm.
         """
         raise NotImplementedError(f"{type(self).__name__} must define make_learner")
 
@@ -276,7 +271,6 @@ def network_of(
 
     Args:
         network: the architecture; None for fully connected layers of `settings.hidden_cells`.
-        outputs: the number of outputs.
     """
     if network is not None and settings.hidden_cells != DEFAULT_HIDDEN_CELLS:
         raise ValueError(
@@ -317,8 +311,6 @@ def module_of(network: nn.Module, name: str, *, state: str = "recurrent_state") 
     """A network as a TensorDict module.
 
     Args:
-        network: reads "observation".
-        name: the entry of its outputs.
         state: the entry of the states before each step, of a recurrent network.
     """
     if state_shape_of(network) is None:

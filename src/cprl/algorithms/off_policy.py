@@ -37,7 +37,7 @@ from cprl.learners.settings import (
     TabularSettings,
 )
 from cprl.learners.tabular import TabularLearner, table_network
-from cprl.networks.agent import AgentNetworks, AtomNetwork, JointNetwork, JointValues
+from cprl.networks.agent import AgentNetworks, AtomNetwork, JointNetwork, OtherOutputs
 from cprl.objectives.pr2 import PR2Loss
 from cprl.objectives.td import DISTANCES, LOG_COSH, LogCoshDQNLoss
 from cprl.policies.tabular import TableNetwork
@@ -111,25 +111,12 @@ class DistributionalDQN(OffPolicy):
         refuse_relu(type(self).__name__, self.settings)
         assert isinstance(network, AtomNetwork)
         actor = DistributionalQValueActor(
-            AtomLogits(network), support=network.support, spec=None, action_space="categorical"
+            OtherOutputs(network, "atom_logits"),
+            support=network.support,
+            spec=None,
+            action_space="categorical",
         )
         return DistributionalDQNLoss(actor, gamma=self.settings.gamma, delay_value=True)
-
-
-class AtomLogits(nn.Module):
-    """An `AtomNetwork` with the outputs that TorchRL's distributional actor expects: logits [..., atoms, A].
-
-    Args:
-        network: the network, whose weights it shares.
-    """
-
-    def __init__(self, network: AtomNetwork) -> None:
-        super().__init__()
-        self.of = network
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        """The logits."""
-        return self.of.atom_logits(observation)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -305,7 +292,7 @@ class PR2(OffPolicy):
     def make_loss(self, network: nn.Module) -> LossModule:
         assert isinstance(network, JointNetwork)
         loss = PR2Loss(
-            JointValues(network),
+            OtherOutputs(network, "joint_values"),
             temperature=self.temperature,
             entropy_bonus=self.entropy_bonus,
             loss_function=self.loss_function,

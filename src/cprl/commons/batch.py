@@ -53,15 +53,10 @@ class Batch:
     """B worlds of a game, played a turn at a time.
 
     Args:
-        worlds: The number of worlds B, at least 1.
         seed: 0 to 2**64 - 1. Random numbers are a function of the seed, the index of the world, the episode
             and the step alone.
         first_world: The index of the first world; with it, world b of a larger batch can be played alone.
         threads: The number of CPU threads that share the worlds; None uses all cores where that is faster.
-        driver: The driver; CPU threads by default.
-
-    Raises:
-        MemoryError: If the worlds do not fit into memory.
     """
 
     def __init__(
@@ -135,13 +130,13 @@ class Batch:
         """Begins the next episode of some worlds and writes their rows of `output`.
 
         Args:
-            output: Arrays made by `new_output`.
             which: bool [B], the worlds that begin; None for all. Of a new batch, all worlds begin.
         """
         if which is None:
             which = self._all_worlds
         else:
-            _check_form("which", which, (self.size,), np.bool_)
+            if which.shape != (self.size,) or which.dtype != np.bool_:
+                raise ValueError(f"which is {which.dtype} {list(which.shape)}; allowed: bool [{self.size}]")
             if not self._has_begun and not self.driver.read(which).all():
                 raise ValueError("which leaves worlds out; allowed at first: None, so that all worlds begin")
         self._run("begin_worlds", which, output)
@@ -156,7 +151,6 @@ class Batch:
 
         Args:
             actions: int64 [B, N], contiguous.
-            output: Arrays made by `new_output`.
             decisions: int64 [B, N], contiguous, where agents decide something, see `Game.decisions`; read of
                 worlds in the first turn of an episode alone. None for the first option of all agents.
         """
@@ -201,10 +195,6 @@ class Batch:
     def load(self, state: Mapping[str, NDArray[Any]], output: Output) -> Output:
         """Sets the state of the worlds and writes it into `output`, with no harvest, shots, hits or growth,
         whatever happened in the turn before.
-
-        Args:
-            state: Arrays as returned by `state`, for the same number of worlds of the same game.
-            output: Arrays made by `new_output`.
         """
         checked, arrays = states.checked(state, worlds=self.size, game=self.game), self._state_arrays()
         for name, values in checked.items():
@@ -214,15 +204,13 @@ class Batch:
         return output
 
     def check(self, actions: Actions) -> None:
-        """Checks actions for `play`."""
-        _check_form("actions", actions, (self.size, self.game.agents), np.int64)
+        """Raise a ValueError for actions, int64 [B, N], that cannot be played."""
         if not self._has_begun:
             raise ValueError("the worlds have not begun; allowed: reset() or load() before the first step")
         self._check_known("action", actions, len(self.game.actions), self.game.actions)
 
     def check_decisions(self, decisions: Actions) -> None:
-        """Checks decisions for `play`."""
-        _check_form("decisions", decisions, (self.size, self.game.agents), np.int64)
+        """Raise a ValueError for decisions, int64 [B, N], that agents cannot take."""
         self._check_known("decision", decisions, max(1, self.game.decisions))
 
     def _check_known(self, what: str, chosen: Actions, known: int, names: tuple[str, ...] = ()) -> None:
@@ -234,14 +222,6 @@ class Batch:
             raise ValueError(
                 f"{what} {came} of agent {agent} in world {world} is unknown; allowed: {allowed}"
             )
-
-
-def _check_form(name: str, array: NDArray[Any], shape: tuple[int, ...], dtype: Any) -> None:
-    """Raise a ValueError unless an array, on the CPU or a GPU, has this shape and dtype."""
-    if array.shape != shape or array.dtype != dtype:
-        raise ValueError(
-            f"{name} is {array.dtype} {list(array.shape)}; allowed: {np.dtype(dtype)} {list(shape)}"
-        )
 
 
 def turn_of(output: Output) -> StepOutput:

@@ -108,10 +108,6 @@ def machine_code(function: Any, *arguments: Any) -> Callable[..., Any]:
 def compiled(functions: Iterable[Any], jit: Callable[[FunctionType], Callable[..., Any]]) -> Compiled:
     """Compile plain functions, and before each of them the functions of `cprl` that it calls.
 
-    Args:
-        functions: Plain functions; those that they call are their globals.
-        jit: Compiles one function for the target.
-
     Returns:
         Each of `functions`, compiled, by its name.
     """

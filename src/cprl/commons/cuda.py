@@ -33,9 +33,6 @@ class CudaThreads:
 
     Worlds and scratch memory are stored with the axis B innermost, so that neighbouring threads read
     neighbouring words. Step outputs are stored row-major, as in torch.
-
-    Raises:
-        MemoryError: If the worlds do not fit into its memory.
     """
 
     def __init__(self, game: Game, worlds: int) -> None:

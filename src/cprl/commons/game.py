@@ -37,10 +37,6 @@ class Game:
     """A map, its rules, what agents observe, and the rules that people make.
 
     Warns (UserWarning) if no agent can reach a site that it may harvest: nobody then gets an apple.
-
-    Raises:
-        ValueError: If the observation does not fit the rules, or an institution does not fit the map, the
-            rules, the observation or another institution.
     """
 
     map: Map

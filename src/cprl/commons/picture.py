@@ -154,10 +154,6 @@ def agent_sprite(agent: int, heading: int, size: int) -> NDArray[np.uint8]:
     """An agent in a cell: uint8 [size, size], `NOTHING`, `BODY`, `INK` or `MARKED`.
 
     A number too large for the cell is left out; from eleven pixels on, numbers below 100 fit.
-
-    Args:
-        heading: 0 up, 1 right, 2 down, 3 left.
-        size: The size of a cell in pixels, without lines between cells.
     """
     mark = agent_mark(agent)
     edge = 1 if size > 14 else 0

@@ -29,12 +29,7 @@ def _pool(process: int, threads: int) -> ThreadPoolExecutor:
 
 
 class CpuThreads:
-    """A driver of B worlds in numpy arrays.
-
-    Args:
-        worlds: The number of worlds B.
-        threads: The number of threads that share the worlds; None uses all cores where that is faster.
-    """
+    """A driver of B worlds in numpy arrays."""
 
     def __init__(self, game: Game, worlds: int, *, threads: int | None = None) -> None:
         if threads is not None:
@@ -85,11 +80,6 @@ class CpuThreads:
         """Run a loop over all worlds; the calling thread takes the last share.
 
         Nothing is checked: all arrays are contiguous and have the form that the game gives them.
-
-        Args:
-            argument: the loop's own argument.
-            output: the arrays that the loop writes.
-            law: what the institutions of the game need, arrays that are written included.
         """
         size = len(argument)
         arguments = worlds, self.tables, argument, output, law

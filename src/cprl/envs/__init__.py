@@ -7,7 +7,7 @@ Modules, in the order in which one reads them:
     matrix           MatrixGame, MatrixEnv: payoff tables, played once or several times
     taking           TakingGame, TakingEnv: how much to take of what is shared, once or several times
     drivers          where the worlds run: CPU threads or a GPU
-    recurrent_states  the states of recurrent networks where an episode begins
+    stepping          what environments share in a step: actions, recurrent states
     state            the state of an environment and its transforms, for checkpoints
     pettingzoo_env   parallel_env and env, one world
     gymnasium_env    one world of one agent, played by the parallel_env

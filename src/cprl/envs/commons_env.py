@@ -17,26 +17,27 @@ from cprl.commons.game import Game, output_forms
 from cprl.commons.picture import world_image
 from cprl.commons.world import PLAYING, Bytes, StepOutput
 from cprl.envs.drivers import device_of, drawn_seed, driver_for
-from cprl.envs.recurrent_states import begin_states
+from cprl.envs.stepping import begin_states, carry_on, chosen
 from cprl.institutions import COUNTS
-from cprl.system.compat import LeanStepEnv, flag_spec, put_all, unchecked_tensordict
+from cprl.system.compat import LeanStepEnv, flag_spec, unchecked_tensordict
 from cprl.system.memory import check_memory
 
 WORLD_ENTRIES = ("stock", "regrown")
 DONE_ENTRIES = ("done", "terminated", "truncated")
 _AGENT_ENTRIES = ("observation", "harvest", "in_play", "fired", "hit_by", "tagged_by")
-_WHOLE_NUMBERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
-"""The dtypes of actions that convert to int64 without a change of any number."""
 _AHEAD_BYTES = 2**16
 """Below this size, memory is allocated for sixteen turns at once: an allocation takes as long as a world."""
 _AHEAD_TURNS = 16
 _BALLOT_ENTRIES = (keys.IN_FORCE, keys.BALLOTS_DUE)
-_OWN_KEYS = frozenset(
-    (*WORLD_ENTRIES, *DONE_ENTRIES, *_BALLOT_ENTRIES, keys.STATE, keys.AGENTS, "next", "_reset")
-)
 _PAID_ENTRIES = ("fines", "transfers", "violated", "counts")
 """Entries of agents in games with institutions."""
-_OWN_AGENT_KEYS = frozenset((*_AGENT_ENTRIES, *_PAID_ENTRIES, "scoreboard", "stock_gauge", "reward"))
+_REPLACED = frozenset(
+    (
+        *(*WORLD_ENTRIES, *DONE_ENTRIES, *_BALLOT_ENTRIES, keys.STATE, keys.AGENTS, "next", "_reset"),
+        *(*_AGENT_ENTRIES, *_PAID_ENTRIES, "scoreboard", "stock_gauge", "reward"),
+    )
+)
+"""The entries that the environment writes anew in each turn."""
 
 
 class CommonsEnv(LeanStepEnv):
@@ -46,8 +47,6 @@ class CommonsEnv(LeanStepEnv):
     tensors, so that a TensorDict from an earlier step never changes.
 
     Args:
-        game: the game, a `Map` and its `Rules`; see `presets.game`.
-        worlds: the number of worlds B.
         seed: the seed of all random numbers; `set_seed` restarts from another. None draws one from torch's
             generator, a different one in each worker process: environments that TorchRL's `ParallelEnv`,
             `SerialEnv` or a collector makes by the same call have different worlds.
@@ -254,11 +253,11 @@ class CommonsEnv(LeanStepEnv):
         return np.stack([world_image(board, one, cell_pixels=cell_pixels) for one in states])
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        actions = self._as_array(self._chosen(tensordict, "action").contiguous())
+        actions = self._as_array(self._chosen(tensordict, "action"))
         self.worlds.check(actions)
         decisions = None
         if self._decides:
-            decisions = self._as_array(self._chosen(tensordict, "decision").contiguous())
+            decisions = self._as_array(self._chosen(tensordict, "decision"))
             self.worlds.check_decisions(decisions)
         stepped = tensordict.get("_step", None)
         if stepped is not None:
@@ -279,19 +278,7 @@ class CommonsEnv(LeanStepEnv):
             )
 
     def _chosen(self, tensordict: TensorDictBase, name: str) -> Tensor:
-        """("agents", "action") or ("agents", "decision"), int64 on the device of the worlds."""
-        try:
-            actions: Tensor = keys.entry(keys.entry(tensordict, keys.AGENTS), name)
-        except (KeyError, AttributeError):
-            shape = list(self._agents_size)
-            raise ValueError(f'("agents", "{name}") is missing; allowed: int64 {shape}') from None
-        if actions.dtype is not torch.int64:
-            if actions.dtype not in _WHOLE_NUMBERS:
-                raise ValueError(
-                    f'("agents", "{name}") is {actions.dtype}; allowed: int64 {list(self._agents_size)}'
-                )
-            actions = actions.long()
-        return actions if actions.device == self.device else actions.to(self.device)
+        return chosen(tensordict, name, self._agents_size, self.device).contiguous()
 
     def _any_done(self) -> bool:
         """Whether any world has ended; numpy counts in a tenth of the time that torch takes."""
@@ -310,10 +297,5 @@ class CommonsEnv(LeanStepEnv):
         keys.put(tensordict, "next", following)
         done = self._tensors["done"]
         carried = self._as_tensordict(self._begin(done) if resets and self._any_done() else self._tensors)
-        put_all(carried, {name: value for name, value in tensordict.items() if name not in _OWN_KEYS})
-        of_agents = keys.entry(tensordict, keys.AGENTS).items()
-        others = {name: value for name, value in of_agents if name not in _OWN_AGENT_KEYS}
-        put_all(keys.entry(carried, keys.AGENTS), others)
-        if resets and keys.RECURRENT_STATE[1] in others:
-            begin_states(carried, tensordict, done)
+        carry_on(carried, tensordict, done if resets else None, _REPLACED)
         return tensordict, carried

@@ -55,14 +55,10 @@ def make_env(
 
     Args:
         game: what is played, or a `Custom` that makes it.
-        worlds: how many worlds B.
         seed: of all chance.
         first_world: the number of the first world, so that a world plays the same in batches of any size. A
             game of the user's own is made with the seed `seed + first_world` instead.
         transforms: TorchRL transforms, or a `Custom` for each.
-
-    Raises:
-        ValueError: where the environment or a transform does not fit; says what does.
     """
     playable: Any = made(game)
     env: EnvBase

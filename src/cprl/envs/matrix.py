@@ -111,7 +111,6 @@ def prisoners_dilemma(
         sucker: of who cooperates alone.
         temptation: of who defects alone.
         punishment: of both where both defect.
-        clock: of the game.
     """
     _check_order(temptation=temptation, reward=reward, punishment=punishment, sucker=sucker)
     return _symmetric(reward, sucker, temptation, punishment, clock)

@@ -34,10 +34,8 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
     "violated" a rule.
 
     Args:
-        game: The game, see `presets.game`.
         seed: The seed of all random numbers, 0 to 2**64 - 1; `reset(seed=...)` restarts with another one.
             None draws one from torch's generator, another for each environment, as `CommonsEnv` does.
-        render_mode: "rgb_array" or None.
     """
 
     metadata: ClassVar[dict[str, Any]] = {

@@ -14,11 +14,13 @@ from cprl import arguments, keys
 from cprl.checks import NONE, Check, count, either, is_number
 from cprl.commons.chance import LOW_WORD, WORD_BITS, philox4x32
 from cprl.envs.drivers import device_of, drawn_seed
-from cprl.envs.recurrent_states import begin_states
-from cprl.system.compat import LeanStepEnv, flag_spec, put_all, unchecked_tensordict
+from cprl.envs.stepping import begin_states, carry_on, chosen
+from cprl.system.compat import LeanStepEnv, flag_spec, unchecked_tensordict
 
-_OWN_KEYS: Final = frozenset((keys.AGENTS, keys.DONE, keys.TERMINATED, keys.TRUNCATED, "next", "_reset"))
-_OWN_AGENT_KEYS: Final = frozenset(("observation", "reward"))
+_REPLACED: Final = frozenset(
+    (keys.AGENTS, keys.DONE, keys.TERMINATED, keys.TRUNCATED, "next", "_reset", "observation", "reward")
+)
+"""The entries that the environment writes anew in each turn."""
 _LENGTH: Final = np.uint64(5 << 28)
 """The purpose of a draw in `cprl.commons.chance`: how many turns an episode lasts."""
 
@@ -62,9 +64,7 @@ class StageEnv(LeanStepEnv):
     follow from seed, world and episode alone.
 
     Args:
-        worlds: B.
         seed: of the lengths of episodes, where they have chance; None draws one from torch's generator.
-        device: "cpu" or "cuda".
         first_world: the number of the first world: its episodes are as long as those of that world in a
             larger batch.
     """
@@ -161,32 +161,19 @@ class StageEnv(LeanStepEnv):
             observation = keys.entry(keys.entry(following, keys.AGENTS), "observation")
             ends = {name: keys.entry(following, name) for name in (keys.DONE, *_ENDS)}
             carried = self._moment({"observation": observation}, ends)
-        put_all(carried, {name: value for name, value in tensordict.items() if name not in _OWN_KEYS})
-        of_agents = keys.entry(tensordict, keys.AGENTS).items()
-        others = {name: value for name, value in of_agents if name not in _OWN_AGENT_KEYS}
-        put_all(keys.entry(carried, keys.AGENTS), others)
-        if keys.RECURRENT_STATE[1] in others:
-            begin_states(carried, tensordict, done)
+        carry_on(carried, tensordict, done, _REPLACED)
         return tensordict, carried
 
     def _checked_action(self, tensordict: TensorDictBase) -> Tensor:
-        """("agents", "action"); raises a ValueError unless it is int64 [B, N], 0 to A - 1."""
-        size, most = list(self._agents_size), self.game.actions - 1
-        try:
-            action: Any = keys.entry(keys.entry(tensordict, keys.AGENTS), "action")
-        except (KeyError, AttributeError):
-            raise ValueError(f'("agents", "action") is missing; allowed: int64 {size}') from None
-        if action.dtype != torch.int64 or list(action.shape) != size:
-            raise ValueError(
-                f'("agents", "action") is {action.dtype} {list(action.shape)}; allowed: int64 {size}'
-            )
+        """("agents", "action"); raises a ValueError unless it is [B, N] of integers from 0 to A - 1."""
+        action = chosen(tensordict, "action", self._agents_size, self.device)
         lowest, highest = action.aminmax()
-        if lowest < 0 or highest > most:
+        if lowest < 0 or highest >= self.game.actions:
             raise ValueError(
-                f'("agents", "action") has numbers from {int(lowest)} to {int(highest)}; allowed: 0 to {most}'
+                f'("agents", "action") has numbers from {int(lowest)} to {int(highest)}; allowed: 0 to '
+                f"{self.game.actions - 1}"
             )
-        checked: Tensor = action
-        return checked
+        return action
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = self._checked_action(tensordict)

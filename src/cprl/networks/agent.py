@@ -31,10 +31,8 @@ class AtomNetwork(nn.Module):
 
     Args:
         network: a network with A x atoms outputs.
-        actions: the number of actions A.
         lowest: the lowest atom, a return.
         highest: the highest atom; where float32 needs it, see `_support`, it is some float32 steps lower.
-        atoms: the number of atoms.
     """
 
     support: Tensor
@@ -89,7 +87,6 @@ class JointNetwork(nn.Module):
 
     Args:
         network: a network with (N - 1) x A x A outputs.
-        actions: the number of actions A.
         peers: the number of other agents, N - 1.
         temperature: in units of reward, see `marginal`.
     """
@@ -108,20 +105,16 @@ class JointNetwork(nn.Module):
         return marginal(self.joint_values(observation), self.temperature) / self.temperature
 
 
-class JointValues(nn.Module):
-    """A `JointNetwork` whose output is the values of pairs, [..., N - 1, A, A].
+class OtherOutputs(nn.Module):
+    """A network whose outputs are those of another of its methods, e.g. "joint_values"; shares its weights."""
 
-    Args:
-        network: the network, whose weights it shares.
-    """
-
-    def __init__(self, network: JointNetwork) -> None:
+    def __init__(self, network: nn.Module, method: str) -> None:
         super().__init__()
-        self.of = network
+        self.of, self._method = network, method
 
     def forward(self, observation: Tensor) -> Tensor:
-        """The values."""
-        return self.of.joint_values(observation)
+        outputs: Tensor = getattr(self.of, self._method)(observation)
+        return outputs
 
 
 def conditional(joint: Tensor, temperature: float) -> Tensor:

@@ -71,17 +71,10 @@ class ConvNetwork(nn.Module):
 
     Args:
         observation_shape: (C, X, Y), or (S, C, X, Y) for S observations, whose channels are concatenated.
-        outputs: the number of outputs A.
-        channels: channels of each convolution.
-        kernel_cells: rows and columns of a kernel, odd.
-        hidden_cells: units of each fully connected layer after the convolutions.
         highest: the largest value of an observation; inputs are divided by it.
         relu_on_outputs: whether the outputs pass through ReLU too.
         glorot_uniform: whether weights are initialised Glorot-uniform and biases to zero; else torch's
             default.
-
-    Raises:
-        TooLargeError: if there is too little memory for the weights.
     """
 
     def __init__(

@@ -35,7 +35,6 @@ def check_size(sizes: Sequence[int], more: int = 0) -> None:
 
     Args:
         sizes: the number of inputs, of the units of each layer, and of outputs.
-        more: further weights.
     """
     weights = more + sum((before + 1) * after for before, after in pairwise(sizes))
     check_memory(f"the {weights:,} weights of a network", 4 * weights, "smaller layers")
@@ -79,15 +78,10 @@ class MLPNetwork(nn.Module):
 
     Args:
         observation_shape: (C, X, Y) of an observation, `Game.observation_shape`.
-        actions: the number of actions A.
-        hidden_cells: units of each hidden layer.
         highest: the largest value of an observation, `Observation.highest`; inputs are divided by it.
         relu_on_outputs: whether the values pass through ReLU too, as in the program of the study.
         glorot_uniform: whether weights are initialised Glorot-uniform and biases to zero, as in the program
             of the study; else torch's default.
-
-    Raises:
-        TooLargeError: if there is too little memory for the weights.
     """
 
     def __init__(

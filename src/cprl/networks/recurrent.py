@@ -102,12 +102,7 @@ class RecurrentNetwork(nn.Module):
 
     Args:
         encoder: a network with the attributes `outputs`, F of them, and `observation_dims`.
-        outputs: the number of outputs A.
-        kind: of the recurrent layer.
         recurrent_cells: units of the recurrent layer, H; the state of one agent has K numbers, H or 2 H.
-
-    Raises:
-        TooLargeError: if there is too little memory for the weights.
     """
 
     def __init__(self, encoder: nn.Module, outputs: int, *, kind: Kind, recurrent_cells: int) -> None:
@@ -146,11 +141,7 @@ class RecurrentNetwork(nn.Module):
 
 
 class StackedRecurrent(nn.Module):
-    """L networks like `RecurrentNetwork` whose parameters carry a lane axis, [L, in, out] and [L, 1, out].
-
-    Args:
-        networks: the networks of the lanes, of one architecture; their weights are copied.
-    """
+    """L networks like `RecurrentNetwork` whose parameters carry a lane axis, [L, in, out] and [L, 1, out]."""
 
     def __init__(self, networks: Sequence[RecurrentNetwork]) -> None:
         super().__init__()
@@ -214,9 +205,7 @@ def _outputs(
     """The outputs and the states after each step, of features [..., F] and states [..., K].
 
     Args:
-        weights: of L lanes.
         features: of one step, or of sequences if `is_init` is given.
-        state: before each step.
         size: L, the sequences of each lane or -1, and the steps of each.
     """
     lanes, _, steps = size

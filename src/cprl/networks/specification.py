@@ -31,10 +31,7 @@ def new_network(
     That of a `GRU` or an `LSTM` also reads and returns a state, see `cprl.networks.recurrent`.
 
     Args:
-        spaces: the shape, dtype and largest value of observations.
         outputs: the number of outputs. The network gets the attributes `outputs` and `observation_dims`.
-        relu_on_outputs: whether its outputs pass through ReLU.
-        glorot_uniform: whether its weights are initialised Glorot-uniform and its biases to zero.
         shape: the shape of its input if that is not one observation: (S, *observation_shape) for the central
             critic of S agents. A network of your own gets it as `spaces.observation_shape`.
     """

@@ -20,9 +20,6 @@ class StackedMLP(nn.Module):
 
     A lane is one agent of one replica. Lanes do not influence each other: output l depends on input l and
     parameters l alone.
-
-    Args:
-        networks: the networks of the lanes, of one architecture; their weights are copied.
     """
 
     def __init__(self, networks: Sequence[MLPNetwork]) -> None:
@@ -64,11 +61,7 @@ class StackedMLP(nn.Module):
 
 
 class StackedModules(nn.Module):
-    """L networks of one architecture, vmapped over parameters with a lane axis, [L, ...].
-
-    Args:
-        networks: the networks of the lanes, with the attribute `observation_dims`; their weights are copied.
-    """
+    """L networks of one architecture, vmapped over parameters with a lane axis, [L, ...]."""
 
     def __init__(self, networks: Sequence[nn.Module]) -> None:
         super().__init__()

@@ -59,9 +59,6 @@ class TeamNetwork(nn.Module):
 
     Parameters are [S, in, out] and [S, 1, out]. After `stacked` they have an axis of R teams first:
     [R, S, in, out] and [R, S, 1, out].
-
-    Args:
-        networks: the members' networks, of one architecture; their weights are copied.
     """
 
     def __init__(self, networks: Sequence[MLPNetwork]) -> None:
@@ -101,12 +98,7 @@ class TeamNetwork(nn.Module):
 
 
 class SharedTeam(nn.Module):
-    """Like `TeamNetwork` for members that share one network, of any architecture.
-
-    Args:
-        network: the network of every member.
-        observation_dims: the number of axes of one member's observation.
-    """
+    """Like `TeamNetwork` for members that share one network, of any architecture."""
 
     def __init__(self, network: nn.Module, *, observation_dims: int) -> None:
         super().__init__()
@@ -131,12 +123,7 @@ class SharedTeam(nn.Module):
 
 
 class ModuleTeam(nn.Module):
-    """Like `TeamNetwork` for members' networks of any architecture; evaluates them one after the other.
-
-    Args:
-        networks: the members' networks.
-        observation_dims: the number of axes of one member's observation.
-    """
+    """Like `TeamNetwork` for members' networks of any architecture; evaluates them one after the other."""
 
     def __init__(self, networks: Sequence[nn.Module], *, observation_dims: int) -> None:
         super().__init__()
@@ -170,12 +157,7 @@ def team_network(
 
 
 class CentralCritic(nn.Module):
-    """The value of a state for a team, from the observations of all members; the same for each member.
-
-    Args:
-        network: maps the observations of all members, (S, C, X, Y), to one value.
-        members: the number of members S.
-    """
+    """The value of a state for a team, from the observations of all members; the same for each member."""
 
     def __init__(self, network: nn.Module, members: int) -> None:
         super().__init__()
@@ -253,12 +235,6 @@ class Mixing(nn.Module):
     Its weights on the members' values are never negative, so the best action of each member is the best for
     the team. Source: Rashid et al., "QMIX: Monotonic Value Function Factorisation for Deep Multi-Agent
     Reinforcement Learning" (2018).
-
-    Args:
-        observation_shape: (C, X, Y) of a member's observation.
-        members: the number of members S.
-        cells: units of the mixing layer.
-        highest: the largest value of an observation; inputs are divided by it.
     """
 
     def __init__(self, observation_shape: Sequence[int], *, members: int, cells: int, highest: float) -> None:

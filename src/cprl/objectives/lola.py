@@ -51,9 +51,7 @@ def lola_gradients(
         objectives: one that is exact; or several independent estimates of it, each from a batch of its own.
             The product of two estimates from one batch is biased, so each estimate of the second derivative
             is multiplied by the mean of the others' first, and all such products are averaged.
-        parameters: of N agents.
         rate: the step size that the others are expected to take, 0..1e12; 0 is naive learning.
-        factor: what is differentiated.
 
     Returns:
         Gradients of the shapes of `parameters`, and the mean of the losses of the objectives, [.., N],
@@ -87,8 +85,6 @@ def looked_ahead(
     They are differentiable by `parameters`.
 
     Args:
-        objective: gives the losses.
-        parameters: of N agents.
         rate: the step size, 0..1e12.
         steps: how many steps, 1..1000.
         still: the index of an agent that does not move.
@@ -120,8 +116,6 @@ def look_ahead_losses(
     Args:
         inner: what the others step by.
         outer: what agent i has after their steps, for each agent; agent i reads the entry i of its losses.
-        parameters: of N agents.
-        rate: the step size of the others, 0..1e12.
         steps: how many steps they take, 1..1000.
     """
     losses = []
@@ -386,9 +380,6 @@ class LOLALoss(_OfPolicies):
     It returns sums over groups and agents, so that each agent's parameters get the gradient of its own loss:
     "loss_objective", whose value is 0 and whose gradient is LOLA's, under `backward` and `torch.func.grad`,
     of first order only; "loss_entropy"; and "entropy" [.., N], in nats, without a gradient.
-
-    Raises:
-        ValueError: if B is odd.
     """
 
     def __init__(
@@ -439,9 +430,6 @@ class LOLADiCELoss(_OfPolicies):
     policies; then, for each agent i, B rollouts in which i had its present policy, and the others what
     `look_ahead` makes of the first B rollouts. It returns the entries of `LOLALoss`; what is there the
     gradient of "loss_objective" is here a derivative that can be taken again.
-
-    Raises:
-        ValueError: if there are other rollouts.
     """
 
     def look_ahead(self, rollouts: TensorDictBase) -> list[TensorDict]:

@@ -195,23 +195,13 @@ class MADDPGLoss(TDLoss):
 
 
 def straight_through(logits: Tensor, noise: Tensor) -> Tensor:
-    """One-hot samples of a policy, [.., A], with the gradient of its probabilities.
-
-    Args:
-        logits: of the policy, float [.., A].
-        noise: uniform numbers in 0..1, [..].
-    """
+    """One-hot samples of a policy, [.., A], with the gradient of its probabilities."""
     probs = logits.softmax(-1)
     return sampled_one_hot(probs.detach(), noise) + probs - probs.detach()
 
 
 def sampled_one_hot(probs: Tensor, noise: Tensor) -> Tensor:
-    """One-hot samples [.., A] by inverting the cumulative distribution at uniform numbers.
-
-    Args:
-        probs: float [.., A].
-        noise: uniform numbers in 0..1, [..].
-    """
+    """One-hot samples [.., A] by inverting the cumulative distribution at uniform numbers."""
     below = noise.unsqueeze(-1) >= probs.cumsum(-1)[..., :-1]
     return _one_hot(below.sum(-1), probs)
 

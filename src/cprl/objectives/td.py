@@ -45,12 +45,6 @@ class LogCoshDQNLoss(ReshapedLoss, DQNLoss):
     """TorchRL's `DQNLoss` with the log-cosh of the temporal-difference errors.
 
     log-cosh is even: it is that of the absolute error, which `DQNLoss` computes for `loss_function="l1"`.
-
-    Args:
-        delay_value: whether there is a target network.
-        double_dqn: whether the network itself chooses the action whose value bootstraps.
-        action_space: "categorical" for actions as integers, or "one-hot".
-        reduction: "mean", "sum" or "none".
     """
 
     def __init__(
@@ -109,11 +103,7 @@ class TDLoss(LossModule):
             self._value_estimator.set_keys(**self._estimator_keys())
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> Self:
-        """Sets the discount, e.g. `make_value_estimator(ValueEstimators.TD0, gamma=0.99)`.
-
-        Raises:
-            NotImplementedError: for another estimator than TD0.
-        """
+        """Sets the discount, e.g. `make_value_estimator(ValueEstimators.TD0, gamma=0.99)`."""
         dispatch_value_estimator(
             self,
             self.default_value_estimator if value_type is None else value_type,

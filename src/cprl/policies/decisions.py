@@ -153,11 +153,6 @@ class Decider(nn.Module):
 
 
 def decider_by_chance(game: Game, seeds: Sequence[Sequence[int]], *, worlds: int = 1) -> Decider | None:
-    """Agents of a game who choose by chance, all choices equally likely; None where nothing is decided.
-
-    Args:
-        seeds: of each lane, lane = replica x N + agent.
-        worlds: the number of worlds of each replica.
-    """
+    """Agents of a game who choose by chance, all choices equally likely; None where nothing is decided."""
     sizes = ballot_sizes(game)
     return Decider(sizes, seeds=seeds, agents=game.agents, worlds=worlds) if sizes else None

@@ -25,7 +25,6 @@ class LaneActor(TensorDictModuleBase):
             those afterwards.
         stochastic: whether `values` returns the logits of a policy from which exploring agents sample, with
             no epsilon; else exploring agents are epsilon-greedy.
-        actions: the number of actions A.
         seeds: the exploration seed of each lane.
         agents: the number of agents S of each replica.
         worlds: the number of worlds k of each replica that are played at once, consecutive in the batch.
@@ -203,13 +202,7 @@ def random_lanes(
 
 
 class RandomActor(TensorDictModuleBase):
-    """Chooses uniformly random actions for one agent, from "observation" [..., C, X, Y].
-
-    Args:
-        actions: the number of actions A.
-        device: the device of the actions.
-        seed: the seed of its own generator.
-    """
+    """Chooses uniformly random actions for one agent, from "observation" [..., C, X, Y]."""
 
     in_keys = ("observation",)
     out_keys = ("action",)

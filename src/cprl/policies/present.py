@@ -19,10 +19,6 @@ from cprl.system.compat import unchecked_tensordict
 class FirstReplica(TensorDictModuleBase):
     """What an actor of R replicas chooses in the first of them.
 
-    Args:
-        actor: chooses for S agents of every replica, one world each; has `in_keys`.
-        replicas: the number of replicas R.
-
     Reads entries [1, S, ...], writes "action", int64 [1, S].
     """
 

@@ -20,9 +20,6 @@ class LaneRng:
         seeds: the seed of each lane, e.g. (seed, replica, agent, purpose).
         count: numbers per lane and step.
         ahead: steps whose numbers are generated at once; it changes no number.
-
-    Raises:
-        TooLargeError: if there is less memory than those take that are generated ahead.
     """
 
     def __init__(self, seeds: Sequence[Sequence[int]], count: int, *, ahead: int = DRAWN_AHEAD) -> None:

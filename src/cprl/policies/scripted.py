@@ -74,8 +74,6 @@ class ScriptedActor(TensorDictModuleBase):
     seconds; the compiled code is cached on disk.
 
     Args:
-        policy: The scripted policy.
-        game: The game; its observations are windows.
         seeds: The seeds of each lane's random numbers; lane = replica x S + index among the S agents.
         agents: The number S of agents of each replica, at least 1.
         worlds: The number k of worlds of each replica, adjacent in the batch, at least 1.
@@ -83,9 +81,6 @@ class ScriptedActor(TensorDictModuleBase):
 
     `epsilon`, initially 0, is the probability of a random action under `ExplorationType.RANDOM`; under other
     exploration types it has no effect.
-
-    Raises:
-        ValueError: If the observations are not windows.
     """
 
     in_keys = ("observation",)

@@ -240,11 +240,8 @@ def choose(
     """The action of one agent.
 
     Args:
-        policy: RANDOM, GREEDY, ...
         roles: uint8 [cells], the roles of the cells of its framed window.
-        frame: The layout of the framed window.
         numbers: float64 [NUMBERS], uniform random numbers in [0, 1).
-        settings: The properties of the game.
     """
     if policy == RANDOM:
         return int(numbers[WHICH] * settings.actions)
@@ -281,12 +278,8 @@ def choose_all(
     """The actions of n agents; each is random with probability `epsilon`.
 
     Args:
-        policy: RANDOM, GREEDY, ...
-        epsilon: The probability of a random action.
         roles: uint8 [n, cells], the roles of the cells of each framed window.
-        frame: The layout of all framed windows.
         numbers: float64 [n, NUMBERS], uniform random numbers in [0, 1).
-        settings: The properties of the game.
         chosen: int64 [n], receives the actions.
     """
     for n in range(roles.shape[0]):

@@ -21,13 +21,7 @@ _FIRST_ROWS = 1024
 
 
 class QTables:
-    """A table of action values per lane, all in one array; a state is the bytes of an agent's observation.
-
-    Args:
-        lanes: The number of tables L.
-        actions: The number of actions A.
-        max_states: The largest number of states per lane.
-    """
+    """A table of action values per lane, all in one array; a state is the bytes of an agent's observation."""
 
     def __init__(self, lanes: int, actions: int, *, max_states: int) -> None:
         self.max_states = max_states
@@ -45,11 +39,7 @@ class QTables:
         return np.array(rows, np.int64)
 
     def find_or_add(self, states: Sequence[bytes], lanes: Sequence[int]) -> NDArray[np.int64]:
-        """As `find`, but adds a row for each state that has none.
-
-        Raises:
-            MemoryError: If a lane would have more than `max_states` states.
-        """
+        """As `find`, but adds a row for each state that has none."""
         rows = self.find(states, lanes)
         for n in np.flatnonzero(rows == NEVER_MET).tolist():
             rows[n] = self._add(states[n], lanes[n])
@@ -119,8 +109,6 @@ def states_of(
 
     Args:
         observed: Holds the entries of `observed_entries`, [B, S, ...] each.
-        names: The entries to use.
-        agents: The indices of the agents; None for all.
 
     Returns:
         B x S states, world by world.
@@ -138,11 +126,6 @@ class TableNetwork(nn.Module):
 
     Its state dict holds "states", uint8 [n, bytes], the bytes of observations, and their "values", float64
     [n, A]. It loads a state dict with any number of states n; initially n is 0.
-
-    Args:
-        observation_shape: The shape of an observation, (C, X, Y) of a window.
-        actions: The number of actions A.
-        observation_dtype: The dtype of observations, by numpy's and torch's common name.
     """
 
     states: Tensor
@@ -191,7 +174,6 @@ class TabularActor(TensorDictModuleBase):
 
     Args:
         tables: the tables of the lanes, with lane = replica x S + agent.
-        spaces: what agents observe and may do.
         seeds: of each lane's exploration.
         agents: the number of agents S of each replica.
         worlds: how many worlds k of each replica are played at once, side by side in the batch.

@@ -79,11 +79,7 @@ class PayoffTable:
 
     @classmethod
     def of_pairs(cls, matrix: ArrayLike) -> Self:
-        """The game of two agents: entry [i, j] is what one gets who plays i, where the other plays j.
-
-        Raises:
-            ValueError: if it is not float [S, S].
-        """
+        """The game of two agents: entry [i, j] is what one gets who plays i, where the other plays j."""
         given = np.asarray(matrix, np.float64)
         if given.ndim != 2 or given.shape[0] != given.shape[1] or len(given) < 2:
             raise ValueError(f"matrix is {list(given.shape)}; allowed: [S, S], of 2 or more strategies")
@@ -156,9 +152,6 @@ class PayoffTable:
         It is the mean over what the N - 1 others play, so it is also defined for strategies that nobody
         plays. (OpenSpiel's `expected_payoff` of a heuristic payoff table is another number: the mean over
         the compositions of all N agents in which the strategy occurs, as in K. Tuyls et al. (2018).)
-
-        Args:
-            mixture: the shares of the strategies, float [S], that sum to 1.
         """
         return self.against_shares(mixture_of(mixture, self.strategies))
 
@@ -199,11 +192,7 @@ def sharing_table(game: SharingGame, levels: ArrayLike) -> PayoffTable:
     """A game of sharing in which agents choose among a few levels of what they take.
 
     Args:
-        game: the game, of two or more agents.
         levels: float [S], what an agent may take.
-
-    Raises:
-        ValueError: for levels that cannot be taken.
     """
     taken = np.asarray(levels, np.float64)
     counts = compositions(game.agents, len(taken))

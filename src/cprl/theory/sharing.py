@@ -188,9 +188,6 @@ class SharingGame:
 
         Args:
             taken: what each takes, float [..., n], from 0 to `most_each`.
-
-        Raises:
-            ValueError: for another shape, and for numbers that cannot be taken.
         """
         amounts = np.asarray(taken, np.float64)
         if amounts.ndim == 0 or amounts.shape[-1] != self.agents:
@@ -273,7 +270,6 @@ def herders(agents: int, *, worth: Worth | None = None, cost: float = 1.0) -> Sh
     to 2.5, on G. Hardin, "The Tragedy of the Commons" (1968).
 
     Args:
-        agents: n.
         worth: v; by default 10 - A^2.
         cost: c, of an animal.
     """
@@ -298,11 +294,8 @@ def appropriation(
     Source: E. Ostrom, R. Gardner and J. Walker, "Rules, Games, and Common-Pool Resources" (1994), chapter 5.
 
     Args:
-        agents: n.
         tokens: of each agent; 10 or 25 in the experiments.
         outside: w, what a token earns outside.
-        linear: of F.
-        quadratic: of F.
     """
     worth = PowerWorth(top=linear, factor=quadratic, power=1.0)
     check_arguments(_OF_APPROPRIATION, tokens=tokens, outside=outside)

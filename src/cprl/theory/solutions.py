@@ -161,12 +161,7 @@ def replicator(table: PayoffTable, mixture: ArrayLike) -> Values:
     """How fast the shares of the strategies change, float64 [S], which sums to 0: by OpenSpiel.
 
     Args:
-        table: the game; time is in units of its payoffs.
         mixture: the shares, float [S], that sum to 1.
-
-    Raises:
-        ValueError: for shares that do not.
-        ModuleNotFoundError: if OpenSpiel is not installed.
     """
     shares = mixture_of(mixture, table.strategies)
     flow = extra("open_spiel.python.egt.dynamics").replicator(shares, table.against(shares))
@@ -254,11 +249,7 @@ def check_extras() -> None:
 
 
 def extra(module: str) -> Any:
-    """A module of OpenSpiel or nashpy.
-
-    Raises:
-        ModuleNotFoundError: if its package is not installed; says how to install it.
-    """
+    """A module of OpenSpiel or nashpy."""
     _check(module.partition(".")[0])
     return import_module(module)
 

@@ -12,7 +12,7 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cprl.envs.recurrent_states import begin_states
+from cprl.envs.stepping import begin_states
 
 
 class StepCollector(BaseCollector):

@@ -30,8 +30,8 @@ from cprl.commons.colours import (
 from cprl.commons.game import Game
 from cprl.commons.picture import INK_COLOUR, MARK_COLOUR
 from cprl.commons.world import Bytes
-from cprl.envs.recurrent_states import begin_states
 from cprl.envs.state import load_transforms_state, transforms_state
+from cprl.envs.stepping import begin_states
 from cprl.envs.unwrap import commons_of
 from cprl.system.compat import rows_made, send_chunk, send_made
 from cprl.viewer.frames import FrameRecorder
