@@ -106,7 +106,7 @@ class JointNetwork(nn.Module):
 
 
 class OtherOutputs(nn.Module):
-    """A network whose outputs are those of another of its methods, e.g. "joint_values"; shares its weights."""
+    """A network whose outputs are those of another method of it, e.g. "joint_values"; shares its weights."""
 
     def __init__(self, network: nn.Module, method: str) -> None:
         super().__init__()
