@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.image import imsave
 
-from cprl import Map, maps, presets
-from cprl.commons.picture import board_image
+from cprl import CommonsEnv, Game, Map, Rules, maps, presets
 
 FOLDER = Path(__file__).parent / "boards"
 SMALL_CELL_PIXELS = 12
@@ -24,8 +23,9 @@ BY_RULE = {
 
 def first_image(board: Map, cell_pixels: int = 24) -> np.ndarray:
     """The board at the start of an episode, full of apples."""
-    full = np.ones(len(board.sites), np.uint8)
-    return board_image(board, full, *np.array(board.starts).T, cell_pixels=cell_pixels)
+    env = CommonsEnv(Game(map=board, rules=Rules()))
+    env.reset()
+    return env.render(world=0, cell_pixels=cell_pixels)
 
 
 def main() -> None:

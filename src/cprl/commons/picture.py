@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cprl.arguments import integer
 from cprl.commons.colours import APPLE, BEAM, GROUND, PALETTE, WALL, Colour, agent_colour, agent_mark
 from cprl.commons.maps import Map
-from cprl.commons.world import Bools, Bytes, Ints, Shown
+from cprl.commons.world import Bytes, Shown
 from cprl.system.memory import check_memory
 
 LARGEST_CELL_PIXELS: Final = 1000
@@ -23,31 +23,10 @@ EMPTY_SITE_COLOUR: Final = (40, 43, 51)
 """Of a site without an apple: dim, so that a field that is harvested bare still looks like a field."""
 
 
-def board_image(
-    board: Map,
-    stock: Bytes,
-    row: Ints,
-    col: Ints,
-    heading: Ints,
-    *,
-    in_play: Bools | None = None,
-    beams: Bools | None = None,
-    cell_pixels: int = 24,
-) -> Bytes:
-    """An image of one world.
+def world_image(board: Map, world: Shown, *, cell_pixels: int = 24) -> Bytes:
+    """Return an image of one world without the agents out of play, uint8 [rows, columns, 3] in RGB.
 
-    Args:
-        board: The map, with walls and sites.
-        stock: uint8 [K], 1 where a site holds an apple.
-        row: int [N], the row of each agent.
-        col: int [N], the column of each agent.
-        heading: int [N], 0 up, 1 right, 2 down, 3 left.
-        in_play: bool [N], the agents to draw; None for all.
-        beams: bool [H, W], cells that a beam covers; None for no beam.
-        cell_pixels: The size of a cell in pixels, 8..1000.
-
-    Returns:
-        uint8 [H * cell_pixels + 1, W * cell_pixels + 1, 3], RGB.
+    A cell is `cell_pixels` high and wide, 8..1000, a line between two cells one of these.
     """
     size = integer("cell_pixels", cell_pixels, 8, LARGEST_CELL_PIXELS)
     pixels = (board.height * size + 1) * (board.width * size + 1)
@@ -59,28 +38,13 @@ def board_image(
             _fill(image, r, c, size, 0, PALETTE[GROUND])
     for r, c in board.walls:
         _fill(image, r, c, size, 0, PALETTE[WALL])
-    for (r, c), apple in zip(board.sites, stock, strict=True):
+    for (r, c), apple in zip(board.sites, world.stock, strict=True):
         _fill(image, r, c, size, size // 6, PALETTE[APPLE] if apple else EMPTY_SITE_COLOUR)
-    for r, c in () if beams is None else np.argwhere(beams):
+    for r, c in np.argwhere(world.board == BEAM):
         _fill(image, r, c, size, 2 * size // 5, PALETTE[BEAM])
-    for i, (r, c, h) in enumerate(zip(row, col, heading, strict=True)):
-        if in_play is None or in_play[i]:
-            _draw_agent(image, int(r), int(c), int(h), size, i)
+    for i in np.flatnonzero(world.in_play):
+        _draw_agent(image, int(world.row[i]), int(world.col[i]), int(world.heading[i]), size, int(i))
     return image
-
-
-def world_image(board: Map, world: Shown, *, cell_pixels: int = 24) -> Bytes:
-    """An image of the current state of one world, without agents out of play; see `board_image`."""
-    return board_image(
-        board,
-        world.stock,
-        world.row,
-        world.col,
-        world.heading,
-        in_play=world.in_play,
-        beams=world.board == BEAM,
-        cell_pixels=cell_pixels,
-    )
 
 
 def _fill(image: Bytes, r: int, c: int, size: int, inset: int, colour: tuple[int, int, int]) -> None:

@@ -244,6 +244,7 @@ class CommonsEnv(LeanStepEnv):
             )
         board = batch.game.map
         if world is not None:
+            world = arguments.integer("world", world, 0, batch.size - 1)
             return world_image(board, batch.show(self.output, world=world), cell_pixels=cell_pixels)
         pixels = batch.size * (board.height * cell_pixels + 1) * (board.width * cell_pixels + 1)
         check_memory(
