@@ -29,7 +29,7 @@ from institution_pictures import (
 from matplotlib.figure import Figure
 
 from cprl import Game, Rules, maps
-from cprl.commons.institution_tables import patches_of
+from cprl.commons.near import patches, sites_around
 from cprl.commons.yields import sustainable_yield
 from cprl.institutions import (
     COUNTS,
@@ -116,7 +116,7 @@ def closed_patches() -> Figure:
     )
     course, other = play(rule, "greedy", 200), play(free, "greedy", 200)
     figure, (panel, below) = new_figure(4.8, 2, height_ratios=(1.2, 1))
-    patch = patches_of(board, rule.rules)
+    patch = patches(sites_around(board, rule.rules))
     held = np.bincount(patch, weights=course.apples[-1])
     show_board(panel, course.image, "Turn 200: hatched patches hold fewer than 3 apples and are closed")
     taken = set(zip(course.row[-1].tolist(), course.col[-1].tolist(), strict=True))

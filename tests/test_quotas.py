@@ -8,7 +8,7 @@ import pytest
 from boards import Play
 
 from cprl import Observation, Rules, maps
-from cprl.commons.institution_tables import patches_of
+from cprl.commons.near import patches, sites_around
 from cprl.institutions import ClosedPatches, ClosedSeason, Quota
 
 BOARD = """
@@ -163,9 +163,9 @@ def test_a_patch_that_grows_is_open_again():
 def test_patches_are_sites_that_are_connected_by_being_near():
     board = maps.parse("A.A.A..A\n........\nA>......")
     # Columns 0, 2, 4 are each two cells apart, 7 is three from 4; (2, 0) is two below (0, 0).
-    assert patches_of(board, Rules()).tolist() == [0, 0, 0, 1, 0]
-    assert patches_of(board, Rules(regrow_radius_cells=1)).tolist() == [0, 1, 2, 3, 4]
-    assert patches_of(board, Rules(regrow_radius_cells=3)).tolist() == [0, 0, 0, 0, 0]
+    assert patches(sites_around(board, Rules())).tolist() == [0, 0, 0, 1, 0]
+    assert patches(sites_around(board, Rules(regrow_radius_cells=1))).tolist() == [0, 1, 2, 3, 4]
+    assert patches(sites_around(board, Rules(regrow_radius_cells=3))).tolist() == [0, 0, 0, 0, 0]
 
 
 def test_quota_season_and_patch_break_one_rule_each_and_all_fines_are_due():

@@ -9,7 +9,7 @@ import numpy as np
 
 from cprl.commons.chance import threshold
 from cprl.commons.maps import Map
-from cprl.commons.near import neighbours
+from cprl.commons.near import patches, sites_around
 from cprl.commons.observation import Observation
 from cprl.commons.rules import Rules
 from cprl.commons.tables import Tables
@@ -165,25 +165,9 @@ def _season_tables(institutions: Sequence[Institution]) -> dict[str, Any]:
     }
 
 
-def patches_of(board: Map, rules: Rules) -> Ints:
-    """The patch of each site, int32 [K]: sites that are connected by being near each other."""
-    first, near = neighbours(board, rules)
-    patch = np.full(len(board.sites), -1, np.int32)
-    for start in range(len(patch)):
-        if patch[start] < 0:
-            number, waiting = patch.max() + 1, [start]
-            patch[start] = number
-            while waiting:
-                k = waiting.pop()
-                new = [int(other) for other in near[first[k] : first[k + 1]] if patch[other] < 0]
-                patch[new] = number
-                waiting += new
-    return patch
-
-
 def _patch_tables(institutions: Sequence[Institution], board: Map, rules: Rules) -> dict[str, Any]:
     closures = _of(ClosedPatches, institutions)
-    patch = patches_of(board, rules) if closures else np.zeros(len(board.sites), np.int32)
+    patch = patches(sites_around(board, rules)) if closures else np.zeros(len(board.sites), np.int32)
     return {
         "patch_of": patch,
         "patch_sites": np.bincount(patch).astype(np.int32) if closures else _ints([]),

@@ -63,3 +63,20 @@ def neighbours(board: Map, rules: Rules) -> tuple[Ints, Indices]:
         sites_near.append(others[near].astype(np.uint32))
     first_of = np.cumsum(np.concatenate([[0], *counts]), dtype=np.int32)
     return first_of, np.concatenate(sites_near)
+
+
+def sites_around(board: Map, rules: Rules) -> list[NDArray[np.int64]]:
+    """Return the sites near each site, int64 [..] each."""
+    first, near = neighbours(board, rules)
+    return np.split(near.astype(np.int64), first[1:-1])
+
+
+def patches(around: list[NDArray[np.int64]]) -> Ints:
+    """Return the patch of each site, int32 [K]: sites that are connected by being near each other."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    ends = np.concatenate(around), np.repeat(np.arange(len(around)), list(map(len, around)))
+    links = csr_array((np.ones(len(ends[0])), ends), shape=(len(around), len(around)))
+    patch: Ints = connected_components(links, directed=False)[1].astype(np.int32)
+    return patch

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.maps import Map
-from cprl.commons.near import neighbours
+from cprl.commons.near import sites_around
 from cprl.commons.rules import Rules
 
 
@@ -21,19 +21,18 @@ def sustainable_yield(board: Map, rules: Rules) -> float:
     Returns:
         Apples per turn of all agents together; 0 where nothing grows.
     """
-    first, near = neighbours(board, rules)
+    around = sites_around(board, rules)
     probs = np.array(rules.regrow_prob)
-    most = int(np.diff(first).max())
+    most = max(map(len, around))
     of_count = probs[np.minimum(np.arange(most + 1), len(probs) - 1)]
     lowest = np.minimum.accumulate(of_count[::-1])[::-1]
     rate = lowest if rules.regrow_before_bites else lowest / (1 + lowest)
-    return float(_best(rate, first, near))
+    return _best(rate, around)
 
 
-def _best(rate: NDArray[np.float64], first: NDArray[np.int32], near: NDArray[np.uint32]) -> float:
+def _best(rate: NDArray[np.float64], around: list[NDArray[np.int64]]) -> float:
     """The yield of the harvested sites that a greedy search finds: each added while the sum grows."""
-    sites = len(first) - 1
-    around = [near[first[k] : first[k + 1]].astype(np.int64) for k in range(sites)]
+    sites = len(around)
     others = np.array([len(some) for some in around])
     harvested = np.zeros(sites, np.bool_)
 

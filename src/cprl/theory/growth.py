@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.maps import Map
-from cprl.commons.near import neighbours
+from cprl.commons.near import patches, sites_around
 from cprl.commons.rules import Rules
 
 NODES: Final = 500
@@ -55,8 +55,7 @@ def yield_bounds(board: Map, rules: Rules, *, nodes: int = NODES) -> YieldBounds
         nodes: how long the search goes on: more bring the bounds together. The result follows from it alone,
             not from the machine's speed.
     """
-    first, near = neighbours(board, rules)
-    around = [near[first[k] : first[k + 1]].astype(np.int64) for k in range(len(first) - 1)]
+    around = sites_around(board, rules)
     probs = np.array(rules.regrow_prob, np.float64)
     counts = np.minimum(np.arange(max(map(len, around)) + 1), len(probs) - 1)
     highest = np.maximum.accumulate(probs[counts])
@@ -78,14 +77,9 @@ def _growth(stock: NDArray[np.bool_], around: list[NDArray[np.int64]], rate: Flo
 def _best_stock(around: list[NDArray[np.int64]], rate: Floats, nodes: int) -> tuple[NDArray[np.bool_], float]:
     """The stock with the largest growth that is found, and a bound that no stock exceeds; each patch of sites
     that are near each other, directly or by others, is searched by itself."""
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import connected_components
-
-    ends = np.concatenate(around), np.repeat(np.arange(len(around)), [len(near) for near in around])
-    links = csr_array((np.ones(len(ends[0])), ends), shape=(len(around), len(around)))
-    count, patch_of = connected_components(links, directed=False)
+    patch_of = patches(around)
     stock, bound = np.zeros(len(around), np.bool_), 0.0
-    for patch in range(count):
+    for patch in range(patch_of.max() + 1):
         sites = np.flatnonzero(patch_of == patch)
         around_patch = [np.searchsorted(sites, around[site]) for site in sites]
         stock[sites], most = _best_of_patch(around_patch, rate, nodes)

@@ -121,18 +121,9 @@ class PayoffTable:
     @cached_property
     def pairs(self) -> Values:
         """float64 [S, S]: entry [i, j] is what one agent gets who plays i, where all others play j."""
-        alone = [
-            self.rows[tuple(counts.tolist())] for counts in self.counts if counts.max() >= self.agents - 1
-        ]
-        pairs = np.empty((self.strategies, self.strategies))
-        for row in alone:
-            counts, payoffs = self.counts[row], self.payoffs[row]
-            for focal in np.flatnonzero(counts):
-                rest = counts.copy()
-                rest[focal] -= 1
-                if rest.max() == self.agents - 1:
-                    pairs[focal, rest.argmax()] = payoffs[focal]
-        return pairs
+        others, _ = self._others
+        alike = [int(others[:, strategy].argmax()) for strategy in range(self.strategies)]
+        return self.deviations[alike].T.copy()
 
     @property
     def reduced(self) -> "PayoffTable":
