@@ -123,7 +123,7 @@ def stepped(env, action, how):
         (None, r'\("agents", "action"\) is missing'),
         (torch.zeros(2, 1), r'\("agents", "action"\) is torch.float32'),
         (torch.ones(2, 1, dtype=torch.bool), "is torch.bool"),
-        (torch.zeros(2, 1, 1, dtype=torch.int64), r"actions is int64 \[2, 1, 1\]"),
+        (torch.zeros(2, 1, 1, dtype=torch.int64), r"is torch.int64 \[2, 1, 1\]"),
         (torch.full((2, 1), -1), "action -1 of agent 0 in world 0 is unknown"),
     ],
 )
