@@ -8,6 +8,7 @@ import torch
 import cprl
 from cprl import presets
 from cprl.algorithms import DQN
+from cprl.custom import allowing
 from cprl.population import Learning, Scripted
 
 
@@ -16,6 +17,13 @@ def seeded_torch() -> None:
     """TorchRL's modules draw from torch's global generator; every test starts it anew."""
     torch.manual_seed(0)
     torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def trusted():
+    """What a test allows to be imported is not allowed in the next one."""
+    with allowing(()):
+        yield
 
 
 @pytest.fixture

@@ -33,8 +33,7 @@ from cprl.algorithms import (
     Tabular,
     TabularSettings,
 )
-from cprl.config import KINDS, custom_targets, differences, from_config, to_config
-from cprl.custom import Custom
+from cprl.custom import Custom, allowing, custom_targets
 from cprl.envs.matrix import MatrixGame
 from cprl.institutions import (
     Boundaries,
@@ -55,6 +54,7 @@ from cprl.learners.settings import Optimizer
 from cprl.networks import GRU, LSTM, MLP, Conv
 from cprl.objectives.td import DISTANCES
 from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.values import KINDS, differences, from_config, to_config
 
 SHARES = st.floats(1e-9, 1, allow_subnormal=False)
 POSITIVE = st.floats(1e-6, 100, allow_subnormal=False)
@@ -181,7 +181,8 @@ MATRICES = st.builds(
 @given(value=SPECS | GAMES | MATRICES | CUSTOM | st.tuples(SPECS, GAMES) | st.just(FIRING))
 def test_a_value_comes_back_from_its_table_as_it_was(value):
     text = json.dumps(to_config(value), allow_nan=False)
-    back = from_config(json.loads(text), allow=custom_targets(json.loads(text)))
+    with allowing(custom_targets(json.loads(text))):
+        back = from_config(json.loads(text))
     assert back == value
     assert hash(back) == hash(value)
     assert to_config(back) == json.loads(text)
@@ -195,7 +196,8 @@ def test_a_value_comes_back_from_its_table_as_it_was(value):
 def test_every_kind_comes_back(value):
     table = json.loads(json.dumps(to_config(value)))
     assert KINDS[table["kind"]] is type(value)
-    assert from_config(table, allow=custom_targets(table)) == value
+    with allowing(custom_targets(table)):
+        assert from_config(table) == value
 
 
 def test_what_a_table_leaves_out_takes_its_default():
@@ -268,9 +270,12 @@ def test_what_would_be_imported_is_refused_unless_it_is_allowed():
     assert custom_targets(table) == ["a:B", "c:D"]
     with pytest.raises(ValueError, match=r"^a:B, c:D would be imported.*--allow a:B --allow c:D"):
         from_config(table)
-    with pytest.raises(ValueError, match=r"^c:D would be imported"):
-        from_config(table, allow=["a:B"])
-    assert from_config(table, allow=["a:B", "c:D"])[0] == Custom("a:B")
+    with allowing(["a:B"]), pytest.raises(ValueError, match=r"^c:D would be imported"):
+        from_config(table)
+    with allowing(["a:B", "c:D"]):
+        assert from_config(table)[0] == Custom("a:B")
+    with pytest.raises(ValueError, match="would be imported"):
+        from_config(table)
 
 
 def test_two_tables_are_told_apart_by_place():

@@ -21,12 +21,13 @@ from tiny_study import GAME, LEARNING, TINY
 
 import cprl
 from cprl import Experiment, algorithms, institutions, population, theory
-from cprl.config import KINDS, custom_targets, from_config, to_config
+from cprl.custom import allowing, custom_targets
 from cprl.envs.matrix import prisoners_dilemma
 from cprl.envs.taking import TakingGame
 from cprl.learners import preferences
 from cprl.runs.episodes import read_episodes, read_table
 from cprl.runs.files import RunLock, read_json
+from cprl.values import KINDS, from_config, to_config
 
 LONGEST_S = 10.0
 STORED = Path(__file__).parent / "stored" / "run"
@@ -159,7 +160,8 @@ def is_kept(value):
     is_whole = isinstance(value, Experiment)
     table = value.to_config() if is_whole else to_config(value)
     read = Experiment.from_config if is_whole else from_config
-    return read(table, allow=custom_targets(table)) == value
+    with allowing(custom_targets(table)):
+        return read(table) == value
 
 
 def holds_of_a_change(change):

@@ -74,7 +74,7 @@ def test_a_bad_drawing_is_refused_with_row_and_column(drawing, message):
         ({"starts": ((0, 0, 4),)}, "heading 4"),
         ({"starts": ()}, "starts is empty"),
         ({"sites": ()}, "sites is empty"),
-        ({"height": 0}, "Map.height is 0; allowed: an integer from 1 to 10,000"),
+        ({"height": 0}, "Map.height is 0"),
     ],
 )
 def test_a_map_that_cannot_be_played_is_refused(changes, message):
@@ -84,7 +84,7 @@ def test_a_map_that_cannot_be_played_is_refused(changes, message):
 
 
 def test_an_unknown_board_is_refused_with_the_names_of_all_boards():
-    with pytest.raises(ValueError, match=r"'comons'; allowed: single_basic, .*, two_complex, commons"):
+    with pytest.raises(ValueError, match=r"'comons'; allowed: 'single_basic', .*, 'two_complex', 'commons'"):
         maps.named("comons")
 
 
@@ -169,9 +169,9 @@ def test_fewer_agents_are_spread_over_the_rooms():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"entrances": "two"}, "entrances is 'two'; allowed: single, multiple, none, unequal"),
-        ({"agents": 0}, "agents is 0; allowed: an integer from 1 to 12"),
-        ({"agents": 13}, "agents is 13; allowed: an integer from 1 to 12"),
+        ({"entrances": "two"}, "entrances is 'two'"),
+        ({"agents": 0}, "agents is 0"),
+        ({"agents": 13}, "agents is 13"),
     ],
 )
 def test_rooms_refuse_other_entrances_and_numbers_of_agents(arguments, message):
@@ -211,11 +211,11 @@ def test_more_clustering_puts_sites_closer_together():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"height": 0}, "height is 0; allowed: an integer from 1 to 10,000"),
-        ({"agents": 0}, "agents is 0; allowed: an integer from 1"),
-        ({"density": 0}, "density is 0; allowed: above 0, at most 1"),
+        ({"height": 0}, "height is 0"),
+        ({"agents": 0}, "agents is 0"),
+        ({"density": 0}, "density is 0"),
         ({"density": 1.5}, "density is 1.5"),
-        ({"clustering": -0.1}, r"clustering is -0\.1; allowed: 0\.\.1"),
+        ({"clustering": -0.1}, r"clustering is -0\.1; allowed: a number in 0\.\.1"),
         ({"density": 1}, "12 sites and 2 agents do not fit on 12 cells"),
     ],
 )

@@ -37,7 +37,6 @@ from cprl.algorithms import (
     Reinforce,
     RolloutSettings,
 )
-from cprl.config import from_config, to_config
 from cprl.envs import make_env, spaces_of
 from cprl.envs.matrix import stag_hunt
 from cprl.evaluation.film import film
@@ -50,6 +49,7 @@ from cprl.policies.assignment import AgentPolicies
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.training import train
 from cprl.training.collectors import StepCollector, stock_collector
+from cprl.values import from_config, to_config
 
 SMALL = GRU(encoder=MLP(hidden_cells=(6,)), recurrent_cells=5)
 LONG = LSTM(encoder=MLP(hidden_cells=(6,)), recurrent_cells=5)

@@ -14,7 +14,6 @@ from tiny_study import FREEZE, GAMMA, LEARNING, MIXED, SETTINGS, TINY
 
 from cprl import Custom, Study, maps
 from cprl.algorithms import PPO, VDN
-from cprl.config import KINDS, defaults_of
 from cprl.experiment import MOST_SEED, Experiment
 from cprl.learners.settings import RolloutSettings
 from cprl.population import Frozen, Learning, Scripted, Team, stored_of
@@ -22,6 +21,7 @@ from cprl.studies import Integers, LogUniform, Uniform
 from cprl.studies.factors import changed, drawn, values_at
 from cprl.studies.study import CONDITION_FORMAT, Condition, apart
 from cprl.studies.trials import trials_of
+from cprl.values import KINDS, defaults_of
 
 OF_FIRST, OF_SECOND = (GAMMA.replace("*", agent) for agent in "01")
 

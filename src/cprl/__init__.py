@@ -3,9 +3,10 @@
 A package imports only from those above it:
     checks       what users hand in, as tables by field: what fits, and how a refusal reads
     arguments    the same for the arguments of a function
+    custom       the user's own code, as a text that a recipe can keep, and what is allowed of it
+    values       frozen values: a field's annotation says its range; tables that JSON holds, and back
     system       compilation, caches, memory, output, private parts of libraries
     keys         the TensorDict entries, their shapes and types
-    custom       the user's own code, as a text that a recipe can keep
     institutions  rules that people make: boundaries, quotas, taxes, sanctions, votes; numpy alone
     commons      the game: maps, rules, turns; numpy and numba alone
     theory       games with a known answer: herders, appropriation, what apples can bear; numpy alone
@@ -16,7 +17,6 @@ A package imports only from those above it:
     learners     replay and rollouts, updates of many agents at once
     algorithms   what agents learn by: DQN, PPO, QMIX and so on, frozen values
     population   how each agent is specified: Learning, Team, Scripted, Frozen
-    config       values as JSON tables, and back; how two such tables differ
     presets      the published games and hyper-parameters by name
     measuring    social metrics, episodes, phases, statistics
     runs         what is kept of a run: recipe, table of episodes, checkpoints, weights

@@ -1,21 +1,23 @@
-"""Custom: something of the user's own, as a text that a run's recipe can keep."""
+"""Custom: something of the user's own, as a text that a run's recipe can keep; and what is allowed of it.
+
+A recipe that somebody else made names code that loading it would import. Such a recipe is refused unless this
+process trusts each name: `--allow module:Class` on the command line, `allow=` of `cprl.load`, `trust` here.
+"""
 
 import importlib
 import json
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
+from reprlib import repr as short
 from typing import Any, Final
 
-from cprl.checks import Check, check_nesting, checked, instance
-
 _NAMES: Final = re.compile(r"[\w-]+(\.[\w-]+)*:\w+(\.\w+)*", re.ASCII)
-_TARGET: Final = Check(
-    lambda value: isinstance(value, str) and len(value) <= 1000 and bool(_NAMES.fullmatch(value)),
-    '"module:Class"',
-)
+_LONGEST_NAME: Final = 1000
+_MOST_NESTED: Final = 64
 
 
 @dataclass(frozen=True)
@@ -37,14 +39,20 @@ class Custom:
     arguments: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        checked("Custom.target", self.target, _TARGET)
-        checked("Custom.arguments", self.arguments, instance(Mapping, "a table of keyword arguments"))
-        check_nesting(self.arguments, f"Custom.arguments of {self.target!r}")
+        if (
+            not isinstance(self.target, str)
+            or len(self.target) > _LONGEST_NAME
+            or not _NAMES.fullmatch(self.target)
+        ):
+            raise ValueError(f'Custom.target is {_short(self.target)}; allowed: "module:Class"')
+        if not isinstance(self.arguments, Mapping):
+            came = _short(self.arguments)
+            raise ValueError(f"Custom.arguments is {came}; allowed: a table of keyword arguments")
         try:
             _refuse_other_keys(self.arguments)
             text = json.dumps(dict(self.arguments), allow_nan=False)
             object.__setattr__(self, "arguments", json.loads(text))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, RecursionError) as error:
             raise ValueError(
                 f"Custom.arguments of {self.target!r} cannot be kept as JSON: {error}"
             ) from error
@@ -56,15 +64,15 @@ class Custom:
         """What the target names, imported."""
         module, _, name = self.target.partition(":")
         try:
-            found: Any = importlib.import_module(module)
+            target: Any = importlib.import_module(module)
             for part in name.split("."):
-                found = getattr(found, part)
+                target = getattr(target, part)
         except (ImportError, AttributeError) as error:
             cure = "; allowed: a module in the folder where the command is given, or in one of PYTHONPATH"
             cure = cure if isinstance(error, ModuleNotFoundError) else ""
             raise ValueError(f"Custom({self.target!r}) cannot be imported: {error}{cure}") from error
         source_of(module)
-        return found
+        return target
 
     def make(self, *positional: Any) -> Any:
         """Calls the target with these arguments."""
@@ -73,6 +81,59 @@ class Custom:
             return target(*positional, **{name: _with_keys(value) for name, value in self.arguments.items()})
         except TypeError as error:
             raise ValueError(f"Custom({self.target!r}) does not take its arguments: {error}") from error
+
+
+_ALLOWED: Final[set[str]] = set()
+"""The targets that this process trusts, besides those that its own program names."""
+
+
+def trust(*targets: str) -> None:
+    """Trust code of somebody's own, "module:Class" each: recipes that name it can be read from now on."""
+    _ALLOWED.update(targets)
+
+
+@contextmanager
+def allowing(targets: Iterable[str]) -> Iterator[None]:
+    """Trust code of somebody's own, "module:Class" each, within a block."""
+    before = set(_ALLOWED)
+    _ALLOWED.update(targets)
+    try:
+        yield
+    finally:
+        _ALLOWED.intersection_update(before)
+
+
+def allowed() -> tuple[str, ...]:
+    """Return the targets that this process trusts, for processes that it starts."""
+    return tuple(sorted(_ALLOWED))
+
+
+def custom_targets(table: object) -> list[str]:
+    """Return the targets of each `Custom` in a table, sorted, each once."""
+    return sorted(set(_targets(table)))
+
+
+def refuse_targets(table: object) -> None:
+    """Raise a ValueError for a table that would import what this process does not trust."""
+    refused = [target for target in custom_targets(table) if target not in _ALLOWED]
+    if refused:
+        flags = " ".join(f"--allow {target}" for target in refused)
+        raise ValueError(
+            f"{', '.join(refused)} would be imported, which is code of somebody's own; if you trust it: "
+            f"{flags} (in Python allow={refused!r})"
+        )
+
+
+def _targets(table: object) -> Iterator[str]:
+    if isinstance(table, Mapping):
+        if table.get("kind") == "Custom":
+            yield str(table.get("target"))
+        else:
+            for entry in table.values():
+                yield from _targets(entry)
+    elif isinstance(table, list | tuple):
+        for entry in table:
+            yield from _targets(entry)
 
 
 _IMPORTED: Final[dict[str, tuple[object, str | None]]] = {}
@@ -99,27 +160,36 @@ def source_of(module: str) -> str | None:
     return text
 
 
+def _short(value: object) -> str:
+    try:
+        return short(value)
+    except Exception:  # a user's object may raise anything, and an integer may have too many digits
+        return f"a {type(value).__name__}"
+
+
 def made(value: Any, *positional: Any) -> Any:
     """What a `Custom` makes; anything else as it is."""
     return value.make(*positional) if isinstance(value, Custom) else value
 
 
-def _refuse_other_keys(value: Any) -> None:
+def _refuse_other_keys(value: Any, depth: int = 0) -> None:
     """Raises a TypeError for tables by something else than text, which JSON would turn into text."""
+    if depth > _MOST_NESTED:
+        raise ValueError(f"it is nested more than {_MOST_NESTED} deep")
     if isinstance(value, Mapping):
         for key in value:
             if not isinstance(key, str):
                 raise TypeError(f"a table has the key {key!r}; allowed: text")
     if isinstance(value, Mapping | list | tuple):
-        for own in value.values() if isinstance(value, Mapping) else value:
-            _refuse_other_keys(own)
+        for entry in value.values() if isinstance(value, Mapping) else value:
+            _refuse_other_keys(entry, depth + 1)
 
 
 def _with_keys(value: Any) -> Any:
     """The same with each list of strings within a list as a tuple, a nested TensorDict key."""
     if not isinstance(value, list):
         return value
-    return [tuple(own) if _is_key(own) else _with_keys(own) for own in value]
+    return [tuple(entry) if _is_key(entry) else _with_keys(entry) for entry in value]
 
 
 def _is_key(value: Any) -> bool:

@@ -4,30 +4,15 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Annotated, Any, Final, Literal
 
 from cprl.algorithms import Tabular
 from cprl.algorithms.base import TeamAlgorithm, TrainingEngine
-from cprl.checks import (
-    DIRECTORY_NAME,
-    NONE,
-    Check,
-    check_fields,
-    checked,
-    count,
-    either,
-    instance,
-    is_count,
-    one_of,
-    shown,
-)
 from cprl.commons.game import Game
-from cprl.config import custom_targets, differences, fields_from_config, fields_to_config
-from cprl.custom import Custom
-from cprl.envs.make_env import PlayableGame, game_of, is_playable, stored_game
+from cprl.custom import Custom, custom_targets, trust
+from cprl.envs.make_env import PlayableGame, game_of, stored_game
 from cprl.learners.preferences import check_preference
 from cprl.population import (
-    SPEC,
     AgentSpec,
     Frozen,
     Learning,
@@ -39,7 +24,19 @@ from cprl.population import (
 )
 from cprl.runs.files import RECIPE_FORMAT, written_by_another
 from cprl.runs.recipe import recipe_config
-from cprl.system.memory import DEVICE
+from cprl.system.memory import Device
+from cprl.values import (
+    DirectoryName,
+    Positive,
+    Range,
+    Value,
+    build,
+    checked,
+    differences,
+    hints_of,
+    shown,
+    to_config,
+)
 
 LoggerName = Literal["tensorboard", "wandb"]
 OnNan = Literal["stop", "continue"]
@@ -50,29 +47,29 @@ MOST_SEED: Final = 2**64 - 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Experiment:
+class Experiment(Value, stored=False, called="experiment"):
     """What is trained and how; equals what `recipe.json` holds.
 
     Lists become tuples, though type checkers ask for tuples. Two are equal where their recipes are.
     """
 
-    name: str
+    name: DirectoryName
     """What it is called: of the recipe, and of the run's directory."""
     game: Game | Custom | PlayableGame
     """What is played."""
     agents: tuple[AgentSpec, ...]
     """How each agent is specified; see `cprl.population`."""
-    episodes: int
-    """Episodes that each replica trains, at least 1."""
-    replicas: int = 1
+    episodes: Positive
+    """Episodes that each replica trains."""
+    replicas: Annotated[int, Range(1, 2**20)] = 1
     """Independent repetitions R of the whole training, side by side."""
-    seed: int = 0
-    """Of chance, weights, exploration and replay; 0 to 2**64 - 2."""
-    evaluation_episodes: int = 20
+    seed: Annotated[int, Range(0, MOST_SEED)] = 0
+    """Of chance, weights, exploration and replay."""
+    evaluation_episodes: Annotated[int, Range(1, 2**20)] = 20
     """Fresh episodes of each replica after training, and of the random policy."""
-    evaluate_every: int | None = None
+    evaluate_every: Positive | None = None
     """Episodes after which agents play as many fresh episodes greedily, again and again; None for never."""
-    update_every: int = 1
+    update_every: Positive = 1
     """Environment steps k after which agents learn, then k times."""
     transforms: tuple[Custom, ...] = ()
     """TorchRL transforms of the environment, the first one nearest to it."""
@@ -80,7 +77,7 @@ class Experiment:
     """Callbacks of the training; see `cprl.training`."""
     loggers: tuple[LoggerName | Custom, ...] = ()
     """TorchRL's loggers that get every series: "tensorboard", "wandb", or one of your own."""
-    device: str = "cpu"
+    device: Device = "cpu"
     """Where agents learn, e.g. "cpu" or "cuda:0"."""
     engine: TrainingEngine = "compiled"
     """How updates are computed: "compiled" by torch, several times faster and in need of a C++ compiler;
@@ -96,9 +93,9 @@ class Experiment:
         )
 
     def __post_init__(self) -> None:
-        check_fields(self, _CHECKS, "experiment")
-        _check_game(self.game)
-        _check_specs(self.agents)
+        super().__post_init__()
+        if isinstance(self.game, PlayableGame):
+            checked("experiment.game.agents", self.game.agents, Positive)
         self.to_config()
         _check_numbers(self)
         _check_agents(self)
@@ -106,7 +103,9 @@ class Experiment:
 
     def to_config(self) -> dict[str, Any]:
         """Its fields as JSON can hold them."""
-        return fields_to_config(self, "experiment", instead={"game": stored_game(self.game)})
+        values = {name: getattr(self, name) for name in hints_of(type(self))}
+        values["game"] = stored_game(self.game)
+        return {name: to_config(value, f"experiment.{name}") for name, value in values.items()}
 
     @classmethod
     def from_config(cls, table: Mapping[str, Any], *, allow: Iterable[str] = ()) -> "Experiment":
@@ -115,7 +114,8 @@ class Experiment:
         Args:
             allow: the targets of `Custom` that it may hold, "module:Class" each.
         """
-        read = fields_from_config(cls, table, "experiment", allow=allow)
+        trust(*allow)
+        read = build(cls, table, "experiment")
         return read if not isinstance(read.game, Custom) else replace(read, game=game_of(read.game))
 
     def to_recipe(self, directory: str | Path | None = None) -> dict[str, Any]:
@@ -172,33 +172,6 @@ def _with_runs(experiment: Experiment, moved: Callable[[str], str]) -> Experimen
 
 
 _MOST_WORLDS: Final = 2**22
-_TUPLE: Final = instance(tuple, "a tuple")
-_CHECKS: Final[dict[str, Check]] = {
-    "name": DIRECTORY_NAME,
-    "game": Check(is_playable, "a Game, a Custom, or a value with `agents`, `to_config` and `make`"),
-    "agents": instance(tuple, "a tuple of specifications"),
-    "episodes": count(1),
-    "replicas": count(1, 2**20),
-    "seed": Check(lambda value: is_count(value, 0, MOST_SEED), "an integer in 0..2**64 - 2"),
-    "evaluation_episodes": count(1, 2**20),
-    "evaluate_every": either(NONE, count(1)),
-    "update_every": count(1),
-    **dict.fromkeys(("transforms", "callbacks", "loggers"), _TUPLE),
-    "device": DEVICE,
-    "engine": one_of(*get_args(TrainingEngine)),
-    "on_nan": one_of(*get_args(OnNan)),
-}
-
-
-def _check_game(game: object) -> None:
-    """What the rest of the checks read of a game of the user's own."""
-    if isinstance(game, PlayableGame):
-        checked("experiment.game.agents", game.agents, count(1))
-
-
-def _check_specs(agents: tuple[object, ...]) -> None:
-    for place, spec in enumerate(agents):
-        checked(f"experiment.agents[{place}]", spec, SPEC)
 
 
 def _check_numbers(experiment: Experiment) -> None:

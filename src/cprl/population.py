@@ -8,35 +8,15 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from posixpath import normpath
-from typing import Any, Final, TypeAlias
+from typing import Annotated, Any, Final, TypeAlias
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
-from cprl.checks import (
-    NONE,
-    SWITCH,
-    Check,
-    check_fields,
-    checked,
-    count,
-    either,
-    instance,
-    is_count,
-    one_of,
-    tuple_of,
-)
 from cprl.custom import Custom
 from cprl.learners.decisions import Bandit
-from cprl.learners.preferences import PREFERENCE, Preference
+from cprl.learners.preferences import Preference
 from cprl.learners.settings import Exploring
-from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
-
-
-def _algorithm(kind: type[Algorithm]) -> Check:
-    return instance(
-        kind | Custom,
-        f'a {kind.__name__} of cprl.algorithms, or Custom("module:Class", arguments={{...}}) for one of '
-        "your own",
-    )
+from cprl.policies.scripted import ScriptedPolicy
+from cprl.values import AgentIndices, Natural, Value, Where, checked
 
 
 def _is_path(value: Any) -> bool:
@@ -47,25 +27,12 @@ def _is_path(value: Any) -> bool:
         return False
 
 
-def _are_members(value: Any) -> bool:
-    return (
-        isinstance(value, tuple)
-        and len(value) > 0
-        and all(is_count(agent, 0) for agent in value)
-        and list(value) == sorted(set(value))
-    )
-
-
 _MOST_PATH: Final = 4095
-_PATH: Final = Check(_is_path, f"the path of a run's directory, up to {_MOST_PATH} bytes")
-_MEMBERS: Final = Check(_are_members, "ascending agent indices, at least one")
-_ALGORITHM: Final = _algorithm(Algorithm)
-_TEAM_ALGORITHM: Final = _algorithm(TeamAlgorithm)
-_THEIRS: Final = either(count(0), tuple_of(count(0), 1), NONE)
+RunPath = Annotated[str, Where(_is_path, f"the path of a run's directory, up to {_MOST_PATH} bytes")]
 
 
 @dataclass(frozen=True)
-class Frozen:
+class Frozen(Value):
     """What an agent of an earlier run learned: an agent that plays it, or what another one starts from.
 
     Args:
@@ -75,14 +42,14 @@ class Frozen:
             each replica here, e.g. (0, 1, 0, 1) where four play against two.
     """
 
-    run: str
-    agent: int
-    replica: int | tuple[int, ...] | None = 0
+    run: RunPath
+    agent: Natural
+    replica: Natural | Annotated[tuple[Natural, ...], Where(len, "one or more integers >= 0")] | None = 0
 
     def __post_init__(self) -> None:
         if isinstance(self.run, os.PathLike):
             object.__setattr__(self, "run", os.fspath(self.run))
-        check_fields(self, {"run": _PATH, "agent": count(0), "replica": _THEIRS})
+        super().__post_init__()
         object.__setattr__(self, "run", normpath(self.run))  # of "runs/x/" and "runs/x", the same checksum
 
     def replica_for(self, replica: int) -> int:
@@ -97,12 +64,8 @@ class Frozen:
         return self.replica[replica]
 
 
-_START: Final = either(instance(Frozen, "Frozen(run, agent, replica)"), NONE)
-_DECISIONS: Final = {"decisions": either(instance(Bandit, "Bandit(step_size=0.1, ...)"), NONE)}
-
-
 @dataclass(frozen=True)
-class Learning:
+class Learning(Value):
     """An agent that learns on its own. Equal ones are updated together, as lanes of one engine.
 
     Args:
@@ -120,8 +83,7 @@ class Learning:
     decisions: Bandit | None = None
 
     def __post_init__(self) -> None:
-        check_fields(self, {"algorithm": _ALGORITHM, "reward": PREFERENCE, "start_from": _START})
-        check_fields(self, _DECISIONS)
+        super().__post_init__()
         if isinstance(self.algorithm, TeamAlgorithm):
             name = type(self.algorithm).__name__
             raise ValueError(
@@ -130,7 +92,7 @@ class Learning:
 
 
 @dataclass(frozen=True)
-class Team:
+class Team(Value):
     """Agents that learn together; a team in every replica.
 
     Args:
@@ -147,19 +109,16 @@ class Team:
     """
 
     algorithm: Algorithm | Custom
-    agents: tuple[int, ...]
+    agents: AgentIndices
     reward: Preference = "team"
     start_from: Frozen | None = None
     decisions: Bandit | None = None
     share_parameters: bool = False
 
     def __post_init__(self) -> None:
-        check_fields(self, {"share_parameters": SWITCH})
-        allowed = _ALGORITHM if self.share_parameters else _TEAM_ALGORITHM
-        check_fields(
-            self, {"algorithm": allowed, "agents": _MEMBERS, "reward": PREFERENCE, "start_from": _START}
-        )
-        check_fields(self, _DECISIONS)
+        super().__post_init__()
+        if not self.share_parameters:
+            checked("Team.algorithm", self.algorithm, TeamAlgorithm | Custom)
         if isinstance(self.algorithm, Algorithm):
             refuse_sharing(self.algorithm, self.share_parameters)
 
@@ -174,25 +133,19 @@ def refuse_sharing(algorithm: Algorithm, share_parameters: bool) -> None:
 
 
 @dataclass(frozen=True)
-class Scripted:
+class Scripted(Value):
     """An agent that follows a rule and does not learn; see `cprl.policies.scripted`."""
 
     policy: ScriptedPolicy = "random"
 
-    def __post_init__(self) -> None:
-        check_fields(self, {"policy": one_of(*SCRIPTED_POLICIES)})
-
 
 AgentSpec: TypeAlias = Learning | Team | Scripted | Frozen
-SPEC: Final = instance(AgentSpec, "Learning, Team, Scripted, Frozen of cprl.population")
 
 
 def specs_by_agent(specs: Sequence[AgentSpec], agents: int) -> list[AgentSpec]:
     """The specification of each of N agents; that of a team for each of its members."""
     by_agent: dict[int, AgentSpec] = {}
-    specs = checked("specs", specs, instance(tuple, "a tuple, one for each agent"))
-    for place, spec in enumerate(specs):
-        checked(f"agents[{place}]", spec, SPEC)
+    for spec in specs:
         for agent in spec.agents if isinstance(spec, Team) else ():
             if agent in by_agent:
                 raise ValueError(f"agent {agent} is in two teams; allowed: one specification for each agent")
@@ -231,7 +184,7 @@ def grouped(specs: Sequence[AgentSpec], agents: int) -> list[tuple[AgentSpec, tu
             members = (
                 spec.agents
                 if isinstance(spec, Team)
-                else tuple(other for other, own in enumerate(by_agent) if own == spec)
+                else tuple(other for other, of_other in enumerate(by_agent) if of_other == spec)
             )
             groups.append((spec, members))
     return groups
@@ -243,9 +196,6 @@ def exploration_steps(specs: Sequence[AgentSpec]) -> int | None:
     None if no agent explores by epsilon, or only by an algorithm of the user's own. Agents that draw from a
     policy do not, though the settings of those that learn from replay have an epsilon.
     """
-    specs = tuple(specs)
-    for place, spec in enumerate(specs):
-        checked(f"specs[{place}]", spec, SPEC)
     algorithms = [spec.algorithm for spec in specs if isinstance(spec, Learning | Team)]
     settings = [own.settings for own in algorithms if not isinstance(own, Custom) and not own.stochastic]
     ends = [

@@ -6,15 +6,13 @@ define `make_network` and `make_loss`; docs/algorithms.md has an example of twen
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from inspect import get_annotations
-from typing import Any, ClassVar, Final, Literal, TypeAlias
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import nn
 from torchrl.modules import ProbabilisticActor, QValueActor
 from torchrl.objectives import LossModule
 
-from cprl.checks import NONE, SWITCH, Check, check_fields, checked, count, either, instance, number, one_of
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.learners.base import Learner
@@ -24,11 +22,12 @@ from cprl.learners.replay import ReplayLearner
 from cprl.learners.rollouts import RolloutLearner
 from cprl.learners.settings import DEFAULT_HIDDEN_CELLS, DQNSettings, LOLASettings, RolloutSettings
 from cprl.networks.agent import AgentNetworks
-from cprl.networks.mlp import MLP, MOST_CELLS
+from cprl.networks.mlp import MLP
 from cprl.networks.recurrent import Recurrent, state_shape_of
 from cprl.networks.specification import Network, new_network
 from cprl.objectives.td import TORCHRL_DISTANCES
 from cprl.system.compat.losses import LaneCategorical
+from cprl.values import Range, Value, Where, checked
 
 TrainingEngine: TypeAlias = Literal["compiled", "eager", "torchrl"]
 """How agents are updated. "compiled": all together, in one update that torch compiles; "eager": the same
@@ -36,30 +35,12 @@ update, uncompiled; "torchrl": by TorchRL's stock parts, one agent after the oth
 `cprl.learners.reference`."""
 
 
-_WEIGHT: Final = number(0, 1e6)
-_CHECKS: Final[dict[str, Check]] = {
-    "network": either(instance(Network | Custom, 'MLP, Conv, GRU, LSTM, Custom("module:Class")'), NONE),
-    "double": SWITCH,
-    "atoms": count(2, MOST_CELLS),
-    "lowest_return": number(-1e9, 1e9),
-    "highest_return": number(-1e9, 1e9),
-    "conservative_weight": _WEIGHT,
-    "target_entropy_weight": number(0, 1),
-    "alpha_init": number(1e-12, 1e6),
-    "expectile": number(0.5, 0.999),
-    "temperature": _WEIGHT,
-    "entropy_bonus": SWITCH,
-    "clip_epsilon": number(1e-6, 0.999),
-    "entropy_coeff": _WEIGHT,
-    "critic_coeff": _WEIGHT,
-    "estimator": one_of("policy_gradient", "dice"),
-    "logit_penalty": _WEIGHT,
-    "mixing_cells": count(1, MOST_CELLS),
-}
-"""Of the fields of cprl's algorithms; one of the same name means the same in each."""
+Weight = Annotated[float, Range(0, 1e6)]
+"""Of a term of a loss."""
+ClipEpsilon = Annotated[float, Range(1e-6, 0.999)]
 
 
-class Algorithm:
+class Algorithm(Value, stored=False):
     """How an agent learns: hyperparameters, networks, loss and learner.
 
     Agents with equal algorithms learn as lanes of one stacked update, so an algorithm must be a frozen
@@ -82,19 +63,14 @@ class Algorithm:
     `cprl.algorithms.base.module_of`."""
 
     def __post_init__(self) -> None:
-        kind = self.settings_kind
-        checked(f"{type(self).__name__}.settings", self.settings, instance(kind, f"a {kind.__name__}"))
-        of_cprl = {
-            name
-            for kind in type(self).__mro__
-            if kind.__module__.startswith("cprl.algorithms.")
-            for name in get_annotations(kind)
-        }
-        checks = {**_CHECKS, "loss_function": one_of(*self.loss_functions)}
-        check_fields(self, {name: own for name, own in checks.items() if name in of_cprl})
+        super().__post_init__()
+        name, functions = type(self).__name__, self.loss_functions
+        checked(f"{name}.settings", self.settings, self.settings_kind)
+        if hasattr(self, "loss_function"):
+            allowed = Where(lambda function: function in functions, ", ".join(map(repr, functions)))
+            checked(f"{name}.loss_function", self.loss_function, Annotated[str, allowed])
         network = getattr(self, "network", None)
         if isinstance(network, Recurrent) and not self.can_be_recurrent:
-            name = type(self).__name__
             raise ValueError(
                 f"{name}.network is {network}; allowed for {name}, which does not learn from sequences: MLP, "
                 "Conv, Custom; DQN, PPO, A2C, Reinforce, IPPO and MAPPO learn recurrent networks, and "
@@ -131,7 +107,7 @@ class Algorithm:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OffPolicy(Algorithm):
+class OffPolicy(Algorithm, stored=False):
     """Learns from a replay buffer.
 
     The loss reads transitions with "observation", "action" and "next": "observation", "reward" [.., 1],
@@ -173,7 +149,7 @@ class OffPolicy(Algorithm):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OnPolicy(Algorithm):
+class OnPolicy(Algorithm, stored=False):
     """Learns from rollouts of the current policy.
 
     `make_network` returns `AgentNetworks`: "actor" outputs the policy's logits, "critic" one value. The loss
@@ -205,7 +181,7 @@ class OnPolicy(Algorithm):
         return RolloutLearner(spaces, compile=engine == "compiled", **options)
 
 
-class TeamAlgorithm(Algorithm):
+class TeamAlgorithm(Algorithm, stored=False):
     """Trains a team: agents that learn together and act independently, on their own observations.
 
     `make_network` returns the networks of one member. The loss reads observations [.., S, *shape] and actions

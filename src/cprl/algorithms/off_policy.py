@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
@@ -24,13 +24,13 @@ from cprl.algorithms.base import (
     Algorithm,
     OffPolicy,
     TrainingEngine,
+    Weight,
     module_of,
     network_of,
     policy,
     q_actor,
     refuse_relu,
 )
-from cprl.checks import Check, checked, number
 from cprl.commons.spaces import Spaces
 from cprl.learners.base import Learner
 from cprl.learners.settings import (
@@ -38,10 +38,14 @@ from cprl.learners.settings import (
 )
 from cprl.learners.tabular import TabularLearner, table_network
 from cprl.networks.agent import AgentNetworks, AtomNetwork, JointNetwork, OtherOutputs
+from cprl.networks.mlp import MOST_CELLS
 from cprl.objectives.pr2 import PR2Loss
 from cprl.objectives.td import DISTANCES, LOG_COSH, LogCoshDQNLoss
 from cprl.policies.tabular import TableNetwork
 from cprl.system.compat import bootstrap_from_target
+from cprl.values import Range, Share
+
+Return = Annotated[float, Range(-1e9, 1e9)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,9 +86,9 @@ class DistributionalDQN(OffPolicy):
     itself choose it, as double DQN does, and takes its distribution from the target.
     """
 
-    atoms: int = 51
-    lowest_return: float = 0.0
-    highest_return: float = 100.0
+    atoms: Annotated[int, Range(2, MOST_CELLS)] = 51
+    lowest_return: Return = 0.0
+    highest_return: Return = 100.0
     """The range of the atoms: discounted returns in apples. With a discount of 0.995 one apple per step
     amounts to 200."""
 
@@ -127,7 +131,7 @@ class CQL(OffPolicy):
     Source: Kumar et al., "Conservative Q-Learning for Offline Reinforcement Learning" (2020).
     """
 
-    conservative_weight: float = 0.1
+    conservative_weight: Weight = 0.1
     """The weight of the conservative term. TorchRL's weight is 1, for fixed data sets; with it, agents that
     explore imitate their first random actions (`tests/test_optimum.py`)."""
     loss_function: str = "l2"
@@ -166,9 +170,9 @@ class SAC(OffPolicy):
     Settings" (2019).
     """
 
-    target_entropy_weight: float = 0.5
+    target_entropy_weight: Share = 0.5
     """The target entropy of the temperature, as a fraction of the maximum entropy log A, 0..1."""
-    alpha_init: float = 0.1
+    alpha_init: Annotated[float, Range(1e-12, 1e6)] = 0.1
     """The initial temperature, in units of reward (apples)."""
     loss_function: str = "l2"
     stochastic: ClassVar[bool] = True
@@ -204,9 +208,9 @@ class IQL(OffPolicy):
     Source: Kostrikov, Nair and Levine, "Offline Reinforcement Learning with Implicit Q-Learning" (2021).
     """
 
-    expectile: float = 0.7
+    expectile: Annotated[float, Range(0.5, 0.999)] = 0.7
     """The expectile of the action values that the state value estimates, 0.5..0.999."""
-    temperature: float = 3.0
+    temperature: Weight = 3.0
     """The inverse temperature of the advantage weights, in 1/reward (1/apples)."""
     loss_function: str = "l2"
     stochastic: ClassVar[bool] = True
@@ -238,7 +242,7 @@ class IQL(OffPolicy):
         return loss
 
 
-_TEMPERATURE: Final[Check] = number(1e-6, 1e6)
+Temperature = Annotated[float, Range(1e-6, 1e6)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,7 +257,7 @@ class PR2(OffPolicy):
     Source: Wen et al., "Probabilistic Recursive Reasoning for Multi-Agent Reinforcement Learning" (2019).
     """
 
-    temperature: float = 0.1
+    temperature: Temperature = 0.1
     """Of the policy and of the peers' expected answers, in units of reward (apples), 1e-6..1e6."""
     entropy_bonus: bool = True
     """Whether values contain the entropy of the joint action, as in the paper, which pays agents for every
@@ -263,10 +267,6 @@ class PR2(OffPolicy):
     stochastic: ClassVar[bool] = True
     sees_peers_actions: ClassVar[bool] = True
     loss_functions: ClassVar[tuple[str, ...]] = DISTANCES
-
-    def __post_init__(self) -> None:
-        checked(f"{type(self).__name__}.temperature", self.temperature, _TEMPERATURE)
-        super().__post_init__()
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         """New networks of one agent.

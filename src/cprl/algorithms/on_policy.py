@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 from torch import nn
 from torchrl.objectives import A2CLoss, ClipPPOLoss, LossModule, ReinforceLoss
 
-from cprl.algorithms.base import OnPolicy, module_of, policy
+from cprl.algorithms.base import ClipEpsilon, OnPolicy, Weight, module_of, policy
 from cprl.networks.agent import AgentNetworks
 
 
@@ -18,10 +18,10 @@ class PPO(OnPolicy):
     Source: Schulman et al., "Proximal Policy Optimization Algorithms" (2017).
     """
 
-    clip_epsilon: float = 0.2
+    clip_epsilon: ClipEpsilon = 0.2
     """The largest change of an action's probability, as a ratio minus 1; 1e-6..0.999."""
-    entropy_coeff: float = 0.01
-    critic_coeff: float = 0.5
+    entropy_coeff: Weight = 0.01
+    critic_coeff: Weight = 0.5
     can_be_recurrent: ClassVar[bool] = True
 
     def make_loss(self, network: nn.Module) -> LossModule:
@@ -35,8 +35,8 @@ class A2C(OnPolicy):
     Source: Mnih et al., "Asynchronous Methods for Deep Reinforcement Learning" (2016), here synchronous.
     """
 
-    entropy_coeff: float = 0.01
-    critic_coeff: float = 0.5
+    entropy_coeff: Weight = 0.01
+    critic_coeff: Weight = 0.5
     can_be_recurrent: ClassVar[bool] = True
 
     def make_loss(self, network: nn.Module) -> LossModule:

@@ -15,10 +15,12 @@ from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss, QMixerLoss
 
 from cprl.algorithms.base import (
+    ClipEpsilon,
     OffPolicy,
     OnPolicy,
     TeamAlgorithm,
     TrainingEngine,
+    Weight,
     actor_and_critic,
     network_of,
     policy,
@@ -32,7 +34,7 @@ from cprl.learners.lola import LOLALearner
 from cprl.learners.preferences import Preference
 from cprl.learners.settings import DQNSettings, LOLASettings
 from cprl.networks.agent import AgentNetworks
-from cprl.networks.mlp import MLP, MLPNetwork
+from cprl.networks.mlp import MLP, Cells, MLPNetwork
 from cprl.networks.specification import Network
 from cprl.networks.team import CentralCritic, JointCritics, Mixing, team_network
 from cprl.objectives import LOLADiCELoss, LOLALoss
@@ -66,7 +68,7 @@ class QMIX(TeamAlgorithm, OffPolicy):
     unless `Team.share_parameters` says so, and their networks are not recurrent.
     """
 
-    mixing_cells: int = 32
+    mixing_cells: Cells = 32
     """Units of the mixing layer."""
     fewest_members: ClassVar[int] = 2
 
@@ -91,10 +93,10 @@ class MAPPO(TeamAlgorithm, OnPolicy):
     without value normalisation, and members share no weights, unless `Team.share_parameters` says so.
     """
 
-    clip_epsilon: float = 0.2
+    clip_epsilon: ClipEpsilon = 0.2
     """The largest change of an action's probability, as a ratio minus 1; 1e-6..0.999."""
-    entropy_coeff: float = 0.01
-    critic_coeff: float = 0.5
+    entropy_coeff: Weight = 0.01
+    critic_coeff: Weight = 0.5
     can_be_recurrent: ClassVar[bool] = True
 
     def make_network(self, spaces: Spaces) -> nn.Module:
@@ -118,10 +120,10 @@ class IPPO(TeamAlgorithm, OnPolicy):
     StarCraft Multi-Agent Challenge?" (2020).
     """
 
-    clip_epsilon: float = 0.2
+    clip_epsilon: ClipEpsilon = 0.2
     """The largest change of an action's probability, as a ratio minus 1; 1e-6..0.999."""
-    entropy_coeff: float = 0.01
-    critic_coeff: float = 0.5
+    entropy_coeff: Weight = 0.01
+    critic_coeff: Weight = 0.5
     can_be_recurrent: ClassVar[bool] = True
     shares_reward: ClassVar[bool] = False
 
@@ -166,7 +168,7 @@ class MADDPG(TeamAlgorithm, OffPolicy):
     this differs is listed in docs/algorithms.md.
     """
 
-    logit_penalty: float = 1e-3
+    logit_penalty: Weight = 1e-3
     """The weight of the mean squared logit in the actors' loss, 0..1e6; 1e-3 in the published program."""
     loss_function: str = "l2"
     """The loss of the critics' temporal-difference errors, as `DQN.loss_function`."""
@@ -246,7 +248,7 @@ class LOLA(TeamAlgorithm):
     """How the others' step is judged: "policy_gradient", to first order, from two rollouts of the present
     weights; "dice", by a rollout for each member in which the others act as after their step. All rollouts
     are turns of the training's own episodes; evaluation always has the present weights."""
-    entropy_coeff: float = 0.0
+    entropy_coeff: Weight = 0.0
     network: Network | Custom | None = None
     """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
     settings_kind: ClassVar[type[Any]] = LOLASettings

@@ -326,7 +326,7 @@ def _sentence(text: str) -> str:
 
 def _flag(value: Any, hint: Any, all_agents: bool) -> tuple[Any, Any] | None:
     """The type of a field's flags and their default; None where a command line cannot say it."""
-    from cprl.config import fits  # which needs torch, as flags do and mistakes do not
+    from cprl.values import fits  # which needs torch, as flags do and mistakes do not
 
     if isinstance(value, Custom):
         return None

@@ -10,7 +10,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.arguments import object_of, objects
 from cprl.commons.colours import FIRST_AGENT, MAX_AGENTS_APART, class_colour
 from cprl.commons.institution_tables import (
     build_institution_tables,
@@ -30,10 +29,11 @@ from cprl.institutions.arrays import Form, forms_of
 from cprl.institutions.choice import Ballot, ballots, decision_options
 from cprl.institutions.memory import SHOWN, InstitutionTables, Payments, empty_memory
 from cprl.system.memory import check_memory
+from cprl.values import Value
 
 
 @dataclass(frozen=True, kw_only=True)
-class Game:
+class Game(Value):
     """A map, its rules, what agents observe, and the rules that people make.
 
     Warns (UserWarning) if no agent can reach a site that it may harvest: nobody then gets an apple.
@@ -45,16 +45,8 @@ class Game:
     institutions: tuple[Institution, ...] = ()
 
     def __post_init__(self) -> None:
-        for name, kind in (("map", Map), ("rules", Rules), ("observation", Observation)):
-            object_of(f"Game.{name}", getattr(self, name), kind, f"a cprl.{kind.__name__}")
+        super().__post_init__()
         agents = self.agents
-        institutions = objects(
-            "Game.institutions",
-            self.institutions,
-            Institution,
-            "values of cprl.institutions; one of your own goes into Experiment.transforms",
-        )
-        object.__setattr__(self, "institutions", tuple(institutions))
         if self.observation.area == "full" and self.rules.walls_block_sight:
             raise ValueError(
                 'Observation.area is "full" and Rules.walls_block_sight is True; allowed: area="window" '
@@ -178,7 +170,7 @@ class Game:
 
     def to_config(self) -> dict[str, Any]:
         """Its map, rules, observation and institutions as JSON can hold them."""
-        config: dict[str, Any] = import_module("cprl.config").to_config(self)
+        config: dict[str, Any] = import_module("cprl.values").to_config(self)
         return config
 
     @property

@@ -6,19 +6,17 @@ heading. Everything outside the board is wall.
 
 from bisect import bisect_left, insort
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from inspect import cleandoc
 from itertools import chain
 from math import isqrt
-from typing import Any, Final, Literal, get_args
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl import arguments
-from cprl.arguments import as_integer, choice, integer, listed, refusal
 from cprl.commons.world import DOWN, LEFT, RIGHT, UP
+from cprl.values import PositiveShare, Range, Seed, Share, Value, checked
 
 Cell = tuple[int, int]
 Start = tuple[int, int, int]
@@ -30,20 +28,21 @@ SITE, GROUND, WALL = "A", ".", "#"
 LONGEST_SIDE_CELLS: Final = 10_000
 LARGEST_BOARD_CELLS: Final = 2**20
 """The largest number of cells: on a board this large, tables and working memory take some 100 MB."""
+Side = Annotated[int, Range(1, LONGEST_SIDE_CELLS)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Map:
+class Map(Value):
     """A board with its walls, its apple sites and the starts of the agents. Every cell outside it is wall.
 
     Raises:
         ValueError: If the board cannot be played; the message names the row and column.
     """
 
-    height: int
-    """The number of rows H, 1..10,000; H x W is at most 2**20."""
-    width: int
-    """The number of columns W, 1..10,000."""
+    height: Side
+    """The number of rows H; H x W is at most 2**20."""
+    width: Side
+    """The number of columns W."""
     sites: tuple[Cell, ...]
     """(row, col) of each of the K sites, the cells that can hold an apple; all do when an episode begins."""
     starts: tuple[Start, ...]
@@ -52,13 +51,8 @@ class Map:
     """(row, col) of each inner wall."""
 
     def __post_init__(self) -> None:
-        for name in ("height", "width"):
-            object.__setattr__(self, name, integer(f"Map.{name}", getattr(self, name), 1, LONGEST_SIDE_CELLS))
+        super().__post_init__()
         check_cells("Map", self.height, self.width)
-        for name in ("sites", "starts", "walls"):
-            entry = CELL if name != "starts" else START
-            cells = cells_of(f"Map.{name}", getattr(self, name), entry)
-            object.__setattr__(self, name, cells)
         _check_entries(self)
         _check_cells(self)
 
@@ -82,10 +76,6 @@ class Map:
         return "\n".join("".join(row) for row in signs)
 
 
-CELL: Final = ("row", "col")
-START: Final = ("row", "col", "heading")
-
-
 def check_cells(name: str, height: int, width: int) -> None:
     """Checks the number of cells of a board."""
     if height * width > LARGEST_BOARD_CELLS:
@@ -93,27 +83,6 @@ def check_cells(name: str, height: int, width: int) -> None:
             f"{name} has {height:,} x {width:,} = {height * width:,} cells; allowed: at most "
             f"{LARGEST_BOARD_CELLS:,}"
         )
-
-
-def cells_of(name: str, entries: Any, form: tuple[str, ...] = CELL) -> tuple[Any, ...]:
-    """Cells or starts as tuples of ints; nothing is rounded.
-
-    Args:
-        name: Their name in messages.
-        entries: A sequence of them.
-        form: What the numbers of an entry are.
-    """
-    allowed = f"({', '.join(form)}), integers"
-    if not isinstance(entries, type) and callable(getattr(entries, "tolist", None)):
-        with suppress(NotImplementedError):  # of a tensor without data, which is refused below
-            entries = entries.tolist()
-    cells = []
-    for place, entry in enumerate(listed(name, entries, f"a sequence of {allowed} each")):
-        numbers = tuple(map(as_integer, listed(f"{name}[{place}]", entry, allowed)))
-        if len(numbers) != len(form) or None in numbers:
-            raise refusal(f"{name}[{place}]", entry, allowed)
-        cells.append(numbers)
-    return tuple(cells)
 
 
 def _check_entries(board: Map) -> None:
@@ -250,7 +219,7 @@ NAMES: Final = tuple(_DRAWINGS)
 
 def named(name: str) -> Map:
     """A published board, by its name in `NAMES`."""
-    choice("name", name, NAMES)
+    checked("name", name, Literal[NAMES])
     board = parse(_DRAWINGS[name])
     starts = _NUMBERED_STARTS.get(name, board.starts)
     return Map(height=board.height, width=board.width, sites=board.sites, starts=starts, walls=board.walls)
@@ -315,15 +284,15 @@ def crosses(
     """
     sites = {
         (row + down, col + right)
-        for row, col in cells_of("centres", centres)
+        for row, col in checked("centres", centres, tuple[Cell, ...])
         for down, right in ((0, 0), (-1, 0), (0, 1), (1, 0), (0, -1))
     }
     return Map(
         height=height,
         width=width,
         sites=tuple(sorted(sites)),
-        starts=cells_of("starts", starts, START),
-        walls=cells_of("walls", walls),
+        starts=checked("starts", starts, tuple[Start, ...]),
+        walls=checked("walls", walls, tuple[Cell, ...]),
     )
 
 
@@ -340,8 +309,8 @@ def rooms(entrances: Entrances = "single", *, agents: int = 12) -> Map:
         entrances: The board: "single", "multiple", "none" or "unequal".
         agents: The number of agents N, 1 to 12.
     """
-    choice("entrances", entrances, get_args(Entrances))
-    agents = integer("agents", agents, 1, 2 * len(_NORTH_STARTS))
+    checked("entrances", entrances, Entrances)
+    agents = checked("agents", agents, Annotated[int, Range(1, 2 * len(_NORTH_STARTS))])
     centres: tuple[Cell, ...] = _CENTRES
     if entrances == "unequal":
         in_corner = {(row, col) for row, col in _CENTRES if row < 7 and col < 24}
@@ -415,13 +384,13 @@ def random(
     Raises:
         ValueError: If an argument is out of range, or sites and agents do not fit on the board.
     """
-    height = integer("height", height, 1, LONGEST_SIDE_CELLS)
-    width = integer("width", width, 1, LONGEST_SIDE_CELLS)
+    height = checked("height", height, Side)
+    width = checked("width", width, Side)
     check_cells("the board", height, width)
-    agents = integer("agents", agents, 1, LARGEST_BOARD_CELLS)
-    density = arguments.number("density", density, low=0, high=1, above=True, allowed="above 0, at most 1")
-    clustering = arguments.number("clustering", clustering, low=0, high=1, allowed="0..1")
-    rng = np.random.default_rng(arguments.seed(seed))
+    agents = checked("agents", agents, Annotated[int, Range(1, LARGEST_BOARD_CELLS)])
+    density = checked("density", density, PositiveShare)
+    clustering = checked("clustering", clustering, Share)
+    rng = np.random.default_rng(checked("seed", seed, Seed))
     cells = height * width
     count = max(1, round(density * cells))
     if count + agents > cells:

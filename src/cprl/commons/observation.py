@@ -1,10 +1,10 @@
 """Observation: what agents observe of the game, and in which form."""
 
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Final, Literal
 
-from cprl.checks import SWITCH, Check, check_fields, one_of
 from cprl.commons.colours import BEAM, FIRST_AGENT, GROUND, HIDDEN, OTHER, SELF, class_name
+from cprl.values import Value
 
 Area = Literal["window", "full"]
 Encoding = Literal["rgb", "one_hot"]
@@ -13,7 +13,7 @@ RGB_NAMES: Final = ("red", "green", "blue")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Observation:
+class Observation(Value):
     """The form of every agent's observation; defaults are those of both studies."""
 
     area: Area = "window"
@@ -32,20 +32,10 @@ class Observation:
     stock_gauge: bool = False
     """Whether each agent also observes the share of all sites that hold an apple: float32 [1], 0..1."""
 
-    def __post_init__(self) -> None:
-        check_fields(self, _CHECKS)
-
     @property
     def highest(self) -> int:
         """The largest value of an entry: 255 for "rgb", 1 for "one_hot"."""
         return 255 if self.encoding == "rgb" else 1
-
-
-_CHECKS: Final[dict[str, Check]] = {
-    "area": one_of(*get_args(Area)),
-    "encoding": one_of(*get_args(Encoding)),
-    **dict.fromkeys(("agents_apart", "scoreboard", "stock_gauge"), SWITCH),
-}
 
 
 def classes_shown(observation: Observation, *, agents: int, hides: bool) -> tuple[int, ...]:

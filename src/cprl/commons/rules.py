@@ -6,9 +6,9 @@ Sources: [W] M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement L
 """
 
 from dataclasses import dataclass, fields
-from typing import Any, Final, Literal, get_args
+from typing import Annotated, Final, Literal
 
-from cprl.checks import SWITCH, Check, check_fields, is_bool, is_count, is_number, one_of
+from cprl.values import MOST_INT32, Odd, Positive, Range, Value, Where
 
 ACTIONS: Final = ("forward", "backward", "left", "right", "turn_left", "turn_right", "beam", "stay")
 """The actions by index. If no agent may fire, there is no "beam", and 6 is "stay"."""
@@ -20,58 +20,84 @@ LARGEST_WINDOW_CELLS: Final = 1000
 SMALLEST_PROBABILITY: Final = 2**-32
 """Chance is compared in 32 bits: a smaller probability could never come true, or would be rounded up."""
 
+Probability = Annotated[
+    float,
+    Where(
+        lambda value: value == 0 or SMALLEST_PROBABILITY <= value <= 1,
+        "a number that is 0, or 2**-32 (2.3e-10) to 1",
+    ),
+]
+Window = Annotated[int, Range(1, LARGEST_WINDOW_CELLS)]
+
 
 @dataclass(frozen=True, kw_only=True)
-class Rules:
+class Rules(Value):
     """The numbers of a game.
 
     Defaults are those of `published`: every quirk of the study as run is off. Lists and arrays are stored as
     tuples, so that rules can be compared, hashed and printed.
     """
 
-    regrow_prob: tuple[float, ...] = (0.0, 0.01, 0.01, 0.05, 0.05, 0.1)
+    regrow_prob: Annotated[
+        tuple[Probability, ...],
+        Where(
+            lambda probabilities: len(probabilities) > 0,
+            "one or more numbers, each 0 or 2**-32 (2.3e-10) to 1",
+        ),
+    ] = (0.0, 0.01, 0.01, 0.05, 0.05, 0.1)
     """Probability per turn that an empty site grows an apple, indexed by the number of apples near it [W];
-    the last entry also applies to every larger number. Each 0, or 2**-32 (2.3e-10) to 1.
+    the last entry also applies to every larger number.
 
     With K sites, growth is logistic in the stock by `tuple(r * s / K for s in range(K + 1))` and
     `regrow_radius_cells=1000`."""
 
-    regrow_radius_cells: float = 2.0
-    """The distance up to which apples count as near, in cells, measured by `regrow_norm`, inclusive [W].
-    0..1000."""
+    regrow_radius_cells: Annotated[float, Range(0, 1000)] = 2.0
+    """The distance up to which apples count as near, in cells, measured by `regrow_norm`, inclusive [W]."""
 
     regrow_norm: Norm = "euclidean"
     """The norm that measures this distance [W]."""
 
-    beam_length_cells: int | tuple[int, int, int, int] = 5
-    """The length of a beam in cells, at least 1: one number, or four by heading (up, right, down, left)."""
+    beam_length_cells: Positive | tuple[Positive, Positive, Positive, Positive] = 5
+    """The length of a beam in cells: one number, or four by heading (up, right, down, left)."""
 
-    beam_width_cells: int = 3
-    """The width of a beam in cells: odd, at least 1 [W]."""
+    beam_width_cells: Odd = 3
+    """The width of a beam in cells [W]."""
 
-    hits_to_tag: int = 1
-    """The hits, at most one per turn, after which an agent is tagged [W]; 2 in [run]. At least 1."""
+    hits_to_tag: Positive = 1
+    """The hits, at most one per turn, after which an agent is tagged [W]; 2 in [run]."""
 
-    freeze_steps: int = 25
-    """The number of turns that a tagged agent misses [W], at least 0; by shooter or by offence with
+    freeze_steps: Annotated[
+        int,
+        Where(
+            lambda steps: 0 <= steps <= MOST_INT32,
+            "an integer >= 0; by shooter or by offence with cprl.institutions.GraduatedSanctions",
+        ),
+    ] = 25
+    """The number of turns that a tagged agent misses [W]; by shooter or by offence with
     `cprl.institutions.GraduatedSanctions`."""
 
     may_fire: bool = True
     """Whether agents may fire; if not, there is no beam action. For some agents alone:
     `cprl.institutions.Sanctioner`."""
 
-    window_rows: int = 6
-    """The rows of a window: the agent's own and those ahead of it [W]. At least 1."""
+    window_rows: Window = 6
+    """The rows of a window: the agent's own and those ahead of it [W]."""
 
-    window_columns: int = 13
-    """The columns of a window, the agent's own in the middle: odd, at least 1 [W]."""
+    window_columns: Annotated[
+        int,
+        Where(
+            lambda columns: 1 <= columns <= LARGEST_WINDOW_CELLS and columns % 2 == 1,
+            f"an odd integer from 1 to {LARGEST_WINDOW_CELLS}",
+        ),
+    ] = 13
+    """The columns of a window, the agent's own in the middle [W]."""
 
     walls_block_sight: bool = False
     """Whether a window shows only cells in line of sight, that is, the straight line between the two cell
     centres crosses the interior of no wall (ours)."""
 
-    episode_steps: int = 1000
-    """The number of turns after which an episode is truncated [W]. At least 1."""
+    episode_steps: Positive = 1000
+    """The number of turns after which an episode is truncated [W]."""
 
     shuffle_starts: bool = False
     """Whether each episode permutes the agents' starts, all permutations equally likely (ours)."""
@@ -113,9 +139,6 @@ class Rules:
         changed = [f"{field.name}={value!r}" for field, value in pairs if value != field.default]
         return f"Rules({', '.join(changed)})"
 
-    def __post_init__(self) -> None:
-        check_fields(self, _CHECKS)
-
     @property
     def beam_lengths_cells(self) -> tuple[int, int, int, int]:
         """`beam_length_cells` by heading: up, right, down, left."""
@@ -126,45 +149,3 @@ class Rules:
     def actions(self) -> tuple[str, ...]:
         """The names of the actions, by index: 8 of them, or 7 without a beam."""
         return ACTIONS if self.may_fire else tuple(name for name in ACTIONS if name != "beam")
-
-
-def _is_odd(value: Any, high: int = 2**31 - 1) -> bool:
-    return is_count(value, 1, high) and value % 2 == 1
-
-
-def _are_probabilities(value: Any) -> bool:
-    return isinstance(value, tuple) and bool(value) and all(map(_is_probability, value))
-
-
-def _is_probability(value: Any) -> bool:
-    return is_number(value, 0, 1) and (value == 0 or value >= SMALLEST_PROBABILITY)
-
-
-def _are_beam_lengths(value: Any) -> bool:
-    if isinstance(value, tuple):
-        return len(value) == 4 and all(is_count(length, 1) for length in value)
-    return is_count(value, 1)
-
-
-_SWITCHES: Final = tuple(field.name for field in fields(Rules) if field.default is False)
-_CHECKS: Final[dict[str, Check]] = {
-    "regrow_prob": Check(_are_probabilities, "one or more numbers, each 0 or 2**-32 (2.3e-10) to 1"),
-    "regrow_radius_cells": Check(lambda value: is_number(value, 0, 1000), "a number in 0..1000"),
-    "regrow_norm": one_of(*get_args(Norm)),
-    "beam_length_cells": Check(_are_beam_lengths, "an integer >= 1, or four of them by heading"),
-    "beam_width_cells": Check(_is_odd, "an odd integer >= 1"),
-    "hits_to_tag": Check(lambda value: is_count(value, 1), "an integer >= 1"),
-    "freeze_steps": Check(
-        lambda value: is_count(value, 0),
-        "an integer >= 0; by shooter or by offence with cprl.institutions.GraduatedSanctions",
-    ),
-    "may_fire": Check(is_bool, "True or False; for some agents alone cprl.institutions.Sanctioner"),
-    "window_rows": Check(
-        lambda value: is_count(value, 1, LARGEST_WINDOW_CELLS), f"an integer from 1 to {LARGEST_WINDOW_CELLS}"
-    ),
-    "window_columns": Check(
-        lambda value: _is_odd(value, LARGEST_WINDOW_CELLS), f"an odd integer from 1 to {LARGEST_WINDOW_CELLS}"
-    ),
-    "episode_steps": Check(lambda value: is_count(value, 1), "an integer >= 1"),
-    **dict.fromkeys(_SWITCHES, SWITCH),
-}

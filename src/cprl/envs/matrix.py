@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from cprl import arguments
-from cprl.checks import MOST_NUMBER, check_fields, is_number, shown
-from cprl.envs.stage_games import CLOCK_CHECKS, StageEnv, StageGame
+from cprl.envs.stage_games import Memory, StageEnv, StageGame
+from cprl.values import MOST_NUMBER, Positive, PositiveShare, shown
 
 _MOST_PAYOFFS: Final = 2**16
 
@@ -31,18 +31,17 @@ class MatrixGame(StageGame):
     """What all N agents are paid, float [A, ..., A, N]: an axis for the action of each agent, and their
     payoffs last; nested tuples, lists or an array."""
     _: KW_ONLY
-    turns: int = 1
+    turns: Positive = 1
     """Turns of an episode, at most."""
-    memory: int | None = None
+    memory: Memory = None
     """How many of the last joint actions agents observe, each as A**N + 1 numbers; by default 1, and 0 in a
     game of one turn, in which the observation is the number 1."""
-    continue_prob: float = 1.0
-    """The probability that a further turn follows, above 0."""
+    continue_prob: PositiveShare = 1.0
+    """The probability that a further turn follows."""
 
     def __post_init__(self) -> None:
-        check_fields(self, CLOCK_CHECKS)
+        super().__post_init__()
         object.__setattr__(self, "payoffs", _table(self.payoffs))
-        self.check_clock()
 
     @property
     def agents(self) -> int:
@@ -76,7 +75,7 @@ def _table(payoffs: Any) -> tuple[Any, ...]:
     if table.size > _MOST_PAYOFFS:
         raise ValueError(f"{name} has {table.size:,} numbers; allowed: up to {_MOST_PAYOFFS:,}")
     for number in table.flat:
-        if not is_number(float(number), -MOST_NUMBER, MOST_NUMBER):
+        if not abs(number) <= MOST_NUMBER:
             raise ValueError(f"{name} has {shown(float(number))}; allowed: numbers up to {MOST_NUMBER:g}")
     return tuple(map(_tuples, table.tolist()))
 

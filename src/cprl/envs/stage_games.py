@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from math import log1p
-from typing import Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 import torch
@@ -11,11 +11,11 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 
 from cprl import arguments, keys
-from cprl.checks import NONE, Check, count, either, is_number
 from cprl.commons.chance import LOW_WORD, WORD_BITS, philox4x32
 from cprl.envs.drivers import device_of, drawn_seed
 from cprl.envs.stepping import begin_states, carry_on, chosen
 from cprl.system.compat import LeanStepEnv, flag_spec, unchecked_tensordict
+from cprl.values import Positive, PositiveShare, Range, Value
 
 _REPLACED: Final = frozenset(
     (keys.AGENTS, keys.DONE, keys.TERMINATED, keys.TRUNCATED, "next", "_reset", "observation", "reward")
@@ -24,31 +24,27 @@ _REPLACED: Final = frozenset(
 _LENGTH: Final = np.uint64(5 << 28)
 """The purpose of a draw in `cprl.commons.chance`: how many turns an episode lasts."""
 
-CLOCK_CHECKS: Final[dict[str, Check]] = {
-    "turns": count(1),
-    "memory": either(NONE, count(0, 64)),
-    "continue_prob": Check(lambda value: is_number(value, 0, 1) and value > 0, "a number above 0, at most 1"),
-}
+Memory = Annotated[int, Range(0, 64)] | None
 
 
-class StageGame:
+class StageGame(Value, stored=False):
     """A game of N agents who act at once, for one turn or several: what `StageEnv` asks of a game.
 
     An episode of one turn terminates. One of several is truncated: its end is a clock that nobody sees, so
     agents learn as if it went on; with a `continue_prob` below 1 it terminates where no further turn follows.
     """
 
-    turns: int
-    memory: int | None
-    continue_prob: float
+    turns: Positive
+    memory: Memory
+    continue_prob: PositiveShare
 
     @property
     def remembered(self) -> int:
         """The number of turns that agents observe: `memory`, or what its default means."""
         return int(self.turns > 1) if self.memory is None else self.memory
 
-    def check_clock(self) -> None:
-        """Raise a ValueError for a chance of a further turn where none can follow."""
+    def __post_init__(self) -> None:
+        super().__post_init__()
         if self.turns == 1 and self.continue_prob < 1:
             name = type(self).__name__
             raise ValueError(f"{name}.continue_prob is {self.continue_prob}; allowed for one turn: 1.0")

@@ -4,15 +4,15 @@
 """
 
 from dataclasses import KW_ONLY, dataclass, fields
-from typing import Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from cprl.checks import NONE, Check, check_fields, count, either, instance, is_number
-from cprl.envs.stage_games import CLOCK_CHECKS, StageEnv, StageGame
-from cprl.theory.sharing import SharingGame
+from cprl.envs.stage_games import Memory, StageEnv, StageGame
+from cprl.theory.sharing import Above0, SharingGame
+from cprl.values import Positive, PositiveShare, Range
 
 _MOST_TOTALS: Final = 2**22
 """How many totals there may be when agents choose from levels."""
@@ -36,22 +36,21 @@ class TakingGame(StageGame):
     sharing: SharingGame
     """What agents are paid, and how many they are; e.g. `cprl.theory.herders(5)`."""
     _: KW_ONLY
-    levels: int = 21
+    levels: Annotated[int, Range(2, 2**16)] = 21
     """From how many evenly spaced amounts an agent chooses, 0 the first."""
-    most: float | None = None
+    most: Above0 | None = None
     """The most that an agent can take in a turn. By default twice what it takes in the symmetric equilibrium,
     or what the game itself allows, `SharingGame.most_each`, if that is less."""
-    turns: int = 1
+    turns: Positive = 1
     """Turns of an episode, at most."""
-    memory: int | None = None
+    memory: Memory = None
     """Of how many of the last turns agents observe what was taken, each as three numbers; by default 1, and 0
     in a game of one turn, in which the observation is the number 1."""
-    continue_prob: float = 1.0
-    """The probability that a further turn follows, above 0."""
+    continue_prob: PositiveShare = 1.0
+    """The probability that a further turn follows."""
 
     def __post_init__(self) -> None:
-        check_fields(self, _CHECKS)
-        self.check_clock()
+        super().__post_init__()
         limit = self.sharing.most_each
         if self.most is None and self.sharing.nash_total <= 0:
             raise ValueError(
@@ -95,21 +94,6 @@ class TakingGame(StageGame):
     def make(self, worlds: int, seed: int, device: Any, *, first_world: int = 0) -> "TakingEnv":
         """Its environment, so many worlds; see `TakingEnv`."""
         return TakingEnv(self, worlds, seed=seed, device=device, first_world=first_world)
-
-
-_MOST: Final = 1e12
-
-
-def _is_positive(value: Any) -> bool:
-    return is_number(value, 0, _MOST) and value > 0
-
-
-_CHECKS: Final[dict[str, Check]] = {
-    "sharing": instance(SharingGame, "a cprl.theory.SharingGame, e.g. herders(5)"),
-    "levels": count(2, 2**16),
-    "most": either(NONE, Check(_is_positive, f"a number above 0, up to {_MOST:g}")),
-    **CLOCK_CHECKS,
-}
 
 
 class TakingEnv(StageEnv):

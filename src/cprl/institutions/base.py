@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import ClassVar, Final
+from typing import Annotated, ClassVar, Final
 
-from cprl.checks import NONE, SWITCH, Check, either, number
+from cprl.values import Range, Value
 
 MOST_INSTITUTIONS: Final = 64
 """The largest number of institutions of a game."""
@@ -12,14 +12,12 @@ MOST_INSTITUTIONS: Final = 64
 MOST_APPLES: Final = 1e6
 """The largest amount that an institution takes or gives at once."""
 
-FINE: Final = either(number(0, MOST_APPLES), NONE)
-AMOUNT: Final = number(0, MOST_APPLES)
-PROBABILITY: Final = number(0, 1)
-OBSERVED: Final[dict[str, Check]] = {"observed": SWITCH}
+Amount = Annotated[float, Range(0, MOST_APPLES)]
+"""Apples."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Institution:
+class Institution(Value, stored=False):
     """A rule that people make, as a value that a game carries: `Game(..., institutions=(Quota(), Tax()))`.
 
     Institutions act inside the turn, see `docs/institutions.md`. Amounts are in apples.

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 from string import ascii_lowercase, digits
-from typing import Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final
 
-from cprl.checks import Check, check_fields, shown
-from cprl.institutions.base import FINE, OBSERVED, Institution
+from cprl.institutions.base import Amount, Institution
+from cprl.values import Where, shown
 
 OPEN: Final = "."
 """The sign of a cell that everybody may use."""
@@ -13,6 +13,21 @@ NOBODY: Final = "-"
 """The sign of a cell that nobody may use: a reserve."""
 SIGNS: Final = digits + ascii_lowercase
 """The signs of the regions of agents 0, 1, ..., where `owners` is None."""
+
+Regions = Annotated[
+    tuple[str, ...],
+    Where(
+        lambda rows: len({len(row) for row in rows}) == 1 and all(row.isprintable() and row for row in rows),
+        "equally long texts, one per row of the board, a sign per cell",
+    ),
+]
+Owners = Annotated[
+    tuple[str, ...],
+    Where(
+        lambda owners: owners and all(OPEN not in signs and NOBODY not in signs for signs in owners),
+        "a text per agent: the signs of the regions that it may use",
+    ),
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,26 +38,23 @@ class Boundaries(Institution):
     Agents observe, for each cell of their window, whether a bite there would break a rule.
     """
 
-    regions: tuple[str, ...]
+    regions: Regions
     """The board, a text per row with one sign per cell: "." is open to all, "-" to nobody, any other sign
     names a region."""
 
-    owners: tuple[str, ...] | None = None
+    owners: Owners | None = None
     """For each agent the signs of the regions that it may use, e.g. ("a", "a", "ab"). None: agent i may use
     the region of its own sign, 0 to 9, then a to z."""
 
-    bite_fine: float | None = None
-    """None: nobody can harvest in the region of others. A number, at least 0: it can be done, is a violation,
+    bite_fine: Amount | None = None
+    """None: nobody can harvest in the region of others. A number: it can be done, is a violation,
     and costs so many apples if it is detected."""
 
-    step_fine: float | None = None
-    """None: everybody may stand anywhere. A number, at least 0: each turn that ends in the region of others
+    step_fine: Amount | None = None
+    """None: everybody may stand anywhere. A number: each turn that ends in the region of others
     is a violation, and costs so many apples if it is detected."""
 
     principle: ClassVar[str] = "1 clearly defined boundaries"
-
-    def __post_init__(self) -> None:
-        check_fields(self, _CHECKS)
 
     @classmethod
     def drawn(cls, drawing: str, **fields: Any) -> "Boundaries":
@@ -86,29 +98,3 @@ class Boundaries(Institution):
                         f"Boundaries.regions has {shown(sign)} in row {row}, column {col}, which no agent "
                         "may use; allowed: '.', '-' and the signs of owners"
                     )
-
-
-def _are_rows(value: Any) -> bool:
-    return (
-        isinstance(value, tuple)
-        and bool(value)
-        and all(isinstance(row, str) and row and row.isprintable() for row in value)
-        and len({len(row) for row in value}) == 1
-    )
-
-
-def _are_owners(value: Any) -> bool:
-    return value is None or (
-        isinstance(value, tuple)
-        and bool(value)
-        and all(isinstance(signs, str) and OPEN not in signs and NOBODY not in signs for signs in value)
-    )
-
-
-_CHECKS: Final[dict[str, Check]] = {
-    **OBSERVED,
-    "regions": Check(_are_rows, "equally long texts, one per row of the board, a sign per cell"),
-    "owners": Check(_are_owners, "None, or a text per agent: the signs of the regions that it may use"),
-    "bite_fine": FINE,
-    "step_fine": FINE,
-}

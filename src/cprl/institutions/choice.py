@@ -3,16 +3,24 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import prod
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import Annotated, ClassVar, Final, NamedTuple
 
-from cprl.checks import Check, check_fields, count, instance, is_count, is_number
-from cprl.institutions.base import OBSERVED, PROBABILITY, Institution, check_agent_indices, check_no_election
+from cprl.institutions.base import MOST_APPLES, Amount, Institution, check_agent_indices, check_no_election
 from cprl.institutions.monitoring import ELECTED, Monitoring
 from cprl.institutions.quotas import Quota
 from cprl.institutions.taxes import Tax
+from cprl.values import AgentIndices, Positive, Share, Where
 
 MOST_DECISIONS: Final = 2**20
 """The largest number of options that an agent chooses from."""
+
+Choices = Annotated[
+    tuple[Amount, ...],
+    Where(
+        lambda choices: len(choices) >= 2 and list(choices) == sorted(set(choices)),
+        f"two or more numbers in 0..{MOST_APPLES:g}, ascending",
+    ),
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,21 +34,21 @@ class Vote(Institution):
     on: Tax | Quota
     """The institution whose `rate` or `share` is voted on; its own value is not used."""
 
-    choices: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
+    choices: Choices = (0.0, 0.25, 0.5, 0.75, 1.0)
     """The values to choose from, ascending, at least two; of a tax 0..1."""
 
-    period_episodes: int = 1
+    period_episodes: Positive = 1
     """A vote is held in every such number of episodes, from the first one; its result stays in force until
     the next."""
 
-    override_prob: float = 0.0
+    override_prob: Share = 0.0
     """The probability that an authority from outside puts a choice in force by chance, all equally likely, in
     place of the result of a vote (the opposite of Ostrom's principle 7, the right to organise)."""
 
     principle: ClassVar[str] = "3 collective choice"
 
     def __post_init__(self) -> None:
-        check_fields(self, _VOTE)
+        super().__post_init__()
         if isinstance(self.on, Tax) and (self.on.brackets or self.choices[-1] > 1):
             raise ValueError(
                 "Vote.on is a Tax with brackets; allowed: a Tax with one rate"
@@ -58,13 +66,13 @@ class Sanctioner(Institution):
     game's chance. Agents observe whether they may fire.
     """
 
-    agents: tuple[int, ...] | None = None
+    agents: AgentIndices | None = None
     """The agents that may fire; None for an election."""
 
-    period_episodes: int = 1
+    period_episodes: Positive = 1
     """An election is held in every such number of episodes, from the first one."""
 
-    override_prob: float = 0.0
+    override_prob: Share = 0.0
     """The probability that an authority from outside appoints an agent by chance, all equally likely, in
     place of the elected one."""
 
@@ -72,7 +80,7 @@ class Sanctioner(Institution):
     at_most: ClassVar[int | None] = 1
 
     def __post_init__(self) -> None:
-        check_fields(self, _SANCTIONER)
+        super().__post_init__()
         if self.agents is not None:
             check_no_election(self, "agents is None, so that they are elected")
 
@@ -127,36 +135,3 @@ def decision_options(institutions: Sequence[Institution], agents: int) -> int:
     """The number of options of ("agents", "decision"); 0 where there is nothing to decide."""
     sizes = [len(ballot.choices) for ballot in ballots(institutions, agents)]
     return prod(sizes) if sizes else 0
-
-
-def _are_choices(value: Any) -> bool:
-    return (
-        isinstance(value, tuple)
-        and len(value) >= 2
-        and all(is_number(choice, 0, 1e6) for choice in value)
-        and list(value) == sorted(set(value))
-    )
-
-
-def _are_agents(value: Any) -> bool:
-    return value is None or (
-        isinstance(value, tuple)
-        and bool(value)
-        and all(is_count(agent, 0) for agent in value)
-        and list(value) == sorted(set(value))
-    )
-
-
-_VOTE: Final[dict[str, Check]] = {
-    **OBSERVED,
-    "on": instance(Tax | Quota, "a Tax or a Quota"),
-    "choices": Check(_are_choices, "two or more numbers of at least 0, ascending"),
-    "period_episodes": count(1),
-    "override_prob": PROBABILITY,
-}
-_SANCTIONER: Final[dict[str, Check]] = {
-    **OBSERVED,
-    "agents": Check(_are_agents, "None for an election, or ascending agent indices, at least one"),
-    "period_episodes": count(1),
-    "override_prob": PROBABILITY,
-}

@@ -1,10 +1,10 @@
 """Limits on the harvest that fit the resource: quotas, closed seasons and closed patches."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Annotated, ClassVar
 
-from cprl.checks import SWITCH, Check, check_fields, count, number
-from cprl.institutions.base import FINE, OBSERVED, Institution
+from cprl.institutions.base import Amount, Institution
+from cprl.values import Natural, Positive, Range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,24 +17,21 @@ class Quota(Institution):
     proven lower bound. Agents observe the part of their quota that is left and the time left in the window.
     """
 
-    share: float = 1.0
-    """Of the sustainable yield that all agents together may take, at least 0."""
+    share: Annotated[float, Range(0, 1e6)] = 1.0
+    """Of the sustainable yield that all agents together may take."""
 
-    window_steps: int = 50
-    """The length of a window in turns, at least 1."""
+    window_steps: Positive = 50
+    """The length of a window in turns."""
 
     by_stock: bool = False
     """Whether the quota of a window is multiplied by the share of all sites that hold an apple when it
     begins."""
 
-    fine: float | None = None
-    """None: nobody can harvest more. A number, at least 0: it can be done, is a violation, and each bite
+    fine: Amount | None = None
+    """None: nobody can harvest more. A number: it can be done, is a violation, and each bite
     above the quota costs so many apples if it is detected."""
 
     principle: ClassVar[str] = "2 rules that fit local conditions"
-
-    def __post_init__(self) -> None:
-        check_fields(self, _QUOTA)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,20 +42,20 @@ class ClosedSeason(Institution):
     which bites are forbidden. Agents observe whether the season is closed, and how long it stays so.
     """
 
-    period_steps: int = 100
-    """The length of a period in turns, at least 1."""
+    period_steps: Positive = 100
+    """The length of a period in turns."""
 
-    closed_steps: int = 25
+    closed_steps: Natural = 25
     """The last turns of each period, in which the season is closed: 0 to `period_steps`."""
 
-    fine: float | None = None
-    """None: nobody can harvest in a closed season. A number, at least 0: it can be done, is a violation, and
+    fine: Amount | None = None
+    """None: nobody can harvest in a closed season. A number: it can be done, is a violation, and
     each bite costs so many apples if it is detected."""
 
     principle: ClassVar[str] = "2 rules that fit local conditions"
 
     def __post_init__(self) -> None:
-        check_fields(self, _SEASON)
+        super().__post_init__()
         if self.closed_steps > self.period_steps:
             raise ValueError(
                 f"ClosedSeason.closed_steps is {self.closed_steps}; allowed: up to period_steps, "
@@ -75,31 +72,12 @@ class ClosedPatches(Institution):
     their window, whether a bite there would break a rule.
     """
 
-    below: int = 2
-    """The number of apples, at least 0, below which a patch is closed."""
+    below: Natural = 2
+    """The number of apples below which a patch is closed."""
 
-    fine: float | None = None
-    """None: nobody can harvest in a closed patch. A number, at least 0: it can be done, is a violation, and
+    fine: Amount | None = None
+    """None: nobody can harvest in a closed patch. A number: it can be done, is a violation, and
     each bite costs so many apples if it is detected."""
 
     principle: ClassVar[str] = "2 rules that fit local conditions"
     at_most: ClassVar[int | None] = 1
-
-    def __post_init__(self) -> None:
-        check_fields(self, _PATCHES)
-
-
-_QUOTA: Final[dict[str, Check]] = {
-    **OBSERVED,
-    "share": number(0, 1e6),
-    "window_steps": count(1),
-    "by_stock": SWITCH,
-    "fine": FINE,
-}
-_SEASON: Final[dict[str, Check]] = {
-    **OBSERVED,
-    "period_steps": count(1),
-    "closed_steps": count(0),
-    "fine": FINE,
-}
-_PATCHES: Final[dict[str, Check]] = {**OBSERVED, "below": count(0), "fine": FINE}

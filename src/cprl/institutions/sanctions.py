@@ -1,12 +1,23 @@
 """What follows an offence: graduated sanctions, and mediation of tags."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Literal, get_args
+from typing import Annotated, ClassVar, Literal
 
-from cprl.checks import NONE, Check, check_fields, count, either, is_count, is_table, one_of, tuple_of
-from cprl.institutions.base import AMOUNT, OBSERVED, Institution
+from cprl.institutions.base import Amount, Institution
+from cprl.values import Natural, Positive, Where
 
 Offence = Literal["tags", "violations", "both"]
+Freezes = Annotated[
+    tuple[Natural, ...] | tuple[tuple[Natural, ...], ...],
+    Where(
+        lambda steps: (
+            len(steps) > 0
+            and (isinstance(steps[0], int) or (len({len(row) for row in steps}) == 1 and len(steps[0]) > 0))
+        ),
+        "integers >= 0 by level, or equally long rows of them by shooter",
+    ),
+]
+Fines = Annotated[tuple[Amount, ...], Where(len, "one or more numbers >= 0, by level")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,15 +29,15 @@ class GraduatedSanctions(Institution):
     level 0; each one raises the level of the next. Agents observe their level, 0..1.
     """
 
-    freeze_steps: tuple[int, ...] | tuple[tuple[int, ...], ...] = (5, 25, 100, 100)
+    freeze_steps: Freezes = (5, 25, 100, 100)
     """The turns that an offender misses, by level; the last entry also applies to every higher level. A table
     has a row for each agent that tags, and is allowed with on="tags" alone. For tags it takes the place of
     `Rules.freeze_steps`."""
 
-    fines: tuple[float, ...] = (0.0, 1.0, 2.0, 4.0)
+    fines: Fines = (0.0, 1.0, 2.0, 4.0)
     """The apples that an offender pays, by level; the last entry also applies to every higher level."""
 
-    recovery_steps: int | None = 50
+    recovery_steps: Positive | None = 50
     """After each such number of turns without an offence the level falls by one; None for never."""
 
     on: Offence = "both"
@@ -37,7 +48,7 @@ class GraduatedSanctions(Institution):
     at_most: ClassVar[int | None] = 1
 
     def __post_init__(self) -> None:
-        check_fields(self, _SANCTIONS)
+        super().__post_init__()
         if self.is_table and self.on != "tags":
             raise ValueError(
                 f'GraduatedSanctions.on is "{self.on}" and freeze_steps has a row per agent; allowed with '
@@ -68,31 +79,12 @@ class Mediation(Institution):
     the following indices, cyclically; to know them apart they need `Observation.agents_apart`.
     """
 
-    turns: int = 10
-    """The number of turns, this one included, in which a violation justifies a tag; at least 1."""
+    turns: Positive = 10
+    """The number of turns, this one included, in which a violation justifies a tag."""
 
-    refund: float = 1.0
-    """The apples that the tagged agent is paid, at least 0."""
+    refund: Amount = 1.0
+    """The apples that the tagged agent is paid."""
 
     principle: ClassVar[str] = "6 conflict resolution"
     at_most: ClassVar[int | None] = 1
     needs: ClassVar[tuple[str, ...]] = ("agents_apart",)
-
-    def __post_init__(self) -> None:
-        check_fields(self, _MEDIATION)
-
-
-def _are_freezes(value: Any) -> bool:
-    if isinstance(value, tuple) and value and all(is_count(steps, 0) for steps in value):
-        return True
-    return is_table(value, lambda steps: is_count(steps, 0))
-
-
-_SANCTIONS: Final[dict[str, Check]] = {
-    **OBSERVED,
-    "freeze_steps": Check(_are_freezes, "integers >= 0 by level, or equally long rows of them by shooter"),
-    "fines": tuple_of(AMOUNT, 1),
-    "recovery_steps": either(count(1), NONE),
-    "on": one_of(*get_args(Offence)),
-}
-_MEDIATION: Final[dict[str, Check]] = {**OBSERVED, "turns": count(1), "refund": AMOUNT}

@@ -2,16 +2,16 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from cprl.checks import Check, check_fields, count, number
 from cprl.commons.game import Game
 from cprl.learners.lanes import EVALUATION, EXHIBITION, EXPLORATION, lane_names, lane_seeds
 from cprl.policies.decisions import UNTRIED, Decider, Doubles, Longs, ballot_sizes, choices_of
+from cprl.values import Positive, Range, Share, Value
 
 _OF_DECISIONS: Final = 16
 """Added to the purpose of a lane's random numbers, so that decisions have some of their own."""
@@ -25,7 +25,7 @@ def decision_seeds(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bandit:
+class Bandit(Value):
     """How an agent learns its decisions: epsilon-greedy, with a value for each choice of each ballot.
 
     After an episode with the return G the value of the choice that was in it moves towards G, by
@@ -35,31 +35,20 @@ class Bandit:
     Source: Sutton and Barto, "Reinforcement Learning" (2nd edition, 2018), sections 2.4 and 2.5.
     """
 
-    step_size: float = 0.1
-    """The smallest step by which a value moves towards a return, 1e-6..1."""
-    epsilon_start: float = 1.0
-    """Probability of a random choice in the first episode, 0..1. While others choose at random, a vote often
+    step_size: Annotated[float, Range(1e-6, 1)] = 0.1
+    """The smallest step by which a value moves towards a return."""
+    epsilon_start: Share = 1.0
+    """Probability of a random choice in the first episode. While others choose at random, a vote often
     decides, so its value shows."""
-    epsilon_end: float = 0.1
-    """Probability of a random choice after the decay, 0..1."""
-    epsilon_decay_episodes: int = 100
-    """Episodes of the linear decay, at least 1."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, _BANDIT)
+    epsilon_end: Share = 0.1
+    """Probability of a random choice after the decay."""
+    epsilon_decay_episodes: Positive = 100
+    """Episodes of the linear decay."""
 
     def epsilon(self, episode: int) -> float:
         """The probability of a random choice in an episode, counted from 0."""
         done = min(1.0, episode / self.epsilon_decay_episodes)
         return self.epsilon_start + done * (self.epsilon_end - self.epsilon_start)
-
-
-_BANDIT: Final[dict[str, Check]] = {
-    "step_size": number(1e-6, 1),
-    "epsilon_start": number(0, 1),
-    "epsilon_end": number(0, 1),
-    "epsilon_decay_episodes": count(1),
-}
 
 
 class BanditDecider(Decider):

@@ -9,7 +9,7 @@ values of a recipe, then `wanted_rewards`, a pure function, and `WantedRewards`,
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import pi
-from typing import Any, ClassVar, Final, Literal, TypeAlias
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -22,15 +22,14 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from cprl import keys
-from cprl.checks import Check, check_fields, checked, either, instance, number, one_of
+from cprl.values import Range, Share, Value, Where, checked
 
-_WEIGHT: Final = number(0, 1e6)
-_SHARE: Final = number(0, 1)
-_ANGLE: Final = Check(number(-pi, pi).fits, "radians in -pi..pi, e.g. math.radians(45)")
+Weight = Annotated[float, Range(0, 1e6)]
+Angle = Annotated[float, Where(lambda angle: -pi <= angle <= pi, "radians in -pi..pi, e.g. math.radians(45)")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class InequityAversion:
+class InequityAversion(Value):
     """Dislikes having less than others, and having more.
 
     r'_i = r_i - alpha / (N - 1) sum_j max(e_j - e_i, 0) - beta / (N - 1) sum_j max(e_i - e_j, 0), over the
@@ -41,22 +40,19 @@ class InequityAversion:
     after Fehr and Schmidt (1999).
 
     Args:
-        alpha: the dislike of being behind (disadvantageous inequity), 0..1e6; 5 is usual.
-        beta: the dislike of being ahead (advantageous inequity), 0..1e6; 0.05 is usual.
-        smoothing: the share of smoothed rewards that lasts into the next turn, 0..1; gamma x lambda of the
+        alpha: the dislike of being behind (disadvantageous inequity); 5 is usual.
+        beta: the dislike of being ahead (advantageous inequity); 0.05 is usual.
+        smoothing: the share of smoothed rewards that lasts into the next turn; gamma x lambda of the
             source. With 0 only the rewards of the turn are compared, with 1 the returns so far.
     """
 
-    alpha: float
-    beta: float
-    smoothing: float
-
-    def __post_init__(self) -> None:
-        check_fields(self, {"alpha": _WEIGHT, "beta": _WEIGHT, "smoothing": _SHARE})
+    alpha: Weight
+    beta: Weight
+    smoothing: Share
 
 
 @dataclass(frozen=True, kw_only=True)
-class SocialValueOrientation:
+class SocialValueOrientation(Value):
     """Dislikes turns in which rewards are shared in another proportion than it likes.
 
     r'_i = r_i - weight x |angle - theta_i|, with theta_i = atan2(mean of the others' rewards, r_i), in
@@ -67,20 +63,17 @@ class SocialValueOrientation:
     (2020), where rewards are never negative, so that the shorter way is the plain difference.
 
     Args:
-        angle: the proportion that it likes, radians in -pi..pi: 0 is for itself alone, pi / 4 for both
+        angle: the proportion that it likes, in radians: 0 is for itself alone, pi / 4 for both
             alike, pi / 2 for others alone, negative against others.
-        weight: reward lost per radian, 0..1e6.
+        weight: reward lost per radian.
     """
 
-    angle: float
-    weight: float
-
-    def __post_init__(self) -> None:
-        check_fields(self, {"angle": _ANGLE, "weight": _WEIGHT})
+    angle: Angle
+    weight: Weight
 
 
 @dataclass(frozen=True)
-class Exchange:
+class Exchange(Value):
     """Gives a share of its reward away, and gets one of each other's: r'_i = (1 - share) r_i + share x mean
     of the others' rewards.
 
@@ -90,29 +83,18 @@ class Exchange:
     (2024), in which 1 - share is the self-interest level.
 
     Args:
-        share: 0..1: 0 is the agent's own reward, 1 that of the others alone.
+        share: 0 is the agent's own reward, 1 that of the others alone.
     """
 
-    share: float
-
-    def __post_init__(self) -> None:
-        check_fields(self, {"share": _SHARE})
+    share: Share
 
 
 Preference: TypeAlias = Literal["individual", "team"] | InequityAversion | SocialValueOrientation | Exchange
 """What an agent wants: "individual", its own reward; "team", the sum over all agents; or a comparison of its
 own with those of others."""
 
-PREFERENCE: Final = either(
-    one_of("individual", "team"),
-    instance(
-        InequityAversion | SocialValueOrientation | Exchange,
-        "InequityAversion, SocialValueOrientation, Exchange of cprl.learners.preferences",
-    ),
-)
 
-
-def check_preference(name: str, preference: Any, agents: int) -> None:
+def check_preference(name: str, preference: Preference, agents: int) -> None:
     """Refuses what is no preference, or none for a game of so few agents.
 
     Args:
@@ -120,7 +102,7 @@ def check_preference(name: str, preference: Any, agents: int) -> None:
         preference: a value of `Preference`.
         agents: the number of agents N of the game.
     """
-    checked(name, preference, PREFERENCE)
+    checked(name, preference, Preference)
     if agents < 2 and not isinstance(preference, str):
         raise ValueError(
             f"{name} is {named(preference)}, which compares an agent with others, in a game of {agents} "
@@ -217,10 +199,10 @@ class WantedRewards:
     def __init__(self, preferences: Preference | Sequence[Preference]) -> None:
         self.preferences = preferences
         listed = tuple(preferences) if isinstance(preferences, list | tuple) else None
-        for place, own in enumerate(listed or ()):
-            checked(f"preferences[{place}]", own, PREFERENCE)
+        for place, preference in enumerate(listed or ()):
+            checked(f"preferences[{place}]", preference, Preference)
         if not listed:
-            checked("preferences", preferences, PREFERENCE)
+            checked("preferences", preferences, Preference)
         self._listed = listed
         kinds: Any = dict.fromkeys(listed) if listed else [preferences]
         self._columns = {

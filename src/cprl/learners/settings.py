@@ -1,26 +1,14 @@
 """The hyperparameters of learning agents, with their units and sources."""
 
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.checks import (
-    MOST_INT64,
-    NONE,
-    SWITCH,
-    Check,
-    check_fields,
-    count,
-    either,
-    instance,
-    number,
-    one_of,
-    tuple_of,
-)
 from cprl.custom import Custom
-from cprl.networks.mlp import LAYERS
+from cprl.networks.mlp import Layers
+from cprl.values import MOST_INT64, Natural, Positive, Range, Share, Steps, Value
 
 Optimizer = Literal["adam", "adamw", "rmsprop", "keras_rmsprop", "sgd"]
 """Optimisers of `torch.optim` with torch's defaults; "keras_rmsprop" is `torch.optim.RMSprop` with the decay
@@ -30,24 +18,28 @@ not centre (`keras/optimizers.py` of that version)."""
 DEFAULT_HIDDEN_CELLS: Final = (32, 32)
 """Units of each hidden layer in the published study."""
 
+LearningRate = Annotated[float, Range(1e-12, 100)]
+# 0, and what float32 rounds to 0, would divide 0 by 0 wherever a gradient is 0.
+OptimizerEps = Annotated[float, Range(1e-30, 1)]
+NormLimit = Annotated[float, Range(1e-6, 1e12)] | None
+LongSteps = Annotated[int, Range(0, MOST_INT64)]
+Turns = Annotated[int, Range(1, 1000)]
+
 
 @dataclass(frozen=True, kw_only=True)
-class Exploring:
+class Exploring(Value, stored=False):
     """Epsilon-greedy exploration: the probability of a random action is held, then decays linearly."""
 
-    epsilon_start: float = 1.0
-    """Probability of a random action at the start, 0..1."""
-    epsilon_end: float = 0.1
-    """Probability of a random action after the decay, 0..1."""
-    epsilon_hold_steps: int = 800
+    epsilon_start: Share = 1.0
+    """Probability of a random action at the start."""
+    epsilon_end: Share = 0.1
+    """Probability of a random action after the decay."""
+    epsilon_hold_steps: LongSteps = 800
     """Steps at `epsilon_start` before the decay."""
-    epsilon_decay_steps: int = 500_000
+    epsilon_decay_steps: Steps = 500_000
     """Steps of the linear decay after the hold."""
-    epsilon_evaluation: float = 0.05
-    """Probability of a random action in evaluation, 0..1."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, _EXPLORING)
+    epsilon_evaluation: Share = 0.05
+    """Probability of a random action in evaluation."""
 
     def epsilon(self, step: int) -> float:
         """The probability of a random action at a step, counted from 0."""
@@ -63,42 +55,42 @@ class DQNSettings(Exploring):
     and, for fields marked [run], the program of the study.
     """
 
-    buffer_size: int = 100_000
+    buffer_size: Annotated[int, Range(1, 2**40 - 1)] = 100_000
     """Capacity of the replay buffer, in transitions."""
-    batch_size: int = 8
+    batch_size: Positive = 8
     """Transitions in a minibatch, or sequences of `sequence_steps` transitions."""
-    learning_starts: int = 16
+    learning_starts: Steps = 16
     """Transitions stored before the first update; after that `updates_per_step` updates follow every
     `steps_per_update` environment steps."""
-    gamma: float = 0.995
+    gamma: Share = 0.995
     """Discount factor per step."""
-    learning_rate: float = 1e-5
-    """The optimiser's step size, 1e-12..100."""
-    adam_eps: float = 1e-8
-    """Added to the denominator of Adam, AdamW and both kinds of RMSprop, 1e-30..1; [run] 1e-7, Keras's."""
-    hidden_cells: tuple[int, ...] = DEFAULT_HIDDEN_CELLS
+    learning_rate: LearningRate = 1e-5
+    """The optimiser's step size."""
+    adam_eps: OptimizerEps = 1e-8
+    """Added to the denominator of Adam, AdamW and both kinds of RMSprop; [run] 1e-7, Keras's."""
+    hidden_cells: Layers = DEFAULT_HIDDEN_CELLS
     """Units of each hidden layer, with ReLU; used if the algorithm has no `network`."""
-    updates_per_step: int = 1
+    updates_per_step: Positive = 1
     """Updates per environment step, or after `steps_per_update` of them, each with a new minibatch."""
-    steps_per_update: int = 1
+    steps_per_update: Steps = 1
     """Environment steps from one update to the next; the study updates after each, Mnih et al. (2015) after
     every fourth, with minibatches of 32."""
-    n_steps: int = 1
+    n_steps: Turns = 1
     """Rewards that an n-step target sums before it bootstraps; fewer if the episode ends sooner. As TorchRL's
     `MultiStepTransform`; the study used 1."""
-    sequence_steps: int = 1
+    sequence_steps: Turns = 1
     """Consecutive turns T of each sampled sequence, through which gradients of a recurrent network run: 2 or
     more for such a network, 1 for any other. A minibatch then has `batch_size` sequences. Hausknecht and
     Stone (2015) took 10 turns, Kapturowski et al. (2019) 80."""
     optimizer: Optimizer = "adam"
     """See `Optimizer`; [run] "adam", and "keras_rmsprop" in some versions of experiment 5."""
-    tau: float | None = None
-    """Soft target updates: the fraction by which targets move towards the network after each update, 1e-6..1;
+    tau: Annotated[float, Range(1e-6, 1)] | None = None
+    """Soft target updates: the fraction by which targets move towards the network after each update;
     None for a copy every `target_every_episodes` episodes."""
     replay_transforms: tuple[Custom, ...] = ()
     """TorchRL transforms of the replay buffer, in order: sampled batches pass through them, and stored
     transitions through their inverse. Random transforms use torch's global generator."""
-    target_every_episodes: int = 3
+    target_every_episodes: Steps = 3
     """Episodes between copies of the network to its target if `tau` is None; experiment 5 used 3 or 10."""
     relu_on_outputs: bool = False
     """[run] Whether the Q values pass through ReLU too; refused for C51, SAC and IQL."""
@@ -111,7 +103,7 @@ class DQNSettings(Exploring):
     else over the batch alone. Every loss is divided by A then, whatever its function."""
 
     def __post_init__(self) -> None:
-        check_fields(self, _DQN)
+        super().__post_init__()
         longest = max(1, min(self.learning_starts, self.buffer_size // 2))
         for name, turns in {"n_steps": self.n_steps, "sequence_steps": self.sequence_steps}.items():
             if turns > longest:
@@ -125,35 +117,35 @@ class DQNSettings(Exploring):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RolloutSettings:
+class RolloutSettings(Value):
     """Hyperparameters of one independent on-policy agent. The study has none; the defaults are ours."""
 
-    rollout_steps: int = 250
+    rollout_steps: Positive = 250
     """Steps T collected between updates."""
-    epochs: int = 4
+    epochs: Positive = 4
     """Passes over each rollout."""
-    minibatch_size: int = 50
+    minibatch_size: Positive = 50
     """Steps in a minibatch; must divide `rollout_steps`."""
-    gamma: float = 0.995
+    gamma: Share = 0.995
     """Discount factor per step."""
     optimizer: Optimizer = "adam"
     """See `Optimizer`."""
-    gae_lambda: float = 0.95
-    """Lambda of generalised advantage estimation, 0..1 (Schulman et al. 2016)."""
+    gae_lambda: Share = 0.95
+    """Lambda of generalised advantage estimation (Schulman et al. 2016)."""
     normalize_advantage: bool = True
     """Whether each agent's advantages of a rollout are normalised to mean 0 and standard deviation 1."""
-    learning_rate: float = 3e-4
-    """The optimiser's step size, 1e-12..100."""
-    adam_eps: float = 1e-5
-    """Added to the denominator of Adam, AdamW and both kinds of RMSprop, 1e-30..1."""
-    max_grad_norm: float | None = 0.5
-    """The norm to which an agent's gradient is clipped, 1e-6 or more; None for no clipping."""
-    hidden_cells: tuple[int, ...] = DEFAULT_HIDDEN_CELLS
+    learning_rate: LearningRate = 3e-4
+    """The optimiser's step size."""
+    adam_eps: OptimizerEps = 1e-5
+    """Added to the denominator of Adam, AdamW and both kinds of RMSprop."""
+    max_grad_norm: NormLimit = 0.5
+    """The norm to which an agent's gradient is clipped; None for no clipping."""
+    hidden_cells: Layers = DEFAULT_HIDDEN_CELLS
     """Units of each hidden layer, with ReLU, of the actor and of the critic; used if the algorithm has no
     `network`."""
 
     def __post_init__(self) -> None:
-        check_fields(self, _ROLLOUTS)
+        super().__post_init__()
         if self.rollout_steps % self.minibatch_size:
             raise ValueError(
                 f"RolloutSettings.minibatch_size is {self.minibatch_size}; it must divide rollout_steps, "
@@ -170,21 +162,18 @@ class RolloutSettings:
 class TabularSettings(Exploring):
     """Hyperparameters of one tabular agent. The study gives none; the defaults are ours."""
 
-    gamma: float = 0.995
+    gamma: Share = 0.995
     """Discount factor per step, as `DQNSettings.gamma`."""
-    learning_rate: float | Literal["1/visits"] = 0.1
-    """alpha: a number in 0..1, or one divided by the number of visits of that action in that state."""
-    visits_power: float = 1.0
+    learning_rate: Share | Literal["1/visits"] = 0.1
+    """alpha: a number, or one divided by the number of visits of that action in that state."""
+    visits_power: Share = 1.0
     """With "1/visits", alpha is 1 / visits ** visits_power. Powers below 1 forget early targets sooner, which
     came from values that were still wrong: 0.5..1 needs far fewer steps (Even-Dar and Mansour 2003)."""
-    epsilon_decay_steps: int = 50_000
+    epsilon_decay_steps: Steps = 50_000
     """Steps of the linear decay after the hold."""
-    max_states: int = 100_000
+    max_states: Positive = 100_000
     """The largest number of states in an agent's table; one more raises a MemoryError. A state takes the
     bytes of its observation, 16 per action and about 150 more."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, _TABULAR)
 
     def rates(self, visits: NDArray[np.int64]) -> NDArray[np.float64]:
         """alpha of values with these numbers of visits, the current one included."""
@@ -193,122 +182,46 @@ class TabularSettings(Exploring):
         return np.full(visits.shape, self.learning_rate)
 
 
-_SHARE: Final = number(0, 1)
-_LEARNING_RATE: Final = number(1e-12, 100)
-_OPTIMISED: Final[dict[str, Check]] = {
-    "gamma": _SHARE,
-    "optimizer": one_of(*get_args(Optimizer)),
-    "learning_rate": _LEARNING_RATE,
-    # 0, and what float32 rounds to 0, would divide 0 by 0 wherever a gradient is 0.
-    "adam_eps": number(1e-30, 1),
-    "hidden_cells": LAYERS,
-}
-_EXPLORING: Final[dict[str, Check]] = {
-    "epsilon_start": _SHARE,
-    "epsilon_end": _SHARE,
-    "epsilon_hold_steps": count(0, MOST_INT64),
-    "epsilon_decay_steps": count(1, MOST_INT64),
-    "epsilon_evaluation": _SHARE,
-}
-_DQN: Final[dict[str, Check]] = {
-    **_EXPLORING,
-    **_OPTIMISED,
-    "buffer_size": count(1, 2**40 - 1),
-    "batch_size": count(1),
-    "learning_starts": count(1, MOST_INT64),
-    "updates_per_step": count(1),
-    "steps_per_update": count(1, MOST_INT64),
-    "n_steps": count(1, 1000),
-    "sequence_steps": count(1, 1000),
-    "tau": either(number(1e-6, 1), Check(NONE.fits, "None for copies every target_every_episodes episodes")),
-    "replay_transforms": tuple_of(
-        instance(
-            Custom,
-            'Custom("torchrl.envs:RewardScaling", arguments={...}); for an instance call append_transform on '
-            "the learner's buffer",
-        )
-    ),
-    "target_every_episodes": count(1, MOST_INT64),
-    "relu_on_outputs": SWITCH,
-    "glorot_uniform": SWITCH,
-    "own_target_weights": SWITCH,
-    "mean_over_all_outputs": SWITCH,
-}
-_ROLLOUTS: Final[dict[str, Check]] = {
-    **_OPTIMISED,
-    "rollout_steps": count(1),
-    "epochs": count(1),
-    "minibatch_size": count(1),
-    "gae_lambda": _SHARE,
-    "normalize_advantage": SWITCH,
-    "max_grad_norm": either(number(1e-6, 1e12), Check(NONE.fits, "None for no clipping")),
-}
-_TABULAR: Final[dict[str, Check]] = {
-    **_EXPLORING,
-    "gamma": _SHARE,
-    "learning_rate": either(_SHARE, one_of("1/visits")),
-    "visits_power": _SHARE,
-    "max_states": count(1),
-}
-
-
 @dataclass(frozen=True, kw_only=True)
-class LOLASettings:
+class LOLASettings(Value):
     """Hyperparameters of the members of a team that learns by LOLA. The study has none; the defaults are
     ours.
     """
 
-    rollout_steps: int = 250
+    rollout_steps: Positive = 250
     """Steps T of a rollout; an update takes several rollouts, see `cprl.algorithms.LOLA.estimator`."""
-    gamma: float = 0.995
-    """Discount factor per step, 0..1."""
-    look_ahead_rate: float = 0.03
-    """The size of the step, by plain gradient descent, that each member expects of the others, 0..1e12; 0 is
+    gamma: Share = 0.995
+    """Discount factor per step."""
+    look_ahead_rate: Annotated[float, Range(0, 1e12)] = 0.03
+    """The size of the step, by plain gradient descent, that each member expects of the others; 0 is
     naive learning. The papers' 0.3 to 1 are for policies of five numbers; on boards of the commons 0.03 is a
     step as long as a tenth of the weights, 1 a policy that has nothing to do with the present one."""
     optimizer: Optimizer = "adam"
     """The optimiser of the policies, see `cprl.learners.settings.Optimizer`. The papers' is "sgd"."""
-    learning_rate: float = 1e-3
-    """Its step size, 1e-12..100."""
-    adam_eps: float = 1e-5
-    """Added to the denominator of Adam, AdamW and both kinds of RMSprop, 1e-30..1."""
-    max_grad_norm: float | None = None
-    """The norm to which each member's gradient is clipped, 1e-6 or more; None for no clipping."""
-    gae_lambda: float = 1.0
-    """Lambda of generalised advantage estimation, 0..1: at 1 advantages are returns to the end of the
+    learning_rate: LearningRate = 1e-3
+    """Its step size."""
+    adam_eps: OptimizerEps = 1e-5
+    """Added to the denominator of Adam, AdamW and both kinds of RMSprop."""
+    max_grad_norm: NormLimit = None
+    """The norm to which each member's gradient is clipped; None for no clipping."""
+    gae_lambda: Share = 1.0
+    """Lambda of generalised advantage estimation: at 1 advantages are returns to the end of the
     episode, or of the rollout, less a value."""
     normalize_advantage: bool = False
     """Whether each member's advantages of a rollout are normalised to mean 0 and standard deviation 1. This
     scales the gradients, and so the steps that are expected of the others."""
-    critic_learning_rate: float = 1e-3
-    """The step size of Adam for the critics, 1e-12..100."""
-    critic_epochs: int = 10
+    critic_learning_rate: LearningRate = 1e-3
+    """The step size of Adam for the critics."""
+    critic_epochs: Natural = 10
     """Steps of each critic after an update of the policies, over all its rollouts."""
-    hidden_cells: tuple[int, ...] = DEFAULT_HIDDEN_CELLS
+    hidden_cells: Layers = DEFAULT_HIDDEN_CELLS
     """Units of each hidden layer, with ReLU, of the actor and of the critic; used if the algorithm has no
     `network`."""
 
     def __post_init__(self) -> None:
-        check_fields(self, _CHECKS)
+        super().__post_init__()
         if self.normalize_advantage and self.rollout_steps == 1:
             raise ValueError(
                 "LOLASettings.rollout_steps is 1; allowed with normalize_advantage: 2 or more, because one "
                 "advantage has no standard deviation"
             )
-
-
-_RATE: Final = number(1e-12, 100)
-_CHECKS: Final[dict[str, Check]] = {
-    "rollout_steps": count(1),
-    "gamma": number(0, 1),
-    "look_ahead_rate": number(0, 1e12),
-    "optimizer": one_of(*get_args(Optimizer)),
-    "learning_rate": _RATE,
-    "adam_eps": number(1e-30, 1),
-    "max_grad_norm": either(number(1e-6, 1e12), Check(NONE.fits, "None for no clipping")),
-    "gae_lambda": number(0, 1),
-    "normalize_advantage": SWITCH,
-    "critic_learning_rate": _RATE,
-    "critic_epochs": count(0),
-    "hidden_cells": LAYERS,
-}

@@ -4,35 +4,35 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import prod
-from typing import Any, Final
+from typing import Annotated, Any
 
 from torch import Tensor, nn
 from torchrl import modules
 
-from cprl.checks import Check, check_fields, is_count
 from cprl.commons.spaces import Spaces
-from cprl.networks.mlp import LAYERS, check_size, glorot_uniform_, layers
+from cprl.networks.mlp import MOST_CELLS, MOST_LAYERS, Layers, check_size, glorot_uniform_
+from cprl.values import Value, Where
 
-_CHECKS: Final[dict[str, Check]] = {
-    "channels": layers(1),
-    "kernel_cells": Check(lambda value: is_count(value, 1, 999) and value % 2 == 1, "1, 3, 5 and so on"),
-    "hidden_cells": LAYERS,
-}
+Channels = Annotated[
+    Layers,
+    Where(
+        lambda channels: len(channels) > 0,
+        f"1 to {MOST_LAYERS} layers, each an integer in 1..{MOST_CELLS}",
+    ),
+]
+Kernel = Annotated[int, Where(lambda cells: 1 <= cells <= 999 and cells % 2 == 1, "1, 3, 5 and so on")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Conv:
+class Conv(Value):
     """Convolutions that keep the size of the window, then fully connected layers; ReLU after each."""
 
-    channels: tuple[int, ...] = (16, 16)
+    channels: Channels = (16, 16)
     """Channels of each convolution."""
-    kernel_cells: int = 3
-    """Rows and columns of a kernel, odd."""
-    hidden_cells: tuple[int, ...] = (32,)
+    kernel_cells: Kernel = 3
+    """Rows and columns of a kernel."""
+    hidden_cells: Layers = (32,)
     """Units of each fully connected layer after the convolutions."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, _CHECKS)
 
     def make(
         self,

@@ -4,30 +4,28 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import prod
-from typing import Final
+from typing import Annotated, Final
 
 from torch import Tensor, nn
 from torchrl import modules
 
-from cprl.checks import Check, check_fields, is_count
 from cprl.commons.spaces import Spaces
 from cprl.system.memory import check_memory
+from cprl.values import Range, Value, Where
 
 MOST_LAYERS: Final = 64
 MOST_CELLS: Final = 2**16
 """Of one layer."""
 
-
-def layers(at_least: int) -> Check:
-    """The sizes of so many layers or more."""
-    return Check(
-        lambda value: (
-            isinstance(value, tuple)
-            and at_least <= len(value) <= MOST_LAYERS
-            and all(is_count(cells, 1, MOST_CELLS) for cells in value)
-        ),
-        f"{at_least} to {MOST_LAYERS} layers, each an integer in 1..{MOST_CELLS}",
-    )
+Cells = Annotated[int, Range(1, MOST_CELLS)]
+Layers = Annotated[
+    tuple[Cells, ...],
+    Where(
+        lambda layers: len(layers) <= MOST_LAYERS,
+        f"0 to {MOST_LAYERS} layers, each an integer in 1..{MOST_CELLS}",
+    ),
+]
+"""Units of each hidden layer; none is a linear network."""
 
 
 def check_size(sizes: Sequence[int], more: int = 0) -> None:
@@ -40,19 +38,12 @@ def check_size(sizes: Sequence[int], more: int = 0) -> None:
     check_memory(f"the {weights:,} weights of a network", 4 * weights, "smaller layers")
 
 
-LAYERS: Final = layers(0)
-"""Units of each hidden layer; none is a linear network."""
-
-
 @dataclass(frozen=True, kw_only=True)
-class MLP:
+class MLP(Value):
     """Fully connected layers with ReLU."""
 
-    hidden_cells: tuple[int, ...] = (32, 32)
+    hidden_cells: Layers = (32, 32)
     """Units of each hidden layer."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, {"hidden_cells": LAYERS})
 
     def make(
         self,

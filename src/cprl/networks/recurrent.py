@@ -8,42 +8,36 @@ sequence may hold several episodes, and may begin in the middle of one.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Final, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from cprl.checks import Check, check_fields, count, instance
 from cprl.commons.spaces import Spaces
 from cprl.networks.convolutional import Conv
-from cprl.networks.mlp import MLP, MOST_CELLS, check_size
+from cprl.networks.mlp import MLP, Cells, check_size
 from cprl.networks.stacked import lane_state, stack_lanes
+from cprl.values import Value, Where
 
 Kind = Literal["GRU", "LSTM"]
-_CHECKS: Final[dict[str, Check]] = {
-    "encoder": Check(
-        lambda value: instance(MLP | Conv, "").fits(value) and len(value.hidden_cells) > 0,
-        "MLP or Conv, with at least one of hidden_cells",
-    ),
-    "recurrent_cells": count(1, MOST_CELLS),
-}
+Encoder = Annotated[
+    MLP | Conv,
+    Where(lambda encoder: len(encoder.hidden_cells) > 0, "MLP or Conv, with at least one of hidden_cells"),
+]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recurrent:
+class Recurrent(Value, stored=False):
     """A recurrent layer between an encoder of observations and a linear layer: a `GRU` or an `LSTM`.
 
     Its state is zero where an episode begins.
     """
 
-    encoder: MLP | Conv = MLP(hidden_cells=(32,))  # noqa: RUF009 - a frozen value
+    encoder: Encoder = MLP(hidden_cells=(32,))  # noqa: RUF009 - a frozen value
     """What reads the observation; its last hidden layer, with ReLU, is the input of the recurrent one."""
-    recurrent_cells: int = 32
+    recurrent_cells: Cells = 32
     """Units H of the recurrent layer."""
     kind: ClassVar[Kind]
-
-    def __post_init__(self) -> None:
-        check_fields(self, _CHECKS)
 
     def make(
         self,

@@ -9,12 +9,12 @@ from typing import Any, Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from cprl.config import differences
 from cprl.runs.episodes import FILE_NAME, read_episodes, read_table, small
 from cprl.runs.files import refuse_links, refuse_missing, unlist, verify, write_listed
 from cprl.runs.recipe import RECIPE_FILE, read_recipe
 from cprl.runs.weights import DECISIONS, TRANSFORMS
 from cprl.runs.weights import FIELD as FROZEN
+from cprl.values import differences
 
 _IF_ANY = tuple(f"checkpoints/{name}" for name in (TRANSFORMS, DECISIONS))
 _WHOLE = ("recipe.json", "report.json")

@@ -107,7 +107,7 @@ def refuse_another_run(
         raise ValueError(
             f"{out} has a recipe of the format {shown(kept.get('format'))}; allowed: {now['format']}"
         )
-    from cprl.config import differences
+    from cprl.values import differences
 
     before, asked = kept["experiment"], now["experiment"]
     free = {"episodes": 0, "on_nan": ""}
@@ -148,7 +148,7 @@ def changed_circumstances(run: Path) -> list[str]:
 
     Numbers may then differ from those of an undisturbed run.
     """
-    from cprl.config import differences
+    from cprl.values import differences
 
     recipe = read_recipe(run)
     now = _circumstances(recipe)
@@ -212,7 +212,7 @@ def _code_text(recipe: Mapping[str, Any]) -> dict[str, dict[str, str]]:
 
 def _sources(recipe: Mapping[str, Any]) -> dict[str, str]:
     """The text of each module that a `Custom` of a recipe names, without packages whose versions it has."""
-    from cprl.config import custom_targets
+    from cprl.custom import custom_targets
 
     modules = {target.partition(":")[0] for target in custom_targets(recipe.get("experiment"))}
     texts = {own: source_of(own) for own in sorted(modules) if own.partition(".")[0] not in PACKAGES}
@@ -227,7 +227,7 @@ def resume_command(run: Path, command: Sequence[str] | None = None) -> str:
             from Python without one, which `cprl run` resumes.
     """
     if command is None:
-        from cprl.config import custom_targets
+        from cprl.custom import custom_targets
 
         path = run / RECIPE_FILE
         targets = custom_targets(read_json(path).get("experiment")) if path.exists() else []

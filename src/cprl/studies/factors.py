@@ -21,11 +21,11 @@ from cprl.arguments import refusal
 from cprl.checks import MOST_NUMBER, is_count, is_number, shown
 from cprl.commons import maps
 from cprl.commons.maps import Map
-from cprl.config import fits, from_config, to_config, type_text
 from cprl.custom import Custom
 from cprl.envs.make_env import game_of, stored_game
 from cprl.experiment import Experiment
 from cprl.population import Learning, Team, with_run_moved
+from cprl.values import fits, from_config, to_config, words
 
 _ALLOWED: Final = (
     "the values of the field that the factor's path names, as a list; a table of named levels, each a table "
@@ -152,7 +152,7 @@ def factor_from_config(
         return made
     if "levels" in table:
         return {level: changes_from_config(own, allow, place) for level, own in table["levels"]}
-    values = from_config(table["values"], allow=allow)
+    values = from_config(table["values"])
     return tuple(_read(name, own, place) for own in values)
 
 
@@ -165,7 +165,7 @@ def changes_from_config(
     table: Mapping[str, Any], allow: Sequence[str], place: Callable[[str], str]
 ) -> dict[str, Any]:
     """The values by path that `changes_to_config` gave."""
-    return {path: _read(path, from_config(value, path, allow=allow), place) for path, value in table.items()}
+    return {path: _read(path, from_config(value, path), place) for path, value in table.items()}
 
 
 def _stored(path: str, value: Any, place: Callable[[str], str]) -> Any:
@@ -369,7 +369,7 @@ def _fitting(value: Any, hint: Any, at: tuple[str, ...]) -> Any:
         except ValueError as error:
             raise ValueError(f"at the path {'.'.join(at)}: {error}") from error
     if not fits(found, hint):
-        raise ValueError(f"at the path {'.'.join(at)} is {shown(value)}; allowed: {type_text(hint)}")
+        raise ValueError(f"at the path {'.'.join(at)} is {shown(value)}; allowed: {words(hint)}")
     return found
 
 
@@ -437,10 +437,10 @@ def _value(text: str, hints: list[Any], path: str) -> Any:
     kinds = [kind for hint in dict.fromkeys(hints) if (kind := _sayable(hint)) is not None]
     if not kinds:
         raise ValueError(
-            f"the path {path} holds {type_text(hints[0])}, which a command line cannot say; allowed: paths "
+            f"the path {path} holds {words(hints[0])}, which a command line cannot say; allowed: paths "
             "of its fields, or a Study in Python"
         )
-    raise ValueError(f"at the path {path} is {text!r}; allowed: {' and '.join(map(type_text, kinds))}")
+    raise ValueError(f"at the path {path} is {text!r}; allowed: {' and '.join(map(words, kinds))}")
 
 
 _UNREAD: Final = object()

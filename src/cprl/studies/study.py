@@ -12,7 +12,6 @@ from typing import Any, Final
 
 from cprl.arguments import BLOCK, integer, refusal
 from cprl.checks import DIRECTORY_NAME, TEXT, checked, instance, shown
-from cprl.config import without_defaults
 from cprl.experiment import MOST_SEED, Experiment, frozen_from, frozen_relative_to
 from cprl.population import stored_of
 from cprl.runs.files import STUDY_FORMAT, read_json, refuse_newer, write_json
@@ -30,6 +29,7 @@ from cprl.studies.factors import (
     factor_to_config,
     grid,
 )
+from cprl.values import without_defaults
 
 _TRIES: Final = 20
 """Draws for each one that is kept, at most."""
@@ -38,7 +38,7 @@ SEEDS_APART: Final = 1000
 
 
 CONDITION_FORMAT: Final = 1
-"""Of checksums: counted up when a default of any value of `cprl.config.KINDS`, or of `Experiment`, changes,
+"""Of checksums: counted up when a default of any value of `cprl.values.KINDS`, or of `Experiment`, changes,
 so that the same checksum never means two things."""
 
 

@@ -25,7 +25,7 @@ from typing import Any, Final, Literal, NamedTuple, Self
 import psutil
 from tensordict import TensorDictBase
 
-from cprl.config import custom_targets, differences
+from cprl.custom import custom_targets
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
 from cprl.population import Frozen, with_stored
@@ -46,6 +46,7 @@ from cprl.system.output import printed
 from cprl.system.process import cpu
 from cprl.system.shipped import cprl_here
 from cprl.training import Training
+from cprl.values import differences
 
 State = Literal["missing", "unfinished", "finished", "refused"]
 PATIENCE_S: Final = 60.0

@@ -3,11 +3,11 @@
 torch is imported where a device is asked for, so that the game, which does without, can use this too.
 """
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import psutil
 
-from cprl.checks import Check
+from cprl.values import Where
 
 if TYPE_CHECKING:
     import torch
@@ -22,7 +22,7 @@ def _is_device(value: Any) -> bool:
         return False
 
 
-DEVICE: Final = Check(_is_device, '"cpu", "cuda:0"')
+Device = Annotated[str, Where(_is_device, '"cpu", "cuda:0"')]
 _SMALL: Final = 2**20
 """Bytes that are not worth the question how many are free."""
 

@@ -10,22 +10,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf
-from typing import Final, Protocol, runtime_checkable
+from typing import Annotated, Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cprl.checks import (
-    NONE,
-    Check,
-    check_arguments,
-    check_fields,
-    count,
-    either,
-    instance,
-    is_number,
-    number,
-)
+from cprl.values import Positive, Range, Value, Where, checked
 
 _STEP: Final = 1e-6
 """Of the numerical slope, as a share of the range."""
@@ -36,20 +26,8 @@ _NOTHING: Final = 1e-3
 """What a unit may still be worth at `most`, as a share of the highest value."""
 _HALVINGS: Final = 200
 _MOST: Final = 1e12
-_POSITIVE: Final = Check(
-    lambda value: is_number(value, 0, _MOST) and value > 0, f"a number above 0, up to {_MOST:g}"
-)
-_FUNCTION: Final = Check(callable, "a function of the total")
-_OF_POWER: Final[dict[str, Check]] = {
-    "top": _POSITIVE,
-    "factor": _POSITIVE,
-    "power": Check(lambda value: is_number(value, 1, 64), "a number in 1..64"),
-}
-_OF_CALLABLE: Final[dict[str, Check]] = {
-    "function": _FUNCTION,
-    "most": _POSITIVE,
-    "derivative": either(NONE, _FUNCTION),
-}
+Above0 = Annotated[float, Where(lambda value: 0 < value <= _MOST, f"a number above 0, up to {_MOST:g}")]
+Cost = Annotated[float, Range(0, _MOST)]
 
 
 @runtime_checkable
@@ -72,18 +50,15 @@ class Worth(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PowerWorth:
+class PowerWorth(Value):
     """v(A) = top - factor A^power, and 0 where that is negative."""
 
-    top: float = 10.0
-    """v(0), above 0."""
-    factor: float = 1.0
-    """Above 0."""
-    power: float = 2.0
-    """At least 1; with 1 it is a straight line."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, _OF_POWER)
+    top: Above0 = 10.0
+    """v(0)."""
+    factor: Above0 = 1.0
+    """How steeply it falls."""
+    power: Annotated[float, Range(1, 64)] = 2.0
+    """With 1 it is a straight line."""
 
     @property
     def most(self) -> float:
@@ -106,18 +81,18 @@ class PowerWorth:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CallableWorth:
+class CallableWorth(Value, stored=False):
     """A function of your own: positive below `most`, falling there to 0, and never less steeply."""
 
     function: Callable[[float], float]
     """v(A), from a total to what a unit is worth."""
-    most: float
+    most: Above0
     """The total from which on a unit is worth nothing."""
     derivative: Callable[[float], float] | None = None
     """v'(A); by default from differences of the function."""
 
     def __post_init__(self) -> None:
-        check_fields(self, _OF_CALLABLE)
+        super().__post_init__()
         totals = np.linspace(0.0, self.most, _TRIED + 1)
         values = self._tried("function", totals)
         chords = np.diff(values) / totals[1]
@@ -163,25 +138,22 @@ class CallableWorth:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SharingGame:
+class SharingGame(Value):
     """n agents share what is worth v(X) a unit when they take X in all; see the module for the formulas.
 
     Totals, payoffs and costs are numbers of Python, in units of one's own.
     """
 
-    agents: int
+    agents: Positive
     """The number of agents n."""
     worth: Worth
     """v, what a unit is worth."""
-    cost: float
-    """c, what a unit costs who takes it, at least 0."""
-    most_each: float | None = None
-    """The most that an agent can take, above 0; None for as much as it wants."""
-    payment: float = 0.0
+    cost: Cost
+    """c, what a unit costs who takes it."""
+    most_each: Above0 | None = None
+    """The most that an agent can take; None for as much as it wants."""
+    payment: Annotated[float, Range(-_MOST, _MOST)] = 0.0
     """e, what each agent is paid whatever it takes."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, _CHECKS)
 
     def payoffs(self, taken: ArrayLike) -> NDArray[np.float64]:
         """What agents are paid, float64 [..., n].
@@ -298,7 +270,7 @@ def appropriation(
         outside: w, what a token earns outside.
     """
     worth = PowerWorth(top=linear, factor=quadratic, power=1.0)
-    check_arguments(_OF_APPROPRIATION, tokens=tokens, outside=outside)
+    tokens, outside = checked("tokens", tokens, Above0), checked("outside", outside, Cost)
     return SharingGame(agents=agents, worth=worth, cost=outside, most_each=tokens, payment=tokens * outside)
 
 
@@ -315,15 +287,3 @@ def _root(falling: Callable[[float], float], most: float) -> float:
             break
         low, high = (middle, high) if falling(middle) > 0 else (low, middle)
     return (low + high) / 2
-
-
-_CHECKS: Final[dict[str, Check]] = {
-    "agents": count(1),
-    "worth": instance(
-        Worth, "a Worth: PowerWorth, CallableWorth, or one of your own with `most`, `at`, `slope`"
-    ),
-    "cost": number(0, _MOST),
-    "most_each": either(NONE, _POSITIVE),
-    "payment": number(-_MOST, _MOST),
-}
-_OF_APPROPRIATION: Final[dict[str, Check]] = {"tokens": _POSITIVE, "outside": _CHECKS["cost"]}
