@@ -31,5 +31,4 @@ Of games with institutions (`cprl.institutions`):
     yields               what a map can bear
     institution_tables  that they fit each other and the game, which entries they show agents, and their
                         lookup tables for the compiled rules
-    institution_turn    what they do in a turn and add to observations, on one world
 """

@@ -90,7 +90,7 @@ class Game(Value):
     @property
     def channels(self) -> tuple[str, ...]:
         """The name of each channel of an observation: "red", "green", "blue", or the classes of cells, then
-        those of institutions, see `cprl.commons.institution_turn`."""
+        those of institutions, see `cprl.commons.views`."""
         return *self.cell_channels, *self._institution_channels
 
     @property

@@ -24,7 +24,7 @@ class Institution(Value, stored=False):
     """
 
     observed: bool = True
-    """Whether agents observe what this institution shows them, see `cprl.commons.institution_turn`."""
+    """Whether agents observe what this institution shows them, see `cprl.commons.views`."""
 
     principle: ClassVar[str] = ""
     """Of the eight design principles of Ostrom, "Governing the Commons" (1990), table 3.1."""

@@ -11,7 +11,7 @@
 - `Sanctioner`: 1 if the agent may fire;
 - `Vote`: the value in force, relative to the highest choice.
 
-`Boundaries` and `ClosedPatches` show where bites are forbidden, see `cprl.commons.institution_turn`.
+`Boundaries` and `ClosedPatches` show where bites are forbidden, see `cprl.commons.views`.
 """
 
 from cprl.institutions.limits import is_season_closed
