@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import nn
 from torchrl.modules import ProbabilisticActor, QValueActor
-from torchrl.objectives import LossModule
+from torchrl.objectives import LossModule, ValueEstimators
 
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
@@ -20,7 +20,7 @@ from cprl.learners.preferences import Preference, named
 from cprl.learners.reference import TorchRLReplayLearner, TorchRLRolloutLearner
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.rollouts import RolloutLearner
-from cprl.learners.settings import DEFAULT_HIDDEN_CELLS, DQNSettings, LOLASettings, RolloutSettings
+from cprl.learners.settings import DEFAULT_HIDDEN_CELLS, DQNSettings, RolloutSettings
 from cprl.networks.agent import AgentNetworks
 from cprl.networks.mlp import MLP
 from cprl.networks.recurrent import Recurrent, state_shape_of
@@ -37,7 +37,6 @@ update, uncompiled; "torchrl": by TorchRL's stock parts, one agent after the oth
 
 Weight = Annotated[float, Range(0, 1e6)]
 """Of a term of a loss."""
-ClipEpsilon = Annotated[float, Range(1e-6, 0.999)]
 
 
 class Algorithm(Value, stored=False):
@@ -49,6 +48,8 @@ class Algorithm(Value, stored=False):
 
     settings: Any
     """The hyperparameters."""
+    network: Any
+    """The architecture of its networks; None for fully connected layers of `settings.hidden_cells`."""
     settings_kind: ClassVar[type[Any]] = object
     """The class of the settings."""
     stochastic: ClassVar[bool] = False
@@ -76,6 +77,22 @@ class Algorithm(Value, stored=False):
                 "Conv, Custom; DQN, PPO, A2C, Reinforce, IPPO and MAPPO learn recurrent networks, and "
                 "torchrl.envs.CatFrames shows any agent its latest observations"
             )
+
+    def new_network(self, spaces: Spaces, outputs: int, **options: Any) -> nn.Module:
+        """Return a new network of the algorithm's architecture; see `cprl.networks.specification.new_network`
+        for `options`."""
+        network, cells = self.network, self.settings.hidden_cells
+        if network is not None and cells != DEFAULT_HIDDEN_CELLS:
+            raise ValueError(
+                f"settings.hidden_cells is {cells}; allowed: the default, because the algorithm has a "
+                "network; set the layers in the network"
+            )
+        options["glorot_uniform"] = getattr(self.settings, "glorot_uniform", False)
+        return new_network(network or MLP(hidden_cells=cells), spaces, outputs, **options)
+
+    def new_networks(self, spaces: Spaces, **outputs: int) -> AgentNetworks:
+        """Return new networks by name, each with so many outputs; the acting one first."""
+        return AgentNetworks({name: self.new_network(spaces, count) for name, count in outputs.items()})
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         """New networks of one agent, initialised from torch's generator. They map observations [..., *shape]
@@ -128,7 +145,13 @@ class OffPolicy(Algorithm, stored=False):
     by torch's generator instead would make replicas depend on each other."""
 
     def make_network(self, spaces: Spaces) -> nn.Module:
-        return q_network_of(spaces, self.settings, self.network)
+        relu = self.settings.relu_on_outputs
+        return self.new_network(spaces, spaces.actions, relu_on_outputs=relu)
+
+    def bootstrapped(self, loss: LossModule) -> LossModule:
+        """Return a loss, with targets that bootstrap after one step by the discount of the settings."""
+        loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
+        return loss
 
     def make_learner(
         self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **options: Any
@@ -164,7 +187,7 @@ class OnPolicy(Algorithm, stored=False):
     can_share_parameters: ClassVar[bool] = True
 
     def make_network(self, spaces: Spaces) -> nn.Module:
-        return actor_and_critic(spaces, self.settings, self.network)
+        return self.new_networks(spaces, actor=spaces.actions, critic=1)
 
     def make_learner(
         self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **options: Any
@@ -233,45 +256,6 @@ def _refuse_sharing(options: dict[str, Any]) -> None:
         raise ValueError(
             'share_parameters is True; allowed with engine="torchrl", which trains independent agents: False'
         )
-
-
-def network_of(
-    spaces: Spaces,
-    settings: DQNSettings | RolloutSettings | LOLASettings,
-    network: Network | Custom | None,
-    *,
-    outputs: int,
-    **options: Any,
-) -> nn.Module:
-    """A new network of one agent.
-
-    Args:
-        network: the architecture; None for fully connected layers of `settings.hidden_cells`.
-    """
-    if network is not None and settings.hidden_cells != DEFAULT_HIDDEN_CELLS:
-        raise ValueError(
-            f"settings.hidden_cells is {settings.hidden_cells}; allowed: the default, because the algorithm "
-            "has a network; set the layers in the network"
-        )
-    made = MLP(hidden_cells=settings.hidden_cells) if network is None else network
-    glorot_uniform = isinstance(settings, DQNSettings) and settings.glorot_uniform
-    return new_network(made, spaces, outputs, glorot_uniform=glorot_uniform, **options)
-
-
-def q_network_of(spaces: Spaces, settings: DQNSettings, network: Network | Custom | None) -> nn.Module:
-    """A new network of one agent, which outputs the value of each action."""
-    relu = settings.relu_on_outputs
-    return network_of(spaces, settings, network, outputs=spaces.actions, relu_on_outputs=relu)
-
-
-def actor_and_critic(
-    spaces: Spaces, settings: RolloutSettings | LOLASettings, network: Network | Custom | None
-) -> AgentNetworks:
-    """New networks of one agent: "actor" and "critic"."""
-    sizes = {"actor": spaces.actions, "critic": 1}
-    return AgentNetworks(
-        {name: network_of(spaces, settings, network, outputs=size) for name, size in sizes.items()}
-    )
 
 
 def refuse_relu(name: str, settings: DQNSettings) -> None:

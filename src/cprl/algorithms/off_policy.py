@@ -17,7 +17,6 @@ from torchrl.objectives import (
     DistributionalDQNLoss,
     DQNLoss,
     LossModule,
-    ValueEstimators,
 )
 
 from cprl.algorithms.base import (
@@ -26,7 +25,6 @@ from cprl.algorithms.base import (
     TrainingEngine,
     Weight,
     module_of,
-    network_of,
     policy,
     q_actor,
     refuse_relu,
@@ -73,8 +71,7 @@ class DQN(OffPolicy):
         is_ours = self.loss_function == LOG_COSH
         make = LogCoshDQNLoss if is_ours else partial(DQNLoss, loss_function=self.loss_function)
         loss = make(q_actor(network), delay_value=True, double_dqn=self.double, action_space="categorical")
-        loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
-        return loss
+        return self.bootstrapped(loss)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +101,7 @@ class DistributionalDQN(OffPolicy):
     def make_network(self, spaces: Spaces) -> nn.Module:
         actions = spaces.actions
         return AtomNetwork(
-            network_of(spaces, self.settings, self.network, outputs=actions * self.atoms),
+            self.new_network(spaces, actions * self.atoms),
             actions=actions,
             lowest=self.lowest_return,
             highest=self.highest_return,
@@ -144,8 +141,7 @@ class CQL(OffPolicy):
             loss_function=self.loss_function,
             action_space="categorical",
         )
-        loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
-        bootstrap_from_target(loss.value_estimator)
+        bootstrap_from_target(self.bootstrapped(loss).value_estimator)
         return loss
 
 
@@ -179,10 +175,7 @@ class SAC(OffPolicy):
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         actions = spaces.actions
-        names = "actor", "critic_0", "critic_1"
-        return AgentNetworks(
-            {name: network_of(spaces, self.settings, self.network, outputs=actions) for name in names}
-        )
+        return self.new_networks(spaces, actor=actions, critic_0=actions, critic_1=actions)
 
     def make_loss(self, network: nn.Module) -> LossModule:
         refuse_relu(type(self).__name__, self.settings)
@@ -197,8 +190,7 @@ class SAC(OffPolicy):
             alpha_init=self.alpha_init,
             target_entropy_weight=self.target_entropy_weight,
         )
-        loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
-        return loss
+        return self.bootstrapped(loss)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,13 +209,7 @@ class IQL(OffPolicy):
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         actions = spaces.actions
-        sizes = {"actor": actions, "critic_0": actions, "critic_1": actions, "value": 1}
-        return AgentNetworks(
-            {
-                name: network_of(spaces, self.settings, self.network, outputs=size)
-                for name, size in sizes.items()
-            }
-        )
+        return self.new_networks(spaces, actor=actions, critic_0=actions, critic_1=actions, value=1)
 
     def make_loss(self, network: nn.Module) -> LossModule:
         refuse_relu(type(self).__name__, self.settings)
@@ -238,8 +224,7 @@ class IQL(OffPolicy):
             temperature=self.temperature,
             expectile=self.expectile,
         )
-        loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
-        return loss
+        return self.bootstrapped(loss)
 
 
 Temperature = Annotated[float, Range(1e-6, 1e6)]
@@ -280,13 +265,8 @@ class PR2(OffPolicy):
                 f"{spaces.agents} agent; allowed: games of 2 agents or more; for one agent use DQN or SAC"
             )
         peers, actions = spaces.agents - 1, spaces.actions
-        values = network_of(
-            spaces,
-            self.settings,
-            self.network,
-            outputs=peers * actions * actions,
-            relu_on_outputs=self.settings.relu_on_outputs,
-        )
+        relu = self.settings.relu_on_outputs
+        values = self.new_network(spaces, peers * actions * actions, relu_on_outputs=relu)
         return JointNetwork(values, actions=actions, peers=peers, temperature=self.temperature)
 
     def make_loss(self, network: nn.Module) -> LossModule:
@@ -297,8 +277,7 @@ class PR2(OffPolicy):
             entropy_bonus=self.entropy_bonus,
             loss_function=self.loss_function,
         )
-        loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
-        return loss
+        return self.bootstrapped(loss)
 
 
 @dataclass(frozen=True, kw_only=True)

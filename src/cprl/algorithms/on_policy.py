@@ -2,30 +2,50 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, ClassVar
 
 from torch import nn
 from torchrl.objectives import A2CLoss, ClipPPOLoss, LossModule, ReinforceLoss
 
-from cprl.algorithms.base import ClipEpsilon, OnPolicy, Weight, module_of, policy
+from cprl.algorithms.base import OnPolicy, Weight, module_of, policy
 from cprl.networks.agent import AgentNetworks
+from cprl.values import Range
+
+ClipEpsilon = Annotated[float, Range(1e-6, 0.999)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class PPO(OnPolicy):
+class Clipped(OnPolicy, stored=False):
+    """What algorithms with a clipped ratio have in common."""
+
+    clip_epsilon: ClipEpsilon = 0.2
+    """The largest change of an action's probability, as a ratio minus 1."""
+    entropy_coeff: Weight = 0.01
+    critic_coeff: Weight = 0.5
+    can_be_recurrent: ClassVar[bool] = True
+    loss_kind: ClassVar[Callable[..., LossModule]]
+    """TorchRL's loss."""
+
+    def make_loss(self, network: nn.Module) -> LossModule:
+        return _loss(
+            network,
+            self.loss_kind,
+            clip_epsilon=self.clip_epsilon,
+            entropy_coeff=self.entropy_coeff,
+            critic_coeff=self.critic_coeff,
+            loss_critic_type="l2",
+            normalize_advantage=False,  # `RolloutLearner` normalises them per lane
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPO(Clipped):
     """Proximal policy optimisation with a clipped ratio, TorchRL's `ClipPPOLoss`.
 
     Source: Schulman et al., "Proximal Policy Optimization Algorithms" (2017).
     """
 
-    clip_epsilon: ClipEpsilon = 0.2
-    """The largest change of an action's probability, as a ratio minus 1; 1e-6..0.999."""
-    entropy_coeff: Weight = 0.01
-    critic_coeff: Weight = 0.5
-    can_be_recurrent: ClassVar[bool] = True
-
-    def make_loss(self, network: nn.Module) -> LossModule:
-        return clipped_loss(network, ClipPPOLoss, self)
+    loss_kind: ClassVar[Callable[..., LossModule]] = ClipPPOLoss
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,16 +89,3 @@ def _loss(network: nn.Module, kind: Callable[..., LossModule], **options: object
     assert isinstance(network, AgentNetworks)
     critic = module_of(network["critic"], "state_value", state="critic_recurrent_state")
     return kind(policy(network["actor"]), critic, **options)
-
-
-def clipped_loss(network: nn.Module, kind: Callable[..., LossModule], algorithm: Any) -> LossModule:
-    """A TorchRL loss with a clipped ratio over "actor" and "critic", with the fields of a `PPO`."""
-    return _loss(
-        network,
-        kind,
-        clip_epsilon=algorithm.clip_epsilon,
-        entropy_coeff=algorithm.entropy_coeff,
-        critic_coeff=algorithm.critic_coeff,
-        loss_critic_type="l2",
-        normalize_advantage=False,  # `RolloutLearner` normalises them per lane
-    )

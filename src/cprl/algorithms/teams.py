@@ -3,7 +3,7 @@
 A lane is then a team. VDN, QMIX and MAPPO change the social dilemma: their agents share one reward.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import prod
 from typing import Any, ClassVar, Literal
@@ -11,28 +11,24 @@ from typing import Any, ClassVar, Literal
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import VDNMixer
-from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives import LossModule
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss, QMixerLoss
 
 from cprl.algorithms.base import (
-    ClipEpsilon,
     OffPolicy,
-    OnPolicy,
     TeamAlgorithm,
     TrainingEngine,
     Weight,
-    actor_and_critic,
-    network_of,
     policy,
     q_actor,
 )
-from cprl.algorithms.on_policy import clipped_loss
+from cprl.algorithms.on_policy import Clipped
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.learners.base import Learner
 from cprl.learners.lola import LOLALearner
 from cprl.learners.preferences import Preference
-from cprl.learners.settings import DQNSettings, LOLASettings
+from cprl.learners.settings import LOLASettings
 from cprl.networks.agent import AgentNetworks
 from cprl.networks.mlp import MLP, Cells, MLPNetwork
 from cprl.networks.specification import Network
@@ -56,7 +52,7 @@ class VDN(TeamAlgorithm, OffPolicy):
         return AgentNetworks({"actor": _team(members, spaces), "mixer": mixer})
 
     def make_loss(self, network: nn.Module) -> LossModule:
-        return _mixed(network, [_CHOSEN], self.settings)
+        return self.bootstrapped(_mixed(network, [_CHOSEN]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,37 +78,30 @@ class QMIX(TeamAlgorithm, OffPolicy):
         return AgentNetworks({"actor": _team(members, spaces), "mixer": mixer})
 
     def make_loss(self, network: nn.Module) -> LossModule:
-        return _mixed(network, [_CHOSEN, "observation"], self.settings)
+        return self.bootstrapped(_mixed(network, [_CHOSEN, "observation"]))
 
 
 @dataclass(frozen=True, kw_only=True)
-class MAPPO(TeamAlgorithm, OnPolicy):
+class MAPPO(TeamAlgorithm, Clipped):
     """PPO with an actor per member and a central critic of all observations, TorchRL's `MAPPOLoss`.
 
     Source: Yu et al., "The Surprising Effectiveness of PPO in Cooperative Multi-Agent Games" (2022); here
     without value normalisation, and members share no weights, unless `Team.share_parameters` says so.
     """
 
-    clip_epsilon: ClipEpsilon = 0.2
-    """The largest change of an action's probability, as a ratio minus 1; 1e-6..0.999."""
-    entropy_coeff: Weight = 0.01
-    critic_coeff: Weight = 0.5
-    can_be_recurrent: ClassVar[bool] = True
+    loss_kind: ClassVar[Callable[..., LossModule]] = MAPPOLoss
 
     def make_network(self, spaces: Spaces) -> nn.Module:
-        return network_of(spaces, self.settings, self.network, outputs=spaces.actions)
+        return self.new_network(spaces, spaces.actions)
 
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
         everything = len(members), *spaces.observation_shape
-        critic = network_of(spaces, self.settings, self.network, outputs=1, shape=everything)
+        critic = self.new_network(spaces, 1, shape=everything)
         return AgentNetworks({"actor": _team(members, spaces), "critic": CentralCritic(critic, len(members))})
-
-    def make_loss(self, network: nn.Module) -> LossModule:
-        return clipped_loss(network, MAPPOLoss, self)
 
 
 @dataclass(frozen=True, kw_only=True)
-class IPPO(TeamAlgorithm, OnPolicy):
+class IPPO(TeamAlgorithm, Clipped):
     """PPO with an actor and a critic per member, TorchRL's `IPPOLoss`.
 
     Unlike agents that each learn with `PPO`, members share gradient clipping and the normalisation of
@@ -120,11 +109,7 @@ class IPPO(TeamAlgorithm, OnPolicy):
     StarCraft Multi-Agent Challenge?" (2020).
     """
 
-    clip_epsilon: ClipEpsilon = 0.2
-    """The largest change of an action's probability, as a ratio minus 1; 1e-6..0.999."""
-    entropy_coeff: Weight = 0.01
-    critic_coeff: Weight = 0.5
-    can_be_recurrent: ClassVar[bool] = True
+    loss_kind: ClassVar[Callable[..., LossModule]] = IPPOLoss
     shares_reward: ClassVar[bool] = False
 
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
@@ -133,15 +118,12 @@ class IPPO(TeamAlgorithm, OnPolicy):
             {name: _team([member[name] for member in of_each], spaces) for name in ("actor", "critic")}
         )
 
-    def make_loss(self, network: nn.Module) -> LossModule:
-        return clipped_loss(network, IPPOLoss, self)
-
 
 def _team(members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
     return team_network(members, observation_dims=len(spaces.observation_shape))
 
 
-def _mixed(network: nn.Module, seen_by_mixer: Sequence[str], settings: DQNSettings) -> LossModule:
+def _mixed(network: nn.Module, seen_by_mixer: Sequence[str]) -> LossModule:
     """`QMixerLoss` over a team's "actor" and "mixer", with entries at the root of the TensorDict."""
     assert isinstance(network, AgentNetworks)
     loss = QMixerLoss(
@@ -151,7 +133,6 @@ def _mixed(network: nn.Module, seen_by_mixer: Sequence[str], settings: DQNSettin
         action_space="categorical",
     )
     loss.set_keys(action="action", action_value="action_value", local_value=_CHOSEN, global_value=_OF_TEAM)
-    loss.make_value_estimator(ValueEstimators.TD0, gamma=settings.gamma)
     return loss
 
 
@@ -184,7 +165,7 @@ class MADDPG(TeamAlgorithm, OffPolicy):
     loss_functions: ClassVar[tuple[str, ...]] = DISTANCES
 
     def make_network(self, spaces: Spaces) -> nn.Module:
-        return network_of(spaces, self.settings, self.network, outputs=spaces.actions)
+        return self.new_network(spaces, spaces.actions)
 
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
         dims = len(spaces.observation_shape)
@@ -199,10 +180,7 @@ class MADDPG(TeamAlgorithm, OffPolicy):
             cells = self.network.hidden_cells
         elif self.network is not None:
             features, cells = cells[-1], cells[-1:]
-            each = [
-                network_of(spaces, self.settings, self.network, outputs=features, shape=everything)
-                for _ in range(members)
-            ]
+            each = [self.new_network(spaces, features, shape=everything) for _ in range(members)]
             encoders = team_network(each, observation_dims=dims)
         names = "relu_on_outputs", "glorot_uniform"
         options = {name: getattr(self.settings, name) for name in names}
@@ -225,8 +203,7 @@ class MADDPG(TeamAlgorithm, OffPolicy):
             loss_function=self.loss_function,
             logit_penalty=self.logit_penalty,
         )
-        loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
-        return loss
+        return self.bootstrapped(loss)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,7 +235,7 @@ class LOLA(TeamAlgorithm):
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         """New networks of one member: "actor" and "critic"."""
-        return actor_and_critic(spaces, self.settings, self.network)
+        return self.new_networks(spaces, actor=spaces.actions, critic=1)
 
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
         """The members' networks in a row, as `make_loss` reads them."""

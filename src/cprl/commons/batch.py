@@ -1,12 +1,11 @@
 """Batch: B worlds of a game, played a turn at a time by a driver (CPU threads or a GPU)."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Protocol, TypeAlias
+from typing import Annotated, Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from cprl import arguments
 from cprl.commons import state as states
 from cprl.commons.game import Game, check_worlds_fit, output_forms
 from cprl.commons.loops import Loop
@@ -23,6 +22,7 @@ from cprl.commons.world import (
     empty_worlds,
 )
 from cprl.institutions.memory import REMEMBERED, Law, Payments, empty_memory
+from cprl.values import Range, Seed, checked
 
 Output: TypeAlias = StepOutput | GovernedOutput
 """`GovernedOutput` for a game with institutions."""
@@ -69,14 +69,13 @@ class Batch:
         threads: int | None = None,
         driver: Driver | None = None,
     ) -> None:
-        worlds = arguments.integer("worlds", worlds, 1, 2**32)
-        first_world = arguments.integer("first_world", first_world, 0, 2**32 - 1)
+        worlds = checked("worlds", worlds, Annotated[int, Range(1, 2**32)])
+        first_world = checked("first_world", first_world, Annotated[int, Range(0, 2**32 - 1)])
         if first_world + worlds > 2**32:
             raise ValueError(
                 f"first_world is {first_world} and worlds is {worlds}; "
                 "allowed: worlds with indices from 0 to 2**32 - 1"
             )
-        arguments.seed(seed)
         if driver is None:
             check_worlds_fit(game, worlds)
         self.game = game
@@ -108,7 +107,7 @@ class Batch:
 
     def set_seed(self, seed: int) -> None:
         """Restarts from a seed: the next episode of each world is the first episode of this seed."""
-        self.driver.write(self.now.seed, np.full((self.size, 1), arguments.seed(seed), np.uint64))
+        self.driver.write(self.now.seed, np.full((self.size, 1), checked("seed", seed, Seed), np.uint64))
         self.driver.write(self.now.episode, np.full((self.size, 1), -1, np.int32))
 
     def new_output(self) -> Output:
@@ -196,11 +195,11 @@ class Batch:
         """Sets the state of the worlds and writes it into `output`, with no harvest, shots, hits or growth,
         whatever happened in the turn before.
         """
-        checked, arrays = states.checked(state, worlds=self.size, game=self.game), self._state_arrays()
-        for name, values in checked.items():
+        sound, arrays = states.checked(state, worlds=self.size, game=self.game), self._state_arrays()
+        for name, values in sound.items():
             self.driver.write(arrays[name], values)
         self._run("refresh_worlds", self._all_worlds, output)
-        self._has_begun = bool((checked["episode"] >= 0).all())
+        self._has_begun = bool((sound["episode"] >= 0).all())
         return output
 
     def check(self, actions: Actions) -> None:

@@ -6,16 +6,16 @@ can draw them as lines, neither with a font.
 
 from functools import cache
 from itertools import pairwise
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.arguments import integer
 from cprl.commons.colours import APPLE, BEAM, GROUND, PALETTE, WALL, Colour, agent_colour, agent_mark
 from cprl.commons.maps import Map
 from cprl.commons.world import Bytes, Shown
 from cprl.system.memory import check_memory
+from cprl.values import Range, checked
 
 LARGEST_CELL_PIXELS: Final = 1000
 GRID_COLOUR: Final = (28, 30, 36)
@@ -28,7 +28,7 @@ def world_image(board: Map, world: Shown, *, cell_pixels: int = 24) -> Bytes:
 
     A cell is `cell_pixels` high and wide, 8..1000, a line between two cells one of these.
     """
-    size = integer("cell_pixels", cell_pixels, 8, LARGEST_CELL_PIXELS)
+    size = checked("cell_pixels", cell_pixels, Annotated[int, Range(8, LARGEST_CELL_PIXELS)])
     pixels = (board.height * size + 1) * (board.width * size + 1)
     check_memory(f"cell_pixels is {size}: the pixels", 3 * pixels, "fewer pixels")
     image = np.empty((board.height * size + 1, board.width * size + 1, 3), np.uint8)

@@ -6,10 +6,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.checks import shown
 from cprl.commons.game import Game
 from cprl.commons.world import COL_STEP, PLAYING, ROW_STEP, TRUNCATED, Worlds, empty_worlds
 from cprl.institutions.memory import REMEMBERED, empty_memory
+from cprl.values import shown
 
 State = dict[str, NDArray[Any]]
 

@@ -3,18 +3,18 @@
 import os
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from cprl import arguments
 from cprl.commons.compiled import entry_for_cpu, rules_for_cpu
 from cprl.commons.game import Game
 from cprl.commons.loops import Loop
 from cprl.commons.tables import Tables
 from cprl.commons.world import Actions, Arrays, StepOutput, Worlds, empty_scratch
 from cprl.institutions.memory import Law
+from cprl.values import Range, checked
 
 MOST_THREADS: Final = 1024
 """The largest number of threads; no machine has that many cores."""
@@ -33,8 +33,7 @@ class CpuThreads:
 
     def __init__(self, game: Game, worlds: int, *, threads: int | None = None) -> None:
         if threads is not None:
-            allowed = f"an integer from 1 to {MOST_THREADS}, or None for all cores"
-            threads = arguments.integer("threads", threads, 1, MOST_THREADS, allowed=allowed)
+            threads = checked("threads", threads, Annotated[int, Range(1, MOST_THREADS)])
         limit = threads or os.cpu_count() or 1
         self.threads = min(limit, worlds if threads else -(-worlds // WORLDS_PER_THREAD))
         self.tables: Tables = game.tables

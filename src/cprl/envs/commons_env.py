@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from math import prod
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
-from cprl import arguments, keys
+from cprl import keys
 from cprl.commons.batch import Batch, Output, output_of, turn_of
 from cprl.commons.game import Game, output_forms
 from cprl.commons.picture import world_image
@@ -21,6 +21,7 @@ from cprl.envs.stepping import begin_states, carry_on, chosen
 from cprl.institutions import COUNTS
 from cprl.system.compat import LeanStepEnv, flag_spec, unchecked_tensordict
 from cprl.system.memory import check_memory
+from cprl.values import Range, Seed, checked
 
 WORLD_ENTRIES = ("stock", "regrown")
 DONE_ENTRIES = ("done", "terminated", "truncated")
@@ -188,7 +189,9 @@ class CommonsEnv(LeanStepEnv):
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Restarts from a seed, 0 to 2**64 - 1; see `EnvBase.set_seed`."""
-        following: int | None = super().set_seed(None if seed is None else arguments.seed(seed), static_seed)
+        following: int | None = super().set_seed(
+            None if seed is None else checked("seed", seed, Seed), static_seed
+        )
         return following
 
     def _set_seed(self, seed: int | None) -> None:
@@ -244,7 +247,7 @@ class CommonsEnv(LeanStepEnv):
             )
         board = batch.game.map
         if world is not None:
-            world = arguments.integer("world", world, 0, batch.size - 1)
+            world = checked("world", world, Annotated[int, Range(0, batch.size - 1)])
             return world_image(board, batch.show(self.output, world=world), cell_pixels=cell_pixels)
         pixels = batch.size * (board.height * cell_pixels + 1) * (board.width * cell_pixels + 1)
         check_memory(

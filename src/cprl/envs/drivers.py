@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cprl import arguments
 from cprl.commons.batch import Driver
 from cprl.commons.game import Game, check_worlds_fit
 from cprl.commons.threads import CpuThreads
+from cprl.values import refusal
 
 
 def drawn_seed() -> int:
@@ -32,7 +32,7 @@ def device_of(device: Any) -> torch.device:
     try:
         return torch.device(device)
     except (RuntimeError, TypeError, ValueError):
-        raise arguments.refusal("device", device, '"cpu" and "cuda"') from None
+        raise refusal("device", device, '"cpu" and "cuda"') from None
 
 
 def driver_for(
@@ -45,7 +45,7 @@ def driver_for(
     if device.type != "cuda":
         raise ValueError(f'device is "{device}"; allowed: "cpu" and "cuda"')
     if threads is not None:
-        raise arguments.refusal("threads", threads, "None on a GPU, where each world has its own thread")
+        raise refusal("threads", threads, "None on a GPU, where each world has its own thread")
     if not torch.cuda.is_available():
         raise ValueError(f'device is "{device}"; allowed: "cpu", because torch finds no GPU')
     from cprl.commons.cuda import CudaThreads

@@ -8,10 +8,10 @@ from typing import Any
 
 import gymnasium
 
-from cprl import arguments
 from cprl.commons.game import Game
 from cprl.commons.world import Bytes
 from cprl.envs.pettingzoo_env import RENDER_FPS, RENDER_MODES, CommonsParallelEnv, Observed
+from cprl.values import Seed, checked
 
 
 class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
@@ -41,7 +41,7 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observed, dict[str, Any]]:
         """Begins the next episode, or the first episode of a new seed."""
-        super().reset(seed=None if seed is None else arguments.seed(seed))
+        super().reset(seed=checked("seed", seed, Seed | None))
         self.world.reset(seed, options)
         return self.world.observation(0), self.world.info(0)
 

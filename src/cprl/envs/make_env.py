@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from cprl import arguments, keys
+from cprl import keys
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom, made
@@ -19,6 +19,7 @@ from cprl.envs.state import env_state, load_env_state
 from cprl.envs.taking import TakingGame
 from cprl.envs.unwrap import commons_of
 from cprl.theory import PowerWorth
+from cprl.values import Seed, checked, refusal
 
 
 @runtime_checkable
@@ -67,9 +68,9 @@ def make_env(
     elif isinstance(playable, MatrixGame | TakingGame):
         env = playable.make(worlds, seed, device, first_world=first_world)
     elif isinstance(playable, PlayableGame) and not isinstance(playable, type):
-        env = playable.make(worlds, arguments.seed(seed + first_world, "seed + first_world"), device)
+        env = playable.make(worlds, checked("seed + first_world", seed + first_world, Seed), device)
     else:
-        raise arguments.refusal("game", playable, "a cprl.Game, or a game with agents, to_config and make")
+        raise refusal("game", playable, "a cprl.Game, or a game with agents, to_config and make")
     chain = [made(transform) for transform in transforms]
     if chain:
         env = TransformedEnv(env, Compose(*chain))

@@ -14,9 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cprl import arguments
 from cprl.envs.stage_games import Memory, StageEnv, StageGame
-from cprl.values import MOST_NUMBER, Positive, PositiveShare, shown
+from cprl.values import MOST_NUMBER, Positive, PositiveShare, refusal
 
 _MOST_PAYOFFS: Final = 2**16
 
@@ -65,7 +64,10 @@ class MatrixGame(StageGame):
 def _table(payoffs: Any) -> tuple[Any, ...]:
     """Payoffs as nested tuples of Python's floats."""
     name = "MatrixGame.payoffs"
-    table = arguments.floats(name, payoffs)
+    try:
+        table = np.asarray(payoffs, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise refusal(name, payoffs, "an array of numbers") from None
     *actions, agents = table.shape or (0,)
     if agents != len(actions) or len(set(actions)) != 1 or actions[0] < 2:
         raise ValueError(
@@ -74,9 +76,8 @@ def _table(payoffs: Any) -> tuple[Any, ...]:
         )
     if table.size > _MOST_PAYOFFS:
         raise ValueError(f"{name} has {table.size:,} numbers; allowed: up to {_MOST_PAYOFFS:,}")
-    for number in table.flat:
-        if not abs(number) <= MOST_NUMBER:
-            raise ValueError(f"{name} has {shown(float(number))}; allowed: numbers up to {MOST_NUMBER:g}")
+    if not (np.abs(table) <= MOST_NUMBER).all():
+        raise ValueError(f"{name} has {np.abs(table).max():g}; allowed: numbers up to {MOST_NUMBER:g}")
     return tuple(map(_tuples, table.tolist()))
 
 
@@ -155,7 +156,8 @@ def matching_pennies(*, stake: float = 1.0, **clock: Unpack[Clock]) -> MatrixGam
 
     Payoffs of Foerster et al. (2018), table 2; the winner gets `stake`, above 0, and the other loses it.
     """
-    arguments.number("stake", stake, low=0, high=MOST_NUMBER, above=True, allowed="a number above 0")
+    if not stake > 0:
+        raise refusal("stake", stake, "a number above 0")
     same, other = (stake, -stake), (-stake, stake)
     return MatrixGame(((same, other), (other, same)), **clock)
 

@@ -1,7 +1,7 @@
 """Adapters for PettingZoo: all agents at once (`parallel_env`), or one after the other (`env`)."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Final
+from collections.abc import Sequence
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
 from gymnasium import spaces
@@ -9,14 +9,13 @@ from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import parallel_to_aec
 
-from cprl import arguments
-from cprl.checks import shown
 from cprl.commons.batch import Batch, Output, turn_of
 from cprl.commons.game import Game
 from cprl.commons.picture import world_image
 from cprl.commons.world import Bytes, GovernedOutput
 from cprl.envs.drivers import drawn_seed
 from cprl.institutions.memory import Payments
+from cprl.values import Range, checked, refusal, shown
 
 RENDER_MODES: Final = ("rgb_array",)
 RENDER_FPS: Final = 15
@@ -46,8 +45,7 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
     }
 
     def __init__(self, game: Game, *, seed: int | None = None, render_mode: str | None = None) -> None:
-        if render_mode is not None:
-            arguments.choice("render_mode", render_mode, RENDER_MODES)
+        checked("render_mode", render_mode, Literal[RENDER_MODES] | None)
         self.game, self.render_mode = game, render_mode
         self.batch = Batch(game, 1, seed=drawn_seed() if seed is None else seed)
         self._show_in(self.batch.new_output())
@@ -107,14 +105,15 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
 
     def _decided(self, decisions: Any) -> NDArray[np.int64]:
         """Decisions by name as int64 [1, N]; the first option of an agent that is not named."""
-        arguments.object_of("decisions", decisions, Mapping, "a dict of decisions by the names of agents")
         options, decided = self.game.decisions, np.zeros((1, self.game.agents), np.int64)
         if decisions and not options:
-            raise arguments.refusal("decisions", decisions, "None: agents decide nothing in this game")
+            raise refusal("decisions", decisions, "None: agents decide nothing in this game")
         for name, decision in decisions.items():
-            arguments.choice("the agent of a decision", name, self.possible_agents)
+            if name not in self.possible_agents:
+                raise refusal("the agent of a decision", name, ", ".join(self.possible_agents))
             agent = self.possible_agents.index(name)
-            decided[0, agent] = arguments.integer(f"the decision of {name}", decision, 0, options - 1)
+            hint = Annotated[int, Range(0, options - 1)]
+            decided[0, agent] = checked(f"the decision of {name}", decision, hint)
         return decided
 
     def step(
@@ -144,9 +143,9 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         """Plays one turn with one action per agent, in their order; see `step`. An ended world stays as it
         is."""
         self._check_begun("the first step")
-        last = len(self.game.actions) - 1
+        known = Annotated[int, Range(0, len(self.game.actions) - 1)]
         row = [
-            arguments.integer(f"the action of {name}", action, 0, last)
+            checked(f"the action of {name}", action, known)
             for name, action in zip(self.possible_agents, actions, strict=True)
         ]
         output, decisions = self.batch.new_output(), self._decisions if self.game.decisions else None

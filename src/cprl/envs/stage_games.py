@@ -10,12 +10,12 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 
-from cprl import arguments, keys
+from cprl import keys
 from cprl.commons.chance import LOW_WORD, WORD_BITS, philox4x32
 from cprl.envs.drivers import device_of, drawn_seed
 from cprl.envs.stepping import begin_states, carry_on, chosen
 from cprl.system.compat import LeanStepEnv, flag_spec, unchecked_tensordict
-from cprl.values import Positive, PositiveShare, Range, Value
+from cprl.values import Positive, PositiveShare, Range, Seed, Value, checked
 
 _REPLACED: Final = frozenset(
     (keys.AGENTS, keys.DONE, keys.TERMINATED, keys.TRUNCATED, "next", "_reset", "observation", "reward")
@@ -78,8 +78,8 @@ class StageEnv(LeanStepEnv):
         device: str | torch.device = "cpu",
         first_world: int = 0,
     ) -> None:
-        worlds = arguments.integer("worlds", worlds, 1, 2**32)
-        first_world = arguments.integer("first_world", first_world, 0, 2**32 - 1)
+        worlds = checked("worlds", worlds, Annotated[int, Range(1, 2**32)])
+        first_world = checked("first_world", first_world, Annotated[int, Range(0, 2**32 - 1)])
         device = device_of(device)
         super().__init__(device=device, batch_size=torch.Size([worlds]))
         self.game, self._first_world = game, first_world
@@ -237,7 +237,7 @@ class StageEnv(LeanStepEnv):
         return unchecked_tensordict({keys.AGENTS: group, **ends}, self.batch_size, self.device)
 
     def _set_seed(self, seed: int | None) -> None:
-        seed = drawn_seed() if seed is None else arguments.seed(seed)
+        seed = drawn_seed() if seed is None else checked("seed", seed, Seed)
         self.seed_bits.fill_(int(np.uint64(seed).astype(np.int64)))
         for name in _STATE:
             self._buffers[name] = torch.zeros_like(self._buffers[name])

@@ -4,13 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import prod
-from typing import Annotated, Any
+from typing import Annotated, Any, Unpack
 
 from torch import Tensor, nn
-from torchrl import modules
 
 from cprl.commons.spaces import Spaces
-from cprl.networks.mlp import MOST_CELLS, MOST_LAYERS, Layers, check_size, glorot_uniform_
+from cprl.networks.mlp import MOST_CELLS, MOST_LAYERS, Layers, Options, check_size, glorot_uniform_, layers
 from cprl.values import Value, Where
 
 Channels = Annotated[
@@ -39,31 +38,17 @@ class Conv(Value):
         spaces: Spaces,
         outputs: int,
         *,
-        relu_on_outputs: bool = False,
-        glorot_uniform: bool = False,
         shape: Sequence[int] | None = None,
+        **options: Unpack[Options],
     ) -> "ConvNetwork":
-        """A new network.
-
-        Raises:
-            ValueError: if observations have no rows and columns.
-        """
-        shape = tuple(spaces.observation_shape if shape is None else shape)
+        """Return a new network; raises a ValueError if observations have no rows and columns."""
+        shape = shape or spaces.observation_shape
         if len(shape) < 3:
             raise ValueError(
                 f"observations have the shape {list(shape)}; allowed for Conv: channels, rows and columns; "
                 "use MLP"
             )
-        return ConvNetwork(
-            shape,
-            outputs,
-            channels=self.channels,
-            kernel_cells=self.kernel_cells,
-            hidden_cells=self.hidden_cells,
-            highest=spaces.observation_scale,
-            relu_on_outputs=relu_on_outputs,
-            glorot_uniform=glorot_uniform,
-        )
+        return ConvNetwork(self, shape, outputs, highest=spaces.observation_scale, **options)
 
 
 class ConvNetwork(nn.Module):
@@ -72,19 +57,14 @@ class ConvNetwork(nn.Module):
     Args:
         observation_shape: (C, X, Y), or (S, C, X, Y) for S observations, whose channels are concatenated.
         highest: the largest value of an observation; inputs are divided by it.
-        relu_on_outputs: whether the outputs pass through ReLU too.
-        glorot_uniform: whether weights are initialised Glorot-uniform and biases to zero; else torch's
-            default.
     """
 
     def __init__(
         self,
+        form: Conv,
         observation_shape: Sequence[int],
         outputs: int,
         *,
-        channels: Sequence[int] = (16, 16),
-        kernel_cells: int = 3,
-        hidden_cells: Sequence[int] = (32,),
         highest: float = 255.0,
         relu_on_outputs: bool = False,
         glorot_uniform: bool = False,
@@ -92,22 +72,15 @@ class ConvNetwork(nn.Module):
         super().__init__()
         self.highest, self.outputs, self.observation_dims = highest, outputs, len(observation_shape)
         *planes, rows, columns = observation_shape
-        check_size(
-            (channels[-1] * rows * columns, *hidden_cells, outputs),
-            more=kernel_cells**2 * sum(a * b for a, b in pairwise((prod(planes), *channels))),
-        )
+        steps = list(pairwise((prod(planes), *form.channels)))
+        features, weights = form.channels[-1] * rows * columns, sum(a * b for a, b in steps)
+        check_size((features, *form.hidden_cells, outputs), more=form.kernel_cells**2 * weights)
         self._window = prod(planes), rows, columns
         self.convolutions = nn.ModuleList(
-            nn.Conv2d(before, after, kernel_cells, padding=kernel_cells // 2)
-            for before, after in pairwise((prod(planes), *channels))
+            nn.Conv2d(before, after, form.kernel_cells, padding=form.kernel_cells // 2)
+            for before, after in steps
         )
-        self.layers = modules.MLP(
-            in_features=channels[-1] * rows * columns,
-            out_features=outputs,
-            num_cells=list(hidden_cells),
-            activation_class=nn.ReLU,
-            activate_last_layer=relu_on_outputs,
-        )
+        self.layers = layers(features, outputs, form.hidden_cells, relu_on_outputs=relu_on_outputs)
         if glorot_uniform:
             self.apply(glorot_uniform_)
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import prod
-from typing import Annotated, Final
+from typing import Annotated, Final, TypedDict, Unpack
 
 from torch import Tensor, nn
 from torchrl import modules
@@ -29,13 +29,20 @@ Layers = Annotated[
 
 
 def check_size(sizes: Sequence[int], more: int = 0) -> None:
-    """Raises a TooLargeError if there is too little memory for a network.
-
-    Args:
-        sizes: the number of inputs, of the units of each layer, and of outputs.
-    """
+    """Raise a TooLargeError if there is too little memory for a network with layers of so many units, inputs
+    and outputs included, and `more` weights."""
     weights = more + sum((before + 1) * after for before, after in pairwise(sizes))
     check_memory(f"the {weights:,} weights of a network", 4 * weights, "smaller layers")
+
+
+class Options(TypedDict, total=False):
+    """What algorithms say of the networks that they have made."""
+
+    relu_on_outputs: bool
+    """Whether the outputs pass through ReLU too, as in the program of the study."""
+    glorot_uniform: bool
+    """Whether weights are initialised Glorot-uniform and biases to zero, as in the program of the study; else
+    torch's default."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,18 +57,12 @@ class MLP(Value):
         spaces: Spaces,
         outputs: int,
         *,
-        relu_on_outputs: bool = False,
-        glorot_uniform: bool = False,
         shape: Sequence[int] | None = None,
+        **options: Unpack[Options],
     ) -> "MLPNetwork":
-        return MLPNetwork(
-            spaces.observation_shape if shape is None else shape,
-            outputs,
-            hidden_cells=self.hidden_cells,
-            highest=spaces.observation_scale,
-            relu_on_outputs=relu_on_outputs,
-            glorot_uniform=glorot_uniform,
-        )
+        """Return a new network of observations, or of inputs of another shape."""
+        shape, highest = shape or spaces.observation_shape, spaces.observation_scale
+        return MLPNetwork(shape, outputs, hidden_cells=self.hidden_cells, highest=highest, **options)
 
 
 class MLPNetwork(nn.Module):
@@ -70,9 +71,6 @@ class MLPNetwork(nn.Module):
     Args:
         observation_shape: (C, X, Y) of an observation, `Game.observation_shape`.
         highest: the largest value of an observation, `Observation.highest`; inputs are divided by it.
-        relu_on_outputs: whether the values pass through ReLU too, as in the program of the study.
-        glorot_uniform: whether weights are initialised Glorot-uniform and biases to zero, as in the program
-            of the study; else torch's default.
     """
 
     def __init__(
@@ -89,13 +87,7 @@ class MLPNetwork(nn.Module):
         check_size((prod(observation_shape), *hidden_cells, actions))
         self.highest, self.relu_on_outputs = highest, relu_on_outputs
         self.observation_dims, self.outputs = len(observation_shape), actions
-        self.layers = modules.MLP(
-            in_features=prod(observation_shape),
-            out_features=actions,
-            num_cells=list(hidden_cells),
-            activation_class=nn.ReLU,
-            activate_last_layer=relu_on_outputs,
-        )
+        self.layers = layers(prod(observation_shape), actions, hidden_cells, relu_on_outputs=relu_on_outputs)
         if glorot_uniform:
             self.apply(glorot_uniform_)
 
@@ -108,6 +100,17 @@ class MLPNetwork(nn.Module):
         """uint8 [..., C, X, Y] to [..., A], in the parameters' type."""
         seen = observation.flatten(-self.observation_dims).to(self.linears[0].weight.dtype) / self.highest
         return self.layers(seen)  # type: ignore[no-any-return]
+
+
+def layers(inputs: int, outputs: int, cells: Sequence[int], *, relu_on_outputs: bool) -> modules.MLP:
+    """Return fully connected layers with ReLU between them."""
+    return modules.MLP(
+        in_features=inputs,
+        out_features=outputs,
+        num_cells=list(cells),
+        activation_class=nn.ReLU,
+        activate_last_layer=relu_on_outputs,
+    )
 
 
 def glorot_uniform_(module: nn.Module) -> None:

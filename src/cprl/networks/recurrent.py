@@ -8,14 +8,14 @@ sequence may hold several episodes, and may begin in the middle of one.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Unpack
 
 import torch
 from torch import Tensor, nn
 
 from cprl.commons.spaces import Spaces
 from cprl.networks.convolutional import Conv
-from cprl.networks.mlp import MLP, Cells, check_size
+from cprl.networks.mlp import MLP, Cells, Options, check_size
 from cprl.networks.stacked import lane_state, stack_lanes
 from cprl.values import Value, Where
 
@@ -44,12 +44,11 @@ class Recurrent(Value, stored=False):
         spaces: Spaces,
         outputs: int,
         *,
-        relu_on_outputs: bool = False,
-        glorot_uniform: bool = False,
         shape: Sequence[int] | None = None,
+        **options: Unpack[Options],
     ) -> "RecurrentNetwork":
-        """A new network."""
-        for name, value in {"relu_on_outputs": relu_on_outputs, "glorot_uniform": glorot_uniform}.items():
+        """Return a new network."""
+        for name, value in options.items():
             if value:
                 raise ValueError(f"settings.{name} is True; allowed with a recurrent network: False")
         *hidden_cells, features = self.encoder.hidden_cells

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import TypeAlias, Unpack
 
 import torch
 from torch import nn
@@ -10,7 +10,7 @@ from torch import nn
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.networks.convolutional import Conv
-from cprl.networks.mlp import MLP
+from cprl.networks.mlp import MLP, Options
 from cprl.networks.recurrent import GRU, LSTM
 
 Network: TypeAlias = MLP | Conv | GRU | LSTM
@@ -22,9 +22,8 @@ def new_network(
     spaces: Spaces,
     outputs: int,
     *,
-    relu_on_outputs: bool = False,
-    glorot_uniform: bool = False,
     shape: Sequence[int] | None = None,
+    **options: Unpack[Options],
 ) -> nn.Module:
     """A new network from observations [..., *shape] to [..., outputs], initialised from torch's generator.
 
@@ -37,11 +36,8 @@ def new_network(
     """
     refuse_unseen(spaces)
     if not isinstance(network, Custom):
-        return network.make(
-            spaces, outputs, relu_on_outputs=relu_on_outputs, glorot_uniform=glorot_uniform, shape=shape
-        )
-    switches = {"relu_on_outputs": relu_on_outputs, "glorot_uniform": glorot_uniform}
-    for name, value in switches.items():
+        return network.make(spaces, outputs, shape=shape, **options)
+    for name, value in options.items():
         if value:
             raise ValueError(
                 f"settings.{name} is True; allowed with a network of your own, {network.target}: False; "
@@ -51,18 +47,7 @@ def new_network(
     if shape is not None:
         spaces = replace(spaces, observation_shape=tuple(shape))
         name += " of a critic, whose observation has the members first,"
-    return _checked(_made(network, name, spaces, outputs), name, spaces, outputs)
-
-
-def _made(network: Custom, name: str, spaces: Spaces, outputs: int) -> Any:
-    """What a user's own code makes for observations."""
-    network.resolve()
-    try:
-        return network.make(spaces, outputs)
-    except Exception as error:  # a user's network may raise anything
-        raise ValueError(
-            f"{name} cannot be made for observations of {spaces.observation_shape}: {error}"
-        ) from error
+    return _users_network(network, name, spaces, outputs)
 
 
 def refuse_unseen(spaces: Spaces) -> None:
@@ -76,16 +61,21 @@ def refuse_unseen(spaces: Spaces) -> None:
         )
 
 
-def _checked(made: Any, name: str, spaces: Spaces, outputs: int) -> nn.Module:
-    """A user's network, after a check that it reads observations."""
+def _users_network(network: Custom, name: str, spaces: Spaces, outputs: int) -> nn.Module:
+    """A network that a user's own code makes, after a check that it reads observations."""
+    shape, dtype = spaces.observation_shape, spaces.observation_dtype
+    network.resolve()
+    try:
+        made = network.make(spaces, outputs)
+    except Exception as error:  # a user's network may raise anything
+        raise ValueError(f"{name} cannot be made for observations of {shape}: {error}") from error
     if not isinstance(made, nn.Module):
         raise ValueError(f"{name} is a {type(made).__name__}; allowed: a torch.nn.Module")
-    shape, dtype = spaces.observation_shape, spaces.observation_dtype
     was_training = made.training
     try:
         with torch.no_grad():
             given = made.eval()(torch.zeros(2, *shape, dtype=getattr(torch, dtype)))
-    except Exception as error:  # a user's network may raise anything
+    except Exception as error:  # likewise
         raise ValueError(
             f"{name} cannot read observations [2, {', '.join(map(str, shape))}] of {dtype}: {error}"
         ) from error

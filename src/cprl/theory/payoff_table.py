@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from math import comb, factorial
-from typing import Final, Self
+from typing import Annotated, Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cprl import arguments
 from cprl.theory.sharing import SharingGame
+from cprl.values import Range, checked, refusal
 
 Counts = NDArray[np.int64]
 Values = NDArray[np.float64]
@@ -63,7 +63,7 @@ class PayoffTable:
     `counts`; finite where somebody plays it, elsewhere whatever is given becomes NaN."""
 
     def __post_init__(self) -> None:
-        agents = arguments.integer("agents", self.agents, 2, 1000)
+        agents = checked("agents", self.agents, Annotated[int, Range(2, 1000)])
         given = np.asarray(self.payoffs, np.float64)
         strategies = given.shape[1] if given.ndim == 2 else 0
         rows = comb(agents + strategies - 1, agents) if strategies > 1 else 0
@@ -200,7 +200,7 @@ def mixture_of(mixture: ArrayLike, strategies: int) -> Values:
     is_mixture = shares.shape == (strategies,) and (shares >= 0).all() and abs(shares.sum() - 1) < _SUM
     if not is_mixture:
         allowed = f"[{strategies}] of shares from 0 to 1 that sum to 1"
-        raise arguments.refusal("mixture", shares.tolist(), allowed)
+        raise refusal("mixture", shares.tolist(), allowed)
     return shares
 
 
