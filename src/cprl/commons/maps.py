@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.world import DOWN, LEFT, RIGHT, UP
-from cprl.values import PositiveShare, Range, Seed, Share, Value, checked
+from cprl.values import PositiveShare, Range, Seed, Share, Value, Where, checked
 
 Cell = tuple[int, int]
 Start = tuple[int, int, int]
@@ -33,19 +33,21 @@ Side = Annotated[int, Range(1, LONGEST_SIDE_CELLS)]
 
 @dataclass(frozen=True, kw_only=True)
 class Map(Value):
-    """A board with its walls, its apple sites and the starts of the agents. Every cell outside it is wall.
-
-    Raises:
-        ValueError: If the board cannot be played; the message names the row and column.
-    """
+    """A board with its walls, its apple sites and the starts of the agents. Every cell outside it is wall."""
 
     height: Side
     """The number of rows H; H x W is at most 2**20."""
     width: Side
     """The number of columns W."""
-    sites: tuple[Cell, ...]
+    sites: Annotated[tuple[Cell, ...], Where(lambda sites: len(sites) > 0, "at least one (row, column)")]
     """(row, col) of each of the K sites, the cells that can hold an apple; all do when an episode begins."""
-    starts: tuple[Start, ...]
+    starts: Annotated[
+        tuple[Start, ...],
+        Where(
+            lambda starts: len(starts) > 0 and all(heading in SIGN_OF_HEADING for *_, heading in starts),
+            "at least one (row, column, heading), each heading 0 to 3",
+        ),
+    ]
     """(row, col, heading) of each of the N agents, agent 0 first; heading 0 up, 1 right, 2 down, 3 left."""
     walls: tuple[Cell, ...] = ()
     """(row, col) of each inner wall."""
@@ -53,7 +55,6 @@ class Map(Value):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_cells("Map", self.height, self.width)
-        _check_entries(self)
         _check_cells(self)
 
     def __repr__(self) -> str:
@@ -85,50 +86,32 @@ def check_cells(name: str, height: int, width: int) -> None:
         )
 
 
-def _check_entries(board: Map) -> None:
-    for name, cells in (("sites", board.sites), ("starts", board.starts)):
-        if not cells:
-            raise ValueError(f"Map.{name} is empty; allowed: at least one entry")
-    for row, col, heading in board.starts:
-        if heading not in SIGN_OF_HEADING:
-            raise ValueError(
-                f"the start at row {row}, column {col} has heading {heading}; allowed: 0, 1, 2, 3"
-            )
-
-
 def _check_cells(board: Map) -> None:
+    """Raise a ValueError for a cell outside the board, on a wall, or named twice."""
+    walls = set(board.walls)
     starts = [(row, col) for row, col, _ in board.starts]
     for name, cells in (("site", board.sites), ("start", starts), ("wall", board.walls)):
+        seen: set[Cell] = set()
         for row, col in cells:
+            problem = ""
             if not (0 <= row < board.height and 0 <= col < board.width):
-                raise ValueError(
-                    f"the {name} at row {row}, column {col} lies outside the board of "
-                    f"{board.height} rows and {board.width} columns; allowed: rows 0 to {board.height - 1}, "
-                    f"columns 0 to {board.width - 1}"
+                problem = (
+                    f"lies outside the board of {board.height} rows and {board.width} columns; allowed: rows "
+                    f"0 to {board.height - 1}, columns 0 to {board.width - 1}"
                 )
-        for row, col in _duplicates(cells):
-            raise ValueError(f"two {name}s at row {row}, column {col}; allowed: one per cell")
-    for name, cells in (("site", board.sites), ("start", starts)):
-        for row, col in sorted(set(cells) & set(board.walls)):
-            raise ValueError(f"the {name} at row {row}, column {col} is on a wall; allowed: open ground")
-
-
-def _duplicates(cells: Iterable[Cell]) -> Iterable[Cell]:
-    seen: set[Cell] = set()
-    for cell in cells:
-        if cell in seen:
-            yield cell
-        seen.add(cell)
+            elif (row, col) in seen:
+                problem = "is there twice; allowed: one per cell"
+            elif name != "wall" and (row, col) in walls:
+                problem = "is on a wall; allowed: open ground"
+            if problem:
+                raise ValueError(f"the {name} at row {row}, column {col} {problem}")
+            seen.add((row, col))
 
 
 def parse(drawing: str) -> Map:
     """Reads a drawing of any size; agents are numbered in reading order, rows and columns from 0.
 
     Common indentation and empty lines around the drawing are ignored.
-
-    Raises:
-        ValueError: If rows differ in length, a sign is unknown, or there is no site or no agent; the message
-            names the row and column.
     """
     rows = [row.rstrip() for row in cleandoc(drawing).splitlines()]
     if not rows:
@@ -156,12 +139,6 @@ def _check_drawing(rows: list[str]) -> None:
                 f"row {r} ends after column {len(row) - 1}, row 0 after column {width - 1}; "
                 "all rows of a drawing must have the same length"
             )
-    last = f"searched up to row {len(rows) - 1}, column {width - 1}"
-    signs = set(chain.from_iterable(rows))
-    if SITE not in signs:
-        raise ValueError(f"no apple site ({SITE}) in the drawing; {last}")
-    if not signs & set(HEADING_OF_SIGN):
-        raise ValueError(f"no agent ({' '.join(HEADING_OF_SIGN)}) in the drawing; {last}")
 
 
 _DRAWINGS: Final = {
@@ -276,23 +253,19 @@ def crosses(
     """A board whose sites form crosses: each centre and its four neighbours.
 
     Args:
-        height: The number of rows H.
-        width: The number of columns W.
         centres: (row, col) of the centre of each cross; a cell in two crosses is one site.
-        starts: (row, col, heading) of each agent.
-        walls: (row, col) of each inner wall.
     """
     sites = {
         (row + down, col + right)
-        for row, col in checked("centres", centres, tuple[Cell, ...])
+        for row, col in centres
         for down, right in ((0, 0), (-1, 0), (0, 1), (1, 0), (0, -1))
     }
     return Map(
         height=height,
         width=width,
         sites=tuple(sorted(sites)),
-        starts=checked("starts", starts, tuple[Start, ...]),
-        walls=checked("walls", walls, tuple[Cell, ...]),
+        starts=tuple(starts),
+        walls=tuple(walls),
     )
 
 
@@ -304,10 +277,6 @@ def rooms(entrances: Entrances = "single", *, agents: int = 12) -> Map:
     together.
     The starts are ours: up to three agents per room, assigned in turn to the north-west, north-east,
     south-east and south-west room.
-
-    Args:
-        entrances: The board: "single", "multiple", "none" or "unequal".
-        agents: The number of agents N, 1 to 12.
     """
     checked("entrances", entrances, Entrances)
     agents = checked("agents", agents, Annotated[int, Range(1, 2 * len(_NORTH_STARTS))])
@@ -373,16 +342,8 @@ def random(
     otherwise on any free cell. At 0 they are independent; near 1 they form a single patch.
 
     Args:
-        height: The number of rows H, see `Map`.
-        width: The number of columns W.
-        agents: The number of agents N, at least 1.
         density: Sites per cell, above 0, at most 1. The number of sites is density x H x W, rounded, at
             least 1.
-        clustering: A probability, 0..1.
-        seed: The seed of the random numbers.
-
-    Raises:
-        ValueError: If an argument is out of range, or sites and agents do not fit on the board.
     """
     height = checked("height", height, Side)
     width = checked("width", width, Side)
