@@ -1,5 +1,7 @@
 """Networks made of others: several of one agent, distributions of returns, values of joint actions."""
 
+from typing import ClassVar
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -36,6 +38,7 @@ class AtomNetwork(nn.Module):
     """
 
     support: Tensor
+    stacks_over: ClassVar = ("network",)
 
     def __init__(
         self, network: nn.Module, *, actions: int, lowest: float, highest: float, atoms: int
@@ -90,6 +93,8 @@ class JointNetwork(nn.Module):
         peers: the number of other agents, N - 1.
         temperature: in units of reward, see `marginal`.
     """
+
+    stacks_over: ClassVar = ("network",)
 
     def __init__(self, network: nn.Module, *, actions: int, peers: int, temperature: float) -> None:
         super().__init__()

@@ -2,17 +2,13 @@
 
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
-from typing import Any, Final
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from cprl.networks.agent import AgentNetworks, AtomNetwork, JointNetwork
+from cprl.networks.agent import AgentNetworks
 from cprl.networks.mlp import MLPNetwork
-
-_OVER_ANOTHER: Final = AtomNetwork, JointNetwork
-"""Networks that compute with the outputs of another, their attribute `network`; weights of their own get a
-lane axis in front."""
 
 
 class StackedMLP(nn.Module):
@@ -124,9 +120,10 @@ def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
     if hasattr(first, "stacked"):
         itself: nn.Module = first.stacked(networks)
         return itself
-    if isinstance(first, _OVER_ANOTHER) and all(type(network) is type(first) for network in networks):
-        stack: Any = deepcopy(networks[0])
-        stack.network = stack_lanes([network.network for network in networks])  # type: ignore[misc]
+    if _over(first) and all(type(network) is type(first) for network in networks):
+        stack: Any = deepcopy(first)
+        for part in _over(first):
+            setattr(stack, part, stack_lanes([getattr(network, part) for network in networks]))
         for name, _ in first.named_parameters(recurse=False):
             weights = torch.stack([getattr(network, name).detach() for network in networks])
             setattr(stack, name, nn.Parameter(weights))
@@ -146,15 +143,26 @@ def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
 def lane_state(stack: nn.Module, lane: int) -> dict[str, Tensor]:
     """Copies of the weights of one lane of an acting network that `stack_lanes` made, as the state dict of
     the lane's network."""
-    if isinstance(stack, _OVER_ANOTHER):
-        inner = {f"network.{name}": value for name, value in lane_state(stack.network, lane).items()}
+    if _over(stack):
         weights = {
             name: value[lane].detach().clone() for name, value in stack.named_parameters(recurse=False)
         }
         buffers = {name: value.clone() for name, value in stack.named_buffers(recurse=False)}
+        inner = {
+            f"{part}.{name}": value
+            for part in _over(stack)
+            for name, value in lane_state(getattr(stack, part), lane).items()
+        }
         return {**weights, **buffers, **inner}
     state: dict[str, Tensor] = stack.lane_state(lane)  # type: ignore[operator]
     return state
+
+
+def _over(network: Any) -> list[str]:
+    """The attributes of a network that computes with the outputs of others: `stacks_over` of its class names
+    them, and its own weights get a lane axis in front."""
+    names = getattr(network, "stacks_over", ())
+    return [name for name in names if getattr(network, name) is not None]
 
 
 def _shapes(network: MLPNetwork) -> tuple[tuple[int, ...], ...]:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from copy import deepcopy
 from math import prod
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -11,7 +11,7 @@ from torchrl.modules import QMixer
 
 from cprl.networks.mlp import MLPNetwork
 from cprl.networks.recurrent import RecurrentNetwork, StackedRecurrent, state_shape_of
-from cprl.networks.stacked import StackedMLP, lane_state, stack_lanes, through_layers
+from cprl.networks.stacked import StackedMLP, lane_state, through_layers
 
 
 class RecurrentTeam(nn.Module):
@@ -100,6 +100,8 @@ class TeamNetwork(nn.Module):
 class SharedTeam(nn.Module):
     """Like `TeamNetwork` for members that share one network, of any architecture."""
 
+    stacks_over: ClassVar = ("network",)
+
     def __init__(self, network: nn.Module, *, observation_dims: int) -> None:
         super().__init__()
         self.network, self.observation_dims = network, 1 + observation_dims
@@ -111,15 +113,6 @@ class SharedTeam(nn.Module):
 
     def member_state(self, state: dict[str, Tensor], member: int) -> dict[str, Tensor]:
         return {name.removeprefix("network."): value for name, value in state.items()}
-
-    def stacked(self, teams: Sequence["SharedTeam"]) -> "SharedTeam":
-        """One network with the parameters of R teams along a first axis; copies."""
-        together = stack_lanes([team.network for team in teams])
-        return SharedTeam(together, observation_dims=self.observation_dims - 1)
-
-    def lane_state(self, lane: int) -> dict[str, Tensor]:
-        """Copies of the weights of one team of a stack, as its state dict."""
-        return {f"network.{name}": value for name, value in lane_state(self.network, lane).items()}
 
 
 class ModuleTeam(nn.Module):
@@ -159,6 +152,8 @@ def team_network(
 class CentralCritic(nn.Module):
     """The value of a state for a team, from the observations of all members; the same for each member."""
 
+    stacks_over: ClassVar = ("network",)
+
     def __init__(self, network: nn.Module, members: int) -> None:
         super().__init__()
         self.network, self.members = network, members
@@ -175,10 +170,6 @@ class CentralCritic(nn.Module):
     def _for_each(self, value: Tensor) -> Tensor:
         return value.unsqueeze(-2).expand(*value.shape[:-1], self.members, 1)
 
-    def stacked(self, critics: Sequence["CentralCritic"]) -> "CentralCritic":
-        """One critic with the parameters of many teams; copies."""
-        return CentralCritic(stack_lanes([critic.network for critic in critics]), self.members)
-
 
 class JointCritics(nn.Module):
     """The value of joint actions to each of S members, by a critic for each; critics share no weights.
@@ -191,6 +182,8 @@ class JointCritics(nn.Module):
         observation_dims: the number of axes of one member's observation.
         highest: the largest value of an observation; without encoders, observations are divided by it.
     """
+
+    stacks_over: ClassVar = ("heads", "encoders")
 
     def __init__(
         self,
@@ -217,16 +210,6 @@ class JointCritics(nn.Module):
             features = self.encoders(everyone.expand(*leading, members, *shape)).relu()
         values: Tensor = self.heads(torch.cat([features, joint_action.flatten(-2)], -1))
         return values
-
-    def stacked(self, critics: Sequence["JointCritics"]) -> "JointCritics":
-        """The critics of many teams, with their parameters along a first axis; copies."""
-        heads, encoders = ([getattr(critic, name) for critic in critics] for name in ("heads", "encoders"))
-        return JointCritics(
-            stack_lanes(heads),
-            None if self.encoders is None else stack_lanes(encoders),
-            observation_dims=self._dims - 1,
-            highest=self.highest,
-        )
 
 
 class Mixing(nn.Module):

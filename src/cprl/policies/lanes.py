@@ -14,7 +14,34 @@ from cprl.policies.rng import LaneRng
 from cprl.system.compiling import Compiled
 
 
-class LaneActor(TensorDictModuleBase):
+class ActorOfLanes(TensorDictModuleBase):
+    """What actors of S agents of every replica share: `count` random numbers a step of each lane's own.
+
+    Args:
+        seeds: of each lane, lane = replica x S + agent.
+        agents: the number of agents S of each replica.
+        worlds: the number of worlds k of each replica that are played at once, consecutive in the batch.
+        count: of each world.
+    """
+
+    in_keys: tuple[str, ...] = ("observation",)
+    out_keys: tuple[str, ...] = ("action",)
+
+    def __init__(self, seeds: Sequence[Sequence[int]], agents: int, worlds: int, count: int) -> None:
+        super().__init__()
+        self.agents, self.worlds, self.replicas = agents, worlds, len(seeds) // agents
+        self.rng = LaneRng(seeds, count * worlds)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """The state of its random numbers; part of `state_dict`."""
+        return self.rng.state_dict()
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Continue from that state."""
+        self.rng.load_state_dict(state)
+
+
+class LaneActor(ActorOfLanes):
     """Chooses epsilon-greedy, stochastic or uniformly random actions for S agents of every replica.
 
     It explores only under `ExplorationType.RANDOM`; each lane has its own random numbers.
@@ -25,9 +52,6 @@ class LaneActor(TensorDictModuleBase):
             those afterwards.
         stochastic: whether `values` returns the logits of a policy from which exploring agents sample, with
             no epsilon; else exploring agents are epsilon-greedy.
-        seeds: the exploration seed of each lane.
-        agents: the number of agents S of each replica.
-        worlds: the number of worlds k of each replica that are played at once, consecutive in the batch.
         state_cells: the numbers H of a recurrent state; 0 for networks without one.
         compile: whether torch compiles exploration; if that fails, the actor warns once and runs uncompiled.
 
@@ -47,9 +71,8 @@ class LaneActor(TensorDictModuleBase):
         state_cells: int = 0,
         compile: bool = False,
     ) -> None:
-        super().__init__()
+        super().__init__(seeds, agents, worlds, 2)
         self.values, self.stochastic, self.actions = values, stochastic, actions
-        self.agents, self.worlds, self.replicas = agents, worlds, len(seeds) // agents
         self.state_cells = 0 if values is None else state_cells
         states = ("recurrent_state",) if self.state_cells else ()
         self.in_keys, self.out_keys = ("observation", *states), ("action", *states)
@@ -57,7 +80,6 @@ class LaneActor(TensorDictModuleBase):
         self._chance = 0.0 if stochastic else 1.0
         self._epsilon = torch.tensor(self._chance, dtype=torch.float64)
         self._seeds = seeds
-        self.rng = LaneRng(seeds, 2 * self.worlds)
         self._explore = Compiled(type(self)._explored, what="agents act", enabled=compile)
 
     @property
@@ -147,14 +169,6 @@ class LaneActor(TensorDictModuleBase):
             return None
         values = self._by_replica(self._outputs(*seen)[0])
         return values.softmax(-1) if self.stochastic else values
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """The state of its random numbers; part of `state_dict`."""
-        return self.rng.state_dict()
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Continue from that state."""
-        self.rng.load_state_dict(state)
 
     def _outputs(self, *seen: Tensor) -> list[Tensor]:
         """The outputs of each lane's network [L, k, A], and the states afterwards [R x k, S, H]."""

@@ -40,7 +40,6 @@ import numba
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
@@ -52,8 +51,7 @@ from cprl.commons.near import distance
 from cprl.commons.spaces import Spaces
 from cprl.commons.world import Bytes
 from cprl.policies import scripted_rules
-from cprl.policies.lanes import random_lanes
-from cprl.policies.rng import LaneRng
+from cprl.policies.lanes import ActorOfLanes, random_lanes
 from cprl.policies.scripted_rules import AGENT, APPLE, NUMBERS, OPEN, UNKNOWN, WALL, Frame, Scratch, Settings
 
 ScriptedPolicy = Literal["random", "greedy", "sustainable", "territorial", "aggressive", "pacifist"]
@@ -67,24 +65,18 @@ all near each other, grows fastest with 3 apples: 2 empty sites x 0.05 per turn,
 apples and 3 x 0.01 with 2."""
 
 
-class ScriptedActor(TensorDictModuleBase):
+class ScriptedActor(ActorOfLanes):
     """S agents of every replica that follow one scripted policy; see the table above.
 
     The actions of a lane depend only on its own seed and observations. The first call compiles for some
     seconds; the compiled code is cached on disk.
 
     Args:
-        seeds: The seeds of each lane's random numbers; lane = replica x S + index among the S agents.
-        agents: The number S of agents of each replica, at least 1.
-        worlds: The number k of worlds of each replica, adjacent in the batch, at least 1.
         spare: For "sustainable": the number of other apples near an apple that it harvests, at least 1.
 
     `epsilon`, initially 0, is the probability of a random action under `ExplorationType.RANDOM`; under other
     exploration types it has no effect.
     """
-
-    in_keys = ("observation",)
-    out_keys = ("action",)
 
     def __init__(
         self,
@@ -96,15 +88,13 @@ class ScriptedActor(TensorDictModuleBase):
         worlds: int = 1,
         spare: int = SPARE,
     ) -> None:
-        super().__init__()
+        super().__init__(seeds, agents, worlds, NUMBERS)
         if game.observation.area != "window":
             raise ValueError(
                 f"Observation.area is {game.observation.area!r}; allowed with scripted policies: 'window', "
                 "because they rely on the agent's position in it"
             )
         self.policy, self.game, self.epsilon = policy, game, 0.0
-        self.agents, self.worlds, self.replicas = agents, worlds, len(seeds) // agents
-        self.rng = LaneRng(seeds, NUMBERS * self.worlds)
         self._settings, self._role_of_class = _settings(game, spare), _roles()
         self._rim, self._frame = _frame(game)
         size = self._frame.stride * (game.observation_shape[1] + 2 * self._rim)
@@ -143,14 +133,6 @@ class ScriptedActor(TensorDictModuleBase):
         """The random numbers of this turn in the order of the batch: float64 [replicas x k x S, NUMBERS]."""
         drawn = self.rng.next().numpy().reshape(self.replicas, self.agents, self.worlds, NUMBERS)
         return drawn.transpose(0, 2, 1, 3).reshape(-1, NUMBERS)
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """The state of the random numbers; part of `state_dict`."""
-        return self.rng.state_dict()
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Continues from that state."""
-        self.rng.load_state_dict(state)
 
 
 def scripted_lanes(

@@ -8,12 +8,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl.commons.spaces import Spaces
-from cprl.policies.rng import LaneRng
+from cprl.policies.lanes import ActorOfLanes
 
 NEVER_MET = 0
 """The row of states that are in no table; its values stay 0."""
@@ -166,7 +165,7 @@ def _find_them_again(network: TableNetwork, *_hook: Any) -> None:
     network._rows = {state.tobytes(): row for row, state in enumerate(network.states.numpy(force=True))}
 
 
-class TabularActor(TensorDictModuleBase):
+class TabularActor(ActorOfLanes):
     """Acts epsilon-greedily on the tables of its lanes.
 
     It explores only under `ExplorationType.RANDOM`, with separate random numbers for each lane. Of several
@@ -174,25 +173,19 @@ class TabularActor(TensorDictModuleBase):
 
     Args:
         tables: the tables of the lanes, with lane = replica x S + agent.
-        seeds: of each lane's exploration.
-        agents: the number of agents S of each replica.
-        worlds: how many worlds k of each replica are played at once, side by side in the batch.
 
     Reads "observation", [replicas x k, S, C, X, Y], and "stock_gauge" and "scoreboard" if the game has them;
     writes "action", int64 [replicas x k, S].
     """
 
-    out_keys = ("action",)
     stochastic = False
 
     def __init__(
         self, tables: QTables, spaces: Spaces, *, seeds: Sequence[Sequence[int]], agents: int, worlds: int = 1
     ) -> None:
-        super().__init__()
+        super().__init__(seeds, agents, worlds, 2)
         self.in_keys = observed_entries(spaces)
         self.tables, self.actions, self.epsilon = tables, spaces.actions, 1.0
-        self.agents, self.worlds, self.replicas = agents, worlds, len(seeds) // agents
-        self.rng = LaneRng(seeds, 2 * worlds)
         lanes = np.arange(self.rng.lanes).reshape(self.replicas, 1, agents)
         self._lanes = np.broadcast_to(lanes, (self.replicas, worlds, agents)).reshape(-1).tolist()
 
@@ -206,11 +199,3 @@ class TabularActor(TensorDictModuleBase):
             chosen = np.where(explores < self.epsilon, (which * self.actions).astype(np.int64), chosen)
         action = torch.from_numpy(chosen.reshape(-1, self.agents)).to(tensordict.get("observation").device)
         return tensordict.set("action", action)
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """The state of the random numbers; part of `state_dict`."""
-        return self.rng.state_dict()
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Continues from that state."""
-        self.rng.load_state_dict(state)
