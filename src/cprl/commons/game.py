@@ -168,11 +168,6 @@ class Game(Value):
         envs = import_module("cprl.envs.commons_env")  # the game itself knows nothing of torch
         return envs.CommonsEnv(self, worlds, seed=seed, device=device)
 
-    def to_config(self) -> dict[str, Any]:
-        """Its map, rules, observation and institutions as JSON can hold them."""
-        config: dict[str, Any] = import_module("cprl.values").to_config(self)
-        return config
-
     @property
     def palette(self) -> Bytes:
         """The colour of each class of cell: uint8 [classes, 3], red, green and blue."""

@@ -6,7 +6,7 @@ Sources: Foerster et al. (2018), "Learning with Opponent-Learning Awareness", AA
 "Multi-agent Reinforcement Learning in Sequential Social Dilemmas", AAMAS.
 """
 
-from dataclasses import KW_ONLY, asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, ClassVar, Final, TypedDict, Unpack
 
@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cprl.envs.stage_games import Memory, StageEnv, StageGame
-from cprl.values import MOST_NUMBER, Positive, PositiveShare, refusal
+from cprl.envs.stage_games import StageEnv, StageGame
+from cprl.values import MOST_NUMBER, refusal
 
 _MOST_PAYOFFS: Final = 2**16
 
@@ -23,20 +23,13 @@ _MOST_PAYOFFS: Final = 2**16
 @dataclass(frozen=True)
 class MatrixGame(StageGame):
     """A game of N agents who choose among A actions each, at once, and are paid by a table; where it is
-    played for several turns, agents observe the last joint actions. When it ends, see `StageGame`.
+    played for several turns, agents observe the last joint actions, each as A**N + 1 numbers. When it ends,
+    see `StageGame`.
     """
 
     payoffs: Any
     """What all N agents are paid, float [A, ..., A, N]: an axis for the action of each agent, and their
     payoffs last; nested tuples, lists or an array."""
-    _: KW_ONLY
-    turns: Positive = 1
-    """Turns of an episode, at most."""
-    memory: Memory = None
-    """How many of the last joint actions agents observe, each as A**N + 1 numbers; by default 1, and 0 in a
-    game of one turn, in which the observation is the number 1."""
-    continue_prob: PositiveShare = 1.0
-    """The probability that a further turn follows."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -51,10 +44,6 @@ class MatrixGame(StageGame):
     def actions(self) -> int:
         """The number of actions A of each agent."""
         return len(self.payoffs)
-
-    def to_config(self) -> dict[str, Any]:
-        """Its fields."""
-        return asdict(self)
 
     def make(self, worlds: int, seed: int, device: Any, *, first_world: int = 0) -> "MatrixEnv":
         """Its environment, so many worlds; see `MatrixEnv`."""

@@ -1,6 +1,7 @@
 """Stage games: all that happens is the agents' joint action, once or for several turns; B worlds at once."""
 
 from abc import abstractmethod
+from dataclasses import dataclass
 from math import log1p
 from typing import Annotated, Any, ClassVar, Final
 
@@ -24,9 +25,8 @@ _REPLACED: Final = frozenset(
 _LENGTH: Final = np.uint64(5 << 28)
 """The purpose of a draw in `cprl.commons.chance`: how many turns an episode lasts."""
 
-Memory = Annotated[int, Range(0, 64)] | None
 
-
+@dataclass(frozen=True, kw_only=True)
 class StageGame(Value, stored=False):
     """A game of N agents who act at once, for one turn or several: what `StageEnv` asks of a game.
 
@@ -34,9 +34,13 @@ class StageGame(Value, stored=False):
     agents learn as if it went on; with a `continue_prob` below 1 it terminates where no further turn follows.
     """
 
-    turns: Positive
-    memory: Memory
-    continue_prob: PositiveShare
+    turns: Positive = 1
+    """Turns of an episode, at most."""
+    memory: Annotated[int, Range(0, 64)] | None = None
+    """How many of the last turns agents observe; by default 1, and 0 in a game of one turn, in which the
+    observation is the number 1."""
+    continue_prob: PositiveShare = 1.0
+    """The probability that a further turn follows."""
 
     @property
     def remembered(self) -> int:

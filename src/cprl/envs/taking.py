@@ -3,16 +3,16 @@
 `TakingGame` is a `cprl.theory.SharingGame` that agents play, and `TakingEnv` plays B worlds of one.
 """
 
-from dataclasses import KW_ONLY, dataclass, fields
+from dataclasses import KW_ONLY, dataclass
 from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from cprl.envs.stage_games import Memory, StageEnv, StageGame
+from cprl.envs.stage_games import StageEnv, StageGame
 from cprl.theory.sharing import Above0, SharingGame
-from cprl.values import Positive, PositiveShare, Range
+from cprl.values import Range
 
 _MOST_TOTALS: Final = 2**22
 """How many totals there may be when agents choose from levels."""
@@ -26,8 +26,8 @@ class TakingGame(StageGame):
     """A game in which each of n agents chooses, all at once, how much it takes of what they share.
 
     Agents are paid `SharingGame.payoffs`. They choose one of `levels` evenly spaced amounts from 0 to
-    `most_each`. Where it is played for several turns, agents observe what they took in the last ones. When it
-    ends, see `StageGame`.
+    `most_each`. Where it is played for several turns, agents observe what they took in the last ones, each as
+    three numbers. When it ends, see `StageGame`.
 
     A recipe holds games whose worth is a `PowerWorth`. A worth of your own, e.g. a `CallableWorth`, can be
     played; in an experiment the game is then a `Custom` of a function that makes it.
@@ -41,13 +41,6 @@ class TakingGame(StageGame):
     most: Above0 | None = None
     """The most that an agent can take in a turn. By default twice what it takes in the symmetric equilibrium,
     or what the game itself allows, `SharingGame.most_each`, if that is less."""
-    turns: Positive = 1
-    """Turns of an episode, at most."""
-    memory: Memory = None
-    """Of how many of the last turns agents observe what was taken, each as three numbers; by default 1, and 0
-    in a game of one turn, in which the observation is the number 1."""
-    continue_prob: PositiveShare = 1.0
-    """The probability that a further turn follows."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -86,10 +79,6 @@ class TakingGame(StageGame):
     def amounts(self) -> tuple[float, ...]:
         """What an agent takes by its action 0, 1 and so on."""
         return tuple(np.linspace(0, self.most_each, self.levels).tolist())
-
-    def to_config(self) -> dict[str, Any]:
-        """Its fields."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def make(self, worlds: int, seed: int, device: Any, *, first_world: int = 0) -> "TakingEnv":
         """Its environment, so many worlds; see `TakingEnv`."""
