@@ -6,61 +6,26 @@ import shutil
 import signal
 import time
 from contextlib import contextmanager
-from dataclasses import MISSING, fields, replace
+from dataclasses import fields, replace
 from decimal import Decimal
-from functools import cache
 from pathlib import Path
-from typing import get_type_hints
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from tiny_study import GAME, LEARNING, TINY
+from valid_values import valid
 
 import cprl
-from cprl import Experiment, algorithms, institutions, population, theory
+from cprl import Experiment
 from cprl.custom import allowing, custom_targets
-from cprl.envs.matrix import prisoners_dilemma
-from cprl.envs.taking import TakingGame
-from cprl.learners import preferences
 from cprl.runs.episodes import read_episodes, read_table
 from cprl.runs.files import RunLock, read_json
 from cprl.values import KINDS, from_config, to_config
 
 LONGEST_S = 10.0
 STORED = Path(__file__).parent / "stored" / "run"
-REQUIRED = {
-    "Game": lambda: replace(GAME, institutions=(institutions.Quota(fine=1.0), institutions.Monitoring())),
-    "Map": lambda: GAME.map,
-    "Learning": lambda: LEARNING,
-    "Team": lambda: population.Team(algorithms.VDN(settings=algorithms.DQNSettings()), agents=(0, 1)),
-    "Frozen": lambda: population.Frozen("runs/none", agent=0),
-    "MatrixGame": prisoners_dilemma,
-    "TakingGame": lambda: TakingGame(theory.herders(2)),
-    "SharingGame": lambda: theory.herders(2),
-    "InequityAversion": lambda: preferences.InequityAversion(alpha=5, beta=0.05, smoothing=0.9),
-    "SocialValueOrientation": lambda: preferences.SocialValueOrientation(angle=0.5, weight=1.0),
-    "Exchange": lambda: preferences.Exchange(0.5),
-    "Boundaries": lambda: institutions.Boundaries.strips(height=3, width=5, agents=2),
-    "Levies": lambda: institutions.Levies(groups=((0,), (1,))),
-    "Vote": lambda: institutions.Vote(on=institutions.Tax()),
-    "Custom": lambda: cprl.Custom("torchrl.envs.transforms:RewardScaling", arguments={"loc": 0.0}),
-}
-"""Values of the kinds that cannot be made of nothing, or of their settings alone."""
-
-
-@cache
-def valid(name):
-    """A valid value of a registered kind, or an experiment."""
-    if name == "Experiment":
-        return TINY
-    kind = KINDS[name]
-    if name in REQUIRED:
-        return REQUIRED[name]()
-    required = [field.name for field in fields(kind) if field.init and field.default is MISSING]
-    return kind(settings=get_type_hints(kind)["settings"]()) if "settings" in required else kind()
 
 
 def nested(depth):

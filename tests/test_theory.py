@@ -113,12 +113,7 @@ def test_payoffs_have_any_leading_axes():
 @pytest.mark.parametrize(
     ("call", "field"),
     [
-        (lambda: herders(0), r"SharingGame\.agents"),
-        (lambda: herders(2, cost=-1), r"SharingGame\.cost"),
-        (lambda: herders(2, worth=3), r"SharingGame\.worth"),
-        (lambda: herders(2, worth=PowerWorth), r"SharingGame\.worth"),
         (lambda: appropriation(tokens=0), "tokens"),
-        (lambda: PowerWorth(power=0.5), r"PowerWorth\.power"),
         (lambda: herders(2).payoffs([1, 2, 3]), "taken"),
         (lambda: herders(2).payoffs([1, -1]), "taken"),
         (lambda: appropriation(2).payoffs([1, float("nan")]), "taken"),

@@ -1,0 +1,48 @@
+"""A valid value of each kind that a recipe holds."""
+
+from dataclasses import MISSING, fields, replace
+from functools import cache
+from typing import get_type_hints
+
+from tiny_study import GAME, LEARNING, TINY
+
+import cprl
+from cprl import algorithms, institutions, population, theory
+from cprl.envs.matrix import prisoners_dilemma
+from cprl.envs.taking import TakingGame
+from cprl.learners import preferences
+from cprl.values import KINDS
+
+REQUIRED = {
+    "Game": lambda: replace(GAME, institutions=(institutions.Quota(fine=1.0), institutions.Monitoring())),
+    "Map": lambda: GAME.map,
+    "Learning": lambda: LEARNING,
+    "Team": lambda: population.Team(algorithms.VDN(settings=algorithms.DQNSettings()), agents=(0, 1)),
+    "Frozen": lambda: population.Frozen("runs/none", agent=0),
+    "MatrixGame": prisoners_dilemma,
+    "TakingGame": lambda: TakingGame(theory.herders(2)),
+    "SharingGame": lambda: theory.herders(2),
+    "InequityAversion": lambda: preferences.InequityAversion(alpha=5, beta=0.05, smoothing=0.9),
+    "SocialValueOrientation": lambda: preferences.SocialValueOrientation(angle=0.5, weight=1.0),
+    "Exchange": lambda: preferences.Exchange(0.5),
+    "Boundaries": lambda: institutions.Boundaries.strips(height=3, width=5, agents=2),
+    "Levies": lambda: institutions.Levies(groups=((0,), (1,))),
+    "Vote": lambda: institutions.Vote(on=institutions.Tax()),
+    "Custom": lambda: cprl.Custom("torchrl.envs.transforms:RewardScaling", arguments={"loc": 0.0}),
+}
+"""Values of the kinds that cannot be made of nothing, or of their settings alone."""
+
+
+@cache
+def valid(name):
+    """A valid value of a registered kind, or an experiment."""
+    if name == "Experiment":
+        return TINY
+    kind = KINDS[name]
+    if name in REQUIRED:
+        return REQUIRED[name]()
+    required = [field.name for field in fields(kind) if field.init and field.default is MISSING]
+    return kind(settings=get_type_hints(kind)["settings"]()) if "settings" in required else kind()
+
+
+EVERY = [valid(name) for name in sorted({*KINDS, "Experiment"})]
