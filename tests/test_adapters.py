@@ -264,7 +264,7 @@ def test_the_image_shows_each_agent_in_play_in_its_own_colour():
     [
         ({"agent_0": 0}, r"actions has the agents \['agent_0'\]; allowed: exactly "),
         ({"agent_0": 0, "agent_1": 0, "agent_2": 0}, "allowed: exactly "),
-        ({"agent_0": 0, "agent_1": 8}, "the action of agent_1 is 8; allowed: an integer from 0 to 7"),
+        ({"agent_0": 0, "agent_1": 8}, "the action of agent_1 is 8"),
     ],
 )
 def test_wrong_actions_are_refused_and_change_nothing(actions, message):

@@ -91,8 +91,8 @@ def test_torchrls_video_recorder_takes_the_worlds_as_a_grid_or_one_of_them(world
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"world": 2}, "world is 2; allowed: an integer from 0 to 1"),
-        ({"cell_pixels": 7}, "cell_pixels is 7; allowed: an integer from 8 to 1,000"),
+        ({"world": 2}, "world is 2"),
+        ({"cell_pixels": 7}, "cell_pixels is 7"),
         ({"cell_pixels": 8.5}, r"cell_pixels is 8\.5; allowed"),
     ],
 )
