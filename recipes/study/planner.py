@@ -12,18 +12,18 @@ It is a rule of thumb, not an optimum: nobody has shown that more cannot be got;
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.checks import Check, check_fields, is_number
 from cprl.commons.batch import Batch, turn_of
 from cprl.commons.compiled import kept_on_disk
 from cprl.commons.game import Game
 from cprl.commons.moves import WALK_TURN
 from cprl.commons.near import neighbours
 from cprl.commons.world import COL_STEP, ROW_STEP
+from cprl.values import Range, Value
 
 Array = NDArray[Any]
 
@@ -227,32 +227,23 @@ _SEED_OF_CHOICE: Final = 50_023
 
 Values = NDArray[np.float64]
 
-_CHECKS: Final[dict[str, Check]] = {
-    "patience_steps": Check(lambda value: is_number(value, 1, 1e9), "a number of at least 1"),
-    **dict.fromkeys(
-        ("growth_weight_steps", "haste_steps"),
-        Check(lambda value: is_number(value, 0, 1e9), "a number of at least 0"),
-    ),
-}
+Weight = Annotated[float, Range(0, 1e9)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Planner:
+class Planner(Value):
     """The numbers that a planner weighs by.
 
     Raises:
         ValueError: names the field, what came and what is allowed.
     """
 
-    patience_steps: float = 160.0
-    """For how many turns a change of the growth counts, at least 1; fewer near the end of an episode."""
-    growth_weight_steps: float = 20.0
+    patience_steps: Annotated[float, Range(1, 1e9)] = 160.0
+    """For how many turns a change of the growth counts; fewer near the end of an episode."""
+    growth_weight_steps: Weight = 20.0
     """How many steps further an agent goes for an apple whose taking adds 1 apple a turn to the growth."""
-    haste_steps: float = 15.0
+    haste_steps: Weight = 15.0
     """How many turns before the end of an episode nothing is left to grow any more."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, _CHECKS)
 
 
 CANDIDATES: Final = tuple(Planner(growth_weight_steps=weight) for weight in (0.0, 20.0, 60.0, 200.0))

@@ -8,11 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
-from cprl.arguments import refusal
-from cprl.checks import checked, one_of
 from cprl.commons import maps
 from cprl.commons.game import Game
 from cprl.commons.rules import Rules
+from cprl.values import checked, refusal
 
 if TYPE_CHECKING:
     from cprl.envs.gymnasium_env import CommonsGymnasiumEnv
@@ -105,23 +104,21 @@ def dqn_settings(board: Board, *, variant: Variant = "published") -> "DQNSetting
     )
 
 
-def variant_of(game: object) -> Variant | None:
+def variant_of(played: object) -> Variant | None:
     """The variant of a published game, whether agents may fire or not; None for any other game."""
-    if not isinstance(game, Game) or game.institutions:
+    if not isinstance(played, Game) or played.institutions:
         return None
     for board, variant in GAMES:
-        published = _published(board, variant)
-        rules = replace(game.rules, may_fire=published.rules.may_fire)
-        if (game.map, rules, game.observation) == (published.map, published.rules, published.observation):
+        published = game(board, variant=variant)
+        rules = replace(played.rules, may_fire=published.rules.may_fire)
+        if (played.map, rules, played.observation) == (published.map, published.rules, published.observation):
             return variant
     return None
 
 
-def _published(board: Board, variant: Variant) -> Game:
-    return game(board, variant=variant)
-
-
 def _check(board: str, variant: str) -> None:
-    checked("board", board, one_of(*BOARDS))
-    checked("variant", variant, one_of(*VARIANTS))
-    checked(f"variant of {board}", variant, one_of(*(own for of, own in GAMES if of == board)))
+    checked("board", board, Board)
+    checked("variant", variant, Variant)
+    if (board, variant) not in GAMES:
+        allowed = ", ".join(repr(known) for of, known in GAMES if of == board)
+        raise refusal(f"variant of {board}", variant, allowed)

@@ -15,7 +15,6 @@ import reprlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from difflib import get_close_matches
-from functools import cache
 from math import isfinite
 from types import NoneType, UnionType
 from typing import (
@@ -143,11 +142,15 @@ class Value:
         return {name: to_config(getattr(self, name), f"{self._called}.{name}") for name in names}
 
 
-@cache
-def hints_of(kind: type[Any]) -> dict[str, Any]:
+_HINTS: Final[dict[Any, dict[str, Any]]] = {}
+
+
+def hints_of(kind: Any) -> dict[str, Any]:
     """Return the annotations of the fields that a dataclass is made from, in their order."""
-    hints = get_type_hints(kind, include_extras=True)
-    return {field.name: hints[field.name] for field in fields(kind) if field.init}
+    if kind not in _HINTS:
+        hints = get_type_hints(kind, include_extras=True)
+        _HINTS[kind] = {field.name: hints[field.name] for field in fields(kind) if field.init}
+    return _HINTS[kind]
 
 
 class _UnfitError(Exception):
@@ -175,13 +178,13 @@ def _refused(name: str, value: Any, hint: Any) -> ValueError:
             place = next((place for place, entry in enumerate(value) if not fits(entry, inner[0])), None)
             if place is not None:
                 return _refused(f"{name}[{place}]", value[place], inner[0])
-    is_object = not isinstance(value, _SIMPLE | type | Value | Custom)
+    is_object = not isinstance(value, (*_SIMPLE, Value, Custom))
     if is_object and Custom in (*get_args(hint), hint):
         return ValueError(_not_stored(value, name))
     return refusal(name, value, words(hint))
 
 
-_SIMPLE = str | bytes | int | float | complex | tuple | list | dict | set | range | None
+_SIMPLE: Final = (str, bytes, int, float, complex, tuple, list, dict, set, range, NoneType, type)
 
 
 def fits(value: Any, hint: Any) -> bool:

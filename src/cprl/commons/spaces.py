@@ -1,25 +1,16 @@
 """Spaces: what every agent of an environment observes and may do; learners and networks are made from it."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Final
 
 from cprl.values import Positive, Range, Value, Where
 
-Dtype = Literal[
-    "bool",
-    "uint8",
-    "uint16",
-    "uint32",
-    "uint64",
-    "int8",
-    "int16",
-    "int32",
-    "int64",
-    "float16",
-    "float32",
-    "float64",
-]
-"""The dtypes that numpy and torch share; numpy has no bfloat16."""
+DTYPES: Final = (
+    *("bool", "uint8", "uint16", "uint32", "uint64", "int8", "int16", "int32", "int64"),
+    *("float16", "float32", "float64"),  # numpy has no bfloat16
+)
+Dtype = Annotated[str, Where(lambda name: name in DTYPES, ", ".join(map(repr, DTYPES)))]
+"""By the name that numpy and torch share."""
 
 
 Name = Annotated[str, Where(bool, "the name of an entry")]
