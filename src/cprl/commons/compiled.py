@@ -106,11 +106,7 @@ def machine_code(function: Any, *arguments: Any) -> Callable[..., Any]:
 
 
 def compiled(functions: Iterable[Any], jit: Callable[[FunctionType], Callable[..., Any]]) -> Compiled:
-    """Compile plain functions, and before each of them the functions of `cprl` that it calls.
-
-    Returns:
-        Each of `functions`, compiled, by its name.
-    """
+    """Compile plain functions, and before each of them the functions of `cprl` that it calls."""
     done: dict[FunctionType, Callable[..., Any]] = {}
 
     def compile_one(function: FunctionType) -> Callable[..., Any]:

@@ -13,11 +13,8 @@ UNSEEN: Final = 255
 
 
 def classes_seen(game: Game, windows: Bytes) -> Bytes:
-    """The class of each cell (`cprl.commons.colours`) of a game's observations, uint8 [T, N, C, X, Y]; UNSEEN
-    for a colour that the game does not use.
-
-    Returns:
-        uint8 [T, N, X, Y].
+    """Return the class of each cell (`cprl.commons.colours`), uint8 [T, N, X, Y], of a game's observations,
+    uint8 [T, N, C, X, Y]; UNSEEN for a colour that the game does not use.
     """
     windows = windows[:, :, : len(game.cell_channels)]
     if game.observation.encoding == "one_hot":

@@ -39,13 +39,7 @@ class Observation(Value):
 
 
 def classes_shown(observation: Observation, *, agents: int, hides: bool) -> tuple[int, ...]:
-    """The classes that can occur, in the order of the channels of "one_hot".
-
-    Args:
-        observation: The form of the observations.
-        agents: The number of agents N.
-        hides: Whether walls block sight.
-    """
+    """The classes that can occur, in the order of the channels of "one_hot"."""
     others = [FIRST_AGENT + i for i in range(agents)] if observation.agents_apart else [OTHER]
     hidden = [HIDDEN] if hides else []
     return (*range(GROUND, BEAM + 1), *sorted([*others, SELF, *hidden]))

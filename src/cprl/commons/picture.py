@@ -86,11 +86,8 @@ POINTS: Final = max(map(len, _PATHS))
 
 
 def number_paths(number: int) -> NDArray[np.float32]:
-    """The paths of a number's digits around (0, 0), in points of the grid.
-
-    Returns:
-        float32 [digits, POINTS, 2], column and row of each corner.
-    """
+    """Return the paths of a number's digits around (0, 0), float32 [digits, POINTS, 2]: column and row of each
+    corner, in points of the grid."""
     digits = str(number)
     paths = np.empty((len(digits), POINTS, 2), np.float32)
     for place, digit in enumerate(digits):

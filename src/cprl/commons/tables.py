@@ -162,9 +162,6 @@ def cells_between(rows: int, cols: int) -> list[tuple[int, int]]:
     A line that only touches a corner of a cell does not cross the cell: agents see through the gap between
     two diagonal walls. The line crosses the interior of the unit square around (r, c) if
     abs(rows c - cols r) < (abs(rows) + abs(cols)) / 2.
-
-    Returns:
-        (row, col) of each cell, relative to the first.
     """
     down, right = (1 if rows >= 0 else -1), (1 if cols >= 0 else -1)
     return [

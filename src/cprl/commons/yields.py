@@ -17,9 +17,6 @@ def sustainable_yield(board: Map, rules: Rules) -> float:
     in which it is bitten, except under `regrow_before_bites`, where it bears p. Which sites are harvested is
     found by a greedy search, so more may be possible. An isolated cross under the published probabilities
     has two harvested sites with three apples near each: 0.1 apples a turn as run.
-
-    Returns:
-        Apples per turn of all agents together; 0 where nothing grows.
     """
     around = sites_around(board, rules)
     probs = np.array(rules.regrow_prob)

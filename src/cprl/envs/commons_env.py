@@ -1,6 +1,6 @@
 """CommonsEnv: B worlds of a commons as one TorchRL environment."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from math import prod
 from typing import Annotated, Any
 
@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 
 from cprl import keys
 from cprl.commons.batch import Batch, Output, output_of, turn_of
@@ -18,7 +18,6 @@ from cprl.commons.picture import world_image
 from cprl.commons.world import PLAYING, Bytes, StepOutput
 from cprl.envs.drivers import device_of, drawn_seed, driver_for
 from cprl.envs.stepping import begin_states, carry_on, chosen
-from cprl.institutions import COUNTS
 from cprl.system.compat import LeanStepEnv, flag_spec, unchecked_tensordict
 from cprl.system.memory import check_memory
 from cprl.values import Range, Seed, checked
@@ -106,46 +105,42 @@ class CommonsEnv(LeanStepEnv):
         self._make_specs()
 
     def _make_specs(self) -> None:
-        game, worlds, per_agent = self.game, self._size, (self._size, self.game.agents)
+        game, worlds, per_agent = self.game, self._size, self._agents_size
+        highest = {"observation": game.observation_highest, "harvest": 1, "stock_gauge": 1}
+        highest |= {
+            "scoreboard": game.rules.episode_steps,
+            **dict.fromkeys(WORLD_ENTRIES, len(game.map.sites)),
+        }
 
-        def group(**specs: Any) -> Composite:
-            return Composite(agents=Composite(**specs, shape=per_agent), shape=(worlds,))
+        def specs(names: Iterable[str]) -> dict[str, TensorSpec]:
+            return {name: spec(name, *self._forms[name]) for name in names}
 
+        def spec(name: str, shape: tuple[int, ...], dtype: torch.dtype) -> TensorSpec:
+            if dtype is torch.bool:
+                return flag_spec(*shape)
+            if name in highest:
+                return Bounded(0, highest[name], shape=shape, dtype=dtype)
+            return Unbounded(shape=shape, dtype=dtype)
+
+        def group(**of_agents: TensorSpec) -> Composite:
+            return Composite(agents=Composite(**of_agents, shape=per_agent), shape=(worlds,))
+
+        choices = {"action": len(game.actions), **({"decision": game.decisions} if self._decides else {})}
         self.action_spec = group(
-            action=Categorical(len(game.actions), shape=per_agent, dtype=torch.int64),
-            **({"decision": Categorical(game.decisions, shape=per_agent)} if self._decides else {}),
+            **{
+                name: Categorical(count, shape=per_agent, dtype=torch.int64)
+                for name, count in choices.items()
+            }
         )
-        observation = group(
-            observation=Bounded(
-                0, game.observation_highest, shape=(*per_agent, *game.observation_shape), dtype=torch.uint8
-            ),
-            harvest=Bounded(0, 1, shape=per_agent, dtype=torch.float32),
-            in_play=flag_spec(*per_agent),
-            fired=flag_spec(*per_agent),
-            hit_by=flag_spec(*per_agent, game.agents),
-            tagged_by=flag_spec(*per_agent, game.agents),
-        )
-        highest = {"scoreboard": float(game.rules.episode_steps), "stock_gauge": 1.0}
-        for name, size in game.spaces.vectors:
-            vector = Bounded(0, highest[name], shape=(*per_agent, size), dtype=torch.float32)
-            observation[keys.AGENTS, name] = vector
-        if self._is_governed:
-            for key in (keys.FINES, keys.TRANSFERS):
-                observation[key] = Unbounded(shape=per_agent, dtype=torch.float32)
-            observation[keys.VIOLATED] = flag_spec(*per_agent)
-            observation[keys.COUNTS] = Unbounded(shape=(*per_agent, len(COUNTS)), dtype=torch.int32)
-        if game.ballots:
-            of_ballots = worlds, len(game.ballots)
-            observation[keys.IN_FORCE] = Unbounded(shape=of_ballots, dtype=torch.float32)
-            observation[keys.BALLOTS_DUE] = flag_spec(*of_ballots)
-        for name in WORLD_ENTRIES:
-            observation[name] = Bounded(0, len(game.map.sites), shape=(worlds, 1), dtype=torch.int64)
+        observation = group(**specs(self._agent_entries))
+        for name, of_worlds in specs(self._world_entries).items():
+            observation[name] = of_worlds
         if self._with_state:
             board = worlds, 3, game.map.height, game.map.width
             observation[keys.STATE] = Bounded(0, 255, shape=board, dtype=torch.uint8)
         self.observation_spec = observation
         self.reward_spec = group(reward=Unbounded(shape=(*per_agent, 1), dtype=torch.float32))
-        self.done_spec = Composite({name: flag_spec(worlds, 1) for name in DONE_ENTRIES}, shape=(worlds,))
+        self.done_spec = Composite(specs(DONE_ENTRIES), shape=(worlds,))
 
     def __repr__(self) -> str:
         return f"CommonsEnv({self.game!r}, worlds={self._size}, device={str(self.device)!r})"

@@ -79,11 +79,7 @@ def make_env(
 
 
 def spaces_of(env: EnvBase) -> Spaces:
-    """What each agent of an environment observes and may do, transforms included.
-
-    Raises:
-        ValueError: for specs that agents cannot read, e.g. actions that are not categorical.
-    """
+    """What each agent of an environment observes and may do, transforms included."""
     observation, action = _spec(env, "observation"), _spec(env, "action")
     if not isinstance(action, Categorical) or action.ndim != 2:
         raise ValueError(

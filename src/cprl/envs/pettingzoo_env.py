@@ -200,11 +200,7 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         return np.ascontiguousarray(board.transpose(2, 0, 1))
 
     def render(self) -> Bytes:
-        """Return an image, uint8 [rows, columns, 3].
-
-        Raises:
-            ValueError: If there is no render mode, or the episode has not begun.
-        """
+        """Return an image, uint8 [rows, columns, 3]."""
         if self.render_mode is None:
             raise ValueError('render_mode is None, so there is no render(); allowed: "rgb_array", when made')
         self._check_begun("render()")

@@ -130,9 +130,6 @@ def conditional(joint: Tensor, temperature: float) -> Tensor:
     Args:
         joint: values of pairs, float [..., N - 1, A, A].
         temperature: T, in units of reward.
-
-    Returns:
-        Probabilities [..., N - 1, A, A], which sum to 1 over the last axis, the peer's action.
     """
     return (joint / temperature).softmax(-1)
 
@@ -150,11 +147,7 @@ def chosen(joint: Tensor, action: Tensor) -> Tensor:
     """The value of one joint action.
 
     Args:
-        joint: values of pairs, float [..., N - 1, A, A].
         action: int64 [..., N], the agent's own action first.
-
-    Returns:
-        Float [...].
     """
     actions = joint.shape[-1]
     action_of_agent, peers = action[..., :1], action[..., 1:]

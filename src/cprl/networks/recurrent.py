@@ -198,7 +198,6 @@ def _outputs(
     """The outputs and the states after each step, of features [..., F] and states [..., K].
 
     Args:
-        features: of one step, or of sequences if `is_init` is given.
         size: L, the sequences of each lane or -1, and the steps of each.
     """
     lanes, _, steps = size
@@ -226,13 +225,7 @@ def _through_time(weights: _Weights, gates: Tensor, state: Tensor, is_init: Tens
 
 
 def _step(weights: _Weights, of_input: Tensor, state: Tensor) -> Tensor:
-    """The states after a step, [L, n, K].
-
-    Args:
-        weights: of L lanes.
-        of_input: what the gates get from the input, [L, n, gates x H].
-        state: before the step, [L, n, K].
-    """
+    """The states after a step, [L, n, K]."""
     cells, gates = weights.state.shape[-2:]
     return (_gru_step if gates == 3 * cells else _lstm_step)(weights, of_input, state)
 

@@ -17,10 +17,6 @@ from cprl.networks.stacked import StackedMLP, lane_state, through_layers
 class RecurrentTeam(nn.Module):
     """The recurrent networks of the S members of a team as one network, with the parameters of each member
     along a first axis, or with those of one network that all of them share.
-
-    Args:
-        networks: the members' networks, of one architecture, whose weights are copied; or the same one for
-            each member, which is kept.
     """
 
     def __init__(self, networks: Sequence[RecurrentNetwork]) -> None:

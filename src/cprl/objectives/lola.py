@@ -201,8 +201,6 @@ def dice_objective(
     """The mean discounted return of the pieces of each rollout, [.., N], differentiable any number of times.
 
     Args:
-        log_prob: of the actions that were taken, float [.., T, N]; every reward may depend on all of them.
-        reward: of N agents, float [.., T, N].
         gamma: the discount per step, 0..1.
         done: whether a piece ends with this step, bool [.., T, 1]; by default none does before the last.
         baseline: what the returns from a step on are compared with, float [.., T, N], without a gradient. It
@@ -221,7 +219,6 @@ def loaded_dice(log_prob: Tensor, advantage: Tensor, *, gamma: float, done: Tens
     """Zeros [.., N] with the derivatives, of any order, of the mean discounted return of pieces.
 
     Args:
-        log_prob: of the actions that were taken, float [.., T, N].
         advantage: an estimate of each action's advantage, float [.., T, N], without a gradient. Returns to
             the end of the piece less a baseline are unbiased, and then this is `dice_objective`, less its
             value; what bootstraps, as generalised advantage estimates do, has less variance and a bias.

@@ -147,9 +147,6 @@ def scripted_lanes(
 
     Args:
         playing: the game; its spaces alone where it is not a `Game`, for the random policy.
-
-    Raises:
-        ValueError: for another policy than "random" in a game that is not a `Game`.
     """
     if policy == "random":
         spaces = playing if isinstance(playing, Spaces) else playing.spaces

@@ -36,9 +36,6 @@ _ROUNDING: Final = 1e-9
 def compositions(agents: int, strategies: int) -> Counts:
     """How many of N agents play each of S strategies, int64 [C, S], every way once; the first row has all of
     them play strategy 0, the last one the last strategy.
-
-    Raises:
-        ValueError: for more than 100,000 rows.
     """
     rows = comb(agents + strategies - 1, agents)
     if rows > MOST_COMPOSITIONS:

@@ -73,10 +73,6 @@ def equilibria(table: PayoffTable) -> tuple[Equilibrium, ...]:
 
     Args:
         table: of two agents and up to 6 strategies; of a game of more agents its `reduced`.
-
-    Raises:
-        ValueError: for other tables.
-        ModuleNotFoundError: if nashpy is not installed.
     """
     if table.agents != 2:
         raise ValueError(f"table is of {table.agents} agents; allowed: 2, e.g. table.reduced")
@@ -111,10 +107,6 @@ def alpha_rank(table: PayoffTable) -> AlphaRank:
 
     Args:
         table: with at most 256 profiles S^N; of a larger game its `reduced`.
-
-    Raises:
-        ValueError: for a larger table.
-        ModuleNotFoundError: if OpenSpiel is not installed.
     """
     profiles = table.strategies**table.agents
     if profiles > MOST_PROFILES:
@@ -185,10 +177,6 @@ def replicator_ends(table: PayoffTable, *, starts: int = STARTS, seed: int = 0) 
 
     Args:
         starts: so many mixtures, drawn uniformly.
-        seed: the seed of these draws.
-
-    Raises:
-        ModuleNotFoundError: if OpenSpiel is not installed.
     """
     rng = np.random.default_rng(seed)
     reached = [_end(table, mixture) for mixture in rng.dirichlet(np.ones(table.strategies), starts)]
