@@ -86,8 +86,8 @@ POINTS: Final = max(map(len, _PATHS))
 
 
 def number_paths(number: int) -> NDArray[np.float32]:
-    """Return the paths of a number's digits around (0, 0), float32 [digits, POINTS, 2]: column and row of each
-    corner, in points of the grid."""
+    """Return the paths of a number's digits around (0, 0), in points of the grid: column and row of each
+    corner, float32 [digits, POINTS, 2]."""
     digits = str(number)
     paths = np.empty((len(digits), POINTS, 2), np.float32)
     for place, digit in enumerate(digits):

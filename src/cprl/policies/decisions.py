@@ -87,8 +87,9 @@ class Decider(nn.Module):
         self._held: Tensor | None = None
 
     def decide(self, due: Tensor) -> Tensor:
-        """Return the decisions of all agents, int64 [R x k, N], which do not change later; `due`: bool [R x k, V],
-        the ballots of the coming turn."""
+        """Return the decisions of all agents, int64 [R x k, N], which do not change later.
+
+        `due`, bool [R x k, V], says which ballots are held in the coming turn."""
         held = due.numpy(force=True)
         if self._held is None or np.count_nonzero(held):
             self._choose(held)
