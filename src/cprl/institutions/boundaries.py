@@ -64,7 +64,7 @@ class Boundaries(Institution):
 
     @classmethod
     def strips(cls, *, height: int, width: int, agents: int, **fields: Any) -> "Boundaries":
-        """Return vertical strips of a board, one for each agent from left to right, equally wide to a column."""
+        """Return vertical strips of a board, one per agent from left to right, equally wide to a column."""
         if not 1 <= agents <= min(width, len(SIGNS)):
             raise ValueError(f"agents is {agents}; allowed: 1 to {min(width, len(SIGNS))}")
         row = "".join(SIGNS[col * agents // width] for col in range(width))
