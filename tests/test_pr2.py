@@ -17,7 +17,7 @@ from cprl.envs import make_env
 from cprl.envs.matrix import MatrixGame, stag_hunt
 from cprl.learners.engine import FunctionalEngine
 from cprl.learners.transitions import joint_actions
-from cprl.networks.agent import chosen, conditional, marginal, soft_value
+from cprl.networks.agent import chosen, marginal, soft_value
 from cprl.objectives import PR2Loss
 from cprl.population import Learning, Scripted
 from cprl.training import train
@@ -39,7 +39,7 @@ def test_the_peers_are_expected_to_answer_as_suits_the_agent_which_is_optimistic
     # Q(row) = log(1 + e^3) = 3.0486 and log(e + e^2) = 2.3133; 1 / (1 + e^(2.3133 - 3.0486)) = 0.676. In the
     # game's one equilibrium, mixed, the row plays (0.5, 0.5).
     expected = torch.tensor([[[0.0474, 0.9526], [0.2689, 0.7311]]])
-    torch.testing.assert_close(conditional(OPTIMISM, 1.0), expected, rtol=0, atol=1e-4)
+    torch.testing.assert_close(OPTIMISM.softmax(-1), expected, rtol=0, atol=1e-4)
     values = marginal(OPTIMISM, 1.0)
     torch.testing.assert_close(values, torch.tensor([3.0486, 2.3133]), rtol=0, atol=1e-4)
     torch.testing.assert_close(values.softmax(-1), torch.tensor([0.676, 0.324]), rtol=0, atol=1e-3)
@@ -49,7 +49,7 @@ def test_the_peers_are_expected_to_answer_as_suits_the_agent_which_is_optimistic
 def test_sums_over_the_joint_actions_of_three_peers_are_products_over_pairs():
     temperature, actions, peers = 0.7, 3, 3
     joint = torch.randn(peers, actions, actions, generator=torch.Generator().manual_seed(1))
-    by_pairs, answers = marginal(joint, temperature), conditional(joint, temperature)
+    by_pairs, answers = marginal(joint, temperature), (joint / temperature).softmax(-1)
     for own in range(actions):
         others = list(product(range(actions), repeat=peers))
         of_all = torch.stack(

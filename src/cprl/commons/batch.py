@@ -92,18 +92,14 @@ class Batch:
             self._no_decisions: Actions = self.driver.empty((worlds, game.agents), np.int64)
             self.driver.write(self._no_decisions, np.zeros((worlds, game.agents), np.int64))
             self.memory = self.driver.place(empty_memory(game.institution_tables, worlds=worlds))
-        self._all_worlds = self._selection(np.ones(worlds, np.bool_))
+        self._all_worlds: Bools = self.driver.empty((worlds,), np.bool_)
+        self.driver.write(self._all_worlds, np.ones(worlds, np.bool_))
         self.set_seed(seed)
 
     @property
     def has_begun(self) -> bool:
         """Whether the worlds have begun an episode, so that there is something to show."""
         return self._has_begun
-
-    def _selection(self, which: Bools) -> Bools:
-        selection = self.driver.empty((self.size,), np.bool_)
-        self.driver.write(selection, which)
-        return selection
 
     def set_seed(self, seed: int) -> None:
         """Restarts from a seed: the next episode of each world is the first episode of this seed."""

@@ -148,7 +148,13 @@ class CommonsEnv(LeanStepEnv):
     def _fresh(self) -> tuple[dict[str, Tensor], Output]:
         """New memory for the output of a turn: as tensors by name, and the same memory as arrays."""
         if not self._ahead:
-            names, blocks = list(self._forms), [self._block(*form) for form in self._forms.values()]
+            names, blocks = (
+                list(self._forms),
+                [
+                    torch.empty((self._turns_ahead, *shape), dtype=dtype, device=self.device)
+                    for shape, dtype in self._forms.values()
+                ],
+            )
             tensors = zip(*(block.unbind() for block in blocks), strict=True)
             arrays = zip(*(self._turns_of(block) for block in blocks), strict=True)
             for turn, output in zip(tensors, arrays, strict=True):
@@ -165,10 +171,6 @@ class CommonsEnv(LeanStepEnv):
         """The turns of a block as arrays."""
         on_cpu = block.device.type == "cpu"
         return block.numpy() if on_cpu else [self._as_array(turn) for turn in block.unbind()]
-
-    def _block(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        """Memory of several turns, [turns, ...]."""
-        return torch.empty((self._turns_ahead, *shape), dtype=dtype, device=self.device)
 
     def _as_tensordict(self, tensors: dict[str, Tensor], reward: Tensor | None = None) -> TensorDict:
         """The entries of one time step; without a reward, as `reset` returns them."""

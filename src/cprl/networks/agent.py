@@ -122,18 +122,6 @@ class OtherOutputs(nn.Module):
         return outputs
 
 
-def conditional(joint: Tensor, temperature: float) -> Tensor:
-    """What an agent expects of each peer after each action of its own: rho(b | s, a) ~ exp(q(s, a, b) / T).
-
-    Source: Wen et al., "Probabilistic Recursive Reasoning for Multi-Agent Reinforcement Learning" (2019).
-
-    Args:
-        joint: values of pairs, float [..., N - 1, A, A].
-        temperature: T, in units of reward.
-    """
-    return (joint / temperature).softmax(-1)
-
-
 def marginal(joint: Tensor, temperature: float) -> Tensor:
     """The value of an agent's own action: T log sum exp(Q(s, a, others) / T) over the others' joint actions.
 

@@ -7,7 +7,7 @@ from typing import Final
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictParams
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
 from cprl.networks.agent import chosen, marginal, soft_value
@@ -90,7 +90,7 @@ class PR2Loss(TDLoss):
     def _reads(self) -> list[NestedKey]:
         keys, seen = self.tensor_keys, list(self.value_network.in_keys)
         after = [*seen, keys.reward, keys.done, keys.terminated]
-        return [keys.action, *seen, *(("next", *_path(key)) for key in after)]
+        return [keys.action, *seen, *(unravel_key(("next", key)) for key in after)]
 
     def _estimator_keys(self) -> dict[str, NestedKey]:
         keys = self.tensor_keys
@@ -125,7 +125,3 @@ class PR2Loss(TDLoss):
         with weights.to_module(self.value_network, preserve_module_state=False):
             values: Tensor = self.value_network(seen).get(self.tensor_keys.joint_action_value)
         return values
-
-
-def _path(key: NestedKey) -> tuple[str, ...]:
-    return key if isinstance(key, tuple) else (key,)

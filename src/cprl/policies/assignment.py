@@ -60,7 +60,9 @@ class AgentPolicies(TensorDictModuleBase):
         self.decisions = decisions
         self._state_cells = max(int(getattr(actor, "state_cells", 0)) for actor in self.actors)
         """The largest state of an agent; 0 if no actor is recurrent."""
-        self._worlds = max(_worlds_of(actor) for actor in self.actors)
+        self._worlds = max(
+            int(getattr(actor, "replicas", 0)) * int(getattr(actor, "worlds", 0)) for actor in self.actors
+        )
         """How many worlds all replicas play together; 0 if actors play any number."""
         if decisions is not None:
             if decisions.agents != self.agents:
@@ -145,8 +147,3 @@ class AgentPolicies(TensorDictModuleBase):
 def _at(agents: TensorDictBase, name: str, index: Any) -> Tensor:
     value: Tensor = keys.entry(agents, name)
     return value if index is None else value[index]
-
-
-def _worlds_of(actor: nn.Module) -> int:
-    """How many worlds an actor plays in all replicas; 0 for an actor that plays any number."""
-    return int(getattr(actor, "replicas", 0)) * int(getattr(actor, "worlds", 0))

@@ -74,7 +74,11 @@ class PresentPolicy:
             first[agents] = present if isinstance(present, LaneActor) else FirstReplica(present, replicas)
             pairs.append((present, training))
         self._policy = AgentPolicies({**first, **others}, decisions=present_decisions)
-        self._pairs = [pair for pair in pairs if _has_epsilon(pair[0])]
+        self._pairs = [
+            pair
+            for pair in pairs
+            if hasattr(pair[0], "epsilon") and not getattr(pair[0], "stochastic", False)
+        ]
         self._evaluation = [present.epsilon for present, _ in self._pairs]
         self._devices = [device] if device is not None and device.type == "cuda" else []
         self.is_trained = False
@@ -106,7 +110,3 @@ class PresentPolicy:
         forked = torch.random.fork_rng(devices=self._devices)
         with forked, torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             yield
-
-
-def _has_epsilon(actor: Any) -> bool:
-    return hasattr(actor, "epsilon") and not getattr(actor, "stochastic", False)

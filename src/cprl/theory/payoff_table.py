@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
-from math import comb, factorial
+from math import comb, factorial, prod
 from typing import Annotated, Final, Self
 
 import numpy as np
@@ -153,7 +153,8 @@ class PayoffTable:
     def _others(self) -> tuple[Counts, Values]:
         """What the N - 1 others may play, and in how many ways, [C', S] and [C']."""
         others = compositions(self.agents - 1, self.strategies)
-        return others, np.array([_ways(counts) for counts in others.tolist()])
+        ways = [factorial(self.agents - 1) // prod(map(factorial, counts)) for counts in others.tolist()]
+        return others, np.array(ways, np.float64)
 
     @property
     def pure_equilibria(self) -> list[tuple[int, ...]]:
@@ -199,11 +200,3 @@ def mixture_of(mixture: ArrayLike, strategies: int) -> Values:
         allowed = f"[{strategies}] of shares from 0 to 1 that sum to 1"
         raise refusal("mixture", shares.tolist(), allowed)
     return shares
-
-
-def _ways(counts: Sequence[int]) -> float:
-    """In how many ways so many agents can play the strategies."""
-    left = factorial(sum(counts))
-    for count in counts:
-        left //= factorial(count)
-    return float(left)
