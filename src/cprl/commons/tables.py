@@ -94,7 +94,7 @@ def check_sizes(board: Map, rules: Rules) -> None:
     pairs = sites * min(sites - 1, around)
     if pairs > LARGEST_TABLE:
         raise ValueError(
-            f"Rules.regrow_radius_cells is {rules.regrow_radius_cells} and the map has {sites:,} sites, up "
+            f"Rules.regrow_radius_cells is {rules.regrow_radius_cells:g} and the map has {sites:,} sites, up "
             f"to {pairs:,} pairs of near sites; allowed: {LARGEST_TABLE:,} pairs, so a smaller radius or map"
         )
     rim = _rim(board, rules)
