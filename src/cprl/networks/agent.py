@@ -126,8 +126,9 @@ def marginal(joint: Tensor, temperature: float) -> Tensor:
     """The value of an agent's own action: T log sum exp(Q(s, a, others) / T) over the others' joint actions.
 
     Computed exactly: with pairs, float [..., N - 1, A, A], the sum over joint actions is a product of sums
-    over each peer's; float [..., A]. What it expects of a peer is rho(b | s, a) ~ exp(q(s, a, b) / T) (Wen et al.,
-    "Probabilistic Recursive Reasoning for Multi-Agent Reinforcement Learning", 2019).
+    over each peer's; float [..., A]. The agent expects that a peer answers with rho(b | s, a), which is
+    proportional to exp(q(s, a, b) / T): Wen et al., "Probabilistic Recursive Reasoning for Multi-Agent
+    Reinforcement Learning" (2019).
     """
     return temperature * (joint / temperature).logsumexp(-1).sum(-2)
 
