@@ -14,11 +14,10 @@ from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom, made
 from cprl.envs.commons_env import CommonsEnv
-from cprl.envs.matrix import MatrixGame
+from cprl.envs.matrix import MatrixGame, nested_tuples
 from cprl.envs.state import env_state, load_env_state
 from cprl.envs.taking import TakingGame
 from cprl.envs.unwrap import commons_of
-from cprl.theory import PowerWorth
 from cprl.values import Seed, checked, refusal
 
 
@@ -151,12 +150,6 @@ OF_CPRL: Final[tuple[type[Any], ...]] = (Game, MatrixGame, TakingGame)
 
 def stored_game(game: object) -> object:
     """As a recipe holds it: a game of the user's by the name of its class."""
-    if isinstance(game, TakingGame) and not isinstance(game.sharing.worth, PowerWorth):
-        raise ValueError(
-            f"experiment.game.sharing.worth is a {type(game.sharing.worth).__name__}, which a recipe cannot "
-            'hold; allowed: a PowerWorth, or as the game Custom("module:function"), a function of yours that '
-            "makes it"
-        )
     if type(game) in OF_CPRL or isinstance(game, Game | Custom) or not isinstance(game, PlayableGame):
         return game
     kind = type(game)
@@ -174,14 +167,10 @@ def game_of(stored: Custom) -> Custom | PlayableGame:
     if not (isinstance(kind, type) and hasattr(kind, "to_config") and hasattr(kind, "make")):
         return stored
     try:
-        game = kind(**{name: _tuples(value) for name, value in stored.arguments.items()})
+        game = kind(**{name: nested_tuples(value) for name, value in stored.arguments.items()})
     except (TypeError, ValueError) as error:
         raise ValueError(f"experiment.game: {stored.target} does not take its arguments: {error}") from error
     return game if isinstance(game, PlayableGame) and stored_game(game) == stored else stored
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def is_playable(value: Any) -> bool:

@@ -67,11 +67,12 @@ def _table(payoffs: Any) -> tuple[Any, ...]:
         raise ValueError(f"{name} has {table.size:,} numbers; allowed: up to {_MOST_PAYOFFS:,}")
     if not (np.abs(table) <= MOST_NUMBER).all():
         raise ValueError(f"{name} has {np.abs(table).max():g}; allowed: numbers up to {MOST_NUMBER:g}")
-    return tuple(map(_tuples, table.tolist()))
+    return tuple(map(nested_tuples, table.tolist()))
 
 
-def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+def nested_tuples(value: Any) -> Any:
+    """Return lists in lists as tuples in tuples."""
+    return tuple(map(nested_tuples, value)) if isinstance(value, list) else value
 
 
 class Clock(TypedDict, total=False):
