@@ -299,10 +299,6 @@ class _OfPolicies(LossModule):
         names = self.tensor_keys
         return [names.observation, names.action, names.advantage, names.done]
 
-    @in_keys.setter
-    def in_keys(self, values: object) -> None:
-        raise ValueError(f"in_keys is set to {values}; allowed: set_keys(observation=..., action=..., ...)")
-
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         """There is no value estimator: advantages are in the rollouts."""
 

@@ -98,7 +98,9 @@ class MADDPGLoss(TDLoss):
         self.loss_function, self.logit_penalty = loss_function, logit_penalty
         self.action_space, self.reduction = action_space, reduction
 
-    def _reads(self) -> list[NestedKey]:
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The entries that `forward` reads."""
         keys = self.tensor_keys
         seen = {*self.actor_network.in_keys, *self.critic_network.in_keys} - {keys.joint_action}
         after = {keys.reward, keys.done, keys.terminated, *seen}

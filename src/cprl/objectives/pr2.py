@@ -87,7 +87,9 @@ class PR2Loss(TDLoss):
             value_network = TensorDictModule(value_network, ["observation"], [_VALUES])
         self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
 
-    def _reads(self) -> list[NestedKey]:
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The entries that `forward` reads."""
         keys, seen = self.tensor_keys, list(self.value_network.in_keys)
         after = [*seen, keys.reward, keys.done, keys.terminated]
         return [keys.action, *seen, *(unravel_key(("next", key)) for key in after)]

@@ -73,32 +73,11 @@ class TDLoss(LossModule):
     """A loss with TorchRL's TD(0) estimator, over the entries that `_estimator_keys` names."""
 
     default_value_estimator = ValueEstimators.TD0
-    _in_keys: list[NestedKey] | None
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._in_keys = None
-
-    def _reads(self) -> list[NestedKey]:
-        """The entries that `forward` must find in a batch."""
-        raise NotImplementedError
 
     def _estimator_keys(self) -> dict[str, NestedKey]:
         raise NotImplementedError
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The entries that `forward` must find in a batch."""
-        if self._in_keys is None:
-            self._in_keys = self._reads()
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, keys: list[NestedKey]) -> None:
-        self._in_keys = keys
-
     def _forward_value_estimator_keys(self, **_: Any) -> None:
-        self._in_keys = None
         if self._value_estimator is not None:
             self._value_estimator.set_keys(**self._estimator_keys())
 
