@@ -24,7 +24,8 @@ _TRIED: Final = 64
 _ROUNDING: Final = 1e-9
 _NOTHING: Final = 1e-3
 """What a unit may still be worth at `most`, as a share of the highest value."""
-_HALVINGS: Final = 200
+_PRECISION: Final = 1e-14
+"""Of a root."""
 _MOST: Final = 1e12
 Above0 = Annotated[float, Where(lambda value: 0 < value <= _MOST, f"a number above 0, up to {_MOST:g}")]
 Cost = Annotated[float, Range(0, _MOST)]
@@ -278,12 +279,9 @@ def _root(falling: Callable[[float], float], most: float) -> float:
     """Where a falling function is 0, between 0 and `most`; one of these where it has one sign."""
     if most <= 0 or falling(0.0) <= 0:
         return 0.0
-    low, high = 0.0, float(np.nextafter(most, 0.0))  # a worth may have a kink where it becomes 0
+    high = float(np.nextafter(most, 0.0))  # a worth may have a kink where it becomes 0
     if falling(high) >= 0:
         return most
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        if middle in (low, high):
-            break
-        low, high = (middle, high) if falling(middle) > 0 else (low, middle)
-    return (low + high) / 2
+    from scipy.optimize import brentq
+
+    return float(brentq(falling, 0.0, high, xtol=_PRECISION * most, rtol=_PRECISION))
