@@ -113,7 +113,7 @@ def test_loading_the_state_from_before_a_rollout_undoes_the_rollout():
         (EVERYTHING, {"counts": -1}, r"state\['counts'\]\[0, 0, 0\] is -1"),
         (EVERYTHING, {"allowed": np.nan}, r"state\['allowed'\]\[0, 0\] is nan"),
         (EVERYTHING, {"income": np.inf}, r"state\['income'\]\[0, 0, 0\] is inf"),
-        (EVERYTHING, {"in_force": 0.7}, r"state\['in_force'\]\[0, 0\] is 0\.7; .*\[0\.5, 1, 2\]"),
+        (EVERYTHING, {"in_force": 0.7}, r"state\['in_force'\]\[0, 0\] is 0\.7; .*\[0\.5, 1\.0, 2\.0\]"),
     ],
 )
 def test_an_impossible_state_is_refused_and_changes_nothing(game, change, message):
