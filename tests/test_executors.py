@@ -13,7 +13,6 @@ from tiny_study import FREEZE, TINY
 
 from cprl import Custom, Study
 from cprl.studies import InProcess, Processes, Ray, executors, run_study
-from cprl.studies.executors import Stopping
 from cprl.studies.study import STATUS
 from cprl.studies.trials import Status, Task, trials_of
 
@@ -94,20 +93,51 @@ def test_by_ray_a_trial_whose_process_is_killed_ends_the_same(tmp_path, undistur
     assert not ray.is_initialized()
 
 
+class Told:
+    """A process that ends when it is told to, and asks this one to stop when it is first looked at."""
+
+    def __init__(self, signals):
+        self.signals, self.stops = [*signals], []
+
+    def poll(self):
+        if self.signals:
+            os.kill(os.getpid(), self.signals.pop(0))
+            return None
+        return 143 if self.stops else None
+
+    def stop(self, *, kill):
+        self.stops.append(kill)
+
+
 @pytest.mark.parametrize(
-    ("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)], ids=str
+    ("signals", "kind", "stops"),
+    [
+        ([signal.SIGINT], KeyboardInterrupt, [False]),
+        ([signal.SIGTERM], SystemExit, [False]),
+        ([signal.SIGINT, signal.SIGTERM], SystemExit, [False, True]),
+    ],
+    ids=str,
 )
-def test_a_study_stopped_in_worker_processes_ends_as_its_signal_says(number, kind, capsys):
-    def stopped():
-        with Stopping() as stopping:
-            os.kill(os.getpid(), number)
-            assert stopping.asked == 1
-            stopping.end(2)
+def test_a_study_that_is_asked_to_stop_asks_its_processes_once_and_kills_them_if_asked_again(
+    signals, kind, stops, tmp_path, capsys
+):
+    process = Told(signals)
+
+    class Fake(Processes):
+        def start(self, task):
+            return process
 
     with pytest.raises(kind) as ended:
-        stopped()
+        run_study(Study(TINY, {FREEZE: [2, 5]}), tmp_path, on=Fake(1), results=False)
     assert getattr(ended.value, "code", None) in (None, 143)
+    assert process.stops == stops
     assert "2 trials are left" in capsys.readouterr().out
+
+
+def test_what_cannot_be_started_is_the_failure_of_its_trial(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "no-python"))
+    result = run_study(Study(TINY, {FREEZE: [2, 5]}), tmp_path, on=Processes(1), results=False)
+    assert [outcome.reason.split(":")[0] for outcome in result.failed] == ["FileNotFoundError"] * 2
 
 
 @pytest.mark.parametrize(

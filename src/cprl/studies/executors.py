@@ -10,16 +10,17 @@ import signal
 import subprocess
 import sys
 import time
+import traceback
 from abc import ABC, abstractmethod
-from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.util import find_spec
 from threading import current_thread, main_thread
 from types import FrameType
-from typing import Any, Final, NoReturn, Protocol, Self
+from typing import Any, Final, Protocol
 
 from cprl.arguments import integer, refusal
 from cprl.runs.checkpoints import interruption
@@ -52,57 +53,30 @@ class InProcess:
             yield task.run_here()
 
 
-class Stopping:
-    """Counts how often this process was asked to stop; a context manager.
+@contextmanager
+def signals() -> Iterator[list[int]]:
+    """The signals by which this process is asked to stop in the block, as they come.
 
-    The handlers only count: what is done about it is up to the loop that looks at `asked`. Python handles
-    signals in the main thread only; in other threads handlers stay as they are.
+    What is done about them is up to the block. Python handles signals in the main thread only; in other
+    threads handlers stay as they are.
     """
+    numbers: list[int] = []
 
-    def __init__(self) -> None:
-        self.asked = self._heard = 0
-        self._number: int = signal.SIGINT
-        self._usual: dict[int, Any] = {}
-
-    def __enter__(self) -> Self:
-        if current_thread() is main_thread():
-            signals = (signal.SIGINT, signal.SIGTERM)
-            self._usual = {number: signal.signal(number, self._ask) for number in signals}
-        return self
-
-    def __exit__(self, kind: object, error: object, traceback: object) -> None:
-        for number, usual in self._usual.items():
-            signal.signal(number, usual)
-
-    def is_asked_again(self) -> bool:
-        """Whether this process was asked since the last call."""
-        is_news, self._heard = self.asked > self._heard, self.asked
-        return is_news
-
-    def _ask(self, number: int, frame: FrameType | None) -> None:
-        self.asked += 1
-        self._number = number
-        if self.asked == 1:
+    def note(number: int, frame: FrameType | None) -> None:
+        numbers.append(number)
+        if len(numbers) == 1:
             console().print(
                 "Stopping: each trial finishes its step and saves a checkpoint; signal again to kill them.",
                 soft_wrap=True,
             )
 
-    def end(self, left: int) -> NoReturn:
-        """Say how many trials are left, and raise what `interruption` makes of the signal."""
-        trials = "1 trial is" if left == 1 else f"{left} trials are"
-        console().print(f"Stopped; {trials} left. The same line again continues the study.", soft_wrap=True)
-        raise interruption(self._number)
-
-
-class Process(Protocol):
-    """The process of a trial, wherever it is."""
-
-    def poll(self) -> int | None:
-        """Its exit code; None while it runs."""
-
-    def stop(self, *, kill: bool) -> None:
-        """Asks it to save a checkpoint and end; or ends it at once."""
+    handled = (signal.SIGINT, signal.SIGTERM) if current_thread() is main_thread() else ()
+    usual = {number: signal.signal(number, note) for number in handled}
+    try:
+        yield numbers
+    finally:
+        for number, handler in usual.items():
+            signal.signal(number, handler)
 
 
 class _SideBySide(ABC):
@@ -117,7 +91,7 @@ class _SideBySide(ABC):
         """How many trials may run at a time."""
 
     @abstractmethod
-    def start(self, task: Task) -> Process:
+    def start(self, task: Task) -> "_LocalProcess | _RayTask":
         """Starts the process of a trial."""
 
     def ready(self) -> AbstractContextManager[object]:
@@ -131,59 +105,52 @@ class _SideBySide(ABC):
             KeyboardInterrupt: after SIGINT, when every process has saved a checkpoint.
             SystemExit: with code 143 after SIGTERM, likewise.
         """
-        waiting: deque[Task] = deque()
+        waiting: list[Task] = []
         for task in tasks:
             outcome = task.settled()
             if outcome is None:
                 waiting.append(task)
             else:
                 yield outcome
-        if waiting:
-            with self.ready(), Stopping() as stopping:  # Ray sets handlers of its own
-                yield from self._run(waiting, stopping)
-
-    def _run(self, waiting: deque[Task], stopping: Stopping) -> Generator[Outcome, None, None]:
-        running: dict[str, tuple[Task, Process]] = {}
-        tried = Counter[str]()
-        try:
-            while (waiting and not stopping.asked) or running:
-                while waiting and len(running) < self.places() and not stopping.asked:
-                    task = waiting.popleft()
-                    outcome = task.begin()
+        if not waiting:
+            return
+        with self.ready(), signals() as asked, ThreadPoolExecutor(self.places()) as pool:
+            try:
+                left = 0
+                for future in as_completed([pool.submit(self._carry_out, task, asked) for task in waiting]):
+                    outcome = future.result()
                     if outcome is None:
-                        running[task.name] = task, self.start(task)
-                        tried[task.name] += 1
+                        left += 1
                     else:
                         yield outcome
-                for task, code in _ended(running, stopping):
-                    outcome = task.ended(code)
-                    if outcome is None and tried[task.name] >= ATTEMPTS and not stopping.asked:
-                        outcome = task.given_up()
-                    if outcome is None:
-                        waiting.appendleft(task)
-                    else:
-                        yield outcome
-            if waiting:
-                stopping.end(len(waiting))
-        finally:
-            stopping.asked = max(1, stopping.asked)
-            while running:
-                _ended(running, stopping)
+                if left:
+                    trials = "1 trial is" if left == 1 else f"{left} trials are"
+                    again = "The same line again continues the study."
+                    console().print(f"Stopped; {trials} left. {again}", soft_wrap=True)
+                    raise interruption(asked[-1])
+            finally:
+                if not asked:  # but this generator is closed, or nothing runs
+                    asked.append(signal.SIGTERM)
 
-
-def _ended(running: dict[str, tuple[Task, Process]], stopping: Stopping) -> list[tuple[Task, int]]:
-    """Waits a moment, and returns what has ended, with exit codes; asks the others to stop, as this process
-    was asked."""
-    time.sleep(_LOOK_S)
-    ended, is_asked = [], stopping.is_asked_again()
-    for task, process in list(running.values()):
-        code = process.poll()
-        if code is not None:
-            del running[task.name]
-            ended.append((task, code))
-        elif is_asked:
-            process.stop(kill=stopping.asked > 1)
-    return ended
+    def _carry_out(self, task: Task, asked: Sequence[int]) -> Outcome | None:
+        """Runs a trial, in a thread; None if this process was asked to stop."""
+        for _ in range(ATTEMPTS):
+            outcome = None if asked else task.begin()
+            if asked or outcome is not None:
+                return outcome
+            try:
+                process, heard = self.start(task), 0
+            except OSError as error:
+                return task.failed(f"{type(error).__name__}: {error}", traceback.format_exc())
+            while (code := process.poll()) is None:
+                time.sleep(_LOOK_S)
+                if heard < len(asked):
+                    heard = len(asked)
+                    process.stop(kill=heard > 1)
+            outcome = task.ended(code)
+            if outcome is not None:
+                return outcome
+        return None if asked else task.given_up()
 
 
 @dataclass(frozen=True)
@@ -204,7 +171,7 @@ class Processes(_SideBySide):
     def places(self) -> int:
         return self.jobs
 
-    def start(self, task: Task) -> Process:
+    def start(self, task: Task) -> "_LocalProcess":
         return _LocalProcess(task)
 
 
@@ -239,8 +206,6 @@ class _LocalProcess:
 
 _STORE_BYTES: Final = 80 * 2**20
 """Of Ray's store of objects, which holds nothing of ours; Ray wants at least 75 MiB."""
-_AHEAD: Final = 2
-"""Tasks that wait in Ray for a free core, so that a cluster that can grow knows that it should."""
 _BYTES: Final = 1_000_000_000
 """What a trial asks for while nobody knows more: torch, Numba, the game and the networks take 850 MB."""
 
@@ -258,7 +223,8 @@ class Ray(_SideBySide):
         address: of a cluster: "auto" for the one that this machine belongs to, or "host:port". None for a
             Ray of this machine, which is started for the study and ends with it. Where this process has
             called `ray.init` already, that Ray is used, and left as it is.
-        jobs: how many trials run at a time, at most; None for one per core.
+        jobs: how many trials run at a time, at most; None for one per core that there is now. Where there are
+            fewer cores, tasks wait in Ray, so that a cluster that can grow knows that it should.
         memory_bytes: what each trial asks for; None for a tenth more than any trial of the study has taken
             so far, and 1 GB while that is less.
     """
@@ -286,10 +252,17 @@ class Ray(_SideBySide):
         if ray.is_initialized():
             yield
             return
-        options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+        options: dict[str, Any] = {
+            "log_to_driver": False,
+            "logging_level": logging.ERROR,
+        }
         if self.address is None:
             cores = min(self.jobs or MOST_JOBS, os.cpu_count() or 1)
-            options |= {"num_cpus": cores, "include_dashboard": False, "object_store_memory": _STORE_BYTES}
+            options |= {
+                "num_cpus": cores,
+                "include_dashboard": False,
+                "object_store_memory": _STORE_BYTES,
+            }
         ray.init(self.address or "local", **options)
         try:
             yield
@@ -298,9 +271,9 @@ class Ray(_SideBySide):
 
     def places(self) -> int:
         ray: Any = import_module("ray")
-        return self.jobs or max(1, int(ray.cluster_resources().get("CPU", 1))) + _AHEAD
+        return self.jobs or max(1, int(ray.cluster_resources().get("CPU", 1)))
 
-    def start(self, task: Task) -> Process:
+    def start(self, task: Task) -> "_RayTask":
         ray: Any = import_module("ray")
         nodes = [int(node["Resources"].get("memory", 0)) for node in ray.nodes() if node["Alive"]]
         memory = self.memory_bytes or bytes_of(task)
@@ -308,7 +281,9 @@ class Ray(_SideBySide):
             memory = min(memory, max(nodes))  # more than any node has would wait forever
         work = ray.remote(num_cpus=1, memory=memory, max_retries=0)(_work())
         return _RayTask(
-            ray, work.remote(task.arguments, os.path.abspath(task.status.log), task.variables), task
+            ray,
+            work.remote(task.arguments, os.path.abspath(task.status.log), task.variables),
+            task,
         )
 
 
@@ -333,7 +308,11 @@ class _RayTask:
             return int(self._ray.get(self._reference))
         except errors.TaskCancelledError:
             return 128 + signal.SIGTERM
-        except (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError):
+        except (
+            errors.WorkerCrashedError,
+            errors.NodeDiedError,
+            errors.OutOfMemoryError,
+        ):
             return -9  # as after SIGKILL
         except errors.RayError as error:  # e.g. the node does not have the study's directory
             lines = str(error).strip().splitlines() or [""]

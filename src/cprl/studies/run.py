@@ -17,16 +17,7 @@ from cprl.studies.progress import Progress
 from cprl.studies.study import RUNS, STATUS, Study, directory_of, levels_in, write_study
 from cprl.studies.tables.comparing import LAST
 from cprl.studies.tables.table import WINDOW, StudyTable
-from cprl.studies.trials import (
-    PATIENCE_S,
-    Outcome,
-    Status,
-    Task,
-    Trial,
-    is_silent,
-    move_aside,
-    trials_of,
-)
+from cprl.studies.trials import PATIENCE_S, Outcome, Status, Task, Trial, is_silent, move_aside, trials_of
 from cprl.system.output import say
 
 _POLL_S: Final = 1.0

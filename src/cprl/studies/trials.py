@@ -31,14 +31,7 @@ from cprl.measuring.episodes import Episode
 from cprl.population import Frozen, with_stored
 from cprl.runs.checkpoints import FOLDER, REPORT, checkpoints_in, depends_on_episodes, is_ending
 from cprl.runs.files import LOCK_FILE, RunLock, RunLockedError, refuse_missing, remove_partial, write_json
-from cprl.runs.recipe import (
-    RECIPE_FILE,
-    changed_code,
-    read_recipe,
-    recipe_config,
-    start_run,
-    write_on_nan,
-)
+from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, recipe_config, start_run, write_on_nan
 from cprl.runs.weights import partners_of
 from cprl.studies.study import Block, Condition, Study
 from cprl.system.compile_clock import CLOCK
@@ -378,14 +371,20 @@ class Task:
         """Run the trial in this process, as `cprl run` does in one of its own."""
         from cprl.training.running import run
 
-        outcome, experiment = self.begin(), self.trial.experiment
+        outcome = self.begin()
         if outcome is not None:
             return outcome
         try:
-            with _printing_into(self.status.log), StatusFile(self.status, experiment) as status:
-                recipe = read_recipe(self.directory)  # whose name may be that of another study
+            name = str(read_recipe(self.directory)["experiment"]["name"])  # perhaps that of another study
+            experiment = replace(self.trial.experiment, name=name)
+            with (
+                open(self.status.log, "a", encoding="utf-8", errors="replace") as log,
+                redirect_stdout(log),
+                redirect_stderr(log),
+                StatusFile(self.status, experiment) as status,
+            ):
                 run(
-                    replace(experiment, name=str(recipe["experiment"]["name"])),
+                    experiment,
                     self.directory,
                     resume=True,
                     keep_checkpoint=self.keep_checkpoint,
@@ -399,17 +398,6 @@ class Task:
         except Exception:
             return self.failed(self.status.failure() or "")
         return Outcome(self.name, "finished", worked=True)
-
-
-@contextmanager
-def _printing_into(log: Path) -> Iterator[None]:
-    """Appends what the block prints to a file."""
-    with (
-        open(log, "a", encoding="utf-8", errors="replace") as file,
-        redirect_stdout(file),
-        redirect_stderr(file),
-    ):
-        yield
 
 
 @contextmanager
