@@ -249,7 +249,7 @@ def test_a_value_is_the_mean_over_replicas_of_the_episodes_asked_for(tmp_path):
         ({"at_once": 0}, "at_once is 0"),
         ({"replicas": 0}, "replicas is 0"),
         ({"factors": {"game.rules.freeze": [1]}}, "matches nothing"),
-        ({"factors": {FREEZE: Uniform(0.1, 0.2)}}, "allowed: a whole number"),
+        ({"factors": {FREEZE: Uniform(0.1, 0.2)}}, "allowed: an integer"),
         ({"factors": {}}, "allowed: factors to draw from"),
     ],
 )

@@ -415,6 +415,7 @@ def carry_out(what: "Study | Search", options: StudyOptions, command: Sequence[s
     Raises:
         SystemExit: with code 1 where trials have failed, and 130 or 143 where it was interrupted.
     """
+    from cprl.custom import trust
     from cprl.studies import Search, run_search, run_study
 
     executor, again = executor_of(options), printed(command_of(command))
@@ -426,7 +427,8 @@ def carry_out(what: "Study | Search", options: StudyOptions, command: Sequence[s
                 )
     if options.dry_run:
         return _list(what, options)
-    names = ("runs", "allow", "last")
+    trust(*options.allow)
+    names = ("runs", "last")
     how: dict[str, Any] = {"on": executor, **{own: getattr(options, own) for own in names}}
     program, *words = named_command(command)
     whole = without_options(words, ["--only"])  # what a part of a study lacks, it lacks

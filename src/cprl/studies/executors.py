@@ -20,14 +20,15 @@ from importlib import import_module
 from importlib.util import find_spec
 from threading import current_thread, main_thread
 from types import FrameType
-from typing import Any, Final, Protocol
+from typing import Annotated, Any, Final, Protocol
 
-from cprl.arguments import integer, refusal
 from cprl.runs.checkpoints import interruption
 from cprl.studies.trials import ATTEMPTS, Outcome, Status, Task
 from cprl.system.output import console
+from cprl.values import Range, Value, Where
 
-MOST_JOBS: Final = 4096
+Jobs = Annotated[int, Range(1, 4096)]
+"""Trials that run at a time."""
 _LOOK_S: Final = 0.1
 """Seconds between two looks at which processes have ended, and at whether this one was asked to stop."""
 
@@ -154,19 +155,16 @@ class _SideBySide(ABC):
 
 
 @dataclass(frozen=True)
-class Processes(_SideBySide):
+class Processes(Value, _SideBySide, stored=False):
     """Processes on this machine, one for each trial, each with one thread of torch.
 
     Each has the trial's log as its output, and ends at once if the process that runs the study dies.
 
     Args:
-        jobs: how many trials run at a time, 1 to 4,096; as many cores and the memory of as many runs.
+        jobs: how many trials run at a time; as many cores and the memory of as many runs.
     """
 
-    jobs: int
-
-    def __post_init__(self) -> None:
-        integer("Processes.jobs", self.jobs, 1, MOST_JOBS)
+    jobs: Jobs
 
     def places(self) -> int:
         return self.jobs
@@ -211,7 +209,7 @@ _BYTES: Final = 1_000_000_000
 
 
 @dataclass(frozen=True)
-class Ray(_SideBySide):
+class Ray(Value, _SideBySide, stored=False):
     """Tasks of Ray, each of which runs a trial in a process of its own, on one core.
 
     A study that is killed with all of Ray continues when it is started again. On a cluster every node has the
@@ -229,17 +227,12 @@ class Ray(_SideBySide):
             so far, and 1 GB while that is less.
     """
 
-    address: str | None = None
-    jobs: int | None = field(default=None, kw_only=True)
-    memory_bytes: int | None = field(default=None, kw_only=True)
+    address: Annotated[str, Where(lambda text: bool(text.strip()), '"auto", "host:port"')] | None = None
+    jobs: Jobs | None = field(default=None, kw_only=True)
+    memory_bytes: Annotated[int, Range(1, 2**63 - 1)] | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        if self.address is not None and not self.address.strip():
-            raise refusal("Ray.address", self.address, '"auto", "host:port", or None')
-        if self.jobs is not None:
-            integer("Ray.jobs", self.jobs, 1, MOST_JOBS)
-        if self.memory_bytes is not None:
-            integer("Ray.memory_bytes", self.memory_bytes, 1)
+        super().__post_init__()
         if find_spec("ray") is None:
             raise ModuleNotFoundError('Ray is not installed; run pip install "cprl[ray]"', name="ray")
 
@@ -257,7 +250,7 @@ class Ray(_SideBySide):
             "logging_level": logging.ERROR,
         }
         if self.address is None:
-            cores = min(self.jobs or MOST_JOBS, os.cpu_count() or 1)
+            cores = min(self.jobs or sys.maxsize, os.cpu_count() or 1)
             options |= {
                 "num_cpus": cores,
                 "include_dashboard": False,

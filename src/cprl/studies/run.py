@@ -8,9 +8,8 @@ from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
-from cprl.arguments import integer, refusal
 from cprl.runs.files import LOCK_FILE, StudyLock, remove_partial
 from cprl.studies.executors import Executor, InProcess
 from cprl.studies.progress import Progress
@@ -19,6 +18,7 @@ from cprl.studies.tables.comparing import LAST
 from cprl.studies.tables.table import WINDOW, StudyTable
 from cprl.studies.trials import PATIENCE_S, Outcome, Status, Task, Trial, is_silent, move_aside, trials_of
 from cprl.system.output import say
+from cprl.values import MOST_INT32, Range, checked, refusal
 
 _POLL_S: Final = 1.0
 """Seconds between two looks at whether other processes have ended their trials."""
@@ -47,7 +47,6 @@ def run_study(
     runs: Path | str | None = None,
     only: Sequence[str] = (),
     keep_checkpoints: bool = False,
-    allow: Sequence[str] = (),
     progress: bool = True,
     results: bool = True,
     last: int = LAST,
@@ -67,7 +66,6 @@ def run_study(
             "gamma=0.9" or "gamma=0.9, freeze_steps=5"; the others stay as they are. By default all are run.
         keep_checkpoints: whether runs keep the state of their trainings, buffers included, so that the same
             study with more episodes goes on from them, bit for bit.
-        allow: the user's own code, "module:Class", that stored runs of `Frozen` agents may import.
         progress: whether a table of all trials is shown; lines where the output is not a terminal.
         results: whether `table.parquet`, `summary.md` and `figures/` are written at the end, see
             `cprl.studies.results`.
@@ -84,7 +82,7 @@ def run_study(
     trials = trials_of(study)
     chosen = trials_with(trials, only)
     check_comparison(last)
-    driver = Driver(out, folder, on or InProcess(), allow, keep_checkpoints, progress)
+    driver = Driver(out, folder, on or InProcess(), keep_checkpoints, progress)
     with driver.running(study):
         failed = driver.run(chosen, study.name)
         table = results_of(study, out, folder, last=last, again=again) if results else None
@@ -115,7 +113,7 @@ def results_of(study: Study, out: Path, runs: Path, *, last: int, again: str) ->
 
 def check_comparison(last: int) -> None:
     """Raises a ValueError for episodes that the table of a study does not tell apart."""
-    integer("last", last, WINDOW, allowed=f"an integer >= {WINDOW}, the episodes of a window of the table")
+    checked("last", last, Annotated[int, Range(WINDOW, MOST_INT32)])
 
 
 @dataclass(frozen=True)
@@ -126,13 +124,12 @@ class Driver:
         out: the study's directory.
         runs: that of its runs.
         executor: where trials are run.
-        allow: see `run_study`, as the others.
+        keep_checkpoints: see `run_study`, as the others.
     """
 
     out: Path
     runs: Path
     executor: Executor
-    allow: Sequence[str] = ()
     keep_checkpoints: bool = False
     progress: bool = True
 
@@ -192,7 +189,6 @@ class Driver:
             trial=trial,
             runs=self.runs,
             status=Status(self.out / STATUS, trial.name),
-            allow=tuple(self.allow),
             keep_checkpoint=self.keep_checkpoints,
         )
 

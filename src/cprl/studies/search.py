@@ -225,7 +225,6 @@ def run_search(
     *,
     on: Executor | None = None,
     runs: Path | str | None = None,
-    allow: Sequence[str] = (),
     progress: bool = True,
     results: bool = True,
     last: int = LAST,
@@ -240,7 +239,7 @@ def run_search(
     out = directory_of(study, out)
     folder = out / RUNS if runs is None else Path(runs)
     failed: list[Outcome] = []
-    driver = Driver(out, folder, on or InProcess(), allow, progress=progress)
+    driver = Driver(out, folder, on or InProcess(), progress=progress)
     with driver.running(study):
         while batch:
             failed += _run_batch(search, batch, driver, of=asked)

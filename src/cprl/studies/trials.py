@@ -25,7 +25,7 @@ from typing import Any, Final, Literal, NamedTuple, Self
 import psutil
 from tensordict import TensorDictBase
 
-from cprl.custom import custom_targets
+from cprl.custom import allowed, custom_targets
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
 from cprl.population import Frozen, with_stored
@@ -221,8 +221,6 @@ class Task:
     runs: Path
     """The directory in which the trial's is."""
     status: Status
-    allow: tuple[str, ...] = ()
-    """Further targets of `Custom` that may be imported, those of stored runs that agents come from."""
     keep_checkpoint: bool = False
     """Whether the finished run keeps the state of its training, so that a longer trial can go on from it."""
     take_over: bool = False
@@ -245,8 +243,8 @@ class Task:
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """The user's own code that it may import; what the experiment itself has it was made with."""
-        return tuple(dict.fromkeys([*custom_targets(self.recipe["experiment"]), *self.allow]))
+        """The user's own code that it may import: of this experiment, and what this process trusts."""
+        return tuple(dict.fromkeys([*custom_targets(self.recipe["experiment"]), *allowed()]))
 
     @property
     def words(self) -> list[str]:
