@@ -9,8 +9,9 @@ import pyarrow.parquet as pq
 import torch
 
 from cprl.studies import study_table
+from cprl.studies.status import Status
 from cprl.studies.study import STATUS
-from cprl.studies.trials import Status, trials_of
+from cprl.studies.trials import trials_of
 
 CHECKPOINT = re.compile(r"(?:training|ending)-(\d{12})-[0-9a-f]{32}\.pt")
 LEARNED = ("steps", "played", "env", "learners", "others", "tracker", "torch")

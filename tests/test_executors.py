@@ -4,17 +4,21 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
+from threading import Thread
 from types import ModuleType
 
+import psutil
 import pytest
-from same_runs import assert_same_study, attempts_of, log_of
+from same_runs import assert_same_study, attempts_of, log_of, still_alive
 from tiny_study import FREEZE, TINY
 
 from cprl import Custom, Study
 from cprl.studies import InProcess, Processes, Ray, executors, run_study
+from cprl.studies.status import Status
 from cprl.studies.study import STATUS
-from cprl.studies.trials import Status, Task, trials_of
+from cprl.studies.trials import Task, trials_of
 
 OFTEN_SAVED = replace(TINY, episodes=60, callbacks=(Custom("often_saved:OftenSaved"),))
 STUDY = Study(OFTEN_SAVED, {FREEZE: [2, 5]})
@@ -82,12 +86,25 @@ def test_a_trial_that_failed_says_why_and_can_be_repeated_by_hand_with_the_line_
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
-def test_by_ray_a_trial_whose_process_is_killed_ends_the_same(tmp_path, undisturbed, deaths):
+def test_by_ray_a_trial_whose_worker_is_killed_ends_the_same(tmp_path, undisturbed):
     import ray
 
-    deaths("1")
+    killed = []
+
+    def kill_a_worker():
+        while not list(tmp_path.glob("runs/*/checkpoints/training-*")):
+            time.sleep(0.02)
+        children = psutil.Process().children(recursive=True)
+        trial = next(process for process in children if "--trial" in process.cmdline())
+        killed.extend([trial, trial.parent()])
+        trial.parent().kill()
+
+    thread = Thread(target=kill_a_worker)
+    thread.start()
     result = run_study(STUDY, tmp_path, on=Ray(jobs=2), results=False)
+    thread.join()
     assert result.failed == ()
+    assert still_alive(killed, 5) == []
     assert_same_study(STUDY, result.runs, undisturbed)
     assert sum(attempts_of(tmp_path, trial) for trial in result.trials) == 3
     assert not ray.is_initialized()

@@ -13,9 +13,10 @@ from tiny_study import FREEZE, TINY
 
 from cprl import Study, run_study
 from cprl.runs.files import write_json
-from cprl.studies import progress, trials
+from cprl.studies import progress
 from cprl.studies.progress import Overview, Progress, table_of
-from cprl.studies.trials import Outcome, Status, StatusFile, trials_of
+from cprl.studies.status import Status, StatusFile
+from cprl.studies.trials import Outcome, trials_of
 
 TRIALS = trials_of(Study(replace(TINY, episodes=10, replicas=2), {FREEZE: [2, 5, 9]}))
 
@@ -64,9 +65,9 @@ def test_the_time_left_is_that_of_the_speed_at_which_trials_say_they_play(says, 
 
 
 def test_a_trial_says_its_speed_without_compiling_and_what_it_had_done_before(tmp_path, monkeypatch):
-    now = SimpleNamespace(s=0.0)
-    monkeypatch.setattr(trials, "time", SimpleNamespace(monotonic=lambda: now.s))
-    monkeypatch.setattr(trials, "CLOCK", SimpleNamespace(total_s=0.0, is_running=False))
+    now, clock = SimpleNamespace(s=0.0), SimpleNamespace(total_s=0.0, is_running=False)
+    monkeypatch.setattr("cprl.studies.status.time", SimpleNamespace(monotonic=lambda: now.s))
+    monkeypatch.setattr("cprl.studies.status.CLOCK", clock)
     file = StatusFile(Status(tmp_path, "trial"), TRIALS[0].experiment)
 
     def speed():
@@ -76,7 +77,7 @@ def test_a_trial_says_its_speed_without_compiling_and_what_it_had_done_before(tm
     now.s = 5.0
     file.on_start(SimpleNamespace(steps=200, episodes_played=10))
     assert speed() is None
-    now.s, trials.CLOCK.total_s = 39.0, 30.0
+    now.s, clock.total_s = 39.0, 30.0
     for _ in range(2):
         file.on_episode(None, {})
     assert speed() == pytest.approx(0.5), "2 episodes in 4 s of work"

@@ -11,10 +11,11 @@ from study_runs import EXPERIMENT, TIME_OUT, with_seed, write_run, write_study
 
 from cprl import Study
 from cprl.runs.recipe import runs_in, write_changed_circumstances
+from cprl.studies.status import Status
 from cprl.studies.tables.pooled import pooled_table
 from cprl.studies.tables.sources import design_of
 from cprl.studies.tables.table import METADATA, StudyTable, circumstances_of, study_table
-from cprl.studies.trials import Status, trials_of
+from cprl.studies.trials import trials_of
 
 STUDY = Study(EXPERIMENT, {TIME_OUT: [5, 25]}, name="small", replicas=3, block=2)
 NAN = float("nan")

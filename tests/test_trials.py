@@ -20,10 +20,11 @@ from cprl.runs.checkpoints import FOLDER as CHECKPOINTS
 from cprl.runs.episodes import read_episodes
 from cprl.runs.files import LOCK_FILE, RunLock, RunLockedError
 from cprl.runs.recipe import changed_circumstances, start_run
-from cprl.studies import Processes, read_study, run, trials
+from cprl.studies import Processes, read_study, run
 from cprl.studies.results import write_results
 from cprl.studies.run import trials_with
-from cprl.studies.trials import Outcome, Status, Task, state_of, trials_of
+from cprl.studies.status import PATIENCE_S, Status
+from cprl.studies.trials import Outcome, Task, state_of, trials_of
 from cprl.training import running
 
 STUDY = Study(TINY, {FREEZE: [5, 25]})
@@ -155,9 +156,9 @@ def test_the_lock_of_another_host_is_taken_over_once_its_trial_is_silent(tmp_pat
             status.path.write_text(json.dumps({"episodes": clock.now}))
 
     monkeypatch.setattr(run, "time", SimpleNamespace(sleep=wait))
-    monkeypatch.setattr(trials, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    monkeypatch.setattr("cprl.studies.status.time", SimpleNamespace(monotonic=lambda: clock.now))
     assert not run_study(study, tmp_path, progress=False, results=False).failed
-    assert clock.now == 40 + trials.PATIENCE_S
+    assert clock.now == 40 + PATIENCE_S
     assert differences(directory, undisturbed) == []
 
 

@@ -88,7 +88,7 @@ def run(
     with ExitStack() as stack:
         callbacks: tuple[object, ...] = ()
         if trial is not None:
-            from cprl.studies.trials import process_of_trial
+            from cprl.studies.status import process_of_trial
 
             callbacks = (stack.enter_context(process_of_trial(trial, experiment)),)
         done = run_experiment(

@@ -453,8 +453,9 @@ def _list(what: "Study | Search", options: StudyOptions) -> Path:
     from cprl.studies import Search, Study
     from cprl.studies.progress import Overview, table_of
     from cprl.studies.run import trials_with
+    from cprl.studies.status import BEAT_S
     from cprl.studies.study import RUNS, STATUS, directory_of
-    from cprl.studies.trials import BEAT_S, trials_of
+    from cprl.studies.trials import trials_of
 
     study = Study(what.experiment, name=what.name) if isinstance(what, Search) else what
     out = directory_of(study, options.out)
@@ -491,8 +492,8 @@ def _say_best(result: "SearchResult") -> None:
 
 def _say_failed(result: "StudyResult | SearchResult", again: str) -> None:
     """Lists the trials that failed, where to look, and what to do."""
+    from cprl.studies.status import Status
     from cprl.studies.study import STATUS
-    from cprl.studies.trials import Status
 
     trials: dict[str, Trial] = {trial.name: trial for trial in result.trials}
     outcomes: dict[str, Outcome] = {own.name: own for own in result.failed}

@@ -3,7 +3,8 @@
 Modules, in the order in which one reads them:
     factors      levels and distributions, by the places of values in an experiment; the same as words
     study        Study: factors, replicas; a value. Its conditions and its directory
-    trials       one run of a study, run or resumed, whatever was there; what it says of itself
+    status       what a trial says of itself while it runs, and what it obeys
+    trials       one run of a study, and the process that makes a finished run of its directory
     executors    where trials are run
     progress     how far every trial is, in the terminal
     run          run_study: every trial of a study

@@ -23,7 +23,8 @@ from types import FrameType
 from typing import Annotated, Any, Final, Protocol
 
 from cprl.runs.checkpoints import interruption
-from cprl.studies.trials import ATTEMPTS, Outcome, Status, Task
+from cprl.studies.status import STOPPED, Status
+from cprl.studies.trials import ATTEMPTS, Outcome, Task
 from cprl.system.output import console
 from cprl.values import Range, Value, Where
 
@@ -300,7 +301,7 @@ class _RayTask:
         try:
             return int(self._ray.get(self._reference))
         except errors.TaskCancelledError:
-            return 128 + signal.SIGTERM
+            return STOPPED[-1]
         except (
             errors.WorkerCrashedError,
             errors.NodeDiedError,

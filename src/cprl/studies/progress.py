@@ -14,8 +14,9 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from cprl.studies.status import Status
 from cprl.studies.tables.sources import REASONS
-from cprl.studies.trials import Outcome, Status, Trial
+from cprl.studies.trials import Outcome, Trial
 from cprl.system.output import Output, console
 from cprl.terminal.progress import in_words
 

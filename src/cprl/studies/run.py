@@ -13,10 +13,11 @@ from typing import Annotated, Final
 from cprl.runs.files import LOCK_FILE, StudyLock, remove_partial
 from cprl.studies.executors import Executor, InProcess
 from cprl.studies.progress import Progress
+from cprl.studies.status import PATIENCE_S, Status, is_silent
 from cprl.studies.study import RUNS, STATUS, Study, directory_of, levels_in, write_study
 from cprl.studies.tables.comparing import LAST
 from cprl.studies.tables.table import WINDOW, StudyTable
-from cprl.studies.trials import PATIENCE_S, Outcome, Status, Task, Trial, is_silent, move_aside, trials_of
+from cprl.studies.trials import Outcome, Task, Trial, move_aside, trials_of
 from cprl.system.output import say
 from cprl.values import MOST_INT32, Range, checked, refusal
 

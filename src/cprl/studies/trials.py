@@ -3,95 +3,38 @@
 The truth of a study lies in these directories. A trial is begun when its recipe is written there; from then
 on `cprl run DIRECTORY --resume` makes a finished run of it, in a process of its own, whatever was there:
 nothing but the recipe, or a run that was killed at any moment. `Task` is that process, from its command line
-to what came of it; `process_of_trial` is what goes on within it.
+to what came of it.
 """
 
-import json
 import os
 import shutil
-import signal
-import socket
 import sys
-import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from threading import Event, Thread
-from typing import Any, Final, Literal, NamedTuple, Self
-
-import psutil
-from tensordict import TensorDictBase
+from typing import Any, Final, Literal, NamedTuple
 
 from cprl.custom import allowed, custom_targets
 from cprl.experiment import Experiment
-from cprl.measuring.episodes import Episode
 from cprl.population import Frozen, with_stored
 from cprl.runs.checkpoints import FOLDER, REPORT, checkpoints_in, depends_on_episodes, is_ending
-from cprl.runs.files import LOCK_FILE, RunLock, RunLockedError, refuse_missing, remove_partial, write_json
+from cprl.runs.files import LOCK_FILE, RunLock, RunLockedError, refuse_missing, remove_partial
 from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, recipe_config, start_run, write_on_nan
 from cprl.runs.weights import partners_of
+from cprl.studies.status import LOCKED, STOPPED, Status, StatusFile
 from cprl.studies.study import Block, Condition, Study
-from cprl.system.compile_clock import CLOCK
 from cprl.system.output import printed
-from cprl.system.process import cpu
 from cprl.system.shipped import cprl_here
-from cprl.training import Training
 from cprl.values import differences
 
 State = Literal["missing", "unfinished", "finished", "refused"]
-PATIENCE_S: Final = 60.0
-"""Seconds without a sign of life after which a trial is taken over that another host has locked."""
-BEAT_S: Final = 1.0
-"""Seconds between two signs of life."""
 ATTEMPTS: Final = 5
 """How often a trial is tried whose process dies."""
-LOCKED: Final = 75
-"""The exit code of a process whose trial another one runs; EX_TEMPFAIL of sysexits.h."""
-_STOPPED: Final = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _FREE: Final = {"name": "", "on_nan": ""}
 """Fields that may differ between runs of the same trial."""
-
-
-class Status:
-    """The files in which a trial says how far it is.
-
-    Args:
-        folder: in which they are; made by whoever writes first.
-    """
-
-    def __init__(self, folder: Path, name: str) -> None:
-        self.folder, self.name = folder, name
-        self.path, self.log = folder / f"{name}.json", folder / f"{name}.log"
-        self.failed = folder / f"{name}.failed.txt"
-
-    def read(self) -> dict[str, Any]:
-        """What the trial said last; empty if it has said nothing."""
-        try:
-            table = json.loads(self.path.read_bytes())
-        except (OSError, ValueError):
-            return {}
-        return table if isinstance(table, dict) else {}
-
-    def fail(self, reason: str, trace: str) -> None:
-        """Notes why the trial failed."""
-        with suppress(OSError):  # of a full disk, say; then the reason is in the outcome alone
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self.failed.write_text(f"{reason}\n\n{trace}", encoding="utf-8", errors="replace")
-
-    def failure(self) -> str | None:
-        """The error of the last attempt in a line; None if it did not fail."""
-        try:
-            return self.failed.read_text(encoding="utf-8").partition("\n")[0]
-        except (OSError, ValueError):
-            return None
-
-    def tidy_up(self) -> None:
-        """Forgets earlier failures."""
-        with suppress(OSError):
-            self.failed.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +211,7 @@ class Task:
     @property
     def variables(self) -> dict[str, str]:
         """Variables of its process, which imports what this one does from where this one does."""
-        return {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path)), "OMP_NUM_THREADS": "1"}
+        return {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
 
     @property
     def is_elsewhere(self) -> bool:
@@ -344,7 +287,7 @@ class Task:
             return Outcome(self.name, "finished", worked=True)
         if code == LOCKED:
             return Outcome(self.name, "elsewhere")
-        if code < 0 or code in _STOPPED:
+        if code < 0 or code in STOPPED:
             return None
         reason = self.status.failure()
         if reason is not None:
@@ -367,158 +310,29 @@ class Task:
 
     def run_here(self) -> Outcome:
         """Run the trial in this process, as `cprl run` does in one of its own."""
+        return self.begin() or self._tried(self._run) or Outcome(self.name, "finished", worked=True)
+
+    def _run(self) -> None:
         from cprl.training.running import run
 
-        outcome = self.begin()
-        if outcome is not None:
-            return outcome
-        try:
-            name = str(read_recipe(self.directory)["experiment"]["name"])  # perhaps that of another study
-            experiment = replace(self.trial.experiment, name=name)
-            with (
-                open(self.status.log, "a", encoding="utf-8", errors="replace") as log,
-                redirect_stdout(log),
-                redirect_stderr(log),
-                StatusFile(self.status, experiment) as status,
-            ):
-                run(
-                    experiment,
-                    self.directory,
-                    resume=True,
-                    keep_checkpoint=self.keep_checkpoint,
-                    watch="off",
-                    figures=False,
-                    allow=self.targets,
-                    callbacks=(status,),
-                )
-        except RunLockedError:
-            return Outcome(self.name, "elsewhere")
-        except Exception:
-            return self.failed(self.status.failure() or "")
-        return Outcome(self.name, "finished", worked=True)
-
-
-@contextmanager
-def process_of_trial(path: Path, experiment: Experiment) -> Iterator["StatusFile"]:
-    """Make this process one that a study started: it says how far it is, stops when the study asks it to,
-    ends when the study's process has died, and says by its exit code that another process runs the trial.
-
-    Args:
-        path: the file of its status; its standard input is a pipe from the study's process.
-    """
-    Thread(target=_obey, args=(sys.stdin.fileno(),), daemon=True).start()
-    with StatusFile(Status(path.parent, path.stem), experiment) as status:
-        try:
-            yield status
-        except RunLockedError as error:
-            sys.stderr.write(f"{error}\n")
-            sys.exit(LOCKED)
-
-
-def _obey(pipe: int) -> None:
-    """Gives this process SIGTERM when it is asked to stop; ends it when there is nobody left to ask."""
-    while os.read(pipe, 1):
-        if sys.platform == "win32":  # where os.kill ends the process at once, without its handler
-            signal.raise_signal(signal.SIGTERM)
-        else:
-            os.kill(os.getpid(), signal.SIGTERM)
-    os._exit(1)
-
-
-class StatusFile:
-    """Writes every second how far a trial is, and why it failed; a context manager around the run, and
-    a callback of `cprl.training`."""
-
-    is_extendable = True
-
-    def __init__(self, status: Status, experiment: Experiment) -> None:
-        self._status = status
-        self._table: dict[str, Any] = {
-            "pid": os.getpid(),
-            "host": socket.gethostname(),
-            "cpu": cpu(),
-            "episodes": 0,
-            "of": experiment.episodes * experiment.replicas,
-            "steps": 0,
-            "beat": 0,
-        }
-        self._began, self._compiled_s = time.monotonic(), CLOCK.total_s
-        self._first: tuple[int, float] | None = None
-        """Episodes and seconds of work when this process began to train."""
-        self._is_over = Event()
-        self._thread = Thread(target=self._write_on, daemon=True)
-
-    def __enter__(self) -> Self:
-        self.write()
-        self._thread.start()
-        return self
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        self._is_over.set()
-        self._thread.join()
-        self.write()
-        if error is None:
-            self._status.tidy_up()
-        elif isinstance(error, Exception) and not isinstance(error, RunLockedError):
-            lines = traceback.format_exception(error)
-            self._status.fail(f"{type(error).__name__}: {error}", "".join(lines))
-
-    def _write_on(self) -> None:
-        while not self._is_over.wait(BEAT_S):
-            self.write()
-
-    def write(self) -> None:
-        """Write how far the trial is now."""
-        self._table["beat"] += 1
-        running_s, compiling_s = time.monotonic() - self._began, CLOCK.total_s - self._compiled_s
-        episodes, work_s = self._first or (self._table["episodes"], 0.0)
-        played, worked_s = self._table["episodes"] - episodes, running_s - compiling_s - work_s
-        times = {
-            "running_s": round(running_s, 1),
-            "compiling_s": round(compiling_s, 1),
-            "is_compiling": CLOCK.is_running,
-            "episodes_per_s": round(played / worked_s, 4) if played and worked_s > 0 else None,
-            "peak_bytes": peak_bytes(),
-        }
-        with suppress(OSError):  # of a full disk the run itself says more
-            write_json(self._status.path, {**self._table, **times})
-
-    def on_start(self, training: Training) -> None:
-        """Continues counting where the training does."""
-        self._table.update(steps=training.steps, episodes=training.episodes_played)
-        work_s = time.monotonic() - self._began - (CLOCK.total_s - self._compiled_s)
-        self._first = training.episodes_played, work_s
-
-    def on_step(self, batch: TensorDictBase) -> None:
-        """Counts a step of every world."""
-        self._table["steps"] += 1
-
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Counts an episode."""
-        self._table["episodes"] += 1
-
-
-def is_silent(status: Status, patience_s: float) -> Iterator[bool]:
-    """Whether a trial has given no sign of life for so many seconds, each time it is asked.
-
-    Other hosts' clocks may differ from this one's, so what counts is whether the status changes.
-    """
-    last, since = status.read(), time.monotonic()
-    while True:
-        table = status.read()
-        if table != last:
-            last, since = table, time.monotonic()
-        yield time.monotonic() - since >= patience_s
-
-
-def peak_bytes() -> int:
-    """The largest memory that this process has had, in bytes."""
-    if sys.platform == "win32":
-        return int(psutil.Process().memory_info().peak_wset)
-    import resource
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else 1024 * peak
+        name = str(read_recipe(self.directory)["experiment"]["name"])  # perhaps that of another study
+        experiment = replace(self.trial.experiment, name=name)
+        with (
+            open(self.status.log, "a", encoding="utf-8", errors="replace") as log,
+            redirect_stdout(log),
+            redirect_stderr(log),
+            StatusFile(self.status, experiment) as status,
+        ):
+            run(
+                experiment,
+                self.directory,
+                resume=True,
+                keep_checkpoint=self.keep_checkpoint,
+                watch="off",
+                figures=False,
+                allow=self.targets,
+                callbacks=(status,),
+            )
 
 
 def begin_from_shorter(run: Path, experiment: Experiment, recipe: Mapping[str, Any]) -> Path | None:

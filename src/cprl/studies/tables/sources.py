@@ -15,8 +15,9 @@ from cprl.measuring.now import DECLINE, HARVESTING, LEAST_LOSS, LOST, RECOVERY, 
 from cprl.measuring.phases import FEWEST_EPISODES
 from cprl.runs.curves import Values, as_curves, curves_of, phases_of, running_mean
 from cprl.runs.episodes import read_episodes, read_table
+from cprl.studies.status import Status
 from cprl.studies.study import Study, level_text, unlike
-from cprl.studies.trials import State, Status, trials_of
+from cprl.studies.trials import State, trials_of
 from cprl.terminal.course import BELOW_RANDOM, LAST_EPISODES, PEAK_EPISODES, PEAK_OVER_RANDOM
 from cprl.terminal.figures import COLOURS as PHASE_COLOURS
 from cprl.terminal.figures import UNNAMED

@@ -1,0 +1,198 @@
+"""Status: what a trial says of itself while it runs, in files beside those of its study, and what it obeys.
+
+`process_of_trial` is the process that a study starts for a trial, from within.
+"""
+
+import json
+import os
+import signal
+import socket
+import sys
+import time
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any, Final, Self
+
+import psutil
+from tensordict import TensorDictBase
+
+from cprl.experiment import Experiment
+from cprl.measuring.episodes import Episode
+from cprl.runs.files import RunLockedError, write_json
+from cprl.system.compile_clock import CLOCK
+from cprl.system.process import cpu
+from cprl.training import Training
+
+PATIENCE_S: Final = 60.0
+"""Seconds without a sign of life after which a trial is taken over that another host has locked."""
+BEAT_S: Final = 1.0
+"""Seconds between two signs of life."""
+LOCKED: Final = 75
+"""The exit code of a process whose trial another one runs; EX_TEMPFAIL of sysexits.h."""
+STOPPED: Final = (128 + signal.SIGINT, 128 + signal.SIGTERM)
+"""The exit codes of a process that was asked to stop, and saved a checkpoint."""
+
+
+class Status:
+    """The files in which a trial says how far it is.
+
+    Args:
+        folder: in which they are; made by whoever writes first.
+    """
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self.folder, self.name = folder, name
+        self.path, self.log = folder / f"{name}.json", folder / f"{name}.log"
+        self.failed = folder / f"{name}.failed.txt"
+
+    def read(self) -> dict[str, Any]:
+        """What the trial said last; empty if it has said nothing."""
+        try:
+            table = json.loads(self.path.read_bytes())
+        except (OSError, ValueError):
+            return {}
+        return table if isinstance(table, dict) else {}
+
+    def fail(self, reason: str, trace: str) -> None:
+        """Notes why the trial failed."""
+        with suppress(OSError):  # of a full disk, say; then the reason is in the outcome alone
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self.failed.write_text(f"{reason}\n\n{trace}", encoding="utf-8", errors="replace")
+
+    def failure(self) -> str | None:
+        """The error of the last attempt in a line; None if it did not fail."""
+        try:
+            return self.failed.read_text(encoding="utf-8").partition("\n")[0]
+        except (OSError, ValueError):
+            return None
+
+    def tidy_up(self) -> None:
+        """Forgets earlier failures."""
+        with suppress(OSError):
+            self.failed.unlink(missing_ok=True)
+
+
+@contextmanager
+def process_of_trial(path: Path, experiment: Experiment) -> Iterator["StatusFile"]:
+    """Make this process one that a study started: it says how far it is, stops when the study asks it to,
+    ends when the study's process has died, and says by its exit code that another process runs the trial.
+
+    Args:
+        path: the file of its status; its standard input is a pipe from the study's process.
+    """
+    Thread(target=_obey, args=(sys.stdin.fileno(),), daemon=True).start()
+    with StatusFile(Status(path.parent, path.stem), experiment) as status:
+        try:
+            yield status
+        except RunLockedError as error:
+            sys.stderr.write(f"{error}\n")
+            sys.exit(LOCKED)
+
+
+def _obey(pipe: int) -> None:
+    """Gives this process SIGTERM when it is asked to stop; ends it when there is nobody left to ask."""
+    while os.read(pipe, 1):
+        if sys.platform == "win32":  # where os.kill ends the process at once, without its handler
+            signal.raise_signal(signal.SIGTERM)
+        else:
+            os.kill(os.getpid(), signal.SIGTERM)
+    os._exit(1)
+
+
+class StatusFile:
+    """Writes every second how far a trial is, and why it failed; a context manager around the run, and
+    a callback of `cprl.training`."""
+
+    is_extendable = True
+
+    def __init__(self, status: Status, experiment: Experiment) -> None:
+        self._status = status
+        self._table: dict[str, Any] = {
+            "pid": os.getpid(),
+            "host": socket.gethostname(),
+            "cpu": cpu(),
+            "episodes": 0,
+            "of": experiment.episodes * experiment.replicas,
+            "steps": 0,
+            "beat": 0,
+        }
+        self._began, self._compiled_s = time.monotonic(), CLOCK.total_s
+        self._first: tuple[int, float] | None = None
+        """Episodes and seconds of work when this process began to train."""
+        self._is_over = Event()
+        self._thread = Thread(target=self._write_on, daemon=True)
+
+    def __enter__(self) -> Self:
+        self.write()
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        self._is_over.set()
+        self._thread.join()
+        self.write()
+        if error is None:
+            self._status.tidy_up()
+        elif isinstance(error, Exception) and not isinstance(error, RunLockedError):
+            lines = traceback.format_exception(error)
+            self._status.fail(f"{type(error).__name__}: {error}", "".join(lines))
+
+    def _write_on(self) -> None:
+        while not self._is_over.wait(BEAT_S):
+            self.write()
+
+    def write(self) -> None:
+        """Write how far the trial is now."""
+        self._table["beat"] += 1
+        running_s, compiling_s = time.monotonic() - self._began, CLOCK.total_s - self._compiled_s
+        episodes, work_s = self._first or (self._table["episodes"], 0.0)
+        played, worked_s = self._table["episodes"] - episodes, running_s - compiling_s - work_s
+        times = {
+            "running_s": round(running_s, 1),
+            "compiling_s": round(compiling_s, 1),
+            "is_compiling": CLOCK.is_running,
+            "episodes_per_s": round(played / worked_s, 4) if played and worked_s > 0 else None,
+            "peak_bytes": peak_bytes(),
+        }
+        with suppress(OSError):  # of a full disk the run itself says more
+            write_json(self._status.path, {**self._table, **times})
+
+    def on_start(self, training: Training) -> None:
+        """Continues counting where the training does."""
+        self._table.update(steps=training.steps, episodes=training.episodes_played)
+        work_s = time.monotonic() - self._began - (CLOCK.total_s - self._compiled_s)
+        self._first = training.episodes_played, work_s
+
+    def on_step(self, batch: TensorDictBase) -> None:
+        """Counts a step of every world."""
+        self._table["steps"] += 1
+
+    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+        """Counts an episode."""
+        self._table["episodes"] += 1
+
+
+def is_silent(status: Status, patience_s: float) -> Iterator[bool]:
+    """Whether a trial has given no sign of life for so many seconds, each time it is asked.
+
+    Other hosts' clocks may differ from this one's, so what counts is whether the status changes.
+    """
+    last, since = status.read(), time.monotonic()
+    while True:
+        table = status.read()
+        if table != last:
+            last, since = table, time.monotonic()
+        yield time.monotonic() - since >= patience_s
+
+
+def peak_bytes() -> int:
+    """The largest memory that this process has had, in bytes."""
+    if sys.platform == "win32":
+        return int(psutil.Process().memory_info().peak_wset)
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
