@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 from threading import Thread
 from types import ModuleType
@@ -110,10 +111,11 @@ def test_by_ray_a_trial_whose_worker_is_killed_ends_the_same(tmp_path, undisturb
     assert not ray.is_initialized()
 
 
-class Told:
-    """A process that ends when it is told to, and asks this one to stop when it is first looked at."""
+class FakeProcess(nullcontext):
+    """A process that ends when it is stopped, and asks this one to stop whenever it is looked at."""
 
     def __init__(self, signals):
+        super().__init__(self)
         self.signals, self.stops = [*signals], []
 
     def poll(self):
@@ -122,30 +124,27 @@ class Told:
             return None
         return 143 if self.stops else None
 
-    def stop(self, *, kill):
-        self.stops.append(kill)
+    def kill(self):
+        self.stops.append("kill")
 
 
 @pytest.mark.parametrize(
     ("signals", "kind", "stops"),
     [
-        ([signal.SIGINT], KeyboardInterrupt, [False]),
-        ([signal.SIGTERM], SystemExit, [False]),
-        ([signal.SIGINT, signal.SIGTERM], SystemExit, [False, True]),
+        ([signal.SIGINT], KeyboardInterrupt, ["ask"]),
+        ([signal.SIGTERM], SystemExit, ["ask"]),
+        ([signal.SIGINT, signal.SIGTERM], SystemExit, ["ask", "kill"]),
     ],
     ids=str,
 )
 def test_a_study_that_is_asked_to_stop_asks_its_processes_once_and_kills_them_if_asked_again(
-    signals, kind, stops, tmp_path, capsys
+    signals, kind, stops, tmp_path, capsys, monkeypatch
 ):
-    process = Told(signals)
-
-    class Fake(Processes):
-        def start(self, task):
-            return process
-
+    process = FakeProcess(signals)
+    monkeypatch.setattr(executors, "_started", lambda *_: process)
+    monkeypatch.setattr(executors, "_ask_to_stop", lambda process: process.stops.append("ask"))
     with pytest.raises(kind) as ended:
-        run_study(Study(TINY, {FREEZE: [2, 5]}), tmp_path, on=Fake(1), results=False)
+        run_study(Study(TINY, {FREEZE: [2, 5]}), tmp_path, on=Processes(1), results=False)
     assert getattr(ended.value, "code", None) in (None, 143)
     assert process.stops == stops
     assert "2 trials are left" in capsys.readouterr().out

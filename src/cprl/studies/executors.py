@@ -12,7 +12,7 @@ import sys
 import time
 import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
@@ -93,8 +93,8 @@ class _SideBySide(ABC):
         """How many trials may run at a time."""
 
     @abstractmethod
-    def start(self, task: Task) -> "_LocalProcess | _RayTask":
-        """Starts the process of a trial."""
+    def exit_code(self, task: Task, asked: Sequence[int]) -> int:
+        """Runs the process of a trial; asks it to stop when this one is asked, the second time kills it."""
 
     def ready(self) -> AbstractContextManager[object]:
         """In which processes are started."""
@@ -141,14 +141,9 @@ class _SideBySide(ABC):
             if asked or outcome is not None:
                 return outcome
             try:
-                process, heard = self.start(task), 0
+                code = self.exit_code(task, asked)
             except OSError as error:
                 return task.failed(f"{type(error).__name__}: {error}", traceback.format_exc())
-            while (code := process.poll()) is None:
-                time.sleep(_LOOK_S)
-                if heard < len(asked):
-                    heard = len(asked)
-                    process.stop(kill=heard > 1)
             outcome = task.ended(code)
             if outcome is not None:
                 return outcome
@@ -170,37 +165,34 @@ class Processes(Value, _SideBySide, stored=False):
     def places(self) -> int:
         return self.jobs
 
-    def start(self, task: Task) -> "_LocalProcess":
-        return _LocalProcess(task)
-
-
-class _LocalProcess:
-    """A process of this machine; it reads from a pipe that it shall stop."""
-
-    def __init__(self, task: Task) -> None:
-        with open(task.status.log, "ab") as log:
-            self._process = subprocess.Popen(
-                [sys.executable, *task.arguments],
-                stdin=subprocess.PIPE,
-                stdout=log,
-                stderr=log,
-                env={**os.environ, **task.variables},
-                start_new_session=True,  # Ctrl-C is the business of the process that runs the study
-            )
-
-    def poll(self) -> int | None:
-        code = self._process.poll()
-        if code is not None and self._process.stdin is not None:
-            self._process.stdin.close()
+    def exit_code(self, task: Task, asked: Sequence[int]) -> int:
+        heard = 0
+        with _started(task.arguments, str(task.status.log), task.variables) as process:
+            while (code := process.poll()) is None:
+                time.sleep(_LOOK_S)
+                if heard < len(asked):
+                    heard = len(asked)
+                    process.kill() if heard > 1 else _ask_to_stop(process)
         return code
 
-    def stop(self, *, kill: bool) -> None:
-        assert self._process.stdin is not None
-        if kill:
-            self._process.kill()
-        else:
-            with suppress(OSError):  # it has ended
-                os.write(self._process.stdin.fileno(), b"!")
+
+def _started(arguments: Sequence[str], log: str, variables: Mapping[str, str]) -> "subprocess.Popen[bytes]":
+    """The process of a trial; it reads from a pipe that it shall stop, or that nobody is left to say so."""
+    with open(log, "ab") as file:
+        return subprocess.Popen(
+            [sys.executable, *arguments],
+            stdin=subprocess.PIPE,
+            stdout=file,
+            stderr=file,
+            env={**os.environ, **variables},
+            start_new_session=True,  # Ctrl-C is the business of the process that runs the study
+        )
+
+
+def _ask_to_stop(process: "subprocess.Popen[bytes]") -> None:
+    assert process.stdin is not None
+    with suppress(OSError):  # it has ended
+        os.write(process.stdin.fileno(), b"!")
 
 
 _STORE_BYTES: Final = 80 * 2**20
@@ -243,6 +235,7 @@ class Ray(Value, _SideBySide, stored=False):
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to Ray's makers
         os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's own is 15: a tenth of a busy machine
         ray: Any = import_module("ray")
+        ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
         if ray.is_initialized():
             yield
             return
@@ -267,18 +260,41 @@ class Ray(Value, _SideBySide, stored=False):
         ray: Any = import_module("ray")
         return self.jobs or max(1, int(ray.cluster_resources().get("CPU", 1)))
 
-    def start(self, task: Task) -> "_RayTask":
+    def exit_code(self, task: Task, asked: Sequence[int]) -> int:
         ray: Any = import_module("ray")
         nodes = [int(node["Resources"].get("memory", 0)) for node in ray.nodes() if node["Alive"]]
         memory = self.memory_bytes or bytes_of(task)
         if any(nodes):
             memory = min(memory, max(nodes))  # more than any node has would wait forever
-        work = ray.remote(num_cpus=1, memory=memory, max_retries=0)(_work())
-        return _RayTask(
-            ray,
-            work.remote(task.arguments, os.path.abspath(task.status.log), task.variables),
-            task,
-        )
+        work = ray.remote(num_cpus=1, memory=memory, max_retries=0)(_wait)
+        reference = work.remote(task.arguments, os.path.abspath(task.status.log), task.variables)
+        heard, errors = 0, ray.exceptions
+        while not ray.wait([reference], timeout=_LOOK_S)[0]:
+            if heard < len(asked):
+                heard = len(asked)
+                ray.cancel(reference, force=heard > 1)
+        try:
+            return int(ray.get(reference))
+        except errors.TaskCancelledError:
+            return STOPPED[-1]
+        except (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError):
+            return -9  # as after SIGKILL
+        except errors.RayError as error:  # e.g. the node does not have the study's directory
+            lines = str(error).strip().splitlines() or [""]
+            task.status.fail(f"{type(error).__name__}: {lines[-1].strip()}", "\n".join(lines))
+            return 1
+
+
+def _wait(arguments: Sequence[str], log: str, variables: Mapping[str, str]) -> int:
+    """The exit code of the process of a trial; what Ray's workers do, which need not import cprl for it."""
+    with _started(arguments, log, variables) as process:
+        while True:
+            try:
+                return process.wait(0.1)
+            except subprocess.TimeoutExpired:
+                pass
+            except KeyboardInterrupt:  # Ray's way of asking
+                _ask_to_stop(process)
 
 
 def bytes_of(task: Task) -> int:
@@ -286,60 +302,3 @@ def bytes_of(task: Task) -> int:
     folder = task.status.folder
     peaks = [Status(folder, path.stem).read().get("peak_bytes", 0) for path in folder.glob("*.json")]
     return max(_BYTES, round(1.1 * max(peaks, default=0)))
-
-
-class _RayTask:
-    """A task of Ray that waits for the process of a trial."""
-
-    def __init__(self, ray: Any, reference: Any, task: Task) -> None:
-        self._ray, self._reference, self._task = ray, reference, task
-
-    def poll(self) -> int | None:
-        errors = self._ray.exceptions
-        if not self._ray.wait([self._reference], timeout=0)[0]:
-            return None
-        try:
-            return int(self._ray.get(self._reference))
-        except errors.TaskCancelledError:
-            return STOPPED[-1]
-        except (
-            errors.WorkerCrashedError,
-            errors.NodeDiedError,
-            errors.OutOfMemoryError,
-        ):
-            return -9  # as after SIGKILL
-        except errors.RayError as error:  # e.g. the node does not have the study's directory
-            lines = str(error).strip().splitlines() or [""]
-            self._task.status.fail(f"{type(error).__name__}: {lines[-1].strip()}", "\n".join(lines))
-            return 1
-
-    def stop(self, *, kill: bool) -> None:
-        self._ray.cancel(self._reference, force=kill)
-
-
-def _work() -> Callable[[list[str], str, Mapping[str, str]], int]:
-    """What Ray's workers do; defined within, so that it is sent whole and they need not import cprl."""
-
-    def work(arguments: list[str], log: str, variables: Mapping[str, str]) -> int:
-        import os
-        import subprocess
-        import sys
-
-        with open(log, "ab") as file:
-            process = subprocess.Popen(
-                [sys.executable, *arguments],
-                stdin=subprocess.PIPE,
-                stdout=file,
-                stderr=file,
-                env={**os.environ, **variables},
-            )
-        assert process.stdin is not None
-        while True:
-            try:
-                return process.wait(0.1)
-            except subprocess.TimeoutExpired:
-                pass
-            except KeyboardInterrupt:  # Ray's way of asking
-                os.write(process.stdin.fileno(), b"!")
-
-    return work
