@@ -43,7 +43,7 @@ STAGES = {
 }
 
 
-def study_of(factors, episodes=40):
+def study_of(factors, episodes=24):
     """2 x 2 conditions of 4 replicas, in two blocks each."""
     return Study(replace(OFTEN_SAVED, episodes=episodes), factors, replicas=4, block=2)
 
@@ -52,7 +52,7 @@ def runs_in(out, state):
     return [run for run in (out / "runs").glob("*-s*") if state_of(run) == state]
 
 
-def started(out, on, factors=GRID, episodes=40):
+def started(out, on, factors=GRID, episodes=24):
     """A process that runs the study, with a group of its own."""
     script = out.with_suffix(".py")
     script.write_text(SCRIPT.format(out=str(out), on=on, factors=factors, episodes=episodes))
