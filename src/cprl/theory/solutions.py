@@ -80,12 +80,12 @@ def equilibria(table: PayoffTable) -> tuple[Equilibrium, ...]:
         raise ValueError(f"table has {table.strategies} strategies; allowed: at most {MOST_STRATEGIES}")
     nashpy = extra("nashpy")
     payoffs = table.normalised.pairs + 1.0  # above 0, or the polytopes have no end
-    equilibria_of: dict[tuple[float, ...], Equilibrium] = {}
+    by_shares: dict[tuple[float, ...], Equilibrium] = {}
     for first, second in nashpy.Game(payoffs, payoffs.T).vertex_enumeration():
         sides = sorted((tuple(np.round(side, 6) + 0.0) for side in (first, second)), reverse=True)
         key = (*sides[0], *sides[1])
-        equilibria_of.setdefault(key, Equilibrium(first=np.array(sides[0]), second=np.array(sides[1])))
-    return tuple(equilibria_of[key] for key in sorted(equilibria_of, reverse=True))
+        by_shares.setdefault(key, Equilibrium(first=np.array(sides[0]), second=np.array(sides[1])))
+    return tuple(by_shares[key] for key in sorted(by_shares, reverse=True))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -116,11 +116,11 @@ def alpha_rank(table: PayoffTable) -> AlphaRank:
         )
     of_profiles = _long_run(table)
     played = np.array(np.unravel_index(np.arange(profiles), (table.strategies,) * table.agents)).T
-    shares = np.zeros(len(table.counts))
+    frequencies = np.zeros(len(table.counts))
     for profile, chance in zip(played, of_profiles, strict=True):
         counts = np.bincount(profile, minlength=table.strategies)
-        shares[table.rows[tuple(counts.tolist())]] += chance
-    return AlphaRank(compositions=shares, shares=shares @ table.counts / table.agents)
+        frequencies[table.rows[tuple(counts.tolist())]] += chance
+    return AlphaRank(compositions=frequencies, shares=frequencies @ table.counts / table.agents)
 
 
 def _long_run(table: PayoffTable) -> Values:
