@@ -81,7 +81,8 @@ class Batch:
         self.game = game
         self.size = worlds
         self.driver: Driver = driver or CpuThreads(game, worlds, threads=threads)
-        self._has_begun = False
+        self.has_begun = False
+        """Whether the worlds have begun an episode, so that there is something to show."""
         host = empty_worlds(worlds=worlds, agents=game.agents, sites=len(game.map.sites))
         host.number[:, 0] = np.arange(first_world, first_world + worlds, dtype=np.uint64)
         self.now: Worlds = self.driver.place(host)
@@ -95,11 +96,6 @@ class Batch:
         self._all_worlds: Bools = self.driver.empty((worlds,), np.bool_)
         self.driver.write(self._all_worlds, np.ones(worlds, np.bool_))
         self.set_seed(seed)
-
-    @property
-    def has_begun(self) -> bool:
-        """Whether the worlds have begun an episode, so that there is something to show."""
-        return self._has_begun
 
     def set_seed(self, seed: int) -> None:
         """Restarts from a seed: the next episode of each world is the first episode of this seed."""
@@ -132,10 +128,10 @@ class Batch:
         else:
             if which.shape != (self.size,) or which.dtype != np.bool_:
                 raise ValueError(f"which is {which.dtype} {list(which.shape)}; allowed: bool [{self.size}]")
-            if not self._has_begun and not self.driver.read(which).all():
+            if not self.has_begun and not self.driver.read(which).all():
                 raise ValueError("which leaves worlds out; allowed at first: None, so that all worlds begin")
         self._run("begin_worlds", which, output)
-        self._has_begun = True
+        self.has_begun = True
         return output
 
     def play(self, actions: Actions, output: Output, decisions: Actions | None = None) -> Output:
@@ -195,12 +191,12 @@ class Batch:
         for name, values in sound.items():
             self.driver.write(arrays[name], values)
         self._run("refresh_worlds", self._all_worlds, output)
-        self._has_begun = bool((sound["episode"] >= 0).all())
+        self.has_begun = bool((sound["episode"] >= 0).all())
         return output
 
     def check(self, actions: Actions) -> None:
         """Raise a ValueError for actions, int64 [B, N], that cannot be played."""
-        if not self._has_begun:
+        if not self.has_begun:
             raise ValueError("the worlds have not begun; allowed: reset() or load() before the first step")
         self._check_known("action", actions, len(self.game.actions), self.game.actions)
 
