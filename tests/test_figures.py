@@ -152,11 +152,11 @@ def test_phases_are_drawn_from_a_thousand_episodes_on(episodes, has_bands, tmp_p
 
 def test_phases_need_a_group_and_numbers_in_every_window():
     curves = {**the_tragedy(2, 1200), "return_0": np.ones((2, 1200)), "return_1": np.ones((2, 1200))}
-    changes, found = phases_of(curves, resamples=1)
+    found = phases_of(curves)
     assert bands_of(found)[0][2] == "exploration"
     assert {name for _, _, name in bands_of(found)} <= {*PHASES, UNNAMED}
-    centred, _ = phases_of(curves, centred=True, resamples=1)
-    assert [one.episode for one in centred] == [one.episode + 49.5 for one in changes]
+    centred = phases_of(curves, centred=True)
+    assert [phase.first for phase in centred] == [phase.first + 49.5 for phase in found]
     nobody = curves["equality"].copy()
     nobody[:, 300:450] = np.nan
     assert phases_of({**curves, "equality": nobody}) is None

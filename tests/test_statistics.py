@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from cprl.measuring.statistics import curve_interval, difference, estimate
+from cprl.measuring.statistics import curve_interval, difference, estimate, holm
 
 
 def test_intervals_are_by_student():
@@ -22,7 +23,7 @@ def test_intervals_are_by_student():
 def test_one_replica_has_no_interval_and_values_that_are_not_finite_are_refused():
     alone = estimate([3.0])
     assert alone.value == 3.0
-    assert np.isnan([alone.low, alone.high]).all()
+    assert np.isnan([alone.low, alone.high, alone.p_value]).all()
     for wrong in ([1.0, float("nan")], []):
         with pytest.raises(ValueError, match="values"):
             estimate(wrong)
@@ -39,3 +40,31 @@ def test_a_curve_has_an_interval_at_each_episode():
     middle, low, high = curve_interval(curves[:1])
     assert middle[:2].tolist() == [1.0, 5.0]
     assert np.isnan([low, high]).all(), "a single replica has no interval"
+
+
+def test_p_values_are_those_of_t_tests_and_agree_with_intervals():
+    values, reference = [3.0, 104.0, 208.0], [0.0, 100.0, 200.0]
+    pairs, apart = (difference(values, reference, paired=paired) for paired in (True, False))
+    assert pairs.p_value == pytest.approx(stats.ttest_rel(values, reference).pvalue)
+    assert apart.p_value == pytest.approx(stats.ttest_ind(values, reference, equal_var=False).pvalue)
+    at_the_bound = difference(values, [value + pairs.low for value in reference], paired=True)
+    assert at_the_bound.p_value == pytest.approx(0.05)
+    assert [estimate([value, value]).p_value for value in (0.0, 2.0)] == [1, 0]
+
+
+@pytest.mark.parametrize(
+    ("p_values", "differs"),
+    [
+        ([0.04], [True]),
+        # Compared with 0.05 / 3, 0.05 / 2 and 0.05, from the smallest on.
+        ([0.04, 0.01, 0.02], [True, True, True]),
+        # 0.03 is above 0.05 / 2, so that 0.04 differs neither.
+        ([0.04, 0.01, 0.03], [False, True, False]),
+        ([0.02, 0.02, 0.02], [False, False, False]),
+        # A single replica, which has no p-value, is no comparison.
+        ([float("nan"), 0.024, 0.04], [False, True, True]),
+        ([], []),
+    ],
+)
+def test_of_several_differences_those_differ_that_holm_names(p_values, differs):
+    assert holm(p_values).tolist() == differs

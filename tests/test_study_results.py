@@ -1,7 +1,9 @@
 """What a study's table says: means, differences, phases, figures and the summary; numbers worked by hand."""
 
 import json
+import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,19 +21,19 @@ from cprl.studies.figures import levels as levels_module
 from cprl.studies.figures.courses import courses
 from cprl.studies.figures.diagrams import grids, heat_map, phase_diagram
 from cprl.studies.figures.levels import (
-    _Axis,
     by_condition,
     by_factor,
     is_logarithmic,
     is_numeric,
     is_one,
+    names_of,
+    places_of,
     replicas_text,
-    with_counts,
 )
 from cprl.studies.results import write_results
 from cprl.studies.tables.comparing import Cells, cells, compare, markdown, metrics_of
-from cprl.studies.tables.sources import design_of, ending, endings, sources_of
-from cprl.studies.tables.table import StudyTable, study_table
+from cprl.studies.tables.sources import design_of, ending, study_table
+from cprl.studies.tables.table import StudyTable
 from cprl.studies.trials import trials_of
 
 SEES = "game.rules.window_rows"
@@ -91,7 +93,7 @@ def test_conditions_are_compared_by_the_last_episodes_and_pairs_of_replicas(pair
     assert other.difference.value == 5
     assert other.difference.low == pytest.approx(5 - 6.5724, abs=1e-3)
     assert compared.episodes_text == "the last 30 episodes of training"
-    assert compared.differences_text == "differences from freeze_steps=5, paired by replica"
+    assert compared.pairing_text == "paired by replica"
     assert compare(pairs, "collective_return", last=10).conditions[0].values[0] == 34.5
     evaluated = compare(pairs, "collective_return", part="evaluation")
     assert evaluated.conditions[1].values == {0: 3, 1: 104, 2: 208}
@@ -122,6 +124,27 @@ def test_a_table_in_markdown_has_replicas_intervals_and_differences(pairs):
     )
     assert [row[:2] for row in levels.rows] == [["freeze_steps=5", "3"], ["freeze_steps=25", "3"]]
     assert differences.rows == [["freeze_steps=25", "3", "+5.0 [-1.6, +11.6]"]]
+
+
+def test_differences_are_bold_that_differ_among_all_of_their_table(tmp_path):
+    def apples(condition, replica, number):
+        return (
+            100 * replica
+            + {5: 0, 25: (4, 5, 6)[replica], 100: (40, 41, 42)[replica]}[condition.levels[TIME_OUT]]
+        )
+
+    table = table_of(tmp_path, {TIME_OUT: [5, 25, 100]}, apples, replicas=3)
+    # 5 +- 1 and 41 +- 1 of 3 pairs: t is 8.66 and 71.0, p is 0.0131 and 0.0002; the equality is 0.5 in all.
+    alone = cells([compare(table, "collective_return")], "differences")
+    assert [row[2] for row in alone.rows] == ["**+5.00 [+2.52, +7.48]**", "**+41.0 [+38.5, +43.5]**"]
+    assert "Holm's method for 2 comparisons" in alone.note
+    several = cells(
+        [compare(table, name) for name in ("collective_return", "equality", "peace")], "differences"
+    )
+    assert [row[2] for row in several.rows] == ["+5.00 [+2.52, +7.48]", "**+41.0 [+38.5, +43.5]**"]
+    assert several.rows[0][3] == "+0.000 [+0.000, +0.000]"
+    assert "for 6 comparisons" in several.note
+    assert markdown(several)[-2:] == [several.note, ""]
 
 
 @pytest.mark.parametrize(
@@ -175,10 +198,8 @@ def test_the_most_frequent_phase_of_a_condition_is_counted_over_replicas(tmp_pat
 
     write_study(PAIRED, tmp_path, fall, random=100.0, but=("freeze_steps=25",))
     # The last 30 of 40 episodes include 10 of the peak: their mean is 140, above 95.
-    phases = endings(sources_of(PAIRED, tmp_path)[0])
-    assert phases.most_frequent("freeze_steps=5") == ("decline", 2, 3)
-    assert dict(phases.labels["freeze_steps=5"]) == {0: "harvesting", 1: "decline", 2: "decline"}
-    assert phases.most_frequent("freeze_steps=25") is None
+    phases = study_table(PAIRED, tmp_path).endings
+    assert list(phases.items()) == [("freeze_steps=5", {"decline": 2, "harvesting": 1})]
 
 
 # Figures
@@ -202,7 +223,6 @@ def drawn(monkeypatch):
 @pytest.mark.integration
 def test_figures_of_a_grid_are_drawn_with_a_condition_that_has_no_run(grid_runs, tmp_path):
     table = study_table(GRID, grid_runs)
-    phases = endings(sources_of(GRID, grid_runs)[0])
     (pair,) = grids(table.design)
     assert pair == (TIME_OUT, SEES)
     for name, draw in {
@@ -211,8 +231,7 @@ def test_figures_of_a_grid_are_drawn_with_a_condition_that_has_no_run(grid_runs,
         "differences": lambda path: by_condition(table, path, kind="differences"),
         "courses": lambda path: courses(table, path),
         "map": lambda path: heat_map(table, pair, path),
-        "bars": lambda path: phase_diagram(table, phases, path),
-        "squares": lambda path: phase_diagram(table, phases, path, factors=pair),
+        "phases": lambda path: phase_diagram(table, pair, path),
     }.items():
         assert_drawn(draw(tmp_path / f"{name}.png"))
         with pytest.raises(ValueError, match=r"path is '.*\.pdf'"):
@@ -232,9 +251,17 @@ def test_conditions_that_were_not_run_do_not_count_among_the_replicas_of_a_figur
     assert replicas_text({"as run": 8, "no beam": 8, "later": 0}) == "8 replicas each"
     assert replicas_text({"as run": 16, "no beam": 8, "later": 0}) == "8 to 16 replicas each (n)"
     assert replicas_text({"later": 0}) == "0 replicas each"
-    names = {"as run": "as run", "later": "later"}
-    assert with_counts(names, {"as run": 8, "later": 0}) == names
-    assert with_counts(names, {"as run": 8, "later": 4})["later"] == "later (n=4)"
+
+
+def test_figures_call_conditions_by_the_level_and_say_where_replicas_differ(pairs, tmp_path):
+    assert names_of(pairs) == {"freeze_steps=5": "5", "freeze_steps=25": "25"}
+    write_study(PAIRED, tmp_path, harvest, but=("freeze_steps=25",))
+    assert names_of(study_table(PAIRED, tmp_path)) == names_of(pairs), "what was not run has no number"
+    block = replace(PAIRED, block=2)
+    write_study(block, tmp_path / "blocks", harvest)
+    shutil.rmtree(tmp_path / "blocks" / trials_of(block)[1].name)
+    words = names_of(study_table(block, tmp_path / "blocks"))
+    assert words == {"freeze_steps=5": "5 (n=3)", "freeze_steps=25": "25 (n=1)"}
 
 
 @pytest.mark.integration
@@ -303,7 +330,7 @@ def test_levels_are_mapped_in_the_order_in_which_they_were_given(tmp_path, drawn
     if is_map:
         heat_map(table, (TIME_OUT, "view"), "map.png")
     else:
-        phase_diagram(table, endings([]), "phases.png", factors=(TIME_OUT, "view"))
+        phase_diagram(table, (TIME_OUT, "view"), "phases.png")
     axes = drawn[0].axes[0]
     assert [label.get_text() for label in axes.get_xticklabels()] == ["tall", "low", "middle"]
     assert [label.get_text() for label in axes.get_yticklabels()] == ["25", "1"]
@@ -321,13 +348,8 @@ def test_numbers_that_are_far_apart_stand_on_a_logarithmic_axis_and_names_on_non
 
 
 def test_levels_that_are_too_close_for_their_names_stand_at_equal_distances():
-    def axis(levels):
-        return _Axis.of(GAMMA, study_table(Study(EXPERIMENT, {GAMMA: levels}, name="axis"), Path("none")))
-
-    crowded = axis([0.5, 0.95, 0.99, 0.995])
-    assert crowded.places == {0.5: 0, 0.95: 1, 0.99: 2, 0.995: 3}
-    assert "equal distances" in crowded.title
-    assert axis([0.5, 0.7, 0.9]).places == {0.5: 0.5, 0.7: 0.7, 0.9: 0.9}
+    assert places_of([0.5, 0.95, 0.99, 0.995]) == ({0.5: 0, 0.95: 1, 0.99: 2, 0.995: 3}, True)
+    assert places_of([0.5, 0.9, 0.7]) == ({0.5: 0.5, 0.7: 0.7, 0.9: 0.9}, False)
 
 
 def test_a_factor_with_names_is_refused_as_an_axis_of_numbers(tmp_path):
@@ -354,7 +376,7 @@ def test_the_results_of_a_study_are_a_table_a_summary_and_figures(grid_runs, tmp
     pair = "game_rules_freeze_steps_game_rules_window_rows"
     assert figures == {
         "by_game_rules_freeze_steps.png", "by_game_rules_window_rows.png", "levels.png", "courses.png",
-        "phases.png", "differences.png", f"map_{pair}_collective_return.png", f"map_{pair}_equality.png",
+        "differences.png", f"map_{pair}_collective_return.png", f"map_{pair}_equality.png",
         f"phases_{pair}.png",
     }  # fmt: skip
     assert StudyTable.read(tmp_path / "table.parquet").summary == table.summary
@@ -371,7 +393,7 @@ def test_the_results_of_a_study_are_a_table_a_summary_and_figures(grid_runs, tmp
 @pytest.mark.integration
 def test_results_are_written_again_over_earlier_ones_and_none_of_those_is_left(tmp_path):
     (tmp_path / "figures").mkdir()
-    for name in ("map_old.png", "mine.png"):
+    for name in ("map_old.png", "phases.png", "mine.png"):
         (tmp_path / "figures" / name).write_bytes(b"")
     study = Study(EXPERIMENT, {TIME_OUT: [5]}, name="one", replicas=3)
     write_study(study, tmp_path / "runs", harvest)
@@ -381,7 +403,7 @@ def test_results_are_written_again_over_earlier_ones_and_none_of_those_is_left(t
         written.append([(tmp_path / name).read_bytes() for name in ("summary.md", "table.parquet")])
     assert written[0] == written[1]
     figures = {path.name for path in (tmp_path / "figures").iterdir()}
-    assert figures == {"levels.png", "courses.png", "phases.png", "mine.png"}
+    assert figures == {"levels.png", "courses.png", "mine.png"}
 
 
 def test_a_study_without_a_finished_run_has_a_summary_that_says_so(tmp_path):
@@ -395,7 +417,7 @@ def test_a_study_without_a_finished_run_has_a_summary_that_says_so(tmp_path):
 @pytest.fixture
 def summary_of_pairs(tmp_path, monkeypatch):
     """Writes the results of the paired study, without figures, and gives the summary."""
-    monkeypatch.setattr("cprl.studies.results._draw", lambda *_: iter(()))
+    monkeypatch.setattr("cprl.studies.results._figures", lambda *_: iter(()))
 
     def written():
         write_results(PAIRED, tmp_path, tmp_path / "runs")
@@ -433,8 +455,8 @@ def table_command(tmp_path, monkeypatch):
     """Runs `cprl table` where the runs of the paired study are."""
     monkeypatch.chdir(tmp_path)
 
-    def command(*words):
-        monkeypatch.setattr(sys, "argv", ["cprl", "table", "runs", *words])
+    def command(*words, of="runs"):
+        monkeypatch.setattr(sys, "argv", ["cprl", "table", of, *words])
         cli.main()
 
     return command
@@ -446,6 +468,7 @@ def table_command(tmp_path, monkeypatch):
         (["--by", "name", "--part", "evaluation", "--last", "30"], "--last .* without --part evaluation"),
         (["--by", "name", "--part", "random", "--last", "30"], "--last .* without --part random"),
         ([], r"cprl table RUN\.\.\. --by "),
+        (["--by", "name", "--summary"], "--summary .* without --by"),
     ],
 )
 def test_words_of_cprl_table_that_do_not_fit_are_refused_by_the_flag(words, message, table_command):
@@ -456,13 +479,32 @@ def test_words_of_cprl_table_that_do_not_fit_are_refused_by_the_flag(words, mess
 def test_cprl_table_prints_any_runs_by_a_field_and_writes_them(table_command, capsys):
     write_study(PAIRED, Path("runs"), harvest)
     words = ["--by", "game.rules.freeze-steps", "--metric", "collective_return", "--out"]
-    for out in ("table.parquet", "table.md"):
+    for out in ("table.parquet", "table.md", "table.csv"):
         table_command(*words, out)
     printed = capsys.readouterr().out
     assert "+5.0 [-1.6, +11.6]" in printed
     assert "2 runs by game.rules.freeze_steps: 6 replicas of 2 of 2 conditions" in printed
     assert len(StudyTable.read("table.parquet").rows) > 0
     assert "| freeze_steps=25 | 3 | +5.0 [-1.6, +11.6] |" in Path("table.md").read_text()
-    for out, message in (("table.md", "is not overwritten"), ("a.csv", r"a name that ends in \.parquet")):
+    for out, message in (("table.md", "is not overwritten"), ("a.txt", r"a name that ends in \.parquet")):
         with pytest.raises(SystemExit, match=message):
             table_command(*words, out)
+
+
+def test_cprl_table_of_a_study_says_and_writes_what_its_table_alone_gives(table_command, capsys):
+    table = write_results(PAIRED, "pairs", write_study(PAIRED, Path("runs"), harvest))
+    summary = Path("pairs/summary.md").read_text()
+    Path("pairs/summary.md").unlink()
+    capsys.readouterr()
+    table_command("--csv", of="pairs")
+    head, *rows = capsys.readouterr().out.splitlines()
+    assert head.replace('"', "").split(",") == table.rows.column_names
+    assert len(rows) == len(table.rows)
+    shutil.rmtree("runs")
+    table_command("--summary", of="pairs")
+    assert Path("pairs/summary.md").read_text() == summary
+    table_command("--metric", "collective_return", "--reference", "freeze_steps=25", of="pairs")
+    assert "-5.0 [-11.6, +1.6]" in capsys.readouterr().out
+    for words in (["--window", "1"], ["--reference", "none"]):
+        with pytest.raises(SystemExit, match=words[0]):
+            table_command(*words, of="pairs")

@@ -13,8 +13,8 @@ from cprl import Study
 from cprl.runs.recipe import runs_in, write_changed_circumstances
 from cprl.studies.status import Status
 from cprl.studies.tables.pooled import pooled_table
-from cprl.studies.tables.sources import design_of
-from cprl.studies.tables.table import METADATA, StudyTable, circumstances_of, study_table
+from cprl.studies.tables.sources import circumstances_of, design_of, study_table
+from cprl.studies.tables.table import METADATA, StudyTable
 from cprl.studies.trials import trials_of
 
 STUDY = Study(EXPERIMENT, {TIME_OUT: [5, 25]}, name="small", replicas=3, block=2)

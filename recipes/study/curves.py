@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Final
 
 import numpy as np
@@ -24,6 +25,7 @@ RUNS: Final = (1, 2)
 """The numbers of runs of which a published number or curve may be the mean."""
 PARTS: Final = ((500, 1000), (-500, None))
 """Parts of a training whose mean return is shown, first and last episode."""
+_RESAMPLES: Final = 200
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -276,9 +278,11 @@ def phases_of(results: Sequence[Result]) -> list[str]:
     runs = _of_experiment_5(results)
     if not runs:
         return []
-    rows = [["published curves", *_phase_cells(*_published_phases())]]
+    rows = [["published curves", *_phase_cells(_published_phases())]]
     for result in runs:
-        cells = _phase_cells(*result.phases) if result.phases else [TOO_FEW, "", "", ""]
+        cells = [TOO_FEW, "", "", ""]
+        if result.phases:
+            cells = _phase_cells(result.phases, _change_intervals(result))
         rows.append([result.name, *cells])
     head = ["curves", "second phase from", "third", "fourth", "phases by their pattern"]
     drawn = ", ".join(map(str, PHASES_BEGIN))
@@ -321,7 +325,7 @@ def _of_experiment_5(results: Sequence[Result]) -> list[Result]:
     return [result for result in results if result.study and result.study.number == 5]
 
 
-def _published_phases() -> tuple[list[phases.ChangePoint], list[phases.Phase]]:
+def _published_phases() -> list[phases.Phase]:
     study = published_experiment("commons")
     assert study is not None
     episodes = np.arange(10, 4745)
@@ -330,10 +334,27 @@ def _published_phases() -> tuple[list[phases.ChangePoint], list[phases.Phase]]:
     return phases.find_phases(episodes, metrics)
 
 
-def _phase_cells(changes: Sequence[phases.ChangePoint], found: Sequence[phases.Phase]) -> list[str]:
+def _change_intervals(result: Result) -> list[str]:
+    """In which episodes 95 % of the change points of resampled replicas lie; nothing for a single replica.
+
+    Change points are no means, of which Student's t speaks: replicas are drawn anew, with replacement.
+    """
+    smoothed = {name: running_mean(result.curves[name]) for name in phases.METRICS}
+    replicas, episodes = smoothed[phases.METRICS[0]].shape
+    if replicas == 1:
+        return []
+    rng = np.random.default_rng(0)
+    resampled = []
+    for _ in range(_RESAMPLES):
+        drawn = rng.integers(replicas, size=replicas)
+        metrics = {name: curves[drawn] for name, curves in smoothed.items()}
+        resampled.append(phases.change_points(np.arange(episodes), metrics))
+    return [f" [{low:.0f}, {high:.0f}]" for low, high in np.quantile(resampled, [0.025, 0.975], axis=0).T]
+
+
+def _phase_cells(divided: Sequence[phases.Phase], intervals: Sequence[str] = ()) -> list[str]:
     cells = [
-        f"{change.episode:.0f}"
-        + (f" [{change.low:.0f}, {change.high:.0f}]" if np.isfinite(change.low) else "")
-        for change in changes
+        f"{phase.first:.0f}{interval}"
+        for phase, interval in zip_longest(divided[1:], intervals, fillvalue="")
     ]
-    return [*cells, ", ".join(phase.label or "none of them" for phase in found)]
+    return [*cells, ", ".join(phase.label or "none of them" for phase in divided)]

@@ -112,7 +112,7 @@ def _draw(result: Result, metric: str, limits: Limits, path: Path) -> None:
     if result.study and result.study.recipe == PHASED_RECIPE:
         strips["published"] = published_bands(result.study.episodes)
         if result.phases:
-            strips["ours"] = bands_of(result.phases[1])
+            strips["ours"] = bands_of(result.phases)
     heights = [STRIP_IN * len(strips)] * bool(strips) + [HEIGHT_IN]
     figure, panels = style.new_figure(heights, title=result.title)
     axes = panels[-1]

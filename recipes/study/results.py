@@ -27,11 +27,11 @@ from cprl.evaluation.evaluate import SEED
 from cprl.evaluation.lanes import Source, fresh_worlds, policies_of, random_policies
 from cprl.experiment import Experiment
 from cprl.measuring.movement import Trace, overlap, trace
+from cprl.measuring.phases import Phase
 from cprl.policies.assignment import AgentPolicies
 from cprl.population import Learning, Scripted, Team, exploration_steps
 from cprl.runs.curves import (
     SMOOTHED_EPISODES,
-    Phases,
     as_curves,
     curves_of,
     episode_of_step,
@@ -365,8 +365,8 @@ class Result:
         return read_episodes(self.path)
 
     @cached_property
-    def phases(self) -> Phases | None:
-        """Change points and phases; None if there are too few episodes, see `phases_of`."""
+    def phases(self) -> list[Phase] | None:
+        """Its phases; None if there are too few episodes, see `phases_of`."""
         return phases_of(dict(self.curves))
 
     def evaluated(self, policy: str) -> Mapping[str, Values] | None:

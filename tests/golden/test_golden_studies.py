@@ -1,11 +1,14 @@
 """The summaries of the committed studies come out of their tables line by line."""
 
+import re
+import shutil
 from pathlib import Path
 
 import pytest
 
 import cprl
 from cprl.studies import StudyTable
+from cprl.studies.results import write_summary
 from cprl.studies.tables.comparing import cells, compare, markdown, metrics_of
 
 RESULTS = Path(cprl.__file__).parents[2] / "docs" / "results"
@@ -32,3 +35,14 @@ def test_a_summary_holds_what_its_table_gives(study):
             lines = markdown(cells(compared, kind))
             assert len(lines) > 3
             assert set(lines) <= set(summary), (part, kind)
+
+
+@pytest.mark.parametrize("study", STUDIES, ids=name_of)
+def test_a_summary_is_what_its_table_alone_gives(study, tmp_path):
+    if (study / "figures").exists():
+        shutil.copytree(study / "figures", tmp_path / "figures")
+    summary = (study / "summary.md").read_text()
+    (again,) = re.findall("This line runs what is lacking: `(.*)`", summary) or [""]
+    table = StudyTable.read(study / "table.parquet")
+    written = write_summary(table, tmp_path, last=last_of(summary.splitlines()), again=again)
+    assert written.read_text() == summary

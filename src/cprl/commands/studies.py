@@ -37,7 +37,7 @@ _RECIPE: Final = (
 )
 _MODULE: Final = "cprl_swept_recipe"
 _TRAINING: Final = "training"
-_TABLE_SUFFIXES: Final = (".parquet", ".md")
+_TABLE_SUFFIXES: Final = (".parquet", ".csv", ".md")
 Part = Literal["training", "evaluation", "random"]
 _NOTE: Final = (
     "cprl sweep runs a recipe under several conditions. With --vary PATH=VALUES any value below is varied: "
@@ -283,86 +283,133 @@ def recipe_of(source: Path, allow: Sequence[str] = ()) -> "Callable[..., Experim
     return made
 
 
+@dataclass(frozen=True, kw_only=True)
+class Compare:
+    """What of a table is compared."""
+
+    metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """What is compared, e.g. collective_return; may be repeated."""
+    part: Part = _TRAINING
+    """Of the runs: their training, their agents in fresh worlds, or random play in these."""
+    last: int | None = None
+    """Episodes at the end of the training that are compared, by default 30."""
+
+    def __post_init__(self) -> None:
+        if self.last is not None and self.part != _TRAINING:
+            raise ValueError(f"--last counts episodes of the training; allowed: without --part {self.part}")
+
+
 def runs_table(
     runs: tuple[Path, ...],
     /,
     *,
-    by: tyro.conf.UseAppendAction[tuple[str, ...]],
-    metric: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
-    part: Part = _TRAINING,
-    last: int | None = None,
+    by: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    compare: Annotated[Compare, tyro.conf.arg(name="")] = Compare(),
     reference: str | None = None,
-    window: int = WINDOW,
+    window: int | None = None,
     out: Path | None = None,
+    csv: bool = False,
+    summary: bool = False,
     allow: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
 ) -> None:
     """Compares any runs, grouped by fields of their experiments, with intervals over replicas.
 
     Args:
-        runs: directories of runs, or of directories that hold them.
+        runs: directories of runs, or of directories that hold them, with --by; or the directory of a study.
         by: the path of a field, e.g. game.rules.freeze-steps, agents.*.algorithm.settings.gamma or name; may
             be repeated.
-        metric: what is compared, e.g. collective_return; may be repeated.
-        part: of the runs: their training, their agents in fresh worlds, or random play in these.
-        last: episodes at the end of the training that are compared, by default 30.
         reference: the name of the condition that others are compared with, e.g. freeze_steps=25; by default
-            the first.
-        window: episodes of a row of the table, of which --last compares whole ones and --out FILE.parquet
-            writes all; 1 for episodes one by one.
-        out: a file to be: .parquet with every window of episodes, replica and metric, or .md with what is
-            printed.
+            the first, or that of the study.
+        window: episodes of a row of the table, of which --last compares whole ones, 10 by default; 1 for
+            episodes one by one; with --by.
+        out: a file to be: .parquet or .csv with every window of episodes, replica and metric, or .md with
+            what is printed.
+        csv: print every window of episodes, replica and metric as CSV, and nothing else.
+        summary: write summary.md of a study again, from its table alone.
         allow: code of your own, module:Class, that a run's recipe may name; may be repeated.
     """
     if out is not None:
         if out.suffix not in _TABLE_SUFFIXES:
-            raise ValueError(f"--out is {out}; allowed: a name that ends in {' or '.join(_TABLE_SUFFIXES)}")
+            raise ValueError(f"--out is {out}; allowed: a name that ends in {', '.join(_TABLE_SUFFIXES)}")
         refuse_to_write_over(out)
-    if last is not None and part != _TRAINING:
-        raise ValueError(f"--last counts episodes of the training; allowed: without --part {part}")
     if not runs:
         raise ValueError("cprl table wants at least one run: cprl table RUN... --by FIELD")
-    if not by:
-        raise ValueError(
-            "cprl table wants a field that tells runs apart: cprl table RUN... --by game.rules.freeze-steps"
-        )
-    runs_in(runs)
+    if summary and by:
+        raise ValueError("--summary is of a study; allowed: without --by, cprl table STUDY --summary")
+    if by:
+        runs_in(runs)
+
+        from cprl.studies.tables.pooled import pooled_table
+
+        window = WINDOW if window is None else window
+        table = pooled_table(runs, by=by, window=window, reference=reference, allow=allow)
+    else:
+        table = _table_in(runs, reference, window)
+    if csv:
+        OUT.write(table.to_csv())
+        return
 
     from cprl.studies.tables.comparing import rich_table
-    from cprl.studies.tables.pooled import pooled_table
 
-    found = pooled_table(runs, by=by, window=window, reference=reference, allow=allow)
-    compared = _compared(found, metric, part, LAST if last is None else last)
-    shown = console(width=None if OUT.isatty() else 250)
-    for own in compared:
-        shown.print(rich_table(own))
-    say(str(found))
+    last = LAST if compare.last is None else compare.last
+    compared = _compared(table, compare.metric, compare.part, last)
+    terminal = console(width=None if OUT.isatty() else 250)
+    for cells in compared:
+        terminal.print(rich_table(cells))
+    say(str(table))
+    if summary:
+        from cprl.studies.results import write_summary
+
+        say(f"Written: {write_summary(table, runs[0], last=last)}")
     if out is not None:
-        _write(found, compared, out)
+        _write(table, compared, out)
         say(f"Written: {out}")
 
 
-def _compared(found: "StudyTable", metrics: Sequence[str], part: Part, last: int) -> "list[Cells]":
+def _table_in(runs: Sequence[Path], reference: str | None, window: int | None) -> "StudyTable":
+    """The table of a study's directory."""
+    from cprl.studies import StudyTable
+
+    path = runs[0] / "table.parquet"
+    if len(runs) > 1 or not path.exists():
+        raise ValueError(
+            "cprl table wants a field that tells runs apart: cprl table RUN... --by game.rules.freeze-steps; "
+            "or the directory of one study with its table.parquet: cprl table STUDY"
+        )
+    if window is not None:
+        raise ValueError("--window is for runs; allowed: with --by, as a study's table has its windows")
+    table = StudyTable.read(path)
+    if reference is None:
+        return table
+    if reference not in table.design.conditions:
+        names = ", ".join(list(table.design.conditions)[:10])
+        raise ValueError(f"--reference is {reference}; allowed: the name of a condition: {names}")
+    return replace(table, design=replace(table.design, reference=reference))
+
+
+def _compared(table: "StudyTable", metrics: Sequence[str], part: Part, last: int) -> "list[Cells]":
     """Levels, and differences where there is more than one condition."""
     from cprl.studies.tables.comparing import cells, compare, metrics_of
 
-    chosen = metrics_of(found, metrics)
-    if not chosen:
+    comparisons = [compare(table, metric, part=part, last=last) for metric in metrics_of(table, metrics)]
+    if not comparisons:
         return []
-    every = [compare(found, own, part=part, last=last) for own in chosen]
-    several = len(found.design.conditions) > 1
-    return [cells(every), cells(every, "differences")] if several else [cells(every)]
+    several = len(table.design.conditions) > 1
+    return [cells(comparisons), cells(comparisons, "differences")] if several else [cells(comparisons)]
 
 
-def _write(found: "StudyTable", compared: "Sequence[Cells]", out: Path) -> None:
+def _write(table: "StudyTable", compared: "Sequence[Cells]", out: Path) -> None:
     if out.suffix == ".parquet":
-        found.write(out)
+        table.write(out)
         return
-    from cprl.studies.tables.comparing import markdown
+    content = table.to_csv()
+    if out.suffix == ".md":
+        from cprl.studies.tables.comparing import markdown
 
-    lines = [line for own in compared for line in (own.heading, "", *markdown(own))]
-    content = "\n".join([*lines, *str(found).split("\n"), ""]).encode()
+        lines = [line for cells in compared for line in (cells.heading, "", *markdown(cells))]
+        content = "\n".join([*lines, *str(table).split("\n"), ""])
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(out, lambda file: file.write(content))
+    write_atomically(out, lambda file: file.write(content.encode()))
 
 
 def _about(study: "Study") -> str:

@@ -49,9 +49,9 @@ class Dilemma:
     @property
     def candidates(self) -> tuple[str, ...]:
         """The dilemmas that the intervals allow, most likely first: one where they tell which it is."""
-        own = [getattr(self, field.name) for field in fields(self)]
-        likely = _name(*(estimate.value > 0 for estimate in own))
-        return tuple(dict.fromkeys((likely, *(_name(*signs) for signs in product(*map(_signs, own))))))
+        margins = [getattr(self, field.name) for field in fields(self)]
+        likely = _name(*(estimate.value > 0 for estimate in margins))
+        return tuple(dict.fromkeys((likely, *(_name(*signs) for signs in product(*map(_signs, margins))))))
 
     @property
     def name(self) -> str:

@@ -89,9 +89,9 @@ class Episode:
     def outcome(self) -> str:
         """The outcome as text: apples if the game reports a harvest, else returns."""
         if self.harvest is None:
-            return f"returns: {', '.join(f'{own:.4g}' for own in self.return_)}"
+            return f"returns: {', '.join(f'{value:.4g}' for value in self.return_)}"
         left = "" if self.stock_left is None else f"; {self.stock_left} left"
-        return f"apples: {', '.join(f'{own:.0f}' for own in self.harvest)}{left}"
+        return f"apples: {', '.join(f'{apples:.0f}' for apples in self.harvest)}{left}"
 
     @property
     def reported(self) -> tuple[str, ...]:
@@ -178,8 +178,8 @@ class EpisodeTracker:
     @property
     def returns(self) -> NDArray[np.float64]:
         """A copy of the returns so far of the running episodes, [B, N]; zeros before the first turn."""
-        kept = self._running.get("return")
-        return np.zeros((self.worlds, self.agents)) if kept is None else kept.copy()
+        returns = self._running.get("return")
+        return np.zeros((self.worlds, self.agents)) if returns is None else returns.copy()
 
     def state_dict(self) -> dict[str, Tensor]:
         """Copies of what the running episodes add up to."""
@@ -325,9 +325,9 @@ class EpisodeTracker:
         if "counts" in ended:
             columns = torch.from_numpy(ended["counts"]).unbind(-1)
             given["counts"] = dict(zip(COUNTS, columns, strict=True))
-        found = institutions.summary(**given, groups=institutions.groups_of(self._institutions))
-        kept = institutions.metrics_for(self._institutions)
-        return {name: found[name] for name in kept if name in found}
+        metrics = institutions.summary(**given, groups=institutions.groups_of(self._institutions))
+        wanted = institutions.metrics_for(self._institutions)
+        return {name: metrics[name] for name in wanted if name in metrics}
 
 
 _TOTALS: Final = ("steps", "harvest", "harvest_steps", "harvest_time", "in_play_steps")
@@ -392,8 +392,8 @@ def decisions_of(env: EnvBase) -> tuple[str, ...]:
 def _widths_in(tensordict: TensorDictBase) -> dict[str, int]:
     """The last axes of "counts" and "in_force" of a batch."""
     places: dict[str, Any] = {"counts": ("next", *keys.COUNTS), "in_force": ("next", keys.IN_FORCE)}
-    found = {name: tensordict.get(place, None) for name, place in places.items()}
-    widths = {name: values.shape[-1] for name, values in found.items() if values is not None}
+    entries = {name: tensordict.get(place, None) for name, place in places.items()}
+    widths = {name: values.shape[-1] for name, values in entries.items() if values is not None}
     if widths.get("counts", len(COUNTS)) != len(COUNTS):
         raise ValueError(
             f'"counts" of the batch has {widths["counts"]} columns; allowed: {len(COUNTS)}, '

@@ -145,29 +145,29 @@ def summary(
         tags: how often it tagged somebody.
         groups: agents that belong together, for `OF_GROUPS`.
     """
-    found: dict[str, Tensor] = {}
+    metrics: dict[str, Tensor] = {}
     for name, values in (("fines", fines), ("transfers", transfers), ("violations", violations)):
         if values is not None:
-            found[name] = total(values)
+            metrics[name] = total(values)
     if violations is not None and in_play_steps is not None:
-        found["violations_per_step"] = violations_per_step(violations, in_play_steps)
+        metrics["violations_per_step"] = violations_per_step(violations, in_play_steps)
     if counts is not None:
         totals = ("trespasses", "excess_bites", "closed_bites")
-        found |= {name: total(counts[name]) for name in totals if name in counts}
+        metrics |= {name: total(counts[name]) for name in totals if name in counts}
         for name, ratio in _RATIOS.items():
             if counts.keys() >= set(COUNTED[name]):
-                found[name] = ratio(*(counts[count] for count in COUNTED[name]))
+                metrics[name] = ratio(*(counts[count] for count in COUNTED[name]))
         if tags is not None and "unjust_tags" in counts:
-            found["unjust_share_of_tags"] = unjust_share_of_tags(counts["unjust_tags"], tags)
+            metrics["unjust_share_of_tags"] = unjust_share_of_tags(counts["unjust_tags"], tags)
     incomes = {} if harvest is None else {"": harvest}
     if harvest is not None and fines is not None and transfers is not None:
         incomes["net_"] = net_income(harvest, fines, transfers)
-        found["net_equality"] = equality(incomes["net_"])
+        metrics["net_equality"] = equality(incomes["net_"])
     if groups is not None:
         for kind, income in incomes.items():
-            found[f"{kind}equality_within"] = equality_within(income, groups).nanmean(-1)
-            found[f"{kind}equality_between"] = equality_between(income, groups)
-    return {name: found[name] for name in NEEDS if name in found}
+            metrics[f"{kind}equality_within"] = equality_within(income, groups).nanmean(-1)
+            metrics[f"{kind}equality_between"] = equality_between(income, groups)
+    return {name: metrics[name] for name in NEEDS if name in metrics}
 
 
 def total(values: Tensor) -> Tensor:
@@ -180,8 +180,8 @@ def own_share_of_bites(own_bites: Tensor, foreign_bites: Tensor) -> Tensor:
 
     The share of bites in places that the agent may use, those open to all included. Undefined without a bite.
     """
-    own = total(own_bites)
-    return _ratio(own, own + total(foreign_bites))
+    allowed = total(own_bites)
+    return _ratio(allowed, allowed + total(foreign_bites))
 
 
 def violations_per_step(violations: Tensor, in_play_steps: Tensor) -> Tensor:

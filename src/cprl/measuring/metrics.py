@@ -59,8 +59,8 @@ def title(name: str) -> str:
 def unit(name: str) -> str:
     """The unit after a value, e.g. "steps"; "" where a range stands for one. A single agent's return is in
     apples."""
-    found = "apples" if name.startswith("return_") else _WORDS.get(name, ("", ""))[1]
-    return "" if found == SHARE else found
+    word = "apples" if name.startswith("return_") else _WORDS.get(name, ("", ""))[1]
+    return "" if word == SHARE else word
 
 
 def with_unit(name: str, *, rewards: str = "") -> str:
@@ -70,8 +70,8 @@ def with_unit(name: str, *, rewards: str = "") -> str:
         name: of a metric, or of what an agent gets or pays: ".../return", ".../fines", ".../transfers".
         rewards: the unit of rewards; "" if the game does not say.
     """
-    own = rewards if name.endswith(("/return", "/fines", "/transfers")) else _WORDS.get(name, ("", ""))[1]
-    return f"{name} ({own})" if own else name
+    word = rewards if name.endswith(("/return", "/fines", "/transfers")) else _WORDS.get(name, ("", ""))[1]
+    return f"{name} ({word})" if word else name
 
 
 OPTIONAL: Final = ("harvest", "in_play", "fired", "hit_by", "tagged_by", "stock")
@@ -114,8 +114,8 @@ INSTITUTIONAL: Final[Mapping[str, str]] = MappingProxyType(
 
 def reported_by(env: EnvBase) -> tuple[str, ...]:
     """The entries of `OPTIONAL` and `OF_INSTITUTIONS` in the specs of an environment, transforms included."""
-    found = set(env.observation_spec.keys(include_nested=True))
-    return tuple(name for name in (*OPTIONAL, *OF_INSTITUTIONS) if {name, (keys.AGENTS, name)} & found)
+    entries = set(env.observation_spec.keys(include_nested=True))
+    return tuple(name for name in (*OPTIONAL, *OF_INSTITUTIONS) if {name, (keys.AGENTS, name)} & entries)
 
 
 def reported_in(tensordict: TensorDictBase) -> tuple[str, ...]:

@@ -132,8 +132,8 @@ def visitors(visits: ArrayLike) -> Array:
     odds = np.divide(shares, within, out=np.zeros_like(shares), where=within > 0)
     logs = np.log(odds, out=np.zeros_like(odds), where=odds > 0)
     with np.errstate(invalid="ignore"):
-        found: Array = np.exp(-(shares * logs).sum((-3, -2, -1)) / agents)
-    return np.where(agents > 0, found, np.nan)
+        number: Array = np.exp(-(shares * logs).sum((-3, -2, -1)) / agents)
+    return np.where(agents > 0, number, np.nan)
 
 
 def exclusion(visits: ArrayLike) -> Array:
@@ -148,10 +148,10 @@ def exclusion(visits: ArrayLike) -> Array:
         visits: shares [..., N, H, W].
     """
     agents = _in_play(visits)
-    found = np.full(agents.shape, np.nan)
+    exclusions = np.full(agents.shape, np.nan)
     several = agents > 1
-    found[several] = 1 - np.log(visitors(visits)[several]) / np.log(agents[several])
-    inside: Array = np.clip(found, 0, 1)
+    exclusions[several] = 1 - np.log(visitors(visits)[several]) / np.log(agents[several])
+    inside: Array = np.clip(exclusions, 0, 1)
     return inside
 
 
@@ -163,8 +163,8 @@ def owners(visits: ArrayLike) -> Array:
         visits: shares [..., N, H, W].
     """
     shares = np.asarray(visits, np.float64)
-    found: Array = np.where(shares.any(-3), shares.argmax(-3), -1)
-    return found
+    agents: Array = np.where(shares.any(-3), shares.argmax(-3), -1)
+    return agents
 
 
 def taggings(trace: Trace) -> Array:
@@ -210,8 +210,8 @@ def defence(trace: Trace, visits: ArrayLike) -> Array:
     more = np.sign(shares[world, by, *cell] - shares[world, tagged, *cell])
     sums = np.bincount(world, (1 + more) / 2, minlength=worlds)
     with np.errstate(invalid="ignore"):
-        found: Array = sums / np.bincount(world, minlength=worlds)
-    return found
+        tags_at_home: Array = sums / np.bincount(world, minlength=worlds)
+    return tags_at_home
 
 
 def _in_play(visits: ArrayLike) -> Array:

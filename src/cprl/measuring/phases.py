@@ -18,6 +18,8 @@ Values = NDArray[np.float64]
 
 PHASES: Final = ("exploration", "tragedy", "combat", "cultivation")
 """The study's names of phases, in its order."""
+UNNAMED: Final = "none of the four patterns"
+"""What a phase without a label is called."""
 PHASES_BEGIN: Final = (450, 1500, 2400)
 """The episodes at which tragedy, combat and cultivation begin in the study's figures of experiment 5."""
 METRICS: Final = ("collective_return", "equality", "survival_steps", "peacefulness")
@@ -42,16 +44,6 @@ CHANGE: Final = 0.25
 
 
 @dataclass(frozen=True, kw_only=True)
-class ChangePoint:
-    """An episode at which a phase ends and the next begins."""
-
-    episode: float
-    low: float
-    high: float
-    """low .. high contains 95 % of the change points of resampled replicas; NaN for a single replica."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Phase:
     """The episodes between two change points."""
 
@@ -64,23 +56,14 @@ class Phase:
     range over the whole training; negative for a fall."""
 
 
-def change_points(
-    episodes: ArrayLike,
-    metrics: Mapping[str, ArrayLike],
-    *,
-    number: int = 3,
-    resamples: int = 200,
-    seed: int = 0,
-) -> list[ChangePoint]:
-    """Finds the change points between phases.
+def change_points(episodes: ArrayLike, metrics: Mapping[str, ArrayLike], *, number: int = 3) -> list[float]:
+    """Return the episodes at which a phase ends and the next begins.
 
     Args:
         episodes: The index of each episode, [E], increasing.
         metrics: float [E] or [R, E] by name, the same R replicas for all; running means work well. Means
             over replicas ignore NaN.
         number: The number of change points.
-        resamples: The number of bootstrap resamples of the replicas.
-        seed: The seed of the resampling.
 
     Raises:
         ValueError: If there are too few or too many episodes, or a metric is NaN in some episode of all
@@ -94,34 +77,17 @@ def change_points(
         raise ValueError(
             f"episodes {at[0]:g} to {at[-1]:g} are too few for {number + 1} phases of at least {SHORTEST}"
         )
-    found = _found(grid, at, _over_replicas(curves), number)
-    replicas = curves.shape[1]
-    low = high = np.full(number, np.nan)
-    if replicas > 1:
-        rng = np.random.default_rng(seed)
-        resampled = [
-            _found(grid, at, _over_replicas(curves[:, rng.integers(replicas, size=replicas)]), number)
-            for _ in range(resamples)
-        ]
-        low, high = np.quantile(resampled, [0.025, 0.975], axis=0)
-    return [
-        ChangePoint(episode=float(middle), low=float(lower), high=float(upper))
-        for middle, lower, upper in zip(found, low, high, strict=True)
-    ]
+    return _change_points(grid, at, _over_replicas(curves), number)
 
 
-def find_phases(
-    episodes: ArrayLike, metrics: Mapping[str, ArrayLike], *, number: int = 3, resamples: int = 200
-) -> tuple[list[ChangePoint], list[Phase]]:
-    """Finds `number` change points and the phases between them; see `change_points` and `phases`."""
-    changes = change_points(episodes, metrics, number=number, resamples=resamples) if number else []
-    return changes, phases(episodes, metrics, changes)
+def find_phases(episodes: ArrayLike, metrics: Mapping[str, ArrayLike], *, number: int = 3) -> list[Phase]:
+    """Return the phases between `number` change points; see `change_points` and `phases`."""
+    changes = change_points(episodes, metrics, number=number) if number else []
+    return phases(episodes, metrics, changes)
 
 
-def phases(
-    episodes: ArrayLike, metrics: Mapping[str, ArrayLike], changes: Sequence[ChangePoint]
-) -> list[Phase]:
-    """The phases between change points, labelled if they have a pattern that the study claims.
+def phases(episodes: ArrayLike, metrics: Mapping[str, ArrayLike], changes: Sequence[float]) -> list[Phase]:
+    """Return the phases between change points, labelled if they have a pattern that the study claims.
 
     exploration: the first phase, if the collective return rises;
     tragedy: collective return, survival and peacefulness all fall;
@@ -140,8 +106,8 @@ def phases(
     """
     at, by_name = np.asarray(episodes, np.float64), _curves(metrics)
     means = {name: _over_replicas(by_name[name]) for name in METRICS}
-    bounds = [at[0], *(change.episode for change in changes), at[-1]]
-    found: list[Phase] = []
+    bounds = [at[0], *changes, at[-1]]
+    divided: list[Phase] = []
     for first, last in pairwise(bounds):
         inside = (at >= first) & (at <= last)
         if inside.sum() < 2:
@@ -155,9 +121,9 @@ def phases(
             )
             for name, curve in means.items()
         }
-        label = _label(change, [phase.label for phase in found])
-        found.append(Phase(first=float(first), last=float(last), label=label, change=change))
-    return found
+        label = _label(change, [phase.label for phase in divided])
+        divided.append(Phase(first=float(first), last=float(last), label=label, change=change))
+    return divided
 
 
 def _curves(metrics: Mapping[str, ArrayLike]) -> dict[str, Values]:
@@ -186,7 +152,7 @@ def _over_replicas(curves: Values) -> Values:
     return means
 
 
-def _found(grid: Values, at: Values, means: Values, number: int) -> Values:
+def _change_points(grid: Values, at: Values, means: Values, number: int) -> list[float]:
     """The change points of one set of curves, [M, E] for M metrics.
 
     Points of the grid are candidates at every `GRID` episodes, and the cost of a segment is the squared error
@@ -210,11 +176,11 @@ def _found(grid: Values, at: Values, means: Values, number: int) -> Values:
         totals = best[:, None] + costs
         before.append(totals.argmin(0))
         best = totals.min(0)
-    place, found = len(ends) - 1, []
+    place, changes = len(ends) - 1, []
     for of_last in reversed(before):
         place = of_last[place]
-        found.append(grid[ends[place] - 1])
-    return np.array(found[::-1])
+        changes.append(float(grid[ends[place] - 1]))
+    return changes[::-1]
 
 
 def _costs_of_lines(signal: Values, ends: NDArray[np.int64]) -> Values:

@@ -32,7 +32,7 @@ def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence
     numbers |= {f"institutions/{name}": value for name, value in institution_metrics(episode).items()}
     for name in OF_AGENTS:
         if (values := getattr(episode, name)) is not None:
-            numbers |= {f"{agent}/{name}": float(own) for agent, own in zip(agents, values, strict=True)}
+            numbers |= {f"{agent}/{name}": float(value) for agent, value in zip(agents, values, strict=True)}
     named = {f"agent_{index}": agent for index, agent in enumerate(agents)}
     for name, value in learning.items():
         arguments.object_of("a name in learning", name, str, "a text")
@@ -67,18 +67,18 @@ class Series:
         if len(of_episode) < self.replicas:
             return None
         del self._waiting[episode]
-        names = {name: None for own in of_episode.values() for name in own}
+        names = {name: None for numbers in of_episode.values() for name in numbers}
         return {
             name: np.array([of_episode[r].get(name, np.nan) for r in range(self.replicas)]) for name in names
         }
 
     def state_dict(self) -> dict[str, Any]:
         """The incomplete episodes."""
-        return {"waiting": {episode: dict(own) for episode, own in self._waiting.items()}}
+        return {"waiting": {episode: dict(numbers) for episode, numbers in self._waiting.items()}}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continues with the incomplete episodes of a state."""
-        self._waiting = {int(episode): dict(own) for episode, own in state["waiting"].items()}
+        self._waiting = {int(episode): dict(numbers) for episode, numbers in state["waiting"].items()}
 
 
 def mean_of(values: Values) -> float:
@@ -113,7 +113,7 @@ class Recent:
         self._last.append(float(value))
         while len(self._last) > self.window:
             self._last.popleft()
-        defined = [own for own in self._last if not isnan(own)]
+        defined = [value for value in self._last if not isnan(value)]
         return fmean(defined) if defined else float("nan")
 
     def state_dict(self) -> dict[str, Any]:

@@ -32,6 +32,9 @@ class Estimate:
     """The bounds of the interval; NaN for a single replica."""
     replicas: int
     """Of all samples together; of paired differences, the pairs."""
+    p_value: float = float("nan")
+    """How often a value at least as far from 0 would come by chance if it were 0, by the same t, two-sided;
+    NaN for a single replica."""
 
     def __str__(self) -> str:
         """The value with its interval, of a single replica the value alone."""
@@ -50,9 +53,9 @@ def estimate(values: ArrayLike, *, confidence: float = CONFIDENCE) -> Estimate:
         ValueError: If there are no replicas, or a value is not finite.
     """
     sample = _sample(values)
-    low, high = _t_interval([sample], [1.0], confidence)
-    # + 0.0, so that none is -0.0
-    return Estimate(value=float(sample.mean()) + 0.0, low=low, high=high, replicas=len(sample))
+    low, high, p_value = _by_t([sample], [1.0], confidence)
+    value = float(sample.mean()) + 0.0  # so that none is -0.0
+    return Estimate(value=value, low=low, high=high, replicas=len(sample), p_value=p_value)
 
 
 def difference(
@@ -78,9 +81,31 @@ def difference(
                 "as many"
             )
         return estimate(samples[0] - samples[1], confidence=confidence)
-    low, high = _t_interval(samples, [1.0, -1.0], confidence)
+    low, high, p_value = _by_t(samples, [1.0, -1.0], confidence)
     value = float(samples[0].mean() - samples[1].mean())
-    return Estimate(value=value, low=low, high=high, replicas=sum(map(len, samples)))
+    return Estimate(value=value, low=low, high=high, replicas=sum(map(len, samples)), p_value=p_value)
+
+
+def holm(p_values: ArrayLike, *, level: float = 1 - CONFIDENCE) -> NDArray[np.bool_]:
+    """Return which of several differences are not 0, with the level for a mistake in any of them.
+
+    S. Holm, "A simple sequentially rejective multiple test procedure" (1979): the smallest of m p-values is
+    compared with level / m, the next one with level / (m - 1) and so on, up to the first that is larger.
+
+    Args:
+        p_values: float [M]; those that are NaN are no comparisons.
+
+    Returns:
+        bool [M].
+    """
+    p_values = np.asarray(p_values, np.float64)
+    order = np.argsort(p_values)  # NaN last
+    left = np.count_nonzero(~np.isnan(p_values)) - np.arange(len(order))
+    with np.errstate(divide="ignore"):
+        is_small = p_values[order] <= level / np.maximum(left, 0)
+    differs = np.zeros(len(order), bool)
+    differs[order] = np.logical_and.accumulate(is_small)
+    return differs
 
 
 def curve_interval(curves: ArrayLike, *, confidence: float = CONFIDENCE) -> tuple[Values, Values, Values]:
@@ -107,9 +132,9 @@ def curve_interval(curves: ArrayLike, *, confidence: float = CONFIDENCE) -> tupl
     return middle, middle - reach, middle + reach
 
 
-def _t_interval(
+def _by_t(
     samples: Sequence[Values], weights: Sequence[float], confidence: float
-) -> tuple[float, float]:
+) -> tuple[float, float, float]:
     """The interval of a weighted sum of means by Student's t, with the degrees of freedom of Welch.
 
     Args:
@@ -118,23 +143,23 @@ def _t_interval(
         confidence: of the interval.
 
     Returns:
-        Low and high; NaN where a sample has one value.
+        Low, high and the p-value of the sum being 0; NaN where a sample has one value.
     """
     from scipy import stats
 
     if any(len(sample) < 2 for sample in samples):
-        return float("nan"), float("nan")
-    middle = sum(weight * float(own.mean()) for weight, own in zip(weights, samples, strict=True))
-    parts = [
-        weight**2 * float(own.var(ddof=1)) / len(own) for weight, own in zip(weights, samples, strict=True)
-    ]
+        return float("nan"), float("nan"), float("nan")
+    weighted = list(zip(weights, samples, strict=True))
+    middle = sum(weight * float(sample.mean()) for weight, sample in weighted)
+    parts = [weight**2 * float(sample.var(ddof=1)) / len(sample) for weight, sample in weighted]
     if sum(parts) == 0:
-        return middle, middle
+        return middle, middle, float(middle == 0)
     freedom = sum(parts) ** 2 / sum(
-        part**2 / (len(own) - 1) for part, own in zip(parts, samples, strict=True)
+        part**2 / (len(sample) - 1) for part, sample in zip(parts, samples, strict=True)
     )
-    reach = float(stats.t.ppf((1 + confidence) / 2, freedom)) * sum(parts) ** 0.5
-    return middle - reach, middle + reach
+    error = sum(parts) ** 0.5
+    reach = float(stats.t.ppf((1 + confidence) / 2, freedom)) * error
+    return middle - reach, middle + reach, 2 * float(stats.t.sf(abs(middle) / error, freedom))
 
 
 def _sample(values: ArrayLike) -> Values:
@@ -173,10 +198,10 @@ def over_replicas(values: Mapping[int, Sequence[float]]) -> Measured:
         ValueError: if there are no replicas, or a replica has no episodes.
     """
     if not values or not all(map(len, values.values())):
-        counts = {replica: len(own) for replica, own in values.items()}
+        counts = {replica: len(episodes) for replica, episodes in values.items()}
         raise ValueError(f"episodes by replica are {counts}; allowed: at least one replica, each at least 1")
-    defined = [[value for value in own if not isnan(value)] for own in values.values()]
-    means = [fmean(own) for own in defined if own]
+    defined = [[value for value in episodes if not isnan(value)] for episodes in values.values()]
+    means = [fmean(episodes) for episodes in defined if episodes]
     episodes = sum(map(len, values.values()))
     return Measured(
         estimate=estimate(means) if means else None,
@@ -199,7 +224,7 @@ def institution_metrics(episode: Episode) -> dict[str, float]:
     """Each of "Institutions" in docs/metrics.md by name, NaN where undefined: `Episode.institutions`, and
     what was decided, `in_force_0` and so on. Empty for a game without institutions."""
     in_force: list[float] = [] if episode.in_force is None else episode.in_force.tolist()
-    return {**episode.institutions, **{f"in_force_{nth}": value for nth, value in enumerate(in_force)}}
+    return {**episode.institutions, **{f"in_force_{place}": value for place, value in enumerate(in_force)}}
 
 
 def institution_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measured]:

@@ -16,7 +16,6 @@ from cprl.measuring.institutions import summary
 from cprl.runs.episodes import OF_INSTITUTIONS, read_episodes
 
 Values = NDArray[np.float64]
-Phases = tuple[list[phases.ChangePoint], list[phases.Phase]]
 
 SMOOTHED_EPISODES: Final = 100
 """The window of running means in episodes, where nothing else is asked for."""
@@ -106,12 +105,11 @@ def centres(values: Values, window: int) -> Values:
     return np.arange(values.shape[-1] - window + 1) + (window - 1) / 2
 
 
-def phases_of(curves: dict[str, Values], *, centred: bool = False, resamples: int = 200) -> Phases | None:
-    """Change points and phases of a training, of running means over `SMOOTHED_EPISODES`.
+def phases_of(curves: dict[str, Values], *, centred: bool = False) -> list[phases.Phase] | None:
+    """Return the phases of a training, of running means over `SMOOTHED_EPISODES`.
 
     Args:
         centred: whether an episode is the centre of its running mean; else its first, as in the study.
-        resamples: of the replicas, for the intervals of the change points.
 
     Returns:
         None for a number of episodes that is not in `phases.EPISODES`, a single agent, a game that does not
@@ -126,7 +124,7 @@ def phases_of(curves: dict[str, Values], *, centred: bool = False, resamples: in
     if any(np.isnan(means).all(0).any() for means in smoothed.values()):
         return None
     at = centres(whole, SMOOTHED_EPISODES)
-    return phases.find_phases(at if centred else at - at[0], smoothed, resamples=resamples)
+    return phases.find_phases(at if centred else at - at[0], smoothed)
 
 
 def episode_of_step(curves: dict[str, Values], step: int) -> float | None:

@@ -19,7 +19,8 @@ from cprl.studies.factors import Integers, LogUniform, Uniform
 from cprl.studies.run import StudyResult, run_study
 from cprl.studies.search import Search, SearchResult, run_search
 from cprl.studies.study import Study, read_study
-from cprl.studies.tables.table import StudyTable, study_table
+from cprl.studies.tables.sources import study_table
+from cprl.studies.tables.table import StudyTable
 
 __all__ = [
     "InProcess",

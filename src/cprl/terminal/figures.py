@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from cprl.measuring.episodes import Episode
 from cprl.measuring.metrics import title as metric_title
 from cprl.measuring.metrics import unit
+from cprl.measuring.phases import UNNAMED as UNNAMED
 from cprl.measuring.phases import Phase
 from cprl.measuring.statistics import institution_metrics
 from cprl.runs.curves import SMOOTHED_EPISODES, centres, curves_of, episode_of_step, phases_of, running_mean
@@ -23,7 +24,6 @@ from cprl.terminal.style import MARK, SMALL_PT, WIDTH_IN
 Bands = Sequence[tuple[float, float, str]]
 """First episode, last episode and name of each phase."""
 
-UNNAMED: Final = "none of the four patterns"
 COLOURS: Final = {
     "exploration": "#e4e4e4",
     "tragedy": "#f9cdbf",
@@ -152,8 +152,7 @@ def training_curve(
     panels = _panels(curves, random)
     episodes = panels[0].values.shape[1]
     window = min(smoothed, max(1, episodes // PARTS))
-    found = phases_of(curves, centred=True, resamples=1)
-    ours = bands_of(found[1]) if found else []
+    ours = bands_of(phases_of(curves, centred=True) or [])
     strips = {"this run": ours} if ours else {}
 
     heights = [STRIP_IN * len(strips)] * bool(strips) + list(HEIGHTS_IN[: len(panels)])

@@ -166,7 +166,7 @@ class EventDetector:
         number = max(0, min(3, smoothed.shape[1] // phases.SHORTEST - 1))
         episodes = np.arange(smoothed.shape[1])
         metrics = dict(zip(phases.METRICS, smoothed, strict=True))
-        return phases.find_phases(episodes, metrics, number=number)[1]
+        return phases.find_phases(episodes, metrics, number=number)
 
     def _smoothed(self) -> NDArray[np.float64]:
         """Running means [M, E]; an undefined metric repeats its last value."""

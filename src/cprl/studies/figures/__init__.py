@@ -3,5 +3,5 @@
 Modules, in the order in which one reads them:
     levels       metrics against a factor, and conditions one below the other; what the figures share
     courses      the course of the training under each condition
-    diagrams     heat maps and phase diagrams of two factors
+    diagrams     maps of two factors: a metric, and phases
 """

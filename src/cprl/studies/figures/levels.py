@@ -1,11 +1,10 @@
 """Figures of metrics against a factor whose levels are numbers, or of conditions one below the other."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from math import isclose
 from pathlib import Path
 from textwrap import fill
-from typing import Any, Final, Literal, Self
+from typing import Any, Final
 
 import matplotlib
 import numpy as np
@@ -14,17 +13,34 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from cprl.arguments import choice, refusal
+from cprl.arguments import refusal
 from cprl.measuring.statistics import Estimate
-from cprl.studies.tables.comparing import LAST, Compared, Comparison, compare, metric_title, metrics_of
-from cprl.studies.tables.sources import RANDOM, TRAINING, Design
-from cprl.studies.tables.table import StudyTable
+from cprl.studies.tables.comparing import (
+    INTERVALS,
+    LAST,
+    Compared,
+    Comparison,
+    Kind,
+    compare,
+    metric_title,
+    metrics_of,
+)
+from cprl.studies.tables.table import RANDOM, TRAINING, Design, StudyTable
 from cprl.terminal.style import CHARACTER_IN, MEAN, RANDOM_LINE, SMALL_PT, head, picture_path, save, wrapped
 
+MOST_CONDITIONS: Final = 60
+"""A figure with a row for each condition has at most so many rows."""
+NAME_CHARACTERS: Final = 34
+"""The largest number of characters on a line of a condition's name; then it wraps."""
+COLOURS: Final = ("#08519c", "#d95f02", "#1b9e77", "#7b3294", "#a50f15", "#8c6d31", "#e7298a", "#555555")
+"""Of conditions or lines that have names; numbers get a scale from dark to light."""
+FAINT: Final = "#9ecae1"
 _COLUMNS: Final = 3
 _MOST_LINES: Final = 8
 _CLOSEST: Final = 0.07
 """The smallest distance of two levels, as a share of the axis, at which their names can be read."""
+_APART: Final = 30
+"""Levels whose largest is more than so many times the smallest stand on a logarithmic axis."""
 
 
 def by_factor(
@@ -50,40 +66,43 @@ def by_factor(
         metrics: by default those of `cprl.studies.tables.comparing.METRICS` that it has.
     """
     design, path = table.design, picture_path(path)
-    numeric = [own for own in design.factors if is_numeric([at[own] for at in design.conditions.values()])]
+    numeric = [name for name in design.factors if is_numeric(design.levels(name))]
     if factor not in numeric:
-        raise refusal(
-            "factor", factor, ", ".join(numeric) or "none, as no factor has levels that are numbers"
-        )
-    comparisons = [compare(table, own, part=part, last=last) for own in metrics_of(table, metrics)]
-    lines = _lines(design, factor)
-    others = [own for own in design.factors if own != factor]
-    only = [
-        design.conditions[own[0]][others[0]] if len(others) == 1 else nth
-        for nth, own in enumerate(lines.values())
-    ]
-    colours = dict.fromkeys(lines, LEVEL) if len(lines) == 1 else colours_of(list(lines), only)
-    figure, panels = _grid(len(comparisons))
-    axis = _Axis.of(factor, table)
-    random = {own.metric: compare(table, own.metric, part=RANDOM).by_name for own in comparisons}
-    is_same = all(_is_same(own.values(), factor) for own in random.values())
-    for axes, comparison in zip(panels, comparisons, strict=True):
-        for name, members in lines.items():
-            found = [comparison.by_name[own] for own in members]
-            at = [axis.places[design.conditions[own][factor]] for own in members]
-            _draw_line(axes, at, found, colours[name], name, joined=design.is_grid)
+        allowed = ", ".join(numeric) or "none, as no factor has levels that are numbers"
+        raise refusal("factor", factor, allowed)
+    comparisons = [compare(table, metric, part=part, last=last) for metric in metrics_of(table, metrics)]
+    by_chance = [compare(table, comparison.metric, part=RANDOM).by_name for comparison in comparisons]
+    lines, others = _lines(design, factor), [name for name in design.factors if name != factor]
+    only = [design.conditions[names[0]][others[0]] for names in lines.values()] if len(others) == 1 else []
+    colours = colours_of(list(lines), only or range(len(lines)))
+    places, is_even = places_of(design.levels(factor))
+    is_same = all(_is_same(random.values(), design, factor) for random in by_chance)
+    columns = min(len(comparisons), _COLUMNS)
+    rows = -(-len(comparisons) // columns)
+    figure = Figure((max(4.0 * columns, 6.0), 2.9 * rows + 1.3), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).reshape(-1)
+    for axes in panels[len(comparisons) :]:
+        axes.set_visible(False)
+    panels = panels[: len(comparisons)]
+    for axes, comparison, random in zip(panels, comparisons, by_chance, strict=True):
+        for label, names in lines.items():
+            at = [places[design.conditions[name][factor]] for name in names]
+            line = "-" if design.is_grid and len(set(at)) == len(at) else "none"
+            colour = colours[label]
+            _draw_line(axes, at, [comparison.by_name[name] for name in names], colour, line, label)
             if is_same or len(lines) > 1:
-                chance = [random[comparison.metric][own] for own in members]
-                colour = RANDOM_LINE["color"] if is_same else colours[name]
-                _draw_random(axes, at, chance, colour, joined=design.is_grid)
+                means = [_value(random[name].estimate) for name in names]
+                look = RANDOM_LINE if is_same else {**RANDOM_LINE, "color": colour}
+                look = look if line == "-" else {**look, "linestyle": "none"}
+                axes.plot(at, means, marker="_", markersize=9, **look)
         if is_same or len(lines) > 1:
             label = "random play" if is_same else "random play, in the colour of its conditions"
             axes.plot([], [], label=label, **RANDOM_LINE)
-        axis.draw(axes)
+        _draw_axis(axes, places, _replicas_by_level(table, factor), is_even=is_even)
         axes.set_title(wrapped(title_of(comparison), 3.6), fontsize=SMALL_PT + 1)
         axes.tick_params(labelsize=SMALL_PT)
     for axes in panels[-_COLUMNS:]:
-        axes.set_xlabel(axis.title, fontsize=SMALL_PT)
+        axes.set_xlabel(f"{factor}\n(levels at equal distances)" if is_even else factor, fontsize=SMALL_PT)
     legend(figure, panels[0])
     note = f"{replicas_text(table.replicas)}. {levels_note(comparisons[0])} Faint: single replicas."
     if others and list(lines) == [""]:
@@ -92,130 +111,155 @@ def by_factor(
     return save(figure, path)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Axis:
-    """Where the levels of a factor stand."""
+def places_of(levels: Iterable[float]) -> tuple[dict[float, float], bool]:
+    """Return where each level stands on an axis of numbers, in order, and whether at equal distances."""
+    ordered = sorted(set(levels))
+    at = np.log(ordered) if is_logarithmic(ordered) else np.array(ordered, np.float64)
+    is_crowded = np.diff(at).min(initial=np.inf) < _CLOSEST * np.ptp(at)
+    if is_crowded and len(ordered) <= _MOST_LINES:
+        return {level: float(place) for place, level in enumerate(ordered)}, True
+    return {level: level for level in ordered}, False
 
-    factor: str
-    counts: dict[float, int]
-    """The number of replicas of each level, in order."""
-    is_even: bool
-    """Whether levels stand at equal distances."""
 
-    @classmethod
-    def of(cls, factor: str, table: StudyTable) -> Self:
-        """That of a factor of a table."""
-        counts: dict[float, int] = {}
-        for name, own in table.design.conditions.items():
-            counts[own[factor]] = counts.get(own[factor], 0) + table.replicas[name]
-        levels = sorted(counts)
-        at = np.log(levels) if is_logarithmic(levels) else np.array(levels, np.float64)
-        is_crowded = np.diff(at).min(initial=np.inf) < _CLOSEST * np.ptp(at)
-        return cls(
-            factor=factor,
-            counts={own: counts[own] for own in levels},
-            is_even=bool(is_crowded) and len(levels) <= _MOST_LINES,
-        )
+def _replicas_by_level(table: StudyTable, factor: str) -> dict[float, int]:
+    counts: dict[float, int] = {}
+    for name, levels in table.design.conditions.items():
+        counts[levels[factor]] = counts.get(levels[factor], 0) + table.replicas[name]
+    return counts
 
-    @property
-    def places(self) -> dict[float, float]:
-        """The place of each level."""
-        return {own: float(nth) if self.is_even else own for nth, own in enumerate(self.counts)}
 
-    @property
-    def title(self) -> str:
-        """The factor, and what is to be known of the axis."""
-        return f"{self.factor}\n(levels at equal distances)" if self.is_even else self.factor
-
-    def draw(self, axes: Axes) -> None:
-        """A tick for each level where there are few, with the number of replicas where it differs."""
-        if not self.is_even and is_logarithmic(list(self.counts)):
-            axes.set_xscale("log")
-            axes.xaxis.set_major_formatter("{x:g}")  # of matplotlib's own, formulas are texts like names
-            axes.xaxis.set_minor_locator(NullLocator())
-        if len(self.counts) <= _MOST_LINES:
-            is_same = len(set(self.counts.values())) == 1
-            texts = [f"{own:g}" + ("" if is_same else f"\nn={n}") for own, n in self.counts.items()]
-            axes.set_xticks(list(self.places.values()), texts)
+def _draw_axis(
+    axes: Axes, places: Mapping[float, float], replicas: Mapping[float, int], *, is_even: bool
+) -> None:
+    """A tick for each level where there are few, with the number of replicas where it differs."""
+    if not is_even and is_logarithmic(list(places)):
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter("{x:g}")  # of matplotlib's own, formulas are texts like names
+        axes.xaxis.set_minor_locator(NullLocator())
+    if len(places) <= _MOST_LINES:
+        is_same = len(set(replicas.values())) == 1
+        texts = [f"{level:g}" + ("" if is_same else f"\nn={replicas[level]}") for level in places]
+        axes.set_xticks(list(places.values()), texts)
 
 
 def _lines(design: Design, factor: str) -> dict[str, list[str]]:
     """Conditions that are equal but for a factor, in the order of its levels, by what they have in common."""
-    others = [own for own in design.factors if own != factor]
-    found: dict[str, list[str]] = {}
-    for name, levels in design.conditions.items():
-        common = ", ".join(f"{short(own)} {levels[own]}" for own in others) if design.is_grid else ""
-        found.setdefault(common, []).append(name)
-    if len(found) > _MOST_LINES:
-        found = {"": [name for own in found.values() for name in own]}
-    return {
-        common: sorted(own, key=lambda name: float(design.conditions[name][factor]))
-        for common, own in found.items()
-    }
-
-
-def _grid(count: int) -> tuple[Figure, list[Axes]]:
-    """Panels for so many metrics, in rows of three."""
-    columns = min(count, _COLUMNS)
-    rows = -(-count // columns)
-    figure = Figure((max(4.0 * columns, 6.0), 2.9 * rows + 1.3), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False).reshape(-1)
-    for axes in panels[count:]:
-        axes.set_visible(False)
-    return figure, list(panels[:count])
+    others = [name for name in design.factors if name != factor]
+    lines: dict[str, list[str]] = {}
+    in_order = sorted(design.conditions.items(), key=lambda condition: float(condition[1][factor]))
+    for name, levels in design.conditions.items():  # lines are in the order of the conditions
+        common = ", ".join(f"{short(other)} {levels[other]}" for other in others) if design.is_grid else ""
+        lines.setdefault(common, []).append(name)
+    if len(lines) > _MOST_LINES:
+        lines = {"": list(design.conditions)}
+    return {common: [name for name, _ in in_order if name in names] for common, names in lines.items()}
 
 
 def _draw_line(
-    axes: Axes, at: Sequence[float], found: Sequence[Compared], colour: str, name: str, *, joined: bool
+    axes: Axes, at: Sequence[float], line: Sequence[Compared], colour: str, style: str, label: str
 ) -> None:
     """Means with their intervals over a factor, and each replica."""
-    for x, own in zip(at, found, strict=True):
-        axes.plot([x] * len(own.defined), own.defined, ".", color=colour, alpha=0.25, markersize=5, zorder=2)
-        if own.estimate is not None:
-            bounds = [own.estimate.low, own.estimate.high]
-            axes.plot([x, x], bounds, color=colour, linewidth=2.2, alpha=0.8, zorder=3)
-    means = [np.nan if own.estimate is None else own.estimate.value for own in found]
-    label = name or "mean and interval"
-    line = "-" if joined and len(set(at)) == len(at) else "none"
-    axes.plot(at, means, marker="o", linestyle=line, color=colour, linewidth=1.4, label=label, zorder=4)
+    for place, compared in zip(at, line, strict=True):
+        values, mean = compared.defined, compared.estimate
+        axes.plot([place] * len(values), values, ".", color=colour, alpha=0.25, markersize=5, zorder=2)
+        if mean is not None:
+            bounds = [mean.low, mean.high]
+            axes.plot([place, place], bounds, color=colour, linewidth=2.2, alpha=0.8, zorder=3)
+    means = [_value(compared.estimate) for compared in line]
+    look: dict[str, Any] = {"marker": "o", "linestyle": style, "linewidth": 1.4, "zorder": 4}
+    axes.plot(at, means, color=colour, label=label or "mean and interval", **look)
 
 
-def _is_same(random: Iterable[Compared], factor: str) -> bool:
+def _value(estimate: Estimate | None) -> float:
+    return float("nan") if estimate is None else estimate.value
+
+
+def _is_same(random: Iterable[Compared], design: Design, factor: str) -> bool:
     """Whether random play is the same under all conditions of each level of a factor."""
     of_level: dict[float, list[Estimate | None]] = {}
-    for own in random:
-        of_level.setdefault(own.levels[factor], []).append(own.estimate)
+    for compared in random:
+        level = design.conditions[compared.condition][factor]
+        of_level.setdefault(level, []).append(compared.estimate)
     return all(map(is_one, of_level.values()))
 
 
-def _draw_random(
-    axes: Axes, at: Sequence[float], random: Sequence[Compared], colour: str, *, joined: bool
-) -> None:
-    """Random play under each of the conditions that a line joins."""
-    means = [np.nan if own.estimate is None else own.estimate.value for own in random]
-    look = {**RANDOM_LINE, "color": colour}
-    if not (joined and len(set(at)) == len(at)):
-        look["linestyle"] = "none"
-    axes.plot(at, means, marker="_", markersize=9, **look)
+def by_condition(
+    table: StudyTable,
+    path: Path | str,
+    *,
+    kind: Kind = "levels",
+    metrics: Sequence[str] = (),
+    part: str = TRAINING,
+    last: int = LAST,
+) -> Path:
+    """Draws the conditions one below the other: means over replicas, or differences from the reference.
+
+    Args:
+        table: the table, of at most `MOST_CONDITIONS` conditions.
+        kind: "levels", with random play as dashes; or "differences", with a dashed line at 0.
+    """
+    design, path = table.design, picture_path(path)
+    conditions = [name for name in design.conditions if kind == "levels" or name != design.reference]
+    if kind == "differences" and not table.replicas[design.reference]:
+        raise ValueError(f"the reference {design.reference} has no finished run; allowed: one that has")
+    if not 0 < len(conditions) <= MOST_CONDITIONS:
+        raise refusal("table", table, f"1 to {MOST_CONDITIONS} conditions, not {len(conditions)}")
+    comparisons = [compare(table, metric, part=part, last=last) for metric in metrics_of(table, metrics)]
+    first, names = comparisons[0], names_of(table)
+    rows_in = 0.34 if all("\n" not in names[name] for name in conditions) else 0.46
+    figure = Figure((12.0, rows_in * len(conditions) + 1.8), layout="constrained")
+    panels = figure.subplots(1, len(comparisons), sharey=True, squeeze=False)[0]
+    for axes, comparison in zip(panels, comparisons, strict=True):
+        random = compare(table, comparison.metric, part=RANDOM).by_name
+        for place, name in enumerate(conditions):
+            _draw_row(axes, place, comparison.by_name[name], kind)
+            level = random[name].estimate
+            if kind == "levels" and level is not None:
+                look = {**RANDOM_LINE, "linestyle": (0, (2, 1))}
+                axes.plot([level.value] * 2, [place - 0.42, place + 0.42], **look)
+        if kind == "differences":
+            axes.axvline(0, **RANDOM_LINE)
+        axes.set_title(wrapped(title_of(comparison), 9.5 / len(panels)), fontsize=SMALL_PT)
+        axes.set_yticks(range(len(conditions)), [names[name] for name in conditions])
+        axes.tick_params(labelsize=SMALL_PT)
+        axes.locator_params(axis="x", nbins=3)
+        axes.grid(axis="y", color="#e6e6e6", linewidth=0.6)
+        axes.set_axisbelow(True)
+    panels[0].set_ylim(len(conditions) - 0.4, -0.6)
+    what = short(design.factors[0]) if len(design.factors) == 1 else "condition"
+    figure.supylabel(what, fontsize=SMALL_PT + 1)
+    title = f"{design.name}: outcome by condition"
+    note = (
+        f"{replicas_text(table.replicas)}. {levels_note(first)} Faint: single replicas. Dashed: random play."
+    )
+    if kind == "differences":
+        title = f"{design.name}: difference from {' '.join(design.reference.splitlines())}"
+        pairing = f"{first.pairing_text[0].upper()}{first.pairing_text[1:]}"
+        note = f"{replicas_text(table.replicas)}. {pairing}; means of {first.episodes_text}; {INTERVALS}."
+    head(figure, title, note)
+    return save(figure, path)
 
 
-MOST_CONDITIONS: Final = 60
-"""A figure with a row for each condition has at most so many rows."""
-NAME_CHARACTERS: Final = 34
-"""The largest number of characters on a line of a condition's name; then it wraps."""
-COLOURS: Final = ("#08519c", "#d95f02", "#1b9e77", "#7b3294", "#a50f15", "#8c6d31", "#e7298a", "#555555")
-"""Of conditions or lines that have names; numbers get a scale from dark to light."""
-LEVEL: Final = "#08519c"
-FAINT: Final = "#9ecae1"
-NUMBERS_MAP: Final = "viridis"
-_APART: Final = 30
-"""Levels whose largest is more than so many times the smallest stand on a logarithmic axis."""
+def _draw_row(axes: Axes, place: int, compared: Compared, kind: Kind) -> None:
+    """One condition's mean or difference with its interval."""
+    mean = compared.estimate if kind == "levels" else compared.difference
+    if kind == "levels":
+        values = compared.defined
+        axes.plot(values, [place + 0.16] * len(values), ".", color=FAINT, markersize=5, zorder=2)
+    if mean is None:
+        why = "no run" if not compared.replicas else "undefined" if compared.estimate is None else "no pairs"
+        box = {"facecolor": "white", "edgecolor": "none", "pad": 1}
+        middle: dict[str, Any] = {"ha": "center", "va": "center", "transform": axes.get_yaxis_transform()}
+        axes.text(0.5, place, why, fontsize=SMALL_PT, bbox=box, **middle)
+        return
+    axes.plot([mean.low, mean.high], [place, place], color=MEAN, linewidth=2.5, alpha=0.6, zorder=3)
+    axes.plot([mean.value], [place], "o", color=MEAN, markersize=6, zorder=4)
 
 
 def is_numeric(levels: Sequence[Any]) -> bool:
     """Whether levels stand on an axis of numbers: at least two, all numbers."""
     return len(set(levels)) > 1 and all(
-        isinstance(own, int | float) and not isinstance(own, bool) for own in levels
+        isinstance(level, int | float) and not isinstance(level, bool) for level in levels
     )
 
 
@@ -229,24 +273,33 @@ def short(factor: str) -> str:
     return factor.rpartition(".")[2].replace("_", " ")
 
 
-def names_of(design: Design) -> dict[str, str]:
-    """What figures call each condition: the level alone where there is one factor; wrapped."""
+def names_of(table: StudyTable) -> dict[str, str]:
+    """What figures call each condition: the level alone where there is one factor; wrapped.
+
+    With the number of replicas where it is not the same for all.
+    """
+    design, names = table.design, list(table.design.conditions)
+    words = names
     if len(design.factors) == 1:
-        only = design.factors[0]
-        words = [_text(own[only]) for own in design.conditions.values()]
-        if len(set(words)) == len(words):
-            return dict(zip(design.conditions, (fill(own, NAME_CHARACTERS) for own in words), strict=True))
-    return {own: fill(own, NAME_CHARACTERS) for own in design.conditions}
+        levels = design.levels(design.factors[0])
+        words = [f"{level:,.6g}" if isinstance(level, float) else str(level) for level in levels]
+        words = words if len(set(words)) == len(words) else names
+    is_same = len(_counts(table.replicas)) == 1
+    counts = ["" if is_same else f" (n={table.replicas[name]})" for name in names]
+    return {
+        name: f"{fill(word, NAME_CHARACTERS)}{count}"
+        for name, word, count in zip(names, words, counts, strict=True)
+    }
 
 
 def colours_of(names: Sequence[str], levels: Sequence[Any]) -> dict[str, str]:
     """A colour for each of several lines: from dark to light where their levels are numbers."""
     if len(names) > 2 and is_numeric(levels):
-        shades = matplotlib.colormaps[NUMBERS_MAP]
         order = sorted(set(levels))
-        places = {own: 0.88 * nth / (len(order) - 1) for nth, own in enumerate(order)}
-        return {name: to_hex(shades(places[own])) for name, own in zip(names, levels, strict=True)}
-    return {name: COLOURS[nth % len(COLOURS)] for nth, name in enumerate(names)}
+        shades = matplotlib.colormaps["viridis"]
+        places = {level: 0.88 * place / (len(order) - 1) for place, level in enumerate(order)}
+        return {name: to_hex(shades(places[level])) for name, level in zip(names, levels, strict=True)}
+    return {name: COLOURS[place % len(COLOURS)] for place, name in enumerate(names)}
 
 
 def replicas_text(replicas: Mapping[str, int]) -> str:
@@ -257,34 +310,27 @@ def replicas_text(replicas: Mapping[str, int]) -> str:
     return f"{counts[0]} to {counts[-1]} replicas each (n)"
 
 
-def with_counts(names: Mapping[str, str], replicas: Mapping[str, int]) -> dict[str, str]:
-    """Names of conditions, with the number of replicas where it is not the same for all."""
-    if len(_counts(replicas)) == 1:
-        return dict(names)
-    return {own: f"{name} (n={replicas[own]})" for own, name in names.items()}
-
-
 def _counts(replicas: Mapping[str, int]) -> list[int]:
-    return sorted({own for own in replicas.values() if own}) or [0]
+    return sorted({number for number in replicas.values() if number}) or [0]
 
 
 def levels_note(comparison: Comparison) -> str:
     """What points and intervals are."""
-    return f"Means of {comparison.episodes_text}, then over replicas; {comparison.interval_text}."
+    return f"Means of {comparison.episodes_text}, then over replicas; {INTERVALS}."
 
 
 def is_one(estimates: Iterable[Estimate | None]) -> bool:
     """Whether estimates are one number, but for the rounding of exported tables to float32."""
-    values = [own.value for own in estimates if own is not None]
+    values = [estimate.value for estimate in estimates if estimate is not None]
     return not values or isclose(min(values), max(values), rel_tol=1e-6)
 
 
 def title_of(comparison: Comparison) -> str:
     """A metric with its unit, and in how many episodes it is undefined, which are in no mean."""
-    undefined = sum(own.undefined for own in comparison.conditions)
-    of = sum(own.episodes for own in comparison.conditions)
+    undefined = sum(compared.undefined for compared in comparison.conditions)
+    episodes = sum(compared.episodes for compared in comparison.conditions)
     name = metric_title(comparison.metric)
-    return f"{name}, undefined in {undefined:,} of {of:,} episodes" if undefined else name
+    return f"{name}, undefined in {undefined:,} of {episodes:,} episodes" if undefined else name
 
 
 def legend(figure: Figure, axes: Axes, *, title: str | None = None) -> None:
@@ -303,97 +349,3 @@ def legend(figure: Figure, axes: Axes, *, title: str | None = None) -> None:
         title_fontsize=SMALL_PT,
         frameon=False,
     )
-
-
-def _text(level: Any) -> str:
-    return f"{level:,.6g}" if isinstance(level, float) else str(level)
-
-
-Kind = Literal["levels", "differences"]
-
-
-def by_condition(
-    table: StudyTable,
-    path: Path | str,
-    *,
-    kind: Kind = "levels",
-    metrics: Sequence[str] = (),
-    part: str = TRAINING,
-    last: int = LAST,
-) -> Path:
-    """Draws the conditions one below the other: means over replicas, or differences from the reference.
-
-    Args:
-        table: the table, of at most `MOST_CONDITIONS` conditions.
-        kind: "levels", with random play as dashes; or "differences", with a dashed line at 0.
-    """
-    choice("kind", kind, ("levels", "differences"))
-    design, path = table.design, picture_path(path)
-    shown = [own for own in design.conditions if kind == "levels" or own != design.reference]
-    if kind == "differences" and not table.replicas[design.reference]:
-        raise ValueError(f"the reference {design.reference} has no finished run; allowed: one that has")
-    if not 0 < len(shown) <= MOST_CONDITIONS:
-        raise refusal("table", table, f"1 to {MOST_CONDITIONS} conditions, not {len(shown)}")
-    comparisons = [compare(table, own, part=part, last=last) for own in metrics_of(table, metrics)]
-    names = with_counts(names_of(design), table.replicas)
-    rows_in = 0.34 if all("\n" not in names[own] for own in shown) else 0.46
-    figure = Figure((12.0, rows_in * len(shown) + 1.8), layout="constrained")
-    panels = figure.subplots(1, len(comparisons), sharey=True, squeeze=False)[0]
-    for axes, comparison in zip(panels, comparisons, strict=True):
-        for place, name in enumerate(shown):
-            _draw_row(axes, place, comparison.by_name[name], kind)
-        if kind == "differences":
-            axes.axvline(0, **RANDOM_LINE)
-        else:
-            _mark_random(axes, shown, compare(table, comparison.metric, part=RANDOM))
-        axes.set_title(wrapped(title_of(comparison), 9.5 / len(panels)), fontsize=SMALL_PT)
-        axes.set_yticks(range(len(shown)), [names[own] for own in shown])
-        axes.tick_params(labelsize=SMALL_PT)
-        axes.locator_params(axis="x", nbins=3)
-        axes.grid(axis="y", color="#e6e6e6", linewidth=0.6)
-        axes.set_axisbelow(True)
-    panels[0].set_ylim(len(shown) - 0.4, -0.6)
-    figure.supylabel(
-        short(design.factors[0]) if len(design.factors) == 1 else "condition", fontsize=SMALL_PT + 1
-    )
-    replicas, first = replicas_text(table.replicas), comparisons[0]
-    if kind == "levels":
-        title = f"{design.name}: outcome by condition"
-        note = f"{replicas}. {levels_note(first)} Faint: single replicas. Dashed: random play."
-    else:
-        name = design.reference.replace("\n", " ")
-        title = f"{design.name}: difference from {name}"
-        how = "Paired by replica" if first.is_paired else "Not paired: each condition has chance of its own"
-        note = f"{replicas}. {how}; means of {first.episodes_text}; {first.interval_text}."
-    head(figure, title, note)
-    return save(figure, path)
-
-
-def _draw_row(axes: Axes, place: int, own: Compared, kind: Kind) -> None:
-    """One condition's mean or difference with its interval."""
-    found = own.estimate if kind == "levels" else own.difference
-    if kind == "levels":
-        values = own.defined
-        axes.plot(values, [place + 0.16] * len(values), ".", color=FAINT, markersize=5, zorder=2)
-    if found is None:
-        why = "no run" if not own.replicas else "undefined" if own.estimate is None else "no pairs"
-        box = {"facecolor": "white", "edgecolor": "none", "pad": 1}
-        middle: dict[str, Any] = {
-            "ha": "center",
-            "va": "center",
-            "transform": axes.get_yaxis_transform(),
-            "bbox": box,
-        }
-        axes.text(0.5, place, why, fontsize=SMALL_PT, **middle)
-        return
-    axes.plot([found.low, found.high], [place, place], color=MEAN, linewidth=2.5, alpha=0.6, zorder=3)
-    axes.plot([found.value], [place], "o", color=MEAN, markersize=6, zorder=4)
-
-
-def _mark_random(axes: Axes, shown: Sequence[str], random: Comparison) -> None:
-    """Random play under each condition."""
-    look: dict[str, Any] = {**RANDOM_LINE, "linestyle": (0, (2, 1))}
-    for place, name in enumerate(shown):
-        own = random.by_name[name]
-        if own.estimate is not None:
-            axes.plot([own.estimate.value] * 2, [place - 0.42, place + 0.42], **look)

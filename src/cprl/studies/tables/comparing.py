@@ -1,11 +1,15 @@
-"""Conditions compared: the mean of a metric over replicas, and its difference from the reference."""
+"""Conditions compared: the mean of a metric over replicas, and its difference from the reference.
+
+Intervals are by Student's t over replicas, each of a single comparison. Where a table makes several, those
+that are marked differ by Holm's method: with 95 % none of the marked ones is by chance.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import isnan
-from typing import Any, Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +19,14 @@ from rich.text import Text
 from cprl.arguments import LAST as LAST
 from cprl.arguments import choice, integer, refusal
 from cprl.measuring.metrics import title
-from cprl.measuring.statistics import CONFIDENCE, Estimate, difference, estimate
-from cprl.studies.tables.sources import NET, PARTS, TRAINING
-from cprl.studies.tables.table import StudyTable
+from cprl.measuring.statistics import CONFIDENCE, Estimate, difference, estimate, holm
+from cprl.studies.tables.table import NET, PARTS, RANDOM, TRAINING, StudyTable
 
 METRICS: Final = ("collective_return", NET, "equality", "sustainability", "survival_steps", "peacefulness")
 """Metrics that are compared, unless others are asked for, where a table has them."""
+INTERVALS: Final = f"{CONFIDENCE:.0%} intervals over replicas by Student's t"
 
+Kind = Literal["levels", "differences"]
 Values = NDArray[np.float64]
 
 
@@ -30,15 +35,12 @@ class Compared:
     """A metric under one condition."""
 
     condition: str
-    levels: Mapping[str, Any]
     values: Mapping[int, float]
     """The mean over its episodes by the number of the replica; NaN where it is defined in none."""
     episodes: int
     """Episodes of all replicas together."""
     undefined: int
     """Episodes in which the metric is undefined, which are no part of a mean."""
-    estimate: Estimate | None
-    """Over the replicas in which it is defined; None if there are none."""
     difference: Estimate | None
     """From the reference; None of the reference itself, and where there are no replicas to compare."""
 
@@ -50,8 +52,13 @@ class Compared:
     @property
     def defined(self) -> Values:
         """The values of the replicas in which it is defined, [R]."""
-        found = np.array(list(self.values.values()), dtype=np.float64)
-        return found[~np.isnan(found)]
+        values = np.array(list(self.values.values()), dtype=np.float64)
+        return values[~np.isnan(values)]
+
+    @cached_property
+    def estimate(self) -> Estimate | None:
+        """Over the replicas in which it is defined; None if there are none."""
+        return estimate(self.defined) if len(self.defined) else None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,7 +77,7 @@ class Comparison:
     @cached_property
     def by_name(self) -> dict[str, Compared]:
         """The conditions by name."""
-        return {own.condition: own for own in self.conditions}
+        return {compared.condition: compared for compared in self.conditions}
 
     @property
     def episodes_text(self) -> str:
@@ -79,115 +86,105 @@ class Comparison:
         number = f"{high}" if low == high else f"{low} to {high}"
         if self.part == TRAINING:
             return f"the last {number} episodes of training"
-        return (
-            f"{number} fresh episodes of {'random play' if self.part == 'random' else 'the trained agents'}"
-        )
+        return f"{number} fresh episodes of {'random play' if self.part == RANDOM else 'the trained agents'}"
 
     @property
-    def differences_text(self) -> str:
+    def pairing_text(self) -> str:
         """How differences are computed."""
-        how = "paired by replica" if self.is_paired else "not paired: each condition has chance of its own"
-        return f"differences from {self.reference}, {how}"
-
-    @property
-    def interval_text(self) -> str:
-        """How intervals are computed."""
-        return f"{CONFIDENCE:.0%} intervals over replicas by Student's t"
+        return "paired by replica" if self.is_paired else "not paired: each condition has chance of its own"
 
 
 def compare(table: StudyTable, metric: str, *, part: str = TRAINING, last: int = LAST) -> Comparison:
-    """A metric under every condition, with intervals over replicas.
+    """Return a metric under every condition, with intervals over replicas.
 
     Args:
         part: "training", "evaluation" or "random".
         last: of training: episodes at its end; those of whole windows.
     """
-    if metric not in table.metrics:
-        raise refusal("metric", metric, ", ".join(table.metrics) or "none, as the table has no finished run")
+    metrics_of(table, [metric])
     choice("part", part, PARTS)
     integer("last", last, 1)
     if part == TRAINING and last < table.window:
         raise refusal("last", last, f"at least {table.window}, the episodes of a window of the table")
-    asked = metric, part, last
-    if asked not in table.comparisons:
-        table.comparisons[asked] = _compared(table, *asked)
-    own: Comparison = table.comparisons[asked]
-    return own
+    key = metric, part, last
+    if key not in table.comparisons:
+        table.comparisons[key] = _compared(table, *key)
+    comparison: Comparison = table.comparisons[key]
+    return comparison
+
+
+def metrics_of(table: StudyTable, metrics: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the metrics asked for, by default those of `METRICS` that a table has."""
+    for metric in metrics:
+        if metric not in table.metrics:
+            allowed = ", ".join(table.metrics) or "none, as the table has no finished run"
+            raise refusal("metric", metric, allowed)
+    return tuple(metrics) or tuple(metric for metric in METRICS if metric in table.metrics)
 
 
 def _compared(table: StudyTable, metric: str, part: str, last: int) -> Comparison:
-    found = {name: _of_condition(table, name, metric, part, last) for name in table.design.conditions}
-    lengths = [length for *_, length in found.values() if length]
     reference, is_paired = table.design.reference, table.design.is_paired
-    compared = []
-    for name, (values, undefined, length) in found.items():
-        defined = [own for own in values.values() if not np.isnan(own)]
-        other = None
-        if name != reference:
-            other = _difference(values, found[reference][0], is_paired)
-        compared.append(
-            Compared(
-                condition=name,
-                levels=table.design.conditions[name],
-                values=values,
-                episodes=length * len(values),
-                undefined=undefined,
-                estimate=estimate(defined) if defined else None,
-                difference=other,
-            )
-        )
+    means = {name: _means(table, name, metric, part, last) for name in table.design.conditions}
+    lengths = [length for *_, length in means.values() if length]
     return Comparison(
         metric=metric,
         part=part,
         last=(min(lengths, default=0), max(lengths, default=0)),
         is_paired=is_paired,
         reference=reference,
-        conditions=tuple(compared),
+        conditions=tuple(
+            Compared(
+                condition=name,
+                values=values,
+                episodes=length * len(values),
+                undefined=undefined,
+                difference=_difference(values, means[reference][0], is_paired) if name != reference else None,
+            )
+            for name, (values, undefined, length) in means.items()
+        ),
     )
 
 
-def metrics_of(table: StudyTable, metrics: Sequence[str] = ()) -> tuple[str, ...]:
-    """The metrics asked for, by default those of `METRICS` that a table has."""
-    for own in metrics:
-        if own not in table.metrics:
-            raise refusal("metric", own, ", ".join(table.metrics))
-    return tuple(metrics) or tuple(own for own in METRICS if own in table.metrics)
-
-
-def _of_condition(
+def _means(
     table: StudyTable, condition: str, metric: str, part: str, last: int
 ) -> tuple[dict[int, float], int, int]:
     """The value of each replica, undefined episodes of all, and the episodes of each."""
-    rows = table.values(condition, metric, part)
-    if rows is None:
+    grid = table.values(condition, metric, part)
+    if grid is None:
         return {}, 0, 0
-    lengths = rows["window_episodes"]
-    ends = int((rows["episode"] + lengths).max())
-    kept = rows["episode"] >= ends - last if part == TRAINING else np.ones(len(lengths), bool)
-    counts = lengths[kept] - rows["undefined"][:, kept]
-    sums = np.where(counts > 0, rows["value"][:, kept], 0.0) * counts
+    lengths = grid["window_episodes"]
+    ends = int((grid["episode"] + lengths).max())
+    is_last = grid["episode"] >= ends - last if part == TRAINING else np.ones(len(lengths), bool)
+    counts = lengths[is_last] - grid["undefined"][:, is_last]
+    sums = np.where(counts > 0, grid["value"][:, is_last], 0.0) * counts
     with np.errstate(invalid="ignore"):
         means = sums.sum(1) / counts.sum(1)
-    values = dict(zip(rows["replica"].tolist(), means.tolist(), strict=True))
-    return values, int(rows["undefined"][:, kept].sum()), int(lengths[kept].sum())
+    values = dict(zip(grid["replica"].tolist(), means.tolist(), strict=True))
+    return values, int(grid["undefined"][:, is_last].sum()), int(lengths[is_last].sum())
 
 
 def _difference(
     values: Mapping[int, float], reference: Mapping[int, float], is_paired: bool
 ) -> Estimate | None:
     if is_paired:
-        both = [own for own in values if own in reference]
-        pairs = np.array([(values[own], reference[own]) for own in both], dtype=np.float64).reshape(-1, 2)
+        both = [replica for replica in values if replica in reference]
+        pairs = np.array([(values[replica], reference[replica]) for replica in both]).reshape(-1, 2)
         pairs = pairs[~np.isnan(pairs).any(1)]
         return difference(*pairs.T, paired=True) if len(pairs) else None
-    samples = [[x for x in own.values() if not np.isnan(x)] for own in (values, reference)]
-    if not all(samples):
-        return None
-    return difference(samples[0], samples[1], paired=False)
+    samples = [[value for value in sample.values() if not isnan(value)] for sample in (values, reference)]
+    return difference(samples[0], samples[1], paired=False) if all(samples) else None
 
 
-Kind = Literal["levels", "differences"]
-NET_TITLE = "return of all agents together"
+def differing(comparisons: Sequence[Comparison]) -> set[tuple[str, str]]:
+    """Return which differences are not 0, by metric and condition, of all these together by Holm's method."""
+    differences = {
+        (comparison.metric, compared.condition): compared.difference.p_value
+        for comparison in comparisons
+        for compared in comparison.conditions
+        if compared.difference is not None
+    }
+    is_different = holm(list(differences.values()))
+    return {place for place, differs in zip(differences, is_different, strict=True) if differs}
 
 
 class Cells(NamedTuple):
@@ -197,75 +194,90 @@ class Cells(NamedTuple):
     """What it shows, in a sentence."""
     head: list[str]
     rows: list[list[str]]
+    note: str = ""
+    """What is bold, below the table."""
 
 
 def cells(comparisons: Sequence[Comparison], kind: Kind = "levels") -> Cells:
-    """A row for each condition, a column for each metric.
+    """Return a row for each condition, a column for each metric.
 
     Args:
-        comparisons: of the same part and interval, one for each metric; at least one.
-        kind: "levels", means over replicas; or "differences" from the reference, bold where the interval
-            excludes 0.
+        comparisons: of the same part, one for each metric; at least one.
+        kind: "levels", means over replicas; or "differences" from the reference.
     """
-    choice("kind", kind, ("levels", "differences"))
     first = comparisons[0]
-    rows = []
-    for nth, own in enumerate(first.conditions):
-        every = [comparison.conditions[nth] for comparison in comparisons]
-        if kind == "differences" and own.condition == first.reference:
+    marked = differing(comparisons) if kind == "differences" else set()
+    number, rows = 0, []
+    for compared in first.conditions:
+        name, texts = compared.condition, []
+        if kind == "differences" and name == first.reference:
             continue
-        texts = [level_text(one) if kind == "levels" else difference_text(one) for one in every]
-        rows.append([own.condition, str(own.replicas), *texts])
-    what = "means over replicas" if kind == "levels" else first.differences_text
-    heading = f"{first.episodes_text[0].upper()}{first.episodes_text[1:]}; {what}; {first.interval_text}."
-    return Cells(heading, ["condition", "replicas", *(metric_title(own.metric) for own in comparisons)], rows)
+        for comparison in comparisons:
+            of_metric = comparison.by_name[name]
+            if kind == "levels":
+                texts.append(level_text(of_metric))
+            else:
+                texts.append(difference_text(of_metric, is_marked=(comparison.metric, name) in marked))
+                number += of_metric.difference is not None and not isnan(of_metric.difference.p_value)
+        rows.append([name, str(compared.replicas), *texts])
+    head = ["condition", "replicas", *(metric_title(comparison.metric) for comparison in comparisons)]
+    what, note = "means over replicas", ""
+    if kind == "differences":
+        what = f"differences from {first.reference}, {first.pairing_text}"
+        note = (
+            f"Bold: not 0 by Holm's method for {number} comparison{'s' * (number != 1)} (two-sided t-tests, "
+            f"{1 - CONFIDENCE:.0%} for all together); intervals are of single comparisons."
+        )
+    heading = f"{first.episodes_text[0].upper()}{first.episodes_text[1:]}; {what}; {INTERVALS}."
+    return Cells(heading, head, rows, note)
 
 
-def level_text(own: Compared) -> str:
-    """A mean over replicas with its interval, and where the metric is undefined."""
-    if not own.replicas:
+def level_text(compared: Compared) -> str:
+    """Return a mean over replicas with its interval, and where the metric is undefined."""
+    if not compared.replicas:
         return "-"
-    if own.estimate is None:
-        return f"undefined in all {own.episodes} episodes"
-    text = estimate_text(own.estimate)
-    return f"{text}, undefined in {own.undefined} of {own.episodes} episodes" if own.undefined else text
+    if compared.estimate is None:
+        return f"undefined in all {compared.episodes} episodes"
+    text = estimate_text(compared.estimate)
+    if compared.undefined:
+        text += f", undefined in {compared.undefined} of {compared.episodes} episodes"
+    return text
 
 
-def difference_text(own: Compared) -> str:
-    """A difference with its interval, bold where it excludes 0; fewer pairs than replicas are said."""
-    found = own.difference
-    if found is None:
+def difference_text(compared: Compared, *, is_marked: bool) -> str:
+    """Return a difference with its interval, bold where it is marked; fewer pairs than replicas are said."""
+    if compared.difference is None:
         return "-"
-    text = estimate_text(found, signed=True)
-    if found.low > 0 or found.high < 0:
-        text = f"**{text}**"
-    return f"{text} (of {found.replicas})" if found.replicas < own.replicas else text
+    text = estimate_text(compared.difference, signed=True)
+    text = f"**{text}**" if is_marked else text
+    pairs = compared.difference.replicas
+    return f"{text} (of {pairs})" if pairs < compared.replicas else text
 
 
-def estimate_text(found: Estimate, *, signed: bool = False) -> str:
-    """An estimate with its interval; of a single replica the value alone."""
-    numbers = [own for own in (found.value, found.low, found.high) if not isnan(own)]
-    digits = digits_for(max(map(abs, numbers)))
-    texts = [f"{own:{'+' if signed else ''},.{digits}f}" for own in (found.value, found.low, found.high)]
-    return texts[0] if isnan(found.low) else f"{texts[0]} [{texts[1]}, {texts[2]}]"
+def estimate_text(estimated: Estimate, *, signed: bool = False) -> str:
+    """Return an estimate with its interval; of a single replica the value alone."""
+    numbers = [estimated.value, estimated.low, estimated.high]
+    digits = digits_for(max(abs(number) for number in numbers if not isnan(number)))
+    value, low, high = (f"{number:{'+' if signed else ''},.{digits}f}" for number in numbers)
+    return value if isnan(estimated.low) else f"{value} [{low}, {high}]"
 
 
 def digits_for(largest: float) -> int:
-    """How many digits after the point a number of this size is shown with."""
-    return next((nth for nth, size in enumerate((100, 10, 0.5)) if largest >= size), 3)
+    """Return how many digits after the point a number of this size is shown with."""
+    return next((digits for digits, size in enumerate((100, 10, 0.5)) if largest >= size), 3)
 
 
 def metric_title(metric: str) -> str:
-    """What a metric is called, with its unit."""
-    return NET_TITLE if metric == NET else title(metric)
+    """Return what a metric is called, with its unit."""
+    return "return of all agents together" if metric == NET else title(metric)
 
 
-def markdown(found: Cells) -> list[str]:
-    """The lines of a table, numbers to the right, followed by an empty line."""
-    rule = "|---|" + "---:|" * (len(found.head) - 1)
-    rows = [[*map(cell, found.head)], *([cell(row[0]), *row[1:]] for row in found.rows)]
+def markdown(table: Cells) -> list[str]:
+    """Return the lines of a table, numbers to the right, each part followed by an empty line."""
+    rows = [[*map(cell, table.head)], *([cell(name), *texts] for name, *texts in table.rows)]
     lines = [f"| {' | '.join(row)} |" for row in rows]
-    return [lines[0], rule, *lines[1:], ""]
+    lines.insert(1, "|---|" + "---:|" * (len(table.head) - 1))
+    return [*lines, "", *[table.note, ""] * bool(table.note)]
 
 
 def cell(name: str) -> str:
@@ -273,19 +285,19 @@ def cell(name: str) -> str:
     return re.sub(r"[\\`*<$|]", r"\\\g<0>", " ".join(name.splitlines()))
 
 
-def rich_table(found: Cells) -> Table:
-    """A table for the terminal; what is bold has a star too."""
-    is_marked = any(own.startswith("**") for row in found.rows for own in row)
-    caption = "* the interval excludes 0" if is_marked else None
-    table = Table(title=found.heading, title_justify="left", caption=caption, caption_justify="right")
-    for nth, name in enumerate(found.head):
-        table.add_column(name, justify="right" if nth else "left", overflow="fold")
-    for row in found.rows:
+def rich_table(cells: Cells) -> Table:
+    """Return a table for the terminal; what is bold has a star too."""
+    caption = cells.note.replace("Bold:", "*") or None
+    table = Table(title=cells.heading, title_justify="left", caption=caption, caption_justify="left")
+    for column, name in enumerate(cells.head):
+        table.add_column(name, justify="right" if column else "left", overflow="fold")
+    for row in cells.rows:
         table.add_row(*map(_for_terminal, row))
     return table
 
 
 def _for_terminal(text: str) -> Text:
+    if not text.startswith("**"):
+        return Text(text)
     bold, _, more = text.removeprefix("**").partition("**")
-    is_marked = text.startswith("**")
-    return Text(f"{bold} *{more}" if is_marked else text, style="bold" if is_marked else "")
+    return Text(f"{bold} *{more}", style="bold")

@@ -1,8 +1,9 @@
-"""What a table is made of: runs, each with its condition and its replicas; and what is lacking."""
+"""The table of finished runs: which runs it is made of, their episodes as rows, and how replicas end."""
 
-from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -10,17 +11,34 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from cprl.arguments import integer
 from cprl.measuring import social
 from cprl.measuring.now import DECLINE, HARVESTING, LEAST_LOSS, LOST, RECOVERY, REGAINED, TRAGEDY
-from cprl.measuring.phases import FEWEST_EPISODES
-from cprl.runs.curves import Values, as_curves, curves_of, phases_of, running_mean
+from cprl.measuring.phases import FEWEST_EPISODES, UNNAMED
+from cprl.runs.checkpoints import REPORT
+from cprl.runs.curves import Values, as_curves, phases_of, running_mean
 from cprl.runs.episodes import read_episodes, read_table
+from cprl.runs.files import read_json
+from cprl.runs.recipe import read_recipe
 from cprl.studies.status import Status
 from cprl.studies.study import Study, level_text, unlike
+from cprl.studies.tables.table import (
+    COLUMNS,
+    NET,
+    PARTS,
+    RANDOM,
+    TRAINING,
+    UNKNOWN,
+    WINDOW,
+    WORDS,
+    Circumstances,
+    Design,
+    Lacking,
+    StudyTable,
+    counted,
+)
 from cprl.studies.trials import State, trials_of
 from cprl.terminal.course import BELOW_RANDOM, LAST_EPISODES, PEAK_EPISODES, PEAK_OVER_RANDOM
-from cprl.terminal.figures import COLOURS as PHASE_COLOURS
-from cprl.terminal.figures import UNNAMED
 
 REASONS: Final[dict[State, str]] = {
     "missing": "was not begun",
@@ -47,62 +65,38 @@ class Source:
     """That each replica trains."""
 
 
-@dataclass(frozen=True)
-class Lacking:
-    """A run that is not part of a table, and why."""
+def study_table(
+    study: Study, runs: Path | str, *, window: int = WINDOW, status: Path | str | None = None
+) -> StudyTable:
+    """The table of the finished runs of a study.
 
-    name: str
-    condition: str
-    replicas: int
-    reason: str
-
-    def __str__(self) -> str:
-        """In a sentence."""
-        replicas = f"{self.replicas} replica{'s' * (self.replicas != 1)}"
-        return f"{self.condition}: {self.name}, {replicas}, {self.reason}."
-
-
-@dataclass(frozen=True, kw_only=True)
-class Design:
-    """The conditions that a table compares."""
-
-    name: str
-    conditions: Mapping[str, Mapping[str, Any]]
-    """The level of each factor by condition, in order: a number, a truth value or a text."""
-    reference: str
-    """The condition that others are compared with."""
-    is_paired: bool
-    """Whether replicas of the same number have the same seeds and worlds in each condition."""
-    is_grid: bool = True
-    """Whether levels are few and repeat; not so for random draws."""
-    notes: tuple[str, ...] = field(default=())
-    """Sentences on what is compared."""
-
-    @property
-    def factors(self) -> tuple[str, ...]:
-        """The names of the factors; () where conditions have names alone."""
-        first = next(iter(self.conditions.values()))
-        return tuple(first)
+    Args:
+        window: episodes of a window of training; 1 for episodes one by one, of the evaluation too.
+        status: where its trials say why they failed, see `cprl.studies.trials`.
+    """
+    finished, lacking = sources_of(study, Path(runs), None if status is None else Path(status))
+    return table_of(design_of(study), finished, lacking, window=window)
 
 
 def design_of(study: Study) -> Design:
     """The conditions of a study."""
-    levels: dict[str, dict[int, Any]] = {name: {} for name in study.factors}
-    for name, own in ((name, own) for own in study.all_conditions for name in study.factors):
-        at = own.levels[name]
-        if id(at) not in levels[name]:
-            plain = plain_level(at)
-            alike = set(levels[name].values())
-            levels[name][id(at)] = unlike(plain, alike) if isinstance(plain, str) else plain
+    conditions: dict[str, dict[str, Any]] = {condition.name: {} for condition in study.all_conditions}
+    for factor in study.factors:
+        plain: dict[int, Any] = {}  # by the identity of a level, as levels that differ may have equal texts
+        for condition in study.all_conditions:
+            level = condition.levels[factor]
+            if id(level) not in plain:
+                text = plain_level(level)
+                plain[id(level)] = unlike(text, set(plain.values())) if isinstance(text, str) else text
+            conditions[condition.name][factor] = plain[id(level)]
     return Design(
         name=study.name,
-        conditions={
-            own.name: {name: levels[name][id(own.levels[name])] for name in study.factors}
-            for own in study.all_conditions
-        },
+        conditions=conditions,
         reference=study.reference_name,
         is_paired=True,
         is_grid=study.draws is None,
+        question=study.question,
+        expectation=study.expectation,
     )
 
 
@@ -110,22 +104,22 @@ def sources_of(study: Study, runs: Path, status: Path | None = None) -> tuple[li
     """The finished runs of a study, and the others; `status` is where its trials say why they failed."""
     finished, lacking = [], []
     for trial in trials_of(study):
-        state, of = trial.state(runs), trial.condition
-        if state == "finished":
-            source = Source(
-                run=runs / trial.name,
-                name=trial.name,
-                condition=of.name,
-                checksum=of.checksum,
-                first=trial.block.first,
-                replicas=trial.block.replicas,
-                episodes=trial.experiment.episodes,
-            )
-            finished.append(source)
-        else:
+        state, condition, block = trial.state(runs), trial.condition, trial.block
+        if state != "finished":
             failure = None if status is None else Status(status, trial.name).failure()
             reason = REASONS[state] if failure is None else f"failed: {failure}"
-            lacking.append(Lacking(trial.name, of.name, trial.block.replicas, reason))
+            lacking.append(Lacking(trial.name, condition.name, block.replicas, reason))
+            continue
+        source = Source(
+            run=runs / trial.name,
+            name=trial.name,
+            condition=condition.name,
+            checksum=condition.checksum,
+            first=block.first,
+            replicas=block.replicas,
+            episodes=trial.experiment.episodes,
+        )
+        finished.append(source)
     return finished, lacking
 
 
@@ -134,21 +128,53 @@ def plain_level(value: Any) -> Any:
     return value if isinstance(value, bool | int | float) else level_text(value)
 
 
-TRAINING: Final = "training"
-EVALUATION: Final = "evaluation"
-RANDOM: Final = "random"
-PARTS: Final = {TRAINING: None, EVALUATION: "trained", RANDOM: "random"}
-"""The parts of a run: its training, its agents in fresh worlds afterwards, and random play in these worlds;
-with the name of the table that holds it."""
-NET: Final = "net"
-"""The return of all agents together: harvest - fines + transfers, where a game has institutions."""
+def table_of(
+    design: Design, sources: Sequence[Source], lacking: Sequence[Lacking], *, window: int = WINDOW
+) -> StudyTable:
+    """The table of finished runs.
+
+    Args:
+        design: the conditions that are compared.
+        sources: the runs; what is damaged of them is listed as lacking.
+        lacking: other runs, which are listed.
+    """
+    integer("window", window, 1)
+    measured: list[_Measured] = []
+    damaged: list[Lacking] = []
+    for source in sources:
+        try:
+            measured.append(_measured(source, window))
+        except (ValueError, OSError, KeyError) as error:
+            reason = f"is damaged: {error}"
+            damaged.append(Lacking(source.name, source.condition, source.replicas, reason))
+    endings: dict[str, Counter[str]] = defaultdict(Counter)
+    lengths: dict[str, dict[str, list[int]]] = defaultdict(lambda: {"episodes": [], "steps": []})
+    for run in measured:
+        endings[run.source.condition].update(run.phases)
+        lengths[run.source.condition]["episodes"].append(run.source.episodes)
+        lengths[run.source.condition]["steps"] += run.steps
+    made = {run.source.name: run.circumstances for run in measured}
+    return StudyTable(
+        design=design,
+        rows=_rows(design, measured, marks(made)),
+        window=window,
+        lacking=(*lacking, *damaged),
+        made=made,
+        endings={
+            name: dict(Counter(sorted(counts.elements())).most_common()) for name, counts in endings.items()
+        },
+        ending_rules=tuple(dict.fromkeys(run.rule for run in measured)),
+        lengths={
+            name: {what: (min(numbers), max(numbers)) for what, numbers in length.items()}
+            for name, length in lengths.items()
+            if length["steps"]
+        },
+    )
 
 
-class Windows(NamedTuple):
+class _Windows(NamedTuple):
     """A metric in one part of a run, for R replicas and W windows."""
 
-    part: str
-    metric: str
     episodes: NDArray[np.int64]
     """The first episode of each window, [W]."""
     lengths: NDArray[np.int64]
@@ -159,41 +185,141 @@ class Windows(NamedTuple):
     """Means over the episodes in which it is defined, [R, W]; NaN where there are none."""
 
 
-def windows_of(source: Source, window: int) -> Iterator[Windows]:
-    """Every metric of every part of a finished run.
+class _Measured(NamedTuple):
+    """What a table takes from a run."""
+
+    source: Source
+    windows: Mapping[tuple[str, str], _Windows]
+    """By part and metric."""
+    phases: Sequence[str]
+    """In which each replica ends."""
+    rule: str
+    """How these were told."""
+    circumstances: Circumstances
+    steps: Sequence[int]
+    """Those that its report says a replica trained; none where it says none."""
+
+
+def _measured(source: Source, window: int) -> _Measured:
+    """Reads a finished run.
 
     In training, windows are of so many episodes; evaluation and random play are one window each, but for
     `window=1`.
-
-    Raises:
-        FileNotFoundError: if a part is missing.
     """
-    for part, table_name in PARTS.items():
-        if table_name is None:
-            table = read_episodes(source.run)
-        else:
-            table = read_table(source.run / "evaluation" / f"{table_name}.parquet")
-        _check_episodes(table, source, part)
-        curves = as_curves(table)
-        curves[NET] = np.sum([own for name, own in curves.items() if name.startswith("return_")], axis=0)
-        for metric, values in curves.items():
+    windows, curves = {}, {}
+    for part, name in PARTS.items():
+        folder = source.run / "evaluation"
+        table = read_episodes(source.run) if name is None else read_table(folder / f"{name}.parquet")
+        _refuse_gaps(table, source, part)
+        curves[part] = as_curves(table)
+        for metric, values in {**curves[part], NET: _net(curves[part])}.items():
             length = window if part == TRAINING or window == 1 else values.shape[1]
-            yield Windows(part, metric, *in_windows(values, length))
+            windows[part, metric] = _in_windows(values, length)
+    phases, rule = _phases(source, curves)
+    return _Measured(source, windows, phases, rule, circumstances_of(source.run), _steps_of(source.run))
 
 
-def in_windows(values: Values, window: int) -> tuple[Any, Any, Any, Values]:
-    """First episodes, [W], lengths, [W], undefined episodes, [R, W], and means, [R, W], of values [R, E]."""
+def _in_windows(values: Values, window: int) -> _Windows:
+    """Values by episode, [R, E], in windows of so many."""
     firsts = np.arange(0, values.shape[1], window)
     lengths = np.diff(np.append(firsts, values.shape[1]))
     defined = ~np.isnan(values)
     counts = np.add.reduceat(defined.astype(np.int64), firsts, axis=1)
     with np.errstate(invalid="ignore"):
         means = np.add.reduceat(np.where(defined, values, 0.0), firsts, axis=1) / counts
-    return firsts, lengths, lengths - counts, means
+    return _Windows(firsts, lengths, lengths - counts, means)
 
 
-def ordered(metrics: set[str]) -> list[str]:
-    """Metrics in the order of tables: social ones, returns of single agents, those of institutions."""
+def _net(curves: Mapping[str, Values]) -> Values:
+    """The return of all agents together, [R, E]."""
+    returns = [curve for name, curve in curves.items() if name.startswith("return_")]
+    return np.asarray(np.sum(returns, axis=0))
+
+
+def _refuse_gaps(table: pa.Table, source: Source, part: str) -> None:
+    """Raises a ValueError unless each episode of each replica is there once."""
+    rows = np.stack([table[name].to_numpy() for name in ("replica", "episode", "agent")], axis=1)
+    each, times = np.unique(rows, axis=0, return_counts=True)
+    if (times > 1).any():
+        replica, episode, _ = each[times > 1][0].tolist()
+        raise ValueError(f"{source.name} has episode {episode} of replica {replica} in {part} twice")
+    played = np.unique(rows[:, :2], axis=0)
+    replicas, counts = np.unique(played[:, 0], return_counts=True)
+    wanted = source.episodes if part == TRAINING else counts.max(initial=0)
+    if replicas.tolist() != list(range(source.replicas)) or not (counts == wanted).all() or not wanted:
+        raise ValueError(
+            f"{source.name} has these episodes by replica in {part}: "
+            f"{dict(zip(replicas.tolist(), counts.tolist(), strict=True))}; allowed: {wanted} of each of "
+            f"{source.replicas} replicas"
+        )
+
+
+def _steps_of(run: Path) -> list[int]:
+    try:
+        steps = read_json(run / REPORT).get("steps")
+    except (OSError, ValueError):  # which ends no table
+        return []
+    return [steps] if isinstance(steps, int) else []
+
+
+def _rows(design: Design, measured: Sequence[_Measured], marked: Mapping[str, str]) -> pa.Table:
+    """The sorted rows of a table; `marked` has the marks of each run by its name."""
+    metrics = _metrics(measured)
+    names = list(design.conditions)
+    blocks: list[tuple[Any, ...]] = []
+    """Condition, run, replica, part, metric and, by window, episode, length, undefined and value."""
+    for place, name in enumerate(names):
+        replicas: dict[int, tuple[_Measured, int]] = {}
+        for run in measured:
+            for row in range(run.source.replicas if run.source.condition == name else 0):
+                number = run.source.first + row
+                if number in replicas:
+                    raise ValueError(f"replica {number} of the condition {name!r} is there twice")
+                replicas[number] = run, row
+        blocks += [
+            (place, run.source, number, part, metric, *at[:2], at.undefined[row], at.values[row])
+            for number, (run, row) in sorted(replicas.items())
+            for part in PARTS
+            for metric in metrics
+            if (at := run.windows.get((part, metric))) is not None
+        ]
+    conditions, runs, numbers, parts, of_metrics, *by_window = (
+        zip(*blocks, strict=True) if blocks else [()] * 9
+    )
+    windows = [len(values) for values in by_window[-1]]
+    places = pa.array(np.repeat(np.arange(len(blocks)), np.array(windows, np.int64)))
+
+    def spread(name: str, values: Sequence[Any]) -> pa.Array:
+        """A value for each block, in all of its rows."""
+        return pa.array(values, COLUMNS[name]).take(places)
+
+    columns = {
+        "condition": spread("condition", [names[place] for place in conditions]),
+        "checksum": spread("checksum", [run.checksum for run in runs]),
+    }
+    for factor in design.factors:
+        column = f"factor {factor}" if factor in COLUMNS else factor
+        columns[column] = _levels(design.levels(factor)).take(pa.array(conditions, pa.int64())).take(places)
+    columns |= {
+        "run": spread("run", [run.name for run in runs]),
+        "marks": spread("marks", [marked[run.name] for run in runs]),
+        "replica": spread("replica", numbers),
+        "part": spread("part", parts),
+        "metric": spread("metric", of_metrics),
+    }
+    for name, arrays in zip(("episode", "window_episodes", "undefined", "value"), by_window, strict=True):
+        columns[name] = pa.array(np.concatenate([np.zeros(0, np.int64), *arrays]), COLUMNS[name])
+    return pa.table(columns)
+
+
+def _metrics(measured: Sequence[_Measured]) -> list[str]:
+    """Metrics in the order of tables: social ones, returns of single agents, those of institutions.
+
+    The return of all agents together is among them where it is not the harvest.
+    """
+    metrics = {metric for run in measured for _, metric in run.windows}
+    if "collective_return" in metrics and not any(name.startswith("institutions/") for name in metrics):
+        metrics.discard(NET)
     social_ones = [*social.METRICS, "yield_share", NET]
 
     def place(name: str) -> tuple[int, int, str]:
@@ -205,196 +331,78 @@ def ordered(metrics: set[str]) -> list[str]:
     return sorted(metrics, key=place)
 
 
-def _check_episodes(table: pa.Table, source: Source, part: str) -> None:
-    """Raises a ValueError unless each episode of each replica is there once."""
-    replica, episode, agent = (table[name].to_numpy() for name in ("replica", "episode", "agent"))
-    rows = np.stack([replica, episode, agent], axis=1)
-    each, times = np.unique(rows, axis=0, return_counts=True)
-    if (times > 1).any():
-        twice = each[times > 1][0].tolist()
-        raise ValueError(f"{source.name} has episode {twice[1]} of replica {twice[0]} in {part} twice")
-    played = np.unique(rows[:, :2], axis=0)
-    replicas, counts = np.unique(played[:, 0], return_counts=True)
-    wanted = source.episodes if part == TRAINING else counts.max(initial=0)
-    if replicas.tolist() != list(range(source.replicas)) or not (counts == wanted).all() or not wanted:
-        found = dict(zip(replicas.tolist(), counts.tolist(), strict=True))
-        raise ValueError(
-            f"{source.name} has these episodes by replica in {part}: {found}; allowed: {wanted} of each of "
-            f"{source.replicas} replicas"
-        )
+def _levels(levels: Sequence[Any]) -> pa.Array:
+    """The levels of all conditions as a column: whole numbers, numbers, truth values, or else texts."""
+    if all(isinstance(level, bool) for level in levels):
+        return pa.array(levels, pa.bool_())
+    if all(isinstance(level, int | float) and not isinstance(level, bool) for level in levels):
+        is_whole = all(isinstance(level, int) and abs(level) < 2**63 for level in levels)
+        return pa.array(levels, pa.int64() if is_whole else pa.float64())
+    return pa.array(list(map(str, levels)), pa.string())
 
 
-COLUMNS: Final = {
-    "condition": pa.string(),
-    "checksum": pa.string(),
-    "run": pa.string(),
-    "marks": pa.string(),
-    "replica": pa.int32(),
-    "part": pa.string(),
-    "metric": pa.string(),
-    "episode": pa.int32(),
-    "window_episodes": pa.int32(),
-    "undefined": pa.int32(),
-    "value": pa.float64(),
-}
-"""All but those of factors, which follow "checksum"."""
-_NUMBERS: Final = ("replica", "episode", "window_episodes", "undefined", "value")
+def circumstances_of(run: Path) -> Circumstances:
+    """What the recipe of a run says of how it was made."""
+    recipe = read_recipe(run)
+    each = [
+        _circumstances(table) for table in (recipe, *recipe.get("extended", ()), *recipe.get("resumed", ()))
+    ]
+    names = dict.fromkeys(name for circumstances in each for name in circumstances)
+    values = {name: [circumstances.get(name, UNKNOWN) for circumstances in each] for name in names}
+    return {name: " then ".join(value for value, _ in groupby(in_order)) for name, in_order in values.items()}
 
 
-def column_of(factor: str) -> str:
-    """The column of a factor."""
-    return f"factor {factor}" if factor in COLUMNS else factor
+def _circumstances(recipe: Mapping[str, Any]) -> dict[str, str]:
+    made = {
+        name: str(version) for name, version in (recipe.get("versions") or {}).items() if version is not None
+    }
+    made |= {module: str(digest)[:12] for module, digest in (recipe.get("code") or {}).items()}
+    git = recipe.get("git")
+    if isinstance(git, Mapping):
+        made["git"] = f"{str(git.get('commit'))[:12]}{' with changes' if git.get('dirty') else ''}"
+    if recipe.get("cpu"):
+        made["cpu"] = str(recipe["cpu"])
+    return made
 
 
-def rows_of(design: Design, found: list[tuple[Source, list[Windows]]], marked: Mapping[str, str]) -> pa.Table:
-    """The sorted rows of a table, with the columns that `cprl.studies.tables.table` lists.
+def marks(made: Mapping[str, Circumstances]) -> dict[str, str]:
+    """What of each run's circumstances differs from those of most runs, e.g. "torch, git commit", or "".
 
     Args:
-        found: runs, and what was measured in them.
-        marked: the marks of each run by its name.
+        made: the circumstances by run, in the order of the table.
     """
-    names = list(design.conditions)
-    is_net_known = not any(own.metric == "collective_return" for _, every in found for own in every)
-    is_net_known |= any(own.metric.startswith("institutions/") for _, every in found for own in every)
-    kept = [(source, own) for source, every in found for own in every if own.metric != NET or is_net_known]
-    metrics, parts, runs = ordered({own.metric for _, own in kept}), list(PARTS), [own for own, _ in found]
-    places = {id(source): nth for nth, source in enumerate(runs)}
-    blocks: dict[str, list[NDArray[Any]]] = {
-        name: [] for name in (*_NUMBERS, "condition", "part", "metric", "run")
-    }
-    for source, own in kept:
-        replicas, windows = own.values.shape
-        shape = (replicas, windows)
-        cells: dict[str, Any] = {
-            "condition": names.index(source.condition),
-            "run": places[id(source)],
-            "part": parts.index(own.part),
-            "metric": metrics.index(own.metric),
-            "replica": source.first + np.arange(replicas)[:, None],
-            "episode": own.episodes,
-            "window_episodes": own.lengths,
-            "undefined": own.undefined,
-            "value": own.values,
-        }
-        for name, cell in cells.items():
-            blocks[name].append(np.broadcast_to(cell, shape).reshape(-1))
-    arrays = {name: np.concatenate([np.zeros(0, np.int64), *own]) for name, own in blocks.items()}
-    keys = ("condition", "replica", "part", "metric", "episode")
-    order = np.lexsort([arrays[name] for name in reversed(keys)])
-    arrays = {name: own[order] for name, own in arrays.items()}
-    _refuse_twice(arrays, keys, names)
-    columns: dict[str, pa.Array] = {
-        "condition": _texts(names, arrays["condition"]),
-        "checksum": _texts([own.checksum for own in runs], arrays["run"]),
-    }
-    for factor in design.factors:
-        levels = _levels([own[factor] for own in design.conditions.values()])
-        columns[column_of(factor)] = levels.take(pa.array(arrays["condition"]))
-    columns |= {
-        "run": _texts([own.name for own in runs], arrays["run"]),
-        "marks": _texts([marked[own.name] for own in runs], arrays["run"]),
-        "replica": pa.array(arrays["replica"], pa.int32()),
-        "part": _texts(parts, arrays["part"]),
-        "metric": _texts(metrics, arrays["metric"]),
-    }
-    columns |= {
-        name: pa.array(arrays[name], COLUMNS[name])
-        for name in ("episode", "window_episodes", "undefined", "value")
-    }
-    return pa.table(columns)
-
-
-def _refuse_twice(arrays: Mapping[str, NDArray[Any]], keys: tuple[str, ...], names: list[str]) -> None:
-    """Raises a ValueError where a row is there twice."""
-    same = np.ones(max(len(arrays["value"]) - 1, 0), bool)
-    for name in keys:
-        same &= arrays[name][1:] == arrays[name][:-1]
-    if same.any():
-        at = int(same.argmax())
-        raise ValueError(
-            f"replica {arrays['replica'][at]} of the condition {names[arrays['condition'][at]]!r} is "
-            "there twice"
+    usual = {name: counts.most_common(1)[0][0] for name, counts in counted(made).items()}
+    return {
+        run: ", ".join(
+            WORDS.get(name, name)
+            for name, value in usual.items()
+            if circumstances.get(name, UNKNOWN) != value
         )
-
-
-def _texts(names: list[str], codes: NDArray[Any]) -> pa.Array:
-    return pa.array(names, pa.string()).take(pa.array(codes, pa.int64()))
-
-
-def _levels(levels: list[Any]) -> pa.Array:
-    """The levels of all conditions as a column: whole numbers, numbers, truth values, or else texts."""
-    if all(isinstance(own, bool) for own in levels):
-        return pa.array(levels, pa.bool_())
-    if all(isinstance(own, int | float) and not isinstance(own, bool) for own in levels):
-        whole = all(isinstance(own, int) and abs(own) < 2**63 for own in levels)
-        return pa.array(levels, pa.int64() if whole else pa.float64())
-    return pa.array([own if isinstance(own, str) else str(own) for own in levels], pa.string())
+        for run, circumstances in made.items()
+    }
 
 
 NO_BETTER: Final = "no better"
-COLOURS: Final = {
-    **PHASE_COLOURS,
-    HARVESTING: "#c7e9c0",
-    RECOVERY: "#c6dbef",
-    DECLINE: "#d9c9b6",
-    NO_BETTER: "#cfcfcf",
-}
-"""Of labels, light enough for text before them."""
 BY_PHASES: Final = f"the last phase that cprl.measuring.phases finds, from {FEWEST_EPISODES:,} episodes on"
 BY_RETURNS: Final = "its last 30 episodes against its peak and random play, see cprl.studies.tables.sources"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Endings:
-    """In which phase the replicas of each condition end."""
-
-    labels: Mapping[str, Mapping[int, str]]
-    """By condition and number of the replica; none for conditions without a finished run."""
-    rules: tuple[str, ...]
-    """How they were found, one for short trainings and one for long ones."""
-
-    def counts(self, condition: str) -> Counter[str]:
-        """How many replicas of a condition have each label, the most frequent one first."""
-        return Counter(sorted(self.labels.get(condition, {}).values()))
-
-    def most_frequent(self, condition: str) -> tuple[str, int, int] | None:
-        """The most frequent label of a condition, how many replicas have it, and how many there are.
-
-        Of equally frequent ones the first by name; None without a finished run.
-        """
-        found = self.counts(condition)
-        if not found:
-            return None
-        label, number = found.most_common(1)[0]
-        return label, number, found.total()
-
-
-def endings(sources: list[Source]) -> Endings:
-    """The phases in which the replicas of finished runs end."""
-    labels: dict[str, dict[int, str]] = {}
-    rules: dict[str, None] = {}
-    for source in sources:
-        found, rule = _labels(source)
-        rules[rule] = None
-        numbered = {source.first + nth: own for nth, own in enumerate(found)}
-        labels[source.condition] = {**labels.get(source.condition, {}), **numbered}
-    return Endings(labels=labels, rules=tuple(rules))
-
-
-def _labels(source: Source) -> tuple[list[str], str]:
-    """The label of each replica of a run, and by which rule."""
-    curves = curves_of(source.run)
-    of_each = [{name: own[nth : nth + 1] for name, own in curves.items()} for nth in range(source.replicas)]
-    by_phases = [phases_of(own, resamples=1) for own in of_each]
-    if all(own is not None for own in by_phases):
-        return [own[1][-1].label or UNNAMED for own in by_phases if own is not None], BY_PHASES
-    agents = sum(name.startswith("return_") for name in curves)
-    random = float(_harvest(as_curves(read_table(source.run / "evaluation" / "random.parquet"))).mean())
-    return [ending(own, random=random, agents=agents) for own in _harvest(curves)], BY_RETURNS
+def _phases(source: Source, curves: Mapping[str, dict[str, Values]]) -> tuple[list[str], str]:
+    """In which phase each replica ends, and by which rule; `curves` are those of the parts of the run."""
+    training = curves[TRAINING]
+    by_phases = [
+        phases_of({name: values[row : row + 1] for name, values in training.items()})
+        for row in range(source.replicas)
+    ]
+    if all(phases is not None for phases in by_phases):
+        return [phases[-1].label or UNNAMED for phases in by_phases if phases is not None], BY_PHASES
+    agents = sum(name.startswith("return_") for name in training)
+    random = float(_harvest(curves[RANDOM]).mean())
+    return [ending(returns, random=random, agents=agents) for returns in _harvest(training)], BY_RETURNS
 
 
 def ending(returns: Values, *, random: float, agents: int) -> str:
-    """In which phase a replica of a short training ends; see the module.
+    """In which phase a replica of a short training ends.
 
     Args:
         returns: of all agents together by episode, [E].
@@ -419,6 +427,4 @@ def ending(returns: Values, *, random: float, agents: int) -> str:
 
 def _harvest(curves: Mapping[str, Values]) -> Values:
     """The collective return, [R, E]; of games without a harvest the return of all agents."""
-    if "collective_return" in curves:
-        return curves["collective_return"]
-    return np.asarray(np.sum([own for name, own in curves.items() if name.startswith("return_")], axis=0))
+    return curves["collective_return"] if "collective_return" in curves else _net(curves)

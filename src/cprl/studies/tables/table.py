@@ -15,9 +15,11 @@ Columns:
     value            the mean over its other episodes, float64; NaN where there are none
 
 Rows are sorted by condition, replica, part, metric and episode, so that the same runs give the same table.
-A factor with the name of another column is called "factor NAME".
+A factor with the name of another column is called "factor NAME". Summaries and figures are made of a table
+alone.
 """
 
+import io
 import json
 from collections import Counter
 from collections.abc import Mapping
@@ -29,33 +31,94 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cprl.arguments import WINDOW as WINDOW
-from cprl.arguments import integer
 from cprl.runs.episodes import write_table
 from cprl.runs.files import STUDY_TABLE_FORMAT, refuse_newer
-from cprl.runs.recipe import read_recipe, versions
-from cprl.studies.study import Study
-from cprl.studies.tables.sources import (
-    Design,
-    Lacking,
-    Source,
-    Windows,
-    design_of,
-    rows_of,
-    sources_of,
-    windows_of,
-)
+from cprl.runs.recipe import versions
 
 METADATA: Final = b"cprl"
-"""The key of the metadata: the study, its conditions, how the runs were made, and what is lacking."""
+"""The key of all that a table holds beside its rows, see the fields of `StudyTable`."""
+TRAINING: Final = "training"
+EVALUATION: Final = "evaluation"
+RANDOM: Final = "random"
+PARTS: Final = {TRAINING: None, EVALUATION: "trained", RANDOM: "random"}
+"""The parts of a run: its training, its agents in fresh worlds afterwards, and random play in these worlds;
+with the name of the table that holds it."""
+NET: Final = "net"
+"""The return of all agents together: harvest - fines + transfers, where a game has institutions."""
+COLUMNS: Final = {
+    "condition": pa.string(),
+    "checksum": pa.string(),
+    "run": pa.string(),
+    "marks": pa.string(),
+    "replica": pa.int32(),
+    "part": pa.string(),
+    "metric": pa.string(),
+    "episode": pa.int32(),
+    "window_episodes": pa.int32(),
+    "undefined": pa.int32(),
+    "value": pa.float64(),
+}
+"""All but those of factors, which follow "checksum"."""
 
-
+Grid = Mapping[str, NDArray[Any]]
+"""The rows of a metric in one part, for R replicas and W windows: "replica", [R]; "episode" and
+"window_episodes", [W]; "undefined" and "value", [R, W]."""
 Circumstances = Mapping[str, str]
 """The version of each package, the checksum of each module of the user's own, the git commit and the type of
 processor, by name. Where a run was resumed under others, all of them in order, with " then " between them."""
+UNKNOWN: Final = "not recorded"
+WORDS: Final = {"git": "git commit", "cpu": "processor"}
+_NAMED: Final = 4
+"""The largest number of runs that a sentence names."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Design:
+    """The conditions that a table compares."""
+
+    name: str
+    conditions: Mapping[str, Mapping[str, Any]]
+    """The level of each factor by condition, in order: a number, a truth value or a text."""
+    reference: str
+    """The condition that others are compared with."""
+    is_paired: bool
+    """Whether replicas of the same number have the same seeds and worlds in each condition."""
+    is_grid: bool = True
+    """Whether levels are few and repeat; not so for random draws."""
+    notes: tuple[str, ...] = ()
+    """Sentences on what is compared."""
+    question: str = ""
+    expectation: str = ""
+    """Before it was run."""
+
+    @property
+    def factors(self) -> tuple[str, ...]:
+        """The names of the factors; () where conditions have names alone."""
+        return tuple(next(iter(self.conditions.values())))
+
+    def levels(self, factor: str) -> list[Any]:
+        """The level of a factor in each condition."""
+        return [levels[factor] for levels in self.conditions.values()]
+
+
+@dataclass(frozen=True)
+class Lacking:
+    """A run that is not part of a table, and why."""
+
+    name: str
+    condition: str
+    replicas: int
+    reason: str
+
+    def __str__(self) -> str:
+        """In a sentence."""
+        replicas = f"{self.replicas} replica{'s' * (self.replicas != 1)}"
+        return f"{self.condition}: {self.name}, {replicas}, {self.reason}."
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,15 +128,35 @@ class StudyTable:
     design: Design
     rows: pa.Table = field(repr=False)
     window: int
-    lacking: tuple[Lacking, ...]
+    """Episodes of a window of training."""
+    lacking: tuple[Lacking, ...] = ()
     """The runs that are no part of it: not finished, failed or damaged."""
-    made: Mapping[str, Circumstances] = field(repr=False)
+    made: Mapping[str, Circumstances] = field(default_factory=dict, repr=False)
     """Versions, git commit and processor of each run in it."""
+    endings: Mapping[str, Mapping[str, int]] = field(default_factory=dict, repr=False)
+    """How many replicas of a condition end in each phase, the most frequent one first, equally frequent ones
+    by name; none for conditions without a finished run."""
+    ending_rules: tuple[str, ...] = field(default=(), repr=False)
+    """How phases were told, one for short trainings and one for long ones."""
+    lengths: Mapping[str, Mapping[str, tuple[int, int]]] = field(default_factory=dict, repr=False)
+    """The least and the most "episodes" and environment "steps" of the replicas of a condition; none where
+    the reports of its runs do not say how many steps."""
 
     @cached_property
     def mixed(self) -> list[str]:
         """How its runs were made in different circumstances, in sentences; [] if in the same."""
-        return sentences(self.made)
+        sentences = []
+        for name, counts in counted(self.made).items():
+            if len(counts) == 1:
+                continue
+            parts = []
+            for value, number in counts.most_common():
+                runs = [run for run, made in self.made.items() if made.get(name, UNKNOWN) == value]
+                text = f"{value} in {number} run{'s' * (number != 1)}"
+                parts.append(f"{text} ({some(runs, _NAMED)})" if parts else text)
+            what = WORDS.get(name, f"version of {name}")
+            sentences.append(f"The runs were made under more than one {what}: {'; '.join(parts)}.")
+        return sentences
 
     @cached_property
     def metrics(self) -> tuple[str, ...]:
@@ -84,8 +167,8 @@ class StudyTable:
     def replicas(self) -> Mapping[str, int]:
         """How many replicas of each condition are in it."""
         pairs = self.rows.select(["condition", "replica"]).group_by(["condition", "replica"]).aggregate([])
-        found = pairs["condition"].to_pylist()
-        return {name: found.count(name) for name in self.design.conditions}
+        counts = Counter(pairs["condition"].to_pylist())
+        return {condition: counts[condition] for condition in self.design.conditions}
 
     @cached_property
     def comparisons(self) -> dict[Any, Any]:
@@ -113,56 +196,46 @@ class StudyTable:
             raise ImportError("to_pandas needs pandas, which is not installed; run: pip install pandas")
         return self.rows.to_pandas()
 
-    def values(self, condition: str, metric: str, part: str) -> dict[str, NDArray[Any]] | None:
-        """The rows of a condition in one part as arrays for R replicas and W windows.
+    def values(self, condition: str, metric: str, part: str) -> Grid | None:
+        """Return the rows of a condition in one part, None if there are none.
 
-        Returns:
-            "replica", [R]; "episode" and "window_episodes", [W]; "undefined" and "value", [R, W]. None if
-            there are none. Of windows that not every replica has, only those that all have.
+        Of windows that not every replica has, those that all have.
         """
-        rows = self._parts.get((condition, part, metric))
-        if rows is None:
-            return None
-        replica, episode = rows["replica"], rows["episode"]
-        replicas, place = np.unique(replica, return_inverse=True)
-        episodes, times = np.unique(episode, return_counts=True)
-        episodes = episodes[times == len(replicas)]
-        kept = np.isin(episode, episodes)
-        at = place[kept], np.searchsorted(episodes, episode[kept])
-        found: dict[str, NDArray[Any]] = {"replica": replicas, "episode": episodes}
-        for name in ("undefined", "value", "window_episodes"):
-            found[name] = np.zeros((len(replicas), len(episodes)), rows[name].dtype)
-            found[name][at] = rows[name][kept]
-        found["window_episodes"] = found["window_episodes"][0]
-        return found
+        return self._grids.get((condition, part, metric))
 
     @cached_property
-    def _parts(self) -> dict[tuple[str, str, str], dict[str, NDArray[Any]]]:
+    def _grids(self) -> dict[tuple[str, str, str], Grid]:
         """The rows by condition, part and metric."""
-        keys = [
-            self.rows[name].combine_chunks().dictionary_encode() for name in ("condition", "part", "metric")
-        ]
-        codes = np.stack([own.indices.to_numpy(zero_copy_only=False) for own in keys], axis=1)
-        names = [own.dictionary.to_pylist() for own in keys]
-        numbers = {
-            name: self.rows[name].to_numpy()
-            for name in ("replica", "episode", "window_episodes", "undefined", "value")
-        }
-        each, group = np.unique(codes, axis=0, return_inverse=True)
-        order = np.argsort(group.reshape(-1), kind="stable")
-        cuts = np.searchsorted(group.reshape(-1)[order], np.arange(1, len(each)))
+        keys = ["condition", "part", "metric"]
+        columns = ["replica", "episode", "window_episodes", "undefined", "value"]
+        rows = self.rows.select(keys + columns).sort_by([("replica", "ascending"), ("episode", "ascending")])
+        groups = rows.group_by(keys, use_threads=False).aggregate([(name, "list") for name in columns])
+        lists = {name: groups[f"{name}_list"].combine_chunks() for name in columns}
+        names = zip(*(groups[name].to_pylist() for name in keys), strict=True)
         return {
-            (names[0][at[0]], names[1][at[1]], names[2][at[2]]): {
-                name: own[which] for name, own in numbers.items()
-            }
-            for at, which in zip(each.tolist(), np.split(order, cuts), strict=True)
+            key: _grid({name: each[place].values.to_numpy() for name, each in lists.items()})
+            for place, key in enumerate(names)
         }
 
     def write(self, path: Path | str) -> Path:
         """Writes a parquet file atomically, which `read` gives back; replaces an older one."""
         path = Path(path)
-        write_table(path, self.rows, over=True)
+        held = {
+            "format": STUDY_TABLE_FORMAT,
+            "versions": versions(),
+            "design": asdict(self.design),
+            "lacking": [asdict(run) for run in self.lacking],
+            **{name: getattr(self, name) for name in _HELD},
+        }
+        rows = self.rows.replace_schema_metadata({METADATA: json.dumps(held)})
+        write_table(path, rows, over=True)
         return path
+
+    def to_csv(self) -> str:
+        """The rows as CSV, with the names of the columns, e.g. for spreadsheets and R."""
+        file = io.BytesIO()
+        pyarrow.csv.write_csv(self.rows, file)
+        return file.getvalue().decode()
 
     @classmethod
     def read(cls, path: Path | str) -> "StudyTable":
@@ -171,147 +244,40 @@ class StudyTable:
         try:
             rows = pq.read_table(path)
             held = json.loads((rows.schema.metadata or {})[METADATA])
-        except (pa.ArrowException, OSError, KeyError, ValueError) as error:
+            refuse_newer(path, held, STUDY_TABLE_FORMAT)
+            return cls(
+                rows=rows,
+                design=Design(**{**held["design"], "notes": tuple(held["design"]["notes"])}),
+                lacking=tuple(Lacking(**run) for run in held["lacking"]),
+                **{name: held[name] for name in _HELD},
+            )
+        except (pa.ArrowException, OSError, LookupError, TypeError, json.JSONDecodeError) as error:
             raise ValueError(f"{path} is not the table of a study: {error!r}") from error
-        refuse_newer(path, held, STUDY_TABLE_FORMAT)
-        if held.get("format") != STUDY_TABLE_FORMAT:
-            raise ValueError(f"{path} has the format {held.get('format')}; allowed: {STUDY_TABLE_FORMAT}")
-        design = held["design"]
-        return cls(
-            design=Design(
-                **{**design, "conditions": dict(design["conditions"]), "notes": tuple(design["notes"])}
-            ),
-            rows=rows,
-            window=held["window"],
-            lacking=tuple(Lacking(**own) for own in held["lacking"]),
-            made=held["made"],
-        )
 
 
-def study_table(
-    study: Study, runs: Path | str, *, window: int = WINDOW, status: Path | str | None = None
-) -> StudyTable:
-    """The table of the finished runs of a study.
-
-    Args:
-        window: episodes of a window of training; 1 for episodes one by one, of the evaluation too.
-        status: where its trials say why they failed, see `cprl.studies.trials`.
-    """
-    folder = Path(runs)
-    finished, lacking = sources_of(study, folder, None if status is None else Path(status))
-    return table_of(design_of(study), finished, lacking, window=window)
+_HELD: Final = ("window", "made", "endings", "ending_rules", "lengths")
+"""Fields that JSON can hold as they are."""
 
 
-def table_of(
-    design: Design, sources: list[Source], lacking: list[Lacking], *, window: int = WINDOW
-) -> StudyTable:
-    """The table of finished runs.
-
-    Args:
-        design: the conditions that are compared.
-        sources: the runs; what is damaged of them is listed as lacking.
-        lacking: other runs, which are listed.
-    """
-    integer("window", window, 1)
-    found: list[tuple[Source, list[Windows]]] = []
-    made: dict[str, Circumstances] = {}
-    out = list(lacking)
-    for source in sources:
-        try:
-            found.append((source, list(windows_of(source, window))))
-            made[source.name] = circumstances_of(source.run)
-        except (ValueError, OSError, KeyError) as error:
-            found = [own for own in found if own[0] is not source]
-            reason = f"is damaged: {error}"
-            out.append(Lacking(source.name, source.condition, source.replicas, reason))
-    rows = rows_of(design, found, marks(made))
-    held = {
-        "format": STUDY_TABLE_FORMAT,
-        "design": {**asdict(design), "conditions": [[*pair] for pair in design.conditions.items()]},
-        "window": window,
-        "versions": versions(),
-        "lacking": [vars(own) for own in out],
-        "made": made,
-        "mixed": sentences(made),
+def _grid(columns: Mapping[str, NDArray[Any]]) -> Grid:
+    """Columns that are sorted by replica and episode, with a row for each replica."""
+    replicas, counts = np.unique(columns["replica"], return_counts=True)
+    windows = counts.min()
+    places = np.concatenate([np.arange(count) for count in counts])
+    grid = {
+        name: column[places < windows].reshape(len(replicas), windows) for name, column in columns.items()
     }
-    rows = rows.replace_schema_metadata({METADATA: json.dumps(held, sort_keys=False)})
-    return StudyTable(design=design, rows=rows, window=window, lacking=tuple(out), made=made)
+    by_window = {name: grid[name][0] for name in ("episode", "window_episodes")}
+    return {**grid, **by_window, "replica": replicas}
 
 
-UNKNOWN: Final = "not recorded"
-WORDS: Final = {"git": "git commit", "cpu": "processor"}
-_NAMED: Final = 4
-"""The largest number of runs that a sentence names."""
+def counted(made: Mapping[str, Circumstances]) -> dict[str, Counter[str]]:
+    """How many runs have each value of each circumstance; of equally many the first run's comes first."""
+    names = dict.fromkeys(name for circumstances in made.values() for name in circumstances)
+    return {name: Counter(run.get(name, UNKNOWN) for run in made.values()) for name in names}
 
 
-def circumstances_of(run: Path) -> Circumstances:
-    """What the recipe of a run says of how it was made."""
-    recipe = read_recipe(run)
-    every = [_of(recipe), *(_of(own) for own in (*recipe.get("extended", ()), *recipe.get("resumed", ())))]
-    names = dict.fromkeys(name for own in every for name in own)
-    return {name: _joined([own.get(name, UNKNOWN) for own in every]) for name in names}
-
-
-def marks(made: Mapping[str, Circumstances]) -> dict[str, str]:
-    """What of each run's circumstances differs from those of most runs, e.g. "torch, git commit", or "".
-
-    Of circumstances that equally many runs have, the first run's count as those of most.
-
-    Args:
-        made: the circumstances by run, in the order of the table.
-    """
-    usual = {name: _counted(made, name).most_common(1)[0][0] for name in _names(made)}
-    return {
-        run: ", ".join(
-            WORDS.get(name, name) for name, value in usual.items() if own.get(name, UNKNOWN) != value
-        )
-        for run, own in made.items()
-    }
-
-
-def sentences(made: Mapping[str, Circumstances]) -> list[str]:
-    """How the runs of a table were made in different circumstances, a sentence for each."""
-    found = []
-    for name in _names(made):
-        counted = _counted(made, name)
-        if len(counted) == 1:
-            continue
-        parts = []
-        for nth, (value, number) in enumerate(counted.most_common()):
-            runs = [run for run, own in made.items() if own.get(name, UNKNOWN) == value]
-            named = f" ({_some(runs)})" if nth else ""
-            parts.append(f"{value} in {number} run{'s' * (number != 1)}{named}")
-        found.append(
-            f"The runs were made under more than one {WORDS.get(name, f'version of {name}')}: "
-            f"{'; '.join(parts)}."
-        )
-    return found
-
-
-def _of(recipe: Mapping[str, Any]) -> dict[str, str]:
-    found = {name: str(own) for name, own in (recipe.get("versions") or {}).items() if own is not None}
-    found |= {module: str(digest)[:12] for module, digest in (recipe.get("code") or {}).items()}
-    git = recipe.get("git")
-    if isinstance(git, Mapping):
-        found["git"] = f"{str(git.get('commit'))[:12]}{' with changes' if git.get('dirty') else ''}"
-    if recipe.get("cpu"):
-        found["cpu"] = str(recipe["cpu"])
-    return found
-
-
-def _joined(values: list[str]) -> str:
-    """Values in order, without one that follows itself."""
-    return " then ".join(own for nth, own in enumerate(values) if not nth or own != values[nth - 1])
-
-
-def _names(made: Mapping[str, Circumstances]) -> list[str]:
-    return list(dict.fromkeys(name for own in made.values() for name in own))
-
-
-def _counted(made: Mapping[str, Circumstances], name: str) -> Counter[str]:
-    return Counter(own.get(name, UNKNOWN) for own in made.values())
-
-
-def _some(runs: list[str]) -> str:
-    more = f" and {len(runs) - _NAMED} more" if len(runs) > _NAMED else ""
-    return f"{', '.join(runs[:_NAMED])}{more}"
+def some(names: list[str], most: int) -> str:
+    """The first names, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"{', '.join(names[:most])}{more}"
