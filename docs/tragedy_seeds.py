@@ -12,7 +12,7 @@ from pathlib import Path
 from cprl.measuring.statistics import Estimate, estimate
 from cprl.runs.curves import curves_of
 from cprl.terminal.course import LAST_EPISODES, PEAK_EPISODES, course_of
-from cprl.training.stored import load
+from cprl.training.agents import load
 
 HEADING = (
     "| seed | replicas | peak of 10 episodes, apples | its episode | last 30 episodes, apples "

@@ -303,8 +303,7 @@ def test_a_recipe_runs_its_experiment(runs):
         "keep_checkpoint": True,
         "watch": "file",
         "linger": False,
-        "at_end": None,
-        "command": line,
+        "callbacks": [],
         "allow": ("a:B", "c:D"),
     }
 

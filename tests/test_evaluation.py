@@ -36,8 +36,7 @@ from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.recipe import start_run
 from cprl.system.process import one_thread
 from cprl.training import train
-from cprl.training.agents import Population
-from cprl.training.stored import StoredAgent, stored_policies
+from cprl.training.agents import Population, StoredAgent, stored_policies
 
 
 @pytest.fixture(scope="module")
@@ -226,7 +225,7 @@ def test_an_agent_values_actions_alone_as_among_others_to_the_last_bit():
     spaces = presets.game("two_complex").spaces
     shape = spaces.observation_shape
     torch.manual_seed(0)
-    agents = [StoredAgent(("trained", False, 0.0, "DQN"), MLPNetwork(shape, 8)) for _ in range(8)]
+    agents = [StoredAgent(network=MLPNetwork(shape, 8), algorithm="DQN") for _ in range(8)]
     seen = torch.randint(0, 256, (8, 1, *shape), dtype=torch.uint8)
 
     def values(lanes):

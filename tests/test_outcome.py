@@ -18,7 +18,7 @@ from cprl.learners.settings import DQNSettings
 from cprl.measuring.evaluate import evaluate
 from cprl.population import Learning, Scripted
 from cprl.runs.episodes import read_table
-from cprl.training.outcome import evaluate_population, fresh_env, is_same_later, make_parts, random_play
+from cprl.training.outcome import evaluate_population, fresh_env, is_same_later, make_agents, random_play
 
 SETTINGS = DQNSettings(buffer_size=200, learning_rate=1e-3, hidden_cells=(8,))
 EXPERIMENT = cprl.Experiment(
@@ -39,10 +39,10 @@ def numbers(episodes):
 
 
 def test_random_play_before_is_the_one_after_and_the_trained_agents_meet_the_same_worlds():
-    made = make_parts(EXPERIMENT, ())
-    before = random_play(EXPERIMENT, made.population)
-    as_ever = evaluate_population(EXPERIMENT, made.env, make_parts(EXPERIMENT, ()).population)
-    reused = evaluate_population(EXPERIMENT, made.env, made.population, random=before)
+    env, population = make_agents(EXPERIMENT)
+    before = random_play(EXPERIMENT, population)
+    as_ever = evaluate_population(EXPERIMENT, *make_agents(EXPERIMENT))
+    reused = evaluate_population(EXPERIMENT, env, population, random=before)
     assert len(before) == 8
     assert reused["random"] is before
     assert numbers(before) == numbers(as_ever["random"])
@@ -50,7 +50,7 @@ def test_random_play_before_is_the_one_after_and_the_trained_agents_meet_the_sam
 
 
 def test_random_play_moves_no_generator_even_of_a_game_that_draws_from_global_ones(monkeypatch):
-    made = make_parts(EXPERIMENT, ())
+    _, population = make_agents(EXPERIMENT)
 
     def states():
         of_numpy = np.random.get_state()  # noqa: NPY002  (the global generator is the point)
@@ -63,7 +63,7 @@ def test_random_play_moves_no_generator_even_of_a_game_that_draws_from_global_on
 
     monkeypatch.setattr("cprl.training.outcome.fresh_env", drawing)
     before = states()
-    random_play(EXPERIMENT, made.population)
+    random_play(EXPERIMENT, population)
     assert states() == before
 
 
@@ -116,8 +116,8 @@ class Counting(Transform):
 
 def test_what_transforms_have_learned_is_the_same_for_everybody_who_is_evaluated(monkeypatch):
     experiment = replace(EXPERIMENT, transforms=(Custom("test_outcome:Counting"),))
-    made = make_parts(experiment, ())
-    load_transforms_state(made.env, {"transforms.0.seen": torch.tensor(100.0)})
+    env, population = make_agents(experiment)
+    load_transforms_state(env, {"transforms.0.seen": torch.tensor(100.0)})
     begun = []
 
     def noting(env, policy, **how):
@@ -125,5 +125,5 @@ def test_what_transforms_have_learned_is_the_same_for_everybody_who_is_evaluated
         return evaluate(env, policy, **how)
 
     monkeypatch.setattr("cprl.training.outcome.evaluate", noting)
-    evaluate_population(experiment, made.env, made.population)
+    evaluate_population(experiment, env, population)
     assert begun == [100, 100], "random play does not count"

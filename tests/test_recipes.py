@@ -429,13 +429,6 @@ def test_the_tragedy_ends_with_what_happened_and_what_to_try_next(tmp_path, caps
     assert after.count(str(run)) >= 4, "in the figure's path and in lines to be copied"
 
 
-def test_what_is_called_at_the_end_must_be_a_function(tmp_path):
-    experiment = recipe("tragedy").experiment()
-    with pytest.raises(ValueError, match=r"at_end is 'tell'; allowed: a function"):
-        cprl.run(experiment, tmp_path / "run", at_end="tell")
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.integration
 @pytest.mark.parametrize("watch", ["telepathy", "connect rerun+http://127.0.0.1:9876/proxy"])
 @pytest.mark.parametrize(

@@ -43,7 +43,7 @@ from cprl.runs.files import read_json
 from cprl.runs.recipe import read_recipe
 from cprl.runs.weights import lacks_weights
 from cprl.studies.study import UNNAMED, Condition
-from cprl.training.stored import LoadedRun, load
+from cprl.training.agents import LoadedRun, load
 
 Values = NDArray[np.float64]
 

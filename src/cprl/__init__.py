@@ -68,8 +68,8 @@ if TYPE_CHECKING:
     from cprl.experiment import Experiment
     from cprl.studies import Study, run_study
     from cprl.training import train
+    from cprl.training.agents import load
     from cprl.training.running import run
-    from cprl.training.stored import load
 
     __version__: str
 
@@ -122,7 +122,7 @@ _MODULES: Final = {
     "Study": "cprl.studies",
     "crossplay": "cprl.evaluation",
     "evaluate_run": "cprl.evaluation",
-    "load": "cprl.training.stored",
+    "load": "cprl.training.agents",
     "recipe_main": "cprl.commands.recipe",
     "run": "cprl.training.running",
     "run_study": "cprl.studies",

@@ -31,7 +31,7 @@ from cprl.commands.recipes import recipe as print_recipe
 from cprl.commands.recipes import refuse_unknown, run_by_name
 from cprl.commands.studies import runs_table, sweep
 from cprl.presets import Variant, check_board
-from cprl.runs.recipe import read_recipe
+from cprl.runs.recipe import read_recipe, started_by
 from cprl.system.output import printed, say
 from cprl.system.process import prepare_process
 from cprl.viewer.page import Page, has_display, headers_of
@@ -87,7 +87,9 @@ def run(
         experiment = replace(experiment, episodes=episodes)
     with ExitStack() as stack:
         callbacks: tuple[object, ...] = ()
-        if trial is not None:
+        if trial is None:
+            stack.enter_context(started_by(sys.argv))
+        else:
             from cprl.studies.status import process_of_trial
 
             callbacks = (stack.enter_context(process_of_trial(trial, experiment)),)
@@ -100,7 +102,6 @@ def run(
             watch=watch,
             linger=linger,
             allow=allow,
-            command=sys.argv if trial is None else None,
             callbacks=callbacks,
             figures=trial is None,
         )

@@ -36,6 +36,7 @@ from cprl.checks import checked, instance
 from cprl.commons import maps
 from cprl.commons.maps import Map
 from cprl.custom import Custom
+from cprl.runs.recipe import started_by
 from cprl.system.output import RESUMES, say
 from cprl.system.shipped import program_of
 
@@ -90,7 +91,7 @@ def recipe_main(
         make_experiment: gives the experiment; its arguments become flags, so each has a type and a default,
             and a line under "Args:".
         argv: the command line, script first; by default that of this process.
-        at_end: called with the directory of a run that has just finished, see `cprl.run`.
+        at_end: called with the directory of a run that has just finished, when all is written and said.
 
     Returns:
         The run's directory.
@@ -107,8 +108,16 @@ def recipe_main(
             raise ValueError(TAKES_NOTHING_OVER)
     from cprl.training.running import run
 
-    with in_a_sentence(program_of(command[0])):
-        return run(experiment, command=command, at_end=at_end, **vars(options))
+    callbacks = [] if at_end is None else [_AtEnd(at_end)]
+    with in_a_sentence(program_of(command[0])), started_by(command):
+        return run(experiment, callbacks=callbacks, **vars(options))
+
+
+@dataclass(frozen=True)
+class _AtEnd:
+    """A callback that calls a function with the directory of a run that has finished."""
+
+    on_finished: Callable[[Path], object]
 
 
 @contextmanager

@@ -52,7 +52,7 @@ from cprl.measuring.statistics import (
 )
 from cprl.runs.episodes import labelled
 from cprl.terminal.style import EMPTY, SHADES, SMALL_PT, draw_cell, head, picture_path, save, wrapped
-from cprl.training.stored import LoadedRun
+from cprl.training.agents import LoadedRun
 
 Whose: TypeAlias = Literal["focal", "background", "group"]
 _WHOSE: Final[dict[Whose, Callable[..., float]]] = {

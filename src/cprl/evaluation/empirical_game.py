@@ -27,7 +27,7 @@ from cprl.measuring.episodes import Episode
 from cprl.runs.episodes import labelled
 from cprl.theory.payoff_table import PayoffTable, compositions
 from cprl.theory.solutions import MOST_PROFILES
-from cprl.training.stored import LoadedRun
+from cprl.training.agents import LoadedRun
 
 Values = NDArray[np.float64]
 Who = tuple[int, ...]

@@ -25,7 +25,7 @@ from cprl.measuring.statistics import (
     social_measures,
 )
 from cprl.runs.episodes import labelled
-from cprl.training.stored import LoadedRun, load
+from cprl.training.agents import LoadedRun, load
 
 _LONGEST: Final = 40
 """The largest number of characters of a value in a message."""
@@ -260,5 +260,5 @@ def how_they_play(runs: list[LoadedRun], greedy: bool) -> str:
     if greedy:
         return ", greedy"
     agents = [run.agent(agent, replica=run.replicas[0]) for run in runs for agent in range(run.game.agents)]
-    chances = {agent.kind[2] for agent in agents if agent.kind[0] == "trained" and not agent.kind[1]}
+    chances = {agent.epsilon for agent in agents if agent.scripted is None and not agent.stochastic}
     return "".join(f", epsilon {chance:g}" for chance in sorted(chances))

@@ -32,7 +32,7 @@ from cprl.policies.assignment import AgentPolicies
 from cprl.runs.files import refuse_to_write_over
 from cprl.system.memory import check_memory
 from cprl.training import train
-from cprl.training.stored import LoadedRun, load
+from cprl.training.agents import LoadedRun, load
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.institutions import has_institutions
 from cprl.viewer.replay import Decisions, Offences, events

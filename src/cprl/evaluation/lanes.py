@@ -22,7 +22,7 @@ from cprl.policies.assignment import AgentPolicies
 from cprl.policies.decisions import decider_by_chance
 from cprl.policies.lanes import random_lanes
 from cprl.system.process import one_thread
-from cprl.training.stored import LoadedRun, stored_policies
+from cprl.training.agents import LoadedRun, stored_policies
 
 Played: TypeAlias = dict[int, list[Episode]]
 """Episodes by the index of the replica."""

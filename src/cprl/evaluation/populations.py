@@ -18,8 +18,7 @@ from cprl.evaluation.lanes import Place, Played, play
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
 from cprl.presets import Variant
-from cprl.training.agents import Population
-from cprl.training.stored import LoadedRun, load
+from cprl.training.agents import LoadedRun, Population, load
 
 _SPECS: Final = "Scripted(policy) or Frozen(run, agent, replica)"
 

@@ -42,7 +42,7 @@ from cprl.evaluation.populations import play_population
 from cprl.measuring.statistics import Estimate, difference, estimate
 from cprl.population import Frozen
 from cprl.runs.episodes import labelled
-from cprl.training.stored import LoadedRun, load
+from cprl.training.agents import LoadedRun, load
 
 
 def check_population(run: LoadedRun) -> None:

@@ -55,8 +55,7 @@ from cprl.policies.assignment import AgentPolicies
 from cprl.population import Frozen, Scripted
 from cprl.runs.episodes import labelled
 from cprl.terminal.style import MARK, MEAN, SMALL_PT, head, picture_path, save
-from cprl.training.agents import check_scripted
-from cprl.training.stored import LoadedRun, StoredAgent, load, stored_policies
+from cprl.training.agents import LoadedRun, StoredAgent, check_scripted, load, stored_policies
 
 Focal: TypeAlias = Literal["majority", "minority"]
 """How many agents are focal: "majority", all but one; "minority", one."""
@@ -405,13 +404,13 @@ def _focal(run: LoadedRun, focal: FocalAgents, agent: int) -> Member:
     """The agent in a focal place."""
     if focal == "run":
         return lambda replica: run.agent(agent, replica=replica)
-    return lambda _: StoredAgent(("scripted", focal))
+    return lambda _: StoredAgent(scripted=focal)
 
 
 def _background(spec: Scripted | Frozen, stored: Mapping[str, LoadedRun]) -> Member:
     """The agent in a background place; see `Scenario.background`."""
     if isinstance(spec, Scripted):
-        return lambda _: StoredAgent(("scripted", spec.policy))
+        return lambda _: StoredAgent(scripted=spec.policy)
     run = stored[spec.run]
 
     def theirs(replica: int) -> StoredAgent:

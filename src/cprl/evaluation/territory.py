@@ -34,7 +34,7 @@ from cprl.measuring.movement import Trace, overlap, owners, trace, visits
 from cprl.measuring.statistics import Estimate, estimate
 from cprl.policies.assignment import AgentPolicies
 from cprl.terminal import style
-from cprl.training.stored import LoadedRun
+from cprl.training.agents import LoadedRun
 
 Array = NDArray[Any]
 Policy = Literal["trained", "random"]

@@ -91,6 +91,8 @@ class Checkpointer:
         self.every_s, self.keep_ending, self._take_over = every_s, keep_ending, take_over
         self.resume_command = command_to_resume(run) if resume_command is None else resume_command
         self.console = console or safe_console()
+        self.has_begun = False
+        """Whether a training has begun, or was resumed."""
         self._saved = time.monotonic()
         self._is_training = True
         self._asked_to_stop: int | None = None
@@ -122,9 +124,11 @@ class Checkpointer:
             self._saved = time.monotonic()
             self._sound = path if _is_sound(training) else None
             self._has_ending |= training.is_ending
+            self.has_begun = True
             return
         if reasons:
             raise ValueError("no checkpoint can be read: " + "; ".join(reasons)) from cause
+        self.has_begun = True
 
     def after_step(self, training: HasState) -> None:
         """Saves a checkpoint if one is due, or if the process was asked to stop; then stops it."""

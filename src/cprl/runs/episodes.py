@@ -197,6 +197,16 @@ def read_table(path: str | os.PathLike[str]) -> pa.Table:
         raise ValueError(f"{path} is not a table: {error}") from error
 
 
+EVALUATIONS: Final = "evaluation/training.parquet"
+"""The evaluations while a run was trained: the columns of `episodes.parquet`, after "trained_episodes", the
+episodes that the agents had been trained; "episode" counts those of an evaluation."""
+
+
+def read_evaluations(run: Path) -> pa.Table | None:
+    """The table of `EVALUATIONS`; None for a run without `Experiment.evaluate_every`, or before the first."""
+    return read_table(run / EVALUATIONS) if (run / EVALUATIONS).exists() else None
+
+
 def as_table(episodes: Sequence[Episode], replica: int) -> pa.Table:
     """At least one episode of a replica as a table with the columns of a run's table."""
     return pa.Table.from_batches([rows_of(episodes, replica, schema_of(episodes[0]))])

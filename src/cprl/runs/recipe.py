@@ -6,8 +6,9 @@ import platform
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from itertools import count
@@ -35,6 +36,19 @@ PACKAGES: Final = ("cprl", "torch", "torchrl", "tensordict", "numpy", "numba", "
 """The packages whose versions are recorded."""
 
 
+_COMMAND: Final[ContextVar[Sequence[str] | None]] = ContextVar("command", default=None)
+
+
+@contextmanager
+def started_by(command: Sequence[str]) -> Iterator[None]:
+    """Within the block runs begin, and are resumed, by a command line, script first."""
+    token = _COMMAND.set(command)
+    try:
+        yield
+    finally:
+        _COMMAND.reset(token)
+
+
 def start_run(
     out: Path | None,
     name: str,
@@ -47,7 +61,7 @@ def start_run(
     Args:
         out: the directory, new or empty; None for `runs/<name>-<YYYYmmdd-HHMMSS>` in the working directory.
         to_recipe: makes the recipe for a directory, e.g. `cprl.Experiment.to_recipe`.
-        command: the command line, script first; by default that of this process.
+        command: the command line, script first; by default that of `started_by`, or of this process.
 
     Returns:
         The directory. Its `recipe.json` holds the recipe, versions, the git commit of the code of cprl (see
@@ -73,7 +87,7 @@ def start_run(
                 **_circumstances(recipe),
                 **_code_text(recipe),
                 "started": started.isoformat(timespec="seconds"),
-                "command": _command(sys.argv if command is None else command),
+                "command": _command(command or _COMMAND.get() or sys.argv),
             }
             write_json(directory / RECIPE_FILE, recipe)
     except BaseException:
@@ -223,9 +237,10 @@ def resume_command(run: Path, command: Sequence[str] | None = None) -> str:
     """The command line that resumes a run.
 
     Args:
-        command: the command line that started or resumed it, script first; None for a run that was started
-            from Python without one, which `cprl run` resumes.
+        command: the command line that started or resumed it, script first; by default that of `started_by`.
+            A run that was started from Python without one is resumed by `cprl run`.
     """
+    command = command or _COMMAND.get()
     if command is None:
         from cprl.custom import custom_targets
 

@@ -1,7 +1,7 @@
 """Figures of a run, plotted from its table of episodes alone."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Final
@@ -18,6 +18,7 @@ from cprl.measuring.phases import UNNAMED as UNNAMED
 from cprl.measuring.phases import Phase
 from cprl.measuring.statistics import institution_metrics
 from cprl.runs.curves import SMOOTHED_EPISODES, centres, curves_of, episode_of_step, phases_of, running_mean
+from cprl.runs.episodes import read_evaluations
 from cprl.terminal import style
 from cprl.terminal.style import MARK, SMALL_PT, WIDTH_IN
 
@@ -121,6 +122,8 @@ class _Panel:
     """[R, E]."""
     random: float | None
     """The mean of random play."""
+    evaluated: tuple[Values, Values] | None = None
+    """The episodes of evaluations, and their means over replicas and episodes."""
 
 
 def training_curve(
@@ -139,7 +142,8 @@ def training_curve(
     violations and fines of all agents.
 
     Args:
-        random: episodes of the random policy, whose means are dashed lines.
+        random: episodes of the random policy, whose means are dashed lines; those of evaluations while the
+            agents were trained are points.
         smoothed: the largest window of the running means, in episodes; they take in at most 1/20 of all.
         exploration_steps: the environment step of a replica at which exploration ends, see
             `cprl.population.exploration_steps`; a tick marks its episode.
@@ -149,7 +153,7 @@ def training_curve(
     """
     title = title.encode("utf-8", "replace").decode()
     curves = curves_of(run)
-    panels = _panels(curves, random)
+    panels = [replace(panel, evaluated=_evaluated(run, panel.name)) for panel in _panels(curves, random)]
     episodes = panels[0].values.shape[1]
     window = min(smoothed, max(1, episodes // PARTS))
     ours = bands_of(phases_of(curves, centred=True) or [])
@@ -191,6 +195,20 @@ def _panels(curves: dict[str, Values], random: list[Episode] | None) -> list[_Pa
     return [whole, *of_institutions]
 
 
+def _evaluated(run: Path, name: str) -> tuple[Values, Values] | None:
+    """The episodes after which agents were evaluated, counted from 0, and the means of a metric, or of the
+    return of all agents; None where nothing was evaluated."""
+    table = read_evaluations(run)
+    if table is None or name not in table.column_names:
+        return None
+    trained = table["trained_episodes"].to_numpy()
+    values = table[name].to_numpy().astype(np.float64)
+    if name == "return":
+        values = values * (table["agent"].to_numpy().max() + 1)
+    at = np.unique(trained)
+    return at - 1.0, np.array([np.nanmean(values[trained == episodes]) for episodes in at])
+
+
 def _panel(name: str, values: Values, random: list[Episode] | None) -> _Panel:
     played = [{**one.metrics, **_of_institutions(one)} for one in random or ()]
     if played and name not in played[0]:
@@ -217,6 +235,8 @@ def _draw(axes: Axes, panel: _Panel, window: int, dashed: str) -> None:
         lines[0].set_label("each replica, running mean")
     label = f"mean of the {replicas} replicas, running mean" if several else "running mean"
     axes.plot(at, means.mean(0), color=style.MEAN, linewidth=2.4, marker=dot, label=label, zorder=3)
+    if panel.evaluated is not None:
+        axes.plot(*panel.evaluated, **style.EVALUATED, label="greedy, evaluated while trained", zorder=3.5)
     if panel.random is not None:
         axes.axhline(panel.random, **style.RANDOM_LINE, label=dashed)
     axes.set_ylabel(panel.title)

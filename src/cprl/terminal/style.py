@@ -36,6 +36,13 @@ REPLICA: Final = "#6baed6"
 INTERVAL: Final = "#4292c6"
 RAW: Final = "#b5b5b5"
 RANDOM_LINE: Final[dict[str, Any]] = {"color": "#555555", "linestyle": "--", "linewidth": 1.4, "zorder": 2.5}
+EVALUATED: Final[dict[str, Any]] = {
+    "color": "#d94801",
+    "linewidth": 1.2,
+    "marker": "D",
+    "markersize": 4,
+    "markerfacecolor": "white",
+}
 PUBLISHED: Final = "#000000"
 MARK: Final = "#a50f15"
 _EDGE: Final = "#303030"

@@ -4,8 +4,7 @@ Modules, in the order in which one reads them:
     collectors  one step of all worlds after the other
     finite      what is NaN or infinite in a training, found and named
     training    Training: one step after the other, with a state that can be read and set; train; callbacks
-    stored      load: a run built again from its directory; its agents as policies
-    agents      the learners and policies of a population, also those of earlier runs
+    agents      the agents of a population; load: those that an earlier run learned
     outcome     what is made of an experiment, and the trained agents in fresh worlds
     running     run: an experiment from its learners to its report
 """

@@ -1,30 +1,38 @@
-"""Population: the learners and policies of a population, in every replica; agents of earlier runs too."""
+"""The agents of a population, of whatever kind; those that earlier runs learned are read by `load`."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import torch
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
+from cprl.checks import shown
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom, made
-from cprl.envs.make_env import spaces_of
+from cprl.envs.make_env import make_env, spaces_of
+from cprl.envs.state import load_transforms_state
 from cprl.envs.unwrap import commons_of
+from cprl.experiment import Experiment
 from cprl.learners.base import Learner
-from cprl.learners.decisions import Bandit, BanditDecider
+from cprl.learners.decisions import Bandit, BanditDecider, stored_decisions
 from cprl.learners.lanes import EVALUATION, EXHIBITION, EXPLORATION, lane_name, lane_seeds
 from cprl.learners.preferences import named
 from cprl.networks.agent import acting_part
-from cprl.networks.recurrent import state_shape_of
+from cprl.networks.finite import all_finite
+from cprl.networks.recurrent import state_cells_of, state_shape_of
+from cprl.networks.stacked import stack_lanes
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import ballot_sizes, decider_by_chance
-from cprl.policies.lanes import random_agents
+from cprl.policies.lanes import actor_of_lanes, random_agents
 from cprl.policies.present import PresentPolicy
-from cprl.policies.scripted import scripted_lanes
+from cprl.policies.scripted import ScriptedPolicy, scripted_lanes
 from cprl.population import (
     AgentSpec,
     Frozen,
@@ -34,8 +42,297 @@ from cprl.population import (
     grouped,
     refuse_sharing,
     refuse_undecided,
+    specs_by_agent,
 )
-from cprl.training.stored import LoadedRun, StoredAgent, load, stored_actor
+from cprl.runs.checkpoints import FOLDER
+from cprl.runs.episodes import read_episodes
+from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, say_changes
+from cprl.runs.weights import kept_of, weights_of
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StoredAgent:
+    """An agent that does not learn any more: how it acts, and its network if it has one."""
+
+    scripted: ScriptedPolicy | None = None
+    """The policy that it follows; None for an agent that acts by a network."""
+    network: nn.Module | None = field(default=None, repr=False)
+    stochastic: bool = False
+    """Whether the network outputs the logits of a policy; else it outputs action values."""
+    epsilon: float = 0.0
+    """The probability of a random action in evaluation."""
+    algorithm: str = field(default="", repr=False)
+    """What it learned by."""
+    decisions: Tensor | None = field(default=None, repr=False)
+    """The values of its choices on all ballots, float64 [C]; None if it decides by chance, or nothing."""
+
+    @property
+    def kind(self) -> tuple[Any, ...]:
+        """What agents have in common that can be lanes of one actor."""
+        return self.scripted, self.stochastic, self.epsilon, self.algorithm
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LoadedRun:
+    """A run, built again from its directory alone; see `load`."""
+
+    path: Path
+    experiment: Experiment
+    recipe: Mapping[str, Any]
+    """What `recipe.json` holds."""
+    networks: Mapping[str, nn.Module]
+    """The trained acting network of each lane, by "replica_0/agent_0" and so on."""
+    weights_from: Path
+    """The file that held them: of a run that has not ended, its newest checkpoint."""
+    transforms_state: Mapping[str, Any]
+    """What the transforms of the environment had learned."""
+    decisions: Mapping[str, Tensor] = field(default_factory=dict)
+    """The values of what each lane decides, see `cprl.policies.decisions`; empty where it decides nothing."""
+    allow: tuple[str, ...] = ()
+    _earlier: dict[str, "LoadedRun"] = field(default_factory=dict, repr=False)
+    """Runs whose agents are frozen in this one, read once."""
+
+    def __repr__(self) -> str:
+        experiment = self.experiment
+        return (
+            f"LoadedRun({str(self.path)!r}, {experiment.name!r}, {experiment.episodes} episodes, "
+            f"{experiment.replicas} replicas, {self.game.agents} agents)"
+        )
+
+    @cached_property
+    def game(self) -> Any:
+        """What was played."""
+        return made(self.experiment.game)
+
+    @property
+    def specs(self) -> list[AgentSpec]:
+        """The specification of each agent."""
+        return specs_by_agent(self.experiment.agents, self.game.agents)
+
+    @cached_property
+    def spaces(self) -> Spaces:
+        """What its agents observe and may do, transforms included."""
+        return spaces_of(self.env())
+
+    @property
+    def playing(self) -> Game | Spaces:
+        """What policies are made for: the game, or its spaces alone where it is none of cprl's."""
+        return self.game if isinstance(self.game, Game) else self.spaces
+
+    @property
+    def replicas(self) -> list[int]:
+        """The numbers of its replicas."""
+        numbers = sorted({int(lane.split("/")[0].removeprefix("replica_")) for lane in self.networks})
+        return numbers or list(range(self.experiment.replicas))
+
+    def env(self, worlds: int = 1, *, seed: int = 0, first_world: int = 0) -> EnvBase:
+        """So many fresh worlds of the run's game, with its transforms as they were at the end."""
+        env = make_env(
+            self.game,
+            worlds=worlds,
+            seed=seed,
+            first_world=first_world,
+            transforms=self.experiment.transforms,
+        )
+        load_transforms_state(env, self.transforms_state)
+        return env
+
+    def agent(self, agent: int, *, replica: int = 0) -> StoredAgent:
+        """An agent of a replica."""
+        if not 0 <= agent < self.game.agents:
+            raise ValueError(f"agent is {agent}; {self.path} has the agents 0 to {self.game.agents - 1}")
+        spec = self.specs[agent]
+        if isinstance(spec, Scripted):
+            return StoredAgent(scripted=spec.policy)
+        if isinstance(spec, Frozen):
+            if spec.run not in self._earlier:
+                weights = weights_of(self.recipe, self.path, spec.run)
+                self._earlier[spec.run] = load(spec.run, weights=weights, allow=self.allow)
+            return self._earlier[spec.run].agent(spec.agent, replica=spec.replica_for(replica))
+        lane = lane_name(replica, agent)
+        if lane not in self.networks:
+            raise ValueError(f"{self.path} keeps no network of {lane}; kept are {sorted(self.networks)}")
+        if not all_finite(self.networks[lane].state_dict().values()):
+            raise ValueError(
+                f"{self.weights_from}: the weights of {lane} are NaN or infinite; leave that replica out"
+            )
+        return _trained(spec, self.networks[lane], self._decisions_of(lane))
+
+    def _decisions_of(self, lane: str) -> Tensor | None:
+        sizes = ballot_sizes(self.game) if isinstance(self.game, Game) else ()
+        values = self.decisions.get(lane)
+        if not sizes:
+            return None
+        if not isinstance(values, Tensor) or values.shape != (sum(sizes),) or values.isnan().any():
+            raise ValueError(
+                f"{self.path} keeps {shown(values)} of what {lane} decides; allowed: {sum(sizes)} values"
+            )
+        return values
+
+    def policy(self, replica: int = 0, *, worlds: int = 1, seed: int = 0) -> AgentPolicies:
+        """The agents of a replica in so many worlds side by side; those that learned explore as in evaluation
+        where asked to, by random numbers that follow from the seed.
+        """
+        agents = [[self.agent(agent, replica=replica)] for agent in range(self.game.agents)]
+        return stored_policies(agents, self.playing, replicas=[replica], worlds=worlds, seed=seed)
+
+    def episodes(self) -> pa.Table:
+        """The table of episodes; see `cprl.runs.episodes.read_episodes`."""
+        return read_episodes(self.path)
+
+
+def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = ()) -> LoadedRun:
+    """Builds a run again from its directory; runs no code that it holds.
+
+    Warns on standard error where the user's own code is no longer what the run was made with.
+
+    Files outside the directory are read for `Frozen` agents alone: the recipe names their runs by paths,
+    which may lead anywhere, e.g. "../other". They are read when such an agent is asked for, without code.
+
+    Args:
+        weights: which of those in its `checkpoints/`: "final", "best" where the recipe keeps them, or
+            "final-4800" of a run that was extended from so many episodes; by default the final ones, or those
+            of the newest readable checkpoint where the run has not ended.
+        allow: the targets, "module:Class", of the user's own code that the run may import.
+    """
+    run = Path(run)
+    if weights is not None and (Path(weights).name != weights or weights in ("", "..")):
+        raise ValueError(f'weights is {weights!r}; allowed: a name in {run / FOLDER}, such as "final"')
+    recipe = read_recipe(run)
+    try:
+        experiment = Experiment.from_recipe(recipe, directory=run, allow=allow)
+    except ValueError as error:
+        raise ValueError(f"{run / RECIPE_FILE}: {error}") from error
+    say_changes(run, [f"the text of {module}, which its recipe keeps" for module in changed_code(recipe)])
+    kept_weights = kept_of(run, weights)
+    networks: dict[str, nn.Module] = {}
+    loaded = LoadedRun(
+        path=run,
+        experiment=experiment,
+        recipe=recipe,
+        networks=networks,
+        weights_from=kept_weights.path,
+        transforms_state=kept_weights.transforms,
+        decisions=kept_weights.decisions,
+        allow=tuple(allow),
+    )
+    with torch.random.fork_rng(devices=[]):  # networks draw weights at first, which the kept ones replace
+        networks |= _networks(loaded, kept_weights.networks)
+    return loaded
+
+
+def _networks(run: LoadedRun, weights: Mapping[str, Any]) -> dict[str, nn.Module]:
+    networks = {}
+    no_network = f"{run.path / RECIPE_FILE}: a network cannot be made"
+    reason = no_weights = f"{run.weights_from} holds no weights of this run"
+    try:
+        for name, state in weights.items():
+            lane = name if "/" in name else f"replica_0/{name}"
+            spec = run.specs[int(lane.rpartition("_")[2])]
+            if not isinstance(spec, Learning | Team):
+                raise ValueError(f"{lane} is the network of an agent that does not learn")
+            reason = no_network
+            network = acting_part(made(spec.algorithm).make_network(run.spaces))
+            reason = no_weights
+            network.load_state_dict(state)
+            networks[lane] = network
+    except Exception as error:
+        raise ValueError(f"{reason}: {error}") from error
+    if not networks and any(isinstance(spec, Learning | Team) for spec in run.specs):
+        raise ValueError(f"{no_weights}: it is empty")
+    if networks and not any(all_finite(network.state_dict().values()) for network in networks.values()):
+        raise ValueError(f"{no_weights}: all are NaN or infinite")
+    return networks
+
+
+def _trained(spec: Learning | Team, network: nn.Module, decisions: Tensor | None) -> StoredAgent:
+    algorithm = made(spec.algorithm)
+    stochastic = bool(algorithm.stochastic)
+    return StoredAgent(
+        network=network,
+        stochastic=stochastic,
+        epsilon=0.0 if stochastic else float(getattr(algorithm.settings, "epsilon_evaluation", 0.0)),
+        algorithm=repr(spec.algorithm),
+        decisions=decisions,
+    )
+
+
+def stored_policies(
+    agents: Sequence[Sequence[StoredAgent]],
+    playing: Game | Spaces,
+    *,
+    replicas: Sequence[int],
+    worlds: int,
+    seed: int,
+) -> AgentPolicies:
+    """Stored agents as the policies of all agents of some replicas, agents of one kind as lanes of one actor.
+
+    Args:
+        agents: by agent and replica.
+        seed: what random numbers follow from, with the replica and the agent.
+    """
+    alike: dict[Any, list[int]] = {}
+    for agent, of_replicas in enumerate(agents):
+        alike.setdefault(of_replicas[0].kind, []).append(agent)
+    actors: dict[AgentIndices, nn.Module] = {}
+    for together in alike.values():
+        seeds = lane_seeds(seed, replicas=replicas, agents=together, purpose=EVALUATION)
+        lanes = [agents[agent][place] for place in range(len(replicas)) for agent in together]
+        actors[tuple(together)] = _actor(
+            lanes, playing, seeds=seeds, agents=len(together), worlds=worlds, stacks=True
+        )
+    decisions = None
+    if isinstance(playing, Game):
+        values = [[stored.decisions for stored in of_replicas] for of_replicas in agents]
+        decisions = stored_decisions(values, playing, replicas=replicas, worlds=worlds, seed=seed)
+    return AgentPolicies(actors, decisions=decisions)
+
+
+def _actor(
+    lanes: Sequence[StoredAgent],
+    playing: Game | Spaces,
+    *,
+    seeds: Sequence[Sequence[int]],
+    agents: int,
+    worlds: int,
+    stacks: bool = False,
+) -> nn.Module:
+    """One actor for stored agents of one kind, a lane each.
+
+    Args:
+        seeds: of each lane, lane = replica x agents + agent.
+        agents: how many agents of a replica it controls.
+        stacks: whether lanes of one and the same network are stacked too, so that its values are, to the last
+            bit, those that it has among others.
+    """
+    first = lanes[0]
+    of_lanes: dict[str, Any] = {"seeds": seeds, "agents": agents, "worlds": worlds}
+    if first.scripted is not None:
+        return scripted_lanes(first.scripted, playing, **of_lanes)
+    networks: list[Any] = [lane.network for lane in lanes]
+    actor = actor_of_lanes(
+        _side_by_side(networks, stacks=stacks),
+        playing.spaces if isinstance(playing, Game) else playing,
+        stochastic=first.stochastic,
+        state_cells=state_cells_of(networks[0]),
+        **of_lanes,
+    )
+    actor.epsilon = first.epsilon
+    return actor
+
+
+def _side_by_side(networks: Sequence[nn.Module], *, stacks: bool) -> Callable[..., Any]:
+    """What all networks give for what their lanes see, [L, k, ...] to [L, k, A]; of recurrent ones also their
+    states."""
+    first = networks[0]
+    if not stacks and all(network is first for network in networks):
+        first.requires_grad_(False)
+        return lambda *seen: first(*seen)
+    try:
+        stack = stack_lanes(networks)
+    except ValueError:  # of a form that does not stack, e.g. a network of the user's own
+        return lambda seen: torch.stack([network(lane) for network, lane in zip(networks, seen, strict=True)])
+    return lambda *seen: stack(*seen)
 
 
 class Population:
@@ -66,75 +363,29 @@ class Population:
         starts: bool = True,
         weights: Mapping[str, str] | None = None,
     ) -> None:
-        self.spaces, self.specs = spaces_of(env), tuple(specs)
-        self.replicas, self.seed, self._first = env.batch_size.numel(), seed, first_replica
+        self.spaces, self.specs, self.seed = spaces_of(env), tuple(specs), seed
+        self.replicas = env.batch_size.numel()
         commons = commons_of(env)
         self._game = None if commons is None else commons.game
         self._device = env.device or torch.device("cpu")
         self._groups = grouped(specs, self.spaces.agents)
         check_scripted(self._groups, self.spaces, self._game)
-        numbers = range(first_replica, first_replica + self.replicas)
-        frozen = (spec for spec, _ in self._groups if isinstance(spec, Frozen))
-        named_weights = {} if weights is None else weights
-        self._frozen = frozen_agents(frozen, self.spaces, self._game, allow, numbers, named_weights)
-        self._acting = _acting_together(self._groups, self._frozen)
-        who = {
-            "replicas": self.replicas,
-            "seed": seed,
-            "first_replica": first_replica,
-            "engine": engine,
-            "device": self._device,
-        }
+        self._numbers = range(first_replica, first_replica + self.replicas)
+        self._frozen = self._frozen_agents(allow, weights or {})
+        self._acting = self._acting_together()
         self.learners: dict[tuple[int, ...], Learner] = {}
         for spec, agents in self._groups:
             if isinstance(spec, Learning | Team):
-                start = start_weights(spec, agents, self.spaces, self._game, numbers, allow) if starts else {}
-                self.learners[agents] = _learner(
-                    spec, self.spaces, agents, {**who, "start_from": start} if start else who
-                )
+                start = self._start_weights(spec, agents, allow) if starts else {}
+                self.learners[agents] = self._learner(spec, agents, engine, start)
         self.others: dict[AgentIndices, nn.Module] = self._others(EXPLORATION, worlds=1)
         self.decisions: BanditDecider | None = self._decisions()
         """What the agents decide, and learn to, where the game asks them."""
 
-    def _decisions(self) -> BanditDecider | None:
-        sizes = () if self._game is None else ballot_sizes(self._game)
-        refuse_undecided(self.specs, len(sizes))
-        if not sizes:
-            return None
-        bandits: list[Bandit | None] = [None] * self.spaces.agents
-        stored: dict[int, list[Tensor]] = {}
-        for spec, agents in self._groups:
-            for agent in agents:
-                if isinstance(spec, Learning | Team):
-                    bandits[agent] = spec.decisions or Bandit()
-                elif isinstance(spec, Frozen):
-                    values = [own.decisions for own in self._frozen[spec] if own.decisions is not None]
-                    stored |= {agent: values} if values else {}  # a scripted agent of that run has none
-        return BanditDecider(
-            sizes,
-            bandits=bandits,
-            stored=stored,
-            replicas=self.replicas,
-            seed=self.seed,
-            first_replica=self._first,
-        )
-
-    def _others(
-        self, purpose: int, *, worlds: int, replicas: int | None = None
-    ) -> dict[AgentIndices, nn.Module]:
-        """The actors of the agents that do not learn, with random numbers for a purpose; for so many
-        replicas, all by default."""
-        actors: dict[AgentIndices, nn.Module] = {}
-        numbers = range(self._first, self._first + (replicas or self.replicas))
-        for agents, specs in self._acting.items():
-            how: dict[str, Any] = {"agents": len(agents), "worlds": worlds}
-            how["seeds"] = lane_seeds(self.seed, replicas=numbers, agents=agents, purpose=purpose)
-            if isinstance(specs[0], Scripted):
-                actors[agents] = scripted_lanes(specs[0].policy, self._game or self.spaces, **how)
-            else:
-                stored = [self._frozen[spec][place] for place in range(len(numbers)) for spec in specs]
-                actors[agents] = stored_actor(stored, self._game or self.spaces, **how)
-        return actors
+    @property
+    def playing(self) -> Game | Spaces:
+        """What policies are made for, see `LoadedRun.playing`."""
+        return self._game or self.spaces
 
     def policy(self, worlds: int) -> AgentPolicies:
         """All agents as they are now, in so many worlds of each replica side by side; those that learn values
@@ -152,11 +403,13 @@ class Population:
                 agents: (learner.evaluation_actor(1), learner.actor)
                 for agents, learner in self.learners.items()
             }
-            others = self._others(EXHIBITION, worlds=1, replicas=1)
-            own = self.decisions
-            decisions = None if own is None else (own.first_replica(), own)
+            decisions = self.decisions
             return PresentPolicy(
-                actors, others, decisions=decisions, replicas=self.replicas, device=self._device
+                actors,
+                self._others(EXHIBITION, worlds=1, replicas=1),
+                decisions=None if decisions is None else (decisions.first_replica(), decisions),
+                replicas=self.replicas,
+                device=self._device,
             )
 
     def random_policy(self, worlds: int) -> AgentPolicies:
@@ -176,37 +429,138 @@ class Population:
             for name, network in learner.networks().items()
         }
 
+    def as_stored(self, replicas: Sequence[int]) -> list[list[StoredAgent]]:
+        """Copies of the agents as they are now, by agent and replica, of these replicas."""
+        networks = self.networks()
+        decisions = {} if self.decisions is None else self.decisions.learned()
+        agents: dict[int, list[StoredAgent]] = {}
+        for spec, indices in self._groups:
+            for agent in indices:
+                lanes = {replica: lane_name(replica, agent) for replica in replicas}
+                agents[agent] = [
+                    _trained(spec, networks[lane], decisions.get(lane))
+                    if isinstance(spec, Learning | Team)
+                    else self._unlearning(spec, self._numbers.index(replica))
+                    for replica, lane in lanes.items()
+                ]
+        return [agents[agent] for agent in sorted(agents)]
 
-def _acting_together(
-    groups: Sequence[tuple[AgentSpec, tuple[int, ...]]], stored: Mapping[Frozen, Sequence[StoredAgent]]
-) -> dict[tuple[int, ...], tuple[Any, ...]]:
-    """The specification of each agent that does not learn, by the agents that act as lanes of one actor:
-    scripted ones that are specified alike, and agents of one kind from one stored run."""
-    alike: dict[Any, dict[int, Scripted | Frozen]] = {}
-    for spec, agents in groups:
-        if isinstance(spec, Scripted | Frozen):
-            key = spec if isinstance(spec, Scripted) else (spec.run, stored[spec][0].kind)
-            alike.setdefault(key, {}).update(dict.fromkeys(agents, spec))
-    together = [dict(sorted(specs.items())) for specs in alike.values()]
-    return {tuple(specs): tuple(specs.values()) for specs in together}
+    def _frozen_agents(
+        self, allow: Sequence[str], weights: Mapping[str, str]
+    ) -> dict[Frozen, list[StoredAgent]]:
+        """The stored agent of each replica, by specification; each run is read once."""
+        runs: dict[str, LoadedRun] = {}
+        agents = {}
+        for spec, _ in self._groups:
+            if isinstance(spec, Frozen):
+                if spec.run not in runs:
+                    run = load(spec.run, weights=weights.get(spec.run), allow=allow)
+                    _refuse_unfitting(run, self.spaces, self._game, is_to_decide=True)
+                    runs[spec.run] = run
+                agents[spec] = [
+                    runs[spec.run].agent(spec.agent, replica=spec.replica_for(replica))
+                    for replica in self._numbers
+                ]
+        return agents
 
+    def _acting_together(self) -> list[dict[int, Scripted | Frozen]]:
+        """The specifications of agents that do not learn, by their indices; those of a group act as lanes of
+        one actor: scripted ones that are specified alike, and agents of one kind from one stored run."""
+        alike: dict[Any, dict[int, Scripted | Frozen]] = {}
+        for spec, agents in self._groups:
+            if isinstance(spec, Scripted | Frozen):
+                key = spec if isinstance(spec, Scripted) else (spec.run, self._frozen[spec][0].kind)
+                alike.setdefault(key, {}).update(dict.fromkeys(agents, spec))
+        return [dict(sorted(specs.items())) for specs in alike.values()]
 
-def _learner(spec: Learning | Team, spaces: Spaces, agents: tuple[int, ...], who: dict[str, Any]) -> Learner:
-    sharing: dict[str, Any] = (
-        {"share_parameters": True} if isinstance(spec, Team) and spec.share_parameters else {}
-    )
-    learner = algorithm_of(spec).make_learner(
-        spaces, agents=agents, reward_kind=spec.reward, **sharing, **who
-    )
-    wants = getattr(learner, "wants", None)
-    if not isinstance(spec.reward, str) and getattr(wants, "preferences", None) != spec.reward:
-        own = spec.algorithm
-        name = own.target if isinstance(own, Custom) else type(own).__name__
-        raise ValueError(
-            f"reward is {named(spec.reward)}, which the learner of {name} does not have as its `wants`; "
-            "allowed for it: 'individual', 'team'"
+    def _others(
+        self, purpose: int, *, worlds: int, replicas: int | None = None
+    ) -> dict[AgentIndices, nn.Module]:
+        """The actors of the agents that do not learn, with random numbers for a purpose; for so many
+        replicas, all by default."""
+        numbers = self._numbers[:replicas]
+        actors: dict[AgentIndices, nn.Module] = {}
+        for group in self._acting:
+            agents, places = tuple(group), range(len(numbers))
+            lanes = [self._unlearning(spec, place) for place in places for spec in group.values()]
+            seeds = lane_seeds(self.seed, replicas=numbers, agents=agents, purpose=purpose)
+            actors[agents] = _actor(lanes, self.playing, seeds=seeds, agents=len(agents), worlds=worlds)
+        return actors
+
+    def _unlearning(self, spec: Scripted | Frozen, place: int) -> StoredAgent:
+        """An agent that does not learn, of the replica at a place."""
+        return StoredAgent(scripted=spec.policy) if isinstance(spec, Scripted) else self._frozen[spec][place]
+
+    def _decisions(self) -> BanditDecider | None:
+        sizes = () if self._game is None else ballot_sizes(self._game)
+        refuse_undecided(self.specs, len(sizes))
+        if not sizes:
+            return None
+        bandits: list[Bandit | None] = [None] * self.spaces.agents
+        stored: dict[int, list[Tensor]] = {}
+        for spec, agents in self._groups:
+            for agent in agents:
+                if isinstance(spec, Learning | Team):
+                    bandits[agent] = spec.decisions or Bandit()
+                elif isinstance(spec, Frozen):
+                    values = [one.decisions for one in self._frozen[spec] if one.decisions is not None]
+                    stored |= {agent: values} if values else {}  # a scripted agent of that run has none
+        return BanditDecider(
+            sizes,
+            bandits=bandits,
+            stored=stored,
+            replicas=self.replicas,
+            seed=self.seed,
+            first_replica=self._numbers.start,
         )
-    return learner
+
+    def _learner(
+        self, spec: Learning | Team, agents: tuple[int, ...], engine: Any, start: Mapping[str, Any]
+    ) -> Learner:
+        more: dict[str, Any] = {"start_from": start} if start else {}
+        if isinstance(spec, Team) and spec.share_parameters:
+            more["share_parameters"] = True
+        learner = _algorithm_of(spec).make_learner(
+            self.spaces,
+            agents=agents,
+            reward_kind=spec.reward,
+            replicas=self.replicas,
+            seed=self.seed,
+            first_replica=self._numbers.start,
+            engine=engine,
+            device=self._device,
+            **more,
+        )
+        wants = getattr(learner, "wants", None)
+        if not isinstance(spec.reward, str) and getattr(wants, "preferences", None) != spec.reward:
+            algorithm = spec.algorithm
+            name = algorithm.target if isinstance(algorithm, Custom) else type(algorithm).__name__
+            raise ValueError(
+                f"reward is {named(spec.reward)}, which the learner of {name} does not have as its `wants`; "
+                "allowed for it: 'individual', 'team'"
+            )
+        return learner
+
+    def _start_weights(
+        self, spec: Learning | Team, agents: tuple[int, ...], allow: Sequence[str]
+    ) -> dict[str, dict[str, Tensor]]:
+        """The state dict of the acting network with which each agent of each replica starts, by the lane's
+        name; empty where they start anew."""
+        source = spec.start_from
+        if source is None:
+            return {}
+        run, algorithm = load(source.run, allow=allow), _algorithm_of(spec)
+        _refuse_unfitting(run, self.spaces, self._game)
+        is_team = isinstance(spec, Team)
+        sources = _members(run, source, len(agents)) if is_team else (source.agent,) * len(agents)
+        weights = {}
+        for replica in self._numbers:
+            there = source.replica_for(replica)
+            for agent, stored_agent in zip(agents, sources, strict=True):
+                where = f"{lane_name(there, stored_agent)} of {source.run}"
+                stored = run.agent(stored_agent, replica=there)
+                weights[lane_name(replica, agent)] = _weights(stored, algorithm, self.spaces, where)
+        return weights
 
 
 def check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game: Game | None) -> None:
@@ -217,13 +571,10 @@ def check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game
         spaces: what agents observe, transforms included.
         game: what is played; None for a game that is not a `Game`.
     """
+    if game is None or replace(spaces, vectors=()) == replace(game.spaces, vectors=()):
+        return
     for spec, agents in groups:
-        is_reading = isinstance(spec, Scripted) and spec.policy != "random"
-        if (
-            is_reading
-            and game is not None
-            and replace(spaces, vectors=()) != replace(game.spaces, vectors=())
-        ):
+        if isinstance(spec, Scripted) and spec.policy != "random":
             raise ValueError(
                 f"agents {list(agents)} follow {spec}, which reads the window of the game; transforms make "
                 f"it {spaces.observation_dtype} {list(spaces.observation_shape)}: leave those transforms "
@@ -231,108 +582,45 @@ def check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game
             )
 
 
-def frozen_agents(
-    specs: Iterable[Frozen],
-    spaces: Spaces,
-    game: Game | None,
-    allow: Sequence[str],
-    replicas: Sequence[int],
-    weights: Mapping[str, str],
-) -> dict[Frozen, list[StoredAgent]]:
-    """The stored agent of each replica, by specification; each run is read once.
-
-    Args:
-        spaces: what agents observe and may do here.
-        weights: the names of the weights, by run; of others the final ones.
-    """
-    specs = tuple(specs)
-    runs = {
-        path: _fitting_run(path, spaces, game, allow, weights=weights.get(path), is_to_decide=True)
-        for path in dict.fromkeys(spec.run for spec in specs)
+def _refuse_unfitting(
+    run: LoadedRun, spaces: Spaces, game: Game | None, *, is_to_decide: bool = False
+) -> None:
+    """Refuses a run that was trained for other observations or actions, or other ballots if its agents are to
+    decide here."""
+    pairs: dict[str, tuple[Any, Any]] = {
+        "observations": (run.spaces.observation_shape, spaces.observation_shape),
+        "observations of the dtype": (run.spaces.observation_dtype, spaces.observation_dtype),
+        "a number of actions of": (run.spaces.actions, spaces.actions),
     }
-    return {
-        spec: [runs[spec.run].agent(spec.agent, replica=spec.replica_for(replica)) for replica in replicas]
-        for spec in specs
-    }
-
-
-def _fitting_run(
-    path: str,
-    spaces: Spaces,
-    game: Game | None,
-    allow: Sequence[str],
-    *,
-    weights: str | None = None,
-    is_to_decide: bool = False,
-) -> LoadedRun:
-    """The stored run, refused where it was trained for other observations or actions, or other ballots if its
-    agents are to decide here."""
-    run = load(path, weights=weights, allow=allow)
-    theirs = run.spaces
-    differences: list[tuple[str, Any, Any]] = [
-        ("observations", theirs.observation_shape, spaces.observation_shape),
-        ("observations of the dtype", theirs.observation_dtype, spaces.observation_dtype),
-        ("a number of actions of", theirs.actions, spaces.actions),
-    ]
     if game is not None and isinstance(run.game, Game):
         if is_to_decide and game.ballots:
-            differences.append(("ballots", _asked(run.game), _asked(game)))
-        differences += [
-            ("a form of observation", run.game.observation, game.observation),
-            ("actions", run.game.actions, game.actions),
-            ("channels", run.game.channels, game.channels),
-            ("institutions that show", run.game.entries_shown, game.entries_shown),
-        ]
-    for name, came, here in differences:
-        if came != here:
-            raise ValueError(f"the agents of {path} have {name} {came}; this game has {here}")
-    return run
+            pairs["ballots"] = _ballots(run.game), _ballots(game)
+        pairs |= {
+            "a form of observation": (run.game.observation, game.observation),
+            "actions": (run.game.actions, game.actions),
+            "channels": (run.game.channels, game.channels),
+            "institutions that show": (run.game.entries_shown, game.entries_shown),
+        }
+    for name, (there, here) in pairs.items():
+        if there != here:
+            raise ValueError(f"the agents of {run.path} have {name} {there}; this game has {here}")
 
 
-def _asked(game: Game) -> list[tuple[str, tuple[float, ...]]]:
+def _ballots(game: Game) -> list[tuple[str, tuple[float, ...]]]:
     """What agents of a game decide on, and the choices."""
     return [(ballot.title, ballot.choices) for ballot in game.ballots]
 
 
-def start_weights(
-    spec: Learning | Team,
-    agents: tuple[int, ...],
-    spaces: Spaces,
-    game: Game | None,
-    replicas: Sequence[int],
-    allow: Sequence[str] = (),
-) -> dict[str, dict[str, Tensor]]:
-    """The state dict of the acting network with which each agent of each replica starts, by the lane's name;
-    empty where they start anew.
-
-    Args:
-        spaces: what they observe and may do.
-    """
-    source = spec.start_from
-    if source is None:
-        return {}
-    run, algorithm = _fitting_run(source.run, spaces, game, allow), algorithm_of(spec)
-    theirs = _members(run, source, len(agents)) if isinstance(spec, Team) else (source.agent,) * len(agents)
-    weights = {}
-    for replica in replicas:
-        for agent, stored_agent in zip(agents, theirs, strict=True):
-            taken = source.replica_for(replica)
-            where = f"{lane_name(taken, stored_agent)} of {source.run}"
-            stored = run.agent(stored_agent, replica=taken)
-            weights[lane_name(replica, agent)] = _weights(stored, algorithm, spaces, where)
-    return weights
-
-
 def _members(run: LoadedRun, source: Frozen, size: int) -> tuple[int, ...]:
     """The agents of the team that the stored agent is in."""
-    theirs = run.specs[source.agent] if source.agent < len(run.specs) else None
-    if not isinstance(theirs, Team) or len(theirs.agents) != size:
-        what = f"in a team of {len(theirs.agents)}" if isinstance(theirs, Team) else "in no team"
+    spec = run.specs[source.agent] if source.agent < len(run.specs) else None
+    if not isinstance(spec, Team) or len(spec.agents) != size:
+        where = f"in a team of {len(spec.agents)}" if isinstance(spec, Team) else "in no team"
         raise ValueError(
-            f"agent {source.agent} of {source.run} is {what}; allowed for a team of {size} to start from: a "
+            f"agent {source.agent} of {source.run} is {where}; allowed for a team of {size} to start from: a "
             f"member of a team of {size}"
         )
-    return theirs.agents
+    return spec.agents
 
 
 def _weights(stored: StoredAgent, algorithm: Algorithm, spaces: Spaces, where: str) -> dict[str, Tensor]:
@@ -340,11 +628,11 @@ def _weights(stored: StoredAgent, algorithm: Algorithm, spaces: Spaces, where: s
     name = type(algorithm).__name__
     if stored.network is None:
         raise ValueError(f"{where} is scripted, without weights; allowed: an agent that learned")
-    if stored.kind[1] != algorithm.stochastic:
-        kinds = {True: "the logits of a policy", False: "action values"}
+    if stored.stochastic != algorithm.stochastic:
+        outputs = {True: "the logits of a policy", False: "action values"}
         raise ValueError(
-            f"the network of {where} outputs {kinds[stored.kind[1]]}; {name} learns "
-            f"{kinds[algorithm.stochastic]}"
+            f"the network of {where} outputs {outputs[stored.stochastic]}; {name} learns "
+            f"{outputs[algorithm.stochastic]}"
         )
     weights = stored.network.state_dict()
     with torch.random.fork_rng(devices=[]), torch.no_grad():
@@ -359,26 +647,25 @@ def _weights(stored: StoredAgent, algorithm: Algorithm, spaces: Spaces, where: s
         seen = seen.to(getattr(torch, spaces.observation_dtype))
         shape = state_shape_of(network)
         state = () if shape is None else (torch.zeros(8, *shape),)
-        ours, theirs = network(seen, *state), stored.network(seen, *state)
-        if not all(
-            torch.equal(*pair) for pair in (zip(ours, theirs, strict=True) if state else [(ours, theirs)])
-        ):
+        outputs_here, outputs_there = network(seen, *state), stored.network(seen, *state)
+        pairs = zip(outputs_here, outputs_there, strict=True) if state else [(outputs_here, outputs_there)]
+        if not all(torch.equal(*pair) for pair in pairs):
             raise ValueError(
                 f"{where} has another network than {name} here: with the same weights the outputs differ"
             )
     return weights
 
 
-def algorithm_of(spec: Learning | Team) -> Algorithm:
+def _algorithm_of(spec: Learning | Team) -> Algorithm:
     """The algorithm of a specification; refuses code of the user's own that is none."""
     is_sharing = isinstance(spec, Team) and spec.share_parameters
-    wanted = TeamAlgorithm if isinstance(spec, Team) and not is_sharing else Algorithm
+    kind = TeamAlgorithm if isinstance(spec, Team) and not is_sharing else Algorithm
     algorithm = made(spec.algorithm)
-    if not isinstance(algorithm, wanted):
-        named = f" of {spec.algorithm.target}" if isinstance(spec.algorithm, Custom) else ""
+    if not isinstance(algorithm, kind):
+        target = f" of {spec.algorithm.target}" if isinstance(spec.algorithm, Custom) else ""
         raise ValueError(
-            f"the algorithm{named} is a {type(algorithm).__name__}; allowed: a subclass of "
-            f"cprl.algorithms.{wanted.__name__}"
+            f"the algorithm{target} is a {type(algorithm).__name__}; allowed: a subclass of "
+            f"cprl.algorithms.{kind.__name__}"
         )
     refuse_sharing(algorithm, is_sharing)
     return algorithm

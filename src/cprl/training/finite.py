@@ -1,11 +1,10 @@
 """FiniteCheck: finds losses, weights, rewards and observations that are NaN or infinite during a training.
 
-Rewards and losses are summed up as episodes are measured; these sums are looked at every `EVERY_STEPS` steps.
-Observations of floating-point numbers are looked at in every step; weights, as all else, at the end of
-episodes and before the state of a training is saved. One loss that is infinite is reported, even if the
-weights stay finite: most losses are means, so whatever the agent learned from that batch is lost. Weights
-that are not finite never become so again. "Weights" are all that a learner keeps of an agent: targets,
-critics and the state of its optimiser too.
+Rewards, losses and observations of floating-point numbers are summed up; the sums are looked at every
+`EVERY_STEPS` steps, when episodes end and before the state of a training is saved, the latter two times
+weights as well. One loss that is infinite is reported, even if the weights stay finite: most losses are
+means, so whatever the agent learned from that batch is lost. Weights that are not finite never become so
+again. "Weights" are all that a learner keeps of an agent: targets, critics and its optimiser's state too.
 """
 
 import warnings
@@ -13,23 +12,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from itertools import groupby
 from math import isfinite
-from typing import Any, Final, get_args
+from typing import Any, Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, float64
 
 from cprl import keys
-from cprl.checks import checked, one_of
 from cprl.commons.spaces import Spaces
 from cprl.experiment import OnNan
 from cprl.learners.base import LaneLosses, Learner
 
 EVERY_STEPS: Final = 16
-"""Steps between two looks at the sums of rewards and losses; to look in every step took 3 to 8 % of a
-training."""
+"""Steps between two looks at the sums; to look in every step took 3 to 8 % of a training."""
 
 _LEARNED: Final = ("loss", "weights")
 _NAMED: Final = 8
@@ -56,7 +52,7 @@ class NotFinite:
     """The replica, which is the world of the environment."""
     agent: int
     step: int
-    """The step at which it was found."""
+    """The step at which it was seen first."""
 
     @property
     def place(self) -> tuple[str, int, int]:
@@ -74,110 +70,77 @@ class FiniteCheck:
     def __init__(
         self, learners: Mapping[tuple[int, ...], Learner], spaces: Spaces, *, on_nan: OnNan = "stop"
     ) -> None:
-        checked("on_nan", on_nan, one_of(*get_args(OnNan)))
         self.on_nan, self.learners = on_nan, learners
-        self.found: list[NotFinite] = []
-        """Each agent and kind of number once, in the order in which they were found."""
+        self.reported: list[NotFinite] = []
+        """Each agent and kind of number once, in the order in which they were reported."""
         self.saved_step = 0
         """The step of the state that was last saved or loaded, 0 for none."""
-        self._places: set[tuple[str, int, int]] = set()
         is_float = "float" in spaces.observation_dtype
-        self._names = (*(("observation",) if is_float else ()), *dict(spaces.vectors))
-        self._finite_step = 0
-        self._is_fresh = True
+        self._entries = (*(("observation",) if is_float else ()), *dict(spaces.vectors))
         self._sums: dict[str, Tensor] = {}
+        self._is_fresh = True
+        self._weights_step = 0
 
-    @staticmethod
-    def is_on_cpu(tensor: Tensor) -> bool:
-        """Whether looking at a number costs no synchronisation."""
-        return tensor.is_cpu
-
-    def check_turn(self, batch: TensorDictBase, step: int) -> None:
-        """Checks the observations of a turn, [R].
-
-        Those on a GPU are summed up, which needs no synchronisation, and looked at in `check_weights`.
-        """
-        if not self._names:
+    def add(self, batch: TensorDictBase) -> None:
+        """Sums up what agents observe after a turn, [R]; this needs no synchronisation with a GPU."""
+        if not self._entries:
             return
-        following = keys.entry(keys.entry(batch, "next"), keys.AGENTS)
-        tensors = [(name, keys.entry(following, name)) for name in self._names]
+        seen = [keys.entry(keys.entry(batch, "next"), keys.AGENTS)]
         if self._is_fresh:  # the first observation after a reset was nobody's next
-            before = keys.entry(batch, keys.AGENTS)
-            tensors += [(name, keys.entry(before, name)) for name in self._names]
+            seen.append(keys.entry(batch, keys.AGENTS))
             self._is_fresh = False
-        for name, tensor in tensors:
-            if self.is_on_cpu(tensor):
-                array = tensor.numpy(force=True)
-                if not _sum_is_finite(array):
-                    sound = np.isfinite(array).reshape(*array.shape[:2], -1).all(-1)
-                    self._report(_marked(name, ~sound, range(array.shape[1]), step))
-            else:
-                kept = self._sums.get(name)
-                sums = tensor.reshape(*tensor.shape[:2], -1).sum(-1, dtype=torch.float64)
-                self._sums[name] = sums if kept is None else kept + sums
+        for name in self._entries:
+            for agents in seen:
+                entry: Tensor = keys.entry(agents, name)
+                sums = entry.reshape(*entry.shape[:2], -1).sum(-1, dtype=float64)
+                self._sums[name] = sums + self._sums[name] if name in self._sums else sums
 
-    def check_sums(
-        self, losses: Mapping[tuple[int, ...], LaneLosses], returns: NDArray[np.float64], step: int
+    def check(
+        self,
+        losses: Mapping[tuple[int, ...], LaneLosses],
+        returns: NDArray[np.float64],
+        step: int,
+        *,
+        weights: bool = False,
     ) -> None:
-        """Checks sums of losses and rewards; where one is not finite, everything else at once.
+        """Checks the sums; where one is not finite, or episodes have ended, weights too.
 
         Args:
             losses: by the indices of their agents.
             returns: the return of each agent in the running episode of each replica, or in the one that has
                 just ended, [R, N].
+            weights: whether to check them in any case.
 
         Raises:
             NotFiniteError: with "stop", see `OnNan`.
         """
-        found: list[NotFinite] = []
-        if not _sum_is_finite(returns):
-            found += _marked("reward", ~np.isfinite(returns), range(returns.shape[1]), step)
-        for agents, own in losses.items():
-            if not _sum_is_finite(own.total):
-                bad = _marked("loss", ~np.isfinite(own.total), agents, step)
-                found += [one for one in bad if ("weights", *one.place[1:]) not in self._places]
-        if any(one.place not in self._places for one in found):
-            self._report([*found, *self._in_sums(step), *self._in_weights(step)])
-
-    def check_weights(self, step: int) -> None:
-        """Checks the weights of all agents, and what `check_turn` has summed up; called when episodes have
-        ended, and before the state is saved.
-
-        Raises:
-            NotFiniteError: with "stop", see `OnNan`.
-        """
-        self._is_fresh = True
-        self._report([*self._in_sums(step), *self._in_weights(step)])
-        self._finite_step = step
-
-    def _in_weights(self, step: int) -> list[NotFinite]:
-        found = []
-        for agents, learner in self.learners.items():
-            sound = learner.finite().numpy(force=True)
-            if not sound.all():
-                found += _marked("weights", ~sound, agents, step)
-        return found
-
-    def _in_sums(self, step: int) -> list[NotFinite]:
-        found = []
+        known = {finding.place for finding in self.reported}
+        findings = _marked("reward", returns, range(returns.shape[1]), step)
+        for agents, lane_losses in losses.items():
+            of_losses = _marked("loss", lane_losses.total, agents, step)
+            findings += [loss for loss in of_losses if ("weights", *loss.place[1:]) not in known]
         for name, sums in self._sums.items():
-            array = sums.numpy(force=True)
-            found += _marked(name, ~np.isfinite(array), range(array.shape[1]), step)
-        return found
+            findings += _marked(name, sums.numpy(force=True), range(sums.shape[1]), step)
+        if weights or any(finding.place not in known for finding in findings):
+            for agents, learner in self.learners.items():
+                sound = np.where(learner.finite().numpy(force=True), 0.0, np.nan)
+                findings += _marked("weights", sound, agents, step)
+        self._report([finding for finding in findings if finding.place not in known])
+        if weights:
+            self._is_fresh, self._weights_step = True, step
 
-    def _report(self, found: Sequence[NotFinite]) -> None:
-        new = [one for one in found if one.place not in self._places]
-        if not new:
+    def _report(self, findings: Sequence[NotFinite]) -> None:
+        if not findings:
             return
-        self.found += new
-        self._places |= {one.place for one in new}
-        text = f"at step {new[0].step:,} {places(new)} not finite"
-        if any(one.what == "weights" for one in new):
-            text += f" (weights were last checked at step {self._finite_step:,})"
-        if all(one.what in _LEARNED for one in new):
-            text += f"; {_ADVICE}" if self.on_nan == "stop" else ""
-        else:
+        self.reported += findings
+        text = f"at step {findings[0].step:,} {places(findings)} not finite"
+        kinds = {finding.what for finding in findings}
+        if "weights" in kinds:
+            text += f" (weights were last checked at step {self._weights_step:,})"
+        if not kinds <= set(_LEARNED):
             text += f"; {_ADVICE_ON_ENVIRONMENT}"
+        elif self.on_nan == "stop":
+            text += f"; {_ADVICE}"
         if self.on_nan == "continue":
             warnings.warn(f"{text}; the others train on", RuntimeWarning, stacklevel=2)
             return
@@ -185,47 +148,46 @@ class FiniteCheck:
         raise NotFiniteError(text + saved)
 
     def state_dict(self) -> list[list[Any]]:
-        """What was found, so that it is not reported again."""
-        return [list(astuple(one)) for one in self.found]
+        """What was reported, so that it is not reported again."""
+        return [list(astuple(finding)) for finding in self.reported]
 
     def load_state_dict(self, state: Sequence[Sequence[Any]], *, step: int) -> None:
         """Continues from what `state_dict` returned at a step."""
-        self.found = [NotFinite(*one) for one in state]
-        self._places = {one.place for one in self.found}
-        self._finite_step = self.saved_step = step
+        self.reported = [NotFinite(*values) for values in state]
+        self._weights_step = self.saved_step = step
 
 
-def places(found: Iterable[NotFinite]) -> str:
+def places(findings: Iterable[NotFinite]) -> str:
     """What is not finite, in words: "the loss of agent 1 in replica 0 and the weights of ... are"."""
-    listed = sorted(found)
+    ordered = sorted(findings)
     parts = []
-    for (what, replica), of_agents in groupby(listed, key=lambda one: (one.what, one.replica)):
-        agents = [str(one.agent) for one in of_agents]
+    for (what, replica), of_agents in groupby(ordered, key=lambda finding: (finding.what, finding.replica)):
+        agents = [str(finding.agent) for finding in of_agents]
         plural = "s" if len(agents) > 1 else ""
         parts.append(f"the {what} of agent{plural} {', '.join(agents)} in replica {replica}")
-    more = [f"{len(parts) - _NAMED} more"] if len(parts) > _NAMED else []
-    named = [*parts[:_NAMED], *more]
-    is_one = len(listed) == 1 and listed[0].what != "weights"
-    return ", and ".join(filter(None, [", ".join(named[:-1]), named[-1]])) + (" is" if is_one else " are")
+    if len(parts) > _NAMED:
+        parts[_NAMED:] = [f"{len(parts) - _NAMED} more"]
+    is_one = len(ordered) == 1 and ordered[0].what != "weights"
+    return ", and ".join(filter(None, [", ".join(parts[:-1]), parts[-1]])) + (" is" if is_one else " are")
 
 
-def summary(found: Sequence[NotFinite]) -> str | None:
-    """What was found in a training that went on, as a sentence below its evaluation; None for nothing."""
-    if not found:
+def summary(findings: Sequence[NotFinite]) -> str | None:
+    """What a training that went on has reported, as a sentence below its evaluation; None for nothing."""
+    if not findings:
         return None
-    first = min(one.step for one in found)
+    first = min(finding.step for finding in findings)
     return (
-        f"From step {first:,} on {places(found)} not finite. What such an agent does means nothing, in this "
-        "evaluation too; report.json has the step of each."
+        f"From step {first:,} on {places(findings)} not finite. What such an agent does means nothing, in "
+        "this evaluation too; report.json has the step of each."
     )
 
 
-def _marked(what: str, bad: NDArray[np.bool_], agents: Sequence[int], step: int) -> list[NotFinite]:
-    """One for each marked entry of [R, S]."""
-    return [NotFinite(what, int(r), agents[s], step) for r, s in np.argwhere(bad)]
-
-
-def _sum_is_finite(array: NDArray[Any]) -> bool:
-    """False where a number is NaN or infinite; also where finite ones add up to more than the largest."""
+def _marked(what: str, numbers: NDArray[Any], agents: Sequence[int], step: int) -> list[NotFinite]:
+    """One for each number of [R, S] that is NaN or infinite."""
     with np.errstate(all="ignore"):
-        return isfinite(array.sum())
+        if isfinite(numbers.sum()):  # the rule: the sum of finite numbers is hardly ever infinite
+            return []
+    return [
+        NotFinite(what, int(replica), agents[place], step)
+        for replica, place in np.argwhere(~np.isfinite(numbers))
+    ]

@@ -1,33 +1,72 @@
-"""The outcome of a training: its agents in fresh worlds, beside the random policy."""
+"""The agents of a training in fresh worlds: by chance before it, greedily meanwhile, as trained after it."""
 
 import random as random_of_python
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from statistics import fmean
+from typing import Any, Final
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import torch
 from torchrl.envs import EnvBase
 
-from cprl.custom import made
 from cprl.envs.make_env import OF_CPRL, make_env
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.envs.unwrap import commons_of
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate
+from cprl.measuring.statistics import social_metrics
 from cprl.policies.present import PresentPolicy
-from cprl.runs.episodes import EpisodeTable
-from cprl.runs.recipe import read_recipe
-from cprl.training.agents import Population
-
-if TYPE_CHECKING:
-    from cprl.viewer.callback import ViewerCallback
+from cprl.runs.episodes import EVALUATIONS, EpisodeTable, labelled
+from cprl.runs.files import write_listed
+from cprl.training.agents import Population, stored_policies
 
 EXHIBITED_WORLD: Final = 2**31
 """The number of the exhibited world; those of a training, of as many replicas, are smaller."""
+
+
+def make_agents(
+    experiment: Experiment,
+    allow: Sequence[str] = (),
+    *,
+    starts: bool = True,
+    weights: Mapping[str, str] | None = None,
+) -> tuple[EnvBase, Population]:
+    """Make the worlds of a training and its agents; refuse what does not fit, in the evaluation too.
+
+    Args:
+        allow: the user's own code that stored runs may import.
+        starts: whether agents start with the weights of stored ones, where they ask for it; a training that
+            is resumed reads its own.
+        weights: those that `Frozen` agents play with, see `Population`.
+    """
+    env = make_env(
+        experiment.game,
+        worlds=experiment.replicas,
+        seed=experiment.seed,
+        device=experiment.device,
+        transforms=experiment.transforms,
+    )
+    population = Population(
+        env,
+        experiment.agents,
+        seed=experiment.seed,
+        engine=experiment.engine,
+        allow=allow,
+        starts=starts,
+        weights=weights,
+    )
+    with torch.random.fork_rng(devices=[]):
+        fresh_env(experiment)  # what the evaluation cannot have is refused now, not after hours
+        population.random_policy(experiment.evaluation_episodes)
+        population.policy(experiment.evaluation_episodes)
+    return env, population
 
 
 def fresh_env(experiment: Experiment) -> EnvBase:
@@ -60,9 +99,8 @@ def exhibited(
 
 
 def random_play(experiment: Experiment, population: Population) -> list[Episode]:
-    """Lets agents who take every action with equal probability play the worlds of the evaluation, before the
-    training: what it is compared with while it runs, `evaluation_episodes` for each replica. No generator
-    moves."""
+    """Let agents who take every action with equal probability play the worlds of the evaluation, before the
+    training: what it is compared with while it runs. No generator moves."""
     with _generators_kept(experiment.device):
         return evaluate(fresh_env(experiment), population.random_policy(experiment.evaluation_episodes))
 
@@ -81,6 +119,85 @@ def _generators_kept(device: str) -> Iterator[None]:
         np.random.set_state(of_numpy)  # noqa: NPY002
 
 
+class Evaluations:
+    """Lets agents play fresh episodes greedily after every so many episodes of their training; a callback.
+
+    The replicas that have just ended such an episode play `evaluation_episodes` each, always the same ones,
+    as `cprl.evaluate_run(run, greedy=True, seed=experiment.seed + 1)` would let them. Nothing of the training
+    changes. The numbers of an evaluation are logged with those of the episode, and the table
+    `evaluation/training.parquet` has a row for each of its episodes and agents.
+    """
+
+    def __init__(self, run: Path, experiment: Experiment, env: EnvBase, population: Population) -> None:
+        self._run, self._experiment, self._env, self._population = run, experiment, env, population
+        self._tables: list[pa.Table] = []
+
+    def on_ended(self, ended: Sequence[tuple[Episode, dict[str, float]]]) -> None:
+        """Evaluates the replicas that are due."""
+        every = self._experiment.evaluate_every
+        due = {
+            episode.world: (episode.episode + 1, learning)
+            for episode, learning in ended
+            if every is not None and (episode.episode + 1) % every == 0
+        }
+        if not due:
+            return
+        with _generators_kept(self._experiment.device):
+            played = self._play(due)
+        for replica, episodes in played.items():
+            trained_episodes, learning = due[replica]
+            learning |= {f"evaluation/{name}": mean for name, mean in _means(episodes).items()}
+            self._tables.append(labelled([({"trained_episodes": trained_episodes}, replica, episodes)]))
+        table = pa.concat_tables(self._tables)
+        write_listed(self._run, EVALUATIONS, lambda file: pq.write_table(table, file, compression="zstd"))
+
+    def _play(self, replicas: Iterable[int]) -> dict[int, list[Episode]]:
+        groups: list[list[int]] = []  # without gaps, as the worlds of an environment are
+        for replica in sorted(replicas):
+            if groups and replica == groups[-1][-1] + 1:
+                groups[-1].append(replica)
+            else:
+                groups.append([replica])
+        experiment, worlds = self._experiment, self._experiment.evaluation_episodes
+        seed, played = experiment.seed + 1, dict[int, list[Episode]]()
+        for group in groups:
+            env = make_env(
+                experiment.game,
+                worlds=len(group) * worlds,
+                seed=seed,
+                first_world=group[0] * worlds,
+                transforms=experiment.transforms,
+            )
+            load_transforms_state(env, transforms_state(self._env))
+            agents, playing = self._population.as_stored(group), self._population.playing
+            policies = stored_policies(agents, playing, replicas=group, worlds=worlds, seed=seed)
+            episodes = evaluate(env, policies)
+            for place, replica in enumerate(group):
+                played[replica] = episodes[place * worlds : (place + 1) * worlds]
+        return played
+
+    def state_dict(self) -> dict[str, Any]:
+        """The table so far, as the bytes of a file."""
+        file = BytesIO()
+        if self._tables:
+            pq.write_table(pa.concat_tables(self._tables), file, compression="zstd")
+        return {"table": torch.tensor(np.frombuffer(file.getvalue(), np.uint8))}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continues with the table of a state; what was evaluated after it is evaluated again."""
+        table = state["table"].numpy().tobytes()
+        self._tables = [pq.read_table(BytesIO(table))] if table else []
+
+
+def _means(episodes: Sequence[Episode]) -> dict[str, float]:
+    """The mean of each social metric over the episodes in which it is defined, and of the summed return."""
+    means = {"return": fmean(float(episode.return_.sum()) for episode in episodes)}
+    for name in social_metrics(episodes[0]):
+        values = [social_metrics(episode)[name] for episode in episodes]
+        means[name] = float(np.nanmean(values)) if not np.isnan(values).all() else float("nan")
+    return means
+
+
 def is_same_later(experiment: Experiment) -> bool:
     """Whether random play is the same before and after a training: the game is one of cprl's, whose chance
     depends on seeds alone, and has no transforms, which may learn in between."""
@@ -96,10 +213,9 @@ def _keeps_decisions(env: EnvBase) -> bool:
 def evaluate_population(
     experiment: Experiment, trained: EnvBase, population: Population, *, random: list[Episode] | None = None
 ) -> dict[str, list[Episode]]:
-    """Lets the agents play fresh episodes, so many of each replica.
+    """Let the agents play fresh episodes, so many of each replica.
 
     Args:
-        experiment: what was trained.
         trained: the environment of the training; what its transforms have learned is used.
         random: the episodes of `random_play`, which are not played again if they are the same now.
 
@@ -119,7 +235,7 @@ def evaluate_population(
 
 
 def write_evaluation(run: Path, played: Mapping[str, Sequence[Episode]], *, of_replica: int) -> None:
-    """Writes `evaluation/<policy>.parquet` of a run; again where one is there.
+    """Write `evaluation/<policy>.parquet` of a run; again where one is there.
 
     Args:
         played: the episodes by policy.
@@ -128,94 +244,9 @@ def write_evaluation(run: Path, played: Mapping[str, Sequence[Episode]], *, of_r
     for name, episodes in played.items():
         path = run / "evaluation" / f"{name}.parquet"
         path.parent.mkdir(exist_ok=True)
-        for old in (path, path.with_suffix(".arrows")):
-            old.unlink(missing_ok=True)
+        for before in (path, path.with_suffix(".arrows")):
+            before.unlink(missing_ok=True)
         with EpisodeTable(path, run=run) as table:
-            for number, episode in enumerate(episodes):
-                replica, nth = divmod(number, of_replica)
-                table.add(replace(episode, world=replica, episode=nth))
-
-
-def heading(population: Population) -> str:
-    """What a table of the evaluation calls the agents: trained, where any learns, and with which probability
-    those with action values explore; others draw from a policy."""
-    if not population.learners:
-        return "agents"
-    chances = {
-        learner.settings.epsilon_evaluation
-        for learner in population.learners.values()
-        if not learner.actor.stochastic
-    }
-    return "trained" + "".join(f", epsilon {chance:g}" for chance in sorted(chances))
-
-
-@dataclass(kw_only=True, eq=False)
-class Parts:
-    """What an experiment makes before anything is written, so that what does not fit is refused first."""
-
-    env: EnvBase
-    population: Population
-    callbacks: list[Any]
-
-
-def make_parts(
-    experiment: Experiment,
-    allow: Sequence[str],
-    *,
-    starts: bool = True,
-    weights: Mapping[str, str] | None = None,
-) -> Parts:
-    """The parts; raises a ValueError for whatever does not fit.
-
-    Args:
-        experiment: what they are made of.
-        starts: whether agents start with the weights of stored ones, where they ask for it; a training that
-            is resumed reads its own.
-        weights: those that `Frozen` agents play with, see `Population`.
-    """
-    env = make_env(
-        experiment.game,
-        worlds=experiment.replicas,
-        seed=experiment.seed,
-        device=experiment.device,
-        transforms=experiment.transforms,
-    )
-    population = Population(
-        env,
-        experiment.agents,
-        seed=experiment.seed,
-        engine=experiment.engine,
-        allow=allow,
-        starts=starts,
-        weights=weights,
-    )
-    with torch.random.fork_rng(devices=[]):
-        fresh_env(experiment)  # what the evaluation cannot have is refused now, not after hours
-        population.random_policy(experiment.evaluation_episodes)
-        population.policy(experiment.evaluation_episodes)
-    return Parts(env=env, population=population, callbacks=[made(own) for own in experiment.callbacks])
-
-
-def make_viewer(
-    watch: str, directory: Path, own: Parts, experiment: Experiment
-) -> "AbstractContextManager[ViewerCallback | None]":
-    if watch == "off":
-        return nullcontext()
-    from cprl.viewer.callback import ViewerCallback
-
-    recipe = read_recipe(directory)
-    shown = {name: recipe.get(name) for name in ("command", "started", "git", "versions")}
-    return ViewerCallback(
-        directory,
-        own.env,
-        title=title_of(experiment),
-        episodes=experiment.episodes,
-        recipe={**shown, **recipe["experiment"]},
-        live=None if watch == "file" else watch,
-        exhibited=None if watch == "file" else exhibited(experiment, own.env, own.population),
-    )
-
-
-def title_of(experiment: Experiment) -> str:
-    """For tables and figures."""
-    return f"{experiment.name}, {experiment.replicas} replicas, {experiment.episodes} episodes"
+            for place, episode in enumerate(episodes):
+                replica, number = divmod(place, of_replica)
+                table.add(replace(episode, world=replica, episode=number))

@@ -1,14 +1,15 @@
 """run: one experiment from its learners to its report: train, save, evaluate in fresh worlds, summarise."""
 
 import shutil
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cprl.checks import shown
+from torchrl.envs import EnvBase
+
 from cprl.custom import Custom, made
 from cprl.envs.state import transforms_state
 from cprl.envs.unwrap import agent_names
@@ -24,7 +25,6 @@ from cprl.runs.recipe import (
     changed_circumstances,
     read_recipe,
     refuse_another_run,
-    resume_command,
     say_changes,
     start_run,
     write_changed_circumstances,
@@ -38,34 +38,22 @@ from cprl.system.times import RunTimes
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
-from cprl.training import Training, train
+from cprl.training.agents import Population
 from cprl.training.finite import summary
 from cprl.training.outcome import (
-    Parts,
+    Evaluations,
     evaluate_population,
-    heading,
-    make_parts,
-    make_viewer,
+    exhibited,
+    make_agents,
     random_play,
-    title_of,
     write_evaluation,
 )
-from cprl.training.training import check_callbacks
+from cprl.training.training import Training, check_callbacks, train
 from cprl.viewer.watching import check_linger, check_watch
 from cprl.viewer.watching import linger as stay_served
 
 if TYPE_CHECKING:
     from cprl.viewer.callback import ViewerCallback
-
-
-class _Began:
-    """A callback that notes that the training has begun."""
-
-    is_extendable = True
-    has_begun = False
-
-    def on_start(self, training: Training) -> None:
-        self.has_begun = True
 
 
 @cleared_up()
@@ -79,12 +67,10 @@ def run(
     watch: str = "file",
     linger: bool = False,
     allow: Sequence[str] = (),
-    command: Sequence[str] | None = None,
     callbacks: Sequence[object] = (),
     figures: bool = True,
-    at_end: Callable[[Path], object] | None = None,
 ) -> Path:
-    """Trains the agents of all replicas, evaluates them in fresh worlds, and writes and prints the outcome.
+    """Train the agents of all replicas, evaluate them in fresh worlds, and write and print the outcome.
 
     A run that ends before its training has begun leaves nothing behind; later, all that it produced.
 
@@ -101,12 +87,9 @@ def run(
         linger: whether the recording stays served after the run, until Ctrl-C (SIGINT) or SIGTERM; only with
             `watch` "serve" or "spawn".
         allow: the user's own code, "module:Class", that stored runs of `Frozen` agents may import.
-        command: the command line that began the run, script first, which the recipe keeps and the line that
-            resumes is made of; by default the run is resumed by `cprl run`.
-        callbacks: further callbacks of this process (see `cprl.training.training`), which the recipe does
+        callbacks: further callbacks of this process (see `cprl.training.Callback`), which the recipe does
             not hold; they may look, and change nothing.
         figures: whether the training curve is drawn; a study draws its own.
-        at_end: called with the directory of a run that has just finished, when all is written and said.
 
     Returns:
         The directory, now with `recipe.json`, `episodes.parquet`, `run.rrd`, `checkpoints/final.pt`,
@@ -121,69 +104,88 @@ def run(
         OSError: for a full disk or a deleted directory; the message names it. What was written before is
             intact, and the run can be resumed.
     """
-
-    def recipe_in(directory: Path) -> dict[str, Any]:
-        return {**experiment.to_recipe(directory), **partners_of(directory, _partners(experiment))}
-
     times = RunTimes()
     free_earlier()
     out = None if out is None else Path(out)
     check_watch(watch)
     check_linger(linger, watch)
-    if at_end is not None and not callable(at_end):  # found out after hours otherwise
-        raise ValueError(f"at_end is {shown(at_end)}; allowed: a function")
     for logger in experiment.loggers:
         check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
     prepare_process(experiment.seed)
     is_begun = resume and out is not None and bool(checkpoints_in(out / FOLDER))
-    weights = _partners_then(experiment, out) if resume and out is not None else {}
-    own = make_parts(experiment, allow, starts=not is_begun, weights=weights)
-    own.callbacks += check_callbacks(callbacks)
+    weights = _weights_of_partners(experiment, out) if resume and out is not None else {}
+    env, population = make_agents(experiment, allow, starts=not is_begun, weights=weights)
+    observers: list[Any] = [*(made(callback) for callback in experiment.callbacks), *callbacks]
+    check_callbacks(observers)
     episodes = refuse_another_run(out, experiment.to_recipe, Experiment) if resume else experiment.episodes
-    is_there = out is not None and out.exists()
-    if resume and out is not None:
-        if episodes < experiment.episodes:
-            refuse_to_extend(out, episodes, own.callbacks)
-        elif (out / REPORT).exists():
-            tidy_up(out, keep_checkpoint=keep_checkpoint, take_over=take_over)
-            return out
-        directory = out
+    is_new = out is None or not out.exists()
+    if not resume or out is None:
+        directory = start_run(out, experiment.name, lambda directory: _recipe(experiment, directory))
+    elif episodes == experiment.episodes and (out / REPORT).exists():
+        _tidy_up(out, keep_checkpoint=keep_checkpoint, take_over=take_over)
+        return out
     else:
-        directory = start_run(out, experiment.name, recipe_in, command=command)
-    checkpointer = Checkpointer(
-        directory,
-        keep_ending=keep_checkpoint,
-        take_over=take_over,
-        resume_command=resume_command(directory, command),
-    )
-    began = _Began()
+        directory = out
+        if episodes < experiment.episodes:
+            refuse_to_extend(out, episodes, observers)
+    checkpointer = Checkpointer(directory, keep_ending=keep_checkpoint, take_over=take_over)
     closing = ExitStack()  # of the viewer, which outlives the rest
     try:
         with checkpointer:
             if resume:
-                say_what_changed(directory)
-                if not is_begun:
-                    say("No checkpoint yet: begins with the first episode")
-                write_on_nan(directory, experiment.on_nan)
-            if episodes < experiment.episodes:
-                extend(directory, episodes, experiment.episodes)
-            viewer = closing.enter_context(make_viewer(watch, directory, own, experiment))
-            _train_and_evaluate(directory, experiment, own, viewer, checkpointer, began, times, figures)
+                _begin_again(directory, experiment, is_begun=is_begun, episodes=episodes)
+            viewer = closing.enter_context(_make_viewer(watch, directory, experiment, env, population))
+            before: list[Episode] | None = None
+            with ExitStack() as stack:
+                table, bar, *loggers = _recorders(stack, directory, experiment, env)
+                if viewer is not None:
+                    before = random_play(experiment, population)
+                    viewer.random_play(before)
+                    observers.append(viewer)
+                evaluations = Evaluations(directory, experiment, env, population)
+                training = train(
+                    env,
+                    population.learners,
+                    others=population.others,
+                    decisions=population.decisions,
+                    episodes=experiment.episodes,
+                    callbacks=[evaluations, table, bar, *observers, *loggers],
+                    checkpointer=checkpointer,
+                    update_every=experiment.update_every,
+                    on_nan=experiment.on_nan,
+                )
+                _save(directory, env, population)
+            if viewer is not None:
+                viewer.flush()
+            played = evaluate_population(experiment, env, population, random=before)
+            write_evaluation(directory, played, of_replica=experiment.evaluation_episodes)
+            if viewer is not None:
+                viewer.finished(played)
+            figure = _draw(directory, experiment, played["random"]) if figures else None
+            _write_report(directory, training, times)
+            columns = {"random": played["random"], _heading(population): played["trained"]}
+            note = summary(training.finite.reported)
+            summarise(directory, title=_title(experiment), played=columns, figure=figure, note=note)
             checkpointer.done()
-            say_what_is_kept(directory)
+            _say_what_is_kept(directory)
     except BaseException as error:
         closing.close()
-        if began.has_begun or (resume and isinstance(error, OSError)):
+        if checkpointer.has_begun or (resume and isinstance(error, OSError)):
             error.add_note(f"{RESUMES}{checkpointer.resume_command}")
         elif not resume and not isinstance(error, RunLockedError):
-            remove(directory, but_keep_empty=is_there)
+            _remove(directory, with_directory=is_new)
         raise
     with closing:
-        if at_end is not None:
-            at_end(directory)
+        for callback in observers:
+            if hasattr(callback, "on_finished"):
+                callback.on_finished(directory)
         if linger and viewer is not None:
             stay_served(viewer.logger, viewer.play_on)
     return directory
+
+
+def _recipe(experiment: Experiment, directory: Path) -> dict[str, Any]:
+    return {**experiment.to_recipe(directory), **partners_of(directory, _partners(experiment))}
 
 
 def _partners(experiment: Experiment) -> list[str]:
@@ -191,7 +193,7 @@ def _partners(experiment: Experiment) -> list[str]:
     return sorted({spec.run for spec in experiment.agents if isinstance(spec, Frozen)})
 
 
-def _partners_then(experiment: Experiment, run: Path) -> dict[str, str]:
+def _weights_of_partners(experiment: Experiment, run: Path) -> dict[str, str]:
     """The names of the weights of `Frozen` agents that played when a run began, by their run."""
     partners = _partners(experiment)
     recipe = read_recipe(run) if partners and (run / RECIPE_FILE).exists() else {}
@@ -199,104 +201,104 @@ def _partners_then(experiment: Experiment, run: Path) -> dict[str, str]:
     return {partner: name for partner, name in names.items() if name is not None}
 
 
-def _train_and_evaluate(
-    directory: Path,
-    experiment: Experiment,
-    own: Parts,
-    viewer: "ViewerCallback | None",
-    checkpointer: Checkpointer,
-    began: _Began,
-    times: RunTimes,
-    figures: bool,
-) -> None:
-    """All that follows the beginning; `report.json`, the sign that a run is finished, comes last."""
-    training, before = _train(
-        directory, experiment, own, viewer=viewer, checkpointer=checkpointer, began=began
+def _begin_again(directory: Path, experiment: Experiment, *, is_begun: bool, episodes: int) -> None:
+    """Says what is new since a run was begun, of so many episodes, and writes it into its recipe."""
+    changed = changed_circumstances(directory)
+    say_changes(directory, changed)
+    if changed:
+        write_changed_circumstances(directory)
+    if not is_begun:
+        say("No checkpoint yet: begins with the first episode")
+    write_on_nan(directory, experiment.on_nan)
+    if episodes < experiment.episodes:
+        extend(directory, episodes, experiment.episodes)
+
+
+def _make_viewer(
+    watch: str, directory: Path, experiment: Experiment, env: EnvBase, population: Population
+) -> "AbstractContextManager[ViewerCallback | None]":
+    if watch == "off":
+        return nullcontext()
+    from cprl.viewer.callback import ViewerCallback
+
+    recipe = read_recipe(directory)
+    circumstances = {name: recipe.get(name) for name in ("command", "started", "git", "versions")}
+    return ViewerCallback(
+        directory,
+        env,
+        title=_title(experiment),
+        episodes=experiment.episodes,
+        recipe={**circumstances, **recipe["experiment"]},
+        live=None if watch == "file" else watch,
+        exhibited=None if watch == "file" else exhibited(experiment, env, population),
     )
-    played = evaluate_population(experiment, own.env, own.population, random=before)
-    write_evaluation(directory, played, of_replica=experiment.evaluation_episodes)
-    if viewer is not None:
-        viewer.finished(played)
-    title, figure = title_of(experiment), None
-    if figures:
-        ends = exploration_steps(experiment.agents)
-        figure = training_curve(directory, title=title, random=played["random"], exploration_steps=ends)
-    broken = training.finite.found
+
+
+def _recorders(stack: ExitStack, directory: Path, experiment: Experiment, env: EnvBase) -> list[Any]:
+    """The callbacks that write the table of episodes, show the progress and write to loggers."""
+    episodes, replicas, names = experiment.episodes, experiment.replicas, agent_names(env)
+    table = stack.enter_context(EpisodeTable(directory / "episodes.parquet", resumable=True))
+    bar = stack.enter_context(ProgressBar(env, episodes=episodes, replicas=replicas))
+    loggers = (
+        LoggerCallback(make_logger(made(logger), directory), replicas=replicas, agents=names)
+        for logger in experiment.loggers
+    )
+    return [table, bar, *map(stack.enter_context, loggers)]
+
+
+def _save(directory: Path, env: EnvBase, population: Population) -> None:
+    """Saves what was learned."""
+    save_weights(directory, population.networks())
+    save_transforms(directory, transforms_state(env))
+    if population.decisions is not None:
+        save_decisions(directory, population.decisions.learned())
+
+
+def _draw(directory: Path, experiment: Experiment, random: list[Episode]) -> Path:
+    ends = exploration_steps(experiment.agents)
+    return training_curve(directory, title=_title(experiment), random=random, exploration_steps=ends)
+
+
+def _write_report(directory: Path, training: Training, times: RunTimes) -> None:
+    """Writes `report.json`, the sign that a run is finished."""
     report = {
         **times.report(training.times),
         "steps": training.steps,
         "finished": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "episodes": training.episodes,
     }
-    also = {"not_finite": [asdict(one) for one in broken]} if broken else {}
-    write_json(directory / REPORT, {**report, "episodes": experiment.episodes, **also})
-    columns = {"random": played["random"], heading(own.population): played["trained"]}
-    summarise(directory, title=title, played=columns, figure=figure, note=summary(broken))
+    if training.finite.reported:
+        report["not_finite"] = [asdict(finding) for finding in training.finite.reported]
+    write_json(directory / REPORT, report)
 
 
-def _train(
-    directory: Path,
-    experiment: Experiment,
-    own: Parts,
-    *,
-    viewer: "ViewerCallback | None",
-    checkpointer: Checkpointer,
-    began: _Began,
-) -> tuple[Training, list[Episode] | None]:
-    """Trains and keeps what happens, from the newest checkpoint on if there is one.
-
-    Returns:
-        The training, and what the viewer compares it with: random play, None without a viewer.
-    """
-    with ExitStack() as stack:
-        table = stack.enter_context(EpisodeTable(directory / "episodes.parquet", resumable=True))
-        bar = stack.enter_context(
-            ProgressBar(own.env, episodes=experiment.episodes, replicas=experiment.replicas)
-        )
-        loggers = [
-            stack.enter_context(
-                LoggerCallback(
-                    make_logger(made(logger), directory),
-                    replicas=experiment.replicas,
-                    agents=agent_names(own.env),
-                )
-            )
-            for logger in experiment.loggers
-        ]
-        before = None
-        if viewer is not None:
-            before = random_play(experiment, own.population)
-            viewer.random_play(before)
-        shown = [viewer] if viewer else []
-        training = train(
-            own.env,
-            own.population.learners,
-            others=own.population.others,
-            decisions=own.population.decisions,
-            episodes=experiment.episodes,
-            callbacks=[began, table, bar, *own.callbacks, *shown, *loggers],
-            checkpointer=checkpointer,
-            update_every=experiment.update_every,
-            on_nan=experiment.on_nan,
-        )
-        save_weights(directory, own.population.networks())
-        save_transforms(directory, transforms_state(own.env))
-        if own.population.decisions is not None:
-            save_decisions(directory, own.population.decisions.learned())
-    if viewer is not None:
-        viewer.flush()
-    return training, before
+def _title(experiment: Experiment) -> str:
+    return f"{experiment.name}, {experiment.replicas} replicas, {experiment.episodes} episodes"
 
 
-def tidy_up(finished: Path, *, keep_checkpoint: bool, take_over: bool) -> None:
+def _heading(population: Population) -> str:
+    """What a table of the evaluation calls the agents: trained, where any learns, and with which probability
+    those with action values explore; others draw from a policy."""
+    if not population.learners:
+        return "agents"
+    chances = {
+        learner.settings.epsilon_evaluation
+        for learner in population.learners.values()
+        if not learner.actor.stochastic
+    }
+    return "trained" + "".join(f", epsilon {chance:g}" for chance in sorted(chances))
+
+
+def _tidy_up(finished: Path, *, keep_checkpoint: bool, take_over: bool) -> None:
     """Says that a run is finished, and tidies up if its process died before it had."""
     refuse_missing(finished)
     if (finished / LOCK_FILE).exists():
-        with Checkpointer(finished, keep_ending=keep_checkpoint, take_over=take_over) as left:
-            left.done()
+        with Checkpointer(finished, keep_ending=keep_checkpoint, take_over=take_over) as checkpointer:
+            checkpointer.done()
     console().print(f"{finished} is finished; with more --episodes it is extended", soft_wrap=True)
 
 
-def remove(directory: Path, *, but_keep_empty: bool) -> None:
+def _remove(directory: Path, *, with_directory: bool) -> None:
     """Removes a run that never began; nobody else has written into its directory."""
     with suppress(OSError):
         for path in directory.iterdir():
@@ -304,23 +306,15 @@ def remove(directory: Path, *, but_keep_empty: bool) -> None:
                 shutil.rmtree(path)
             else:
                 path.unlink()
-        if not but_keep_empty:
+        if with_directory:
             directory.rmdir()
 
 
-def say_what_is_kept(directory: Path) -> None:
+def _say_what_is_kept(directory: Path) -> None:
     """Says what of a finished run serves to extend it, and how large it is."""
-    for kept in checkpoints_in(directory / FOLDER):
+    for checkpoint in checkpoints_in(directory / FOLDER):
         console().print(
-            f"Kept so that it can be extended (--resume with more --episodes): {kept}, "
-            f"{kept.stat().st_size / 1e6:,.1f} MB",
+            f"Kept so that it can be extended (--resume with more --episodes): {checkpoint}, "
+            f"{checkpoint.stat().st_size / 1e6:,.1f} MB",
             soft_wrap=True,
         )
-
-
-def say_what_changed(directory: Path) -> None:
-    """Warns where a run that goes on was begun under other versions or other code, and writes that down."""
-    changed = changed_circumstances(directory)
-    say_changes(directory, changed)
-    if changed:
-        write_changed_circumstances(directory)

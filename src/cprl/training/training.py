@@ -1,9 +1,11 @@
 """train: a training from its first step to its last."""
 
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final, Protocol, runtime_checkable
+from pathlib import Path
+from typing import Any, Final, Protocol
 
 import numpy as np
 import torch
@@ -30,6 +32,7 @@ from cprl.learners.base import (
 from cprl.measuring.episodes import Episode, tracker_of
 from cprl.policies.assignment import AgentIndices, AgentPolicies, agent_indices
 from cprl.policies.decisions import Decider
+from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.files import TRAINING_STATE_FORMAT
 from cprl.system.times import Times
 from cprl.training.collectors import StepCollector
@@ -38,17 +41,6 @@ from cprl.training.finite import EVERY_STEPS, FiniteCheck
 MakeCollector = Callable[[EnvBase, nn.Module], BaseCollector]
 """A collector out of an environment and a policy; it yields batches [R], or [R, T] of T turns."""
 _FINISH_THERE: Final = "finish the run with the version that began it (its recipe.json has the commit)"
-
-
-@runtime_checkable
-class SavesTraining(Protocol):
-    """What saves the state of a training, as `cprl.runs.checkpoints.Checkpointer` does."""
-
-    def restore(self, training: Any) -> None:
-        """Puts a new training where the last one was."""
-
-    def after_step(self, training: Any) -> None:
-        """Saves the state, if it is time to."""
 
 
 class Training:
@@ -86,7 +78,8 @@ class Training:
         spaces = spaces_of(env)
         replicas = env.batch_size.numel()
         check_env(env, replicas)
-        self.env, self.episodes, self.callbacks = env, episodes, list(check_callbacks(callbacks))
+        check_callbacks(callbacks)
+        self.env, self.episodes, self.callbacks = env, episodes, list(callbacks)
         self.update_every = update_every
         self.learners, self.others = dict(learners), dict(others or {})
         check_agents(spaces.agents, replicas, self.learners, self.others)
@@ -106,7 +99,7 @@ class Training:
             if hasattr(learner, "begin"):
                 learner.begin()
         self.finite = FiniteCheck(self.learners, spaces, on_nan=on_nan)
-        self._on_step = [own.on_step for own in self.callbacks if hasattr(own, "on_step")]
+        self._on_step = self._hooks("on_step")
         self._played = [0] * replicas
         self.steps = 0
         self.times = Times()
@@ -122,7 +115,7 @@ class Training:
     @property
     def is_sound(self) -> bool:
         """Whether everything was finite so far; with `on_nan` "stop" a training that goes on always is."""
-        return not self.finite.found
+        return not self.finite.reported
 
     @property
     def is_ending(self) -> bool:
@@ -134,16 +127,25 @@ class Training:
         """Episodes that all replicas together have ended so far, those beyond `episodes` left out."""
         return sum(min(played, self.episodes) for played in self._played)
 
-    @property
-    def spent_s(self) -> float:
-        """Seconds that it has taken so far, those before it was stopped included; see also `times`."""
-        return self.times.spent_s
-
     def start(self) -> None:
-        """Calls `on_start` of the callbacks; `train` does before the first step."""
-        for callback in self.callbacks:
-            if hasattr(callback, "on_start"):
-                callback.on_start(self)
+        """Calls `on_start` of the callbacks; `run` does before the first step."""
+        for on_start in self._hooks("on_start"):
+            on_start(self)
+
+    def run(self, checkpointer: Checkpointer | None = None) -> None:
+        """Takes all steps, from the newest checkpoint on if there is one."""
+        if checkpointer is not None:
+            self.state_dict()  # what cannot be saved is refused now, not when the first checkpoint is due
+            checkpointer.restore(self)
+        self.start()
+        while not self.is_over:
+            self.step()
+            if checkpointer is not None:
+                checkpointer.after_step(self)
+
+    def _hooks(self, name: str) -> list[Callable[..., None]]:
+        """The methods of this name of the callbacks that have one."""
+        return [getattr(callback, name) for callback in self.callbacks if hasattr(callback, name)]
 
     def step(self) -> None:
         """The turns that the collector yields, one as a rule: act, store, update, measure, record."""
@@ -156,7 +158,7 @@ class Training:
     def _take(self, batch: TensorDictBase) -> None:
         """One turn of every replica."""
         self.steps += 1
-        self.finite.check_turn(batch, self.steps)
+        self.finite.add(batch)
         began = time.perf_counter()
         for learner in self.learners.values():
             learner.store(batch)
@@ -172,40 +174,42 @@ class Training:
         if ended:
             self._end(ended, batch)
         elif self.steps % EVERY_STEPS == 0:
-            self._check_sums()
+            self._check_finite()
 
     def _update(self, learner: Learner) -> Tensor | None:
         try:
             return learner.update()
         except (RuntimeError, ValueError):  # some losses refuse NaN in words of their own
-            self._check_sums()
-            self.finite.check_weights(self.steps)
+            self._check_finite(weights=True)
             raise
 
-    def _check_sums(self, ended: Sequence[Episode] = ()) -> None:
+    def _check_finite(self, ended: Sequence[Episode] = (), *, weights: bool = False) -> None:
         returns = self._tracker.returns
         for episode in ended:
             returns[episode.world] = episode.return_
-        self.finite.check_sums(self._losses, returns, self.steps)
+        self.finite.check(self._losses, returns, self.steps, weights=weights)
 
     def _end(self, ended: Sequence[Episode], batch: TensorDictBase) -> None:
-        self._check_sums(ended)
-        self.finite.check_weights(self.steps)
+        self._check_finite(ended, weights=True)
         worlds = torch.zeros(len(self._played), dtype=torch.bool)
         worlds[[episode.world for episode in ended]] = True
         values = {agents: learner.values(batch) for agents, learner in self.learners.items()}
         learning = [learned_in(episode.world, self.learners, self._losses, values) for episode in ended]
         for learner in self.learners.values():
             learner.end_episode(worlds)
+        recorded: list[tuple[Episode, dict[str, float]]] = []
         for episode, of_agents in zip(ended, learning, strict=True):
             episode = replace(episode, wanted_return=self._wanted.take(episode.world))
             if self.decisions is not None and episode.decision is not None:
                 self.decisions.learn(episode.world, episode.decision, _return_to_decide_by(episode))
             self._played[episode.world] += 1
             if self._played[episode.world] <= self.episodes:
-                for callback in self.callbacks:
-                    if hasattr(callback, "on_episode"):
-                        callback.on_episode(episode, of_agents)
+                recorded.append((episode, of_agents))
+        for on_ended in self._hooks("on_ended") if recorded else ():
+            on_ended(recorded)
+        for episode, of_agents in recorded:
+            for on_episode in self._hooks("on_episode"):
+                on_episode(episode, of_agents)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the future depends on, in tensors, numbers, lists and dicts; not copies.
@@ -215,8 +219,7 @@ class Training:
             NotFiniteError: where weights are not finite, unless `on_nan` is "continue".
         """
         carried = self._step_collector().carried
-        self._check_sums()
-        self.finite.check_weights(self.steps)
+        self._check_finite(weights=True)
         self.finite.saved_step = self.steps
         return {
             "format": TRAINING_STATE_FORMAT,
@@ -231,7 +234,7 @@ class Training:
             "losses": [losses.state_dict() for losses in self._losses.values()],
             "wanted": self._wanted.state_dict(),
             "tracker": self._tracker.state_dict(),
-            "callbacks": {name: own.state_dict() for name, own in self._with_state().items()},
+            "callbacks": {name: callback.state_dict() for name, callback in self._with_state().items()},
             "not_finite": self.finite.state_dict(),
             "torch": torch.get_rng_state(),
         }
@@ -239,12 +242,12 @@ class Training:
     def _with_state(self) -> dict[str, Any]:
         """The callbacks that have a state, by the name of their class; a second one of a class gets a 2."""
         named: dict[str, Any] = {}
-        for own in self.callbacks:
-            if hasattr(own, "state_dict") and hasattr(own, "load_state_dict"):
-                kind, nth = type(own).__name__, 1
-                while (name := kind if nth == 1 else f"{kind} {nth}") in named:
-                    nth += 1
-                named[name] = own
+        of_kind: Counter[str] = Counter()
+        for callback in self.callbacks:
+            if hasattr(callback, "state_dict") and hasattr(callback, "load_state_dict"):
+                kind = type(callback).__name__
+                of_kind[kind] += 1
+                named[kind if of_kind[kind] == 1 else f"{kind} {of_kind[kind]}"] = callback
         return named
 
     def _step_collector(self) -> StepCollector:
@@ -266,15 +269,15 @@ class Training:
         if len(state["others"]) != len(self.others):
             raise ValueError(
                 f"the state has {len(state['others'])} actors of agents that do not learn; this version has "
-                f"them for {[list(agent_indices(own)) for own in self.others]}; {_FINISH_THERE}"
+                f"them for {[list(agent_indices(agents)) for agents in self.others]}; {_FINISH_THERE}"
             )
         self.times.load_state_dict(state)
         self.steps, self._played = int(state["steps"]), list(state["played"])
         self._load_env(state)
         parts: dict[str, Any] = {"learners": self.learners, "others": self.others, "losses": self._losses}
         for name, of_agents in parts.items():
-            for part, own in zip(of_agents.values(), state[name], strict=True):
-                part.load_state_dict(own)
+            for part, part_state in zip(of_agents.values(), state[name], strict=True):
+                part.load_state_dict(part_state)
         self._wanted.load_state_dict(state.get("wanted", {}))
         if self.decisions is not None:
             self.decisions.load_state_dict(state["decisions"])
@@ -306,7 +309,7 @@ def train(
     others: Mapping[AgentIndices, nn.Module] | None = None,
     decisions: Decider | None = None,
     callbacks: Sequence[Any] = (),
-    checkpointer: SavesTraining | None = None,
+    checkpointer: Checkpointer | None = None,
     update_every: int = 1,
     make_collector: MakeCollector = StepCollector,
     on_nan: OnNan = "stop",
@@ -314,14 +317,8 @@ def train(
     """Plays so many episodes of every replica; each learner stores every turn and then updates.
 
     Args:
-        episodes: how many to play.
-        others: the actors of the agents that do not learn.
-        decisions: what all agents decide, where the game asks them.
-        callbacks: called after each turn and each episode.
-        checkpointer: where the training resumes from, and saves its state now and then.
-        update_every: steps k after which each learner updates, then k times.
-        make_collector: what plays.
-        on_nan: "stop" or "continue".
+        checkpointer: where the training resumes from, and saves its state now and then; all else is as of
+            `Training`.
 
     Returns:
         The training, which is over.
@@ -340,14 +337,7 @@ def train(
         make_collector=make_collector,
         on_nan=on_nan,
     )
-    if checkpointer is not None:
-        training.state_dict()  # what cannot be saved is refused now, not when the first checkpoint is due
-        checkpointer.restore(training)
-    training.start()
-    while not training.is_over:
-        training.step()
-        if checkpointer is not None:
-            checkpointer.after_step(training)
+    training.run(checkpointer)
     return training
 
 
@@ -363,6 +353,10 @@ class Callback(Protocol):
     def on_step(self, batch: TensorDictBase) -> None:
         """One turn of every world, as the collector yields it, [R]."""
 
+    def on_ended(self, ended: Sequence[tuple[Episode, dict[str, float]]]) -> None:
+        """Episodes of some replicas have ended in one turn: all of them, with what was learned in each,
+        before `on_episode` is called with one after the other."""
+
     def on_episode(self, episode: Episode, learning: dict[str, float]) -> None:
         """An episode has ended; what was learned in it: `agent_0/loss`, `agent_0/epsilon`, ...
 
@@ -370,17 +364,18 @@ class Callback(Protocol):
         loggers and the viewer of a run, and by callbacks that come later in a `Training`.
         """
 
+    def on_finished(self, run: Path) -> None:
+        """All of a run is written and said; by `cprl.run` alone, with the run's directory."""
 
-HOOKS: Final = ("on_start", "on_step", "on_episode")
+
+HOOKS: Final = ("on_start", "on_step", "on_ended", "on_episode", "on_finished")
 
 
-def check_callbacks(callbacks: Sequence[Any]) -> tuple[Any, ...]:
-    """The callbacks; refuses one that nothing would call."""
-    found = tuple(callbacks)
-    for callback in found:
+def check_callbacks(callbacks: Sequence[Any]) -> None:
+    """Refuses a callback that nothing would call."""
+    for callback in callbacks:
         if not any(hasattr(callback, hook) for hook in HOOKS):
             raise ValueError(
                 f"the callback {shown(callback)} has none of the methods {', '.join(HOOKS)}: nothing would "
                 "call it"
             )
-    return found

@@ -18,7 +18,7 @@ from rerun.blueprint.encodings import TimelineColumn
 from cprl.commons.colours import WINDOW_CAPTION
 from cprl.viewer import institutions
 from cprl.viewer.panels import BOUNDS, Panels, decision_panels, row
-from cprl.viewer.scenery import BACKGROUND, Curves, Scene, has_lorenz, has_wall
+from cprl.viewer.scenery import BACKGROUND, EVALUATION, RANDOM_PLAY, Curves, Scene, has_lorenz, has_wall
 
 
 def fates(curves: Curves) -> Any:
@@ -253,10 +253,11 @@ _TABS: Final[tuple[Callable[[Curves], Any], ...]] = (
 
 
 def _social(curves: Curves, name: str, metric: str, *, share: bool = False) -> Any:
-    """The plot of a metric with random play's line; None if the game does not report it."""
+    """The plot of a metric with the lines of random play and of evaluations; None if the game does not report
+    it."""
     if metric not in curves.metrics:
         return None
-    return _plot(name, f"social/{metric}", f"random_play/{metric}", share=share)
+    return _plot(name, *(f"{of}/{metric}" for of in ("social", RANDOM_PLAY, EVALUATION)), share=share)
 
 
 def _plot(name: str, *entities: str, share: bool = False) -> Any:

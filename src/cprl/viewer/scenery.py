@@ -47,6 +47,8 @@ OTHERS: Final = {
 OF_AGENTS: Final = ("return", "loss", "epsilon", "q", "harvested")
 RANDOM_PLAY: Final = "random_play"
 """The folder of the lines of random play; each has the name of its metric."""
+EVALUATION: Final = "evaluation"
+"""The folder of the lines of evaluations while agents are trained, likewise."""
 ANOTHER: Final = "another"
 """The name of a phase that matches no pattern of the study."""
 BACKGROUND: Final = (24, 26, 32)
@@ -150,6 +152,9 @@ def lines(curves: Curves) -> dict[str, Any]:
     for metric in curves.metrics:
         styles[f"{RANDOM_PLAY}/{metric}"] = rr.SeriesLines(
             names=["random play"], colors=[GREY], widths=[_THIN_WIDTH]
+        )
+        styles[f"{EVALUATION}/{metric}"] = rr.SeriesLines(
+            names=["greedy, evaluated"], colors=[ORANGE], widths=[_RAW_WIDTH]
         )
     for entity, (name, colour) in OTHERS.items():
         styles[entity] = rr.SeriesLines(names=[name], colors=[colour])
