@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from stock_collector import stock_collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import cprl
@@ -31,7 +32,6 @@ from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
 from cprl.training import Training, train
 from cprl.training.agents import Population
-from cprl.training.collectors import stock_collector
 from cprl.training.outcome import evaluate_population, exhibited, random_play
 
 RULES = Rules(
@@ -382,8 +382,8 @@ def test_agents_of_an_earlier_run_decide_as_they_did_there(in_one_go, monkeypatc
     monkeypatch.chdir(in_one_go.parent)
     env = make_env(MEADOW, worlds=2, seed=4)
     frozen = [Frozen(in_one_go.name, agent, None) for agent in range(3)]
-    population = Population(env, frozen, seed=6, allow=ALLOW)
     loaded = cprl.load(in_one_go, allow=ALLOW)
+    population = Population(env, frozen, seed=6)
     training = trained_for(13, population, env)
     for replica in range(2):
         best = loaded.policy(replica).decisions.best()[0, :2].tolist()
@@ -391,7 +391,7 @@ def test_agents_of_an_earlier_run_decide_as_they_did_there(in_one_go, monkeypatc
     assert training.decisions.learned() == {}
     other = replace(MEADOW, institutions=(replace(VOTE, choices=(0.0, 0.5)), Sanctioner()))
     with pytest.raises(ValueError, match=r"have ballots \[\('the tax rate', \(0.0, 1.0\)\).*this game has"):
-        Population(make_env(other), frozen, allow=ALLOW)
+        Population(make_env(other), frozen)
 
 
 def test_the_exhibition_decides_beside_the_training_and_leaves_it_alone():

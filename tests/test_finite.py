@@ -85,9 +85,9 @@ REPLICAS, BROKEN = 3, (1, 0)
 
 
 def make_learner(name, **changes):
-    algorithm, how = LEARNERS[name]
-    how = {"engine": "eager", "reward_kind": "individual", "replicas": REPLICAS, **how, **changes}
-    return algorithm.make_learner(GAME.spaces, agents=(0, 1), seed=5, **how)
+    algorithm, settings = LEARNERS[name]
+    settings = {"engine": "eager", "reward_kind": "individual", "replicas": REPLICAS, **settings, **changes}
+    return algorithm.make_learner(GAME.spaces, agents=(0, 1), seed=5, **settings)
 
 
 def tensors_of(learner, replica, agent):
@@ -98,48 +98,38 @@ def tensors_of(learner, replica, agent):
     of_replica = len(learner._lanes) // learner.replicas
     lane = replica * of_replica + (agent if of_replica > 1 else 0)
     if isinstance(learner.engine, ListEngine):
-        return [own.data for own in learner.engine.losses[lane].parameters()]
+        return [weights.data for weights in learner.engine.losses[lane].parameters()]
     if isinstance(learner.engine, LOLANetworks):
         stacks = (learner.engine.acting, learner.engine.playing)
-        return [own.data[replica] for stack in stacks for own in stack.parameters()[agent]]
-    return [own[lane] for own in learner.engine.own.values()]
+        return [weights.data[replica] for stack in stacks for weights in stack.parameters()[agent]]
+    return [weights[lane] for weights in learner.engine.own.values()]
 
 
 class Breaks:
-    """Makes the weights of a lane NaN at a step."""
+    """Makes the weights of a lane NaN at a step, and notes returns and actions."""
 
-    def __init__(self, step):
-        self.step, self.steps = step, 0
+    def __init__(self, step=-1):
+        self.step, self.returns, self.actions = step, {}, []
 
     def on_start(self, training):
         (self.learner,) = training.learners.values()
 
     def on_step(self, batch):
-        self.steps += 1
-        if self.steps == self.step:
+        self.actions.append(batch["agents", "action"].clone())
+        if len(self.actions) == self.step:
             for tensor in tensors_of(self.learner, *BROKEN):
                 tensor.fill_(torch.nan)
-
-
-class Witness:
-    def __init__(self):
-        self.returns, self.actions = {}, []
-
-    def on_step(self, batch):
-        self.actions.append(batch["agents", "action"].clone())
 
     def on_episode(self, episode, learning):
         self.returns.setdefault(episode.world, []).append(episode.return_.tolist())
 
 
-def play(learner, *callbacks, episodes=3, **how):
-    """The training, and what was seen of it."""
-    witness = Witness()
+def play(learner, *, breaks=-1, episodes=3, **changes):
+    """The training of a learner that breaks at a step, and what was seen of it."""
+    seen = Breaks(breaks)
     env = CommonsEnv(GAME, learner.replicas, seed=2)
-    training = train(
-        env, {learner.agents: learner}, episodes=episodes, callbacks=[witness, *callbacks], **how
-    )
-    return training, witness
+    training = train(env, {learner.agents: learner}, episodes=episodes, callbacks=[seen], **changes)
+    return training, seen
 
 
 @pytest.mark.integration
@@ -149,7 +139,7 @@ def test_a_lane_that_breaks_stops_the_training_and_is_named(name):
     of_team = name in ("VDN", "QMIX", "IPPO", "MAPPO", "MADDPG") or name.startswith("LOLA")
     agents = r"agents 0, 1" if of_team else "agent 0"
     with pytest.raises(NotFiniteError, match=rf"^at step \d+ .*the weights of {agents} in replica 1 are not"):
-        play(learner, Breaks(14))
+        play(learner, breaks=14)
     assert learner.finite()[[0, 2]].all()
     assert not learner.finite()[BROKEN]
 
@@ -169,7 +159,7 @@ CONTINUING = [
 def test_with_continue_a_broken_lane_is_named_once_and_other_replicas_learn_as_without_it(name, engine):
     whole, sound = make_learner(name, **engine), make_learner(name, **engine)
     with pytest.warns(RuntimeWarning, match=r"replica 1 .*not finite.*; the others train on") as warned:
-        training, seen = play(whole, Breaks(14), episodes=4, on_nan="continue")
+        training, seen = play(whole, breaks=14, episodes=4, on_nan="continue")
     assert sum("not finite" in str(warning.message) for warning in warned) == 1
     _, wanted = play(sound, episodes=4)
     for replica in (0, 2):
@@ -178,18 +168,8 @@ def test_with_continue_a_broken_lane_is_named_once_and_other_replicas_learn_as_w
             lane = f"replica_{replica}/agent_{agent}"
             weights, sound_weights = (each.networks()[lane].state_dict() for each in (whole, sound))
             assert all(torch.equal(weights[key], value) for key, value in sound_weights.items())
-    assert {each.replica for each in training.finite.reported} == {1}
+    assert {finding.replica for finding in training.finite.reported} == {1}
     assert all(0 <= int(action) < GAME.spaces.actions for turn in seen.actions for action in turn.flatten())
-
-
-def losses_of(total, agents=(0, 1)):
-    losses = LaneLosses(len(total), agents)
-    losses.total[:] = total
-    return {agents: losses}
-
-
-NOTHING = np.zeros((3, 2))
-"""Returns of three replicas and two agents."""
 
 
 @pytest.fixture
@@ -198,22 +178,27 @@ def looks_every_step(monkeypatch):
 
 
 def test_a_single_infinite_loss_is_named_with_its_step_and_whether_the_weights_are_sound():
-    learner = make_learner("DQN")
+    learner, losses, returns = make_learner("DQN"), LaneLosses(3, (0, 1)), np.zeros((3, 2))
+
+    def look(check, total, step, **changes):
+        losses.total[:] = total
+        check.check({(0, 1): losses}, returns, step, **changes)
+
     check = FiniteCheck({(0, 1): learner}, GAME.spaces)
-    check.check(losses_of([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), NOTHING, 1)
+    look(check, [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]], 1)
     with pytest.raises(
         NotFiniteError, match=r"^at step 1,234 the loss of agent 1 in replica 2 is not finite;"
     ):
-        check.check(losses_of([[1.0, 2.0], [3.0, 4.0], [5.0, np.inf]]), NOTHING, 1234)
+        look(check, [[1.0, 2.0], [3.0, 4.0], [5.0, np.inf]], 1234)
     tensors_of(learner, 2, 1)[0].fill_(torch.inf)
     check = FiniteCheck({(0, 1): learner}, GAME.spaces, on_nan="continue")
-    broken = losses_of([[np.nan, 2.0], [3.0, 4.0], [5.0, np.nan]])
+    broken = [[np.nan, 2.0], [3.0, 4.0], [5.0, np.nan]]
     with pytest.warns(RuntimeWarning) as warned:
-        check.check(broken, NOTHING, 1234)
+        look(check, broken, 1234)
     with warnings.catch_warnings():  # named once
         warnings.simplefilter("error")
-        check.check(broken, NOTHING, 1235, weights=True)
-    (message,) = [str(one.message) for one in warned]
+        look(check, broken, 1235, weights=True)
+    (message,) = [str(warning.message) for warning in warned]
     assert message == (
         "at step 1,234 the loss of agent 0 in replica 0, the loss of agent 1 in replica 2, and the weights "
         "of agent 1 in replica 2 are not finite (weights were last checked at step 0); the others train on"
@@ -259,9 +244,8 @@ class Poison(Transform):
         return tensordict_reset
 
 
-def poisoned(entry, *, step, learning_starts=4, steps=5, **how):
-    """A training in a game that makes an entry NaN, of world 2 and agent 1, from a step on."""
-    env = TransformedEnv(MatrixGame(3, steps=steps), Poison(entry, world=2, agent=1, step=step, **how))
+def poisoned(entry, *, step, learning_starts=4, steps=5, **changes):
+    env = TransformedEnv(MatrixGame(3, steps=steps), Poison(entry, world=2, agent=1, step=step, **changes))
     algorithm = DQN(settings=replace(REPLAY, learning_starts=learning_starts))
     learner = algorithm.make_learner(spaces_of(env), agents=(0, 1), replicas=3, engine="eager")
     return Training(env, {(0, 1): learner}, episodes=3)
@@ -288,28 +272,19 @@ def test_rewards_and_observations_that_are_not_finite_are_blamed_on_the_environm
         step(poisoned(entry, **poison), 12)
 
 
-def test_rewards_are_looked_at_every_sixteen_steps_and_when_episodes_end():
-    training = poisoned("reward", step=2, steps=20, learning_starts=90)
-    step(training, 15)
-    with pytest.raises(NotFiniteError, match=r"^at step 16 the reward of agent 1 in replica 2 is not finite"):
+@pytest.mark.parametrize("entry", ["reward", "observation"])
+@pytest.mark.parametrize(("steps", "found_at"), [(20, 16), (5, 5)])
+def test_what_a_game_gives_is_looked_at_every_sixteen_steps_and_when_episodes_end(entry, steps, found_at):
+    training = poisoned(entry, step=2, steps=steps, learning_starts=90)
+    step(training, found_at - 1)
+    match = rf"^at step {found_at} the {entry} of agent 1 in replica 2 is not finite"
+    with pytest.raises(NotFiniteError, match=match):
         training.step()
 
 
-def test_on_a_gpu_observations_are_looked_at_when_episodes_end():
-    class OnGpu(FiniteCheck):
-        is_on_cpu = staticmethod(lambda tensor: False)
-
-    training = poisoned("observation", step=2, learning_starts=9)
-    training.finite = OnGpu(training.learners, training.learners[0, 1].spaces, on_nan="continue")
-    step(training, 4)
-    with pytest.warns(RuntimeWarning, match=r"at step 5 .*the observation of agent 1 in replica 2"):
-        training.step()
-    assert {each.place for each in training.finite.reported} >= {("observation", 2, 1)}
-
-
-def a_training(**how):
+def a_training(**changes):
     learner = make_learner("DQN")
-    return Training(CommonsEnv(GAME, REPLICAS, seed=2), {(0, 1): learner}, episodes=9, **how)
+    return Training(CommonsEnv(GAME, REPLICAS, seed=2), {(0, 1): learner}, episodes=9, **changes)
 
 
 def test_no_checkpoint_holds_what_is_not_finite_and_the_last_one_is_kept(tmp_path):
@@ -317,12 +292,12 @@ def test_no_checkpoint_holds_what_is_not_finite_and_the_last_one_is_kept(tmp_pat
     with Checkpointer(tmp_path) as checkpointer:
         step(training, 9)
         checkpointer.save(training)
-        kept = checkpoints_in(tmp_path / "checkpoints")
+        before = checkpoints_in(tmp_path / "checkpoints")
         tensors_of(training.learners[0, 1], *BROKEN)[1].fill_(-torch.inf)
         match = r"at step 9 the weights of agent 0 in replica 1 are .*; what was saved at step 9 is finite$"
         with pytest.raises(NotFiniteError, match=match):
             checkpointer.save(training)
-        assert checkpoints_in(tmp_path / "checkpoints") == kept
+        assert checkpoints_in(tmp_path / "checkpoints") == before
         checkpointer.restore(again)
         assert again.steps == 9
         assert again.learners[0, 1].finite().all()
@@ -344,15 +319,15 @@ def test_with_continue_the_last_sound_checkpoint_is_kept_beside_the_others(tmp_p
         with pytest.warns(RuntimeWarning, match="weights of agent 0 in replica 1"):
             checkpointer.save(training)
         step_and_save(training, 4)
-        kept = folder / f"sound-{sound.name}"
-        assert kept.exists()
+        beside = folder / f"sound-{sound.name}"
+        assert beside.exists()
         assert sound not in checkpoints_in(folder)
         checkpointer.restore(again)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             step_and_save(again, 1)
         assert not again.is_sound
-        kept.rename(sound)
+        beside.rename(sound)
         for path in checkpoints_in(folder):
             if path != sound:
                 path.unlink()
@@ -372,13 +347,13 @@ def test_a_learner_of_somebodys_own_that_refuses_nan_is_explained():
         GAME.spaces, kind=Refuses, agents=(0, 1), replicas=REPLICAS, settings=REPLAY, compile=False
     )
     with pytest.raises(NotFiniteError, match="at step 6 the weights of agent 0 in replica 1 are") as caught:
-        play(learner, Breaks(5))
+        play(learner, breaks=5)
     assert "probability tensor" in str(caught.value.__context__)
 
 
 def experiment(**changes):
-    how = {"replicas": 2, "episodes": 2, "evaluation_episodes": 1, "engine": "eager", **changes}
-    return Experiment(name="breaks", game=GAME, agents=(Learning(DQN(settings=REPLAY)),) * 2, **how)
+    small = {"replicas": 2, "episodes": 2, "evaluation_episodes": 1, "engine": "eager", **changes}
+    return Experiment(name="breaks", game=GAME, agents=(Learning(DQN(settings=REPLAY)),) * 2, **small)
 
 
 def test_on_nan_is_stop_or_continue_and_the_command_line_says_it_too():
@@ -403,8 +378,8 @@ def test_a_run_that_stopped_is_resumed_with_continue_and_its_summary_names_who_i
     assert (
         "From step 6 on the loss of agent 0 in replica 1, and the weights of agent 0 in replica 1" in printed
     )
-    found = json.loads((directory / "report.json").read_text())["not_finite"]
-    assert found[0] == {"what": "loss", "replica": 1, "agent": 0, "step": 6}
+    findings = json.loads((directory / "report.json").read_text())["not_finite"]
+    assert findings[0] == {"what": "loss", "replica": 1, "agent": 0, "step": 6}
     loaded = load(directory, allow=["test_finite:Breaks"])
     assert loaded.experiment == continuing
     assert loaded.agent(0, replica=0).network is not None

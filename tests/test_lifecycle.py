@@ -7,7 +7,6 @@ import signal
 import socket
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -90,8 +89,12 @@ def test_a_command_that_a_signal_stops_says_once_what_resumes_and_exits_as_shell
     number, tmp_path, monkeypatch, capsys
 ):
     begun = start_run(tmp_path / "begun", "field", FIELD.to_recipe)
-    run_it = partial(cprl.run, callbacks=[Signals(number, 30)])
-    monkeypatch.setattr("cprl.training.running.run", run_it)
+    run = cprl.run
+
+    def run_until_the_signal(*values, **options):
+        return run(*values, **{**options, "callbacks": [Signals(number, 30)]})
+
+    monkeypatch.setattr("cprl.training.running.run", run_until_the_signal)
     words = ["cprl", "run", str(begun), "--out", str(tmp_path / "run"), "--watch", "off"]
     monkeypatch.setattr("sys.argv", words)
     with pytest.raises(SystemExit) as ended:

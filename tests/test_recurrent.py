@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from recall_game import Recall
+from stock_collector import stock_collector
 from tensordict import TensorDict
 from test_networks import VECTORS
 from test_population import GAME, Returns, population
@@ -48,7 +49,7 @@ from cprl.networks.stacked import lane_state, stack_lanes
 from cprl.policies.assignment import AgentPolicies
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.training import train
-from cprl.training.collectors import StepCollector, stock_collector
+from cprl.training.collectors import StepCollector
 from cprl.values import from_config, to_config
 
 SMALL = GRU(encoder=MLP(hidden_cells=(6,)), recurrent_cells=5)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from dqn_parts import dqn_learner
+from stock_collector import stock_collector
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.algorithms import DQN, LOLA, PPO, LOLASettings, RolloutSettings
@@ -15,11 +16,10 @@ from cprl.learners.settings import DEFAULT_HIDDEN_CELLS, DQNSettings
 from cprl.measuring.evaluate import evaluate, mean_return
 from cprl.networks import GRU
 from cprl.policies.assignment import AgentPolicies
-from cprl.policies.lanes import RandomActor, random_lanes
+from cprl.policies.lanes import RandomActor
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.episodes import EpisodeTable, read_episodes
 from cprl.training import Training, train
-from cprl.training.collectors import stock_collector
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -27,6 +27,8 @@ GAME = Game(
 )
 
 SETTINGS = DQNSettings(buffer_size=200, learning_rate=1e-3, hidden_cells=(8,), epsilon_hold_steps=5)
+
+OTHER = {1: RandomActor(8)}
 
 ROLLOUTS = RolloutSettings(rollout_steps=8, minibatch_size=4, epochs=1, hidden_cells=(8,))
 
@@ -50,7 +52,7 @@ def learner(agent=0, *, seed=0):
 
 def test_observers_see_every_turn_and_every_episode_and_the_learner_learns_once_a_turn():
     witness, agent = Witness(), learner()
-    train(CommonsEnv(GAME), {(0,): agent}, others={1: RandomActor(8)}, episodes=5, callbacks=[witness])
+    train(CommonsEnv(GAME), {(0,): agent}, others=OTHER, episodes=5, callbacks=[witness])
     assert len(witness.turns) == agent.steps == sum(episode.steps for episode in witness.episodes)
     assert [episode.episode for episode in witness.episodes] == [0, 1, 2, 3, 4]
     assert set(witness.learning[-1]) == {"agent_0/loss", "agent_0/epsilon", "agent_0/q"}
@@ -62,65 +64,46 @@ def test_observers_see_every_turn_and_every_episode_and_the_learner_learns_once_
 def test_two_learners_sit_side_by_side_and_each_stores_its_own_turns():
     learners = {(0,): learner(0), (1,): learner(1)}
     train(CommonsEnv(GAME), learners, episodes=2)
-    first, second = (own.buffer.each[0][:]["observation"] for own in learners.values())
+    first, second = (one.buffer.each[0][:]["observation"] for one in learners.values())
     assert len(first) == len(second) == learners[0,].steps
     assert not torch.equal(first, second)
 
 
-@pytest.mark.integration
-def test_training_again_with_the_same_seeds_gives_the_same_episodes():
-    def returns():
-        torch.manual_seed(3)
-        witness = Witness()
-        train(
-            CommonsEnv(GAME, seed=3),
-            {(0,): learner(0, seed=3), (1,): learner(1, seed=3)},
-            episodes=4,
-            callbacks=[witness],
-        )
-        return [episode.return_.tolist() for episode in witness.episodes]
-
-    assert returns() == returns()
-
-
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("worlds", "arguments", "message"),
     [
-        ({"others": {}}, r"control the agents \[0\]"),
-        ({"others": {0: RandomActor(8), 1: RandomActor(8)}}, r"control the agents \[0, 0, 1\]"),
-        ({"others": {1: RandomActor(8)}, "episodes": 0}, "episodes is 0"),
+        (1, {"others": {}}, r"control the agents \[0\]"),
+        (1, {"others": {0: RandomActor(8), **OTHER}}, r"control the agents \[0, 0, 1\]"),
+        (1, {"episodes": 0}, "episodes is 0"),
+        (1, {"callbacks": [7]}, "callback 7"),
+        (2, {}, r"has 2 worlds; the learner of \(0,\) has 1 replicas"),
     ],
 )
-def test_what_cannot_be_trained_is_refused(arguments, message):
+def test_what_cannot_be_trained_is_refused(worlds, arguments, message):
     with pytest.raises(ValueError, match=message):
-        train(CommonsEnv(GAME), {(0,): learner()}, **{"episodes": 1, **arguments})
-
-
-def test_one_world_is_trained_at_a_time():
-    with pytest.raises(ValueError, match=r"has 2 worlds; the learner of \(0,\) has 1 replicas"):
-        train(CommonsEnv(GAME, 2), {(0,): learner()}, others={1: RandomActor(8)}, episodes=1)
+        train(CommonsEnv(GAME, worlds), {(0,): learner()}, **{"others": OTHER, "episodes": 1, **arguments})
 
 
 def test_learning_may_wait_for_several_steps_and_then_catches_up():
     class Counting(ReplayLearner):
         def update(self):
-            told.append(self.steps)
+            updated_at.append(self.steps)
             return super().update()
 
-    told = []
+    updated_at = []
     settings = replace(SETTINGS, learning_starts=1)
-    how = {"agents": (0, 1), "replicas": 2, "compile": False}
-    agents = dqn_learner(GAME.spaces, kind=Counting, settings=settings, **how)
+    small = {"agents": (0, 1), "replicas": 2, "compile": False}
+    agents = dqn_learner(GAME.spaces, kind=Counting, settings=settings, **small)
     training = train(CommonsEnv(GAME, 2), {(0, 1): agents}, episodes=2, update_every=3)
     bouts = training.steps // 3
-    assert told == [3 * (bout + 1) for bout in range(bouts) for _ in range(3)]
+    assert updated_at == [3 * (bout + 1) for bout in range(bouts) for _ in range(3)]
 
 
 def test_torchrls_own_collector_trains_the_same():
-    def course(**how):
+    def course(**arguments):
         witness = Witness()
         agents = dqn_learner(GAME.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=3, compile=False)
-        train(CommonsEnv(GAME, 2, seed=3), {(0, 1): agents}, episodes=4, callbacks=[witness], **how)
+        train(CommonsEnv(GAME, 2, seed=3), {(0, 1): agents}, episodes=4, callbacks=[witness], **arguments)
         losses = [learning["agent_1/loss"] for learning in witness.learning]
         weights = agents.networks()["replica_1/agent_0"].state_dict().values()
         return (
@@ -137,12 +120,12 @@ def test_torchrls_own_collector_trains_the_same():
 
 def test_checkpoints_of_what_keeps_no_state_are_refused_before_anything_is_played(tmp_path):
     env, witness = CommonsEnv(GAME), Witness()
-    how = {"episodes": 1, "checkpointer": Checkpointer(tmp_path), "callbacks": [witness]}
+    saving = {"episodes": 1, "checkpointer": Checkpointer(tmp_path), "callbacks": [witness]}
     agents = dqn_learner(GAME.spaces, agents=(0, 1), replicas=1, settings=SETTINGS, compile=False)
     with pytest.raises(
         ValueError, match="a Collector has no state to resume from; train with a StepCollector"
     ):
-        train(env, {(0, 1): agents}, make_collector=stock_collector, **how)
+        train(env, {(0, 1): agents}, make_collector=stock_collector, **saving)
     assert witness.turns == []
 
 
@@ -186,8 +169,7 @@ def test_what_a_second_training_stores_does_not_follow_the_last_turn_of_the_firs
     settings = DQNSettings(
         buffer_size=1000, hidden_cells=(8,), n_steps=steps, gamma=0.5, learning_starts=5000
     )
-    how = {"agents": (0, 1), "replicas": 3, "engine": engine}
-    agents = DQN(settings=settings).make_learner(UNEVEN.spaces, **how)
+    agents = DQN(settings=settings).make_learner(UNEVEN.spaces, agents=(0, 1), replicas=3, engine=engine)
     first, second = train_twice(agents)
     came = [*first, *second]
     for lane in range(6):
@@ -196,9 +178,9 @@ def test_what_a_second_training_stores_does_not_follow_the_last_turn_of_the_firs
         done[len(first) - 1] = True
         places = torch.arange(len(came) - steps)
         if engine == "eager":
-            kept = agents.buffer.get(places.expand(6, -1))[lane]
+            stored = agents.buffer.get(places.expand(6, -1))[lane]
         else:
-            kept = agents.buffer.each[lane].storage[:][: len(places)]
+            stored = agents.buffer.each[lane].storage[:][: len(places)]
         for place in places.tolist():
             rewards, last = 0.0, place
             for ahead in range(steps):
@@ -207,9 +189,9 @@ def test_what_a_second_training_stores_does_not_follow_the_last_turn_of_the_firs
                 if done[last]:
                     break
             before, after = came[place]["agents"], came[last]["next", "agents"]
-            assert torch.equal(kept["observation"][place], before["observation"][replica, agent])
-            assert torch.equal(kept["next", "observation"][place], after["observation"][replica, agent])
-            assert kept["next", "reward"][place].item() == pytest.approx(rewards)
+            assert torch.equal(stored["observation"][place], before["observation"][replica, agent])
+            assert torch.equal(stored["next", "observation"][place], after["observation"][replica, agent])
+            assert stored["next", "reward"][place].item() == pytest.approx(rewards)
 
 
 @pytest.mark.integration
@@ -223,11 +205,11 @@ def test_what_a_second_training_stores_does_not_follow_the_last_turn_of_the_firs
     ],
 )
 def test_a_second_training_begins_its_rollouts_anew(algorithm, engine, wanted):
-    how = {"agents": (0, 1), "replicas": 3, "engine": engine}
-    agents = algorithm.make_learner(UNEVEN.spaces, **{name: own for name, own in how.items() if own})
+    engine = {} if engine is None else {"engine": engine}
+    agents = algorithm.make_learner(UNEVEN.spaces, agents=(0, 1), replicas=3, **engine)
 
     def weights():
-        return [value for own in agents.networks().values() for value in own.state_dict().values()]
+        return [value for network in agents.networks().values() for value in network.state_dict().values()]
 
     first = Training(CommonsEnv(UNEVEN, 3, seed=0), {(0, 1): agents}, episodes=1)
     for _ in range(11):
@@ -262,7 +244,9 @@ def test_evaluation_explores_only_if_asked():
         env = CommonsEnv(GAME, 1, seed=1)
         seen = []
         step = env.lean_step
-        env.lean_step = lambda td, **how: seen.append(int(td["agents", "action"][0, 0])) or step(td, **how)
+        env.lean_step = lambda td, **resets: (
+            seen.append(int(td["agents", "action"][0, 0])) or step(td, **resets)
+        )
         evaluate(env, agents, explore=explore)
         return seen
 
@@ -292,27 +276,4 @@ def test_two_callbacks_of_one_class_each_have_their_own_state():
     one, other = training(10, 20), training(0, 0)
     one.step()
     other.load_state_dict(one.state_dict())
-    assert [own.count for own in other.callbacks] == [11, 21]
-
-
-def test_a_state_with_other_actors_of_agents_that_do_not_learn_is_refused_before_anything_is_set():
-    def training(others):
-        return Training(CommonsEnv(GAME, seed=0), {}, episodes=1, others=others)
-
-    apart = training({(agent,): random_lanes(8, seeds=[(agent,)], agents=1) for agent in (0, 1)})
-    apart.step()
-    together = training({(0, 1): random_lanes(8, seeds=[(0,), (1,)], agents=2)})
-    with pytest.raises(ValueError, match=r"has 2 actors .* for \[\[0, 1\]\]; finish the run"):
-        together.load_state_dict(apart.state_dict())
-    assert together.steps == 0
-
-
-def test_a_callback_that_nothing_would_call_is_refused():
-    with pytest.raises(ValueError, match=r"none of the methods on_start, .*: nothing would call it"):
-        train(
-            CommonsEnv(GAME, seed=0),
-            {},
-            others={0: RandomActor(8), 1: RandomActor(8)},
-            episodes=1,
-            callbacks=[7],
-        )
+    assert [callback.count for callback in other.callbacks] == [11, 21]

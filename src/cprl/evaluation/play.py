@@ -17,6 +17,7 @@ from cprl.commons.colours import APPLE, BEAM, PALETTE, WALL, Colour, agent_colou
 from cprl.commons.game import Game
 from cprl.commons.maps import SIGN_OF_HEADING
 from cprl.commons.world import Shown, StepOutput
+from cprl.custom import trust
 from cprl.envs.make_env import make_env
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.lanes import Policy, Turns
@@ -279,5 +280,6 @@ def open_session(
         env = make_env(game, seed=seed)
     else:
         env = replace(run, experiment=replace(run.experiment, game=game)).env(seed=seed)
-    population = Population(env, specs, seed=seed, allow=allow)
+    trust(*allow)
+    population = Population(env, specs, seed=seed)
     return Session(env, population.policy(1), agent=agent, decision=decision)

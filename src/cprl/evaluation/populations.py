@@ -56,7 +56,7 @@ def play_population(
     replicas = arguments.integer("replicas", replicas, 1)
     runs = {spec.run for spec in specs if isinstance(spec, Frozen)}
     check(episodes=episodes, seed=seed, greedy=greedy, runs=[load(run, allow=allow) for run in sorted(runs)])
-    population = Population(place.env(replicas, seed=seed), specs, seed=seed, allow=allow)
+    population = Population(place.env(replicas, seed=seed), specs, seed=seed)
     policies = population.policy(episodes)
     return play(place, lambda _: policies, range(replicas), episodes=episodes, seed=seed, explore=not greedy)
 

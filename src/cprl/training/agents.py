@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
-from cprl.checks import shown
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom, made
@@ -30,7 +29,7 @@ from cprl.networks.recurrent import state_cells_of, state_shape_of
 from cprl.networks.stacked import stack_lanes
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import ballot_sizes, decider_by_chance
-from cprl.policies.lanes import actor_of_lanes, random_agents
+from cprl.policies.lanes import LaneActor, random_agents
 from cprl.policies.present import PresentPolicy
 from cprl.policies.scripted import ScriptedPolicy, scripted_lanes
 from cprl.population import (
@@ -48,6 +47,7 @@ from cprl.runs.checkpoints import FOLDER
 from cprl.runs.episodes import read_episodes
 from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, say_changes
 from cprl.runs.weights import kept_of, weights_of
+from cprl.values import shown
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,7 +88,6 @@ class LoadedRun:
     """What the transforms of the environment had learned."""
     decisions: Mapping[str, Tensor] = field(default_factory=dict)
     """The values of what each lane decides, see `cprl.policies.decisions`; empty where it decides nothing."""
-    allow: tuple[str, ...] = ()
     _earlier: dict[str, "LoadedRun"] = field(default_factory=dict, repr=False)
     """Runs whose agents are frozen in this one, read once."""
 
@@ -147,7 +146,7 @@ class LoadedRun:
         if isinstance(spec, Frozen):
             if spec.run not in self._earlier:
                 weights = weights_of(self.recipe, self.path, spec.run)
-                self._earlier[spec.run] = load(spec.run, weights=weights, allow=self.allow)
+                self._earlier[spec.run] = load(spec.run, weights=weights)
             return self._earlier[spec.run].agent(spec.agent, replica=spec.replica_for(replica))
         lane = lane_name(replica, agent)
         if lane not in self.networks:
@@ -193,7 +192,7 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
         weights: which of those in its `checkpoints/`: "final", "best" where the recipe keeps them, or
             "final-4800" of a run that was extended from so many episodes; by default the final ones, or those
             of the newest readable checkpoint where the run has not ended.
-        allow: the targets, "module:Class", of the user's own code that the run may import.
+        allow: the user's own code, "module:Class", that the process trusts from now on.
     """
     run = Path(run)
     if weights is not None and (Path(weights).name != weights or weights in ("", "..")):
@@ -214,7 +213,6 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
         weights_from=kept_weights.path,
         transforms_state=kept_weights.transforms,
         decisions=kept_weights.decisions,
-        allow=tuple(allow),
     )
     with torch.random.fork_rng(devices=[]):  # networks draw weights at first, which the kept ones replace
         networks |= _networks(loaded, kept_weights.networks)
@@ -310,9 +308,10 @@ def _actor(
     if first.scripted is not None:
         return scripted_lanes(first.scripted, playing, **of_lanes)
     networks: list[Any] = [lane.network for lane in lanes]
-    actor = actor_of_lanes(
+    spaces = playing.spaces if isinstance(playing, Game) else playing
+    actor = LaneActor(
         _side_by_side(networks, stacks=stacks),
-        playing.spaces if isinstance(playing, Game) else playing,
+        spaces.actions,
         stochastic=first.stochastic,
         state_cells=state_cells_of(networks[0]),
         **of_lanes,
@@ -344,7 +343,6 @@ class Population:
         seed: of the run; each agent of each replica has random numbers of its own.
         first_replica: the number of the first replica, so that replica r can be trained alone.
         engine: "compiled", "eager" or "torchrl", see `Experiment.engine`.
-        allow: what stored runs of `Frozen` agents may import, see `cprl.load`.
         starts: whether agents that start from stored weights get them; False where a checkpoint follows,
             which has later ones.
         weights: the names of the weights that `Frozen` agents play with, see `cprl.load`, by their run; of
@@ -359,7 +357,6 @@ class Population:
         seed: int = 0,
         first_replica: int = 0,
         engine: str = "compiled",
-        allow: Sequence[str] = (),
         starts: bool = True,
         weights: Mapping[str, str] | None = None,
     ) -> None:
@@ -371,12 +368,11 @@ class Population:
         self._groups = grouped(specs, self.spaces.agents)
         check_scripted(self._groups, self.spaces, self._game)
         self._numbers = range(first_replica, first_replica + self.replicas)
-        self._frozen = self._frozen_agents(allow, weights or {})
-        self._acting = self._acting_together()
+        self._stored = self._agents_that_do_not_learn(weights or {})
         self.learners: dict[tuple[int, ...], Learner] = {}
         for spec, agents in self._groups:
             if isinstance(spec, Learning | Team):
-                start = self._start_weights(spec, agents, allow) if starts else {}
+                start = self._start_weights(spec, agents) if starts else {}
                 self.learners[agents] = self._learner(spec, agents, engine, start)
         self.others: dict[AgentIndices, nn.Module] = self._others(EXPLORATION, worlds=1)
         self.decisions: BanditDecider | None = self._decisions()
@@ -436,60 +432,50 @@ class Population:
         agents: dict[int, list[StoredAgent]] = {}
         for spec, indices in self._groups:
             for agent in indices:
-                lanes = {replica: lane_name(replica, agent) for replica in replicas}
-                agents[agent] = [
-                    _trained(spec, networks[lane], decisions.get(lane))
-                    if isinstance(spec, Learning | Team)
-                    else self._unlearning(spec, self._numbers.index(replica))
-                    for replica, lane in lanes.items()
-                ]
+                lanes = [lane_name(replica, agent) for replica in replicas]
+                if isinstance(spec, Learning | Team):
+                    agents[agent] = [_trained(spec, networks[lane], decisions.get(lane)) for lane in lanes]
+                else:
+                    agents[agent] = [self._stored[agent][self._numbers.index(r)] for r in replicas]
         return [agents[agent] for agent in sorted(agents)]
 
-    def _frozen_agents(
-        self, allow: Sequence[str], weights: Mapping[str, str]
-    ) -> dict[Frozen, list[StoredAgent]]:
-        """The stored agent of each replica, by specification; each run is read once."""
+    def _agents_that_do_not_learn(self, weights: Mapping[str, str]) -> dict[int, list[StoredAgent]]:
+        """The agents of each replica, by their index; each stored run is read once."""
         runs: dict[str, LoadedRun] = {}
-        agents = {}
-        for spec, _ in self._groups:
-            if isinstance(spec, Frozen):
+        agents: dict[int, list[StoredAgent]] = {}
+        for spec, indices in self._groups:
+            of_replicas: list[StoredAgent] = []
+            if isinstance(spec, Scripted):
+                of_replicas = [StoredAgent(scripted=spec.policy)] * self.replicas
+            elif isinstance(spec, Frozen):
                 if spec.run not in runs:
-                    run = load(spec.run, weights=weights.get(spec.run), allow=allow)
-                    _refuse_unfitting(run, self.spaces, self._game, is_to_decide=True)
-                    runs[spec.run] = run
-                agents[spec] = [
-                    runs[spec.run].agent(spec.agent, replica=spec.replica_for(replica))
-                    for replica in self._numbers
-                ]
+                    runs[spec.run] = load(spec.run, weights=weights.get(spec.run))
+                    _refuse_unfitting(runs[spec.run], self.spaces, self._game, is_to_decide=True)
+                for replica in self._numbers:
+                    there = spec.replica_for(replica)
+                    of_replicas.append(runs[spec.run].agent(spec.agent, replica=there))
+            agents |= dict.fromkeys(indices, of_replicas) if of_replicas else {}
         return agents
-
-    def _acting_together(self) -> list[dict[int, Scripted | Frozen]]:
-        """The specifications of agents that do not learn, by their indices; those of a group act as lanes of
-        one actor: scripted ones that are specified alike, and agents of one kind from one stored run."""
-        alike: dict[Any, dict[int, Scripted | Frozen]] = {}
-        for spec, agents in self._groups:
-            if isinstance(spec, Scripted | Frozen):
-                key = spec if isinstance(spec, Scripted) else (spec.run, self._frozen[spec][0].kind)
-                alike.setdefault(key, {}).update(dict.fromkeys(agents, spec))
-        return [dict(sorted(specs.items())) for specs in alike.values()]
 
     def _others(
         self, purpose: int, *, worlds: int, replicas: int | None = None
     ) -> dict[AgentIndices, nn.Module]:
         """The actors of the agents that do not learn, with random numbers for a purpose; for so many
-        replicas, all by default."""
+        replicas, all by default. Scripted agents of one policy act as lanes of one actor, and agents of one
+        kind from one stored run."""
+        alike: dict[Any, list[int]] = {}
+        for spec, indices in self._groups:
+            if not isinstance(spec, Learning | Team):
+                key = getattr(spec, "run", None), self._stored[indices[0]][0].kind
+                alike.setdefault(key, []).extend(indices)
         numbers = self._numbers[:replicas]
         actors: dict[AgentIndices, nn.Module] = {}
-        for group in self._acting:
-            agents, places = tuple(group), range(len(numbers))
-            lanes = [self._unlearning(spec, place) for place in places for spec in group.values()]
+        for together in alike.values():
+            agents = tuple(sorted(together))
+            lanes = [self._stored[agent][place] for place in range(len(numbers)) for agent in agents]
             seeds = lane_seeds(self.seed, replicas=numbers, agents=agents, purpose=purpose)
             actors[agents] = _actor(lanes, self.playing, seeds=seeds, agents=len(agents), worlds=worlds)
         return actors
-
-    def _unlearning(self, spec: Scripted | Frozen, place: int) -> StoredAgent:
-        """An agent that does not learn, of the replica at a place."""
-        return StoredAgent(scripted=spec.policy) if isinstance(spec, Scripted) else self._frozen[spec][place]
 
     def _decisions(self) -> BanditDecider | None:
         sizes = () if self._game is None else ballot_sizes(self._game)
@@ -497,14 +483,15 @@ class Population:
         if not sizes:
             return None
         bandits: list[Bandit | None] = [None] * self.spaces.agents
-        stored: dict[int, list[Tensor]] = {}
-        for spec, agents in self._groups:
-            for agent in agents:
-                if isinstance(spec, Learning | Team):
+        for spec, indices in self._groups:
+            if isinstance(spec, Learning | Team):
+                for agent in indices:
                     bandits[agent] = spec.decisions or Bandit()
-                elif isinstance(spec, Frozen):
-                    values = [one.decisions for one in self._frozen[spec] if one.decisions is not None]
-                    stored |= {agent: values} if values else {}  # a scripted agent of that run has none
+        stored: dict[int, list[Tensor]] = {}
+        for agent, of_replicas in self._stored.items():
+            values = [agent_of_replica.decisions for agent_of_replica in of_replicas]
+            known = [value for value in values if value is not None]  # scripted agents have none
+            stored |= {agent: known} if known else {}
         return BanditDecider(
             sizes,
             bandits=bandits,
@@ -541,15 +528,13 @@ class Population:
             )
         return learner
 
-    def _start_weights(
-        self, spec: Learning | Team, agents: tuple[int, ...], allow: Sequence[str]
-    ) -> dict[str, dict[str, Tensor]]:
+    def _start_weights(self, spec: Learning | Team, agents: tuple[int, ...]) -> dict[str, dict[str, Tensor]]:
         """The state dict of the acting network with which each agent of each replica starts, by the lane's
         name; empty where they start anew."""
         source = spec.start_from
         if source is None:
             return {}
-        run, algorithm = load(source.run, allow=allow), _algorithm_of(spec)
+        run, algorithm = load(source.run), _algorithm_of(spec)
         _refuse_unfitting(run, self.spaces, self._game)
         is_team = isinstance(spec, Team)
         sources = _members(run, source, len(agents)) if is_team else (source.agent,) * len(agents)

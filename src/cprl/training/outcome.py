@@ -33,7 +33,6 @@ EXHIBITED_WORLD: Final = 2**31
 
 def make_agents(
     experiment: Experiment,
-    allow: Sequence[str] = (),
     *,
     starts: bool = True,
     weights: Mapping[str, str] | None = None,
@@ -41,7 +40,6 @@ def make_agents(
     """Make the worlds of a training and its agents; refuse what does not fit, in the evaluation too.
 
     Args:
-        allow: the user's own code that stored runs may import.
         starts: whether agents start with the weights of stored ones, where they ask for it; a training that
             is resumed reads its own.
         weights: those that `Frozen` agents play with, see `Population`.
@@ -58,7 +56,6 @@ def make_agents(
         experiment.agents,
         seed=experiment.seed,
         engine=experiment.engine,
-        allow=allow,
         starts=starts,
         weights=weights,
     )

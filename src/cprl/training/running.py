@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchrl.envs import EnvBase
 
-from cprl.custom import Custom, made
+from cprl.custom import Custom, made, trust
 from cprl.envs.state import transforms_state
 from cprl.envs.unwrap import agent_names
 from cprl.experiment import Experiment
@@ -86,7 +86,8 @@ def run(
             live as well, see `cprl.viewer.streams.open_live`; "off" for none.
         linger: whether the recording stays served after the run, until Ctrl-C (SIGINT) or SIGTERM; only with
             `watch` "serve" or "spawn".
-        allow: the user's own code, "module:Class", that stored runs of `Frozen` agents may import.
+        allow: the user's own code, "module:Class", that the process trusts from now on; stored runs of
+            `Frozen` agents may need it.
         callbacks: further callbacks of this process (see `cprl.training.Callback`), which the recipe does
             not hold; they may look, and change nothing.
         figures: whether the training curve is drawn; a study draws its own.
@@ -111,10 +112,11 @@ def run(
     check_linger(linger, watch)
     for logger in experiment.loggers:
         check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
+    trust(*allow)
     prepare_process(experiment.seed)
     is_begun = resume and out is not None and bool(checkpoints_in(out / FOLDER))
     weights = _weights_of_partners(experiment, out) if resume and out is not None else {}
-    env, population = make_agents(experiment, allow, starts=not is_begun, weights=weights)
+    env, population = make_agents(experiment, starts=not is_begun, weights=weights)
     observers: list[Any] = [*(made(callback) for callback in experiment.callbacks), *callbacks]
     check_callbacks(observers)
     episodes = refuse_another_run(out, experiment.to_recipe, Experiment) if resume else experiment.episodes

@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 
-from cprl.checks import shown
 from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.state import carried_state, env_state, load_carried, load_env_state
 from cprl.envs.unwrap import commons_of
@@ -30,17 +29,17 @@ from cprl.learners.base import (
     learned_in,
 )
 from cprl.measuring.episodes import Episode, tracker_of
-from cprl.policies.assignment import AgentIndices, AgentPolicies, agent_indices
+from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import Decider
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.files import TRAINING_STATE_FORMAT
 from cprl.system.times import Times
 from cprl.training.collectors import StepCollector
 from cprl.training.finite import EVERY_STEPS, FiniteCheck
+from cprl.values import shown
 
 MakeCollector = Callable[[EnvBase, nn.Module], BaseCollector]
 """A collector out of an environment and a policy; it yields batches [R], or [R, T] of T turns."""
-_FINISH_THERE: Final = "finish the run with the version that began it (its recipe.json has the commit)"
 
 
 class Training:
@@ -57,7 +56,7 @@ class Training:
         decisions: what all agents decide, and learn to, where the game asks them; see `Game.decisions`.
         callbacks: called after each turn and each episode, in this order; see `Callback`.
         update_every: steps k after which each learner updates, then k times.
-        make_collector: `StepCollector`, or for TorchRL's own `cprl.training.collectors.stock_collector`.
+        make_collector: what plays; one of TorchRL's own is several times slower, and cannot be resumed.
         on_nan: whether the training stops where a loss, weight, reward or observation is not finite, see
             `cprl.training.finite`.
     """
@@ -264,12 +263,8 @@ class Training:
         if state.get("format", 1) != TRAINING_STATE_FORMAT:
             raise ValueError(
                 f"the state has the format {state.get('format', 1)}, this version resumes "
-                f"{TRAINING_STATE_FORMAT}; {_FINISH_THERE}"
-            )
-        if len(state["others"]) != len(self.others):
-            raise ValueError(
-                f"the state has {len(state['others'])} actors of agents that do not learn; this version has "
-                f"them for {[list(agent_indices(agents)) for agents in self.others]}; {_FINISH_THERE}"
+                f"{TRAINING_STATE_FORMAT}; finish the run with the version that began it, whose commit is in "
+                "its recipe.json"
             )
         self.times.load_state_dict(state)
         self.steps, self._played = int(state["steps"]), list(state["played"])
@@ -278,11 +273,11 @@ class Training:
         for name, of_agents in parts.items():
             for part, part_state in zip(of_agents.values(), state[name], strict=True):
                 part.load_state_dict(part_state)
-        self._wanted.load_state_dict(state.get("wanted", {}))
+        self._wanted.load_state_dict(state["wanted"])
         if self.decisions is not None:
             self.decisions.load_state_dict(state["decisions"])
         self._tracker.load_state_dict(state["tracker"])
-        self.finite.load_state_dict(state.get("not_finite", ()), step=self.steps)
+        self.finite.load_state_dict(state["not_finite"], step=self.steps)
         for name, callback in self._with_state().items():
             if name in state["callbacks"]:  # a viewer may be added or left out from now on
                 callback.load_state_dict(state["callbacks"][name])
@@ -292,7 +287,7 @@ class Training:
         fresh = self.env.reset()  # the form of what is carried; the state then says where the worlds are
         load_env_state(self.env, state["env"])
         if state["carried"] is not None:
-            self._step_collector().resume_from(load_carried(fresh, state["carried"]))
+            self._step_collector().carried = load_carried(fresh, state["carried"])
 
 
 def _return_to_decide_by(episode: Episode) -> NDArray[np.float64]:
