@@ -1,4 +1,4 @@
-"""A study of parameters is a value: its conditions, their names, seeds and checksums; JSON and back."""
+"""A study is a value: its conditions, their names, seeds and checksums; JSON and back; words."""
 
 import json
 import sys
@@ -13,27 +13,34 @@ from my_game import Dilemma
 from tiny_study import FREEZE, GAMMA, LEARNING, MIXED, SETTINGS, TINY
 
 from cprl import Custom, Study, maps
-from cprl.algorithms import PPO, VDN
+from cprl.algorithms import DQN, PPO, VDN, DQNSettings
 from cprl.experiment import MOST_SEED, Experiment
+from cprl.institutions import Quota, Sanctioner
 from cprl.learners.settings import RolloutSettings
+from cprl.networks import MLP
 from cprl.population import Frozen, Learning, Scripted, Team, stored_of
 from cprl.studies import Integers, LogUniform, Uniform
-from cprl.studies.factors import changed, drawn, values_at
-from cprl.studies.study import CONDITION_FORMAT, Condition, apart
+from cprl.studies.factors import changed, drawn, factors_of, values_at
+from cprl.studies.study import CONDITION_FORMAT, Condition, apart, level_text, named, short_names
 from cprl.studies.trials import trials_of
 from cprl.values import KINDS, defaults_of
 
 OF_FIRST, OF_SECOND = (GAMMA.replace("*", agent) for agent in "01")
+OF_ALL = "agents.*.algorithm.settings"
+SCRIPTED = replace(TINY, agents=(Scripted("greedy"),) * 2)
+ON_POLICY = Learning(PPO(settings=RolloutSettings()))
+OTHER = Dilemma(payoffs=((3.0, 0.5), (4.0, 1.0)))
+OWN_GAME = replace(TINY, game=Dilemma())
 
 
 def checksums(study):
     return [condition.checksum for condition in study.all_conditions]
 
 
-def there_and_back(study, **how):
+def there_and_back(study, directory=None, **options):
     """The study that is read from its JSON, which has the same conditions."""
-    directory = {name: how[name] for name in ("directory",) if name in how}
-    again = Study.from_config(json.loads(json.dumps(study.to_config(**directory))), **how)
+    table = json.loads(json.dumps(study.to_config(directory)))
+    again = Study.from_config(table, directory=directory, **options)
     assert checksums(again) == checksums(study)
     return again
 
@@ -74,11 +81,8 @@ def test_a_path_may_be_written_as_the_flag_is_and_a_list_becomes_a_tuple():
     assert values_at(new, "agents.*.algorithm.settings.hidden_cells") == [(2,), (2,)]
 
 
-SCRIPTED = replace(TINY, agents=(Scripted("greedy"),) * 2)
-
-
 @pytest.mark.parametrize(
-    ("how", "message"),
+    ("options", "message"),
     [
         ({"factors": {"game.rules.freze_steps": [1]}}, r"freze_steps matches .*mean 'freeze_steps'"),
         ({"factors": {"agents.2.algorithm": [3]}}, "agents.2 matches nothing; agents has 0, 1"),
@@ -86,9 +90,9 @@ SCRIPTED = replace(TINY, agents=(Scripted("greedy"),) * 2)
         ({"factors": {"agents.0.reward.by": [1]}}, "reward.by matches nothing"),
         ({"factors": {FREEZE: [2.5]}}, "freeze_steps is 2.5"),
         ({"factors": {FREEZE: [True]}}, "freeze_steps is True"),
-        ({"factors": {GAMMA: [2.0]}}, "gamma: DQNSettings.gamma is 2.0"),
+        ({"factors": {GAMMA: [2.0]}}, "DQNSettings.gamma is 2.0"),
         ({"factors": {"game.map": ["comons"]}}, "at the path game.map: name is 'comons'"),
-        ({"factors": {"game.map": ["commons"]}}, "with game.map: experiment.agents: 2 agents"),
+        ({"factors": {"game.map": ["commons"]}}, "with game.map: .*agents: 2 agents"),
         ({"factors": {"replicas": [1]}}, "a factor is replicas"),
         ({"factors": {FREEZE: []}}, r"factors\['game.rules.freeze_steps'\] is \[\]"),
         ({"factors": {FREEZE: "12"}}, "is '12'"),
@@ -103,14 +107,16 @@ SCRIPTED = replace(TINY, agents=(Scripted("greedy"),) * 2)
         ({"reference": "x"}, "reference is 'x'"),
         ({"draws": 2}, "draws is given without factors"),
         ({"draws": 4, "factors": {FREEZE: Integers(1, 3)}}, "draws is 4; .* no more than 3"),
+        ({"design": "sobol", "factors": {FREEZE: [1]}}, "design is 'sobol'"),
+        ({"design": "even", "draws": 1, "factors": {FREEZE: [1]}}, "design is 'even'"),
         ({"conditions": {"a": {}, "b": {}}}, "conditions 'a' and 'b' are equal"),
         ({"conditions": {"a": {}}, "factors": {FREEZE: [1]}}, "factors and conditions"),
         ({"name": "a/b"}, "name is 'a/b'"),
     ],
 )
-def test_what_is_no_study_is_refused_by_its_path(how, message):
+def test_what_is_no_study_is_refused_by_its_path(options, message):
     with pytest.raises(ValueError, match=message):
-        Study(**{"experiment": TINY, **how})
+        Study(**{"experiment": TINY, **options})
 
 
 # Conditions
@@ -222,9 +228,10 @@ def test_more_replicas_and_levels_keep_the_runs_that_are_there():
     assert {trial.name for trial in few} < {trial.name for trial in more}
 
 
-def test_draws_are_the_same_again_and_more_of_them_keep_the_first():
+@pytest.mark.parametrize("design", ["random", "sobol"])
+def test_draws_are_the_same_again_and_more_of_them_keep_the_first(design):
     factors = {GAMMA: Uniform(0.5, 0.9), FREEZE: Integers(1, 50), "a": {"x": {}, "y": {"episodes": 3}}}
-    few, more = (Study(TINY, factors, draws=count) for count in (3, 6))
+    few, more = (Study(TINY, factors, draws=count, design=design) for count in (3, 6))
     assert checksums(more)[:3] == checksums(few)
     assert len({condition.levels[GAMMA] for condition in more.all_conditions}) == 6
 
@@ -235,13 +242,33 @@ def test_draws_that_are_equal_are_drawn_again():
 
 
 @settings(deadline=None, max_examples=30)
-@given(seed=st.integers(0, 2**63), nth=st.integers(0, 10**6), low=st.floats(1e-6, 1), times=st.floats(1, 1e6))
-def test_draws_stay_in_their_range(seed, nth, low, times):
-    factors = {"a": LogUniform(low, low * times), "b": Uniform(-low, low), "c": Integers(-3, 3)}
-    values = {name: level.value for name, level in drawn(factors, seed=seed, nth=nth).items()}
-    assert low * (1 - 1e-12) <= values["a"] <= low * times * (1 + 1e-12)
-    assert -low <= values["b"] <= low
-    assert values["c"] in range(-3, 4)
+@given(
+    seed=st.integers(0, 2**63),
+    design=st.sampled_from(["random", "latin_hypercube", "sobol"]),
+    low=st.floats(1e-6, 1),
+    times=st.floats(1, 1e6),
+)
+def test_draws_stay_in_their_range(seed, design, low, times):
+    factors = {"a": LogUniform(low, low * times), "b": Uniform(-low, low), "c": Integers(-3, 3), "d": "xyz"}
+    for levels in drawn(factors, 3, seed=seed, design=design):
+        a, b, c, d = (level.value for level in levels.values())
+        assert low * (1 - 1e-12) <= a <= low * times * (1 + 1e-12)
+        assert -low <= b <= low
+        assert c in range(-3, 4)
+        assert d in "xyz"
+
+
+@pytest.mark.parametrize("design", ["latin_hypercube", "sobol"])
+def test_an_even_design_has_a_draw_in_each_part_of_every_range(design):
+    factors = {"a": Uniform(0, 8), "b": LogUniform(1, 2**8), "c": Integers(0, 7)}
+    draws = list(drawn(factors, 8, seed=3, design=design))[:8]
+    assert sorted(int(levels["a"].value) for levels in draws) == [*range(8)]
+    assert sorted(int(levels["b"].value).bit_length() - 1 for levels in draws) == [*range(8)]
+    assert sorted(levels["c"].value for levels in draws) == [*range(8)]
+    study = Study(TINY, {GAMMA: Uniform(0.5, 0.9)}, draws=4, design=design)
+    assert there_and_back(study) == study
+    parts = [int((condition.levels[GAMMA] - 0.5) / 0.1) for condition in study.all_conditions]
+    assert sorted(parts) == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize(
@@ -256,10 +283,7 @@ def test_a_range_that_is_none_is_refused(kind, low, high):
 # JSON
 
 
-ON_POLICY = Learning(PPO(settings=RolloutSettings()))
 GRID = Study(TINY, {FREEZE: [5, 25], "agents": [[LEARNING] * 2, [ON_POLICY, Scripted("random")]]})
-OTHER = Dilemma(payoffs=((3.0, 0.5), (4.0, 1.0)))
-OWN_GAME = replace(TINY, game=Dilemma())
 
 
 @pytest.mark.parametrize(
@@ -343,10 +367,11 @@ def test_runs_are_kept_relative_to_the_study_and_other_texts_as_they_are(tmp_pat
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"factors": None}, "factors"),
+        ({"factors": None}, "NoneType"),
         ({"factors": [["a", {"distribution": "Normal", "low": 0, "high": 1}]]}, "Normal"),
         ({"experiment": {"name": "x"}}, "lacks game, agents, episodes"),
         ({"pairing": False}, "pairing"),
+        ({"format": 3}, "format"),
     ],
 )
 def test_a_table_that_is_no_study_is_refused(change, message):
@@ -356,6 +381,143 @@ def test_a_table_that_is_no_study_is_refused(change, message):
 
 def test_a_stored_study_may_say_that_it_is_paired():
     assert Study.from_config({**GRID.to_config(), "pairing": True}) == GRID
+
+
+# Words
+
+
+FINITE = st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False)
+
+
+def read(word, experiment=TINY):
+    ((_, factor),) = factors_of(experiment, [word]).items()
+    return factor
+
+
+@pytest.mark.parametrize(
+    ("word", "values"),
+    [
+        ("game.rules.freeze-steps=5,25,100", (5, 25, 100)),
+        ("game.rules.freeze_steps= 5 , 25", (5, 25)),
+        (f"{GAMMA}=0.9,1", (0.9, 1.0)),
+        (f"{OF_ALL}.learning-rate=1e-4", (1e-4,)),
+        (f"{OF_ALL}.hidden-cells=32x32,64 64,(8,),16", ((32, 32), (64, 64), (8,), (16,))),
+        (f"{OF_ALL}.hidden-cells=(),(4, 4)", ((), (4, 4))),
+        ("game.rules.regrow-prob=0 0.5,0x.1x.2", ((0.0, 0.5), (0.0, 0.1, 0.2))),
+        ("game.rules.beam-length-cells=6,1x2x3x4", (6, (1, 2, 3, 4))),
+        ("game.rules.may-fire=True,false", (True, False)),
+        (f"{OF_ALL}.tau=None,0.1", (None, 0.1)),
+        ("agents.0.reward=team,individual", ("team", "individual")),
+        ("agents.*.algorithm.network=None", (None,)),
+        ("game.map=commons,single_basic", ("commons", "single_basic")),
+        ("device=cpu", ("cpu",)),
+        (f"{OF_ALL}.learning_rate=loguniform(1e-5,1e-3)", LogUniform(1e-5, 1e-3)),
+        (f"{OF_ALL}.learning_rate=log_uniform(1e-5, 1e-3)", LogUniform(1e-5, 1e-3)),
+        (f"{GAMMA}=Uniform(0.5,1)", Uniform(0.5, 1)),
+        (f"{FREEZE}=integers(1,9)", Integers(1, 9)),
+    ],
+)  # fmt: skip
+def test_values_are_of_the_type_of_their_field(word, values):
+    assert read(word) == values
+    assert repr(read(word)) == repr(values), "1.0 is not 1, and True is not 1"
+
+
+@settings(deadline=None)
+@given(st.lists(FINITE, min_size=1, max_size=4))
+def test_numbers_are_read_as_python_writes_them(numbers):
+    assert read(f"{GAMMA}={','.join(map(repr, numbers))}") == tuple(numbers)
+
+
+@settings(deadline=None)
+@given(st.lists(st.lists(st.integers(0, 99), min_size=1, max_size=3), min_size=1, max_size=3), st.data())
+def test_values_of_several_numbers_are_read_in_each_of_their_forms(values, data):
+    forms = [
+        lambda numbers: "x".join(map(str, numbers)),
+        lambda numbers: " ".join(map(str, numbers)),
+        lambda numbers: f"{(*numbers,)}",
+    ]
+    texts = [data.draw(st.sampled_from(forms))(numbers) for numbers in values]
+    assert read(f"{OF_ALL}.hidden_cells={','.join(texts)}") == tuple(map(tuple, values))
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("game.rules.freeze-step=5", r"freeze_step matches nothing \(did you mean 'freeze_steps'\?\)"),
+        (f"{FREEZE}=many", r"at the path game\.rules\.freeze_steps is 'many'"),
+        (f"{FREEZE}=0.5", "is '0.5'"),
+        (f"{FREEZE}=True", "is 'True'"),
+        (f"{GAMMA}=nan", "is 'nan'"),
+        (f"{OF_ALL}.tau=soft", "is 'soft'"),
+        ("game.rules.beam-length-cells=1x2", r"is '1x2'"),
+        ("agents.0.reward=greedy", "is 'greedy'"),
+        ("agents.0.algorithm=PPO", "a command line can say"),
+        ("game.map.sites=1", "a command line can say"),
+        ("game.institutions=tax", "a command line can say"),
+        (f"{FREEZE}=normal(1,2)", r"is 'normal\(1,2\)'"),
+        (f"{FREEZE}=integers(1,2.5)", r"Integers\.high is 2\.5"),
+        (f"{FREEZE}=integers(5,1)", r"Integers\.low is 5"),
+        (f"{FREEZE}=", "--vary is"),
+        (f"{FREEZE}=1,,2", "--vary is"),
+        (FREEZE, "--vary is 'game.rules.freeze_steps'"),
+        ("=1", "--vary is '=1'"),
+    ],
+)  # fmt: skip
+def test_what_a_field_cannot_have_is_refused_by_its_path(word, message):
+    with pytest.raises(ValueError, match=message):
+        read(word)
+
+
+def test_a_path_stands_once_however_it_is_written():
+    with pytest.raises(ValueError, match=r"has game\.rules\.freeze_steps twice"):
+        factors_of(TINY, ["game.rules.freeze-steps=1", "game.rules.freeze_steps=2"])
+
+
+def test_only_agents_that_learn_are_meant_by_a_star():
+    assert read(f"{GAMMA}=0.5", MIXED) == (0.5,)
+
+
+def test_a_value_fits_every_place_that_its_path_names():
+    mixed = replace(TINY, agents=(LEARNING, ON_POLICY))
+    assert read(f"{GAMMA}=0.5", mixed) == (0.5,)
+    with pytest.raises(ValueError, match="matches nothing"):
+        read(f"{OF_ALL}.buffer_size=7", mixed)
+
+
+# Names
+
+
+LEARNER = DQN(settings=DQNSettings())
+
+
+@pytest.mark.parametrize(
+    ("level", "text"),
+    [
+        (0.1 + 0.2, "0.3"),
+        ((1, 2.5), "(1, 2.5)"),
+        ("greedy", "greedy"),
+        (Scripted("greedy"), "Scripted(greedy)"),
+        (LEARNER, "DQN"),
+        (Learning(LEARNER), "Learning(DQN)"),
+        (Team(VDN(settings=DQNSettings()), (0, 1)), "Team(VDN)"),
+        (MLP(hidden_cells=(8, 8)), "MLP((8, 8))"),
+        ((), "()"),
+        ((Quota(share=0.5), Sanctioner()), "(Quota(0.5), Sanctioner)"),
+    ],
+)
+def test_a_level_is_told_by_its_value_and_an_agent_by_what_it_is(level, text):
+    assert level_text(level) == text
+
+
+def test_a_factor_is_named_by_its_last_word_where_that_tells_it():
+    assert named({"agents.0": Scripted("greedy")}) == "agents.0=Scripted(greedy)"
+    paths = ["agents.0", "game.rules.freeze_steps", "a.gamma", "b.gamma"]
+    assert short_names(paths) == {
+        "agents.0": "agents.0",
+        "game.rules.freeze_steps": "freeze_steps",
+        "a.gamma": "a.gamma",
+        "b.gamma": "b.gamma",
+    }
 
 
 # Recipes

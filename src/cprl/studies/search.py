@@ -1,52 +1,66 @@
 """run_search: a search by Optuna, which proposes points from the values of those that were run before.
 
-What was run is in the run directories, as it is for a study; Optuna itself keeps nothing. Point n depends on
-the seed, n, and the values of the points before its batch alone, so a search that was stopped anywhere
-proposes the same points again, finds their runs finished, and continues as if nothing had happened.
+Optuna keeps what it proposed in its own storage, `optuna/` in the search's directory; what was run is in the
+run directories, as it is for a study. A search that was stopped continues with the points that have no value
+yet, whose runs are resumed.
 """
 
 import hashlib
+import json
 import math
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 
-from cprl.arguments import BLOCK, integer, refusal
-from cprl.checks import checked, instance
+from cprl.arguments import BLOCK
 from cprl.commons.game import Game
 from cprl.experiment import Experiment
 from cprl.measuring import social
 from cprl.runs.curves import as_curves, curves_of
 from cprl.runs.episodes import read_table
-from cprl.runs.files import write_json
-from cprl.studies.executors import Executor, InProcess
+from cprl.runs.files import RunLock
+from cprl.studies.executors import Executor
 from cprl.studies.factors import Distribution, Factor, Integers, LogUniform, levels_of
-from cprl.studies.run import Driver, check_comparison, results_of
-from cprl.studies.study import RUNS, Study, directory_of, level_text, named, short_names, write_study
+from cprl.studies.run import StudyResult, run_study
+from cprl.studies.study import RUNS, Study, directory_of, level_text, named, short_names, unlike
 from cprl.studies.tables.comparing import LAST
-from cprl.studies.tables.table import StudyTable
-from cprl.studies.trials import Outcome, Trial, trials_of
+from cprl.studies.trials import Outcome, trials_of
+from cprl.system.output import say
+from cprl.values import MOST_INT32, Range, checked, refusal
 
-FILE_NAME: Final = "search.json"
-JOURNAL: Final = "optuna.journal"
-"""For Optuna's own tools, e.g. its dashboard; written after each batch and never read."""
-
-
-SAMPLERS: Final = ("tpe", "random", "gp")
-
-
+FOLDER, JOURNAL = "optuna", "journal.log"
+"""The folder of Optuna's storage in the search's directory, and its file."""
+Direction = Literal["maximise", "minimise"]
+Episodes = Literal["evaluation", "training"]
+SamplerName = Literal["tpe", "random", "gp"]
 _TRIES: Final = 100
 """Random combinations of levels of which one has to fit."""
 
 
-Sampler = str | Callable[[int], Any]
-"""One of `SAMPLERS`, or what makes a sampler of Optuna from a seed."""
+@dataclass(frozen=True, kw_only=True)
+class Point:
+    """One point of a search."""
+
+    number: int
+    """Of Optuna's trial."""
+    name: str
+    """Of its condition; that of an earlier point where both are the same."""
+    levels: Mapping[str, Any]
+    """By factor: a number, or the text of a level."""
+    changes: Mapping[str, Any]
+    """What it changes in the experiment, by path."""
+    checksum: str = ""
+    """Of its condition."""
+    reason: str = ""
+    """Why the experiment refuses these levels together; such a point is not run."""
+    value: float | None = None
+    """The mean of the metric over replicas; None where a run of it failed, it is undefined, or refused."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,160 +77,80 @@ class Search:
         last: how many of the training.
         at_once: points that are proposed without the values of each other. Other numbers propose other
             points, so it does not depend on the number of jobs.
-        sampler: "tpe", "random" or "gp" (wants scipy and torch, which are there), or a function that makes
-            a sampler of Optuna from a seed.
-        name: by default that of the experiment.
+        sampler: "tpe", "random" or "gp", or a function that makes a sampler of Optuna from a seed.
+        replicas: of each point; see `Study`, also for `block` and `name`.
     """
 
     experiment: Experiment
     factors: Mapping[str, Factor]
     points: int = field(kw_only=True)
     metric: str = field(default="collective_return", kw_only=True)
-    direction: Literal["maximise", "minimise"] = field(default="maximise", kw_only=True)
-    over: Literal["evaluation", "training"] = field(default="evaluation", kw_only=True)
+    direction: Direction = field(default="maximise", kw_only=True)
+    over: Episodes = field(default="evaluation", kw_only=True)
     last: int = field(default=30, kw_only=True)
     at_once: int = field(default=4, kw_only=True)
-    sampler: Sampler = field(default="tpe", kw_only=True)
+    sampler: SamplerName | Callable[[int], Any] = field(default="tpe", kw_only=True)
     replicas: int | None = field(default=None, kw_only=True)
     block: int = field(default=BLOCK, kw_only=True)
     name: str = field(default="", kw_only=True)
 
     def __post_init__(self) -> None:
-        checked("experiment", self.experiment, instance(Experiment, "an Experiment"))
-        for own, most in (("points", 100_000), ("last", 2**31 - 1), ("at_once", 4096)):
-            integer(own, getattr(self, own), 1, most)
-        allowed_of = {"direction": ("maximise", "minimise"), "over": ("evaluation", "training")}
-        for own, allowed in allowed_of.items():
-            if getattr(self, own) not in allowed:
-                raise refusal(own, getattr(self, own), " or ".join(map(repr, allowed)))
-        if not callable(self.sampler) and self.sampler not in SAMPLERS:
-            raise refusal("sampler", self.sampler, f"{', '.join(SAMPLERS)}, or a function of a seed")
-        _check_metric(self.metric, self.experiment)
-        drawn = self._drawn()
-        object.__setattr__(self, "factors", drawn.factors)
-        object.__setattr__(self, "name", drawn.name)
+        for name, most in (("points", 100_000), ("last", MOST_INT32), ("at_once", 4096)):
+            checked(name, getattr(self, name), Annotated[int, Range(1, most)])
+        checked("direction", self.direction, Direction)
+        checked("over", self.over, Episodes)
+        if not callable(self.sampler):
+            checked("sampler", self.sampler, SamplerName)
+        game = self.experiment.game
+        if isinstance(game, Game) and not (game.institutions and self.metric.startswith("institutions/")):
+            metrics = (*social.METRICS, *(f"return_{agent}" for agent in range(game.agents)))
+            checked("metric", self.metric, Literal[metrics])
+        one = self._one_point()
+        object.__setattr__(self, "factors", one.factors)
+        object.__setattr__(self, "name", one.name)
 
-    def study_of(self, points: Sequence["Point"]) -> Study:
-        """The study of these points, as named conditions; those that came twice once, and none that was
-        refused."""
-        kept = [own for own in points if not own.is_repeated and not own.reason]
-        return self._study(conditions={own.name: own.changes for own in kept})
-
-    def _drawn(self) -> Study:
-        """The study of one random combination of levels, the first that fits; some may contradict each
+    def _one_point(self) -> Study:
+        """Return the study of one random combination of levels, the first that fits; some may contradict each
         other, which is no reason to refuse a search of the others."""
         refused = []
-        for nth in range(_TRIES):
+        for number in range(_TRIES):
+            experiment = replace(self.experiment, seed=self.experiment.seed + number)
             try:
-                experiment = replace(self.experiment, seed=self.experiment.seed + nth)
-                return self._study(self.factors, draws=1, experiment=experiment)
+                return Study(experiment, self.factors, draws=1, **self._plain())
             except ValueError as error:
                 refused.append(error)
         raise refused[0]
 
-    def _study(self, factors: Mapping[str, Factor] | None = None, **others: Any) -> Study:
-        how: dict[str, Any] = {
-            "experiment": self.experiment,
-            "replicas": self.replicas,
-            "block": self.block,
-            "name": self.name,
-        }
-        return Study(factors=factors or {}, **{**how, **others})
+    def _plain(self) -> dict[str, Any]:
+        return {"replicas": self.replicas, "block": self.block, "name": self.name}
 
-    def point(self, number: int, proposed: Mapping[str, Any]) -> "Point":
-        """The point with these levels."""
-        changes: dict[str, Any] = {}
-        for name, own in self.factors.items():
-            is_drawn = isinstance(own, Distribution)
-            changes |= {name: proposed[name]} if is_drawn else labels(name, own)[proposed[name]]
-        short = short_names(self.factors)
-        levels = {short[name]: proposed[name] for name in self.factors}
-        return Point(number=number, name=named(levels), levels=dict(proposed), changes=changes)
+    def study_of(self, points: Sequence[Point]) -> Study:
+        """Return the study of these points, as named conditions; those that came twice once, and none that
+        was refused."""
+        conditions = {point.name: point.changes for point in points if not point.reason}
+        return Study(self.experiment, conditions=conditions, **self._plain())
 
-
-@dataclass(frozen=True, kw_only=True)
-class Point:
-    """One point of a search."""
-
-    number: int
-    name: str
-    """Of its condition."""
-    levels: Mapping[str, Any]
-    """By factor: a number, or the text of a level."""
-    changes: Mapping[str, Any]
-    """What it changes in the experiment, by path."""
-    value: float | None = None
-    """The mean of the metric over replicas; None where a run of it failed, it is undefined, or refused."""
-    is_repeated: bool = False
-    """Whether it equals an earlier one, whose runs count."""
-    reason: str = ""
-    """Why the experiment refuses these levels together; such a point is not run."""
-
-
-def value_of(search: Search, point: Point, runs: Path) -> float | None:
-    """The metric of a point, the mean of its replicas; None if a run of it has not finished, or the
-    experiment refuses it."""
-    if point.reason:
-        return None
-    found: list[float] = []
-    for trial in trials_of(search.study_of([replace(point, is_repeated=False)])):
-        run = runs / trial.name
-        if trial.state(runs) != "finished":
-            return None
-        if search.over == "evaluation":
-            curves = as_curves(read_table(run / "evaluation" / "trained.parquet"))
-        else:
-            curves = {name: own[:, -search.last :] for name, own in curves_of(run).items()}
-        if search.metric not in curves:
-            raise refusal("metric", search.metric, f"what the game reports: {', '.join(sorted(curves))}")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # of replicas in which it is never defined
-            found += np.nanmean(curves[search.metric], 1).tolist()
-    value = float(np.mean(found))
-    return value if math.isfinite(value) else None
-
-
-def labels(name: str, factor: Factor) -> dict[str, Mapping[str, Any]]:
-    """What each level of a factor changes, by the text that Optuna has for it."""
-    levels = levels_of(name, factor)
-    texts = [level_text(own.value) for own in levels]
-    if len(set(texts)) < len(texts):
-        texts = [f"{nth}: {text}" for nth, text in enumerate(texts)]
-    return {text: own.changes for text, own in zip(texts, levels, strict=True)}
-
-
-def _check_metric(metric: object, experiment: Experiment) -> None:
-    """Refuses a metric that a game of cprl cannot report."""
-    if not isinstance(metric, str) or not metric:
-        raise refusal("metric", metric, "the name of a metric, e.g. 'collective_return'")
-    if not isinstance(experiment.game, Game):
-        return
-    known = [*social.METRICS, *(f"return_{agent}" for agent in range(experiment.game.agents))]
-    if metric not in known and not (experiment.game.institutions and metric.startswith("institutions/")):
-        raise refusal("metric", metric, ", ".join(known))
+    def identity(self, out: Path) -> str:
+        """Return what tells the search from others in its directory; one of more points is the same."""
+        sampler = getattr(self.sampler, "__qualname__", str(self.sampler))
+        rules = self.metric, self.direction, self.over, self.last, self.at_once, sampler
+        text = json.dumps([self._one_point().to_config(out), rules], sort_keys=True)
+        return f"{self.name} {hashlib.blake2b(text.encode(), digest_size=6).hexdigest()}"
 
 
 @dataclass(frozen=True, eq=False)
-class SearchResult:
-    """What a search has found."""
+class SearchResult(StudyResult):
+    """What a search has produced; its study has all points, as named conditions."""
 
     search: Search
-    study: Study
-    """Of all points, as named conditions."""
-    out: Path
-    runs: Path
     points: tuple[Point, ...] = field(repr=False)
-    trials: tuple[Trial, ...] = field(repr=False)
-    failed: tuple[Outcome, ...]
-    table: StudyTable | None = field(repr=False)
-    """What came out; None if nothing has finished, and where no results were asked for."""
 
     @property
     def ranked(self) -> list[Point]:
         """The points with a value, each once, the best first."""
-        known = [own for own in self.points if own.value is not None and not own.is_repeated]
+        by_name = {point.name: point for point in self.points if point.value is not None}
         sign = -1.0 if self.search.direction == "maximise" else 1.0
-        return sorted(known, key=lambda own: sign * (own.value or 0.0))
+        return sorted(by_name.values(), key=lambda point: sign * (point.value or 0.0))
 
 
 def run_search(
@@ -230,164 +164,185 @@ def run_search(
     last: int = LAST,
     again: str = "",
 ) -> SearchResult:
-    """Runs a search; may be stopped at any moment, and called again, with more points too."""
-    check_comparison(last)
-    optuna = _optuna()
-    asked = _Asked(search, optuna)
-    batch = asked.first_batch()
-    study = search.study_of(batch)
-    out = directory_of(study, out)
-    folder = out / RUNS if runs is None else Path(runs)
+    """Run a search; may be stopped at any moment, and called again, with more points too.
+
+    Arguments are those of `run_study`. A point whose runs failed is tried again by the next call.
+
+    Raises:
+        RunLockedError: where another process runs a search in the same directory.
+        ValueError: where the experiment refuses the levels of every point.
+    """
+    out = directory_of(search.study_of([]), out)
+    pool = out / RUNS if runs is None else Path(runs)
+    run = partial(run_study, out=out, on=on, runs=pool, progress=progress, last=last, again=again)
     failed: list[Outcome] = []
-    driver = Driver(out, folder, on or InProcess(), progress=progress)
-    with driver.running(study):
-        while batch:
-            failed += _run_batch(search, batch, driver, of=asked)
-            asked.tell([value_of(search, own, folder) for own in batch])
-            study = search.study_of(asked.points)
-            write_study(study, out)
-            write_json(out / FILE_NAME, _as_table(search, asked.points))
-            _write_journal(optuna, asked.study, out / JOURNAL)
-            batch = asked.next_batch()
-        table = results_of(study, out, folder, last=last, again=again) if results else None
-    trials = tuple(trials_of(study))
-    return SearchResult(search, study, out, folder, tuple(asked.points), trials, tuple(failed), table)
+    with _optuna() as optuna:
+        (out / FOLDER).mkdir(parents=True, exist_ok=True)
+        with RunLock(out / FOLDER):
+            proposals = _Proposals(search, out, optuna)
+            while batch := proposals.next_batch():
+                if progress:
+                    say(proposals.heading(batch))
+                fitting = [point.name for point in batch if not point.reason]
+                if fitting:
+                    failed += run(search.study_of(proposals.points), only=fitting, results=False).failed
+                proposals.tell(batch, pool)
+            points = proposals.points
+            if all(point.reason for point in points):
+                reason = f"the first, {points[0].name}: {points[0].reason}"
+                raise ValueError(f"none of the search's {len(points)} points fits; {reason}")
+            valued = [point.name for point in points if point.value is not None]
+            result = run(search.study_of(points), only=valued, results=results)
+    return SearchResult(**{**vars(result), "failed": tuple(failed)}, search=search, points=tuple(points))
 
 
-class _Asked:
-    """What Optuna has proposed so far."""
+class _Proposals:
+    """The points that Optuna has proposed, in its own storage."""
 
-    def __init__(self, search: Search, optuna: Any) -> None:
-        self._search, self._optuna, self._space = search, optuna, _space_of(search, optuna)
-        with _quiet(optuna):
-            self.study = optuna.create_study(direction=search.direction.replace("se", "ze"))
-        self.points: list[Point] = []
-        """Those that were told."""
-        self._waiting: list[tuple[Any, Point]] = []
-        self._first: dict[str, Point] = {}
-        """By checksum, the first point that has it."""
-
-    def first_batch(self) -> list[Point]:
-        """The first points of which one fits."""
-        while batch := self.next_batch():
-            if not all(own.reason for own in batch):
-                return batch
-            self.tell([None] * len(batch))
-        raise ValueError(
-            f"none of the search's {len(self.points)} points fits; the first, {self.points[0].name}: "
-            f"{self.points[0].reason}"
+    def __init__(self, search: Search, out: Path, optuna: Any) -> None:
+        self._search, self._optuna, self._failed = search, optuna, optuna.trial.TrialState.FAIL
+        path, backends = str(out / FOLDER / JOURNAL), optuna.storages.journal
+        # The other kind of lock wants symbolic links.
+        backend = backends.JournalFileBackend(path, lock_obj=backends.JournalFileOpenLock(path))
+        self._study = optuna.create_study(
+            study_name=search.identity(out),
+            storage=optuna.storages.JournalStorage(backend),
+            direction=search.direction.replace("se", "ze"),
+            load_if_exists=True,
         )
+        self._by_number: dict[int, Point] = {}
+        self._open: list[Point] = []
+        for trial in self._study.trials:
+            if trial.params.keys() == search.factors.keys():
+                point = self._add(trial.number, trial.params, trial.value)
+                self._open += [] if trial.state.is_finished() else [point]
+            elif not trial.state.is_finished():  # it was stopped while it was proposed
+                self._study.tell(trial.number, state=self._failed)
+
+    @property
+    def points(self) -> list[Point]:
+        """All points, in order."""
+        return list(self._by_number.values())
 
     def next_batch(self) -> list[Point]:
-        """The next points, at most `at_once` of them."""
-        first = len(self.points)
-        for number in range(first, min(first + self._search.at_once, self._search.points)):
-            self.study.sampler = _sampler(self._optuna, self._search, number)
-            trial = self.study.ask(self._space)
-            self._waiting.append((trial, self._named(self._search.point(number, trial.params))))
-        return [point for _, point in self._waiting]
+        """The points that are run next: first those that were stopped, with the rest of their batch."""
+        batch, self._open = self._open, []
+        first, at_once = len(self._study.trials), self._search.at_once
+        end = math.ceil((first if batch else first + 1) / at_once) * at_once
+        for number in range(first, min(end, self._search.points)):
+            self._study.sampler = self._sampler(number)
+            trial = self._study.ask(self._space())
+            batch.append(self._add(number, trial.params))
+            if batch[-1].reason:
+                trial.set_user_attr("reason", batch[-1].reason)
+        return batch
 
-    def _named(self, point: Point) -> Point:
-        """A point that is known as such, or one whose name no other one has; with the reason where the
-        experiment refuses its levels together, since later ones may fit."""
+    def tell(self, batch: Sequence[Point], runs: Path) -> None:
+        """Tell Optuna the values of a batch; points whose runs failed have none, and are tried again next
+        time."""
+        for point in batch:
+            value = value_of(self._search, point, runs)
+            if point.reason or (value is not None and not math.isfinite(value)):
+                self._study.tell(point.number, state=self._failed)
+            elif value is not None:
+                self._study.tell(point.number, value)
+                self._by_number[point.number] = replace(point, value=value)
+
+    def heading(self, batch: Sequence[Point]) -> str:
+        """What is run next, and the best value so far, in a line."""
+        search, is_high = self._search, self._search.direction == "maximise"
+        values = [point.value for point in self.points if point.value is not None]
+        best = f", best {search.metric} so far {(max if is_high else min)(values):.6g}" if values else ""
+        first, final = batch[0].number + 1, batch[-1].number + 1
+        return f"{search.name}: points {first} to {final} of {search.points}{best}"
+
+    def _add(self, number: int, params: Mapping[str, Any], value: float | None = None) -> Point:
+        """Add the point of a trial; with the reason where the experiment refuses its levels together, since
+        later ones may fit."""
+        factors, short = self._search.factors, short_names(self._search.factors)
+        changes: dict[str, Any] = {}
+        for name, factor in factors.items():
+            is_drawn = isinstance(factor, Distribution)
+            changes |= {name: params[name]} if is_drawn else _labelled(name, factor)[params[name]]
+        name = named({short[factor]: params[factor] for factor in factors})
+        point = Point(number=number, name=name, levels={**params}, changes=changes, value=value)
         try:
             checksum = self._search.study_of([point]).all_conditions[0].checksum
         except ValueError as error:
-            return replace(point, reason=str(error))
-        if checksum in self._first:
-            first = self._first[checksum]
-            return replace(point, name=first.name, changes=first.changes, is_repeated=True)
-        if any(own.name == point.name for own in self._first.values()):  # they differ in the seventh digit
-            point = replace(point, name=f"{point.name}, point {point.number}")
-        self._first[checksum] = point
+            point = replace(point, reason=str(error))
+        else:
+            names = {other.name for other in self.points}  # of six digits, and points may differ in the next
+            new = replace(point, name=unlike(name, names), checksum=checksum)
+            same = next((other for other in self.points if other.checksum == checksum), new)
+            point = replace(new, name=same.name, changes=same.changes)
+        self._by_number[number] = point
         return point
 
-    def tell(self, values: Sequence[float | None]) -> None:
-        """Tells Optuna the values of the batch."""
-        failed = self._optuna.trial.TrialState.FAIL
-        for (trial, point), value in zip(self._waiting, values, strict=True):
-            self.study.tell(trial, value, state=failed if value is None else None)
-            self.points.append(replace(point, value=value))
-        self._waiting = []
+    def _space(self) -> dict[str, Any]:
+        """The distribution of each factor as Optuna has it."""
+        kinds = self._optuna.distributions
+        return {
+            name: kinds.IntDistribution(factor.low, factor.high)
+            if isinstance(factor, Integers)
+            else kinds.FloatDistribution(factor.low, factor.high, log=isinstance(factor, LogUniform))
+            if isinstance(factor, Distribution)
+            else kinds.CategoricalDistribution([*_labelled(name, factor)])
+            for name, factor in self._search.factors.items()
+        }
+
+    def _sampler(self, number: int) -> Any:
+        """A new sampler for each point, whose chance depends on the seed and the point's number alone."""
+        text = f"{self._search.experiment.seed} {number}"
+        seed = int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest())
+        samplers, sampler = self._optuna.samplers, self._search.sampler
+        if callable(sampler):
+            return sampler(seed)
+        if sampler == "tpe":
+            return samplers.TPESampler(seed=seed, constant_liar=True)
+        return {"random": samplers.RandomSampler, "gp": samplers.GPSampler}[sampler](seed=seed)
 
 
-def _space_of(search: Search, optuna: Any) -> dict[str, Any]:
-    """The distribution of each factor as Optuna has it."""
-    kinds, found = optuna.distributions, {}
-    for name, own in search.factors.items():
-        if isinstance(own, Integers):
-            found[name] = kinds.IntDistribution(own.low, own.high)
-        elif isinstance(own, Distribution):
-            found[name] = kinds.FloatDistribution(own.low, own.high, log=isinstance(own, LogUniform))
+def _labelled(name: str, factor: Factor) -> dict[str, Mapping[str, Any]]:
+    """Return what each level of a factor changes, by the text that Optuna has for it."""
+    labelled: dict[str, Mapping[str, Any]] = {}
+    for level in levels_of(name, factor):
+        labelled[unlike(level_text(level.value), labelled)] = level.changes
+    return labelled
+
+
+def value_of(search: Search, point: Point, runs: Path) -> float | None:
+    """Return the metric of a point, the mean of its replicas, NaN where it is undefined; None if a run of it
+    has not finished, or the experiment refuses it."""
+    if point.reason:
+        return None
+    means: list[float] = []
+    for trial in trials_of(search.study_of([point])):
+        run = runs / trial.name
+        if trial.state(runs) != "finished":
+            return None
+        if search.over == "evaluation":
+            curves = as_curves(read_table(run / "evaluation" / "trained.parquet"))
         else:
-            found[name] = kinds.CategoricalDistribution(list(labels(name, own)))
-    return found
-
-
-def _run_batch(search: Search, batch: Sequence[Point], driver: Driver, *, of: _Asked) -> tuple[Outcome, ...]:
-    new = [own for own in batch if not own.is_repeated and not own.reason]
-    if not new:
-        return ()
-    values = [own.value for own in of.points if own.value is not None]
-    best = max(values, default=None) if search.direction == "maximise" else min(values, default=None)
-    so_far = "" if best is None else f", best {search.metric} so far {best:.6g}"
-    numbers = f"points {batch[0].number + 1} to {batch[-1].number + 1} of {search.points}"
-    return driver.run(trials_of(search.study_of(new)), f"{search.name}: {numbers}{so_far}")
-
-
-def _sampler(optuna: Any, search: Search, number: int) -> Any:
-    """A new sampler for each point, whose chance depends on the seed and the point's number alone."""
-    text = f"{search.experiment.seed} {number}"
-    seed = int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest())
-    if callable(search.sampler):
-        return search.sampler(seed)
-    if search.sampler == "random":
-        return optuna.samplers.RandomSampler(seed=seed)
-    if search.sampler == "gp":
-        return optuna.samplers.GPSampler(seed=seed)
-    return optuna.samplers.TPESampler(seed=seed, constant_liar=True)
-
-
-def _as_table(search: Search, points: Sequence[Point]) -> dict[str, Any]:
-    columns = ("number", "name", "value", "is_repeated", "reason")
-    return {
-        **{own: getattr(search, own) for own in ("metric", "direction", "over", "last", "at_once")},
-        "points": [
-            {**{own: getattr(point, own) for own in columns}, "levels": dict(point.levels)}
-            for point in points
-        ],
-    }
-
-
-def _write_journal(optuna: Any, study: Any, path: Path) -> None:
-    """Writes what Optuna knows into a file that its own tools read."""
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".optuna-") as folder, _quiet(optuna):
-        partial = Path(folder) / path.name
-        backend = optuna.storages.journal.JournalFileBackend(str(partial))
-        optuna.copy_study(
-            from_study_name=study.study_name,
-            from_storage=study._storage,
-            to_storage=optuna.storages.JournalStorage(backend),
-            to_study_name="search",
-        )
-        partial.replace(path)
+            curves = {name: curve[:, -search.last :] for name, curve in curves_of(run).items()}
+        if search.metric not in curves:
+            raise refusal("metric", search.metric, f"what the game reports: {', '.join(sorted(curves))}")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of replicas in which it is never defined
+            means += np.nanmean(curves[search.metric], 1).tolist()
+    return float(np.mean(means))
 
 
 @contextmanager
-def _quiet(optuna: Any) -> Iterator[None]:
-    before = optuna.logging.get_verbosity()
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    try:
-        yield
-    finally:
-        optuna.logging.set_verbosity(before)
-
-
-def _optuna() -> Any:
+def _optuna() -> Iterator[Any]:
+    """Optuna, which prints errors alone."""
     try:
         import optuna
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            'Optuna is not installed; run pip install "cprl[optuna]"', name="optuna"
-        ) from error
-    return optuna
+        cure = 'run pip install "cprl[optuna]"'
+        raise ModuleNotFoundError(f"Optuna is not installed; {cure}", name="optuna") from error
+    before = optuna.logging.get_verbosity()
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    try:
+        yield optuna
+    finally:
+        optuna.logging.set_verbosity(before)
