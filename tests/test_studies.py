@@ -90,7 +90,7 @@ def test_a_path_may_be_written_as_the_flag_is_and_a_list_becomes_a_tuple():
         ({"factors": {"agents.0.reward.by": [1]}}, "reward.by matches nothing"),
         ({"factors": {FREEZE: [2.5]}}, "freeze_steps is 2.5"),
         ({"factors": {FREEZE: [True]}}, "freeze_steps is True"),
-        ({"factors": {GAMMA: [2.0]}}, "DQNSettings.gamma is 2.0"),
+        ({"factors": {GAMMA: [2.0]}}, "settings.gamma is 2.0"),
         ({"factors": {"game.map": ["comons"]}}, "at the path game.map: name is 'comons'"),
         ({"factors": {"game.map": ["commons"]}}, "with game.map: .*agents: 2 agents"),
         ({"factors": {"replicas": [1]}}, "a factor is replicas"),

@@ -263,8 +263,10 @@ def _shares(dimensions: int, draws: int, seed: int, design: Design) -> Iterable[
 
     rng = np.random.default_rng(seed)
     if design == "latin_hypercube":
-        return qmc.LatinHypercube(dimensions, rng=rng).random(draws)
-    return qmc.Sobol(dimensions, rng=rng).random_base2((most - 1).bit_length())
+        points: NDArray[np.float64] = qmc.LatinHypercube(dimensions, rng=rng).random(draws)
+    else:
+        points = qmc.Sobol(dimensions, rng=rng).random_base2((most - 1).bit_length())
+    return points
 
 
 def factor_to_config(factor: Factor) -> dict[str, Any]:

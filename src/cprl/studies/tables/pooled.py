@@ -91,7 +91,8 @@ def _groups(
         key = json.dumps([to_config(value, path) for value, path in zip(values, fields, strict=True)])
         by_values.setdefault(key, (values, {}))[1][run] = experiment
     short = short_names(fields)
-    conditions, groups = {}, {}
+    conditions: dict[str, Any] = {}
+    groups: dict[str, Any] = {}
     for values, members in sorted(by_values.values(), key=lambda group: list(map(_rank, group[0]))):
         levels = {path: plain_level(value) for path, value in zip(fields, values, strict=True)}
         name = named({short[path]: level for path, level in levels.items()})

@@ -149,7 +149,7 @@ class StudyTable:
         for name, counts in counted(self.made).items():
             if len(counts) == 1:
                 continue
-            parts = []
+            parts: list[str] = []
             for value, number in counts.most_common():
                 runs = [run for run, made in self.made.items() if made.get(name, UNKNOWN) == value]
                 text = f"{value} in {number} run{'s' * (number != 1)}"
