@@ -18,7 +18,7 @@ import tyro
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from cprl.measuring.statistics import Estimate, curve_interval, estimate
+from cprl.measuring.statistics import Estimate, curve_interval, estimate, holm
 from cprl.runs.curves import as_curves, centres, curves_of, running_mean
 from cprl.runs.episodes import read_table
 from cprl.terminal import style
@@ -58,12 +58,22 @@ def of_replicas(run: Path) -> dict[str, Values]:
     return {name: np.nanmean(curves[name][:, -LAST:], 1) for name in METRICS}
 
 
-def told(found: Estimate, *, signed: bool = False) -> str:
-    """An estimate with its interval; bold where the interval of a difference excludes 0."""
-    digits = 2 if max(abs(found.value), abs(found.low), abs(found.high)) < 5 else 0
-    sign = "+" if signed else ""
-    text = f"{found.value:{sign}.{digits}f} [{found.low:{sign}.{digits}f}, {found.high:{sign}.{digits}f}]"
-    return f"**{text}**" if signed and not found.low <= 0 <= found.high else text
+def text_of(estimated: Estimate, *, sign: str = "") -> str:
+    """An estimate with its interval."""
+    numbers = estimated.value, estimated.low, estimated.high
+    digits = 2 if max(map(abs, numbers)) < 5 else 0
+    value, low, high = (f"{number:{sign}.{digits}f}" for number in numbers)
+    return f"{value} [{low}, {high}]"
+
+
+def difference_texts(differences: dict[str, dict[str, Estimate]]) -> dict[str, list[str]]:
+    """Differences with their intervals; bold those that are not 0 by Holm's method for all of them."""
+    estimates = [estimated for of_metric in differences.values() for estimated in of_metric.values()]
+    is_different = holm([estimated.p_value for estimated in estimates])
+    texts = [text_of(estimated, sign="+") for estimated in estimates]
+    texts = [f"**{text}**" if differs else text for text, differs in zip(texts, is_different, strict=True)]
+    rows = np.array(texts).reshape(len(differences), len(METRICS))
+    return {name: list(row) for name, row in zip(differences, rows, strict=True)}
 
 
 def table(head: str, rows: dict[str, list[str]]) -> str:
@@ -134,17 +144,14 @@ def main(*, runs: Path, figures: Path) -> None:
     """
     found = {name: runs / name for name in NAMES if (runs / name / "evaluation").is_dir()}
     values = {name: of_replicas(run) for name, run in found.items()}
-    levels = {name: [told(estimate(own[metric])) for metric in METRICS] for name, own in values.items()}
+    levels = {name: [text_of(estimate(own[metric])) for metric in METRICS] for name, own in values.items()}
     print(table("institution", levels), end="\n\n")
     differences = {
         name: {metric: estimate(own[metric] - values[NONE][metric]) for metric in METRICS}
         for name, own in values.items()
         if name != NONE
     }
-    cells = {
-        name: [told(own[metric], signed=True) for metric in METRICS] for name, own in differences.items()
-    }
-    print(table("difference from none", cells))
+    print(table("difference from none", difference_texts(differences)))
     figures.mkdir(exist_ok=True)
     forest(differences, figures / "differences.png")
     courses(found, figures / "courses.png")

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from importlib.util import find_spec
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -205,15 +204,6 @@ def test_a_recipe_records_each_time_it_is_resumed_under_other_circumstances(tmp_
     resumed = json.loads((run / "recipe.json").read_text())["resumed"]
     assert [own["versions"]["torch"] for own in resumed] == ["2.1", "2.2"]
     assert circumstances_of(run) == {"torch": "2.0 then 2.1 then 2.2", "cpu": "Xeon"}
-
-
-def test_pandas_is_named_where_it_is_not_installed(runs, monkeypatch):
-    table = study_table(STUDY, runs)
-    if find_spec("pandas") is not None:
-        assert len(table.to_pandas()) == len(table.rows)
-    monkeypatch.setattr("cprl.studies.tables.table.find_spec", lambda name: None)
-    with pytest.raises(ImportError, match="to_pandas needs pandas"):
-        table.to_pandas()
 
 
 def test_levels_that_are_no_numbers_are_texts_and_a_column_has_no_name_twice(tmp_path):

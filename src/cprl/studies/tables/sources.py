@@ -1,7 +1,7 @@
 """The table of finished runs: which runs it is made of, their episodes as rows, and how replicas end."""
 
-from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -47,6 +47,10 @@ REASONS: Final[dict[State, str]] = {
     "refused": "has another recipe than its name says, or none that can be read: was it renamed?",
 }
 
+Windows = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Values]
+"""A metric of R replicas in W windows: the first episode and the episodes of each, [W], of which the last may
+be shorter; episodes in which it is undefined, and means over the others, NaN where there are none, [R, W]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
@@ -66,7 +70,7 @@ class Source:
 
 
 def study_table(
-    study: Study, runs: Path | str, *, window: int = WINDOW, status: Path | str | None = None
+    study: Study, runs: Path | str, *, window: int = WINDOW, status: Path | None = None
 ) -> StudyTable:
     """The table of the finished runs of a study.
 
@@ -74,7 +78,7 @@ def study_table(
         window: episodes of a window of training; 1 for episodes one by one, of the evaluation too.
         status: where its trials say why they failed, see `cprl.studies.trials`.
     """
-    finished, lacking = sources_of(study, Path(runs), None if status is None else Path(status))
+    finished, lacking = sources_of(study, Path(runs), status)
     return table_of(design_of(study), finished, lacking, window=window)
 
 
@@ -147,13 +151,10 @@ def table_of(
         except (ValueError, OSError, KeyError) as error:
             reason = f"is damaged: {error}"
             damaged.append(Lacking(source.name, source.condition, source.replicas, reason))
-    endings: dict[str, Counter[str]] = defaultdict(Counter)
-    lengths: dict[str, dict[str, list[int]]] = defaultdict(lambda: {"episodes": [], "steps": []})
-    for run in measured:
-        endings[run.source.condition].update(run.phases)
-        lengths[run.source.condition]["episodes"].append(run.source.episodes)
-        lengths[run.source.condition]["steps"] += run.steps
     made = {run.source.name: run.circumstances for run in measured}
+    by_condition: dict[str, list[_Measured]] = {}
+    for run in measured:
+        by_condition.setdefault(run.source.condition, []).append(run)
     return StudyTable(
         design=design,
         rows=_rows(design, measured, marks(made)),
@@ -161,43 +162,36 @@ def table_of(
         lacking=(*lacking, *damaged),
         made=made,
         endings={
-            name: dict(Counter(sorted(counts.elements())).most_common()) for name, counts in endings.items()
+            name: dict(Counter(sorted(phase for run in runs for phase in run.phases)).most_common())
+            for name, runs in by_condition.items()
         },
         ending_rules=tuple(dict.fromkeys(run.rule for run in measured)),
         lengths={
-            name: {what: (min(numbers), max(numbers)) for what, numbers in length.items()}
-            for name, length in lengths.items()
-            if length["steps"]
+            name: {"episodes": _range(run.source.episodes for run in runs), "steps": _range(steps)}
+            for name, runs in by_condition.items()
+            if (steps := [run.steps for run in runs if run.steps is not None])
         },
     )
 
 
-class _Windows(NamedTuple):
-    """A metric in one part of a run, for R replicas and W windows."""
-
-    episodes: NDArray[np.int64]
-    """The first episode of each window, [W]."""
-    lengths: NDArray[np.int64]
-    """Episodes of each window, [W]; the last one may be shorter."""
-    undefined: NDArray[np.int64]
-    """Episodes in which the metric is undefined, [R, W]."""
-    values: Values
-    """Means over the episodes in which it is defined, [R, W]; NaN where there are none."""
+def _range(numbers: Iterable[int]) -> tuple[int, int]:
+    ordered = sorted(numbers)
+    return ordered[0], ordered[-1]
 
 
 class _Measured(NamedTuple):
     """What a table takes from a run."""
 
     source: Source
-    windows: Mapping[tuple[str, str], _Windows]
+    windows: Mapping[tuple[str, str], Windows]
     """By part and metric."""
     phases: Sequence[str]
     """In which each replica ends."""
     rule: str
     """How these were told."""
     circumstances: Circumstances
-    steps: Sequence[int]
-    """Those that its report says a replica trained; none where it says none."""
+    steps: int | None
+    """Those that its report says a replica trained."""
 
 
 def _measured(source: Source, window: int) -> _Measured:
@@ -219,7 +213,7 @@ def _measured(source: Source, window: int) -> _Measured:
     return _Measured(source, windows, phases, rule, circumstances_of(source.run), _steps_of(source.run))
 
 
-def _in_windows(values: Values, window: int) -> _Windows:
+def _in_windows(values: Values, window: int) -> Windows:
     """Values by episode, [R, E], in windows of so many."""
     firsts = np.arange(0, values.shape[1], window)
     lengths = np.diff(np.append(firsts, values.shape[1]))
@@ -227,7 +221,7 @@ def _in_windows(values: Values, window: int) -> _Windows:
     counts = np.add.reduceat(defined.astype(np.int64), firsts, axis=1)
     with np.errstate(invalid="ignore"):
         means = np.add.reduceat(np.where(defined, values, 0.0), firsts, axis=1) / counts
-    return _Windows(firsts, lengths, lengths - counts, means)
+    return firsts, lengths, lengths - counts, means
 
 
 def _net(curves: Mapping[str, Values]) -> Values:
@@ -254,62 +248,57 @@ def _refuse_gaps(table: pa.Table, source: Source, part: str) -> None:
         )
 
 
-def _steps_of(run: Path) -> list[int]:
+def _steps_of(run: Path) -> int | None:
     try:
         steps = read_json(run / REPORT).get("steps")
     except (OSError, ValueError):  # which ends no table
-        return []
-    return [steps] if isinstance(steps, int) else []
+        return None
+    return steps if isinstance(steps, int) else None
 
 
 def _rows(design: Design, measured: Sequence[_Measured], marked: Mapping[str, str]) -> pa.Table:
     """The sorted rows of a table; `marked` has the marks of each run by its name."""
-    metrics = _metrics(measured)
-    names = list(design.conditions)
-    blocks: list[tuple[Any, ...]] = []
-    """Condition, run, replica, part, metric and, by window, episode, length, undefined and value."""
-    for place, name in enumerate(names):
-        replicas: dict[int, tuple[_Measured, int]] = {}
-        for run in measured:
-            for row in range(run.source.replicas if run.source.condition == name else 0):
-                number = run.source.first + row
-                if number in replicas:
-                    raise ValueError(f"replica {number} of the condition {name!r} is there twice")
-                replicas[number] = run, row
-        blocks += [
-            (place, run.source, number, part, metric, *at[:2], at.undefined[row], at.values[row])
-            for number, (run, row) in sorted(replicas.items())
-            for part in PARTS
-            for metric in metrics
-            if (at := run.windows.get((part, metric))) is not None
-        ]
-    conditions, runs, numbers, parts, of_metrics, *by_window = (
-        zip(*blocks, strict=True) if blocks else [()] * 9
+    sources = [run.source for run in measured]
+    numbers = [(source.condition, source.first + row) for source in sources for row in range(source.replicas)]
+    for (name, number), times in Counter(numbers).items():
+        if times > 1:
+            raise ValueError(f"replica {number} of the condition {name!r} is there twice")
+    names, parts, metrics = list(design.conditions), list(PARTS), _metrics(measured)
+    blocks = []
+    for place, run in enumerate(measured):
+        at, replicas = names.index(run.source.condition), run.source.first + np.arange(run.source.replicas)
+        for (part, metric), windows in run.windows.items():
+            if metric in metrics:
+                codes = at, replicas[:, None], parts.index(part), metrics.index(metric)
+                blocks.append([array.reshape(-1) for array in np.broadcast_arrays(*codes, *windows, place)])
+    columns = [np.concatenate(arrays) for arrays in zip(*blocks, strict=True)] or [np.zeros(0, np.int64)] * 9
+    order = np.lexsort(columns[4::-1])  # the first five, the first one first
+    condition, replica, part, metric, episode, length, undefined, value, run = (
+        column[order] for column in columns
     )
-    windows = [len(values) for values in by_window[-1]]
-    places = pa.array(np.repeat(np.arange(len(blocks)), np.array(windows, np.int64)))
 
-    def spread(name: str, values: Sequence[Any]) -> pa.Array:
-        """A value for each block, in all of its rows."""
-        return pa.array(values, COLUMNS[name]).take(places)
+    def texts(words: Sequence[str], codes: NDArray[np.int64]) -> pa.Array:
+        return pa.array(words, pa.string()).take(pa.array(codes))
 
-    columns = {
-        "condition": spread("condition", [names[place] for place in conditions]),
-        "checksum": spread("checksum", [run.checksum for run in runs]),
+    rows = {
+        "condition": texts(names, condition),
+        "checksum": texts([source.checksum for source in sources], run),
     }
     for factor in design.factors:
         column = f"factor {factor}" if factor in COLUMNS else factor
-        columns[column] = _levels(design.levels(factor)).take(pa.array(conditions, pa.int64())).take(places)
-    columns |= {
-        "run": spread("run", [run.name for run in runs]),
-        "marks": spread("marks", [marked[run.name] for run in runs]),
-        "replica": spread("replica", numbers),
-        "part": spread("part", parts),
-        "metric": spread("metric", of_metrics),
+        rows[column] = _levels(design.levels(factor)).take(pa.array(condition))
+    rows |= {
+        "run": texts([source.name for source in sources], run),
+        "marks": texts([marked[source.name] for source in sources], run),
+        "replica": pa.array(replica, pa.int32()),
+        "part": texts(parts, part),
+        "metric": texts(metrics, metric),
+        "episode": pa.array(episode, pa.int32()),
+        "window_episodes": pa.array(length, pa.int32()),
+        "undefined": pa.array(undefined, pa.int32()),
+        "value": pa.array(value, pa.float64()),
     }
-    for name, arrays in zip(("episode", "window_episodes", "undefined", "value"), by_window, strict=True):
-        columns[name] = pa.array(np.concatenate([np.zeros(0, np.int64), *arrays]), COLUMNS[name])
-    return pa.table(columns)
+    return pa.table(rows)
 
 
 def _metrics(measured: Sequence[_Measured]) -> list[str]:
@@ -320,19 +309,19 @@ def _metrics(measured: Sequence[_Measured]) -> list[str]:
     metrics = {metric for run in measured for _, metric in run.windows}
     if "collective_return" in metrics and not any(name.startswith("institutions/") for name in metrics):
         metrics.discard(NET)
-    social_ones = [*social.METRICS, "yield_share", NET]
+    order = [*social.METRICS, "yield_share", NET]
 
     def place(name: str) -> tuple[int, int, str]:
-        if name in social_ones:
-            return 0, social_ones.index(name), ""
-        number = name.removeprefix("return_")
-        return (1, int(number), "") if number.isdecimal() else (2, 0, name)
+        if name in order:
+            return 0, order.index(name), ""
+        agent = name.removeprefix("return_")
+        return (1, int(agent), "") if agent.isdecimal() else (2, 0, name)
 
     return sorted(metrics, key=place)
 
 
 def _levels(levels: Sequence[Any]) -> pa.Array:
-    """The levels of all conditions as a column: whole numbers, numbers, truth values, or else texts."""
+    """The levels of all conditions as a column: numbers, truth values, or else texts."""
     if all(isinstance(level, bool) for level in levels):
         return pa.array(levels, pa.bool_())
     if all(isinstance(level, int | float) and not isinstance(level, bool) for level in levels):

@@ -25,7 +25,6 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -50,19 +49,10 @@ PARTS: Final = {TRAINING: None, EVALUATION: "trained", RANDOM: "random"}
 with the name of the table that holds it."""
 NET: Final = "net"
 """The return of all agents together: harvest - fines + transfers, where a game has institutions."""
-COLUMNS: Final = {
-    "condition": pa.string(),
-    "checksum": pa.string(),
-    "run": pa.string(),
-    "marks": pa.string(),
-    "replica": pa.int32(),
-    "part": pa.string(),
-    "metric": pa.string(),
-    "episode": pa.int32(),
-    "window_episodes": pa.int32(),
-    "undefined": pa.int32(),
-    "value": pa.float64(),
-}
+COLUMNS: Final = (
+    *("condition", "checksum", "run", "marks", "replica", "part", "metric"),
+    *("episode", "window_episodes", "undefined", "value"),
+)
 """All but those of factors, which follow "checksum"."""
 
 Grid = Mapping[str, NDArray[Any]]
@@ -189,12 +179,6 @@ class StudyTable:
             f"{sum(map(bool, self.replicas.values()))} of {len(self.design.conditions)} conditions, "
             f"{len(self.rows):,} rows{without}."
         )
-
-    def to_pandas(self) -> Any:
-        """The rows as a `pandas.DataFrame`; raises an ImportError where pandas is not installed."""
-        if find_spec("pandas") is None:
-            raise ImportError("to_pandas needs pandas, which is not installed; run: pip install pandas")
-        return self.rows.to_pandas()
 
     def values(self, condition: str, metric: str, part: str) -> Grid | None:
         """Return the rows of a condition in one part, None if there are none.
