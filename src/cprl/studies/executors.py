@@ -172,7 +172,10 @@ class Processes(Value, _SideBySide, stored=False):
                 time.sleep(_LOOK_S)
                 if heard < len(asked):
                     heard = len(asked)
-                    process.kill() if heard > 1 else _ask_to_stop(process)
+                    if heard > 1:
+                        process.kill()
+                    else:
+                        _ask_to_stop(process)
         return code
 
 
