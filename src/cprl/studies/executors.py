@@ -93,7 +93,7 @@ class _SideBySide(ABC):
         """How many trials may run at a time."""
 
     @abstractmethod
-    def exit_code(self, task: Task, asked: Sequence[int]) -> int:
+    def exit_code(self, task: Task, stops: Sequence[int]) -> int:
         """Runs the process of a trial; asks it to stop when this one is asked, the second time kills it."""
 
     def ready(self) -> AbstractContextManager[object]:
@@ -116,10 +116,10 @@ class _SideBySide(ABC):
                 yield outcome
         if not waiting:
             return
-        with self.ready(), signals() as asked, ThreadPoolExecutor(self.places()) as pool:
+        with self.ready(), signals() as stops, ThreadPoolExecutor(self.places()) as pool:
             try:
                 left = 0
-                for future in as_completed([pool.submit(self._carry_out, task, asked) for task in waiting]):
+                for future in as_completed([pool.submit(self._carry_out, task, stops) for task in waiting]):
                     outcome = future.result()
                     if outcome is None:
                         left += 1
@@ -129,25 +129,25 @@ class _SideBySide(ABC):
                     trials = "1 trial is" if left == 1 else f"{left} trials are"
                     again = "The same line again continues the study."
                     console().print(f"Stopped; {trials} left. {again}", soft_wrap=True)
-                    raise interruption(asked[-1])
+                    raise interruption(stops[-1])
             finally:
-                if not asked:  # but this generator is closed, or nothing runs
-                    asked.append(signal.SIGTERM)
+                if not stops:  # but this generator is closed, or nothing runs
+                    stops.append(signal.SIGTERM)
 
-    def _carry_out(self, task: Task, asked: Sequence[int]) -> Outcome | None:
+    def _carry_out(self, task: Task, stops: Sequence[int]) -> Outcome | None:
         """Runs a trial, in a thread; None if this process was asked to stop."""
         for _ in range(ATTEMPTS):
-            outcome = None if asked else task.begin()
-            if asked or outcome is not None:
+            outcome = None if stops else task.begin()
+            if stops or outcome is not None:
                 return outcome
             try:
-                code = self.exit_code(task, asked)
+                code = self.exit_code(task, stops)
             except OSError as error:
                 return task.failed(f"{type(error).__name__}: {error}", traceback.format_exc())
             outcome = task.ended(code)
             if outcome is not None:
                 return outcome
-        return None if asked else task.given_up()
+        return None if stops else task.given_up()
 
 
 @dataclass(frozen=True)
@@ -165,13 +165,13 @@ class Processes(Value, _SideBySide, stored=False):
     def places(self) -> int:
         return self.jobs
 
-    def exit_code(self, task: Task, asked: Sequence[int]) -> int:
+    def exit_code(self, task: Task, stops: Sequence[int]) -> int:
         heard = 0
         with _started(task.arguments, str(task.status.log), task.variables) as process:
             while (code := process.poll()) is None:
                 time.sleep(_LOOK_S)
-                if heard < len(asked):
-                    heard = len(asked)
+                if heard < len(stops):
+                    heard = len(stops)
                     if heard > 1:
                         process.kill()
                     else:
@@ -263,7 +263,7 @@ class Ray(Value, _SideBySide, stored=False):
         ray: Any = import_module("ray")
         return self.jobs or max(1, int(ray.cluster_resources().get("CPU", 1)))
 
-    def exit_code(self, task: Task, asked: Sequence[int]) -> int:
+    def exit_code(self, task: Task, stops: Sequence[int]) -> int:
         ray: Any = import_module("ray")
         nodes = [int(node["Resources"].get("memory", 0)) for node in ray.nodes() if node["Alive"]]
         memory = self.memory_bytes or bytes_of(task)
@@ -273,8 +273,8 @@ class Ray(Value, _SideBySide, stored=False):
         reference = work.remote(task.arguments, os.path.abspath(task.status.log), task.variables)
         heard, errors = 0, ray.exceptions
         while not ray.wait([reference], timeout=_LOOK_S)[0]:
-            if heard < len(asked):
-                heard = len(asked)
+            if heard < len(stops):
+                heard = len(stops)
                 ray.cancel(reference, force=heard > 1)
         try:
             return int(ray.get(reference))
