@@ -33,7 +33,7 @@ from cprl.commands.studies import runs_table, sweep
 from cprl.presets import Variant, check_board
 from cprl.runs.recipe import read_recipe, started_by
 from cprl.system.output import printed, say
-from cprl.system.process import prepare_process
+from cprl.system.process import obey_parent, prepare_process
 from cprl.viewer.page import Page, has_display, headers_of
 
 # Commands import what they need once their words are checked: torch takes seconds, which a mistake need not.
@@ -71,6 +71,8 @@ def run(
         trial: the file in which the run says every second how far it is, where a study started it: it draws
             no figure and ends with the process that has its standard input.
     """
+    if trial is not None:
+        obey_parent()
     refuse_unknown(recipe)
     if take_over and not resume:
         raise ValueError(TAKES_NOTHING_OVER)

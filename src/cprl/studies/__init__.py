@@ -3,7 +3,7 @@
 Modules, in the order in which one reads them:
     factors      levels and distributions, by the places of values in an experiment; the same as words
     study        Study: factors, replicas; a value. Its conditions and its directory
-    status       what a trial says of itself while it runs, and what it obeys
+    status       what a trial says of itself while it runs
     trials       one run of a study, and the process that makes a finished run of its directory
     executors    where trials are run
     progress     how far every trial is, in the terminal

@@ -1,7 +1,4 @@
-"""Status: what a trial says of itself while it runs, in files beside those of its study, and what it obeys.
-
-`process_of_trial` is the process that a study starts for a trial, from within.
-"""
+"""Status: what a trial says of itself while it runs, in files beside those of its study."""
 
 import json
 import os
@@ -77,29 +74,14 @@ class Status:
 
 @contextmanager
 def process_of_trial(path: Path, experiment: Experiment) -> Iterator["StatusFile"]:
-    """Make this process one that a study started: it says how far it is, stops when the study asks it to,
-    ends when the study's process has died, and says by its exit code that another process runs the trial.
-
-    Args:
-        path: the file of its status; its standard input is a pipe from the study's process.
-    """
-    Thread(target=_obey, args=(sys.stdin.fileno(),), daemon=True).start()
+    """Make this process one that a study started: it says in a file how far it is, and by its exit code that
+    another process runs the trial."""
     with StatusFile(Status(path.parent, path.stem), experiment) as status:
         try:
             yield status
         except RunLockedError as error:
             sys.stderr.write(f"{error}\n")
             sys.exit(LOCKED)
-
-
-def _obey(pipe: int) -> None:
-    """Gives this process SIGTERM when it is asked to stop; ends it when there is nobody left to ask."""
-    while os.read(pipe, 1):
-        if sys.platform == "win32":  # where os.kill ends the process at once, without its handler
-            signal.raise_signal(signal.SIGTERM)
-        else:
-            os.kill(os.getpid(), signal.SIGTERM)
-    os._exit(1)
 
 
 class StatusFile:

@@ -4,11 +4,13 @@ import ctypes
 import logging
 import os
 import platform
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
+from threading import Thread
 from typing import Final
 
 from cprl.checks import MOST_SEED, checked, count
@@ -45,6 +47,21 @@ def prepare_process(seed: int) -> None:
     own.setLevel(logging.INFO)
     if not own.handlers:
         own.addHandler(logging.StreamHandler(OUT))
+
+
+def obey_parent() -> None:
+    """Make this process obey the one at the other end of its standard input, a pipe: each byte is a SIGTERM,
+    and it ends when nobody is left to write any."""
+    Thread(target=_obey, args=(sys.stdin.fileno(),), daemon=True).start()
+
+
+def _obey(pipe: int) -> None:
+    while os.read(pipe, 1):
+        if sys.platform == "win32":  # where os.kill ends the process at once, without its handler
+            signal.raise_signal(signal.SIGTERM)
+        else:
+            os.kill(os.getpid(), signal.SIGTERM)
+    os._exit(1)
 
 
 @contextmanager
