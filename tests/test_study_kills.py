@@ -118,7 +118,7 @@ def test_a_study_that_is_killed_three_times_ends_the_same_and_an_edited_one_runs
     out, grid, edited = tmp_path / "study", study_of(GRID), study_of(EDITED)
     for stage in STAGES:
         kill(started(out, on), out, stage, on)
-    assert runs_in(out, "unfinished"), "something is left to do"
+    assert 3 <= len(runs_in(out, "finished")) < 8, "something is left to do"
     assert started(out, on).wait(600) == 0, printed(out)[-2000:]
     assert "\nwhole\n" in printed(out)
     assert len(runs_in(out, "finished")) == 8
