@@ -20,8 +20,8 @@ from rich.console import Console
 from rich.table import Table
 
 from cprl.algorithms import DQN, DQNSettings
-from cprl.learners.engine import Engine, FunctionalEngine, ListEngine
-from cprl.learners.ring import Ring
+from cprl.learners.engine import Engine, FunctionalEngine, ListEngine, UpdateRule
+from cprl.learners.ring import Ring, TransitionForm
 from cprl.networks.mlp import MLPNetwork
 
 SHAPE, ACTIONS, BATCH, TRANSITIONS = (3, 7, 15), 8, 8, 4096
@@ -43,12 +43,8 @@ LANES = (1, 4, 16, 64)
 
 def filled(lanes: int) -> Ring:
     """A full buffer of noise."""
-    ring = Ring(
-        seeds=[(0, lane) for lane in range(lanes)],
-        transitions=TRANSITIONS,
-        batch_size=BATCH,
-        observation_shape=SHAPE,
-    )
+    form, seeds = TransitionForm(observation_shape=SHAPE), [(0, lane) for lane in range(lanes)]
+    ring = Ring(form, seeds=seeds, transitions=TRANSITIONS, batch_size=BATCH)
     kept = ring.state_dict()
     state = kept["storage"]
     state["observation"] = torch.randint(256, (lanes, TRANSITIONS + 1, *SHAPE), dtype=torch.uint8)
@@ -68,7 +64,9 @@ def update_us(engine: str, lanes: int, repeats: int) -> float:
     torch.set_flush_denormal(True)
     torch.manual_seed(0)
     networks = [MLPNetwork(SHAPE, ACTIONS) for _ in range(lanes)]
-    update = WAYS[engine](networks, DQN(settings=DQNSettings(gamma=0.995)).make_loss, learning_rate=1e-5)
+    update = WAYS[engine](
+        networks, DQN(settings=DQNSettings(gamma=0.995)).make_loss, UpdateRule(learning_rate=1e-5)
+    )
     buffer, best = filled(lanes), float("inf")
     for _ in range(20):
         update.update(buffer)

@@ -20,14 +20,15 @@ from rich.table import Table
 from tensordict import TensorDict
 
 from cprl import presets
-from cprl.algorithms.base import Algorithm, OffPolicy, TeamAlgorithm
+from cprl.algorithms.base import Algorithm, TeamAlgorithm
 from cprl.algorithms.off_policy import CQL, DQN, IQL, PR2, SAC, DistributionalDQN
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
 from cprl.algorithms.teams import IPPO, MADDPG, MAPPO, QMIX, VDN
-from cprl.learners.lanes import WEIGHTS, Lanes, Teams
-from cprl.learners.rollouts import trial_rollout
+from cprl.learners.engine import UpdateRule
+from cprl.learners.lanes import WEIGHTS, Lanes, LearningAgents, Teams
+from cprl.learners.ring import TransitionForm
 from cprl.learners.settings import DQNSettings, RolloutSettings
-from cprl.learners.trial import TRIAL_LANES, fitting_engine, make_engine, trial_batch
+from cprl.learners.trial import TRIAL_LANES, fitting_engine, make_engine, trial_batch, trial_rollout
 
 REPLAY, ROLLOUTS = DQNSettings(), RolloutSettings()
 ALGORITHMS = {
@@ -54,20 +55,9 @@ BATCH = 8
 def lanes_of(algorithm: Algorithm, learners: int) -> Lanes | Teams:
     """So many learners, four in each replica of `commons`, as lanes or teams."""
     game = presets.game("commons")
-    agents = Lanes(
-        game.spaces,
-        agents=range(game.agents),
-        replicas=learners // game.agents,
-        seed=0,
-        first_replica=0,
-        make_network=lambda: algorithm.make_network(game.spaces),
-        stochastic=algorithm.stochastic,
-        sees_peers=getattr(algorithm, "sees_peers_actions", False),
-    )
-    if not isinstance(algorithm, TeamAlgorithm):
-        return agents
-    own_rewards = isinstance(algorithm, OffPolicy) and not algorithm.shares_reward
-    return Teams(agents, lambda members: algorithm.make_team(members, game.spaces), own_rewards=own_rewards)
+    who = LearningAgents(game.spaces, agents=range(game.agents), replicas=learners // game.agents)
+    kind = Teams if isinstance(algorithm, TeamAlgorithm) else Lanes
+    return kind(who, algorithm.method(game.spaces))
 
 
 def update_us(name: str, learners: int, repeats: int) -> tuple[str, bool, float]:
@@ -77,26 +67,27 @@ def update_us(name: str, learners: int, repeats: int) -> tuple[str, bool, float]
     torch.manual_seed(0)
     algorithm = ALGORITHMS[name]
     lanes = lanes_of(algorithm, learners)
-    names = "observation_shape", "action_shape", "reward_shape"
-    shapes = {name: getattr(lanes, name) for name in names}
-    numbers = algorithm.noise_numbers if isinstance(algorithm, OffPolicy) else 0
-    noise = (*lanes.member_shape, numbers) if numbers else ()
+    numbers = lanes.method.noise_numbers
+    form = TransitionForm(
+        observation_shape=lanes.observation_shape,
+        action_shape=lanes.action_shape,
+        reward_shape=lanes.reward_shape,
+        noise_shape=(*lanes.member_shape, numbers) if numbers else (),
+    )
 
     def batch_of(count: int) -> TensorDict:
-        batch = trial_batch(count, actions=len(presets.game("commons").actions), noise_shape=noise, **shapes)
+        batch = trial_batch(count, form, len(presets.game("commons").actions))
         return trial_rollout(batch) if isinstance(algorithm.settings, RolloutSettings) else batch
 
-    networks = lanes_of(algorithm, max(learners, TRIAL_LANES * 4)).new_networks(WEIGHTS, "cpu")
+    networks = lanes_of(algorithm, max(learners, TRIAL_LANES * 4)).new_networks(WEIGHTS)
     trial = batch_of(TRIAL_LANES)
     engine = fitting_engine(networks[:TRIAL_LANES], algorithm.make_loss, trial)
     update = make_engine(
         engine,
         networks[: len(lanes)],
         algorithm.make_loss,
+        UpdateRule(learning_rate=1e-5, adam_eps=1e-5),
         compile=True,
-        trial=trial,
-        learning_rate=1e-5,
-        adam_eps=1e-5,
     )
     batch, best = batch_of(len(lanes)), float("inf")
     with warnings.catch_warnings(record=True) as told:

@@ -26,6 +26,7 @@ from rich.table import Table
 
 from cprl import CommonsEnv, presets
 from cprl.algorithms.off_policy import DQN
+from cprl.learners.lanes import LearningAgents
 from cprl.learners.replay import ReplayLearner
 from cprl.measuring.episodes import EpisodeTracker
 from cprl.policies.assignment import AgentPolicies
@@ -76,7 +77,9 @@ def measure(board: presets.Board, agents: int, replicas: int, repeats: int) -> d
     game = presets.game(board)
     settings = replace(presets.dqn_settings(board), buffer_size=20_000)
     agents = tuple(range(agents))
-    learner = DQN(settings=settings).make_learner(game.spaces, agents=agents, replicas=replicas)
+    learner = DQN(settings=settings).make_learner(
+        LearningAgents(game.spaces, agents=agents, replicas=replicas)
+    )
     training = Training(CommonsEnv(game, replicas, seed=0), {agents: learner}, episodes=10**9)
     while training.steps < 500:
         training.step()

@@ -31,6 +31,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from cprl import CommonsEnv, presets
 from cprl.algorithms.off_policy import DQN
+from cprl.learners.lanes import LearningAgents
 from cprl.measuring import Episode
 from cprl.policies.lanes import random_agents
 from cprl.policies.present import PresentPolicy
@@ -84,7 +85,9 @@ def cost(run: Path, repeats: int) -> Cost:
     prepare_process(0)
     game = presets.game("commons")
     settings = replace(presets.dqn_settings("commons"), buffer_size=20_000)
-    learner = DQN(settings=settings).make_learner(game.spaces, agents=AGENTS, replicas=REPLICAS)
+    learner = DQN(settings=settings).make_learner(
+        LearningAgents(game.spaces, agents=AGENTS, replicas=REPLICAS)
+    )
     env = CommonsEnv(game, REPLICAS, seed=0)
     training = Training(env, {AGENTS: learner}, episodes=10**9)
     steps = game.rules.episode_steps

@@ -1,18 +1,29 @@
 """Learners of plain DQN, and its loss over one network, for tests of learners and engines."""
 
-from functools import partial
+from dataclasses import replace
 
 import numpy as np
 
 from cprl.algorithms import DQN, DQNSettings
+from cprl.learners.lanes import LearningAgents
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.transitions import LaneTurn
 
 
-def dqn_learner(spaces, *, settings, kind=ReplayLearner, **how):
-    algorithm = DQN(settings=settings)
-    parts = {"make_network": partial(algorithm.make_network, spaces), "make_loss": algorithm.make_loss}
-    return kind(spaces, settings=settings, **{**parts, **how})
+def make_learner(algorithm, spaces, *, engine="compiled", **who):
+    return algorithm.make_learner(LearningAgents(spaces, **who), engine)
+
+
+def learner_of_parts(kind, algorithm, spaces, *, parts=(), options=(), **who):
+    """A learner of a kind, with parts of a `Method` in place of the algorithm's, and options of its kind."""
+    method = replace(algorithm.method(spaces), **dict(parts))
+    return kind(LearningAgents(spaces, **who), method, **dict(options))
+
+
+def dqn_learner(spaces, *, settings, kind=ReplayLearner, make_loss=None, engine=None, compile=None, **who):
+    parts = {} if make_loss is None else {"make_loss": make_loss}
+    options = {name: word for name, word in (("engine", engine), ("compile", compile)) if word is not None}
+    return learner_of_parts(kind, DQN(settings=settings), spaces, parts=parts, options=options, **who)
 
 
 def dqn_loss(network, *, gamma):

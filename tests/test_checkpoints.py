@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 import train_and_die
+from dqn_parts import make_learner
 from rich.console import Console
 
 from cprl.algorithms import PPO, RolloutSettings
@@ -281,7 +282,7 @@ def test_few_numbers_of_rollout_learners_are_drawn_ahead_and_earlier_states_hold
 
     def learner():
         algorithm = PPO(settings=RolloutSettings(hidden_cells=(4,)))
-        return algorithm.make_learner(spaces, agents=(0, 1), replicas=1, engine="eager", seed=4)
+        return make_learner(algorithm, spaces, agents=(0, 1), replicas=1, engine="eager", seed=4)
 
     seeds = lane_seeds(4, replicas=range(1), agents=(0, 1), purpose=SAMPLING)
     before, now = LaneRng(seeds, 250, ahead=DRAWN_AHEAD), learner()

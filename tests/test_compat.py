@@ -675,18 +675,6 @@ def test_a_row_is_sent_as_rerun_itself_sends_columns(tmp_path):
         own = sent("own", lambda to: compat.send_chunk(to, "a/b", timelines(at), components(columns)))
         assert own
         assert own == sent("its", lambda to: to.send_columns("a/b", at, columns))
-    with relies_on("rerun_bindings.ChunkInternal", used_by="compat.rows_made and compat.send_made"):
-        made = compat.rows_made("a/b", components(columns))
-        assert len(made) == 2
-        static = []
-        for number, row in enumerate(made):
-            recording = rr.RecordingStream("cprl", recording_id="sent")
-            recording.save(tmp_path / f"row{number}")
-            compat.send_made(recording, row)
-            recording.disconnect()
-            chunks = [chunk.to_record_batch() for chunk in RrdReader(tmp_path / f"row{number}").stream()]
-            static += [batch.num_rows for batch in chunks if "a/b" in str(batch.schema.metadata)]
-        assert static == [1, 1]
 
 
 def test_what_ends_a_recording_waits_for_its_viewer_and_is_in_a_private_part():

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from boards import random_actions
+from dqn_parts import make_learner
 from governed import EVERYTHING, random_decisions
 
 from cprl import CommonsEnv, keys, presets
@@ -90,7 +91,7 @@ def test_an_agent_learns_on_the_gpu():
     env = CommonsEnv(game, device="cuda")
     settings = DQNSettings(buffer_size=500, learning_starts=50)
     how = {"agents": (0,), "replicas": 1, "engine": "torchrl", "device": "cuda"}
-    learner = DQN(settings=settings).make_learner(game.spaces, **how)
+    learner = make_learner(DQN(settings=settings), game.spaces, **how)
     network = learner.engine.parts[0][0]
     before = [weights.clone() for weights in network.parameters()]
     random = RandomActor(8, device="cuda")

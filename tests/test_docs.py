@@ -14,7 +14,7 @@ from rerun.chunk import RrdReader
 from test_rerun_logger import trained
 
 from cprl.commands import main as cli
-from cprl.measuring import institutions, metrics
+from cprl.measuring import institutions
 from cprl.measuring.series import OF_AGENTS
 from cprl.runs.episodes import OF_INSTITUTIONS
 
@@ -62,9 +62,8 @@ def rows_under(heading):
 def test_the_docs_name_what_is_logged_and_kept_of_institutions():
     rows = rows_under("Institutions, one value per episode")
     units = {name: row[1] for row in rows for name in re.findall(r"`([^`]+)`", row[0])}
-    words = {f"institutions/{name}": unit for name, (_, unit) in metrics.INSTITUTION_NAMES.items()}
+    words = {f"institutions/{name}": metric.unit for name, metric in institutions.METRICS.items()}
     assert set(units) == {*words, "institutions/in_force_<v>", *(f"agent_<i>/{name}" for name in OF_AGENTS)}
-    assert tuple(metrics.INSTITUTION_NAMES) == tuple(institutions.NEEDS)
     assert all(words[name] == units[name].replace("0..1", "0 to 1") for name in words)
     columns = [row[0] for row in rows_under("The table of a run")]
     assert columns == [*OF_INSTITUTIONS, "in_force_<v>"]

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from dqn_parts import make_learner
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -26,7 +27,7 @@ def learner(spaces=SPACES, *, seed=0, **changes):
     """The learner of agent 0 in one replica."""
     settings = replace(DQNSettings(buffer_size=100, learning_rate=1e-3), **changes)
     how = {"agents": (0,), "replicas": 1, "seed": seed, "engine": "torchrl"}
-    return DQN(settings=settings).make_learner(spaces, **how)
+    return make_learner(DQN(settings=settings), spaces, **how)
 
 
 def store(agent, count, *, reward=0.0):

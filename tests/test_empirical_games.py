@@ -51,7 +51,7 @@ def with_payoffs(made, names, matrices):
         made,
         runs=dict.fromkeys(names, run),
         payoffs=np.array([PayoffTable.of_pairs(own).payoffs for own in matrices]),
-        replicas=list(range(len(matrices))),
+        fresh=replace(made.fresh, replicas=tuple(range(len(matrices)))),
     )
 
 

@@ -10,6 +10,7 @@ from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss, LossModule
 
 from cprl import Game, Rules, maps
+from cprl.learners.ring import TransitionForm
 from cprl.learners.settings import DQNSettings
 from cprl.learners.trial import fitting_engine, trial_batch
 from cprl.networks.mlp import MLPNetwork
@@ -57,7 +58,11 @@ def loss_of(kind):
 
 
 def engine_of(make_network, make_loss):
-    return fitting_engine([make_network() for _ in range(2)], make_loss, trial_batch(2, SHAPE, ACTIONS))
+    return fitting_engine(
+        [make_network() for _ in range(2)],
+        make_loss,
+        trial_batch(2, TransitionForm(observation_shape=SHAPE), ACTIONS),
+    )
 
 
 def q_network():

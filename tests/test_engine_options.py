@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 import torch
-from dqn_parts import dqn_learner, dqn_loss, write
+from dqn_parts import dqn_learner, dqn_loss, make_learner, write
 from test_lanes import ENGINES, SHAPE, filled, networks, row, transition
 from torchrl.envs.transforms import MultiStepTransform, RewardScaling
 from torchrl.objectives import HardUpdate, SoftUpdate
@@ -15,8 +15,8 @@ from torchrl.objectives import HardUpdate, SoftUpdate
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.algorithms import CQL, DQN, IQL, MADDPG, PR2, QMIX, SAC, VDN, DistributionalDQN
 from cprl.custom import Custom
-from cprl.learners.engine import FunctionalEngine
-from cprl.learners.ring import Horizon, Ring
+from cprl.learners.engine import FunctionalEngine, UpdateRule
+from cprl.learners.ring import Horizon, Ring, TransitionForm
 from cprl.learners.settings import DQNSettings
 from cprl.training import train
 
@@ -82,9 +82,7 @@ def by_engine(engine, *, steps=40, **how):
     update = ENGINES[engine](
         networks([0, 1, 2], torch.float64),
         partial(dqn_loss, gamma=0.9),
-        learning_rate=1e-2,
-        adam_eps=1e-6,
-        **how,
+        UpdateRule(learning_rate=1e-2, adam_eps=1e-6, **how),
     )
     buffer = filled([0, 1, 2])
     losses = [update.update(buffer) for _ in range(steps)]
@@ -105,9 +103,8 @@ def test_soft_targets_move_as_torchrls_soft_update_moves_them(engine):
 @pytest.mark.parametrize("engine", ["list", "lane_axis"])
 def test_an_engine_continues_from_its_state_with_every_optimiser(engine, optimizer):
     def new():
-        return ENGINES[engine](
-            networks([0, 1]), partial(dqn_loss, gamma=0.9), learning_rate=1e-2, optimizer=optimizer
-        )
+        rule = UpdateRule(learning_rate=1e-2, optimizer=optimizer)
+        return ENGINES[engine](networks([0, 1]), partial(dqn_loss, gamma=0.9), rule)
 
     first, second, buffer, same = new(), new(), filled([0, 1]), filled([0, 1])
     for _ in range(5):
@@ -194,13 +191,8 @@ def by_hand(lane, start, steps, *, n_steps, gamma):
 )
 def test_returns_of_several_steps_are_what_one_works_out_by_hand(lanes, n_steps):
     gamma, transitions = 0.9, 30
-    buffer = Ring(
-        seeds=[(7, lane) for lane in lanes],
-        transitions=transitions,
-        batch_size=16,
-        observation_shape=SHAPE,
-        horizon=Horizon(n_steps, gamma),
-    )
+    form = TransitionForm(observation_shape=SHAPE, horizon=Horizon(n_steps, gamma))
+    buffer = Ring(form, seeds=[(7, lane) for lane in lanes], transitions=transitions, batch_size=16)
     shorter, terminal = 0, 0
     for step in range(100):
         write(buffer, row(lanes, step))
@@ -250,7 +242,7 @@ def test_a_target_bootstraps_by_the_discount_of_its_steps():
     batch = buffer.sample()
     made = networks([0, 1])
     update = FunctionalEngine(
-        made, partial(dqn_loss, gamma=gamma), learning_rate=0.1, lane_axis=True, compile=False
+        made, partial(dqn_loss, gamma=gamma), UpdateRule(learning_rate=0.1), lane_axis=True, compile=False
     )
     losses = update.update_from(batch)
     for lane, network in enumerate(networks([0, 1])):
@@ -267,8 +259,8 @@ def test_a_target_bootstraps_by_the_discount_of_its_steps():
 def test_every_algorithm_of_replay_learns_from_returns_of_several_steps(algorithm):
     settings = replace(SETTINGS, n_steps=3, tau=0.05, updates_per_step=2)
     how = {"reward_kind": "team"} if algorithm in (VDN, QMIX) else {}
-    made = algorithm(settings=settings).make_learner(
-        GAME.spaces, agents=(0, 1), replicas=1, engine="eager", **how
+    made = make_learner(
+        algorithm(settings=settings), GAME.spaces, agents=(0, 1), replicas=1, engine="eager", **how
     )
     losses = played(made, steps=25)
     assert torch.isfinite(losses[-1]).all()
@@ -280,7 +272,7 @@ def test_relu_on_outputs_is_refused_where_no_q_values_act(algorithm, engine):
     made = algorithm(settings=replace(SETTINGS, relu_on_outputs=True))
     message = r"settings\.relu_on_outputs is True"
     with pytest.raises(ValueError, match=message):
-        made.make_learner(GAME.spaces, agents=(0,), replicas=1, engine=engine)
+        make_learner(made, GAME.spaces, agents=(0,), replicas=1, engine=engine)
 
 
 def test_a_loss_that_takes_no_notice_of_the_steps_is_refused():
@@ -293,7 +285,7 @@ def test_a_loss_that_takes_no_notice_of_the_steps_is_refused():
     with pytest.raises(ValueError, match="n_steps is 3"):
         learner(replace(SETTINGS, n_steps=3), make_loss=make_loss)
     with pytest.raises(ValueError, match="DiscreteIQLLoss does not read"):  # of TorchRL 0.14.1
-        IQL(settings=replace(SETTINGS, n_steps=3)).make_learner(GAME.spaces, agents=(0,), replicas=1)
+        make_learner(IQL(settings=replace(SETTINGS, n_steps=3)), GAME.spaces, agents=(0,), replicas=1)
     with pytest.raises(ValueError, match=r"DQNLoss has gamma 0\.5 and the settings have gamma 0\.995"):
         learner(replace(SETTINGS, n_steps=3), make_loss=partial(dqn_loss, gamma=0.5))
 
@@ -312,7 +304,7 @@ class Counting(RewardScaling):
 
 def torchrl_learner(**settings):
     algorithm = DQN(settings=replace(SETTINGS, **settings))
-    return algorithm.make_learner(GAME.spaces, agents=(0, 1), replicas=2, engine="torchrl")
+    return make_learner(algorithm, GAME.spaces, agents=(0, 1), replicas=2, engine="torchrl")
 
 
 def test_transforms_of_the_replay_buffer_run():

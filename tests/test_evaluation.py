@@ -262,7 +262,7 @@ def test_a_run_that_has_not_ended_plays_by_its_newest_checkpoint(tmp_path):
         train(env, agents.learners, others=agents.others, episodes=9, checkpointer=checkpoints)
     found = cprl.evaluate_run(run, episodes=3, greedy=True)
     assert found.run.weights_from.name.startswith("training-000000000030")
-    fresh = CommonsEnv(MEADOW, 6, seed=found.seed)
+    fresh = CommonsEnv(MEADOW, 6, seed=found.fresh.seed)
     now = evaluate(fresh, agents.policy(3))
     assert told(now) == told(found.trained[0] + found.trained[1])
 
@@ -490,7 +490,7 @@ def test_the_command_crossplay_tells_a_matrix_for_each_number_and_writes_the_epi
     out = tmp_path / "cross.parquet"
     greedy, sustainable = corridors.values()
     text = command(monkeypatch, capsys, "crossplay", greedy, sustainable, "--episodes", 1, "--out", out)
-    assert "2 replicas, 1 episodes each with focal agent at each index, seed 30011, diagonal: self" in text
+    assert "2 replicas, 1 episode each with focal agent at each index, seed 30011, diagonal: self" in text
     for name in ("focal/return (apples)", "group/return (apples)", "sustainability (steps)"):
         assert name in (line.strip() for line in text.splitlines())
     rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines() if "│" in line]

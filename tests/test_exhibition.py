@@ -15,7 +15,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import Custom, Experiment, Game, Rules, maps
 from cprl.algorithms import DQN, MAPPO, PPO, DQNSettings, RolloutSettings
-from cprl.commons.colours import APPLE, BEAM, FIRST_AGENT, GROUND, MARK, WALL, agent_colour
 from cprl.envs.make_env import make_env
 from cprl.population import Learning, Scripted, Team
 from cprl.training import train
@@ -23,9 +22,9 @@ from cprl.training.agents import Population
 from cprl.training.outcome import exhibited, fresh_env
 from cprl.viewer import exhibition
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.exhibition import BATCH_S, BATCH_STEPS, Exhibition, LiveBoard, caption_of
+from cprl.viewer.exhibition import BATCH_S, BATCH_STEPS, Exhibition, caption_of
 from cprl.viewer.frames import scene_of
-from cprl.viewer.scenery import Scene, curves_of
+from cprl.viewer.scenery import curves_of
 from cprl.viewer.streams import Live, Stream
 
 REPLAY = DQNSettings(buffer_size=300, batch_size=4, hidden_cells=(8,), epsilon_hold_steps=10)
@@ -215,7 +214,7 @@ def test_it_plays_the_weights_and_the_exploration_of_the_moment(tmp_path):
     (learner,) = population.learners.values()
     learner.actor.epsilon = 0.0
     seen = world.reset()
-    last = [own for own in learner.engine.own.values() if own.shape[0] == 8 and own.shape[-1] == 8][-1]
+    last = [value for value in learner.engine.params.values() if len(value) == value.shape[-1] == 8][-1]
     for best in (2, 5):
         with torch.no_grad():
             last.zero_()
@@ -328,61 +327,9 @@ def test_parts_that_never_change_are_sent_once_to_the_server_that_keeps_them_and
         ]
         for path in kept.paths
     )
-    assert "AnnotationContext:context" in set().union(*live)
+    assert "SegmentationImage:opacity" in set().union(*live)
     image = {"SegmentationImage:buffer", "SegmentationImage:format"}
     assert all(image <= frame for frame in frames), "a frame without its format draws nothing"
     assert not any(image & part for part in live), "a format that comes after a frame hides it"
     assert len(frames) == 1 + BATCH_STEPS
     assert "windows" not in {name.partition(":")[0] for frame in frames for name in frame}
-
-
-BOARD = maps.parse(".A>\n.A<")
-
-
-def scene():
-    return Scene(agents=("agent_0", "agent_1"), height=2, width=3, walls=(), sites=BOARD.sites, window=(3, 3))
-
-
-def frames(*in_play):
-    """Frames of the two agents in the right column, each with whether they are in play; a beam on top."""
-    count = len(in_play)
-    beams = np.zeros((count, 2, 3), np.bool_)
-    beams[:, 0] = True
-    return {
-        "step": np.zeros(count, np.int64),
-        "beams": beams,
-        "stock": np.ones((count, 2), np.uint8),
-        "row": np.tile(np.array([0, 1], np.int32), (count, 1)),
-        "col": np.full((count, 2), 2, np.int32),
-        "heading": np.zeros((count, 2), np.int32),
-        "in_play": np.array(in_play, np.bool_),
-    }
-
-
-def rows(name, seen):
-    made = {kind.component: own for kind, own in LiveBoard(scene()).columns(seen).items()}
-    return made[name].to_pylist()
-
-
-def test_a_beam_changes_the_class_of_ground_and_apples_and_agents_stay_before_it():
-    ((picture,),) = rows("SegmentationImage:buffer", frames((True, True)))
-    assert np.array(picture).reshape(4, 5).tolist() == [
-        [WALL] * 5,
-        [WALL, BEAM, MARK, FIRST_AGENT, WALL],
-        [WALL, GROUND, APPLE, FIRST_AGENT + 1, WALL],
-        [WALL] * 5,
-    ]
-
-
-def test_an_agent_out_of_play_has_a_square_and_its_number_in_its_own_colour():
-    seen = frames((True, True), (True, False))
-    both, one = rows("LineStrips2D:strips", seen)
-    red, green, blue = agent_colour(1)
-    of_out = red << 24 | green << 16 | blue << 8 | 255
-    colours = rows("LineStrips2D:colors", seen)
-    assert of_out not in colours[0]
-    assert colours[1].count(of_out) == 2, "a square and the digit 1"
-    square = np.array(one[colours[1].index(of_out)])
-    # Agent 1 is on row 1, column 2; with the rim its middle is (3.5, 2.5), and the square reaches 0.4.
-    assert np.allclose([square.min(0), square.max(0)], [(3.1, 2.1), (3.9, 2.9)])
-    assert [len(own) for own in rows("LineStrips2D:radii", seen)] == [len(both), len(one)]

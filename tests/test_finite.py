@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from dqn_parts import dqn_learner
+from dqn_parts import dqn_learner, make_learner
 from matrix_game import MatrixGame
 from torchrl.envs import Transform, TransformedEnv
 
@@ -84,10 +84,10 @@ REPLICAS, BROKEN = 3, (1, 0)
 """The replica and the agent that break."""
 
 
-def make_learner(name, **changes):
+def learner_named(name, **changes):
     algorithm, settings = LEARNERS[name]
     settings = {"engine": "eager", "reward_kind": "individual", "replicas": REPLICAS, **settings, **changes}
-    return algorithm.make_learner(GAME.spaces, agents=(0, 1), seed=5, **settings)
+    return make_learner(algorithm, GAME.spaces, agents=(0, 1), seed=5, **settings)
 
 
 def tensors_of(learner, replica, agent):
@@ -102,7 +102,7 @@ def tensors_of(learner, replica, agent):
     if isinstance(learner.engine, LOLANetworks):
         stacks = (learner.engine.acting, learner.engine.playing)
         return [weights.data[replica] for stack in stacks for weights in stack.parameters()[agent]]
-    return [weights[lane] for weights in learner.engine.own.values()]
+    return [weights[lane] for weights in learner.engine.params.values()]
 
 
 class Breaks:
@@ -135,7 +135,7 @@ def play(learner, *, breaks=-1, episodes=3, **changes):
 @pytest.mark.integration
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_lane_that_breaks_stops_the_training_and_is_named(name):
-    learner = make_learner(name)
+    learner = learner_named(name)
     of_team = name in ("VDN", "QMIX", "IPPO", "MAPPO", "MADDPG") or name.startswith("LOLA")
     agents = r"agents 0, 1" if of_team else "agent 0"
     with pytest.raises(NotFiniteError, match=rf"^at step \d+ .*the weights of {agents} in replica 1 are not"):
@@ -157,7 +157,7 @@ CONTINUING = [
 @pytest.mark.integration
 @pytest.mark.parametrize(("name", "engine"), CONTINUING)
 def test_with_continue_a_broken_lane_is_named_once_and_other_replicas_learn_as_without_it(name, engine):
-    whole, sound = make_learner(name, **engine), make_learner(name, **engine)
+    whole, sound = learner_named(name, **engine), learner_named(name, **engine)
     with pytest.warns(RuntimeWarning, match=r"replica 1 .*not finite.*; the others train on") as warned:
         training, seen = play(whole, breaks=14, episodes=4, on_nan="continue")
     assert sum("not finite" in str(warning.message) for warning in warned) == 1
@@ -178,7 +178,7 @@ def looks_every_step(monkeypatch):
 
 
 def test_a_single_infinite_loss_is_named_with_its_step_and_whether_the_weights_are_sound():
-    learner, losses, returns = make_learner("DQN"), LaneLosses(3, (0, 1)), np.zeros((3, 2))
+    learner, losses, returns = learner_named("DQN"), LaneLosses(3, (0, 1)), np.zeros((3, 2))
 
     def look(check, total, step, **changes):
         losses.total[:] = total
@@ -247,7 +247,7 @@ class Poison(Transform):
 def poisoned(entry, *, step, learning_starts=4, steps=5, **changes):
     env = TransformedEnv(MatrixGame(3, steps=steps), Poison(entry, world=2, agent=1, step=step, **changes))
     algorithm = DQN(settings=replace(REPLAY, learning_starts=learning_starts))
-    learner = algorithm.make_learner(spaces_of(env), agents=(0, 1), replicas=3, engine="eager")
+    learner = make_learner(algorithm, spaces_of(env), agents=(0, 1), replicas=3, engine="eager")
     return Training(env, {(0, 1): learner}, episodes=3)
 
 
@@ -283,7 +283,7 @@ def test_what_a_game_gives_is_looked_at_every_sixteen_steps_and_when_episodes_en
 
 
 def a_training(**changes):
-    learner = make_learner("DQN")
+    learner = learner_named("DQN")
     return Training(CommonsEnv(GAME, REPLICAS, seed=2), {(0, 1): learner}, episodes=9, **changes)
 
 
@@ -344,7 +344,12 @@ def test_a_learner_of_somebodys_own_that_refuses_nan_is_explained():
             return losses
 
     learner = dqn_learner(
-        GAME.spaces, kind=Refuses, agents=(0, 1), replicas=REPLICAS, settings=REPLAY, compile=False
+        GAME.spaces,
+        kind=Refuses,
+        agents=(0, 1),
+        replicas=REPLICAS,
+        settings=REPLAY,
+        compile=False,
     )
     with pytest.raises(NotFiniteError, match="at step 6 the weights of agent 0 in replica 1 are") as caught:
         play(learner, breaks=5)

@@ -28,7 +28,7 @@ from cprl.institutions import (
 )
 from cprl.measuring import EpisodeTracker, institutions, social
 from cprl.measuring.evaluate import evaluate
-from cprl.measuring.institutions import NEEDS, OF_GROUPS
+from cprl.measuring.institutions import METRICS
 from cprl.measuring.metrics import OF_INSTITUTIONS, OPTIONAL, left_out
 from cprl.measuring.series import numbers_of
 from cprl.measuring.statistics import institution_measures, social_measures
@@ -46,6 +46,7 @@ FINES = torch.tensor([2.0, 0.0, 1.0, 0.0])
 TRANSFERS = torch.tensor([0.0, 1.0, 0.0, 2.0])
 IN_PLAY = torch.tensor([10, 10, 8, 4])
 TAGS = torch.tensor([2, 1, 1, 0])
+OF_GROUPS = {name for name in METRICS if name.endswith(("_within", "_between"))}
 COUNTED = {
     "own_bites": torch.tensor([5, 2, 3, 0]),
     "foreign_bites": torch.tensor([1, 0, 1, 0]),
@@ -99,7 +100,7 @@ def whole(**changes):
 def test_each_metric_is_what_we_work_out_by_hand():
     metrics = whole()
     assert {name: value.item() for name, value in metrics.items()} == pytest.approx(BY_HAND, rel=1e-15)
-    assert list(metrics) == list(NEEDS) == list(BY_HAND)
+    assert list(metrics) == list(METRICS) == list(BY_HAND)
     assert all(value.dtype == torch.float64 and value.shape == () for value in metrics.values())
 
 
@@ -202,7 +203,7 @@ def test_an_episode_has_what_was_paid_broken_counted_and_decided():
     assert episode.reported == (*OPTIONAL, *OF_INSTITUTIONS)
     assert left_out(episode.reported) == ""
     found = episode.institutions
-    assert set(NEEDS) - set(found) == set(OF_GROUPS)
+    assert set(METRICS) - set(found) == OF_GROUPS
     assert (found["fines"], found["transfers"], found["violations"]) == (2.0, 1.5, 2.0)
     assert found["violations_per_step"] == 2 / 6, "three turns of two agents"
     assert (found["own_share_of_bites"], found["detection_rate"], found["recidivism"]) == (0.5, 0.5, 0.0)
@@ -216,7 +217,7 @@ def test_a_table_has_the_counts_of_the_institutions_that_the_game_has_and_no_oth
     (episode,) = played(*an_episode(), institutions=[Quota(share=0.5, window_steps=10), Monitoring(prob=0.5)])
     table = as_table([episode], 0)
     assert set(COUNTS) & set(table.column_names) == {"excess_bites", "violations", "detections"}
-    of_counts = {name for name, needs in NEEDS.items() if "counts" in needs}
+    of_counts = {name for name, metric in METRICS.items() if "counts" in metric.needs}
     curves = as_curves(table)
     measured = {name.removeprefix("institutions/") for name in curves}
     assert measured & of_counts == {"excess_bites", "detection_rate"} == of_counts & set(episode.institutions)
@@ -382,13 +383,13 @@ def test_what_a_game_pays_and_counts_is_what_an_episode_has():
 
 def test_a_game_with_all_institutions_has_all_metrics_and_others_those_that_concern_them():
     (episode, *_), _ = play(GAME, episodes=1)
-    assert list(episode.institutions) == list(NEEDS)
+    assert list(episode.institutions) == list(METRICS)
     always = {"fines", "transfers", "violations", "violations_per_step", "net_equality"}
     kinds = {
         Boundaries: {"trespasses", "own_share_of_bites"},
         Quota: {"excess_bites"},
         ClosedSeason: {"closed_bites"},
-        Levies: set(OF_GROUPS),
+        Levies: OF_GROUPS,
         Vote: set(),
         Monitoring: {"detection_rate"},
         GraduatedSanctions: {"recidivism", "sanctions_per_violation"},
@@ -401,9 +402,8 @@ def test_a_game_with_all_institutions_has_all_metrics_and_others_those_that_conc
     assert set(taxed.institutions) == always
     assert taxed.fines.sum() == pytest.approx(taxed.harvest.sum() / 2)
     assert taxed.in_force is None
-    concerned = {kind for kinds in institutions.KINDS.values() for kind in kinds}
+    concerned = {kind for metric in METRICS.values() for kind in metric.kinds}
     assert concerned | {Tax, Vote, Sanctioner} == set(KINDS), "all others are measured by those of all"
-    assert set(institutions.KINDS) < set(NEEDS)
 
 
 def test_trainings_and_evaluations_measure_what_concerns_the_game_behind_transforms():

@@ -10,12 +10,13 @@ from tensordict import TensorDict, assert_close
 from torch import nn
 from torchrl.objectives import DQNLoss
 
-from cprl.learners.engine import FunctionalEngine, ListEngine
-from cprl.learners.ring import Ring, storage_bytes
+from cprl.learners.engine import FunctionalEngine, ListEngine, UpdateRule
+from cprl.learners.ring import Ring, TransitionForm
 from cprl.networks.mlp import MLPNetwork
 from cprl.networks.stacked import StackedMLP
 
 SHAPE = (3, 4, 5)
+FORM = TransitionForm(observation_shape=SHAPE)
 ACTIONS = 6
 ENGINES = {
     "list": ListEngine,
@@ -65,17 +66,16 @@ def row(lanes, step):
 
 
 def filled(lanes, *, steps=60, transitions=40):
-    buffer = Ring(
-        seeds=[(7, lane) for lane in lanes], transitions=transitions, batch_size=4, observation_shape=SHAPE
-    )
+    buffer = Ring(FORM, seeds=[(7, lane) for lane in lanes], transitions=transitions, batch_size=4)
     for step in range(steps):
         write(buffer, row(lanes, step))
     return buffer
 
 
-def trained(engine, lanes, *, dtype=torch.float32, steps=200, lr=1e-3, **how):
+def trained(engine, lanes, *, dtype=torch.float32, steps=200, lr=1e-3, **of_rule):
     """The update after so many steps, targets copied for lane after lane on the way, and the losses."""
-    update = engine(networks(lanes, dtype), partial(dqn_loss, gamma=0.9), learning_rate=lr, **how)
+    rule = UpdateRule(learning_rate=lr, **of_rule)
+    update = engine(networks(lanes, dtype), partial(dqn_loss, gamma=0.9), rule)
     buffer, losses = filled(lanes), []
     for step in range(steps):
         losses.append(update.update(buffer))
@@ -164,7 +164,7 @@ def test_targets_change_for_the_marked_lanes_alone(engine):
 def test_targets_can_start_from_weights_of_their_own(engine):
     make_loss = partial(dqn_loss, gamma=0.9)
     update = ENGINES[engine](
-        networks([0, 1]), make_loss, target_networks=networks([10, 11]), learning_rate=1e-3
+        networks([0, 1]), make_loss, UpdateRule(learning_rate=1e-3), target_networks=networks([10, 11])
     )
     for lane in range(2):
         parts = in_order(update, lane)
@@ -211,9 +211,9 @@ def test_a_users_own_network_is_vmapped():
             network(torch.zeros(1, *SHAPE))
         return made
 
-    make_loss = partial(dqn_loss, gamma=0.9)
-    fast = FunctionalEngine(both(), make_loss, learning_rate=1e-3, lane_axis=False, compile=False)
-    plain = ListEngine(both(), make_loss, learning_rate=1e-3)
+    make_loss, rule = partial(dqn_loss, gamma=0.9), UpdateRule(learning_rate=1e-3)
+    fast = FunctionalEngine(both(), make_loss, rule, lane_axis=False, compile=False)
+    plain = ListEngine(both(), make_loss, rule)
     for update in (fast, plain):
         buffer = filled([0, 1, 2])
         for _ in range(50):
@@ -313,17 +313,12 @@ def test_a_buffer_goes_on_as_it_was_from_its_state():
 
 
 def test_what_it_takes_is_told_before_and_what_cannot_fit_is_refused(caplog):
-    assert storage_bytes(20, 100_000, (3, 7, 15)) < 0.8e9
+    assert TransitionForm(observation_shape=(3, 7, 15)).stored_bytes(20, 100_000) < 0.8e9
     with caplog.at_level("INFO", logger="cprl"):
-        Ring(seeds=[(0,), (1,)], transitions=10_000, batch_size=8, observation_shape=SHAPE)
+        Ring(FORM, seeds=[(0,), (1,)], transitions=10_000, batch_size=8)
     assert "Replay buffers of 2 learners x 10,000 transitions: 0.00 GiB of " in caplog.text
     buffer = filled([0, 1])
     taken = sum(field.numel() * field.element_size() for field in buffer.fields.values())
-    assert taken == storage_bytes(2, 40, SHAPE)
+    assert taken == FORM.stored_bytes(2, 40)
     with pytest.raises(MemoryError, match=r"200 learners x 10,000,000 .* take [\d.]+ GiB; .* are free"):
-        Ring(
-            seeds=[(lane,) for lane in range(200)],
-            transitions=10_000_000,
-            batch_size=8,
-            observation_shape=SHAPE,
-        )
+        Ring(FORM, seeds=[(lane,) for lane in range(200)], transitions=10_000_000, batch_size=8)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from dqn_parts import make_learner
 from matrix_game import MatrixGame as SmallGame
 from test_population import GAME, Returns, population, trained, weights
 
@@ -35,8 +36,8 @@ def team(estimator="policy_gradient", agents=FOUR, **changes):
 
 def learner_of(estimator, replicas=2, algorithm=None, **changes):
     algorithm = algorithm or lola(estimator, **changes)
-    return algorithm.make_learner(
-        spaces_of(SmallGame(1)), agents=PAIR, replicas=replicas, seed=3, engine="eager"
+    return make_learner(
+        algorithm, spaces_of(SmallGame(1)), agents=PAIR, replicas=replicas, seed=3, engine="eager"
     )
 
 

@@ -6,6 +6,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
+from dqn_parts import make_learner
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from test_population import GAME, REPLAY, population, trained
@@ -18,7 +19,7 @@ from cprl.algorithms import DQN, MADDPG, DQNSettings
 from cprl.algorithms.base import q_actor
 from cprl.envs import make_env
 from cprl.envs.matrix import MatrixGame
-from cprl.learners.ring import Horizon, Ring
+from cprl.learners.ring import Horizon, Ring, TransitionForm
 from cprl.learners.transitions import LaneTurn
 from cprl.networks import MLP
 from cprl.objectives import MADDPGLoss
@@ -277,15 +278,10 @@ def test_the_layers_of_critics_are_those_of_the_settings_or_of_the_network(netwo
 
 def test_returns_of_several_steps_are_those_of_each_member():
     """Rewards 1, 2, 4, 8 .. of member 0, ten times that of member 1; the episode ends with the third turn."""
-    buffer = Ring(
-        seeds=[(0,), (1,)],
-        transitions=10,
-        batch_size=4,
-        observation_shape=(2, 1),
-        action_shape=(2,),
-        reward_shape=(2,),
-        horizon=Horizon(3, 0.5),
+    form = TransitionForm(
+        observation_shape=(2, 1), action_shape=(2,), reward_shape=(2,), horizon=Horizon(3, 0.5)
     )
+    buffer = Ring(form, seeds=[(0,), (1,)], transitions=10, batch_size=4)
     for step in range(6):
         ends = torch.full((2,), step == 2).numpy()
         see, act = (
@@ -341,7 +337,7 @@ def test_each_lane_has_uniform_numbers_of_its_own_whatever_trains_beside_it(engi
     given = []
     for replicas, first in ((3, 0), (1, 2)):
         how = {"agents": (0, 1), "replicas": replicas, "first_replica": first, "seed": 3, "engine": engine}
-        learner = Noisy(settings=REPLAY).make_learner(GAME.spaces, reward_kind="individual", **how)
+        learner = make_learner(Noisy(settings=REPLAY), GAME.spaces, reward_kind="individual", **how)
         NoisyLoss.given.clear()
         agents = population([*[Learning(DQN(settings=REPLAY))] * 2, *[Scripted()] * 2], replicas=replicas)
         agents.learners = {(0, 1): learner}

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from dqn_parts import dqn_learner
+from dqn_parts import learner_of_parts, make_learner
 from tensordict import TensorDict
 from torch import nn
 
@@ -32,6 +32,7 @@ from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.learners import trial
 from cprl.learners.engine import FunctionalEngine, ListEngine, own_targets
+from cprl.learners.replay import ReplayLearner
 from cprl.networks import MLP, Conv, ConvNetwork, MLPNetwork
 from cprl.networks.specification import new_network
 from cprl.networks.stacked import stack_lanes
@@ -123,7 +124,7 @@ def learner_of(kind, network, **how):
         how |= {"reward_kind": "team"}
     algorithm = kind(settings=settings, network=network)
     how = {"agents": (0, 1), "replicas": 2, "engine": "eager", "seed": 4, **how}
-    return algorithm, algorithm.make_learner(SPACES, **how)
+    return algorithm, make_learner(algorithm, SPACES, **how)
 
 
 def played(learner, steps=24):
@@ -195,8 +196,14 @@ def test_a_network_whose_buffers_do_not_stack_is_vmapped():
 
     with pytest.raises(ValueError, match="a Normalised has buffers"):
         stack_lanes([Normalised(), Normalised()])
-    learner = dqn_learner(
-        SPACES, agents=(0, 1), replicas=1, settings=REPLAY, make_network=Normalised, compile=False
+    learner = learner_of_parts(
+        ReplayLearner,
+        DQN(settings=REPLAY),
+        SPACES,
+        parts={"make_network": Normalised},
+        options={"compile": False},
+        agents=(0, 1),
+        replicas=1,
     )
     assert learner.engine._vmapped
     played(learner)

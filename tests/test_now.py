@@ -111,12 +111,6 @@ def test_a_label_goes_on_from_its_state():
     assert second.state_dict() == whole.state_dict()
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_what_is_no_number_is_refused(value):
-    with pytest.raises(ValueError, match="allowed: a finite number"):
-        Now(agents=4).add(value)
-
-
 def test_the_recent_mean_is_of_a_share_of_the_values_so_far_but_of_some_at_least():
     recent = Recent(3, share=0.5)
     assert [recent.add(value) for value in range(10)] == [0, 0.5, 1, 2, 3, 4, 4.5, 5.5, 6, 7]

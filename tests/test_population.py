@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import pytest
 import torch
-from dqn_parts import q_table
+from dqn_parts import learner_of_parts, q_table
 
 import cprl
 from cprl import CommonsEnv, Experiment, Game, Observation, Rules, maps
@@ -116,18 +116,18 @@ def assert_all_weights_move_and_replicas_learn_apart(together, alone):
 def test_each_loss_takes_the_fastest_way_that_agrees_with_a_list_of_torchrls_losses(name):
     algorithm = ALGORITHMS[name]
     (learner,) = population([Learning(algorithm)] * 4, replicas=1).learners.values()
-    how = {
-        "agents": FOUR,
-        "replicas": 1,
-        "settings": algorithm.settings,
-        "seed": 3,
-        "make_network": lambda: algorithm.make_network(GAME.spaces),
-        "make_loss": algorithm.make_loss,
-        "compile": False,
-    }
-    if type(learner) is ReplayLearner:
-        how |= {"stochastic": algorithm.stochastic, "sees_peers": algorithm.sees_peers_actions}
-    named, by_list = (type(learner)(GAME.spaces, engine=way, **how) for way in (WAYS[name], "list"))
+    named, by_list = (
+        learner_of_parts(
+            type(learner),
+            algorithm,
+            GAME.spaces,
+            options={"engine": way, "compile": False},
+            agents=FOUR,
+            replicas=1,
+            seed=3,
+        )
+        for way in (WAYS[name], "list")
+    )
     for each in (learner, named, by_list):
         train(CommonsEnv(GAME, 1, seed=3), {FOUR: each}, episodes=5)
     for lane in range(4):
@@ -383,15 +383,9 @@ def test_learners_that_do_not_fit_are_refused_before_training_and_the_refusal_sa
         population([dqn] * 3)
     with pytest.raises(ValueError, match="ClipPPOLoss is on-policy and cannot learn from a replay buffer"):
         population([Learning(PPOFromReplay(settings=REPLAY))] * 4)
+    parts = {"make_network": lambda: acting_part(ppo.make_network(GAME.spaces))}
     with pytest.raises(ValueError, match="an agent has the networks "):
-        RolloutLearner(
-            GAME.spaces,
-            agents=[0],
-            replicas=1,
-            settings=ROLLOUTS,
-            make_network=lambda: acting_part(ppo.make_network(GAME.spaces)),
-            make_loss=ppo.make_loss,
-        )
+        learner_of_parts(RolloutLearner, ppo, GAME.spaces, parts=parts, agents=[0], replicas=1)
     with pytest.raises(ValueError, match="update_every is 7"):
         trained(population([Learning(ppo)] * 4), update_every=7)
 

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import pytest
 import torch
+from dqn_parts import make_learner
 from tensordict import TensorDict
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -192,7 +193,7 @@ def test_a_team_does_not_see_peers_of_its_own():
 
     how = {"agents": (0, 1), "replicas": 2, "seed": 1, "reward_kind": "team"}
     with pytest.raises(ValueError, match=r"^sees_peers is True"):
-        Seeing(settings=SETTINGS).make_learner(GAME.spaces, engine="eager", **how)
+        make_learner(Seeing(settings=SETTINGS), GAME.spaces, engine="eager", **how)
 
 
 STAG = stag_hunt()

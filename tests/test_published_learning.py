@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from dqn_parts import make_learner
 from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import QValueActor
@@ -12,7 +13,7 @@ from torchrl.objectives import DQNLoss, ValueEstimators
 
 from cprl import presets
 from cprl.algorithms import CQL, DQN, IQL, MADDPG, PR2, SAC, DQNSettings
-from cprl.learners.engine import change_weights, torch_optimizer
+from cprl.learners.engine import UpdateRule, change_weights, torch_optimizer
 from cprl.networks.agent import JointNetwork, OtherOutputs
 from cprl.objectives import LogCoshDQNLoss, PR2Loss, log_cosh
 from cprl.objectives.td import DISTANCES, distance
@@ -23,12 +24,13 @@ from cprl.system.compat import promise_targets
 # the mean of squares is 0.1 * 4 = 0.4, its root 0.6324555; 1 - 0.1 * 2 / (0.6324555 + 0.5) = 0.8233926;
 # then 0.9 * 0.4 + 0.1 * 1 = 0.46, its root 0.6782330; 0.8233926 + 0.1 / (0.6782330 + 0.5) = 0.9082655.
 # (Inside of the root epsilon would give 1 - 0.2 / sqrt(0.9) = 0.7891815 after the first.)
+KERAS = UpdateRule(optimizer="keras_rmsprop", learning_rate=0.1, adam_eps=0.5)
 GRADIENTS, WEIGHTS, SQUARES = (2.0, -1.0), (0.8233926, 0.9082655), (0.4, 0.46)
 
 
 def test_torchs_optimiser_takes_the_steps_of_keras():
     weight = nn.Parameter(torch.ones(1, dtype=torch.float64))
-    optimizer = torch_optimizer("keras_rmsprop", [weight], learning_rate=0.1, eps=0.5)
+    optimizer = torch_optimizer(KERAS, [weight])
     assert type(optimizer) is torch.optim.RMSprop
     for gradient, after, square in zip(GRADIENTS, WEIGHTS, SQUARES, strict=True):
         weight.grad = torch.full_like(weight, gradient)
@@ -42,15 +44,13 @@ def test_many_lanes_take_the_steps_of_keras():
     weight, square = (torch.full((2, 1), start, dtype=torch.float64) for start in (1.0, 0.0))
     for nth, gradient in enumerate(GRADIENTS):
         change_weights(
-            "keras_rmsprop",
+            KERAS,
             [weight],
             [torch.tensor([[gradient], [0.0]], dtype=torch.float64)],
             (),
             [square],
             step_size=torch.zeros(()),
             scale=torch.zeros(()),
-            learning_rate=0.1,
-            eps=0.5,
         )
         assert weight[:, 0].tolist() == pytest.approx([WEIGHTS[nth], 1.0], abs=1e-7)
         assert square[:, 0].tolist() == pytest.approx([SQUARES[nth], 0.0])
@@ -157,7 +157,7 @@ def test_as_run_the_loss_is_that_of_keras_over_all_outputs():
     settings = replace(presets.dqn_settings("two_complex", variant="as_run"), buffer_size=20)
     algorithm = DQN(settings=settings, loss_function="log_cosh")
     spaces = presets.game("two_complex", variant="as_run").spaces
-    learner = algorithm.make_learner(spaces, agents=(0,), replicas=1, engine="torchrl")
+    learner = make_learner(algorithm, spaces, agents=(0,), replicas=1, engine="torchrl")
     engine, chance = learner.engine, torch.Generator().manual_seed(1)
     (loss,), (network,) = engine.losses, engine.parts[0]
     seen, seen_next = torch.randint(256, (2, 8, *spaces.observation_shape), generator=chance).to(torch.uint8)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from dqn_parts import make_learner
 from recall_game import Recall
 from stock_collector import stock_collector
 from tensordict import TensorDict
@@ -187,8 +188,8 @@ def test_a_state_goes_from_turn_to_turn_and_is_zero_where_an_episode_begins(kind
         "matrix": lambda: make_env(stag_hunt(turns=5), worlds=2, seed=3),
         "own": lambda: make_env(Recall(turns=5), worlds=2, seed=3),
     }[kind]()
-    learner = ON_POLICY["PPO"].make_learner(
-        spaces_of(env), agents=range(spaces_of(env).agents), replicas=2, engine="eager"
+    learner = make_learner(
+        ON_POLICY["PPO"], spaces_of(env), agents=range(spaces_of(env).agents), replicas=2, engine="eager"
     )
     policy = AgentPolicies({learner.agents: learner.actor})
     played = batches(env, policy, 30)
@@ -207,7 +208,7 @@ def test_a_state_goes_from_turn_to_turn_and_is_zero_where_an_episode_begins(kind
 
 def test_rollouts_and_collectors_of_torchrl_carry_and_reset_states_too():
     env = CommonsEnv(GAME, 2, seed=3)
-    learner = ON_POLICY["PPO"].make_learner(env.game.spaces, agents=FOUR, replicas=2, engine="eager")
+    learner = make_learner(ON_POLICY["PPO"], env.game.spaces, agents=FOUR, replicas=2, engine="eager")
     policy = AgentPolicies({FOUR: learner.actor})
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         played = env.rollout(30, policy, break_when_any_done=False)
@@ -225,7 +226,7 @@ def test_rollouts_and_collectors_of_torchrl_carry_and_reset_states_too():
 def test_a_rollout_is_evaluated_as_it_was_played_across_rollouts_and_episodes():
     """The logits of `_batch` are those by which agents acted; so are those of any minibatch's own states."""
     env = CommonsEnv(GAME, 2, seed=3)
-    learner = ON_POLICY["PPO"].make_learner(env.game.spaces, agents=FOUR, replicas=2, engine="eager")
+    learner = make_learner(ON_POLICY["PPO"], env.game.spaces, agents=FOUR, replicas=2, engine="eager")
     policy = AgentPolicies({FOUR: learner.actor})
     turns = iter(StepCollector(env, policy))
     for _ in range(3):  # episodes last 12 turns, rollouts 20
@@ -253,8 +254,8 @@ def test_the_critic_goes_on_from_rollout_to_rollout_and_values_the_state_after_e
     """Its values are those of its network over the whole history, the last observation of an episode too."""
     env = make_env(Recall(turns=7), worlds=1)
     settings = replace(ROLLOUTS, rollout_steps=10, minibatch_size=5)
-    learner = PPO(settings=settings, network=SMALL).make_learner(
-        spaces_of(env), agents=(0,), replicas=1, engine="eager"
+    learner = make_learner(
+        PPO(settings=settings, network=SMALL), spaces_of(env), agents=(0,), replicas=1, engine="eager"
     )
     policy = AgentPolicies({(0,): learner.actor})
     turns, played = iter(StepCollector(env, policy)), []
@@ -320,8 +321,8 @@ def test_a_stored_run_is_loaded_evaluated_filmed_and_played_against(ran, tmp_pat
     found = cprl.evaluate_run(run, episodes=3)
     for replica in (0, 1):
         alone = evaluate(
-            loaded.env(3, seed=found.seed, first_world=3 * replica),
-            loaded.policy(replica, worlds=3, seed=found.seed),
+            loaded.env(3, seed=found.fresh.seed, first_world=3 * replica),
+            loaded.policy(replica, worlds=3, seed=found.fresh.seed),
             explore=True,
         )
         for one, other in zip(found.trained[replica], alone, strict=True):
@@ -382,7 +383,7 @@ def test_other_wrong_values_are_refused_by_name():
     with pytest.raises(ValueError, match="relu_on_outputs is True"):
         SMALL.make(VECTORS, 3, relu_on_outputs=True)
     with pytest.raises(ValueError, match="recurrent"):
-        ON_POLICY["PPO"].make_learner(GAME.spaces, agents=FOUR, replicas=1, engine="torchrl")
+        make_learner(ON_POLICY["PPO"], GAME.spaces, agents=FOUR, replicas=1, engine="torchrl")
 
 
 STACKED = Custom(
@@ -449,7 +450,7 @@ def test_memory_is_what_a_game_of_recall_needs(algorithm, settings, episodes):
     def reached(network, **changes):
         env = make_env(Recall(turns=4), worlds=8)
         made = algorithm(settings=replace(settings, **changes), network=network)
-        learner = made.make_learner(spaces_of(env), agents=(0,), replicas=8, engine="eager")
+        learner = make_learner(made, spaces_of(env), agents=(0,), replicas=8, engine="eager")
         returns = Returns()
         train(env, {(0,): learner}, episodes=episodes, callbacks=[returns])
         return [float(np.mean(own[-100:])) for own in returns.of.values()]

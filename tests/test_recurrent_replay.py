@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from dqn_parts import make_learner
 from test_population import GAME
 
 from cprl import CommonsEnv, Custom
@@ -34,7 +35,7 @@ FOUR = (0, 1, 2, 3)
 
 
 def made(algorithm, *, replicas=2, engine="eager"):
-    return algorithm.make_learner(GAME.spaces, agents=FOUR, replicas=replicas, engine=engine)
+    return make_learner(algorithm, GAME.spaces, agents=FOUR, replicas=replicas, engine=engine)
 
 
 def play(learner, steps):

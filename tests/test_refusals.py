@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 import torch
-from dqn_parts import dqn_learner, dqn_loss, write
+from dqn_parts import dqn_learner, dqn_loss, learner_of_parts, make_learner, write
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from test_networks import GAME, REPLAY, ROLLOUTS, SPACES, played
@@ -16,8 +16,9 @@ from cprl import CommonsEnv, Observation
 from cprl.algorithms import A2C, DQN, PPO, QMIX
 from cprl.algorithms.base import policy
 from cprl.learners.engine import ListEngine
+from cprl.learners.lanes import LearningAgents
 from cprl.learners.reference import TorchRLRolloutLearner
-from cprl.learners.ring import Ring
+from cprl.learners.ring import Ring, TransitionForm
 from cprl.learners.rollouts import RolloutLearner
 from cprl.learners.settings import TabularSettings
 from cprl.learners.tabular import TabularLearner
@@ -37,7 +38,7 @@ def float_turn():
 def test_floats_are_not_rounded_into_bytes_and_are_learned_from_where_the_spaces_say_so(kind):
     def new(spaces):
         algorithm = DQN(settings=REPLAY) if kind == "replay" else PPO(settings=ROLLOUTS)
-        return algorithm.make_learner(spaces, agents=(0, 1), replicas=1, engine="eager")
+        return make_learner(algorithm, spaces, agents=(0, 1), replicas=1, engine="eager")
 
     with pytest.raises(ValueError, match=r"observations are .*float32.*Spaces.observation_dtype"):
         new(SPACES).store(float_turn())
@@ -53,7 +54,7 @@ def test_floats_are_not_rounded_into_bytes_and_are_learned_from_where_the_spaces
 
 
 def test_a_buffer_refuses_floats_too():
-    buffer = Ring(seeds=[(0,)], transitions=20, batch_size=2, observation_shape=(2,))
+    buffer = Ring(TransitionForm(observation_shape=(2,)), seeds=[(0,)], transitions=20, batch_size=2)
     turn = {"observation": torch.zeros(1, 2), "action": torch.zeros(1, dtype=torch.int64)}
 
     flags = {name: torch.zeros(1, 1, dtype=torch.bool) for name in ("done", "terminated")}
@@ -79,15 +80,19 @@ def test_a_target_updater_of_torchrls_that_would_have_no_effect_is_refused(updat
 
 
 def test_a_target_updater_on_the_loss_of_an_engine_is_refused():
-    learner = DQN(settings=REPLAY).make_learner(SPACES, agents=(0,), replicas=1, engine="eager")
+    learner = make_learner(DQN(settings=REPLAY), SPACES, agents=(0,), replicas=1, engine="eager")
     with pytest.raises(ValueError, match=r"a SoftUpdate or HardUpdate .* DQNLoss; .* set tau or"):
         SoftUpdate(learner.engine.loss.module, tau=0.1)
 
 
-def rollout_learner(make_loss, *, settings=ROLLOUTS, **how):
-    how = {"agents": (0, 1), "replicas": 1, "compile": False, **how}
-    network = partial(PPO(settings=settings).make_network, SPACES)
-    return RolloutLearner(SPACES, settings=settings, make_network=network, make_loss=make_loss, **how)
+ONE = {"agents": (0,), "replicas": 1}
+
+
+def rollout_learner(make_loss, *, kind=RolloutLearner, settings=ROLLOUTS, **who):
+    who = {"agents": (0, 1), "replicas": 1, **who}
+    options = {"compile": False} if kind is RolloutLearner else {}
+    parts = {"make_loss": make_loss}
+    return learner_of_parts(kind, PPO(settings=settings), SPACES, parts=parts, options=options, **who)
 
 
 @pytest.mark.parametrize("algorithm", [PPO, A2C])
@@ -102,14 +107,7 @@ def test_advantages_by_another_estimator_than_that_of_the_loss_are_refused(algor
     with pytest.raises(ValueError, match=rf"has the value estimator {estimator}; allowed: GAE, "):
         rollout_learner(make_loss)
     with pytest.raises(ValueError, match=rf"has the value estimator {estimator}; allowed: GAE, "):
-        TorchRLRolloutLearner(
-            SPACES,
-            agents=(0, 1),
-            replicas=1,
-            settings=ROLLOUTS,
-            make_network=partial(PPO(settings=ROLLOUTS).make_network, SPACES),
-            make_loss=make_loss,
-        )
+        rollout_learner(make_loss, kind=TorchRLRolloutLearner)
 
 
 def test_gae_by_other_numbers_than_those_of_the_settings_is_refused():
@@ -193,10 +191,10 @@ def test_what_no_network_sees_is_refused_but_tables_read_it(observed):
         with pytest.raises(ValueError, match=rf'agents observe \("agents", "{name}"\); allowed for networks'):
             algorithm.make_network(spaces)
         with pytest.raises(ValueError, match=rf'agents observe \("agents", "{name}"\); allowed for networks'):
-            algorithm.make_learner(spaces, agents=(0,), replicas=1)
+            make_learner(algorithm, spaces, agents=(0,), replicas=1)
     with pytest.raises(ValueError, match="allowed for networks"):
-        QMIX(settings=REPLAY).make_learner(spaces, agents=(0, 1), replicas=1, reward_kind="team")
-    TabularLearner(spaces, agents=(0,), replicas=1, settings=TabularSettings())
+        make_learner(QMIX(settings=REPLAY), spaces, agents=(0, 1), replicas=1, reward_kind="team")
+    TabularLearner(LearningAgents(spaces, agents=(0,), replicas=1), TabularSettings())
 
 
 class OnlyErrors(DQNLoss):
@@ -242,4 +240,4 @@ def test_a_loss_that_returns_none_is_refused_by_name_before_training(kind, came,
     object.__setattr__(algorithm, "make_loss", make_loss)
     allowed = f"{kind.__name__} returns a {came}; allowed: a TensorDict with entries whose names begin with"
     with pytest.raises(ValueError, match=f"the loss test_refusals:{allowed}"):
-        algorithm.make_learner(SPACES, agents=(0,), replicas=1, engine=engine)
+        make_learner(algorithm, SPACES, agents=(0,), replicas=1, engine=engine)

@@ -63,7 +63,7 @@ def learner(engine="lane_axis", *, game=GAME, agents=(0, 1), settings=SETTINGS, 
 def test_as_run_targets_start_from_weights_of_their_own_and_the_loss_is_shared_over_outputs():
     as_run = replace(SETTINGS, own_target_weights=True, mean_over_all_outputs=True)
     plain, odd = (learner(replicas=2, settings=settings) for settings in (SETTINGS, as_run))
-    assert odd.engine._share == plain.engine._share / 8
+    assert odd.engine._rule.loss_share == plain.engine._rule.loss_share / 8
     for agents, same in ((plain, True), (odd, False)):
         weights = agents.engine.weights(0)
         own = [value for name, value in weights.items() if not name.startswith("target_")]

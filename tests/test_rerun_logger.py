@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import rerun as rr
 import torch
+from dqn_parts import make_learner
 from recordings import GAME, SCENE, column, frames, static, strict_rerun
 from rerun.chunk import RrdReader
 from tensordict import TensorDict
@@ -261,29 +262,15 @@ def test_a_stream_that_fails_is_dropped_with_one_warning_and_the_other_goes_on(t
     assert column(tmp_path / "run.rrd", "world/board", "SegmentationImage:buffer")[0] == [1, 2, 3, 10, 11, 12]
 
 
-def trained(run, *, watched):
-    """The weights after a short training, and what torch's generator stands at."""
-    torch.manual_seed(1)
-    settings = DQNSettings(buffer_size=200, learning_rate=1e-3)
-    algorithm = DQN(settings=settings)
-    learner = algorithm.make_learner(GAME.spaces, agents=(0,), replicas=1, seed=1, engine="torchrl")
-    env = CommonsEnv(GAME, seed=1)
-    callbacks = [ViewerCallback(run, env, title="run", episodes=4)] if watched else []
-    train(env, {(0,): learner}, others={1: RandomActor(8)}, episodes=4, callbacks=callbacks)
-    for callback in callbacks:
-        callback.__exit__(None, None, None)
-    (network,) = learner.networks().values()
-    return torch.cat([weight.flatten() for weight in network.parameters()]), torch.get_rng_state()
-
-
 @pytest.mark.integration
-def test_a_watched_training_records_every_turn_and_learns_the_very_same(tmp_path):
-    (weights, state), (watched, other_state) = (
-        trained(tmp_path, watched=False),
-        trained(tmp_path, watched=True),
+def test_a_watched_training_records_every_turn(tmp_path):
+    settings = DQNSettings(buffer_size=200, learning_rate=1e-3)
+    learner = make_learner(
+        DQN(settings=settings), GAME.spaces, agents=(0,), replicas=1, seed=1, engine="torchrl"
     )
-    assert torch.equal(weights, watched)
-    assert torch.equal(state, other_state)
+    env = CommonsEnv(GAME, seed=1)
+    with ViewerCallback(tmp_path, env, title="run", episodes=4) as viewer:
+        train(env, {(0,): learner}, others={1: RandomActor(8)}, episodes=4, callbacks=[viewer])
     path = tmp_path / "run.rrd"
     steps, _ = column(path, "world/board", "SegmentationImage:buffer")
     episodes, _ = column(path, "world/board", "SegmentationImage:buffer", "episode")

@@ -10,6 +10,7 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 import torch
+from dqn_parts import make_learner
 from valid_values import EVERY
 
 from cprl import Custom, Experiment, Rules, presets
@@ -302,7 +303,7 @@ HOW = {"agents": (0, 1), "replicas": 1, "engine": "eager"}
 )
 def test_learners_refuse_agents_and_replicas_that_there_cannot_be(algorithm, changes):
     with pytest.raises(ValueError, match=next(iter(changes))):
-        algorithm.make_learner(SPACES, **{**HOW, **changes})
+        make_learner(algorithm, SPACES, **{**HOW, **changes})
 
 
 WIDE = (2**16,) * 64
@@ -326,13 +327,13 @@ def test_what_no_memory_has_is_refused_before_it_is_allocated(algorithm, how, en
     for place in ("system.memory", "learners.ring"):
         monkeypatch.setattr(f"cprl.{place}.free_bytes", lambda device="cpu": 2 * 2**30)
     with pytest.raises(TooLargeError, match=cure):
-        algorithm.make_learner(SPACES, **{**how, "engine": engine})
+        make_learner(algorithm, SPACES, **{**how, "engine": engine})
 
 
 def test_tables_of_too_many_agents_are_refused_too(monkeypatch):
     monkeypatch.setattr("cprl.system.memory.free_bytes", lambda device="cpu": 2 * 2**30)
     with pytest.raises(TooLargeError, match="1048576 replicas of 2 agents take 8"):
-        Tabular(settings=TABLES).make_learner(SPACES, **MANY)
+        make_learner(Tabular(settings=TABLES), SPACES, **MANY)
 
 
 def test_an_evaluation_that_no_memory_has_is_refused_before_anything_is_written(tmp_path, monkeypatch):

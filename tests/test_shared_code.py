@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from dqn_parts import make_learner
 from torch import nn
 
 from cprl import CommonsEnv, Game, Rules, maps
@@ -44,7 +45,7 @@ ALONE = ("plain", "another gamma", "another learning rate", "double", "wider")
 def trained(case, *, seed=0, steps=60):
     """A learner after a short training."""
     prepare_process(seed)
-    learner = CASES[case].make_learner(PATCH.spaces, agents=AGENTS, replicas=2, seed=seed)
+    learner = make_learner(CASES[case], PATCH.spaces, agents=AGENTS, replicas=2, seed=seed)
     env = CommonsEnv(PATCH, 2, seed=seed)
     training = Training(env, {AGENTS: learner}, episodes=10**6)
     with warnings.catch_warnings():
@@ -59,7 +60,12 @@ def trained(case, *, seed=0, steps=60):
 def digest(learner):
     """Of all weights, targets, moments and stored transitions, to the bit."""
     engine = learner.engine
-    tensors = [*engine.own.values(), *engine.fixed.values(), *engine._mean.values(), *engine._square.values()]
+    tensors = [
+        *engine.params.values(),
+        *engine.targets.values(),
+        *engine._mean.values(),
+        *engine._square.values(),
+    ]
     tensors += learner.buffer.fields.values()
     whole = hashlib.sha256()
     for tensor in tensors:
@@ -140,8 +146,8 @@ def test_a_learner_that_shares_code_trains_its_own_weights_alone(compilations):
     second = trained("another gamma")
     assert len(compilations) == 2
     assert digest(first) == before
-    own = {tensor.data_ptr() for tensor in first.engine.own.values()}
-    assert own.isdisjoint(tensor.data_ptr() for tensor in second.engine.own.values())
+    own = {tensor.data_ptr() for tensor in first.engine.params.values()}
+    assert own.isdisjoint(tensor.data_ptr() for tensor in second.engine.params.values())
 
 
 def scaled(owner, values):

@@ -13,6 +13,7 @@ from cprl import CommonsEnv, Custom, Experiment
 from cprl.algorithms import DQN, PPO, Tabular, TabularSettings
 from cprl.algorithms.base import TeamAlgorithm
 from cprl.learners.engine import SharedEngine
+from cprl.learners.ring import TransitionForm
 from cprl.learners.settings import DEFAULT_HIDDEN_CELLS
 from cprl.learners.trial import trial_batch
 from cprl.networks import Conv
@@ -72,7 +73,7 @@ def test_the_loss_is_the_mean_over_the_transitions_of_all_members():
     agents = population([shared(DQN(settings=REPLAY), (1, 3)), Scripted(), Scripted()], replicas=2)
     (learner,) = agents.learners.values()
     network = agents.networks()["replica_1/agent_1"]
-    batch = trial_batch(4, GAME.observation_shape, len(GAME.actions))
+    batch = trial_batch(4, TransitionForm(observation_shape=GAME.observation_shape), len(GAME.actions))
     mine = batch[2:].reshape(-1)  # lanes are replicas times members
     with torch.no_grad():  # r + gamma max Q', the target is still a copy
         chosen = network(mine["observation"]).gather(-1, mine["action"].unsqueeze(-1))

@@ -12,6 +12,7 @@ from dqn_parts import q_table
 from cprl import CommonsEnv, Game, Observation, Rules, maps
 from cprl.envs import make_env, spaces_of
 from cprl.envs.matrix import prisoners_dilemma
+from cprl.learners.lanes import LearningAgents
 from cprl.learners.settings import TabularSettings
 from cprl.learners.tabular import TabularLearner
 from cprl.measuring.evaluate import evaluate
@@ -156,7 +157,8 @@ def test_the_model_is_the_game_and_what_is_observed_tells_the_state(known):
 
 
 def learned(game, settings, *, episodes, replicas=2, seed=0):
-    learner = TabularLearner(game.spaces, agents=[0], replicas=replicas, settings=settings, seed=seed)
+    who = LearningAgents(game.spaces, agents=[0], replicas=replicas, seed=seed)
+    learner = TabularLearner(who, settings)
     train(CommonsEnv(game, replicas, seed=seed), {(0,): learner}, episodes=episodes)
     return learner
 
@@ -215,8 +217,8 @@ def test_with_regrowth_it_learns_the_values_too():
         assert shortfall(learner, lane, model, rows) < 0.02
 
 
-def learner_of(game, **how):
-    learner = TabularLearner(game.spaces, **how)
+def learner_of(game, settings):
+    learner = TabularLearner(LearningAgents(game.spaces, agents=[0], replicas=1), settings)
     learner.game = game
     return learner
 
@@ -242,14 +244,14 @@ def test_what_comes_after_the_clock_counts_and_nothing_after_the_last_apple():
     settings = TabularSettings(learning_rate=1.0, gamma=0.5)
     rules = {"window_rows": 3, "window_columns": 1, "may_fire": False}
     short = Game(map=maps.parse("A>A"), rules=Rules(episode_steps=1, **rules))
-    learner = learner_of(short, agents=[0], replicas=1, settings=settings)
+    learner = learner_of(short, settings)
     taught(learner, "forward")  # Q(start, forward) = 1
     assert taught(learner, "stay")["next", "truncated"].item()
     assert value_at_the_start(learner, "stay") == 0.5
 
     # Who looks at the wall on the right sees the same whether the left apple hangs (X) or not (terminal).
     endless = Game(map=maps.parse("A>A"), rules=Rules(regrow_prob=(0.0,), **rules))
-    learner = learner_of(endless, agents=[0], replicas=1, settings=settings)
+    learner = learner_of(endless, settings)
     for expected in (1.0, 1.0, 1.25):  # backward from X is worth 0, then 0.5 x 1, and so X itself
         taught(learner, "forward", "backward", "backward")
         assert value_at_the_start(learner, "forward") == expected
@@ -278,9 +280,8 @@ def test_an_agents_course_does_not_depend_on_other_replicas():
     settings = TabularSettings(epsilon_hold_steps=10, epsilon_decay_steps=200, learning_rate="1/visits")
     tables = []
     for first, replicas in ((0, 3), (1, 1)):
-        learner = TabularLearner(
-            PAIR.spaces, agents=[0, 1], replicas=replicas, settings=settings, first_replica=first
-        )
+        who = LearningAgents(PAIR.spaces, agents=[0, 1], replicas=replicas, first_replica=first)
+        learner = TabularLearner(who, settings)
         env = CommonsEnv(PAIR, replicas, seed=0, first_world=first)
         training = Training(env, {(0, 1): learner}, episodes=100)
         for _ in range(300):
@@ -294,9 +295,8 @@ def test_an_agents_course_does_not_depend_on_other_replicas():
 
 def test_the_table_of_an_agent_that_observes_floating_point_numbers_is_kept_as_a_network():
     env = make_env(prisoners_dilemma(turns=5), worlds=2)
-    learner = TabularLearner(
-        spaces_of(env), agents=(0, 1), replicas=2, settings=TabularSettings(gamma=0.0, learning_rate=1.0)
-    )
+    who = LearningAgents(spaces_of(env), agents=(0, 1), replicas=2)
+    learner = TabularLearner(who, TabularSettings(gamma=0.0, learning_rate=1.0))
     train(env, {(0, 1): learner}, episodes=20)
     table, network = q_table(learner, 0), learner.networks()["replica_0/agent_0"]
     seen = torch.from_numpy(table["observation"])
@@ -308,7 +308,7 @@ def test_the_table_of_an_agent_that_observes_floating_point_numbers_is_kept_as_a
 
 
 def test_more_states_than_are_allowed_are_refused():
-    learner = learner_of(ONCE, agents=[0], replicas=1, settings=TabularSettings(max_states=3))
+    learner = learner_of(ONCE, TabularSettings(max_states=3))
     with pytest.raises(MemoryError, match="lane 0 has met 3 states, as many as max_states allows"):
         taught(learner, "turn_left", "turn_left", "turn_left", "turn_left", "forward")
     assert len(q_table(learner, 0)["values"]) == 3

@@ -13,6 +13,7 @@ from cprl import CommonsEnv, Game, Rules, maps, presets
 from cprl.algorithms.off_policy import DQN
 from cprl.algorithms.teams import IPPO, MADDPG, MAPPO, QMIX, VDN
 from cprl.learners.engine import FunctionalEngine
+from cprl.learners.ring import TransitionForm
 from cprl.learners.settings import DQNSettings
 from cprl.learners.trial import trial_batch
 from cprl.measuring.evaluate import evaluate
@@ -65,7 +66,8 @@ def test_a_member_begins_with_the_weights_that_it_would_have_alone():
 def test_the_loss_of_vdn_is_that_of_the_sum_of_its_members_values():
     agents, learner = team_of("VDN", replicas=1)
     networks = list(agents.networks().values())
-    batch = trial_batch(1, (4, *GAME.observation_shape), len(GAME.actions), action_shape=(4,))
+    form = TransitionForm(observation_shape=(4, *GAME.observation_shape), action_shape=(4,))
+    batch = trial_batch(1, form, len(GAME.actions))
     (turn,) = batch
     ends = turn["next", "terminated"].squeeze(-1)
     assert 0 < ends.sum() < 8

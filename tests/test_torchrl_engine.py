@@ -7,6 +7,7 @@ from io import BytesIO
 
 import pytest
 import torch
+from dqn_parts import dqn_learner, learner_of_parts, make_learner
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler, RoundRobinWriter, Sampler, SamplerWithoutReplacement
 from torchrl.envs.transforms import MultiStepTransform
@@ -159,9 +160,10 @@ class Replayed(Sampler):
 
 def both(algorithm):
     """The fast engine's learner, and the stock one that is handed the places that the fast one draws."""
-    fast = algorithm.make_learner(SPACES, engine="eager", **HOW)
+    fast = make_learner(algorithm, SPACES, engine="eager", **HOW)
     samplers = [Replayed() for _ in range(4)]
-    stock = algorithm.make_learner(SPACES, engine="torchrl", make_sampler=samplers.__getitem__, **HOW)
+    kind = TorchRLReplayLearner if isinstance(algorithm.settings, DQNSettings) else TorchRLRolloutLearner
+    stock = learner_of_parts(kind, algorithm, SPACES, options={"make_sampler": samplers.__getitem__}, **HOW)
     if isinstance(algorithm.settings, DQNSettings):
         draw = fast.buffer.draw
 
@@ -226,7 +228,7 @@ def test_from_the_same_draws_both_engines_have_the_same_weights_after_updates(na
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_part_is_torchrls_or_torchs_own(name):
     algorithm = ALGORITHMS[name]
-    learner = algorithm.make_learner(SPACES, engine="torchrl", **HOW)
+    learner = make_learner(algorithm, SPACES, engine="torchrl", **HOW)
     on_policy = name in ON_POLICY
     assert type(learner) is (TorchRLRolloutLearner if on_policy else TorchRLReplayLearner)
     buffers = learner.buffers if on_policy else learner.buffer.each
@@ -245,7 +247,7 @@ def test_every_part_is_torchrls_or_torchs_own(name):
 
 
 def resumable(algorithm, **how):
-    return algorithm.make_learner(SPACES, engine="torchrl", **HOW, **how)
+    return make_learner(algorithm, SPACES, engine="torchrl", **HOW, **how)
 
 
 RESUMED = {
@@ -406,13 +408,8 @@ def test_what_follows_n_steps_is_discounted_by_as_many(name):
 
 
 def replay_learner_of(make_loss, **changes):
-    return TorchRLReplayLearner(
-        SPACES,
-        settings=changed(REPLAY, **changes),
-        make_network=lambda: DQN(settings=REPLAY).make_network(SPACES),
-        make_loss=make_loss,
-        **HOW,
-    )
+    settings = changed(REPLAY, **changes)
+    return dqn_learner(SPACES, settings=settings, kind=TorchRLReplayLearner, make_loss=make_loss, **HOW)
 
 
 def test_a_loss_of_each_transition_learns_as_their_mean():
@@ -458,8 +455,8 @@ def test_updates_per_step_and_the_optimiser_are_those_of_the_settings():
 def test_between_updates_nothing_is_learned_by_either_engine():
     settings = changed(REPLAY, steps_per_update=4)
     stock = resumable(DQN(settings=settings))
-    fast = DQN(settings=settings).make_learner(
-        stock.spaces, agents=stock.agents, replicas=stock.replicas, engine="eager"
+    fast = make_learner(
+        DQN(settings=settings), stock.spaces, agents=stock.agents, replicas=stock.replicas, engine="eager"
     )
     for learner in (stock, fast):
         played, losses = turns(learner.actor), []
@@ -477,26 +474,17 @@ REFUSED.append(Tabular(settings=TabularSettings()))
 def test_teams_and_tables_are_refused_by_name(team):
     match = f'{type(team).__name__} does not support engine="torchrl", .*"compiled" or "eager"'
     with pytest.raises(ValueError, match=match):
-        team.make_learner(SPACES, engine="torchrl", reward_kind="team", **HOW)
+        make_learner(team, SPACES, engine="torchrl", reward_kind="team", **HOW)
 
 
 def test_other_losses_networks_and_sizes_are_refused():
     with pytest.raises(ValueError, match="ClipPPOLoss is on-policy and cannot learn from a replay buffer"):
-        TorchRLReplayLearner(
-            SPACES,
-            settings=REPLAY,
-            make_network=lambda: PPO(settings=ROLLOUT).make_network(SPACES),
-            make_loss=PPO(settings=ROLLOUT).make_loss,
-            **HOW,
+        learner_of_parts(
+            TorchRLReplayLearner, PPO(settings=ROLLOUT), SPACES, parts={"settings": REPLAY}, **HOW
         )
+    parts = {"make_network": partial(DQN(settings=REPLAY).make_network, SPACES)}
     with pytest.raises(ValueError, match="an agent has the networks"):
-        TorchRLRolloutLearner(
-            SPACES,
-            settings=ROLLOUT,
-            make_network=lambda: DQN(settings=REPLAY).make_network(SPACES),
-            make_loss=PPO(settings=ROLLOUT).make_loss,
-            **HOW,
-        )
+        learner_of_parts(TorchRLRolloutLearner, PPO(settings=ROLLOUT), SPACES, parts=parts, **HOW)
     with pytest.raises(
         MemoryError, match=r"4 agents x 1,000,000,000,000 transitions take .* smaller buffer_size"
     ):
@@ -516,13 +504,8 @@ def test_targets_are_refused_for_a_loss_that_has_none(kind):
         return loss
 
     def make(**changes):
-        return kind(
-            SPACES,
-            settings=changed(REPLAY, **changes),
-            make_network=lambda: DQN(settings=REPLAY).make_network(SPACES),
-            make_loss=without_targets,
-            **HOW,
-        )
+        settings = changed(REPLAY, **changes)
+        return dqn_learner(SPACES, settings=settings, kind=kind, make_loss=without_targets, **HOW)
 
     assert getattr(make().engine, "updaters", [None] * 4) == [None] * 4
     with pytest.raises(ValueError, match=r"tau is 0\.1"):

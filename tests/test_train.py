@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from dqn_parts import dqn_learner
+from dqn_parts import dqn_learner, make_learner
 from stock_collector import stock_collector
 
 from cprl import CommonsEnv, Game, Rules, maps
@@ -47,7 +47,7 @@ class Witness:
 
 def learner(agent=0, *, seed=0):
     algorithm = DQN(settings=DQNSettings(buffer_size=200))
-    return algorithm.make_learner(GAME.spaces, agents=(agent,), replicas=1, seed=seed, engine="torchrl")
+    return make_learner(algorithm, GAME.spaces, agents=(agent,), replicas=1, seed=seed, engine="torchrl")
 
 
 def test_observers_see_every_turn_and_every_episode_and_the_learner_learns_once_a_turn():
@@ -169,7 +169,7 @@ def test_what_a_second_training_stores_does_not_follow_the_last_turn_of_the_firs
     settings = DQNSettings(
         buffer_size=1000, hidden_cells=(8,), n_steps=steps, gamma=0.5, learning_starts=5000
     )
-    agents = DQN(settings=settings).make_learner(UNEVEN.spaces, agents=(0, 1), replicas=3, engine=engine)
+    agents = make_learner(DQN(settings=settings), UNEVEN.spaces, agents=(0, 1), replicas=3, engine=engine)
     first, second = train_twice(agents)
     came = [*first, *second]
     for lane in range(6):
@@ -206,7 +206,7 @@ def test_what_a_second_training_stores_does_not_follow_the_last_turn_of_the_firs
 )
 def test_a_second_training_begins_its_rollouts_anew(algorithm, engine, wanted):
     engine = {} if engine is None else {"engine": engine}
-    agents = algorithm.make_learner(UNEVEN.spaces, agents=(0, 1), replicas=3, **engine)
+    agents = make_learner(algorithm, UNEVEN.spaces, agents=(0, 1), replicas=3, **engine)
 
     def weights():
         return [value for network in agents.networks().values() for value in network.state_dict().values()]

@@ -37,7 +37,7 @@ def test_the_episodes_are_those_of_an_evaluation(meadow):
     found, played = (ask(meadow, episodes=5, seed=SEED) for ask in (territory_of, cprl.evaluate_run))
     for policy in ("trained", "random"):
         stays = found.of(policy)
-        for place, replica in enumerate(found.replicas):
+        for place, replica in enumerate(found.fresh.replicas):
             episodes = getattr(played, policy)[replica]
             tagged_by = sum(own.tagged_by for own in episodes)
             assert stays.taggings[place].tolist() == tagged_by.tolist()

@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
+from dqn_parts import make_learner
 from matrix_game import MatrixGame
 from one_road_parts import Dilemma
 
@@ -62,8 +63,14 @@ BOARD = Game(
 
 def learner_of(name, preference, agents=(0, 1)):
     algorithm, engine = LEARNERS[name]
-    return algorithm.make_learner(
-        spaces_of(MatrixGame(2)), agents=agents, replicas=2, seed=3, engine=engine, reward_kind=preference
+    return make_learner(
+        algorithm,
+        spaces_of(MatrixGame(2)),
+        agents=agents,
+        replicas=2,
+        seed=3,
+        engine=engine,
+        reward_kind=preference,
     )
 
 
@@ -233,7 +240,7 @@ def test_a_run_keeps_preferences_in_its_recipe_and_its_table(tmp_path):
             assert row["wanted_return"] is None
     longer = cprl.run(EXPERIMENT, tmp_path / "other", watch="off")
     assert read_episodes(longer).equals(read_episodes(run)), "null equals null, NaN does not"
-    with pytest.raises(ValueError, match=r"agents\[0\]\.reward\.alpha was 5, is 4"):
+    with pytest.raises(ValueError, match=r"agents\[0\]\.reward\.alpha was 5.0, is 4.0"):
         cprl.run(
             replace(EXPERIMENT, agents=[Learning(DQN(settings=REPLAY), reward=replace(AVERSE, alpha=4)),
                                         *EXPERIMENT.agents[1:]]),
@@ -267,9 +274,9 @@ def test_preferences_are_flags_by_their_place():
 class Deaf(DQN):
     """An algorithm of somebody's own, whose learner knows two rewards."""
 
-    def make_learner(self, spaces, *, reward_kind, **how):
-        learner = super().make_learner(spaces, reward_kind="individual", **how)
-        return learner if reward_kind == "individual" else object()
+    def make_learner(self, who, engine="compiled"):
+        learner = super().make_learner(replace(who, reward_kind="individual"), engine)
+        return learner if who.reward_kind == "individual" else object()
 
 
 @pytest.mark.parametrize(
@@ -292,7 +299,7 @@ def test_agents_without_others_are_refused_before_anything_is_written(tmp_path):
     with pytest.raises(ValueError, match=r"experiment\.agents\[0\]\.reward is Exchange.* a game of 1 agent"):
         replace(EXPERIMENT, game=alone, agents=[Learning(DQN(settings=REPLAY), reward=Exchange(0.5))])
     with pytest.raises(ValueError, match=r"reward_kind is Exchange, which compares an agent with others"):
-        DQN(settings=REPLAY).make_learner(alone.spaces, agents=(0,), replicas=1, reward_kind=Exchange(0.5))
+        make_learner(DQN(settings=REPLAY), alone.spaces, agents=(0,), replicas=1, reward_kind=Exchange(0.5))
     assert list(tmp_path.iterdir()) == []
 
 

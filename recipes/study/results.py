@@ -6,9 +6,9 @@ PooledResult        runs of one experiment under several seeds, as one result of
 returns_by_chance   random play over 10,000 episodes, which the study's random scores are compared with
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,11 +24,10 @@ from cprl.algorithms import DQN
 from cprl.commons.batch import Batch
 from cprl.commons.game import Game
 from cprl.evaluation.evaluate import SEED
-from cprl.evaluation.lanes import Source, fresh_worlds, policies_of, random_policies
+from cprl.evaluation.lanes import Fresh, MakePolicies, Source
 from cprl.experiment import Experiment
 from cprl.measuring.movement import Trace, overlap, trace
 from cprl.measuring.phases import Phase
-from cprl.policies.assignment import AgentPolicies
 from cprl.population import Learning, Scripted, Team, exploration_steps
 from cprl.runs.curves import (
     SMOOTHED_EPISODES,
@@ -85,35 +84,31 @@ def measures(
     if lacks_weights(run):
         return Measures(training=training, trained={}, random={})
     loaded = load(run, allow=allow)
-    replicas = tuple(loaded.replicas)
-    trained = _at_play(
-        loaded, replicas, partial(policies_of, [Source(loaded)] * loaded.game.agents), seed=seed
-    )
+    fresh = Fresh(replicas=tuple(loaded.replicas), episodes=WORLDS, seed=seed, greedy=True)
+    trained = _at_play(loaded, fresh, fresh.agents([Source(loaded)] * loaded.game.agents))
     return Measures(
         training=training,
         trained={name: values for name, values in trained.items() if np.isfinite(values).all()},
-        random=_by_chance(loaded, replicas, seed=seed),
+        random=_by_chance(loaded, fresh),
     )
 
 
 _PLAYED_BY_CHANCE: Final[dict[Any, dict[str, Values]]] = {}
 
 
-def _by_chance(run: LoadedRun, replicas: tuple[int, ...], *, seed: int) -> dict[str, Values]:
+def _by_chance(run: LoadedRun, fresh: Fresh) -> dict[str, Values]:
     """`of_play` of the random policy; the same for all runs of a game, so played once."""
-    key = run.game, run.experiment.transforms, replicas, seed
+    key = run.game, run.experiment.transforms, fresh
     if key not in _PLAYED_BY_CHANCE:
-        _PLAYED_BY_CHANCE[key] = _at_play(run, replicas, partial(random_policies, run), seed=seed)
+        _PLAYED_BY_CHANCE[key] = _at_play(run, fresh, fresh.random_agents(run))
     return _PLAYED_BY_CHANCE[key]
 
 
-def _at_play(
-    run: LoadedRun, replicas: Sequence[int], who: Callable[..., AgentPolicies], *, seed: int
-) -> dict[str, Values]:
+def _at_play(run: LoadedRun, fresh: Fresh, policies: MakePolicies) -> dict[str, Values]:
     """`of_play` of a game in the same fresh worlds, whoever plays."""
     found: dict[str, list[Values]] = {}
-    for group, env in fresh_worlds(run, replicas, worlds=WORLDS, seed=seed):
-        played = trace(env, who(group, worlds=WORLDS, seed=seed))
+    for group, env in fresh.worlds(run):
+        played = trace(env, policies(group))
         for name, values in of_play(played, len(group)).items():
             found.setdefault(name, []).append(values)
     return {name: np.concatenate(values) for name, values in found.items()}

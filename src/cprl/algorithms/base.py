@@ -5,7 +5,7 @@ define `make_network` and `make_loss`; docs/algorithms.md has an example of twen
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
@@ -16,6 +16,7 @@ from torchrl.objectives import LossModule, ValueEstimators
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.learners.base import Learner
+from cprl.learners.lanes import LearningAgents, Method
 from cprl.learners.preferences import Preference, named
 from cprl.learners.reference import TorchRLReplayLearner, TorchRLRolloutLearner
 from cprl.learners.replay import ReplayLearner
@@ -103,17 +104,23 @@ class Algorithm(Value, stored=False):
         """TorchRL's loss over networks of `make_network`."""
         raise NotImplementedError(f"{type(self).__name__} must define make_loss(network)")
 
-    def make_learner(
-        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **options: Any
-    ) -> Learner:
+    def method(self, spaces: Spaces) -> Method:
+        """What learners ask of the algorithm, for such observations and actions."""
+        return Method(
+            settings=self.settings,
+            make_network=lambda: self.make_network(spaces),
+            make_loss=self.make_loss,
+            stochastic=self.stochastic,
+        )
+
+    def make_learner(self, who: LearningAgents, engine: TrainingEngine = "compiled") -> Learner:
         """The learner of these agents in every replica.
 
-        Args:
-            spaces: the shape and dtype of observations, and the number of actions A.
-            options: `replicas`, `seed`, `first_replica`, `reward_kind`, `device` and, if the algorithm
-                `can_share_parameters`, `share_parameters`; see `cprl.learners.replay.ReplayLearner`.
+        Raises:
+            ValueError: if the algorithm does not support these agents, or the engine does not support the
+                algorithm.
         """
-        raise NotImplementedError(f"{type(self).__name__} must define make_learner")
+        raise NotImplementedError(f"{type(self).__name__} must define make_learner(who, engine)")
 
     def _refuse_torchrl(self, engine: TrainingEngine) -> None:
         if engine == "torchrl":
@@ -153,22 +160,15 @@ class OffPolicy(Algorithm, stored=False):
         loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
         return loss
 
-    def make_learner(
-        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **options: Any
-    ) -> Learner:
-        options |= {
-            "agents": agents,
-            "settings": self.settings,
-            "make_network": lambda: self.make_network(spaces),
-            "make_loss": self.make_loss,
-            "stochastic": self.stochastic,
-            "sees_peers": self.sees_peers_actions,
-            "noise_numbers": self.noise_numbers,
-        }
+    def method(self, spaces: Spaces) -> Method:
+        return replace(
+            super().method(spaces), sees_peers=self.sees_peers_actions, noise_numbers=self.noise_numbers
+        )
+
+    def make_learner(self, who: LearningAgents, engine: TrainingEngine = "compiled") -> Learner:
         if engine == "torchrl":
-            _refuse_sharing(options)
-            return TorchRLReplayLearner(spaces, **options)
-        return ReplayLearner(spaces, compile=engine == "compiled", **options)
+            return TorchRLReplayLearner(who, self.method(who.spaces))
+        return ReplayLearner(who, self.method(who.spaces), compile=engine == "compiled")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,19 +189,10 @@ class OnPolicy(Algorithm, stored=False):
     def make_network(self, spaces: Spaces) -> nn.Module:
         return self.new_networks(spaces, actor=spaces.actions, critic=1)
 
-    def make_learner(
-        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **options: Any
-    ) -> Learner:
-        options |= {
-            "agents": agents,
-            "settings": self.settings,
-            "make_network": lambda: self.make_network(spaces),
-            "make_loss": self.make_loss,
-        }
+    def make_learner(self, who: LearningAgents, engine: TrainingEngine = "compiled") -> Learner:
         if engine == "torchrl":
-            _refuse_sharing(options)
-            return TorchRLRolloutLearner(spaces, **options)
-        return RolloutLearner(spaces, compile=engine == "compiled", **options)
+            return TorchRLRolloutLearner(who, self.method(who.spaces))
+        return RolloutLearner(who, self.method(who.spaces), compile=engine == "compiled")
 
 
 class TeamAlgorithm(Algorithm, stored=False):
@@ -222,20 +213,17 @@ class TeamAlgorithm(Algorithm, stored=False):
         first. Added networks are initialised from torch's generator."""
         raise NotImplementedError(f"{type(self).__name__} must define make_team(members, spaces)")
 
-    def make_learner(
-        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **options: Any
-    ) -> Learner:
-        self._refuse_torchrl(engine)
-        self._check_team(len(agents), options.get("reward_kind", "individual"))
-        if isinstance(self, OffPolicy):
-            options["own_rewards"] = not self.shares_reward
-        return super().make_learner(
-            spaces,
-            agents=agents,
-            engine=engine,
+    def method(self, spaces: Spaces) -> Method:
+        return replace(
+            super().method(spaces),
             make_team=lambda members: self.make_team(members, spaces),
-            **options,
+            own_rewards=not self.shares_reward,
         )
+
+    def make_learner(self, who: LearningAgents, engine: TrainingEngine = "compiled") -> Learner:
+        self._refuse_torchrl(engine)
+        self._check_team(len(who.agents), who.reward_kind)
+        return super().make_learner(who, engine)
 
     def _check_team(self, members: int, reward: Preference) -> None:
         name = type(self).__name__
@@ -249,13 +237,6 @@ class TeamAlgorithm(Algorithm, stored=False):
                 f"the team has {members} agents; allowed for {name}: at least {self.fewest_members}; DQN and "
                 "VDN support fewer"
             )
-
-
-def _refuse_sharing(options: dict[str, Any]) -> None:
-    if options.pop("share_parameters", False):
-        raise ValueError(
-            'share_parameters is True; allowed with engine="torchrl", which trains independent agents: False'
-        )
 
 
 def refuse_relu(name: str, settings: DQNSettings) -> None:

@@ -1,6 +1,5 @@
 """Algorithms that learn from replay: DQN, C51, CQL, SAC, IQL, PR2; and tabular Q-learning."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, ClassVar
@@ -31,6 +30,7 @@ from cprl.algorithms.base import (
 )
 from cprl.commons.spaces import Spaces
 from cprl.learners.base import Learner
+from cprl.learners.lanes import LearningAgents
 from cprl.learners.settings import (
     TabularSettings,
 )
@@ -295,11 +295,8 @@ class Tabular(Algorithm):
         """
         return table_network(spaces)
 
-    def make_learner(
-        self, spaces: Spaces, *, agents: Sequence[int], engine: TrainingEngine = "compiled", **options: Any
-    ) -> Learner:
+    def make_learner(self, who: LearningAgents, engine: TrainingEngine = "compiled") -> Learner:
         # Tables are neither compiled nor on a GPU.
         self._refuse_torchrl(engine)
-        self.make_network(spaces)
-        options.pop("device", None)
-        return TabularLearner(spaces, agents=agents, settings=self.settings, **options)
+        self.make_network(who.spaces)
+        return TabularLearner(who, self.settings)

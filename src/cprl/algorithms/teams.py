@@ -4,7 +4,7 @@ A lane is then a team. VDN, QMIX and MAPPO change the social dilemma: their agen
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import prod
 from typing import Any, ClassVar, Literal
 
@@ -26,8 +26,8 @@ from cprl.algorithms.on_policy import Clipped
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.learners.base import Learner
+from cprl.learners.lanes import LearningAgents, Method
 from cprl.learners.lola import LOLALearner
-from cprl.learners.preferences import Preference
 from cprl.learners.settings import LOLASettings
 from cprl.networks.agent import AgentNetworks
 from cprl.networks.mlp import MLP, Cells, MLPNetwork
@@ -252,24 +252,10 @@ class LOLA(TeamAlgorithm):
         }
         return LOLADiCELoss(actors, **options) if self.estimator == "dice" else LOLALoss(actors, **options)
 
-    def make_learner(
-        self,
-        spaces: Spaces,
-        *,
-        agents: Sequence[int],
-        engine: TrainingEngine = "compiled",
-        reward_kind: Preference = "individual",
-        **options: Any,
-    ) -> Learner:
+    def method(self, spaces: Spaces) -> Method:
+        return replace(super().method(spaces), make_team=None)  # members are lanes of their own
+
+    def make_learner(self, who: LearningAgents, engine: TrainingEngine = "compiled") -> Learner:
         self._refuse_torchrl(engine)
-        self._check_team(len(agents), reward_kind)
-        return LOLALearner(
-            spaces,
-            agents=agents,
-            settings=self.settings,
-            make_network=lambda: self.make_network(spaces),
-            make_loss=self.make_loss,
-            reward_kind=reward_kind,
-            compile=engine == "compiled",
-            **options,
-        )
+        self._check_team(len(who.agents), who.reward_kind)
+        return LOLALearner(who, self.method(who.spaces), compile=engine == "compiled")

@@ -379,7 +379,7 @@ def exploit(
     carry_out(plan.study, options, ["cprl", *sys.argv[1:]])
     if dry_run:
         return
-    print_tables(*exploitability_tables(measure(plan, folder, allow=allow)))
+    print_tables(*exploitability_tables(measure(plan, folder)))
     say(f"Episodes: {folder / TABLE}")
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Final, Literal, TypeAlias, get_args
+from typing import Annotated, Final, Literal, TypeAlias
 
 import matplotlib
 import numpy as np
@@ -26,21 +26,19 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from cprl import arguments
 from cprl.arguments import Diagonal
 from cprl.evaluation.evaluate import (
     INTERVALS,
     SEED,
-    check,
     check_same_game,
-    chosen_replicas,
+    fresh_episodes,
     how_they_play,
     opened,
     says_nothing,
     table_of,
     unit_of_rewards,
 )
-from cprl.evaluation.lanes import Played, Source, play_sources, pooled
+from cprl.evaluation.lanes import Fresh, Played, Source, pooled
 from cprl.measuring.metrics import with_unit
 from cprl.measuring.statistics import (
     Estimate,
@@ -53,6 +51,7 @@ from cprl.measuring.statistics import (
 from cprl.runs.episodes import labelled
 from cprl.terminal.style import EMPTY, SHADES, SMALL_PT, draw_cell, head, picture_path, save, wrapped
 from cprl.training.agents import LoadedRun
+from cprl.values import Range, checked
 
 Whose: TypeAlias = Literal["focal", "background", "group"]
 _WHOSE: Final[dict[Whose, Callable[..., float]]] = {
@@ -79,13 +78,10 @@ class Cell:
     def measures(self, agent: int | None = None) -> dict[str, Measured]:
         """focal/return, background/return (the mean of the background agents), group/return, the social
         metrics, and those of institutions as `institutions/fines` and so on.
-
-        Args:
-            agent: the index of the focal agent; None for the mean over all indices.
         """
         agents = list(self.by_agent)
         if agent is not None:
-            agents = [arguments.integer("agent", agent, 0, len(agents) - 1)]
+            agents = [checked("agent", agent, Annotated[int, Range(0, len(agents) - 1)])]
         returns = {f"{whose}/return": over_replicas(self.returns(whose, agents)) for whose in _WHOSE}
         apart = agents[:1] if self.is_self_play else agents
         played = pooled(self.by_agent[focal] for focal in apart)
@@ -96,13 +92,12 @@ class Cell:
 
         Args:
             whose: "focal", "background", the mean of the background agents, or "group", the sum of all.
-            agents: the indices of focal agents; empty for all.
         """
         values: dict[int, list[float]] = {}
         for agent in agents or self.by_agent:
             for replica, episodes in self.by_agent[agent].items():
-                own = (float(_WHOSE[whose](episode.return_, agent)) for episode in episodes)
-                values.setdefault(replica, []).extend(own)
+                of_episodes = (float(_WHOSE[whose](episode.return_, agent)) for episode in episodes)
+                values.setdefault(replica, []).extend(of_episodes)
         return values
 
 
@@ -114,18 +109,13 @@ class CrossPlay:
     """The runs by name."""
     cells: Mapping[tuple[str, str], Cell]
     """The cells by the names of the focal agent's run and of the background agents' run."""
-    replicas: list[int]
-    episodes: int
-    seed: int
-    greedy: bool
+    fresh: Fresh
     diagonal: Diagonal
 
     def __repr__(self) -> str:
-        names = ", ".join(self.runs)
-        return f"CrossPlay({names}; replicas {self.replicas}, {self.episodes} episodes, seed={self.seed})"
+        return f"CrossPlay({', '.join(self.runs)}; {self.fresh}, seed={self.fresh.seed})"
 
     def cell(self, focal: str, background: str) -> Cell:
-        """The cell of two runs, by their names."""
         if (focal, background) not in self.cells:
             raise ValueError(f"the cell is {(focal, background)}; allowed: two of the runs {list(self.runs)}")
         return self.cells[focal, background]
@@ -165,49 +155,38 @@ def crossplay(
         runs: at least two runs of the same game: directories, exported results, or values of `cprl.load`;
             or a table of them by the names that they get, which are otherwise those of their directories.
         episodes: episodes of each replica with each focal agent, each in its own world.
-        seed: the seed of the worlds and of all random numbers.
-        replicas: the indices of the replicas that play; by default all that every run has.
         diagonal: the pairing of a run with itself: "self", agents that were trained together, or
             "cross_seed", a focal agent of the run's next replica.
     """
-    arguments.choice("diagonal", diagonal, get_args(Diagonal))
+    checked("diagonal", diagonal, Diagonal)
     named = named_runs(runs, allow)
     first, *_ = named.values()
     check_same_game(named)
     if first.game.agents == 1:
         raise ValueError("the game has 1 agent; allowed for cross-play: at least 2; use `cprl evaluate`")
-    check(episodes=episodes, seed=seed, greedy=greedy, runs=list(named.values()))
-    numbers = chosen_replicas(named, replicas)
+    fresh = fresh_episodes(named.values(), episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
+    numbers = fresh.replicas
     if diagonal == "cross_seed" and len(numbers) < 2:
-        raise ValueError(f"the replicas are {numbers}; allowed for cross_seed: at least 2")
+        raise ValueError(f"the replicas are {list(numbers)}; allowed for cross_seed: at least 2")
     following = dict(zip(numbers, [*numbers[1:], numbers[0]], strict=True))
-    how: dict[str, Any] = {"episodes": episodes, "seed": seed, "explore": not greedy}
     cells = {}
     for focal, background in product(named, repeat=2):
         where, is_self_play = named[background], focal == background and diagonal == "self"
         themselves, agents = [Source(where)] * first.game.agents, range(first.game.agents)
         if is_self_play:
-            by_agent = dict.fromkeys(agents, play_sources(where, themselves, numbers, **how))
+            by_agent = dict.fromkeys(agents, fresh.play(where, fresh.agents(themselves)))
         else:
             visitor = Source(named[focal], following if focal == background else None)
             by_agent = {
-                agent: play_sources(
-                    where, [*themselves[:agent], visitor, *themselves[agent + 1 :]], numbers, **how
+                agent: fresh.play(
+                    where, fresh.agents([*themselves[:agent], visitor, *themselves[agent + 1 :]])
                 )
                 for agent in agents
             }
         cells[focal, background] = Cell(
             focal=focal, background=background, by_agent=by_agent, is_self_play=is_self_play
         )
-    return CrossPlay(
-        runs=named,
-        cells=cells,
-        replicas=numbers,
-        episodes=episodes,
-        seed=seed,
-        greedy=greedy,
-        diagonal=diagonal,
-    )
+    return CrossPlay(runs=named, cells=cells, fresh=fresh, diagonal=diagonal)
 
 
 def named_runs(
@@ -262,8 +241,8 @@ def gains(played: CrossPlay) -> dict[tuple[str, str], Gain]:
     }
 
     def gain(focal: str, background: str, whose: Whose) -> Estimate:
-        own, usual = means[whose][focal, background], means[whose][background, background]
-        return difference(own, usual, paired=True)
+        reached, usual = means[whose][focal, background], means[whose][background, background]
+        return difference(reached, usual, paired=True)
 
     return {
         (focal, background): Gain(
@@ -280,9 +259,8 @@ def diagonal_returns(played: CrossPlay) -> Mapping[str, float]:
 
 
 def _means(played: CrossPlay, at: tuple[str, str], whose: Whose) -> list[float]:
-    """The mean return of each replica in a cell, [R]."""
     returns = played.cell(*at).returns(whose)
-    return [fmean(returns[replica]) for replica in played.replicas]
+    return [fmean(returns[replica]) for replica in played.fresh.replicas]
 
 
 _COLOURS: Final = "RdBu"
@@ -296,21 +274,19 @@ _PANELS: Final = {
 
 def draw_gains(played: CrossPlay, path: Path | str) -> Path:
     """Draws `gains`, a row for each focal agent's run, a column for each of background agents."""
-    path, found = picture_path(path), gains(played)
+    path, by_cell = picture_path(path), gains(played)
     names, diagonal = list(played.runs), diagonal_returns(played)
     returns = with_unit("focal/return", rewards=unit_of_cells(played)).partition("/")[2]
     width = max(_CELL_IN[0] * len(names) + 2.6, _NARROWEST_IN)
     figure = Figure((width, 2 * (_CELL_IN[1] * len(names) + 0.9) + 1.2), layout="constrained")
     for axes, (whose, title) in zip(figure.subplots(2, 1), _PANELS.items(), strict=True):
-        own = {at: getattr(gain, whose) for at, gain in found.items()}
-        _draw_matrix(axes, names, own, diagonal)
+        differences = {at: getattr(gain, whose) for at, gain in by_cell.items()}
+        _draw_matrix(axes, names, differences, diagonal)
         axes.set_title(f"difference in {returns} of {title}", fontsize=SMALL_PT + 1)
-    count = len(played.replicas)
     note = (
-        f"{count} replica{'s' * (count != 1)}, {played.episodes} episodes each with focal agent at each "
-        f"index; diagonal ({played.diagonal.replace('_', '-')}): an agent's return. * the 95 % interval by "
-        f"Student's t excludes 0, as that of about one in twenty would by chance; these are "
-        f"{2 * len(found)}."
+        f"{played.fresh} with focal agent at each index; diagonal ({played.diagonal.replace('_', '-')}): an "
+        "agent's return. * the 95 % interval by Student's t excludes 0, as that of about one in twenty would "
+        f"by chance; these are {2 * len(by_cell)}."
     )
     head(figure, "Cross-play: who gains among whom", note)
     return save(figure, path, colours=SHADES)
@@ -322,12 +298,12 @@ def _draw_matrix(
     gains_by_cell: Mapping[tuple[str, str], Estimate],
     diagonal: Mapping[str, float],
 ) -> None:
-    reach = max(abs(own.value) for own in gains_by_cell.values()) or 1.0
+    reach = max(abs(gain.value) for gain in gains_by_cell.values()) or 1.0
     scale, colours = Normalize(-reach, reach), matplotlib.colormaps[_COLOURS]
-    for (focal, background), own in gains_by_cell.items():
-        star = " *" if own.low > 0 or own.high < 0 else ""
+    for (focal, background), gain in gains_by_cell.items():
+        star = " *" if gain.low > 0 or gain.high < 0 else ""
         at = names.index(background), names.index(focal)
-        draw_cell(axes, *at, colours(scale(own.value)), f"{own.value:+.3g}{star}")
+        draw_cell(axes, *at, colours(scale(gain.value)), f"{gain.value:+.3g}{star}")
     for place, name in enumerate(names):
         draw_cell(axes, place, place, EMPTY, f"{diagonal[name]:.3g}")
     labels = [wrapped(name, _CELL_IN[0]) for name in names]
@@ -343,11 +319,10 @@ def _draw_matrix(
 
 
 def heading(played: CrossPlay) -> str:
-    """The heading of the matrices."""
-    how = how_they_play(list(played.runs.values()), played.greedy)
+    exploring = how_they_play(played.runs.values(), played.fresh)
     return (
-        f"Cross-play: {len(played.replicas)} replicas, {played.episodes} episodes each with focal agent at "
-        f"each index, seed {played.seed}{how}, diagonal: {played.diagonal}\n{INTERVALS}"
+        f"Cross-play: {played.fresh} with focal agent at each index, seed {played.fresh.seed}{exploring}, "
+        f"diagonal: {played.diagonal}\n{INTERVALS}"
     )
 
 
@@ -370,13 +345,13 @@ def _matrix(title: str, played: CrossPlay, texts: Mapping[tuple[str, str], str])
 
 def gains_tables(played: CrossPlay) -> Iterator[Table]:
     """A matrix of what focal agents gain, and one of what background agents do; see `gains`."""
-    found, rewards = gains(played), unit_of_cells(played)
+    by_cell, rewards = gains(played), unit_of_cells(played)
     for whose, beside in (("focal", "the agent whose place it takes"), ("background", "the diagonal")):
         title = with_unit(f"{whose}/return", rewards=rewards)
         yield _matrix(
             f"{title}, difference from {beside}, paired by replica [95 % interval by Student's t]",
             played,
-            {at: str(getattr(gain, whose)) for at, gain in found.items()},
+            {at: str(getattr(gain, whose)) for at, gain in by_cell.items()},
         )
 
 
@@ -398,5 +373,4 @@ def _repeats(name: str, cells: Iterable[Mapping[str, Measured]]) -> bool:
 
 
 def unit_of_cells(played: CrossPlay) -> str:
-    """See `unit_of_rewards`."""
     return unit_of_rewards(next(iter(next(iter(played.cells.values())).by_agent.values())))

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from math import isnan
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -35,6 +35,7 @@ from cprl.theory.solutions import (
     replicator,
     replicator_ends,
 )
+from cprl.values import Range, checked
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,13 +72,13 @@ def analyse(game: EmpiricalGame, *, resamples: int = arguments.EGTA_RESAMPLES, s
     Raises:
         ModuleNotFoundError: if OpenSpiel or nashpy is not installed.
     """
-    resamples = arguments.integer("resamples", resamples, 1, 100_000)
+    resamples = checked("resamples", resamples, Annotated[int, Range(1, 100_000)])
     rng, replicas = np.random.default_rng(seed), len(game.payoffs)
     table = game.table()
     drawn = rng.integers(replicas, size=(resamples if replicas > 1 else 0, replicas))
     # Few replicas have few resamples that differ: each is analysed once.
-    times = Counter(tuple(sorted(own)) for own in drawn.tolist())
-    again = [(game.table(own), count) for own, count in times.items()]
+    times = Counter(tuple(sorted(places)) for places in drawn.tolist())
+    again = [(game.table(places), count) for places, count in times.items()]
     rank = alpha_rank(table)
     return Analysis(
         game=game,
@@ -86,7 +87,7 @@ def analyse(game: EmpiricalGame, *, resamples: int = arguments.EGTA_RESAMPLES, s
         rank=rank,
         shares=_shares(rank, again, replicas),
         pure=_certainty(table, again),
-        equilibria=_equilibria(table.reduced),
+        equilibria=equilibria(table.reduced) if table.strategies <= MOST_STRATEGIES else (),
         in_support=_in_support(table, again),
         ends=replicator_ends(table, seed=seed),
     )
@@ -95,9 +96,9 @@ def analyse(game: EmpiricalGame, *, resamples: int = arguments.EGTA_RESAMPLES, s
 def _shares(rank: AlphaRank, again: list[tuple[PayoffTable, int]], replicas: int) -> tuple[Estimate, ...]:
     bounds = np.full((2, len(rank.shares)), np.nan)
     if again:
-        found = [np.tile(alpha_rank(own).shares, (count, 1)) for own, count in again]
+        ranks = [np.tile(alpha_rank(resample).shares, (count, 1)) for resample, count in again]
         margin = (1 - CONFIDENCE) / 2
-        bounds = np.quantile(np.concatenate(found), [margin, 1 - margin], axis=0)
+        bounds = np.quantile(np.concatenate(ranks), [margin, 1 - margin], axis=0)
     return tuple(
         Estimate(value=float(share), low=float(low), high=float(high), replicas=replicas)
         for share, low, high in zip(rank.shares, *bounds, strict=True)
@@ -105,58 +106,44 @@ def _shares(rank: AlphaRank, again: list[tuple[PayoffTable, int]], replicas: int
 
 
 def _certainty(table: PayoffTable, again: list[tuple[PayoffTable, int]]) -> dict[tuple[int, ...], float]:
-    found: Counter[tuple[int, ...]] = Counter()
-    for own, count in again:
-        for counts in own.pure_equilibria:
-            found[counts] += count
+    times: Counter[tuple[int, ...]] = Counter()
+    for resample, count in again:
+        for counts in resample.pure_equilibria:
+            times[counts] += count
     total = sum(count for _, count in again)
-    return {counts: found[counts] / total if total else float("nan") for counts in table.pure_equilibria}
-
-
-def _equilibria(table: PayoffTable) -> tuple[Equilibrium, ...]:
-    return equilibria(table) if table.strategies <= MOST_STRATEGIES else ()
+    return {counts: times[counts] / total if total else float("nan") for counts in table.pure_equilibria}
 
 
 def _in_support(table: PayoffTable, again: list[tuple[PayoffTable, int]]) -> Values:
-    """See `Analysis.in_support`."""
     shares = np.zeros(table.strategies)
     if not again or table.agents > 2 or table.strategies > MOST_STRATEGIES:
         return np.full(table.strategies, np.nan)
-    for own, count in again:
-        symmetric = [found for found in equilibria(own) if found.is_symmetric]
-        shares[sorted({run for found in symmetric for run in found.support})] += count
+    for resample, count in again:
+        symmetric = [equilibrium for equilibrium in equilibria(resample) if equilibrium.is_symmetric]
+        shares[sorted({run for equilibrium in symmetric for run in equilibrium.support})] += count
     return shares / sum(count for _, count in again)
 
 
 _LEAST: Final = 0.005
 """Smaller shares are not told."""
+_CHOICES: Final = " for each choice of who plays where"
 
 
 def egta_heading(game: EmpiricalGame) -> str:
-    """The heading of the tables."""
-    how = how_they_play(list(game.runs.values()), game.greedy)
+    exploring = how_they_play(game.runs.values(), game.fresh)
     kind = "Pairwise reduction of the empirical game" if game.is_reduction else "Empirical game"
     return (
-        f"{kind}: {how_much_was_played(game)}, seed {game.seed}{how}\n"
+        f"{kind}: {game.fresh}{_CHOICES}, seed {game.fresh.seed}{exploring}\n"
         "returns: mean over replicas [95 % interval by Student's t]"
     )
 
 
-def how_much_was_played(game: EmpiricalGame) -> str:
-    """Replicas and episodes, in words."""
-    replicas, episodes = len(game.replicas), game.episodes
-    return (
-        f"{replicas} replica{'s' * (replicas != 1)}, {episodes} episode{'s' * (episodes != 1)} each for each "
-        "choice of who plays where"
-    )
-
-
-def egta_tables(found: Analysis) -> Iterator[Table]:
+def egta_tables(analysis: Analysis) -> Iterator[Table]:
     """The payoffs, the runs by alpha-rank, the equilibria, and where replicator dynamics end."""
-    game = found.game
+    game = analysis.game
     yield _pairs(game) if game.agents == 2 else _compositions(game)
-    yield _runs(found)
-    yield _equilibria_table(found)
+    yield _runs(analysis)
+    yield _equilibria_table(analysis)
 
 
 def _pairs(game: EmpiricalGame) -> Table:
@@ -185,35 +172,39 @@ def _compositions(game: EmpiricalGame) -> Table:
     return table_of(title, ["agents", *game.names], rows)
 
 
-def _runs(found: Analysis) -> Table:
+def _runs(analysis: Analysis) -> Table:
     title = "alpha-rank at the limit of infinite alpha: share of the agents in the long run"
-    if found.resamples:
-        title += f" [95 % interval, {found.resamples} resamples of the replicas]"
-    is_certain = not np.isnan(found.in_support).any()
+    if analysis.resamples:
+        title += f" [95 % interval, {analysis.resamples} resamples of the replicas]"
+    is_certain = not np.isnan(analysis.in_support).any()
     columns = ["run", "share", *["resamples in which a symmetric equilibrium plays it"] * is_certain]
     rows = [
         (name, _share(share), *[f"{certain:.0%}"] * is_certain)
-        for name, share, certain in zip(found.game.names, found.shares, found.in_support, strict=True)
+        for name, share, certain in zip(
+            analysis.game.names, analysis.shares, analysis.in_support, strict=True
+        )
     ]
     return table_of(title, columns, rows)
 
 
-def _equilibria_table(found: Analysis) -> Table:
-    names, rows = found.game.names, []
-    for counts, certain in found.pure.items():
+def _equilibria_table(analysis: Analysis) -> Table:
+    names, rows = analysis.game.names, []
+    for counts, certain in analysis.pure.items():
         resamples = "" if isnan(certain) else f"in {certain:.0%} of the resamples"
         rows.append(("no agent gains by another run", composition_text(counts, names), resamples))
-    if not found.pure:
+    if not analysis.pure:
         rows.append(("no agent gains by another run", "no composition", ""))
-    of_pair = "Nash equilibrium (nashpy)" if found.game.agents == 2 else "Nash equilibrium of pairs (nashpy)"
-    for equilibrium in found.equilibria:
+    of_pair = (
+        "Nash equilibrium (nashpy)" if analysis.game.agents == 2 else "Nash equilibrium of pairs (nashpy)"
+    )
+    for equilibrium in analysis.equilibria:
         both = [mixture_text(side, names) for side in (equilibrium.first, equilibrium.second)]
         rows.append((of_pair, both[0] if equilibrium.is_symmetric else " against ".join(both), ""))
-    for mixture, share in zip(found.ends.mixtures, found.ends.shares, strict=True):
+    for mixture, share in zip(analysis.ends.mixtures, analysis.ends.shares, strict=True):
         starts = f"from {share:.0%} of the starts"
         rows.append(("end of replicator dynamics", mixture_text(mixture, names), starts))
-    if found.ends.unsettled > 0:
-        starts = f"from {found.ends.unsettled:.0%} of the starts"
+    if analysis.ends.unsettled > 0:
+        starts = f"from {analysis.ends.unsettled:.0%} of the starts"
         rows.append(("end of replicator dynamics", "none, or a late one", starts))
     return table_of("equilibria", ["", "what is played", "how certain"], rows, texts=2)
 
@@ -225,13 +216,13 @@ def composition_text(counts: Sequence[int], names: Sequence[str]) -> str:
 
 def mixture_text(mixture: Values, names: Sequence[str]) -> str:
     """A mixture in words, e.g. "dqn 0.75, ppo 0.25"; one strategy by its name alone."""
-    told = [(name, share) for name, share in zip(names, mixture, strict=True) if share >= _LEAST]
-    return told[0][0] if len(told) == 1 else ", ".join(f"{name} {share:.2f}" for name, share in told)
+    played = [(name, share) for name, share in zip(names, mixture, strict=True) if share >= _LEAST]
+    return played[0][0] if len(played) == 1 else ", ".join(f"{name} {share:.2f}" for name, share in played)
 
 
-def _share(own: Estimate) -> str:
-    told = f"{own.value:.2f}"
-    return told if isnan(own.low) else f"{told} [{own.low:.2f}, {own.high:.2f}]"
+def _share(share: Estimate) -> str:
+    text = f"{share.value:.2f}"
+    return text if isnan(share.low) else f"{text} [{share.low:.2f}, {share.high:.2f}]"
 
 
 _SIZE_IN: Final = (9.0, 4.3)
@@ -241,34 +232,29 @@ _CORNERS: Final = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, 3**0.5 / 2]])
 _UNCERTAIN: Final = "#9a9a9a"
 
 
-def draw_egta(found: Analysis, path: Path | str) -> Path:
-    """Draws an analysis.
-
-    Raises:
-        FileExistsError: if the file exists.
-    """
+def draw_egta(analysis: Analysis, path: Path | str) -> Path:
     path = style.check_picture(path)
     figure = Figure(_SIZE_IN, layout="constrained")
     dynamics, rank = figure.subplots(1, 2, width_ratios=(1.35, 1))
-    draw = {2: _draw_line, 3: _draw_simplex}.get(len(found.game.names), _draw_deviations)
-    draw(dynamics, found)
-    _draw_rank(rank, found)
-    game = found.game
+    draw = {2: _draw_line, 3: _draw_simplex}.get(len(analysis.game.names), _draw_deviations)
+    draw(dynamics, analysis)
+    _draw_rank(rank, analysis)
+    game = analysis.game
     kind = f"pairwise reduction of {game.of_agents} agents" if game.is_reduction else f"{game.agents} agents"
     note = (
-        f"{kind}; {how_much_was_played(game)}; intervals: 95 %, of payoffs by Student's t, of shares by "
-        f"{found.resamples} resamples of the replicas"
+        f"{kind}; {game.fresh}{_CHOICES}; intervals: 95 %, of payoffs by Student's t, of shares by "
+        f"{analysis.resamples} resamples of the replicas"
     )
     style.head(figure, f"Empirical game of {', '.join(game.names)}", note)
     return style.save(figure, path, colours=style.SHADES)
 
 
-def _draw_line(axes: Axes, found: Analysis) -> None:
+def _draw_line(axes: Axes, analysis: Analysis) -> None:
     """What the first run gains over the second, by its share, with the points of rest."""
-    shares, (first, second) = np.linspace(0, 1, _POINTS), found.game.names
-    tables = [found.game.table([place]) for place in range(len(found.game.payoffs))]
+    shares, (first, second) = np.linspace(0, 1, _POINTS), analysis.game.names
+    tables = [analysis.game.table([place]) for place in range(len(analysis.game.payoffs))]
     curves = np.array([[_gain(table, share) for share in shares] for table in tables])
-    means = [estimate(own) for own in curves.T]
+    means = [estimate(gains) for gains in curves.T]
     middle = np.array([mean.value for mean in means])
     axes.fill_between(
         shares,
@@ -296,25 +282,25 @@ def _draw_line(axes: Axes, found: Analysis) -> None:
 
 
 def _gain(table: PayoffTable, share: float) -> float:
-    own, other = table.against([share, 1 - share])
-    return float(own - other)
+    first, second = table.against([share, 1 - share])
+    return float(first - second)
 
 
 def _rests(shares: Values, gains: Values) -> list[tuple[float, bool]]:
     """Where nothing changes, and whether shares nearby move there."""
-    found = [(0.0, bool(gains[0] < 0)), (1.0, bool(gains[-1] > 0))]
+    rests = [(0.0, bool(gains[0] < 0)), (1.0, bool(gains[-1] > 0))]
     for place in np.flatnonzero(gains[:-1] * gains[1:] < 0):
         low, high = gains[place], gains[place + 1]
         at = shares[place] + (shares[place + 1] - shares[place]) * low / (low - high)
-        found.append((float(at), bool(low > 0)))
-    return found
+        rests.append((float(at), bool(low > 0)))
+    return rests
 
 
-def _draw_simplex(axes: Axes, found: Analysis) -> None:
+def _draw_simplex(axes: Axes, analysis: Analysis) -> None:
     """The direction in which shares move, where they end, and the corners by name."""
     axes.plot(*np.vstack([_CORNERS, _CORNERS[:1]]).T, color=style.RAW, lw=1)
     mixtures = (compositions(_GRID - 3, 3) + 1) / _GRID
-    moves = np.array([replicator(found.table.normalised, own) for own in mixtures]) @ _CORNERS
+    moves = np.array([replicator(analysis.table.normalised, mixture) for mixture in mixtures]) @ _CORNERS
     lengths = np.linalg.norm(moves, axis=1, keepdims=True)
     arrows = np.divide(moves, lengths, out=np.zeros_like(moves), where=lengths > 0)
     quiver = axes.quiver(
@@ -323,12 +309,15 @@ def _draw_simplex(axes: Axes, found: Analysis) -> None:
     bar = axes.figure.colorbar(quiver, ax=axes, shrink=0.6)
     bar.set_label("speed, of payoffs scaled to 0..1", fontsize=style.SMALL_PT)
     bar.ax.tick_params(labelsize=style.SMALL_PT)
-    for mixture, share in zip(found.ends.mixtures, found.ends.shares, strict=True):
+    for mixture, share in zip(analysis.ends.mixtures, analysis.ends.shares, strict=True):
         at = mixture @ _CORNERS
         axes.plot(*at, "o", color=style.MARK, markersize=9, zorder=4)
         axes.annotate(f"{share:.0%}", at, (8, 8), textcoords="offset points", fontsize=style.SMALL_PT)
     for corner, name, (align, height) in zip(
-        _CORNERS, found.game.names, (("center", "top"), ("center", "top"), ("center", "bottom")), strict=True
+        _CORNERS,
+        analysis.game.names,
+        (("center", "top"), ("center", "top"), ("center", "bottom")),
+        strict=True,
     ):
         offset = (0, 16 if height == "bottom" else -12)
         axes.annotate(
@@ -339,9 +328,9 @@ def _draw_simplex(axes: Axes, found: Analysis) -> None:
     axes.set_title("replicator dynamics; dots: where starts end", fontsize=style.SMALL_PT)
 
 
-def _draw_deviations(axes: Axes, found: Analysis) -> None:
+def _draw_deviations(axes: Axes, analysis: Analysis) -> None:
     """An arrow from the run that all play to each by which one agent gains."""
-    game, names = found.game, found.game.names
+    game, names = analysis.game, analysis.game.names
     angles = np.pi / 2 - 2 * np.pi * np.arange(len(names)) / len(names)
     places = np.stack([np.cos(angles), np.sin(angles)], 1)
     pairs = np.array([game.table([place]).pairs for place in range(len(game.payoffs))])
@@ -364,7 +353,7 @@ def _draw_deviations(axes: Axes, found: Analysis) -> None:
                     "connectionstyle": "arc3,rad=0.12",
                 },
             )
-    for (x, y), name, share in zip(places, names, found.shares, strict=True):
+    for (x, y), name, share in zip(places, names, analysis.shares, strict=True):
         axes.plot(x, y, "o", color=style.MARK, markersize=5 + 14 * share.value, zorder=4)
         axes.text(1.32 * x, 1.22 * y, name, ha="center", va="center", fontsize=style.SMALL_PT)
     axes.set(xlim=(-1.6, 1.6), ylim=(-1.4, 1.4), aspect="equal")
@@ -375,15 +364,15 @@ def _draw_deviations(axes: Axes, found: Analysis) -> None:
     )
 
 
-def _draw_rank(axes: Axes, found: Analysis) -> None:
+def _draw_rank(axes: Axes, analysis: Analysis) -> None:
     """The share of each run in the long run of alpha-rank, with its interval."""
-    places = np.arange(len(found.shares))
-    values = np.array([share.value for share in found.shares])
+    places = np.arange(len(analysis.shares))
+    values = np.array([share.value for share in analysis.shares])
     axes.barh(places, values, color=style.REPLICA, height=0.6)
-    for place, own in enumerate(found.shares):
-        if not isnan(own.low):
-            axes.plot([own.low, own.high], [place, place], color=style.PUBLISHED, lw=1.4)
-    axes.set_yticks(places, [style.wrapped(name, 1.6) for name in found.game.names])
+    for place, share in enumerate(analysis.shares):
+        if not isnan(share.low):
+            axes.plot([share.low, share.high], [place, place], color=style.PUBLISHED, lw=1.4)
+    axes.set_yticks(places, [style.wrapped(name, 1.6) for name in analysis.game.names])
     axes.set(xlim=(0, 1), ylim=(len(places) - 0.5, -0.5))
     axes.tick_params(labelsize=style.SMALL_PT)
     axes.set_xlabel("share of the agents in the long run", fontsize=style.SMALL_PT)

@@ -21,8 +21,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from cprl.evaluation.cross_play import CrossPlay, named_runs
-from cprl.evaluation.evaluate import SEED, check, check_same_game, chosen_replicas
-from cprl.evaluation.lanes import Played, Source, play_sources
+from cprl.evaluation.evaluate import SEED, check_same_game, fresh_episodes
+from cprl.evaluation.lanes import Fresh, Played, Source
 from cprl.measuring.episodes import Episode
 from cprl.runs.episodes import labelled
 from cprl.theory.payoff_table import PayoffTable, compositions
@@ -47,23 +47,16 @@ class EmpiricalGame:
     payoffs: Values
     """float64 [R, C, S]: the mean return of an agent of a run by replica and composition, in the rows of
     `cprl.theory.compositions(agents, S)`; NaN where nobody plays as the run."""
-    replicas: list[int]
-    episodes: int
-    """Of each replica and each choice of who plays where."""
-    seed: int
-    greedy: bool
+    fresh: Fresh
     episodes_table: pa.Table
     """All episodes with the columns of `episodes.parquet`, after those that say who played: "runs", the
     names of all agents' runs, or those of `CrossPlay.table`."""
 
     def __repr__(self) -> str:
-        names = ", ".join(self.runs)
-        played = f"{self.agents} agents, replicas {self.replicas}, {self.episodes} episodes"
-        return f"EmpiricalGame({names}; {played})"
+        return f"EmpiricalGame({', '.join(self.runs)}; {self.agents} agents, {self.fresh})"
 
     @property
     def names(self) -> list[str]:
-        """The names of the runs."""
         return list(self.runs)
 
     @property
@@ -99,8 +92,6 @@ def play_empirical_game(
             profiles S^N are allowed, e.g. four runs of four agents; `pairwise_game` has no such bound.
         episodes: episodes of each replica and choice of who plays where, each in its own world; the choices
             are N (C - S) + S.
-        seed: the seed of the worlds and of all random numbers.
-        replicas: the indices of the replicas that play; by default all that every run has.
     """
     named = named_runs(runs, allow, command="egta")
     check_same_game(named)
@@ -112,27 +103,24 @@ def play_empirical_game(
             f"{len(named)} runs of {agents} agents have {profiles:,} profiles; allowed: at most "
             f"{MOST_PROFILES}; crossplay and pairwise_game (cprl egta --pairwise) take more"
         )
-    check(episodes=episodes, seed=seed, greedy=greedy, runs=list(named.values()))
-    numbers = chosen_replicas(named, replicas)
+    fresh = fresh_episodes(named.values(), episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
     counts = compositions(agents, len(named))
     played = {}
-    for own in counts.tolist():
-        for who in _choices(own):
+    for composition in counts.tolist():
+        for who in _choices(composition):
             sources = [Source(list(named.values())[run]) for run in who]
-            played[who] = play_sources(
-                sources[0].run, sources, numbers, episodes=episodes, seed=seed, explore=not greedy
-            )
+            played[who] = fresh.play(sources[0].run, fresh.agents(sources))
     return EmpiricalGame(
         runs=named,
         agents=agents,
         of_agents=agents,
         payoffs=np.array(
-            [[_payoffs(own, played, replica) for own in counts.tolist()] for replica in numbers]
+            [
+                [_payoffs(composition, played, replica) for composition in counts.tolist()]
+                for replica in fresh.replicas
+            ]
         ),
-        replicas=numbers,
-        episodes=episodes,
-        seed=seed,
-        greedy=greedy,
+        fresh=fresh,
         episodes_table=labelled(_rows(list(named), played)),
     )
 
@@ -147,17 +135,14 @@ def pairwise_game(played: CrossPlay) -> EmpiricalGame:
     returns = {at: cell.returns("focal") for at, cell in played.cells.items()}
     matrices = [
         [[np.mean(returns[focal, background][replica]) for background in names] for focal in names]
-        for replica in played.replicas
+        for replica in played.fresh.replicas
     ]
     return EmpiricalGame(
         runs=played.runs,
         agents=2,
         of_agents=next(iter(played.runs.values())).game.agents,
         payoffs=np.array([PayoffTable.of_pairs(matrix).payoffs for matrix in matrices]),
-        replicas=played.replicas,
-        episodes=played.episodes,
-        seed=played.seed,
-        greedy=played.greedy,
+        fresh=played.fresh,
         episodes_table=played.table(),
     )
 
@@ -174,9 +159,9 @@ def _payoffs(counts: Sequence[int], played: Mapping[Who, Played], replica: int) 
     returns: list[list[float]] = [[] for _ in counts]
     for who in _choices(counts):
         for episode in played[who][replica]:
-            for run, own in zip(who, episode.return_, strict=True):
-                returns[run].append(float(own))
-    return [float(np.mean(own)) if own else float("nan") for own in returns]
+            for run, return_ in zip(who, episode.return_, strict=True):
+                returns[run].append(float(return_))
+    return [float(np.mean(of_run)) if of_run else float("nan") for of_run in returns]
 
 
 def _rows(

@@ -2,19 +2,18 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import pyarrow as pa
 import torch
 from rich.table import Table
 
-from cprl import arguments
 from cprl.arguments import SEED as SEED
 from cprl.commons.game import Game
+from cprl.custom import trust
 from cprl.envs.unwrap import agent_names
-from cprl.evaluation.lanes import Played, Source, play, play_sources, random_policies
+from cprl.evaluation.lanes import Fresh, Played, Source
 from cprl.measuring.metrics import left_out, with_unit
 from cprl.measuring.series import OF_AGENTS
 from cprl.measuring.statistics import (
@@ -26,6 +25,7 @@ from cprl.measuring.statistics import (
 )
 from cprl.runs.episodes import labelled
 from cprl.training.agents import LoadedRun, load
+from cprl.values import Positive, Seed, checked
 
 _LONGEST: Final = 40
 """The largest number of characters of a value in a message."""
@@ -35,11 +35,11 @@ def check_same_game(runs: Mapping[str, LoadedRun]) -> None:
     """Checks that all runs, by name, have the game of the first."""
     first, *others = runs
     for other in others:
-        found = differences(runs[first].game, runs[other].game)
-        found += transform_differences(runs[first], runs[other])
-        if found:
+        unlike = differences(runs[first].game, runs[other].game)
+        unlike += transform_differences(runs[first], runs[other])
+        if unlike:
             raise ValueError(
-                f"{first} and {other} have different games: {'; '.join(found)}; allowed: runs of the same "
+                f"{first} and {other} have different games: {'; '.join(unlike)}; allowed: runs of the same "
                 "game"
             )
 
@@ -53,34 +53,36 @@ def differences(game: Any, other: Any) -> list[str]:
         alike = is_dataclass(game) and type(game) is type(other)
         return (_field_differences(game, other) if alike else []) or [f"{game!r} and {other!r}"]
     pairs = (game.map, other.map), (game.rules, other.rules), (game.observation, other.observation)
-    found = [line for mine, theirs in pairs for line in _field_differences(mine, theirs)]
+    lines = [line for first, second in pairs for line in _field_differences(first, second)]
     if game.institutions != other.institutions:
         names = (
             ", ".join(type(institution).__name__ for institution in of.institutions) or "none"
             for of in (game, other)
         )
-        found.append(f"institutions {' and '.join(names)}, or their values")
-    return found
+        lines.append(f"institutions {' and '.join(names)}, or their values")
+    return lines
 
 
-def _field_differences(mine: Any, theirs: Any) -> list[str]:
-    found = []
-    for entry in fields(mine):
-        one, two = getattr(mine, entry.name), getattr(theirs, entry.name)
+def _field_differences(first: Any, second: Any) -> list[str]:
+    lines = []
+    for entry in fields(first):
+        one, two = getattr(first, entry.name), getattr(second, entry.name)
         if one != two:
             values = f"{one!r} and {two!r}"
             short = len(values) <= 2 * _LONGEST
-            found.append(f"{type(mine).__name__}.{entry.name} {values if short else 'differ'}")
-    return found
+            lines.append(f"{type(first).__name__}.{entry.name} {values if short else 'differ'}")
+    return lines
 
 
 def transform_differences(run: LoadedRun, other: LoadedRun) -> list[str]:
     """The differences between the transforms of two runs: their specification and their learned state."""
     if run.experiment.transforms != other.experiment.transforms:
         return [f"transforms {run.experiment.transforms} and {other.experiment.transforms}"]
-    mine, theirs = run.transforms_state, other.transforms_state
+    state, other_state = run.transforms_state, other.transforms_state
     unlike = [
-        name for name in mine if not torch.equal(torch.as_tensor(mine[name]), torch.as_tensor(theirs[name]))
+        name
+        for name in state
+        if not torch.equal(torch.as_tensor(state[name]), torch.as_tensor(other_state[name]))
     ]
     return [f"the learned state of the transforms differs: {', '.join(unlike)}"] if unlike else []
 
@@ -90,22 +92,18 @@ class Evaluation:
     """Fresh episodes of a run's agents, and of the random policy in the same worlds."""
 
     run: LoadedRun
-    seed: int
-    greedy: bool
+    fresh: Fresh
     trained: Played = field(repr=False)
-    """The episodes by replica; replica r plays the worlds from r x episodes on."""
+    """The episodes by replica."""
     random: Played = field(repr=False)
     """The episodes of uniformly random agents in the same worlds."""
 
     def measures(self, policy: str = "trained") -> dict[str, Measured]:
         """The social metrics over replicas by name, those of institutions as `institutions/fines` and so on,
         then the agents' returns, and what they paid, got and broke, as `agent_0/return` and so on.
-
-        Args:
-            policy: "trained" or "random".
         """
-        arguments.choice("policy", policy, ("trained", "random"))
-        played = {"trained": self.trained, "random": self.random}[policy]
+        checked("policy", policy, Literal["trained", "random"])
+        played = self.trained if policy == "trained" else self.random
         names = agent_names(self.run.env())
         first = next(iter(played.values()))[0]
         fields = {"return_": "return"} | {
@@ -114,8 +112,8 @@ class Evaluation:
         of_agents = {
             f"{name}/{called}": over_replicas(
                 {
-                    replica: [float(getattr(episode, field)[agent]) for episode in own]
-                    for replica, own in played.items()
+                    replica: [float(getattr(episode, field)[agent]) for episode in episodes]
+                    for replica, episodes in played.items()
                 }
             )
             for field, called in fields.items()
@@ -155,46 +153,51 @@ def evaluate_run(
             the others.
     """
     loaded = opened(run, allow)
-    check(episodes=episodes, seed=seed, greedy=greedy, runs=[loaded])
-    numbers = chosen_replicas({str(loaded.path): loaded}, replicas)
-    sources, common = [Source(loaded)] * loaded.game.agents, {"episodes": episodes, "seed": seed}
-    by_chance = partial(random_policies, loaded, worlds=episodes, seed=seed)
+    fresh = fresh_episodes([loaded], episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
     return Evaluation(
         run=loaded,
-        seed=seed,
-        greedy=greedy,
-        trained=play_sources(loaded, sources, numbers, explore=not greedy, **common),
-        random=play(loaded, by_chance, numbers, explore=True, **common),
+        fresh=fresh,
+        trained=fresh.play(loaded, fresh.agents([Source(loaded)] * loaded.game.agents)),
+        random=fresh.play(loaded, fresh.random_agents(loaded), explore=True),
     )
 
 
 def opened(run: str | Path | LoadedRun, allow: Sequence[str] = ()) -> LoadedRun:
-    """A run, loaded if it is a directory."""
+    trust(*allow)
     return run if isinstance(run, LoadedRun) else load(run, allow=allow)
 
 
-def chosen_replicas(runs: Mapping[str, LoadedRun], replicas: Sequence[int]) -> list[int]:
-    """The chosen replicas, or all that every run has, ascending.
+def fresh_episodes(
+    runs: Iterable[LoadedRun],
+    *,
+    episodes: int,
+    greedy: bool,
+    seed: int,
+    replicas: Sequence[int],
+    trained: Iterable[LoadedRun] = (),
+) -> Fresh:
+    """Fresh episodes of the chosen replicas, or of all that every run has.
 
     Args:
-        replicas: the indices of the chosen replicas; empty for all.
+        trained: more runs of which no agent may have been trained in the worlds.
     """
-    chosen = set(replicas)
-    common = sorted(set.intersection(*(set(run.replicas) for run in runs.values())))
-    for name, run in runs.items():
+    runs, chosen = list(runs), set(replicas)
+    check(episodes=episodes, seed=seed, runs=[*runs, *trained])
+    common = set.intersection(*(set(run.replicas) for run in runs))
+    for run in runs:
         missing = sorted(chosen - set(run.replicas))
         if missing:
-            raise ValueError(f"{name} has no replicas {missing}; allowed: {run.replicas}")
+            raise ValueError(f"{run.path} has no replicas {missing}; allowed: {run.replicas}")
     if not common:
-        has = {name: run.replicas for name, run in runs.items()}
+        has = {str(run.path): run.replicas for run in runs}
         raise ValueError(f"the replicas of the runs are {has}; allowed: runs with a replica in common")
-    return sorted(chosen) or common
+    return Fresh(replicas=tuple(sorted(chosen or common)), episodes=episodes, seed=seed, greedy=greedy)
 
 
-def check(*, episodes: int, seed: int, greedy: bool, runs: Sequence[LoadedRun]) -> None:
+def check(*, episodes: int, seed: int, runs: Sequence[LoadedRun]) -> None:
     """Checks the arguments of an evaluation, and that no agent was trained in the worlds."""
-    arguments.integer("episodes", episodes, 1)
-    arguments.seed(seed)
+    checked("episodes", episodes, Positive)
+    checked("seed", seed, Seed)
     for run in runs:
         if run.experiment.seed == seed:
             raise ValueError(
@@ -229,25 +232,22 @@ def run_table(evaluation: Evaluation) -> Table:
     ]
     without = [agents_without_harvest(played) for played in (evaluation.trained, evaluation.random)]
     if None not in without:
-        counts = (f"{own[0]} of {own[1]}" for own in without if own)
+        counts = (f"{count[0]} of {count[1]}" for count in without if count)
         rows.append(("agents without a harvest, not in sustainability", *counts))
-    episodes = len(next(iter(evaluation.trained.values())))
-    title = played_in_words(evaluation.run, len(evaluation.trained), episodes, evaluation.seed)
-    agents = f"run's agents{how_they_play([evaluation.run], evaluation.greedy)}"
-    table = table_of(f"{title}\n{INTERVALS}", ["", agents, "random"], rows)
+    table = table_of(*heading_beside_random(evaluation.run, evaluation.fresh), rows)
     table.caption = left_out(next(iter(evaluation.trained.values()))[0].reported) or None
     return table
 
 
-def played_in_words(run: LoadedRun, replicas: int, episodes: int, seed: int) -> str:
-    """What was played, e.g. "commons: 8 replicas, 20 episodes each, seed 30011"."""
-    several = "s" * (replicas != 1)
-    return f"{run.path.name}: {replicas} replica{several}, {episodes} episodes each, seed {seed}"
+def heading_beside_random(run: LoadedRun, fresh: Fresh) -> tuple[str, list[str]]:
+    """The title and the columns of a table of a run's agents and of random ones."""
+    title = f"{run.path.name}: {fresh}, seed {fresh.seed}\n{INTERVALS}"
+    return title, ["", f"run's agents{how_they_play([run], fresh)}", "random"]
 
 
 def says_nothing(name: str, measured: Iterable[Measured]) -> bool:
     """Whether it is a metric of institutions that is undefined everywhere."""
-    return name.startswith("institutions/") and all(own.estimate is None for own in measured)
+    return name.startswith("institutions/") and all(of_run.estimate is None for of_run in measured)
 
 
 def unit_of_rewards(played: Played) -> str:
@@ -255,9 +255,9 @@ def unit_of_rewards(played: Played) -> str:
     return "apples" if next(iter(played.values()))[0].harvest is not None else ""
 
 
-def how_they_play(runs: list[LoadedRun], greedy: bool) -> str:
+def how_they_play(runs: Iterable[LoadedRun], fresh: Fresh) -> str:
     """The epsilon of the agents that learned values, as text."""
-    if greedy:
+    if fresh.greedy:
         return ", greedy"
     agents = [run.agent(agent, replica=run.replicas[0]) for run in runs for agent in range(run.game.agents)]
     chances = {agent.epsilon for agent in agents if agent.scripted is None and not agent.stochastic}

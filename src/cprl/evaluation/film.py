@@ -105,7 +105,6 @@ def film(
 
 
 def _recorded(fresh: FreshEpisode, target: Path, title: str) -> Episode:
-    """Plays the episode into a recording."""
     others = dict(zip(fresh.policies.indices, fresh.policies.actors, strict=True))
     with ViewerCallback(
         target.parent,
@@ -134,10 +133,10 @@ def _decisions(viewer: ViewerCallback, fresh: FreshEpisode) -> list[Decisions]:
     scene, game = viewer.logger.scene, fresh.run.game
     if scene is None:
         return []
-    shown = Decisions(
+    decisions = Decisions(
         viewer.logger, fresh.policies, actions=game.actions, names=scene.agents, window=scene.window
     )
-    return [shown]
+    return [decisions]
 
 
 def _offences(viewer: ViewerCallback, fresh: FreshEpisode) -> list[Offences]:
@@ -167,7 +166,6 @@ class _Events:
             self._log(event)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Logs the outcome."""
         self.episode = episode
         self._log(f"the end; {episode.outcome}")
 
@@ -352,8 +350,8 @@ def _play(fresh: FreshEpisode) -> tuple[list[Shown], list[set[int]], Episode]:
     env, commons = fresh.env, _commons(fresh)
 
     def now() -> Shown:
-        shown = commons.worlds.show(commons.output)
-        return shown._replace(observation=shown.observation[:0])
+        board = commons.worlds.show(commons.output)
+        return board._replace(observation=board.observation[:0])
 
     tracker = tracker_of(env)
     turns = Turns(env, fresh.policies)

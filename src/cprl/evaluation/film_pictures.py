@@ -208,12 +208,7 @@ def _fitting(text: str, room: float, largest: int) -> ImageFont.FreeTypeFont:
 
 
 class _Legend:
-    """The number of each agent in its colour, with its harvest, in as many rows as it takes.
-
-    Args:
-        agents: how many.
-        wide: the room in pixels.
-    """
+    """The number of each agent in its colour, with its harvest, in as many rows as it takes."""
 
     def __init__(self, agents: int, wide: int, font: ImageFont.FreeTypeFont) -> None:
         self._font, self._agents = font, agents
@@ -223,7 +218,6 @@ class _Legend:
         self._line = int(font.getbbox("0")[3] * 1.3) + 1
 
     def draw(self, draw: ImageDraw.ImageDraw, at: tuple[int, int], harvested: NDArray[np.int32]) -> None:
-        """Draws it with its upper left corner there."""
         for agent in range(self._agents):
             row, place = divmod(agent, self._in_a_row)
             where = at[0] + place * self._item, at[1] + row * self._line
@@ -324,20 +318,12 @@ class _Palette:
 
 
 def _packed(picture: Bytes) -> NDArray[Any]:
-    """Each pixel's colour as one number, [height, width]."""
     wide = picture.astype(np.uint32)
     packed: NDArray[Any] = wide[..., 0] << 16 | wide[..., 1] << 8 | wide[..., 2]
     return packed
 
 
 def write_mp4(path: Path, pictures: Iterable[Bytes], size: tuple[int, int], *, fps: float) -> None:
-    """Writes an H.264 video.
-
-    Args:
-        pictures: uint8 [height, width, 3] each, RGB.
-        size: (width, height) in pixels, both even.
-        fps: pictures per second.
-    """
     from imageio_ffmpeg import write_frames
 
     with TemporaryDirectory() as folder:

@@ -29,7 +29,6 @@ Played: TypeAlias = dict[int, list[Episode]]
 
 
 def pooled(parts: Iterable[Played]) -> Played:
-    """The episodes of several plays together, by replica."""
     together: Played = {}
     for played in parts:
         for replica, episodes in played.items():
@@ -45,13 +44,9 @@ class Place(Protocol):
     """A game whose fresh worlds can be played, e.g. a `LoadedRun`."""
 
     @property
-    def game(self) -> Any:
-        """What is played."""
-        ...
+    def game(self) -> Any: ...
 
-    def env(self, worlds: int = 1, *, seed: int = 0, first_world: int = 0) -> EnvBase:
-        """So many fresh worlds."""
-        ...
+    def env(self, worlds: int = 1, *, seed: int = 0, first_world: int = 0) -> EnvBase: ...
 
 
 @dataclass(frozen=True)
@@ -66,63 +61,62 @@ class Source:
     replicas: Mapping[int, int] | None = None
 
     def replica(self, number: int) -> int:
-        """The run's replica whose agent plays in this replica."""
         return number if self.replicas is None else self.replicas[number]
 
 
-def play(
-    where: Place, policies: MakePolicies, replicas: Sequence[int], *, episodes: int, seed: int, explore: bool
-) -> Played:
-    """Plays `episodes` fresh episodes of each replica; replica r plays the worlds from r x episodes on."""
-    played: Played = {}
-    for group, env in fresh_worlds(where, replicas, worlds=episodes, seed=seed):
-        found = evaluate(env, policies(group), explore=explore)
-        for place, replica in enumerate(group):
-            played[replica] = found[place * episodes : (place + 1) * episodes]
-    return played
+@dataclass(frozen=True, kw_only=True)
+class Fresh:
+    """Fresh episodes of some replicas; replica r plays the worlds from r x episodes on."""
 
+    replicas: tuple[int, ...]
+    """Their indices, ascending."""
+    episodes: int
+    """Of each replica with each choice of who plays where, each in its own world."""
+    seed: int
+    """Of the worlds and of all random numbers."""
+    greedy: bool = False
+    """Whether stored agents take their best action; else they explore as in evaluation."""
 
-def play_sources(
-    where: Place,
-    sources: Sequence[Source],
-    replicas: Sequence[int],
-    *,
-    episodes: int,
-    seed: int,
-    explore: bool,
-) -> Played:
-    """`play` by agents of stored runs: the sources of agent 0, 1 and so on."""
-    policies = partial(policies_of, sources, worlds=episodes, seed=seed)
-    return play(where, policies, replicas, episodes=episodes, seed=seed, explore=explore)
+    def __str__(self) -> str:
+        counts = {"replica": len(self.replicas), "episode": self.episodes}
+        return ", ".join(f"{count} {name}{'s' * (count != 1)}" for name, count in counts.items()) + " each"
 
+    def agents(self, sources: Sequence[Source]) -> MakePolicies:
+        """Agents of stored runs: the sources of agent 0, 1 and so on."""
+        return partial(policies_of, sources, worlds=self.episodes, seed=self.seed)
 
-def fresh_worlds(
-    where: Place, replicas: Sequence[int], *, worlds: int, seed: int
-) -> Iterator[tuple[list[int], EnvBase]]:
-    """The worlds of each replica, with as many replicas as possible in one environment.
+    def random_agents(self, run: LoadedRun) -> MakePolicies:
+        return partial(random_policies, run, worlds=self.episodes, seed=self.seed)
 
-    Yields:
-        The indices of replicas, and an environment with their worlds in the same order, see `play`.
-    """
-    for group in _consecutive(replicas):
-        yield group, where.env(len(group) * worlds, seed=seed, first_world=group[0] * worlds)
+    def play(self, where: Place, policies: MakePolicies, *, explore: bool | None = None) -> Played:
+        """The episodes by replica; agents explore unless they are greedy, or as is said."""
+        explore = not self.greedy if explore is None else explore
+        played: Played = {}
+        for group, env in self.worlds(where):
+            ended = evaluate(env, policies(group), explore=explore)
+            for place, replica in enumerate(group):
+                played[replica] = ended[place * self.episodes : (place + 1) * self.episodes]
+        return played
+
+    def worlds(self, where: Place) -> Iterator[tuple[list[int], EnvBase]]:
+        """The indices of replicas, and an environment with their worlds in the same order, with as many
+        replicas as possible in one."""
+        for group in _consecutive(self.replicas):
+            first = group[0] * self.episodes
+            yield group, where.env(len(group) * self.episodes, seed=self.seed, first_world=first)
 
 
 def policies_of(
     sources: Sequence[Source], replicas: Sequence[int], *, worlds: int, seed: int
 ) -> AgentPolicies:
-    """The policies of all agents of these replicas, from stored runs.
-
-    Args:
-        seed: the seed of random numbers, together with the replica and the agent.
-    """
-    found = [
+    """The policies of all agents of these replicas, from stored runs."""
+    agents = [
         [source.run.agent(agent, replica=source.replica(replica)) for replica in replicas]
         for agent, source in enumerate(sources)
     ]
     run = sources[0].run
     playing = run.game if isinstance(run.game, Game) else run.spaces
-    return stored_policies(found, playing, replicas=replicas, worlds=worlds, seed=seed)
+    return stored_policies(agents, playing, replicas=replicas, worlds=worlds, seed=seed)
 
 
 def random_policies(run: LoadedRun, replicas: Sequence[int], *, worlds: int, seed: int) -> AgentPolicies:

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from math import isnan
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 import torch
@@ -12,7 +12,8 @@ from rich.text import Text
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from cprl import arguments, keys
+from cprl import keys
+from cprl.arguments import PLAY_SEED
 from cprl.commons.colours import APPLE, BEAM, PALETTE, WALL, Colour, agent_colour
 from cprl.commons.game import Game
 from cprl.commons.maps import SIGN_OF_HEADING
@@ -29,6 +30,7 @@ from cprl.population import Scripted
 from cprl.presets import Variant
 from cprl.system.output import OUT, console, say
 from cprl.training.agents import Population
+from cprl.values import Range, checked, refusal
 
 KEYS: Final = {
     "w": ("forward", "step forward"),
@@ -65,12 +67,12 @@ class Session:
             raise ValueError(f"env is a {type(env).__name__}; allowed: a CommonsEnv, which has a board")
         self._commons, self._others = commons, others
         self.game: Game = commons.game
-        self.agent = arguments.integer("agent", agent, 0, self.game.agents - 1)
+        self.agent = checked("agent", agent, Annotated[int, Range(0, self.game.agents - 1)])
         """The index of the person's agent."""
         if decision is not None:
             if not self.game.decisions:
-                raise arguments.refusal("decision", decision, "None: agents decide nothing in this game")
-            arguments.integer("decision", decision, 0, self.game.decisions - 1)
+                raise refusal("decision", decision, "None: agents decide nothing in this game")
+            checked("decision", decision, Annotated[int, Range(0, self.game.decisions - 1)])
         self._decision, self._action = decision, 0
         self._turns = Turns(env, self._choose)
         self._played: list[TensorDictBase] = []
@@ -79,7 +81,6 @@ class Session:
 
     @property
     def turn(self) -> int:
-        """Turns played."""
         return len(self.moments) - 1
 
     @property
@@ -89,12 +90,10 @@ class Session:
 
     @property
     def harvested(self) -> list[int]:
-        """Apples that each agent has harvested so far."""
         return [int(apples) for apples in self.moments[-1].harvested]
 
     @property
     def stock(self) -> int:
-        """Apples on the board."""
         return int(self.moments[-1].stock.sum(dtype=np.int64))
 
     def act(self, action: str) -> StepOutput:
@@ -103,7 +102,8 @@ class Session:
         Returns:
             What the turn brought, overwritten by the next one.
         """
-        arguments.choice("action", action, self.game.actions)
+        if action not in self.game.actions:
+            raise refusal("action", action, ", ".join(self.game.actions))
         self._action = self.game.actions.index(action)
         self._played.append(self._turns.play())
         self.moments.append(self._now())
@@ -128,9 +128,8 @@ class Session:
         return chosen
 
     def _now(self) -> Shown:
-        """Return the board, without what agents observe."""
-        shown = self._commons.worlds.show(self._commons.output)
-        return shown._replace(observation=shown.observation[:0])
+        board = self._commons.worlds.show(self._commons.output)
+        return board._replace(observation=board.observation[:0])
 
 
 def state(session: Session) -> str:
@@ -178,11 +177,11 @@ def play_in_terminal(session: Session, read_line: Callable[[], str] | None = Non
         read_line: returns a line with its newline, or "" at the end; by default that of standard input.
     """
     read_line = read_line or sys.stdin.readline
-    shown = console(width=None if OUT.isatty() else 4 * session.game.map.width + 120)
+    boards = console(width=None if OUT.isatty() else 4 * session.game.map.width + 120)
     say(f"You are agent {session.agent}. Keys: {help_of(session.game)}; several in a line, then Enter.")
     say(f"Enter alone stays; {QUIT} ends.")
     while True:
-        shown.print(board_text(session), soft_wrap=True)
+        boards.print(board_text(session), soft_wrap=True)
         say(state(session))
         if session.has_ended or not _ask_and_play(session, read_line):
             break
@@ -251,7 +250,7 @@ def open_session(
     replica: int = 0,
     variant: Variant = "published",
     steps: int | None = None,
-    seed: int = arguments.PLAY_SEED,
+    seed: int = PLAY_SEED,
     decision: int | None = None,
     allow: Sequence[str] = (),
 ) -> Session:
@@ -266,11 +265,11 @@ def open_session(
         decision: what the person decides in a game with votes or elections, 0 to `Game.decisions` - 1; None
             for a choice by chance, as of a scripted agent.
     """
-    game, run = board_named(board, variant, allow=allow)
+    trust(*allow)
+    game, run = board_named(board, variant)
     if steps is not None:
-        steps = arguments.integer("steps", steps, 1)
         game = replace(game, rules=replace(game.rules, episode_steps=steps))
-    agent = arguments.integer("agent", agent, 0, game.agents - 1)
+    agent = checked("agent", agent, Annotated[int, Range(0, game.agents - 1)])
     others = others if others is not None else "greedy" if run is None else board
     if replica and others in SCRIPTED_POLICIES:
         raise ValueError(f'replica is {replica}, and others is "{others}"; allowed: with the agents of a run')
@@ -280,6 +279,5 @@ def open_session(
         env = make_env(game, seed=seed)
     else:
         env = replace(run, experiment=replace(run.experiment, game=game)).env(seed=seed)
-    trust(*allow)
     population = Population(env, specs, seed=seed)
     return Session(env, population.policy(1), agent=agent, decision=decision)

@@ -7,18 +7,19 @@ from typing import Any, Final
 
 from torchrl.envs import EnvBase
 
-from cprl import arguments, presets
+from cprl import presets
 from cprl.commons import maps
 from cprl.commons.game import Game
 from cprl.commons.rules import Rules
-from cprl.custom import made
+from cprl.custom import made, trust
 from cprl.envs.make_env import is_playable, make_env
 from cprl.evaluation.evaluate import SEED, check
-from cprl.evaluation.lanes import Place, Played, play
+from cprl.evaluation.lanes import Fresh, Place, Played
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
 from cprl.presets import Variant
 from cprl.training.agents import LoadedRun, Population, load
+from cprl.values import Positive, checked, refusal
 
 _SPECS: Final = "Scripted(policy) or Frozen(run, agent, replica)"
 
@@ -48,17 +49,19 @@ def play_population(
     Returns:
         Episodes by the index of the replica, 0 to R - 1.
     """
+    trust(*allow)
     place = place_of(where)
     specs = specs_by_agent(agents, place.game.agents)
     for agent, spec in enumerate(specs):
         if not isinstance(spec, Scripted | Frozen):
             raise ValueError(f"agents[{agent}] is a {type(spec).__name__}; allowed: {_SPECS}")
-    replicas = arguments.integer("replicas", replicas, 1)
+    replicas = checked("replicas", replicas, Positive)
     runs = {spec.run for spec in specs if isinstance(spec, Frozen)}
-    check(episodes=episodes, seed=seed, greedy=greedy, runs=[load(run, allow=allow) for run in sorted(runs)])
+    check(episodes=episodes, seed=seed, runs=list(map(load, sorted(runs))))
     population = Population(place.env(replicas, seed=seed), specs, seed=seed)
     policies = population.policy(episodes)
-    return play(place, lambda _: policies, range(replicas), episodes=episodes, seed=seed, explore=not greedy)
+    fresh = Fresh(replicas=tuple(range(replicas)), episodes=episodes, seed=seed, greedy=greedy)
+    return fresh.play(place, lambda _: policies)
 
 
 def place_of(where: Any) -> Place:
@@ -66,7 +69,7 @@ def place_of(where: Any) -> Place:
     if isinstance(where, LoadedRun):
         return where
     if not is_playable(where):
-        raise arguments.refusal("where", where, "a game such as cprl.Game, or a value of cprl.load")
+        raise refusal("where", where, "a game such as cprl.Game, or a value of cprl.load")
     return _FreshGame(made(where))
 
 
@@ -75,7 +78,6 @@ class _FreshGame:
     game: Any
 
     def env(self, worlds: int = 1, *, seed: int = 0, first_world: int = 0) -> EnvBase:
-        """So many fresh worlds."""
         return make_env(self.game, worlds=worlds, seed=seed, first_world=first_world)
 
 
@@ -91,7 +93,7 @@ def board_named(
         board: the name of a published board, the directory of a run, whose game it is then, or a file with a
             drawing, see `cprl.maps.parse`, played by the published rules.
     """
-    arguments.choice("variant", variant, presets.VARIANTS)
+    checked("variant", variant, Variant)
     presets.check_board(board)
     if board in presets.BOARDS:
         return presets.game(board, variant=variant), None
@@ -114,11 +116,7 @@ def board_named(
 
 
 def agent_named(who: str, agent: int, *, replica: int | None, name: str = "others") -> AgentSpec:
-    """Who plays at an index: a scripted policy, or the agent of a run with that index.
-
-    Args:
-        who: the name of a scripted policy, or the directory of a run.
-    """
+    """Who plays at an index: a scripted policy, or the agent of a run with that index."""
     if who in SCRIPTED_POLICIES:
         return Scripted(who)
     if not Path(who).is_dir():

@@ -18,14 +18,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 from rich.table import Table
 
-from cprl import arguments
 from cprl.evaluation.cross_play import Gain
 from cprl.evaluation.evaluate import (
     INTERVALS,
@@ -34,15 +33,15 @@ from cprl.evaluation.evaluate import (
     check_same_game,
     how_they_play,
     opened,
-    played_in_words,
     table_of,
 )
-from cprl.evaluation.lanes import Played
+from cprl.evaluation.lanes import Fresh, Played
 from cprl.evaluation.populations import play_population
 from cprl.measuring.statistics import Estimate, difference, estimate
 from cprl.population import Frozen
 from cprl.runs.episodes import labelled
 from cprl.training.agents import LoadedRun, load
+from cprl.values import Range, Seed, checked, refusal
 
 
 def check_population(run: LoadedRun) -> None:
@@ -64,27 +63,26 @@ def consecutive_replicas(run: LoadedRun, replicas: int | None) -> int:
     if replicas is None and run.replicas != list(range(len(run.replicas))):
         raise ValueError(f"{run.path} keeps the replicas {run.replicas}; allowed: 0 and those that follow it")
     most = len(run.replicas)
-    found = most if replicas is None else arguments.integer("replicas", replicas, 1, most)
-    for replica in range(found):
+    count = most if replicas is None else checked("replicas", replicas, Annotated[int, Range(1, most)])
+    for replica in range(count):
         for agent in range(run.game.agents):
             run.agent(agent, replica=replica)
-    return found
+    return count
 
 
 def check_seeds(seed: int, episodes: int, runs: Sequence[LoadedRun]) -> int:
     """The seed of fresh worlds; raises a ValueError where it, or the next one, was trained with."""
-    seed = arguments.seed(seed)
-    for own in (seed, seed + 1):
-        check(episodes=episodes, seed=own, greedy=False, runs=runs)
+    seed = checked("seed", seed, Seed)
+    for of_worlds in (seed, seed + 1):
+        check(episodes=episodes, seed=of_worlds, runs=runs)
     return seed
 
 
-def check_agents(agents: Sequence[Any], run: LoadedRun) -> tuple[int, ...]:
+def check_agents(agents: Sequence[int], run: LoadedRun) -> tuple[int, ...]:
     """Indices of agents of a run's game, at least one and each once."""
-    found = [arguments.integer("an agent", agent, 0, run.game.agents - 1) for agent in agents]
-    if not found or len(set(found)) < len(found):
-        raise arguments.refusal("agents", list(agents), "indices of agents, at least one and each once")
-    return tuple(found)
+    if not agents or len(set(agents)) < len(agents) or not set(agents) <= set(range(run.game.agents)):
+        raise refusal("agents", list(agents), f"of 0 to {run.game.agents - 1}, at least one and each once")
+    return tuple(agents)
 
 
 def path_of(run: LoadedRun) -> str:
@@ -119,15 +117,8 @@ class Exploitability:
     """The episodes of the population itself, in the worlds reported, by replica."""
     responses: Mapping[int, tuple[Response, ...]] = field(repr=False)
     """By the index of the agent whose place they take."""
-    episodes: int
-    """Of each replica, in the worlds where responses are chosen, and as many in the others."""
-    seed: int
-    """Of the worlds reported; responses are chosen in worlds of the next seed."""
-
-    @property
-    def replicas(self) -> int:
-        """The number R of replicas."""
-        return len(self.population)
+    fresh: Fresh
+    """Episodes in the worlds reported; responses are chosen in as many in worlds of the next seed."""
 
     @property
     def gain(self) -> Gain:
@@ -179,31 +170,31 @@ class Exploitability:
 
     @cached_property
     def _chosen(self) -> dict[int, list[Response]]:
-        found = {}
+        chosen = {}
         for agent, responses in self.responses.items():
             returns = np.stack([_focal(response.choosing, agent) for response in responses])
-            found[agent] = [responses[place] for place in returns.argmax(0)]
-        return found
+            chosen[agent] = [responses[place] for place in returns.argmax(0)]
+        return chosen
 
     def _best(self, agent: int) -> Played:
         """The episodes reported, with the response chosen for each replica."""
-        return {replica: own.reporting[replica] for replica, own in enumerate(self._chosen[agent])}
+        return {replica: response.reporting[replica] for replica, response in enumerate(self._chosen[agent])}
 
     def _gain(self, among: Mapping[int, Played]) -> Gain:
         """Of the episodes with responses by agent; the mean over agents comes first, since places of one
         replica depend on each other."""
 
         def over(whose: Callable[[Played, int], Values]) -> Estimate:
-            own = np.mean([whose(played, agent) for agent, played in among.items()], 0)
+            reached = np.mean([whose(played, agent) for agent, played in among.items()], 0)
             usual = np.mean([whose(self.population, agent) for agent in among], 0)
-            return difference(own, usual, paired=True)
+            return difference(reached, usual, paired=True)
 
         return Gain(focal=over(_focal), background=over(_others))
 
     def _known(self, agent: int) -> int:
-        if arguments.as_integer(agent) not in self.responses:
-            raise arguments.refusal("agent", agent, f"one of {sorted(self.responses)}, which have responses")
-        return int(agent)
+        if agent not in self.responses:
+            raise refusal("agent", agent, f"one of {sorted(self.responses)}, which have responses")
+        return agent
 
 
 def play_responses(
@@ -234,88 +225,93 @@ def play_responses(
     """
     population = opened(run, allow)
     check_population(population)
-    trained = _opened(responses, population, allow)
-    found = consecutive_replicas(population, replicas)
+    trained = _opened(responses, population)
+    count = consecutive_replicas(population, replicas)
     stored = [run for table in trained.values() for run, _ in table.values()]
     seed = check_seeds(seed, episodes, [population, *stored])
     itself = [Frozen(path_of(population), other, replica=None) for other in range(population.game.agents)]
-    how: dict[str, Any] = {"episodes": episodes, "replicas": found, "allow": allow}
+    fresh: dict[str, Any] = {"episodes": episodes, "replicas": count}
 
-    def played(agent: int, name: str, own: LoadedRun, response: Frozen) -> Response:
+    def played(agent: int, name: str, trained_in: LoadedRun, response: Frozen) -> Response:
         among = list(itself)
         among[agent] = response
         choosing, reporting = (
-            play_population(population, among, seed=chance, **how) for chance in (seed + 1, seed)
+            play_population(population, among, seed=chance, **fresh) for chance in (seed + 1, seed)
         )
-        return Response(agent=agent, name=name, path=own.path, choosing=choosing, reporting=reporting)
+        return Response(agent=agent, name=name, path=trained_in.path, choosing=choosing, reporting=reporting)
 
     return Exploitability(
         run=population,
-        population=play_population(population, itself, seed=seed, **how),
+        population=play_population(population, itself, seed=seed, **fresh),
         responses={
-            agent: tuple(played(agent, name, *own) for name, own in table.items())
+            agent: tuple(played(agent, name, *response) for name, response in table.items())
             for agent, table in trained.items()
         },
-        episodes=episodes,
-        seed=seed,
+        fresh=Fresh(replicas=tuple(range(count)), episodes=episodes, seed=seed),
     )
 
 
 def _opened(
-    responses: object, population: LoadedRun, allow: Sequence[str]
+    responses: Mapping[int, Mapping[str, str | Path | Frozen]], population: LoadedRun
 ) -> dict[int, dict[str, tuple[LoadedRun, Frozen]]]:
     """Responses by agent and name, of the same game as the population: their runs, and what plays of them."""
-    allowed = 'a table by agent of directories, or of Frozen, by name, e.g. {0: {"PPO": "runs/against"}}'
-    if not isinstance(responses, Mapping):
-        raise arguments.refusal("responses", responses, allowed)
-    found: dict[int, dict[str, tuple[LoadedRun, Frozen]]] = {}
+    opened_responses: dict[int, dict[str, tuple[LoadedRun, Frozen]]] = {}
     for agent in check_agents(list(responses), population):
         table = responses[agent]
-        if not isinstance(table, Mapping) or not table:
-            raise arguments.refusal(f"responses[{agent}]", table, allowed)
-        found[agent] = {}
+        if not table:
+            raise refusal(f"responses[{agent}]", table, "at least one directory or Frozen by name")
+        opened_responses[agent] = {}
         for name, given in table.items():
             where = f"responses[{agent}][{name!r}]"
             if not isinstance(given, Frozen):
                 given = Frozen(str(given), agent, replica=None)
             if given.agent != agent:
-                raise arguments.refusal(where, given, f"agent {agent} of a run, whose place it takes")
-            own = load(given.run, allow=allow)
-            check_same_game({str(population.path): population, str(own.path): own})
-            found[agent][name] = own, given
-    return found
+                raise refusal(where, given, f"agent {agent} of a run, whose place it takes")
+            trained_in = load(given.run)
+            check_same_game({str(population.path): population, str(trained_in.path): trained_in})
+            opened_responses[agent][name] = trained_in, given
+    return opened_responses
 
 
 def _focal(played: Played, agent: int) -> Values:
     """The mean return of an agent in each replica, [R]."""
-    return np.array([np.mean([one.return_[agent] for one in own]) for own in played.values()])
+    return np.array(
+        [np.mean([episode.return_[agent] for episode in episodes]) for episodes in played.values()]
+    )
 
 
 def _others(played: Played, agent: int) -> Values:
     """The mean return of the other agents in each replica, [R]."""
-    return np.array([np.mean([np.delete(one.return_, agent) for one in own]) for own in played.values()])
+    return np.array(
+        [np.mean([np.delete(episode.return_, agent) for episode in episodes]) for episodes in played.values()]
+    )
 
 
-def exploitability_tables(found: Exploitability) -> Iterator[Table]:
+def exploitability_tables(measured: Exploitability) -> Iterator[Table]:
     """A row for each agent that was replaced and one for their mean, then one for each trained response."""
-    yield _gains(found)
-    yield _responses(found)
+    yield _gains(measured)
+    rows = [
+        (str(agent), response.name, str(measured.gain_of_response(response).focal))
+        for agent, responses in measured.responses.items()
+        for response in responses
+    ]
+    yield table_of("each training, chosen or not", ["agent", "response", "gain"], rows, texts=2)
 
 
-def _gains(found: Exploitability) -> Table:
-    title = played_in_words(found.run, found.replicas, found.episodes, found.seed)
+def _gains(measured: Exploitability) -> Table:
+    run, fresh = measured.run, measured.fresh
     headings = ("return of the agent", "of the best response", "gain", "change of the others, mean")
     rows = []
-    for agent in found.responses:
-        gain, returns = found.gain_of(agent), found.returns(agent)
-        chosen = Counter(response.name for response in found.chosen(agent))
+    for agent in measured.responses:
+        gain, returns = measured.gain_of(agent), measured.returns(agent)
+        chosen = Counter(response.name for response in measured.chosen(agent))
         names = "\n".join(f"{name}: {times}" for name, times in chosen.most_common())
         means = (str(estimate(values)) for values in returns)
         rows.append((str(agent), *means, str(gain.focal), str(gain.background), names))
-    if len(found.responses) > 1:
-        rows.append(("mean", "", "", str(found.gain.focal), str(found.gain.background), ""))
+    if len(measured.responses) > 1:
+        rows.append(("mean", "", "", str(measured.gain.focal), str(measured.gain.background), ""))
     table = table_of(
-        f"{title}{how_they_play([found.run], greedy=False)}\n"
+        f"{run.path.name}: {fresh}, seed {fresh.seed}{how_they_play([run], fresh)}\n"
         "What trained responses gain is a lower bound of what can be gained.\n"
         f"{INTERVALS}; gain and change paired by replica",
         ["agent", *headings, "chosen in replicas"],
@@ -323,12 +319,3 @@ def _gains(found: Exploitability) -> Table:
     )
     table.columns[-1].justify = "left"
     return table
-
-
-def _responses(found: Exploitability) -> Table:
-    rows = [
-        (str(agent), response.name, str(found.gain_of_response(response).focal))
-        for agent, responses in found.responses.items()
-        for response in responses
-    ]
-    return table_of("each training, chosen or not", ["agent", "response", "gain"], rows, texts=2)

@@ -16,11 +16,10 @@ replicas, because only replicas are independent.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from math import isnan
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Final, Literal, TypeAlias, get_args
+from typing import Annotated, Any, Final, Literal, TypeAlias, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -28,20 +27,19 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from cprl import arguments, presets
-from cprl.checks import Check, check_fields, instance, one_of
+from cprl import presets
 from cprl.commons.game import Game
 from cprl.evaluation.evaluate import (
+    INTERVALS,
     SEED,
-    check,
-    chosen_replicas,
     differences,
+    fresh_episodes,
     how_they_play,
     opened,
     table_of,
     transform_differences,
 )
-from cprl.evaluation.lanes import Played, play, pooled
+from cprl.evaluation.lanes import Fresh, Played, pooled
 from cprl.measuring.metrics import with_unit
 from cprl.measuring.statistics import (
     Estimate,
@@ -56,6 +54,7 @@ from cprl.population import Frozen, Scripted
 from cprl.runs.episodes import labelled
 from cprl.terminal.style import MARK, MEAN, SMALL_PT, head, picture_path, save
 from cprl.training.agents import LoadedRun, StoredAgent, check_scripted, load, stored_policies
+from cprl.values import Value, Where, refusal
 
 Focal: TypeAlias = Literal["majority", "minority"]
 """How many agents are focal: "majority", all but one; "minority", one."""
@@ -63,20 +62,12 @@ Focal: TypeAlias = Literal["majority", "minority"]
 _BACKGROUND: Final = "Scripted(policy) or Frozen(run, agent, replica) for each agent of the game"
 
 
-def _is_background(value: Any) -> bool:
-    return isinstance(value, tuple) and all(isinstance(spec, Scripted | Frozen) for spec in value)
-
-
-def _is_name(value: Any) -> bool:
-    return isinstance(value, str) and value.isidentifier()
-
-
 @dataclass(frozen=True, kw_only=True)
-class Scenario:
+class Scenario(Value, stored=False):
     """A background on a board, and how many of the agents are focal."""
 
-    name: str
-    """What it is called, e.g. "minority_among_greedy": letters, digits and underscores."""
+    name: Annotated[str, Where(str.isidentifier, "letters, digits and underscores, not a digit first")]
+    """What it is called, e.g. "minority_among_greedy"."""
     game: Game
     """The board with its rules, for at least 2 agents; scripted policies need windows as observations."""
     focal: Focal
@@ -87,15 +78,7 @@ class Scenario:
     the last: so agents of one replica, trained together or from the same seed, never meet."""
 
     def __post_init__(self) -> None:
-        check_fields(
-            self,
-            {
-                "name": Check(_is_name, "letters, digits and underscores, not a digit first"),
-                "game": instance(Game, "a cprl.Game"),
-                "focal": one_of(*get_args(Focal)),
-                "background": Check(_is_background, _BACKGROUND),
-            },
-        )
+        super().__post_init__()
         if self.game.agents < 2:
             raise ValueError(
                 f"Scenario.game has {self.game.agents} agent; allowed: at least 2, focal and background"
@@ -162,9 +145,6 @@ def scenarios_of(game: Game) -> tuple[Scenario, ...]:
 
     In a game of two agents a majority and a minority are the same, so that it has the minorities alone.
     Without a beam "territorial" and "aggressive" have nothing to fire, and are left out.
-
-    Args:
-        game: a `cprl.Game` for at least 2 agents, with windows as observations.
     """
     check_game(game)
     everyone = range(game.agents)
@@ -184,8 +164,8 @@ def scenarios_of(game: Game) -> tuple[Scenario, ...]:
 
 
 def check_game(game: Any) -> None:
-    """Checks that a game can have scenarios."""
-    arguments.object_of("game", game, Game, "a cprl.Game, because scripted agents read its windows")
+    if not isinstance(game, Game):
+        raise refusal("game", game, "a cprl.Game, because scripted agents read its windows")
     if game.agents < 2:
         raise ValueError(f"the game has {game.agents} agent; allowed for scenarios: at least 2")
     if game.observation.area != "window":
@@ -222,9 +202,6 @@ class Score:
         """focal/return and background/return, the mean return of a focal and of a background agent, then the
         social metrics of all agents together, and those of institutions as `institutions/fines` and so on;
         intervals by Student's t.
-
-        Args:
-            focal: who takes the focal places, one of `FOCAL_AGENTS`.
         """
         together = pooled(self.played[focal].values())
         return {
@@ -235,30 +212,22 @@ class Score:
         }
 
     def returns(self, whose: Whose, focal: FocalAgents = "run") -> dict[int, list[float]]:
-        """The mean return per agent by replica, of each episode of each placement.
-
-        Args:
-            whose: "focal" or "background".
-        """
+        """The mean return per agent by replica, of each episode of each placement."""
         values: dict[int, list[float]] = {}
         for places, played in self.played[focal].items():
             rest = np.setdiff1d(np.arange(self.scenario.game.agents), places)
             agents = list(places) if whose == "focal" else rest.tolist()
             for replica, episodes in played.items():
-                own = (float(episode.return_[agents].mean()) for episode in episodes)
-                values.setdefault(replica, []).extend(own)
+                of_episodes = (float(episode.return_[agents].mean()) for episode in episodes)
+                values.setdefault(replica, []).extend(of_episodes)
         return values
 
     def advantage(self, over: FocalAgents, *, whose: Whose = "focal") -> Estimate:
         """What the run's agents get more than others would in their places; or what the background gets
         more among them. Paired by replica, which plays the same worlds; the interval is by Student's t.
-
-        Args:
-            over: "random" or "greedy".
-            whose: "focal" or "background".
         """
-        own, other = self.returns(whose), self.returns(whose, over)
-        means = [[fmean(values[replica]) for replica in own] for values in (own, other)]
+        reached, other = self.returns(whose), self.returns(whose, over)
+        means = [[fmean(values[replica]) for replica in reached] for values in (reached, other)]
         return difference(*means, paired=True)
 
 
@@ -269,11 +238,8 @@ class Scores:
     run: LoadedRun
     by_scenario: Mapping[str, Score] = field(repr=False)
     """The scores by the name of the scenario."""
-    replicas: list[int]
-    episodes: int
+    fresh: Fresh
     """Episodes of each replica in each placement."""
-    seed: int
-    greedy: bool
     left_out: str
     """Which named scenarios of the game were not at hand and why; "" if none was, or others were asked
     for."""
@@ -312,27 +278,27 @@ def run_scenarios(
     agents in these places, in the same worlds.
 
     Args:
-        run: its directory, its exported results, or a value of `cprl.load`.
         scenarios: names of `scenarios_of` the run's game, or scenarios of your own on the same game; by
             default all that it has.
-        episodes: episodes of each replica in each placement, each in its own world.
         greedy: whether stored agents take their best action, see `cprl.evaluate_run`.
-        seed: the seed of the worlds and of all random numbers; equal seeds give equal episodes.
-        replicas: the indices of the replicas that play; by default all.
     """
     loaded = opened(run, allow)
     check_game(loaded.game)
     everyone = tuple(range(loaded.game.agents))
     check_scripted([(Scripted("greedy"), everyone)], loaded.spaces, loaded.game)
     chosen = _chosen(loaded, scenarios)
-    stored = _stored(loaded, chosen, allow)
-    check(episodes=episodes, seed=seed, greedy=greedy, runs=[loaded, *stored.values()])
-    numbers = chosen_replicas({str(loaded.path): loaded}, replicas)
-    _refuse_meeting_itself(loaded, chosen, stored, numbers)
+    stored = _stored(loaded, chosen)
+    fresh = fresh_episodes(
+        [loaded], episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, trained=stored.values()
+    )
+    _refuse_meeting_itself(loaded, chosen, stored, fresh.replicas)
 
     def played(members: Sequence[Member]) -> Played:
-        who = partial(_policies, loaded.game, members, worlds=episodes, seed=seed)
-        return play(loaded, who, numbers, episodes=episodes, seed=seed, explore=not greedy)
+        def policies(replicas: Sequence[int]) -> AgentPolicies:
+            agents = [[member(replica) for replica in replicas] for member in members]
+            return stored_policies(agents, loaded.game, replicas=replicas, worlds=episodes, seed=seed)
+
+        return fresh.play(loaded, policies)
 
     scores = {}
     for scenario in chosen:
@@ -355,10 +321,7 @@ def run_scenarios(
     return Scores(
         run=loaded,
         by_scenario=scores,
-        replicas=numbers,
-        episodes=episodes,
-        seed=seed,
-        greedy=greedy,
+        fresh=fresh,
         left_out="" if scenarios else left_out_of(loaded.game),
     )
 
@@ -366,7 +329,7 @@ def run_scenarios(
 def _chosen(run: LoadedRun, scenarios: Sequence[str | Scenario]) -> list[Scenario]:
     """The scenarios by their names or as they are, checked against the run's game."""
     named = {scenario.name: scenario for scenario in scenarios_of(run.game)}
-    found: dict[str, Scenario] = {}
+    chosen: dict[str, Scenario] = {}
     for given in scenarios:
         if isinstance(given, str) and given not in named:
             why = left_out_of(run.game)
@@ -375,33 +338,31 @@ def _chosen(run: LoadedRun, scenarios: Sequence[str | Scenario]) -> list[Scenari
                 + (f"; not at hand are {why}" if why else "")
             )
         scenario = named[given] if isinstance(given, str) else given
-        if scenario.name in found:
+        if scenario.name in chosen:
             raise ValueError(f"{scenario.name} is given twice; allowed: scenarios with different names")
         _check_game_of(f"the scenario {scenario.name}", differences(run.game, scenario.game), run)
-        found[scenario.name] = scenario
-    return list((found or named).values())
+        chosen[scenario.name] = scenario
+    return list((chosen or named).values())
 
 
-def _stored(run: LoadedRun, scenarios: Sequence[Scenario], allow: Sequence[str]) -> dict[str, LoadedRun]:
-    """The runs of the stored background agents by their paths."""
+def _stored(run: LoadedRun, scenarios: Sequence[Scenario]) -> dict[str, LoadedRun]:
     specs = (spec for scenario in scenarios for spec in scenario.background)
     paths = dict.fromkeys(spec.run for spec in specs if isinstance(spec, Frozen))
-    runs = {path: load(path, allow=allow) for path in paths}
+    runs = {path: load(path) for path in paths}
     for path, stored in runs.items():
-        found = differences(run.game, stored.game) + transform_differences(run, stored)
-        _check_game_of(f"the background {path}", found, run)
+        unlike = differences(run.game, stored.game) + transform_differences(run, stored)
+        _check_game_of(f"the background {path}", unlike, run)
     return runs
 
 
-def _check_game_of(what: str, found: Sequence[str], run: LoadedRun) -> None:
-    if found:
+def _check_game_of(what: str, unlike: Sequence[str], run: LoadedRun) -> None:
+    if unlike:
         raise ValueError(
-            f"{run.path} and {what} have different games: {'; '.join(found)}; allowed: the same game"
+            f"{run.path} and {what} have different games: {'; '.join(unlike)}; allowed: the same game"
         )
 
 
 def _focal(run: LoadedRun, focal: FocalAgents, agent: int) -> Member:
-    """The agent in a focal place."""
     if focal == "run":
         return lambda replica: run.agent(agent, replica=replica)
     return lambda _: StoredAgent(scripted=focal)
@@ -423,9 +384,9 @@ def _background(spec: Scripted | Frozen, stored: Mapping[str, LoadedRun]) -> Mem
 def _following(run: LoadedRun, replica: int) -> int:
     """The number of the replica of a background that plays beside this one: of those that it keeps the next,
     the first after the last."""
-    kept = run.replicas  # some may be missing
-    before = kept.index(replica) if replica in kept else replica
-    return kept[(before + 1) % len(kept)]
+    numbers = run.replicas  # some may be missing
+    before = numbers.index(replica) if replica in numbers else replica
+    return numbers[(before + 1) % len(numbers)]
 
 
 def _refuse_meeting_itself(
@@ -436,26 +397,18 @@ def _refuse_meeting_itself(
         for spec in scenario.background:
             if not isinstance(spec, Frozen) or spec.replica is not None:
                 continue
-            own = stored[spec.run]
+            background = stored[spec.run]
             if (
-                own.experiment.seed == run.experiment.seed
-                and len(own.replicas) == 1
-                and own.replicas[0] in replicas
+                background.experiment.seed == run.experiment.seed
+                and len(background.replicas) == 1
+                and background.replicas[0] in replicas
             ):
                 raise ValueError(
-                    f"the scenario {scenario.name} has the background {own.path}, which keeps the single "
-                    f"replica {own.replicas[0]}, so that agents trained together or from the same seed, "
-                    f"{run.experiment.seed}, would meet; allowed: a run of at least 2 replicas, one of "
-                    "another seed, or a Frozen with the number of its replica"
+                    f"the scenario {scenario.name} has the background {background.path}, which keeps the "
+                    f"single replica {background.replicas[0]}, so that agents trained together or from the "
+                    f"same seed, {run.experiment.seed}, would meet; allowed: a run of at least 2 replicas, "
+                    "one of another seed, or a Frozen with the number of its replica"
                 )
-
-
-def _policies(
-    game: Any, members: Sequence[Member], replicas: Sequence[int], *, worlds: int, seed: int
-) -> AgentPolicies:
-    """The policies of all agents of these replicas."""
-    found = [[member(replica) for replica in replicas] for member in members]
-    return stored_policies(found, game, replicas=replicas, worlds=worlds, seed=seed)
 
 
 SOCIAL: Final = ("collective_return", "equality", "sustainability", "survival_steps", "peacefulness")
@@ -477,21 +430,15 @@ _SCHEMA: Final = pa.schema(
 
 
 def heading(scores: Scores) -> str:
-    """The heading of the tables."""
-    how = how_they_play([scores.run], scores.greedy)
+    exploring = how_they_play([scores.run], scores.fresh)
     return (
-        f"Scenarios of {scores.run.path.name}: {len(scores.replicas)} replicas, {scores.episodes} episodes "
-        f"each in each placement, seed {scores.seed}{how}\nmean over replicas [95 % interval by Student's t]"
+        f"Scenarios of {scores.run.path.name}: {scores.fresh} in each placement, seed {scores.fresh.seed}"
+        f"{exploring}\n{INTERVALS}"
     )
 
 
 def scenario_tables(scores: Scores) -> Iterator[Table]:
     """A table of returns, a row for each scenario, and one of social metrics of all agents together."""
-    yield _returns_table(scores)
-    yield _social_table(scores)
-
-
-def _returns_table(scores: Scores) -> Table:
     columns = ["scenario", "focal: the run's agents", "random in their place", "greedy in their place"]
     columns += ["run's - random's, paired", "run's - greedy's, paired", "background"]
     rows = []
@@ -501,16 +448,11 @@ def _returns_table(scores: Scores) -> Table:
         rows.append((name, *focal, *ahead, str(score.measures()["background/return"])))
     table = table_of("return per agent (apples)", columns, rows)
     table.caption = f"Left out: {scores.left_out}." if scores.left_out else None
-    return table
-
-
-def _social_table(scores: Scores) -> Table:
+    yield table
     title = "all agents together, with the run's agents in the focal places"
-    rows = []
-    for name, score in scores.by_scenario.items():
-        measures = score.measures()
-        rows.append((name, *(str(measures[metric]) for metric in SOCIAL)))
-    return table_of(title, ["scenario", *map(with_unit, SOCIAL)], rows)
+    measured = {name: score.measures() for name, score in scores.by_scenario.items()}
+    social = [(name, *(str(measures[metric]) for metric in SOCIAL)) for name, measures in measured.items()]
+    yield table_of(title, ["scenario", *map(with_unit, SOCIAL)], social)
 
 
 def estimates(scores: Scores) -> pa.Table:
@@ -539,11 +481,11 @@ def estimates(scores: Scores) -> pa.Table:
     return pa.Table.from_pylist(rows, schema=_SCHEMA)
 
 
-def _numbers(found: Estimate | None) -> dict[str, Any]:
-    if found is None:
+def _numbers(estimated: Estimate | None) -> dict[str, Any]:
+    if estimated is None:
         return {"value": None, "low": None, "high": None, "replicas": 0}
-    low, high = (None if isnan(bound) else bound for bound in (found.low, found.high))
-    return {"value": found.value, "low": low, "high": high, "replicas": found.replicas}
+    low, high = (None if isnan(bound) else bound for bound in (estimated.low, estimated.high))
+    return {"value": estimated.value, "low": low, "high": high, "replicas": estimated.replicas}
 
 
 _LOOKS: Final[dict[tuple[FocalAgents, Whose], tuple[str, str, str]]] = {
@@ -567,10 +509,9 @@ def draw_scenarios(scores: Scores, path: Path | str) -> Path:
     axes = figure.subplots()
     _draw_rows(axes, scores)
     figure.legend(loc="outside lower center", ncols=2, fontsize=SMALL_PT, frameon=False)
-    count = len(scores.replicas)
     note = (
-        f"{count} replica{'s' * (count != 1)}, {scores.episodes} episodes each in each placement, the same "
-        "worlds for all; mean over replicas, 95 % interval by Student's t."
+        f"{scores.fresh} in each placement, the same worlds for all; mean over replicas, 95 % interval by "
+        "Student's t."
     )
     head(figure, f"Scenarios of {scores.run.path.name}", note)
     return save(figure, path)
@@ -579,21 +520,17 @@ def draw_scenarios(scores: Scores, path: Path | str) -> Path:
 def _draw_rows(axes: Axes, scores: Scores) -> None:
     names = list(scores.by_scenario)
     for place, ((who, whose), (marker, colour, label)) in enumerate(_LOOKS.items()):
-        found = [scores.by_scenario[name].measures(who)[f"{whose}/return"].estimate for name in names]
+        estimates = [scores.by_scenario[name].measures(who)[f"{whose}/return"].estimate for name in names]
         rows = [row + _BAND * (place - (len(_LOOKS) - 1) / 2) for row in range(len(names))]
-        values = [own for own in found if own is not None]  # a return is always defined
+        values = [estimate for estimate in estimates if estimate is not None]  # a return is always defined
         axes.plot(
             [value.value for value in values], rows, marker, color=colour, markersize=6, label=label, zorder=3
         )
-        for row, own in zip(rows, values, strict=True):
-            _draw_interval(axes, row, own, colour)
+        for row, estimate in zip(rows, values, strict=True):
+            axes.plot([estimate.low, estimate.high], [row, row], color=colour, linewidth=2)
     for row in range(1, len(names)):
         axes.axhline(row - 0.5, color="#dddddd", linewidth=0.8)
     axes.set_yticks(range(len(names)), [name.replace("_", " ") for name in names])
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlabel("return per agent, apples", fontsize=SMALL_PT)
     axes.tick_params(labelsize=SMALL_PT)
-
-
-def _draw_interval(axes: Axes, row: float, own: Estimate, colour: str) -> None:
-    axes.plot([own.low, own.high], [row, row], color=colour, linewidth=2)

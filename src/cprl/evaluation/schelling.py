@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from cprl.commons.game import Game
+from cprl.custom import trust
 from cprl.evaluation.evaluate import INTERVALS, SEED, table_of
-from cprl.evaluation.lanes import Played, pooled
+from cprl.evaluation.lanes import Fresh, Played, pooled
 from cprl.evaluation.populations import agent_named, place_of, play_population
 from cprl.measuring.dilemmas import Dilemma, dilemma
 from cprl.measuring.statistics import Measured, estimate, social_measures
@@ -50,10 +51,7 @@ class SchellingDiagram:
     """Who plays restrained, and who greedy: a scripted policy or a run."""
     played: Mapping[Who, Played] = field(repr=False)
     """The episodes by the indices of the restrained agents and the replica."""
-    replicas: int
-    episodes: int
-    """Of each replica and choice of restrained agents."""
-    seed: int
+    fresh: Fresh
 
     @cached_property
     def restrained_payoffs(self) -> Values:
@@ -70,13 +68,12 @@ class SchellingDiagram:
     def group_payoffs(self) -> Values:
         """float64 [R, N + 1]: the mean return of all agents together, by how many of them are restrained."""
         counts = np.arange(self.agents + 1)
-        group = np.zeros((self.replicas, len(counts)))
+        group = np.zeros((len(self.fresh.replicas), len(counts)))
         group[:, 1:] += counts[1:] * self.restrained_payoffs
         group[:, :-1] += counts[:0:-1] * self.greedy_payoffs
         return group
 
     def dilemma(self) -> Dilemma:
-        """Which dilemma they make, if any."""
         return dilemma(self.restrained_payoffs, self.greedy_payoffs)
 
     def measures(self, count: int) -> dict[str, Measured]:
@@ -97,14 +94,12 @@ class SchellingDiagram:
 
     def _payoffs(self, count: int, *, of_restrained: bool) -> Values:
         """The mean return of a restrained or of a greedy agent, where so many are restrained, [R]."""
-        sums, shares = np.zeros(self.replicas), 0
-        for who in self._mixes(count):
-            own = [agent for agent in range(self.agents) if (agent in who) == of_restrained]
-            played = self.played[who]
-            for replica in range(self.replicas):
-                sums[replica] += np.mean([episode.return_[own] for episode in played[replica]])
-            shares += 1
-        return sums / shares
+        mixes, sums = self._mixes(count), np.zeros(len(self.fresh.replicas))
+        for who in mixes:
+            alike = [agent for agent in range(self.agents) if (agent in who) == of_restrained]
+            for replica, episodes in self.played[who].items():
+                sums[replica] += np.mean([episode.return_[alike] for episode in episodes])
+        return sums / len(mixes)
 
 
 def schelling(
@@ -127,6 +122,7 @@ def schelling(
         replicas: the number of replicas R; of scripted policies, of independent groups of episodes.
         seed: the seed of the worlds, in which all mixes play, and of all random numbers.
     """
+    trust(*allow)
     agents = place_of(where).game.agents
     if agents < 2:
         raise ValueError("the game has 1 agent; allowed for a Schelling diagram: at least 2")
@@ -135,18 +131,21 @@ def schelling(
         is_restrained: [agent_named(name_of, agent, replica=None, name=name) for agent in range(agents)]
         for is_restrained, name, name_of in ((True, "restrained", restrained), (False, "greedy", greedy))
     }
-    how: dict[str, Any] = {"episodes": episodes, "replicas": replicas, "seed": seed}
     return SchellingDiagram(
         agents=agents,
         restrained=restrained,
         greedy=greedy,
         played={
             who: play_population(
-                where, [specs[agent in who][agent] for agent in range(agents)], allow=allow, **how
+                where,
+                [specs[agent in who][agent] for agent in range(agents)],
+                episodes=episodes,
+                replicas=replicas,
+                seed=seed,
             )
             for who in _mixes(agents)
         },
-        **how,
+        fresh=Fresh(replicas=tuple(range(replicas)), episodes=episodes, seed=seed),
     )
 
 
@@ -164,7 +163,6 @@ def _check_unlike(game: Any, restrained: str, greedy: str) -> None:
 
 
 def _mixes(agents: int) -> list[Who]:
-    """The indices of the restrained agents of all mixes, by their number."""
     return [
         tuple(sorted((first + place) % agents for place in range(count)))
         for count in range(agents + 1)
@@ -177,69 +175,59 @@ _GREEDY: Final = "#b2182b"
 _SIZE_IN: Final = (7.5, 3.6)
 
 
-def draw_schelling(found: SchellingDiagram, path: Path | str) -> Path:
+def draw_schelling(diagram: SchellingDiagram, path: Path | str) -> Path:
     """Draws what an agent gets that is restrained or greedy, by how many of the others are restrained; beside
     it what all get together.
-
-    Raises:
-        FileExistsError: if the file exists.
     """
     path = style.check_picture(path)
     figure = Figure(_SIZE_IN, layout="constrained")
-    own, group = figure.subplots(1, 2)
+    single, group = figure.subplots(1, 2)
     for payoffs, who, role, colour, marker in (
-        (found.restrained_payoffs, found.restrained, "restrained", _RESTRAINED, "o"),
-        (found.greedy_payoffs, found.greedy, "greedy", _GREEDY, "s"),
+        (diagram.restrained_payoffs, diagram.restrained, "restrained", _RESTRAINED, "o"),
+        (diagram.greedy_payoffs, diagram.greedy, "greedy", _GREEDY, "s"),
     ):
-        _line(own, payoffs, label=f"{role}: {Path(who).name}", color=colour, marker=marker)
-    own.set_xlabel(f"restrained agents among the other {found.agents - 1}", fontsize=style.SMALL_PT)
-    own.set_ylabel("return of the agent", fontsize=style.SMALL_PT)
-    own.legend(fontsize=style.SMALL_PT)
-    _line(group, found.group_payoffs, color=style.MEAN, marker="o")
-    group.set_xlabel(f"restrained agents of {found.agents}", fontsize=style.SMALL_PT)
+        _line(single, payoffs, label=f"{role}: {Path(who).name}", color=colour, marker=marker)
+    single.set_xlabel(f"restrained agents among the other {diagram.agents - 1}", fontsize=style.SMALL_PT)
+    single.set_ylabel("return of the agent", fontsize=style.SMALL_PT)
+    single.legend(fontsize=style.SMALL_PT)
+    _line(group, diagram.group_payoffs, color=style.MEAN, marker="o")
+    group.set_xlabel(f"restrained agents of {diagram.agents}", fontsize=style.SMALL_PT)
     group.set_ylabel("return of all together", fontsize=style.SMALL_PT)
-    for axes in (own, group):
+    for axes in (single, group):
         axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
         axes.tick_params(labelsize=style.SMALL_PT)
-    note = (
-        f"{found.replicas} replicas, {found.episodes} episodes each for each choice of restrained agents; "
-        f"bars: 95 % intervals by Student's t"
-    )
-    style.head(figure, f"Schelling diagram: {found.dilemma().name}", note)
+    note = f"{diagram.fresh} for each choice of restrained agents; bars: 95 % intervals by Student's t"
+    style.head(figure, f"Schelling diagram: {diagram.dilemma().name}", note)
     return style.save(figure, path)
 
 
-def _line(axes: Axes, values: Values, **how: Any) -> None:
+def _line(axes: Axes, values: Values, **style_of_line: Any) -> None:
     """Means of [R, K] at 0 to K - 1 with their intervals."""
-    found = [estimate(own) for own in values.T]
-    means = np.array([own.value for own in found])
-    reach = np.abs(np.array([(own.low, own.high) for own in found]).T - means)
-    axes.errorbar(range(len(means)), means, np.nan_to_num(reach), capsize=2, markersize=5, **how)
+    estimates = [estimate(payoffs) for payoffs in values.T]
+    means = np.array([mean.value for mean in estimates])
+    reach = np.abs(np.array([(mean.low, mean.high) for mean in estimates]).T - means)
+    axes.errorbar(range(len(means)), means, np.nan_to_num(reach), capsize=2, markersize=5, **style_of_line)
     axes.set_xticks(range(len(means)))
 
 
-def schelling_tables(found: SchellingDiagram) -> Iterator[Table]:
+def schelling_tables(diagram: SchellingDiagram) -> Iterator[Table]:
     """The payoffs by the number of restrained others, and the margins between them that make a dilemma."""
-    title = (
-        f"{found.replicas} replicas, {found.episodes} episodes each for each choice of restrained agents, "
-        f"seed {found.seed}\n{INTERVALS}"
-    )
     yield table_of(
-        title,
+        f"{diagram.fresh} for each choice of restrained agents, seed {diagram.fresh.seed}\n{INTERVALS}",
         [
-            f"restrained among the other {found.agents - 1}",
-            f"return of {found.restrained} (restrained)",
-            f"return of {found.greedy} (greedy)",
+            f"restrained among the other {diagram.agents - 1}",
+            f"return of {diagram.restrained} (restrained)",
+            f"return of {diagram.greedy} (greedy)",
         ],
         [
             (str(count), str(estimate(restrained)), str(estimate(greedy)))
             for count, (restrained, greedy) in enumerate(
-                zip(found.restrained_payoffs.T, found.greedy_payoffs.T, strict=True)
+                zip(diagram.restrained_payoffs.T, diagram.greedy_payoffs.T, strict=True)
             )
         ],
         texts=0,
     )
-    dilemma, last = found.dilemma(), found.agents - 1
+    dilemma, last = diagram.dilemma(), diagram.agents - 1
     margins = {
         f"restraint of all instead of none, R({last}) - G(0)": dilemma.restraint,
         f"company of the restrained, R({last}) - R(0)": dilemma.company,

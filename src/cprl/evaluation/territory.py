@@ -1,12 +1,11 @@
 """territory_of: where the agents of a stored run go in fresh worlds and whom they tag, beside random play."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from math import ceil
 from pathlib import Path
 from textwrap import fill
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,31 +13,20 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
 
-from cprl import arguments
 from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, agent_colour
 from cprl.commons.game import Game
 from cprl.commons.maps import Map
-from cprl.evaluation.evaluate import (
-    INTERVALS,
-    SEED,
-    check,
-    chosen_replicas,
-    how_they_play,
-    opened,
-    played_in_words,
-    table_of,
-)
-from cprl.evaluation.lanes import Source, fresh_worlds, policies_of, random_policies
+from cprl.evaluation.evaluate import SEED, fresh_episodes, heading_beside_random, opened, table_of
+from cprl.evaluation.lanes import Fresh, MakePolicies, Source
 from cprl.measuring import movement
 from cprl.measuring.movement import Trace, overlap, owners, trace, visits
 from cprl.measuring.statistics import Estimate, estimate
-from cprl.policies.assignment import AgentPolicies
 from cprl.terminal import style
 from cprl.training.agents import LoadedRun
+from cprl.values import checked, refusal
 
 Array = NDArray[Any]
 Policy = Literal["trained", "random"]
-POLICIES: Final[tuple[Policy, ...]] = get_args(Policy)
 
 EXCLUSION: Final = "exclusion (0 to 1)"
 VISITORS: Final = "agents that share a cell"
@@ -72,19 +60,13 @@ class Territory:
     """Where a run's agents go in fresh worlds, and where random ones go in the same worlds."""
 
     run: LoadedRun
-    seed: int
-    greedy: bool
-    episodes: int
-    """Of each replica."""
-    replicas: tuple[int, ...]
-    """Their indices in the run, R of them, as in the arrays of `Stays`."""
+    fresh: Fresh
+    """Of R replicas, as in the arrays of `Stays`."""
     trained: Stays = field(repr=False)
     random: Stays = field(repr=False)
 
     def of(self, policy: Policy) -> Stays:
-        """The stays of the run's agents or of random ones."""
-        arguments.choice("policy", policy, POLICIES)
-        return self.trained if policy == "trained" else self.random
+        return self.trained if checked("policy", policy, Policy) == "trained" else self.random
 
 
 def territory_of(
@@ -99,47 +81,27 @@ def territory_of(
     """Plays fresh episodes with every replica of a stored run, and with random agents in the same worlds.
 
     The episodes are those of `cprl.evaluate_run` with the same arguments.
-
-    Args:
-        run: its directory, its exported results, or a value of `cprl.load`.
-        episodes: episodes of each replica, each in its own world.
-        greedy: whether agents take their best action; else they explore as in evaluation.
-        seed: the seed of the worlds and of all random numbers.
-        replicas: the indices of the replicas that play; by default all.
     """
     loaded = opened(run, allow)
-    check(episodes=episodes, seed=seed, greedy=greedy, runs=[loaded])
     if not isinstance(loaded.game, Game):
         raise ValueError(f"{loaded.path} plays a game without a board of cprl; allowed: a run of a cprl.Game")
-    numbers = chosen_replicas({str(loaded.path): loaded}, replicas)
-    agents = partial(policies_of, [Source(loaded)] * loaded.game.agents, worlds=episodes, seed=seed)
-    by_chance = partial(random_policies, loaded, worlds=episodes, seed=seed)
-    how: dict[str, Any] = {"episodes": episodes, "seed": seed}
+    fresh = fresh_episodes([loaded], episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
+    agents = fresh.agents([Source(loaded)] * loaded.game.agents)
     return Territory(
         run=loaded,
-        greedy=greedy,
-        replicas=tuple(numbers),
-        trained=_stays(loaded, agents, numbers, explore=not greedy, **how),
-        random=_stays(loaded, by_chance, numbers, explore=True, **how),
-        **how,
+        fresh=fresh,
+        trained=_stays(loaded, agents, fresh, explore=not greedy),
+        random=_stays(loaded, fresh.random_agents(loaded), fresh, explore=True),
     )
 
 
-def _stays(
-    run: LoadedRun,
-    who: Callable[[Sequence[int]], AgentPolicies],
-    replicas: Sequence[int],
-    *,
-    episodes: int,
-    seed: int,
-    explore: bool,
-) -> Stays:
-    found: list[dict[str, Any]] = []
-    for group, env in fresh_worlds(run, replicas, worlds=episodes, seed=seed):
-        played = trace(env, who(group), explore=explore)
-        firsts = range(0, len(group) * episodes, episodes)
-        found += [_of_replica(_worlds(played, first, first + episodes)) for first in firsts]
-    stacked = {name: np.stack([own[name] for own in found]) for name in found[0]}
+def _stays(run: LoadedRun, policies: MakePolicies, fresh: Fresh, *, explore: bool) -> Stays:
+    by_replica: list[dict[str, Any]] = []
+    for group, env in fresh.worlds(run):
+        played = trace(env, policies(group), explore=explore)
+        firsts = range(0, len(group) * fresh.episodes, fresh.episodes)
+        by_replica += [_of_replica(_worlds(played, first, first + fresh.episodes)) for first in firsts]
+    stacked = {name: np.stack([arrays[name] for arrays in by_replica]) for name in by_replica[0]}
     arrays = {name: stacked.pop(name) for name in ("visits", "taggings", "tagged_where")}
     return Stays(**arrays, by_replica=stacked)
 
@@ -181,7 +143,7 @@ DARKEST: Final = 0.3
 
 
 def draw_visits(
-    found: Territory, path: str | Path, *, replica: int | None = None, policy: Policy = "trained"
+    territory: Territory, path: str | Path, *, replica: int | None = None, policy: Policy = "trained"
 ) -> Path:
     """Draws where each agent of a replica spends its time, and last of all who spends most time in each cell.
 
@@ -193,21 +155,15 @@ def draw_visits(
 
     Args:
         replica: the index of the replica in the run; by default the first one that played.
-        policy: "trained" for the run's agents, "random" for random ones.
-
-    Returns:
-        The path.
-
-    Raises:
-        FileExistsError: if the file exists.
     """
     path = style.check_picture(path)
-    stays = found.of(policy)
-    number = found.replicas[0] if replica is None else arguments.integer("replica", replica, 0)
-    if number not in found.replicas:
-        raise arguments.refusal("replica", number, f"one that played, of {list(found.replicas)}")
-    place = found.replicas.index(number)
-    board, shares = found.run.game.map, stays.visits[place]
+    stays = territory.of(policy)
+    replicas = territory.fresh.replicas
+    number = replicas[0] if replica is None else replica
+    if number not in replicas:
+        raise refusal("replica", number, f"one that played, of {list(replicas)}")
+    place = replicas.index(number)
+    board, shares = territory.run.game.map, stays.visits[place]
     figure, panels = _panels(len(shares) + 1, board)
     for agent, panel in enumerate(panels[:-1]):
         _show(panel, board, _in_hue(shares[agent], agent, shares.max()))
@@ -219,15 +175,14 @@ def draw_visits(
     index, sharing = (float(stays.by_replica[name][place]) for name in (EXCLUSION, VISITORS))
     who = "random agents" if policy == "random" else "its agents"
     title = (
-        f"{found.run.path.name}, replica {number}: where {who} spend {found.episodes} episodes; "
-        f"exclusion {index:.2f}, {sharing:.1f} agents share a cell"
+        f"{territory.run.path.name}, replica {number}: where {who} spend {territory.fresh.episodes} "
+        f"episodes; exclusion {index:.2f}, {sharing:.1f} agents share a cell"
     )
     figure.suptitle(fill(title, style.TITLE_CHARACTERS), fontsize=11)
     return style.save(figure, path, colours=style.SHADES)
 
 
 def _panels(count: int, board: Map) -> tuple[Figure, list[Axes]]:
-    """A figure with so many boards, all of the same size."""
     columns = min(COLUMNS, count)
     rows = ceil(count / columns)
     wide = style.WIDTH_IN * 1.25 / columns
@@ -274,21 +229,19 @@ def _owners(panel: Axes, board: Map, shares: Array) -> None:
     hues = np.stack([_rgb(agent_colour(agent)) for agent in range(len(shares))])
     _show(panel, board, _blend(hues[owner], np.where(owner >= 0, light, 0.0)))
     for agent, share in enumerate(shares):
-        own = np.where(owner == agent, share, 0.0)
-        if own.any():
-            row, col = divmod(int(own.argmax()), board.width)
+        owned = np.where(owner == agent, share, 0.0)
+        if owned.any():
+            row, col = divmod(int(owned.argmax()), board.width)
             panel.text(col, row, str(agent), color="white", fontsize=7, ha="center", va="center_baseline")
     panel.set_title("who spends most time where", fontsize=style.SMALL_PT)
 
 
-def territory_table(found: Territory) -> Table:
+def territory_table(territory: Territory) -> Table:
     """A row for each measure of territory: mean over replicas and 95 % interval, of the run's agents and of
     random ones; a dash where it is undefined in all."""
-    title = played_in_words(found.run, len(found.replicas), found.episodes, found.seed)
-    agents = f"run's agents{how_they_play([found.run], found.greedy)}"
-    trained, random = found.trained.measures(), found.random.measures()
+    trained, random = territory.trained.measures(), territory.random.measures()
     rows = [
         (name, *(str(of_policy.get(name, "-")) for of_policy in (trained, random)))
-        for name in found.trained.by_replica
+        for name in territory.trained.by_replica
     ]
-    return table_of(f"{title}\n{INTERVALS}", ["", agents, "random"], rows)
+    return table_of(*heading_beside_random(territory.run, territory.fresh), rows)

@@ -1,8 +1,8 @@
 """The interface between the training loop and a learner."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from math import nan
-from typing import Any, Final, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -10,15 +10,10 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from cprl.checks import checked, count
-from cprl.commons.spaces import Spaces
-from cprl.learners.preferences import Preference, WantedRewards, check_preference
+from cprl.learners.preferences import WantedRewards
 from cprl.policies.assignment import AgentIndices, agent_indices
 from cprl.policies.decisions import Decider
-from cprl.system.memory import check_memory
-
-_LEAST_BYTES: Final = 4096
-"""Of a lane, whatever it learns by: its name, seeds and random number generators."""
+from cprl.values import Positive, checked
 
 
 class Learner(Protocol):
@@ -68,55 +63,8 @@ class Learner(Protocol):
         """Continues from a state that `state_dict` returned."""
 
 
-class BaseLearner:
-    """What learners of S agents of each of R replicas have in common.
-
-    Args:
-        spaces: the shape and dtype of observations, and the number of actions A.
-        agents: the indices of the agents that learn.
-        replicas: the number of replicas R; each is one world of the environment.
-        seed: the seed of the run.
-        reward_kind: what they want, see `cprl.learners.preferences`.
-
-    Raises:
-        TooLargeError: for more replicas than there is memory for, whatever they learn by.
-    """
-
-    def __init__(
-        self,
-        spaces: Spaces,
-        settings: Any,
-        *,
-        agents: Sequence[int],
-        replicas: int,
-        seed: int,
-        reward_kind: Preference,
-    ) -> None:
-        check_preference("reward_kind", reward_kind, spaces.agents)
-        if not agents or len(set(agents)) < len(agents) or not set(agents) <= set(range(spaces.agents)):
-            allowed = f"one or more of the agents 0 to {spaces.agents - 1}, each once"
-            raise ValueError(f"agents is {agents}; allowed: {allowed}")
-        checked("replicas", replicas, count(1, 2**20))
-        lanes = len(agents) * replicas
-        check_memory(f"{replicas} replicas of {len(agents)} agents", lanes * _LEAST_BYTES, "fewer replicas")
-        self.spaces, self.settings, self.agents = spaces, settings, tuple(agents)
-        self.replicas, self.seed, self.wants = replicas, seed, WantedRewards(reward_kind)
-        self.steps = 0
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}(agents={self.agents}, replicas={self.replicas})"
-
-    def end_episode(self, ended: Tensor) -> None:
-        """Does nothing where an episode has ended in the marked replicas, bool [R]."""
-
-
 class LaneLosses:
-    """Mean losses of S agents since the end of each replica's last episode.
-
-    Args:
-        replicas: the number of replicas R.
-        agents: the indices of the agents.
-    """
+    """Mean losses of S agents since the end of each replica's last episode."""
 
     def __init__(self, replicas: int, agents: tuple[int, ...]) -> None:
         self.agents = agents
@@ -137,11 +85,9 @@ class LaneLosses:
         return dict(zip(self.agents, means, strict=True))
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The sums so far."""
         return {"total": torch.tensor(self.total), "updates": torch.tensor(self.updates)}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Continues from the sums of a state."""
         self.total[:], self.updates[:] = state["total"].numpy(), state["updates"].numpy()
 
 
@@ -149,29 +95,27 @@ class WantedReturns:
     """The sums of the rewards that agents want, over the running episode of each replica.
 
     Args:
-        replicas: the number of replicas R.
         agents: the number of agents N; those that do not learn, or whose learner does not say what they want,
             have NaN.
-        learners: by the indices of their agents. What they remember of earlier episodes is cleared.
     """
 
     def __init__(self, replicas: int, agents: int, learners: Mapping[tuple[int, ...], Learner]) -> None:
-        found = {of: getattr(learner, "wants", None) for of, learner in learners.items()}
         self._wants: list[tuple[Any, WantedRewards]] = []
         self._first = np.full(agents, nan)
-        for of, wants in found.items():
+        for indices, learner in learners.items():
+            wants = getattr(learner, "wants", None)
             if isinstance(wants, WantedRewards):
                 wants.clear()
-                self._wants.append((slice(None) if len(of) == agents else list(of), wants))
-                self._first[list(of)] = 0
+                self._wants.append((slice(None) if len(indices) == agents else list(indices), wants))
+                self._first[list(indices)] = 0
         self.returns = np.tile(self._first, (replicas, 1))
 
     def add(self) -> None:
         """Adds the turn that the learners have just stored."""
-        for of, wants in self._wants:
+        for columns, wants in self._wants:
             turn: Any = wants.now
             turn = turn.numpy(force=True) if isinstance(turn, Tensor) else turn
-            self.returns[:, of] += turn[:, of]
+            self.returns[:, columns] += turn[:, columns]
 
     def take(self, replica: int) -> NDArray[np.float64]:
         """The wanted return of each agent of a replica, [N], whose next episode begins at 0."""
@@ -180,11 +124,9 @@ class WantedReturns:
         return taken
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The sums so far."""
         return {"returns": torch.tensor(self.returns)}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Continues from the sums of a state."""
         self.returns[:] = state["returns"].numpy()
 
 
@@ -240,7 +182,7 @@ def check_decisions(decisions: Decider | None, options: int) -> None:
 def check_numbers(episodes: int, update_every: int, learners: Mapping[tuple[int, ...], Learner]) -> None:
     """Raises a ValueError for numbers below 1, and for rollouts that `update_every` does not divide."""
     for name, number in (("episodes", episodes), ("update_every", update_every)):
-        checked(name, number, count(1))
+        checked(name, number, Positive)
     for learner in learners.values():
         steps = getattr(learner, "rollout_steps", update_every)
         if steps % update_every:

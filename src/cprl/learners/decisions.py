@@ -20,7 +20,6 @@ _OF_DECISIONS: Final = 16
 def decision_seeds(
     seed: int, *, replicas: Sequence[int], agents: int, purpose: int
 ) -> list[tuple[int, int, int, int]]:
-    """The seed of each lane's decisions; see `cprl.learners.lanes.lane_seeds`."""
     return lane_seeds(seed, replicas=replicas, agents=range(agents), purpose=_OF_DECISIONS + purpose)
 
 
@@ -55,13 +54,9 @@ class BanditDecider(Decider):
     """The agents of R replicas, of which some learn their decisions, beside others that do not.
 
     Args:
-        sizes: the number of choices of each ballot.
         bandits: by agent; None for those that do not learn.
         stored: the values, float64 [C] for each replica, of those that decide by what they have learned in an
             earlier run, by agent. Agents that are neither here nor have a bandit decide by chance.
-        replicas: the number of replicas R, one world each.
-        seed: the seed of the run.
-        first_replica: the index of the first replica.
     """
 
     def __init__(
@@ -85,7 +80,7 @@ class BanditDecider(Decider):
             agents=agents,
             values=values,
             epsilon=np.zeros((replicas, agents)),
-            by_chance=[own is None and agent not in stored for agent, own in enumerate(bandits)],
+            by_chance=[bandit is None and agent not in stored for agent, bandit in enumerate(bandits)],
         )
         self.bandits = tuple(bandits)
         self.times = np.zeros(values.shape, np.int64)
@@ -145,8 +140,8 @@ class BanditDecider(Decider):
 
     def get_extra_state(self) -> dict[str, Any]:
         """All that the future depends on; part of `state_dict`."""
-        own = {"values": self.values, "times": self.times, "episodes": self.episodes}
-        copies = {name: torch.tensor(array) for name, array in own.items()}
+        arrays = {"values": self.values, "times": self.times, "episodes": self.episodes}
+        copies = {name: torch.tensor(array) for name, array in arrays.items()}
         return {**super().get_extra_state(), **copies, "learned": self.learned()}
 
     def set_extra_state(self, state: Mapping[str, Any]) -> None:
@@ -168,23 +163,20 @@ def stored_decisions(
 
     Args:
         values: float64 [C] by agent and replica, see `BanditDecider.learned`; None for agents by chance.
-        replicas: the numbers of the replicas.
-        worlds: how many worlds of each replica are played side by side.
-        seed: what random numbers follow from, with the replica and the agent.
     """
     sizes = ballot_sizes(game)
     if not sizes:
         return None
-    kept = np.full((len(replicas), len(values), sum(sizes)), UNTRIED)
+    stored = np.full((len(replicas), len(values), sum(sizes)), UNTRIED)
     for agent, of_replicas in enumerate(values):
-        for place, own in enumerate(of_replicas):
-            if own is not None:
-                kept[place, agent] = own.numpy(force=True)
+        for place, of_replica in enumerate(of_replicas):
+            if of_replica is not None:
+                stored[place, agent] = of_replica.numpy(force=True)
     return Decider(
         sizes,
         seeds=decision_seeds(seed, replicas=replicas, agents=len(values), purpose=EVALUATION),
         agents=len(values),
         worlds=worlds,
-        values=kept,
+        values=stored,
         by_chance=[of_replicas[0] is None for of_replicas in values],
     )

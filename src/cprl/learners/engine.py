@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
+from dataclasses import dataclass
 from functools import partial
 from math import prod
 from typing import Any, Final, NamedTuple
@@ -33,6 +34,32 @@ MakeLoss = Callable[[nn.Module], LossModule]
 
 Weights = dict[str, Tensor]
 
+
+@dataclass(frozen=True, kw_only=True)
+class UpdateRule:
+    """How a gradient changes weights: the optimiser, clipping, and how targets follow."""
+
+    optimizer: Optimizer = "adam"
+    """The name of the optimiser of `torch.optim`."""
+    learning_rate: float
+    adam_eps: float = 1e-8
+    """The optimiser's epsilon, if it has one."""
+    loss_share: float = 1.0
+    """A factor of each loss."""
+    max_grad_norm: float | None = None
+    """The norm to which each lane's gradient is clipped; None for no clipping."""
+    tau: float | None = None
+    """The fraction by which targets move towards the weights after each update; None for hard updates by
+    `copy_to_targets` alone."""
+
+    @classmethod
+    def of(cls, settings: Any, *, loss_share: float = 1.0) -> "UpdateRule":
+        """That of the hyperparameters of an agent, as far as they say."""
+        names = ("optimizer", "learning_rate", "adam_eps", "max_grad_norm", "tau")
+        said = {name: getattr(settings, name) for name in names if hasattr(settings, name)}
+        return cls(**said, loss_share=loss_share)
+
+
 COMPILED_STEPS: Final = 16
 """The longest sequences whose update is compiled: torch unrolls their turns, and takes seconds for each."""
 
@@ -47,9 +74,6 @@ class FunctionalLoss:
 
     TorchRL stores the weights of a loss in `TensorDictParams` of the module. During a call plain TensorDicts
     replace them, which both `torch.func` and `torch.compile` accept.
-
-    Args:
-        loss: the module; its own weights are removed from it.
     """
 
     def __init__(self, loss: LossModule) -> None:
@@ -68,15 +92,15 @@ class FunctionalLoss:
         refuse_updaters(loss, _NO_UPDATER.format(type(loss).__name__))
         self.module = loss
 
-    def __call__(self, own: Weights, fixed: Weights, batch: TensorDict) -> Tensor:
+    def __call__(self, params: Weights, targets: Weights, batch: TensorDict) -> Tensor:
         """The loss of each transition, [L, b], or [b] under vmap; a single number if the loss reduces it."""
-        flat = {**own, **fixed}
+        flat = {**params, **targets}
         for name, size in self._groups.items():
-            mine = f"{name}:"
-            group = {key.removeprefix(mine): flat[key] for key in flat if key.startswith(mine)}
+            prefix = f"{name}:"
+            group = {key.removeprefix(prefix): flat[key] for key in flat if key.startswith(prefix)}
             setattr(self.module, name, TensorDict(group, size).unflatten_keys("."))
         for name in self._singles:
-            setattr(self.module, name, own[name])
+            setattr(self.module, name, params[name])
         if not torch.compiler.is_compiling():
             forget_cached_weights(self.module)
         losses = total(self.module(batch), self.module)
@@ -93,12 +117,7 @@ def own_targets(loss: LossModule) -> None:
 
 
 def total(out: Any, loss: LossModule) -> Tensor:
-    """The sum of all entries that TorchRL calls a loss.
-
-    Args:
-        out: what the loss returned.
-        loss: named in the error.
-    """
+    """The sum of all entries that TorchRL calls a loss."""
     entries = dict(out.items()) if is_tensor_collection(out) else {}
     losses = [value for name, value in entries.items() if name.startswith("loss")]
     if not losses:
@@ -115,7 +134,7 @@ def total(out: Any, loss: LossModule) -> Tensor:
 def groups_of(loss: LossModule) -> dict[str, TensorDictParams]:
     """The groups of weights of a loss by name, including targets."""
     named = loss.named_modules(remove_duplicate=False)
-    return {name: own for name, own in named if isinstance(own, TensorDictParams) and "." not in name}
+    return {name: group for name, group in named if isinstance(group, TensorDictParams) and "." not in name}
 
 
 def _single_weights(loss: LossModule) -> dict[str, nn.Parameter]:
@@ -148,9 +167,9 @@ class Stacked(NamedTuple):
     """A loss of many lanes and its weights by name, with the lane axis first."""
 
     loss: LossModule
-    own: Weights
+    params: Weights
     """The trained weights."""
-    fixed: Weights
+    targets: Weights
     """Tensors that gradients do not change: target weights and buffers."""
     names: Mapping[str, str]
     """The names in the loss of those parameters of the network that are among its weights."""
@@ -185,10 +204,9 @@ def stacked(networks: Sequence[nn.Module], make_loss: MakeLoss, *, lane_axis: bo
 
 
 def vmapped(network: nn.Module, weights: Weights, *inputs: Tensor) -> Any:
-    """The outputs of a network with the weights of each lane."""
 
-    def output(own: Weights, *seen: Tensor) -> Any:
-        return torch.func.functional_call(network, own, seen)
+    def output(of_lane: Weights, *seen: Tensor) -> Any:
+        return torch.func.functional_call(network, of_lane, seen)
 
     return torch.vmap(output)(weights, *inputs)
 
@@ -207,24 +225,20 @@ WITH_SQUARE: Final = ("adam", "adamw", *RMSPROP_ALPHAS)
 
 
 def torch_optimizer(
-    name: Optimizer,
-    parameters: Iterable[Tensor],
-    *,
-    learning_rate: float,
-    eps: float,
-    fused: bool | None = True,
+    rule: UpdateRule, parameters: Iterable[Tensor], *, fused: bool | None = True
 ) -> torch.optim.Optimizer:
     """The optimiser of one lane; `fused` where torch has such a form of it, None for torch's default."""
+    name, rate, eps = rule.optimizer, rule.learning_rate, rule.adam_eps
     if name in RMSPROP_ALPHAS:
-        return torch.optim.RMSprop(parameters, lr=learning_rate, eps=eps, alpha=RMSPROP_ALPHAS[name])
+        return torch.optim.RMSprop(parameters, lr=rate, eps=eps, alpha=RMSPROP_ALPHAS[name])
     if name == "sgd":
-        return torch.optim.SGD(parameters, lr=learning_rate, fused=fused)
+        return torch.optim.SGD(parameters, lr=rate, fused=fused)
     kind = torch.optim.Adam if name == "adam" else torch.optim.AdamW
-    return kind(parameters, lr=learning_rate, eps=eps, fused=fused)
+    return kind(parameters, lr=rate, eps=eps, fused=fused)
 
 
 def change_weights(
-    name: Optimizer,
+    rule: UpdateRule,
     weights: Sequence[Tensor],
     gradients: Sequence[Tensor],
     means: Sequence[Tensor],
@@ -232,25 +246,24 @@ def change_weights(
     *,
     step_size: Tensor,
     scale: Tensor,
-    learning_rate: float,
-    eps: float,
 ) -> None:
     """One step of all lanes, in place.
 
     Args:
         weights: [L, ...] each.
-        gradients: of each weight.
+        gradients: of each weight; clipped by their norm if the rule says so.
         means: running means of gradients; empty if the optimiser has none.
         squares: running means of squared gradients, likewise.
         step_size: Adam's learning rate with bias correction.
         scale: the bias correction of the root of Adam's `squares`.
-        learning_rate: the learning rate of the settings.
-        eps: added to denominators.
     """
+    if rule.max_grad_norm is not None:
+        gradients = shortened(gradients, rule.max_grad_norm)
+    name, rate, eps = rule.optimizer, rule.learning_rate, rule.adam_eps
     if name in WITH_MEAN:
         for weight, slope, mean, square in zip(weights, gradients, means, squares, strict=True):
             if name == "adamw":
-                weight.mul_(1 - learning_rate * ADAMW_DECAY)
+                weight.mul_(1 - rate * ADAMW_DECAY)
             mean.mul_(BETA_1).add_(slope, alpha=1 - BETA_1)
             square.mul_(BETA_2).addcmul_(slope, slope, value=1 - BETA_2)
             weight.sub_(step_size * mean / (square.sqrt() * scale + eps))
@@ -258,10 +271,10 @@ def change_weights(
         alpha = RMSPROP_ALPHAS[name]
         for weight, slope, square in zip(weights, gradients, squares, strict=True):
             square.mul_(alpha).addcmul_(slope, slope, value=1 - alpha)
-            weight.sub_(learning_rate * slope / (square.sqrt() + eps))
+            weight.sub_(rate * slope / (square.sqrt() + eps))
     else:
         for weight, slope in zip(weights, gradients, strict=True):
-            weight.sub_(slope, alpha=learning_rate)
+            weight.sub_(slope, alpha=rate)
 
 
 def shortened(gradients: Sequence[Tensor], longest: float) -> list[Tensor]:
@@ -324,44 +337,26 @@ class ListEngine(Engine):
 
     Args:
         networks: the lanes' networks; they are trained in place.
-        make_loss: makes a lane's loss from its network.
         target_networks: networks with the initial target weights; by default targets start as copies.
-        optimizer: the name of the optimiser of `torch.optim`.
-        adam_eps: its epsilon, if it has one.
-        tau: the fraction by which targets move towards the weights after each update; None for hard updates
-            by `copy_to_targets` alone.
-        loss_share: a factor of each loss.
-        max_grad_norm: the norm to which each lane's gradient is clipped; None for no clipping.
     """
 
     def __init__(
         self,
         networks: Sequence[nn.Module],
         make_loss: MakeLoss,
+        rule: UpdateRule,
         *,
         target_networks: Sequence[nn.Module] | None = None,
-        optimizer: Optimizer = "adam",
-        learning_rate: float,
-        adam_eps: float = 1e-8,
-        loss_share: float = 1.0,
-        max_grad_norm: float | None = None,
-        tau: float | None = None,
     ) -> None:
-        self._tau = tau
+        self._rule = rule
         self.parts = [list(parts_of(network).values()) for network in networks]
-        self._max_norm = max_grad_norm
         self.losses = [make_loss(network) for network in networks]
         for loss in self.losses:
             own_targets(loss)
-        self._share = loss_share
         self._start_targets(target_networks or (), make_loss)
-        self.optimizers = [
-            torch_optimizer(optimizer, loss.parameters(), learning_rate=learning_rate, eps=adam_eps)
-            for loss in self.losses
-        ]
+        self.optimizers = [torch_optimizer(rule, loss.parameters()) for loss in self.losses]
 
     def _start_targets(self, networks: Sequence[nn.Module], make_loss: MakeLoss) -> None:
-        """Gives targets the weights of other networks."""
         for loss, network in zip(self.losses, networks, strict=False):
             for name, values in targets_of(make_loss(network)).items():
                 getattr(loss, f"target_{name}").data.copy_(values.data)
@@ -371,15 +366,15 @@ class ListEngine(Engine):
 
     def learn(self, lane: int, batch: TensorDictBase) -> Tensor:
         """One step of an optimiser on a batch of one lane, [b]; returns the loss, 0-d."""
-        loss = total(self.losses[lane](batch), self.losses[lane]).mean() * self._share
+        loss = total(self.losses[lane](batch), self.losses[lane]).mean() * self._rule.loss_share
         self.optimizers[lane].zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        if self._max_norm is not None:
-            torch.nn.utils.clip_grad_norm_(self.losses[lane].parameters(), self._max_norm)
+        if self._rule.max_grad_norm is not None:
+            torch.nn.utils.clip_grad_norm_(self.losses[lane].parameters(), self._rule.max_grad_norm)
         self.optimizers[lane].step()
-        if self._tau is not None:
+        if self._rule.tau is not None:
             for weight, target in _with_targets(self.losses[lane]):
-                target.data.lerp_(weight.data, self._tau)
+                target.data.lerp_(weight.data, self._rule.tau)
         return loss.detach()
 
     def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
@@ -407,25 +402,24 @@ class ListEngine(Engine):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        for loss, own in zip(self.losses, state["losses"], strict=True):
-            loss.load_state_dict(own)
-        for optimizer, own in zip(self.optimizers, state["adams"], strict=True):
-            optimizer.load_state_dict(own)
+        for loss, weights in zip(self.losses, state["losses"], strict=True):
+            loss.load_state_dict(weights)
+        for optimizer, moments in zip(self.optimizers, state["adams"], strict=True):
+            optimizer.load_state_dict(moments)
 
 
 def stacked_outputs(networks: Sequence[nn.Module], *inputs: Tensor) -> Any:
     """The outputs of several networks: [l, k, ...] to [l, k, ...]; of recurrent ones also their states."""
-    given = [own(*seen) for own, *seen in zip(networks, *inputs, strict=True)]
+    given = [network(*seen) for network, *seen in zip(networks, *inputs, strict=True)]
     if isinstance(given[0], tuple):
         return tuple(torch.stack(each) for each in zip(*given, strict=True))
     return torch.stack(given)
 
 
 def is_finite(loss: LossModule, optimizer: torch.optim.Optimizer) -> bool:
-    """Whether all weights of a loss, including targets, and its optimiser's state are finite."""
-    kept = [value for state in optimizer.state.values() for value in state.values()]
+    moments = [value for state in optimizer.state.values() for value in state.values()]
     weights: list[Any] = list(loss.state_dict().values())
-    return all_finite(value for value in (*weights, *kept) if isinstance(value, Tensor))
+    return all_finite(value for value in (*weights, *moments) if isinstance(value, Tensor))
 
 
 def _with_targets(loss: LossModule) -> list[tuple[TensorDictParams, TensorDictParams]]:
@@ -441,14 +435,7 @@ class FunctionalEngine(Engine):
 
     Args:
         networks: the lanes' networks, of one architecture; their weights are copied.
-        make_loss: makes a lane's loss from its network.
         target_networks: networks with the initial target weights; by default targets start as copies.
-        optimizer: the name of the optimiser of `torch.optim`.
-        adam_eps: its epsilon, if it has one.
-        loss_share: a factor of each loss.
-        max_grad_norm: the norm to which each lane's gradient is clipped; None for no clipping.
-        tau: the fraction by which targets move towards the weights after each update; None for hard updates
-            by `copy_to_targets` alone.
         lane_axis: whether the networks are stacked along a lane axis; else the loss is vmapped.
         flat: with a lane axis, whether the loss gets the transitions of all lanes flat, [L x b].
         compile: whether torch compiles the step. If compilation fails, the engine warns once and runs the
@@ -459,44 +446,40 @@ class FunctionalEngine(Engine):
         self,
         networks: Sequence[nn.Module],
         make_loss: MakeLoss,
+        rule: UpdateRule,
         *,
         target_networks: Sequence[nn.Module] | None = None,
-        optimizer: Optimizer = "adam",
-        learning_rate: float,
-        adam_eps: float = 1e-8,
-        loss_share: float = 1.0,
-        max_grad_norm: float | None = None,
-        tau: float | None = None,
         lane_axis: bool,
         flat: bool = False,
         compile: bool = True,
     ) -> None:
-        loss, self.own, self.fixed, names = stacked(networks, make_loss, lane_axis=lane_axis)
+        loss, self.params, self.targets, names = stacked(networks, make_loss, lane_axis=lane_axis)
         if target_networks is not None:
-            others = stacked(target_networks, make_loss, lane_axis=lane_axis).own
-            self.fixed |= {name: others[_source(name)] for name in self.fixed if _source(name) in others}
+            others = stacked(target_networks, make_loss, lane_axis=lane_axis).params
+            self.targets |= {name: others[_source(name)] for name in self.targets if _source(name) in others}
         self._mean, self._square = (
-            {name: torch.zeros_like(value) for name, value in self.own.items() if optimizer in kept_by}
-            for kept_by in (WITH_MEAN, WITH_SQUARE)
+            {
+                name: torch.zeros_like(value)
+                for name, value in self.params.items()
+                if rule.optimizer in have_it
+            }
+            for have_it in (WITH_MEAN, WITH_SQUARE)
         )
         self.loss = FunctionalLoss(loss)
         network = stack_lanes(networks) if lane_axis else deepcopy(networks[0])
         self._parts = list(parts_of(network).items())
-        self._shared = {name: self.own[key] for name, key in names.items() if key in self.own}
+        self._shared = {name: self.params[key] for name, key in names.items() if key in self.params}
         if lane_axis:  # acts with the same tensors that updates change
             for name, parameter in network.named_parameters():
                 if name in self._shared:
                     parameter.requires_grad_(False).data = self._shared[name]
-        self._names, self._fixed_names = tuple(self.own), tuple(self.fixed)
-        groups = self.own, self.fixed, self._mean, self._square
+        self._names, self._target_names = tuple(self.params), tuple(self.targets)
+        groups = self.params, self.targets, self._mean, self._square
         self._tensors = [list(group.values()) for group in groups]
         self.steps = 0
-        kind = next(iter(self.own.values()))
+        kind = next(iter(self.params.values()))
         self._scalars = kind.new_zeros(()), kind.new_zeros(())
-        self._optimizer, self._tau = optimizer, tau
-        self._learning_rate, self._adam_eps, self._share = learning_rate, adam_eps, loss_share
-        self._max_norm = max_grad_norm
-        self._vmapped, self._flat = not lane_axis, flat
+        self._rule, self._vmapped, self._flat = rule, not lane_axis, flat
         self._is_warm = not compile
         self._compiled = Compiled(FunctionalEngine._step, what="updates run", changes=(7,), enabled=compile)
         self._compiled_on = Compiled(
@@ -536,7 +519,7 @@ class FunctionalEngine(Engine):
     def _adam_scalars(self) -> tuple[Tensor, Tensor]:
         """Adam's two bias corrections, computed once here instead of once per weight in the graph."""
         size, scale = self._scalars
-        size.fill_(self._learning_rate / (1 - BETA_1**self.steps))
+        size.fill_(self._rule.learning_rate / (1 - BETA_1**self.steps))
         scale.fill_((1 - BETA_2**self.steps) ** -0.5)
         return size, scale
 
@@ -575,50 +558,38 @@ class FunctionalEngine(Engine):
         self, batch: TensorDict, step_size: Tensor, scale: Tensor, tensors: list[list[Tensor]]
     ) -> Tensor:
         """Computes gradients, changes the weights in place and returns each lane's loss."""
-        own, fixed, means, squares = tensors
-        gradients, losses = self._gradients(own, fixed, batch)
-        if self._max_norm is not None:
-            gradients = shortened(gradients, self._max_norm)
-        change_weights(
-            self._optimizer,
-            own,
-            gradients,
-            means,
-            squares,
-            step_size=step_size,
-            scale=scale,
-            learning_rate=self._learning_rate,
-            eps=self._adam_eps,
-        )
-        if self._tau is not None:
-            for name, target in zip(self._fixed_names, fixed, strict=True):
+        params, targets, means, squares = tensors
+        gradients, losses = self._gradients(params, targets, batch)
+        change_weights(self._rule, params, gradients, means, squares, step_size=step_size, scale=scale)
+        if self._rule.tau is not None:
+            for name, target in zip(self._target_names, targets, strict=True):
                 if _source(name) in self._names:
-                    target.lerp_(own[self._names.index(_source(name))], self._tau)
+                    target.lerp_(params[self._names.index(_source(name))], self._rule.tau)
         return losses
 
     def _gradients(
-        self, own: list[Tensor], fixed: list[Tensor], batch: TensorDict
+        self, params: list[Tensor], targets: list[Tensor], batch: TensorDict
     ) -> tuple[list[Tensor], Tensor]:
         """The gradients of the trained weights, and each lane's loss."""
         gradient = torch.func.grad(self._lane_losses, has_aux=True)
         if self._vmapped:
             gradient = torch.vmap(gradient)
-        gradients, losses = gradient(own, fixed, batch)
+        gradients, losses = gradient(params, targets, batch)
         return gradients, losses
 
     def _lane_losses(
-        self, own: list[Tensor], fixed: list[Tensor], batch: TensorDict
+        self, params: list[Tensor], targets: list[Tensor], batch: TensorDict
     ) -> tuple[Tensor, Tensor]:
         """The sum of the losses of all lanes, to differentiate, and each lane's loss; under vmap there is one
         lane."""
         by_name = (
-            dict(zip(self._names, own, strict=True)),
-            dict(zip(self._fixed_names, fixed, strict=True)),
+            dict(zip(self._names, params, strict=True)),
+            dict(zip(self._target_names, targets, strict=True)),
         )
         each = self.loss(*by_name, batch.reshape(-1) if self._flat else batch)
         if self._flat:
             each = each.reshape(batch.batch_size)
-        losses = (each.mean() if self._vmapped else each.flatten(1).mean(-1)) * self._share
+        losses = (each.mean() if self._vmapped else each.flatten(1).mean(-1)) * self._rule.loss_share
         return losses.sum(), losses
 
     def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
@@ -629,13 +600,15 @@ class FunctionalEngine(Engine):
 
     def _of_part(self, name: str) -> Weights:
         """The weights of one of an agent's networks, by their names in that network."""
-        mine = f"{name}." if name else ""
-        return {key.removeprefix(mine): value for key, value in self._shared.items() if key.startswith(mine)}
+        prefix = f"{name}." if name else ""
+        return {
+            key.removeprefix(prefix): value for key, value in self._shared.items() if key.startswith(prefix)
+        }
 
     def copy_to_targets(self, which: Tensor) -> None:
-        for name, fixed in self.fixed.items():
-            if _source(name) in self.own:
-                fixed[which] = self.own[_source(name)][which]
+        for name, target in self.targets.items():
+            if _source(name) in self.params:
+                target[which] = self.params[_source(name)][which]
 
     def network_state(self, lane: int) -> Weights:
         name, network = self._parts[0]
@@ -645,9 +618,9 @@ class FunctionalEngine(Engine):
         return {**{key: value[lane].clone() for key, value in self._of_part(name).items()}, **buffers}
 
     def weights(self, lane: int) -> Weights:
-        everything = {**self.own, **self.fixed}
+        everything = {**self.params, **self.targets}
         return {
-            name: (value[lane] if self._vmapped or _source(name) in self.own else value).clone()
+            name: (value[lane] if self._vmapped or _source(name) in self.params else value).clone()
             for name, value in everything.items()
         }
 
@@ -657,8 +630,8 @@ class FunctionalEngine(Engine):
 
     def state_dict(self) -> dict[str, Any]:
         return {
-            "own": self.own,
-            "targets": self.fixed,
+            "own": self.params,
+            "targets": self.targets,
             "mean": self._mean,
             "square": self._square,
             "steps": self.steps,
@@ -666,7 +639,7 @@ class FunctionalEngine(Engine):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         # Copies into the existing tensors, which the compiled step refers to.
-        groups = {"own": self.own, "targets": self.fixed, "mean": self._mean, "square": self._square}
+        groups = {"own": self.params, "targets": self.targets, "mean": self._mean, "square": self._square}
         for group, tensors in groups.items():
             if set(state[group]) != set(tensors):
                 raise ValueError(
@@ -678,7 +651,6 @@ class FunctionalEngine(Engine):
 
 
 def _source(name: str) -> str:
-    """The name of the weight that a target copies."""
     return name.removeprefix("target_")
 
 
@@ -693,10 +665,6 @@ class SharedEngine(Engine):
 
     A network learns from the transitions of all its agents in one batch, S x b of them. The loss of a lane is
     that of its network.
-
-    Args:
-        engine: the engine of the R networks.
-        agents: the number of agents S that share a network.
     """
 
     def __init__(self, engine: Engine, agents: int) -> None:
@@ -736,8 +704,8 @@ class SharedEngine(Engine):
         """[L, k, ...] to [L, k, ...], through a function of [R, S x k, ...], or of recurrent networks of
         [R, S, k, ...]."""
         if recurrent:
-            inputs = [own.reshape(-1, self._agents, *own.shape[1:]) for own in (observation, *recurrent)]
-            return tuple(own.flatten(0, 1) for own in outputs(*inputs))
+            inputs = [seen.reshape(-1, self._agents, *seen.shape[1:]) for seen in (observation, *recurrent)]
+            return tuple(output.flatten(0, 1) for output in outputs(*inputs))
         lanes, size = observation.shape[:2]
         by_network = observation.reshape(lanes // self._agents, self._agents * size, *observation.shape[2:])
         given: Tensor = outputs(by_network)

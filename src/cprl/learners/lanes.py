@@ -1,8 +1,9 @@
 """Lanes: the agents that a learner trains in every replica, with their seeds, networks and actors."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
-from typing import Any, Final, Protocol, TypeAlias
+from typing import Annotated, Any, Final, Protocol, TypeAlias
 
 import numpy as np
 import torch
@@ -11,14 +12,15 @@ from torch import Tensor, nn
 
 from cprl import keys
 from cprl.commons.spaces import Spaces
-from cprl.learners.base import BaseLearner
-from cprl.learners.engine import Engine, SharedEngine, is_list
+from cprl.learners.engine import Engine, MakeLoss, SharedEngine, is_list
+from cprl.learners.preferences import Preference, WantedRewards, check_preference
 from cprl.learners.transitions import LaneTurn, array_of, joint_actions, lane_turn, seen_next
 from cprl.networks.agent import acting_part
 from cprl.networks.recurrent import state_cells_of
 from cprl.networks.specification import refuse_unseen
 from cprl.policies.lanes import LaneActor
 from cprl.system.memory import check_memory
+from cprl.values import Natural, Range, Value
 
 WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION, EXHIBITION, NOISE = range(7)
 """The purposes of a lane's random numbers; each has its own seed."""
@@ -35,6 +37,8 @@ _SHARED: Final = 1
 _COPIES: Final = 6
 """Of a lane's weights while it trains: as made, stacked, target, gradient and two of the optimiser."""
 _LARGEST_SEED: Final = 2**63 - 1
+_LEAST_BYTES: Final = 4096
+"""Of a lane, whatever it learns by: its name, seeds and random number generators."""
 
 
 def lane_seeds(
@@ -45,7 +49,6 @@ def lane_seeds(
 
 
 def lane_name(replica: int, agent: int) -> str:
-    """The name under which a lane's networks are stored."""
     return f"replica_{replica}/agent_{agent}"
 
 
@@ -64,46 +67,98 @@ class Acts(Protocol):
         """Copies of the current weights of one lane, as the state dict of its acting network."""
 
 
-class Lanes:
-    """R x S agents: S agents of each of R replicas. A lane is one of them, in order of replicas.
+@dataclass(frozen=True)
+class LearningAgents(Value, stored=False):
+    """Who learns: S agents of each of R replicas, what they want, and what they start from.
 
-    Args:
-        spaces: the shape and dtype of observations, and the number of actions A.
-        agents: the indices of the agents, each once.
-        replicas: the number of replicas R.
-        seed: the seed of the run.
-        first_replica: the index of the first replica.
-        make_network: makes the networks of one agent. It draws weights from torch's generator, which is
-            seeded for each lane.
-        stochastic: whether the network outputs the logits of a policy from which actions are sampled.
-        start_from: the weights with which the acting networks of lanes start, see `StartFrom`.
-        share_parameters: whether the agents of a replica share one network, initialised as that of the first.
-        sees_peers: whether a lane's stored action is that of all N agents, see `transitions.joint_actions`.
+    Made and checked once, then handed whole to the learner.
     """
+
+    spaces: Spaces
+    """The shape and dtype of observations, and the number of actions A."""
+    _: KW_ONLY
+    agents: tuple[Natural, ...]
+    """The indices of the agents, each once."""
+    replicas: Annotated[int, Range(1, 2**20)]
+    """The number of replicas R."""
+    seed: int = 0
+    """The seed of the run."""
+    first_replica: int = 0
+    """The index of the first replica, so that replica r can be trained alone."""
+    reward_kind: Preference = "individual"
+    """What they want, see `cprl.learners.preferences`."""
+    start_from: StartFrom = field(default_factory=dict)
+    """The weights with which acting networks, and their targets, start, by the lane's name; the others, such
+    as critics, are new."""
+    share_parameters: bool = False
+    """Whether the agents of a replica share one network, which learns from all of them."""
+    device: str | torch.device = "cpu"
+    """The torch device of networks, stored turns and updates."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        agents, everyone = self.agents, self.spaces.agents
+        check_preference("reward_kind", self.reward_kind, everyone)
+        if not agents or len(set(agents)) < len(agents) or not set(agents) <= set(range(everyone)):
+            raise ValueError(
+                f"agents is {agents}; allowed: one or more of the agents 0 to {everyone - 1}, each once"
+            )
+        lanes = len(agents) * self.replicas
+        check_memory(
+            f"{self.replicas} replicas of {len(agents)} agents", lanes * _LEAST_BYTES, "fewer replicas"
+        )
+
+    @property
+    def names(self) -> list[str]:
+        """The name of each agent's networks, see `lane_names`."""
+        return lane_names(replicas=self._numbers, agents=self.agents)
+
+    def seeds(self, purpose: int) -> list[tuple[int, int, int, int]]:
+        """The seed of each agent of each replica, see `lane_seeds`."""
+        return lane_seeds(self.seed, replicas=self._numbers, agents=self.agents, purpose=purpose)
+
+    @property
+    def _numbers(self) -> range:
+        return range(self.first_replica, self.first_replica + self.replicas)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """How agents learn: what an algorithm says of its networks and its loss, see `cprl.algorithms.base`."""
+
+    settings: Any
+    make_network: Callable[[], nn.Module]
+    """Makes the networks of one agent. It draws weights from torch's generator, which is seeded for each
+    lane."""
+    make_loss: MakeLoss
+    """Makes a lane's loss from its networks."""
+    make_team: MakeTeam | None = None
+    """Makes the networks of a team from those of its members; a lane is then the team of a replica."""
+    own_rewards: bool = False
+    """Whether each member of a team learns from what it wants itself, with rewards [.., S, 1]; else all have
+    the team reward, [.., 1]."""
+    noise_numbers: int = 0
+    """How many uniform numbers the loss reads for each transition, of each member of a team: the entry
+    "noise", float32 [.., noise_numbers] or [.., S, noise_numbers], from random numbers of each lane's own."""
+    stochastic: bool = False
+    """Whether networks output the logits of a policy from which actions are sampled, with no epsilon; else
+    action values, with `epsilon` of the settings."""
+    sees_peers: bool = False
+    """Whether a lane's stored action is that of all N agents, see `transitions.joint_actions`."""
+
+
+class Lanes:
+    """R x S agents: S agents of each of R replicas. A lane is one of them, in order of replicas."""
 
     member_shape: tuple[int, ...] = ()
     """The axes of the members of a lane: none, since it is one agent."""
 
-    def __init__(
-        self,
-        spaces: Spaces,
-        *,
-        agents: Sequence[int],
-        replicas: int,
-        seed: int,
-        first_replica: int,
-        make_network: Callable[[], nn.Module],
-        stochastic: bool,
-        start_from: StartFrom | None = None,
-        share_parameters: bool = False,
-        sees_peers: bool = False,
-    ) -> None:
-        refuse_unseen(spaces)
-        self.spaces, self.agents, self.replicas, self.seed = spaces, tuple(agents), replicas, seed
-        self._numbers = range(first_replica, first_replica + replicas)
-        self.make_network, self.stochastic = make_network, stochastic
-        self._start_from, self.sees_peers = start_from or {}, sees_peers
-        self.sharing = len(self.agents) if share_parameters else 1
+    def __init__(self, who: LearningAgents, method: Method) -> None:
+        refuse_unseen(who.spaces)
+        self.who, self.method = who, method
+        self.spaces, self.agents, self.replicas = who.spaces, who.agents, who.replicas
+        self.make_network = method.make_network
+        self.sharing = len(self.agents) if who.share_parameters else 1
         """The number of agents that share a network."""
         self.state_cells = 0
         """The numbers H of the state of an acting network; known once there are networks, 0 for those without
@@ -113,11 +168,6 @@ class Lanes:
         return self.replicas * len(self.agents)
 
     @property
-    def names(self) -> list[str]:
-        """The name of each agent's networks, see `lane_names`."""
-        return lane_names(replicas=self._numbers, agents=self.agents)
-
-    @property
     def observation_shape(self) -> tuple[int, ...]:
         """The shape of a lane's observation: (C, X, Y), (S, C, X, Y) of a team."""
         return *self.member_shape, *self.spaces.observation_shape
@@ -125,7 +175,7 @@ class Lanes:
     @property
     def action_shape(self) -> tuple[int, ...]:
         """The shape of a lane's stored action: (), or (N,) if it sees those of peers; (S,) of a team."""
-        return (*self.member_shape, self.spaces.agents) if self.sees_peers else self.member_shape
+        return (*self.member_shape, self.spaces.agents) if self.method.sees_peers else self.member_shape
 
     @property
     def reward_shape(self) -> tuple[int, ...]:
@@ -135,7 +185,7 @@ class Lanes:
     def turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
         """One transition of every lane, as a replay buffer stores it; see `lane_turn`."""
         turn = lane_turn(self.agents, batch, rewards)
-        if self.sees_peers:
+        if self.method.sees_peers:
             turn = turn._replace(action=joint_actions(self.agents, batch))
         if self.state_cells:
             states = self.recurrent_state(batch), self.recurrent_state(batch, keys.RECURRENT_STATE)
@@ -167,31 +217,22 @@ class Lanes:
         """Flags of replicas, [R], as flags of lanes, [L]."""
         return marked.repeat_interleave(len(self) // self.replicas)
 
-    def agent_seeds(self, purpose: int) -> list[tuple[int, int, int, int]]:
-        """The seed of each agent of each replica, see `lane_seeds`."""
-        return lane_seeds(self.seed, replicas=self._numbers, agents=self.agents, purpose=purpose)
-
     def seeds(self, purpose: int) -> list[tuple[int, int, int, int]]:
         """The seed of each lane; that of a team is its first member's."""
-        return self.agent_seeds(purpose)
+        return self.who.seeds(purpose)
 
-    def new_networks(self, purpose: int, device: str | torch.device) -> list[nn.Module]:
+    def new_networks(self, purpose: int) -> list[nn.Module]:
         """New networks for each lane, or for each replica whose agents share one; the acting ones with the
         weights to start from, if there are any.
-
-        Raises:
-            TooLargeError: if the device has less memory than training all of them takes.
         """
-        first, *others = self.agent_seeds(purpose)[:: self.sharing]
+        first, *others = self.who.seeds(purpose)[:: self.sharing]
         networks = [init_network(self.make_network, first)]
-        _check_networks(networks[0], 1 + len(others), device)
+        _check_networks(networks[0], 1 + len(others), self.who.device)
         self.state_cells = state_cells_of(acting_part(networks[0]))
         networks += [init_network(self.make_network, seed) for seed in others]
         for place, network in enumerate(networks):
-            start, *same = (
-                self._start_from.get(name, {})
-                for name in self.names[place * self.sharing : (place + 1) * self.sharing]
-            )
+            names = self.who.names[place * self.sharing : (place + 1) * self.sharing]
+            start, *same = (self.who.start_from.get(name, {}) for name in names)
             if any(not _equal(start, weights) for weights in same):
                 raise ValueError(
                     f"the agents {list(self.agents)} would start from different weights; allowed for agents "
@@ -199,7 +240,7 @@ class Lanes:
                 )
             if start:
                 acting_part(network).load_state_dict(start)
-        return [network.to(device) for network in networks]
+        return [network.to(self.who.device) for network in networks]
 
     def by_lane(self, engine: Engine) -> Engine:
         """An engine of the lanes, from that of their networks."""
@@ -215,7 +256,6 @@ class Lanes:
         return self._actor(self.by_member(engine), EXPLORATION, compile=compile)
 
     def evaluation_actor(self, engine: Acts, worlds: int, *, epsilon: float) -> LaneActor:
-        """The actor of evaluation: the current weights, for `worlds` worlds of each replica."""
         actor = self._actor(self.by_member(engine), EVALUATION, worlds=worlds)
         actor.epsilon = epsilon
         return actor
@@ -224,10 +264,10 @@ class Lanes:
         return LaneActor(
             members.outputs,
             self.spaces.actions,
-            seeds=self.agent_seeds(purpose),
+            seeds=self.who.seeds(purpose),
             agents=len(self.agents),
             worlds=worlds,
-            stochastic=self.stochastic,
+            stochastic=self.method.stochastic,
             state_cells=self.state_cells,
             compile=compile,
         )
@@ -235,10 +275,9 @@ class Lanes:
     def states(self, engine: Acts) -> dict[str, dict[str, Tensor]]:
         """The state dict of each agent's acting network, by "replica_0/agent_0" and so on."""
         members = self.by_member(engine)
-        return {name: members.network_state(lane) for lane, name in enumerate(self.names)}
+        return {name: members.network_state(lane) for lane, name in enumerate(self.who.names)}
 
     def networks(self, engine: Acts) -> dict[str, nn.Module]:
-        """A copy of each agent's current acting network, by "replica_0/agent_0" and so on."""
         made = {}
         for name, weights in self.states(engine).items():
             made[name] = acting_part(self.make_network())
@@ -250,21 +289,17 @@ class Teams(Lanes):
     """Lanes that hold all members of a team instead of one agent: lane r is the team of replica r.
 
     Each member has the seeds of initial weights and exploration that it would have as an independent agent.
-
-    Args:
-        spaces: as of `Lanes`, with the following ones.
-        make_team: makes a team's networks from those of its members. Parts that it adds are initialised from
-            torch's generator, which is seeded for each team.
-        own_rewards: whether a replay buffer stores what each member wants; else one reward of the team.
+    Parts that `make_team` adds are initialised from torch's generator, which is seeded for each team.
     """
 
-    def __init__(self, spaces: Spaces, *, make_team: MakeTeam, own_rewards: bool = False, **how: Any) -> None:
-        super().__init__(spaces, **how)
-        if self.sees_peers:
+    def __init__(self, who: LearningAgents, method: Method) -> None:
+        super().__init__(who, method)
+        assert method.make_team is not None
+        if method.sees_peers:
             raise ValueError(
                 "sees_peers is True; allowed for a team: False; its members' actions are stored together"
             )
-        self._make_team, self._own_rewards = make_team, own_rewards
+        self._make_team = make_team = method.make_team
         self.member_shape = (len(self.agents),)
         form = init_network(
             lambda: make_team(self._shared([self.make_network() for _ in range(self._networks)])),
@@ -286,18 +321,17 @@ class Teams(Lanes):
 
     @property
     def reward_shape(self) -> tuple[int, ...]:
-        return self.member_shape if self._own_rewards else ()
+        return self.member_shape if self.method.own_rewards else ()
 
     def seeds(self, purpose: int) -> list[tuple[int, int, int, int]]:
-        return self.agent_seeds(purpose)[:: len(self.agents)]
+        return self.who.seeds(purpose)[:: len(self.agents)]
 
-    def new_networks(self, purpose: int, device: str | torch.device) -> list[nn.Module]:
-        """New networks for each team."""
-        members, size = super().new_networks(purpose, device), self._networks
+    def new_networks(self, purpose: int) -> list[nn.Module]:
+        members, size = super().new_networks(purpose), self._networks
         made = []
         for replica, seed in enumerate(self.seeds(purpose)):
             of_team = self._shared(members[replica * size : (replica + 1) * size])
-            made.append(init_network(partial(self._make_team, of_team), (*seed, _SHARED)).to(device))
+            made.append(init_network(partial(self._make_team, of_team), (*seed, _SHARED)).to(self.who.device))
         return made
 
     def turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
@@ -308,7 +342,7 @@ class Teams(Lanes):
             rewards: of all agents, [R, N]; those of a team without `own_rewards` all the same.
         """
         turn = self.rollout_turn(batch, rewards)
-        return turn if self._own_rewards else turn._replace(reward=turn.reward[:, 0])
+        return turn if self.method.own_rewards else turn._replace(reward=turn.reward[:, 0])
 
     def rollout_turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
         """One transition of every team, as a rollout stores it: as `turn`, with rewards [R, S]."""
@@ -339,12 +373,30 @@ class Teams(Lanes):
         return _Members(engine, self._acting, len(self.agents))
 
 
+class BaseLearner:
+    """What learners of S agents of each of R replicas have in common."""
+
+    def __init__(self, who: LearningAgents, settings: Any) -> None:
+        self.who, self.settings, self.wants = who, settings, WantedRewards(who.reward_kind)
+        self.spaces, self.agents, self.replicas = who.spaces, who.agents, who.replicas
+        self.steps = 0
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(agents={self.agents}, replicas={self.replicas})"
+
+    def end_episode(self, ended: Tensor) -> None:
+        """Does nothing where an episode has ended in the marked replicas, bool [R]."""
+
+
 class LaneLearner(BaseLearner):
     """What learners have in common whose lanes are updated together by an engine."""
 
     engine: Any
     actor: LaneActor
-    _lanes: Lanes
+
+    def __init__(self, who: LearningAgents, method: Method) -> None:
+        super().__init__(who, method.settings)
+        self._lanes = Teams(who, method) if method.make_team else Lanes(who, method)
 
     @property
     def lanes(self) -> int:
@@ -353,20 +405,16 @@ class LaneLearner(BaseLearner):
 
     @property
     def present(self) -> Acts:
-        """The present weights."""
         acts: Acts = self.engine
         return acts
 
     def evaluation_actor(self, worlds: int) -> LaneActor:
-        """An actor with the current weights, for `worlds` worlds of each replica."""
         return self._lanes.evaluation_actor(self.present, worlds, epsilon=0.0)
 
     def networks(self) -> dict[str, nn.Module]:
-        """A copy of each lane's current acting network, by "replica_0/agent_0" and so on."""
         return self._lanes.networks(self.present)
 
     def finite(self) -> Tensor:
-        """Whether the weights, targets and optimiser state of each agent are finite, bool [R, S]."""
         return self._lanes.by_agent(self.engine.finite())
 
     def state_dict(self) -> dict[str, Any]:
@@ -383,7 +431,6 @@ class LaneLearner(BaseLearner):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from the state of a learner made with the same arguments."""
         self.engine.load_state_dict(state["update"])
         self.actor.rng.load_state_dict(state["exploration"])
         self.steps = int(state["steps"])
@@ -394,9 +441,7 @@ class _Members:
     """Presents an engine of teams as one of their members, with lane = replica x S + member.
 
     Args:
-        engine: the engine whose lanes are teams.
         form: the acting network of a team, of which architecture alone matters.
-        members: the number of members S.
     """
 
     def __init__(self, engine: Acts, form: Any, members: int) -> None:
@@ -415,7 +460,6 @@ class _Members:
         return given.transpose(1, 2).flatten(0, 1)
 
     def network_state(self, lane: int) -> dict[str, Tensor]:
-        """The weights of one member."""
         replica, member = divmod(lane, self._members)
         state: dict[str, Tensor] = self._form.member_state(self._engine.network_state(replica), member)
         return state

@@ -10,48 +10,33 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from cprl.commons.spaces import Spaces
 from cprl.learners.engine import (
     BETA_1,
     BETA_2,
     WITH_MEAN,
     WITH_SQUARE,
+    UpdateRule,
     change_weights,
-    shortened,
     total,
 )
-from cprl.learners.lanes import WEIGHTS, Acts, LaneLearner, Lanes, StartFrom
-from cprl.learners.preferences import Preference
+from cprl.learners.lanes import WEIGHTS, Acts, LaneLearner, LearningAgents, Method
 from cprl.learners.rollouts import refuse_full, refuse_other_parts, rollout_fields, write_turn
-from cprl.learners.settings import LOLASettings, Optimizer
+from cprl.learners.settings import LOLASettings
 from cprl.learners.transitions import wanted_in
 from cprl.networks.finite import finite_lanes
 from cprl.networks.stacked import lane_state, stack_lanes
 from cprl.objectives import LOLADiCELoss, dice_objective
 
 _SMALL: Final = 1e-8
-_CRITIC_EPS: Final = 1e-8
 
 
 class Steps:
-    """An optimiser of the parameters of S members, [R, ...] each.
+    """An optimiser of the parameters of S members, [R, ...] each; it clips the gradients of each member of
+    each replica."""
 
-    Args:
-        parameters: of each member.
-        max_grad_norm: the norm to which the gradient of each member of each replica is clipped, or None.
-    """
-
-    def __init__(
-        self,
-        parameters: Sequence[Sequence[nn.Parameter]],
-        *,
-        name: Optimizer,
-        learning_rate: float,
-        eps: float,
-        max_grad_norm: float | None = None,
-    ) -> None:
-        self._parameters, self._name, self._rate, self._eps = parameters, name, learning_rate, eps
-        self._longest, self.count = max_grad_norm, 0
+    def __init__(self, parameters: Sequence[Sequence[nn.Parameter]], rule: UpdateRule) -> None:
+        self._parameters, self._rule, self.count = parameters, rule, 0
+        name = rule.optimizer
         self.means = [[torch.zeros_like(value) for value in of] for of in parameters if name in WITH_MEAN]
         self.squares = [[torch.zeros_like(value) for value in of] for of in parameters if name in WITH_SQUARE]
 
@@ -61,29 +46,25 @@ class Steps:
         flat = [value for of in self._parameters for value in of]
         slopes = list(torch.autograd.grad(loss, flat))
         for member, of in enumerate(self._parameters):
-            mine, slopes = slopes[: len(of)], slopes[len(of) :]
+            gradients, slopes = slopes[: len(of)], slopes[len(of) :]
             change_weights(
-                self._name,
+                self._rule,
                 [value.data for value in of],
-                mine if self._longest is None else shortened(mine, self._longest),
+                gradients,
                 self.means[member] if self.means else (),
                 self.squares[member] if self.squares else (),
-                step_size=mine[0].new_tensor(self._rate / (1 - BETA_1**self.count)),
-                scale=mine[0].new_tensor((1 - BETA_2**self.count) ** -0.5),
-                learning_rate=self._rate,
-                eps=self._eps,
+                step_size=gradients[0].new_tensor(self._rule.learning_rate / (1 - BETA_1**self.count)),
+                scale=gradients[0].new_tensor((1 - BETA_2**self.count) ** -0.5),
             )
 
-    def kept(self, member: int) -> list[Tensor]:
+    def moments(self, member: int) -> list[Tensor]:
         """What it keeps of a member, [R, ...] each."""
         return [value for of in (self.means, self.squares) if of for value in of[member]]
 
     def state_dict(self) -> dict[str, Any]:
-        """Its running means and its count of steps; the tensors themselves."""
         return {"count": self.count, "means": self.means, "squares": self.squares}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a state that `state_dict` returned."""
         self.count = int(state["count"])
         for name in ("means", "squares"):
             copy_all(getattr(self, name), state[name])
@@ -92,8 +73,8 @@ class Steps:
 def copy_all(values: Sequence[Sequence[Tensor]], state: Sequence[Sequence[Tensor]]) -> None:
     """Copies the tensors of each member into its own, in place."""
     for of, others in zip(values, state, strict=True):
-        for own, other in zip(of, others, strict=True):
-            own.copy_(other)
+        for value, other in zip(of, others, strict=True):
+            value.copy_(other)
 
 
 class MemberStacks:
@@ -111,7 +92,9 @@ class MemberStacks:
         """[R, .., S, *shape] to [R, .., S, outputs]."""
         form: Any = self._forms[0]
         seen = observation.unbind(-1 - form.observation_dims)
-        return torch.stack([own(of) for own, of in zip(self.networks, seen, strict=True)], -2)
+        return torch.stack(
+            [network(of_member) for network, of_member in zip(self.networks, seen, strict=True)], -2
+        )
 
     def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Tensor:
         """[R x S, k, *shape] to [R x S, k, outputs]; there is one part, 0."""
@@ -119,7 +102,6 @@ class MemberStacks:
         return self.of_members(by_replica).transpose(1, 2).flatten(0, 1)
 
     def network_state(self, lane: int) -> dict[str, Tensor]:
-        """Copies of the weights of one lane's network."""
         replica, member = divmod(lane, len(self.networks))
         return lane_state(self.networks[member], replica)
 
@@ -128,11 +110,10 @@ class MemberStacks:
         return [list(network.parameters()) for network in self.networks]
 
     def copy_from(self, other: "MemberStacks", members: Sequence[int]) -> None:
-        """Takes the weights of some members, in place."""
         for member in members:
             pairs = zip(self.parameters()[member], other.parameters()[member], strict=True)
-            for own, value in pairs:
-                own.data.copy_(value.data)
+            for parameter, value in pairs:
+                parameter.data.copy_(value.data)
 
 
 class LOLANetworks:
@@ -140,7 +121,6 @@ class LOLANetworks:
 
     Args:
         networks: `AgentNetworks` of "actor" and "critic" for each lane, replica by replica.
-        members: the number of members S.
         make_loss: makes the loss from an `nn.ModuleList` of the members' networks.
     """
 
@@ -155,33 +135,25 @@ class LOLANetworks:
         stacks: list[Any] = [stack_lanes(networks[member::members]) for member in range(members)]
         forms = networks[:members]
         actors, critics = (
-            ([own[name] for own in stacks], [own[name] for own in forms]) for name in ("actor", "critic")
+            ([stack[name] for stack in stacks], [form[name] for form in forms])
+            for name in ("actor", "critic")
         )
         self.acting, self.critics = MemberStacks(*actors), MemberStacks(*critics)
         self.playing = MemberStacks(deepcopy(actors[0]), actors[1])
         self.loss = make_loss(nn.ModuleList(stacks))
         looks = isinstance(self.loss, LOLADiCELoss)
         self.ahead = MemberStacks(deepcopy(actors[0]), actors[1]) if looks else None
-        self.policy_steps = Steps(
-            self.acting.parameters(),
-            name=settings.optimizer,
-            learning_rate=settings.learning_rate,
-            eps=settings.adam_eps,
-            max_grad_norm=settings.max_grad_norm,
-        )
+        self.policy_steps = Steps(self.acting.parameters(), UpdateRule.of(settings))
         self.critic_steps = Steps(
-            self.critics.parameters(),
-            name="adam",
-            learning_rate=settings.critic_learning_rate,
-            eps=_CRITIC_EPS,
+            self.critics.parameters(), UpdateRule(learning_rate=settings.critic_learning_rate)
         )
 
     def play(self, member: int | None) -> None:
         """From now on all act by their present weights; with a member, the others by those ahead."""
         everyone = range(len(self.acting.networks))
-        self.playing.copy_from(self.acting, [own for own in everyone if member in (None, own)])
+        self.playing.copy_from(self.acting, [other for other in everyone if member in (None, other)])
         if member is not None and self.ahead is not None:
-            self.playing.copy_from(self.ahead, [own for own in everyone if own != member])
+            self.playing.copy_from(self.ahead, [other for other in everyone if other != member])
 
     def look_ahead(self, rollouts: TensorDict) -> None:
         """Puts the weights ahead to those after a naive step, from rollouts [R, B, T] of the present ones."""
@@ -191,11 +163,10 @@ class LOLANetworks:
             of_loss = self.loss.actors_params.get(str(member)).items(True, True)
             names = {value.data_ptr(): key for key, value in of_loss}
             pairs = zip(self.acting.parameters()[member], self.ahead.parameters()[member], strict=True)
-            for own, then in pairs:
-                then.data.copy_(table.get(names[own.data_ptr()]))
+            for parameter, then in pairs:
+                then.data.copy_(table.get(names[parameter.data_ptr()]))
 
     def update_policies(self, rollouts: TensorDict) -> None:
-        """One step of all policies."""
         self.policy_steps.descend(total(self.loss(rollouts), self.loss))
 
     def update_critics(self, observation: Tensor, target: Tensor) -> None:
@@ -209,33 +180,36 @@ class LOLANetworks:
         self.critic_steps.descend(error.mean((1, 2)).sum())
 
     def finite(self) -> Tensor:
-        """Whether all weights and what the optimisers keep are finite, of each member, bool [R, S]."""
-        stacks = [own for own in (self.acting, self.critics, self.playing, self.ahead) if own is not None]
         each = []
         for member in range(len(self.acting.networks)):
-            weights: list[Tensor] = [value for own in stacks for value in own.parameters()[member]]
-            kept = [value for own in (self.policy_steps, self.critic_steps) for value in own.kept(member)]
-            each.append(finite_lanes([*weights, *kept]))
+            weights = [value for stacks in self._stacks().values() for value in stacks.parameters()[member]]
+            moments = [
+                value for steps in (self.policy_steps, self.critic_steps) for value in steps.moments(member)
+            ]
+            each.append(finite_lanes([*weights, *moments]))
         return torch.stack(each, -1)
 
     def state_dict(self) -> dict[str, Any]:
-        """The full state; the tensors themselves, not copies."""
         return {
-            **{name: _data(own) for name, own in self._stacks().items()},
+            **{name: _data(stacks) for name, stacks in self._stacks().items()},
             "policy_steps": self.policy_steps.state_dict(),
             "critic_steps": self.critic_steps.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a state that `state_dict` returned."""
-        for name, own in self._stacks().items():
-            copy_all(_data(own), state[name])
+        for name, stacks in self._stacks().items():
+            copy_all(_data(stacks), state[name])
         self.policy_steps.load_state_dict(state["policy_steps"])
         self.critic_steps.load_state_dict(state["critic_steps"])
 
     def _stacks(self) -> dict[str, MemberStacks]:
-        found = {"actors": self.acting, "critics": self.critics, "playing": self.playing}
-        return found if self.ahead is None else {**found, "ahead": self.ahead}
+        stacks = {
+            "actors": self.acting,
+            "critics": self.critics,
+            "playing": self.playing,
+            "ahead": self.ahead,
+        }
+        return {name: stack for name, stack in stacks.items() if stack is not None}
 
 
 def _data(stacks: MemberStacks) -> list[list[Tensor]]:
@@ -252,61 +226,28 @@ class LOLALearner(LaneLearner):
 
     Each replica learns exactly as it would alone. Updates are not compiled.
 
-    Arguments that are not listed are those of `ReplayLearner`.
-
     Args:
-        agents: the indices of the S members, two or more.
-        make_network: makes a member's "actor" and "critic".
-        make_loss: makes the loss, a `LOLALoss` or `LOLADiCELoss`, from an `nn.ModuleList` of the members'
-            networks.
+        who: the members, two or more; `start_from` is that of actors, critics are new.
+        method: makes a member's "actor" and "critic", and the loss, a `LOLALoss` or `LOLADiCELoss`, from an
+            `nn.ModuleList` of the members' networks.
         compile: whether torch compiles acting.
-        start_from: the weights with which actors start, by the lane's name; critics are new.
-
-    Raises:
-        TooLargeError: if the device has less memory than rollouts and networks take.
     """
 
     settings: LOLASettings
     engine: LOLANetworks
 
-    def __init__(
-        self,
-        spaces: Spaces,
-        *,
-        agents: Sequence[int],
-        replicas: int,
-        settings: LOLASettings,
-        make_network: Callable[[], nn.Module],
-        make_loss: Callable[[nn.Module], LossModule],
-        seed: int = 0,
-        first_replica: int = 0,
-        reward_kind: Preference = "individual",
-        compile: bool = True,
-        start_from: StartFrom | None = None,
-        device: str | torch.device = "cpu",
-    ) -> None:
-        super().__init__(
-            spaces, settings, agents=agents, replicas=replicas, seed=seed, reward_kind=reward_kind
-        )
-        self._lanes = Lanes(
-            spaces,
-            agents=agents,
-            replicas=replicas,
-            seed=seed,
-            first_replica=first_replica,
-            make_network=make_network,
-            stochastic=True,
-            start_from=start_from,
-        )
-        networks = self._lanes.new_networks(WEIGHTS, device)
+    def __init__(self, who: LearningAgents, method: Method, *, compile: bool = True) -> None:
+        super().__init__(who, method)
+        settings: LOLASettings = method.settings
+        networks = self._lanes.new_networks(WEIGHTS)
         refuse_other_parts(networks[0])
-        self.engine = LOLANetworks(networks, members=len(agents), make_loss=make_loss, settings=settings)
+        members = len(self.agents)
+        self.engine = LOLANetworks(networks, members=members, make_loss=method.make_loss, settings=settings)
         self._looks_ahead = isinstance(self.engine.loss, LOLADiCELoss)
-        self.rollouts = 1 + len(agents) if self._looks_ahead else 2
+        self.rollouts = 1 + members if self._looks_ahead else 2
         """The number P of rollouts that an update takes."""
         self.actor = self._lanes.actor(self.engine.playing, compile=compile)
-        size = self.rollouts, settings.rollout_steps
-        self._rollouts = rollout_fields(spaces, self._lanes, size, torch.device(device))
+        self._rollouts = rollout_fields(self._lanes, (self.rollouts, settings.rollout_steps))
         self._size, self._phase = 0, 0
 
     @property
@@ -315,7 +256,6 @@ class LOLALearner(LaneLearner):
 
     @property
     def rollout_steps(self) -> int:
-        """The length of a rollout, in steps."""
         return self.settings.rollout_steps
 
     def begin(self) -> None:
@@ -324,7 +264,6 @@ class LOLALearner(LaneLearner):
         self.engine.play(None)
 
     def store(self, batch: TensorDictBase) -> None:
-        """Stores one step of every replica, as the collector yields it."""
         refuse_full(self._size, self.rollout_steps)
         turn = self._lanes.rollout_turn(batch, wanted_in(self.wants, batch))
         write_turn(self._rollouts, (self._phase, self._size), turn)
@@ -360,7 +299,6 @@ class LOLALearner(LaneLearner):
         self.engine.play(member)
 
     def _columns(self, rollouts: int) -> dict[str, Tensor]:
-        """The fields of the first rollouts, [R, P, T, S, ...]."""
         size = self.replicas, len(self.agents)
         return {
             name: field[:rollouts].reshape(rollouts, -1, *size, *field.shape[3:]).movedim(2, 0)

@@ -94,14 +94,8 @@ Preference: TypeAlias = Literal["individual", "team"] | InequityAversion | Socia
 own with those of others."""
 
 
-def check_preference(name: str, preference: Preference, agents: int) -> None:
-    """Refuses what is no preference, or none for a game of so few agents.
-
-    Args:
-        name: what it is called in messages.
-        preference: a value of `Preference`.
-        agents: the number of agents N of the game.
-    """
+def check_preference(name: str, preference: Any, agents: int) -> None:
+    """Refuses what is no preference, or none for a game of so few agents."""
     checked(name, preference, Preference)
     if agents < 2 and not isinstance(preference, str):
         raise ValueError(
@@ -142,15 +136,15 @@ def _wanted(preference: Preference, rewards: Array, smoothed: Array | None) -> t
         return rewards, None
     if preference == "team":
         return _of_kind(rewards).ones_like(rewards) * rewards.sum(-1)[:, None], None
-    own = _double(rewards)
+    given = _double(rewards)
     if isinstance(preference, InequityAversion):
-        now = own if smoothed is None else preference.smoothing * smoothed + own
-        return _single(own - _dislike(preference, now)), now
-    of_others = (own.sum(-1)[:, None] - own) / (own.shape[1] - 1)
+        now = given if smoothed is None else preference.smoothing * smoothed + given
+        return _single(given - _dislike(preference, now)), now
+    of_others = (given.sum(-1)[:, None] - given) / (given.shape[1] - 1)
     if isinstance(preference, SocialValueOrientation):
-        return _single(own - preference.weight * _off(preference.angle, own, of_others)), None
+        return _single(given - preference.weight * _off(preference.angle, given, of_others)), None
     assert isinstance(preference, Exchange)
-    return _single((1 - preference.share) * own + preference.share * of_others), None
+    return _single((1 - preference.share) * given + preference.share * of_others), None
 
 
 def _dislike(preference: InequityAversion, smoothed: Array) -> Array:
@@ -161,12 +155,12 @@ def _dislike(preference: InequityAversion, smoothed: Array) -> Array:
     return loss
 
 
-def _off(angle: float, own: Array, of_others: Array) -> Array:
+def _off(angle: float, given: Array, of_others: Array) -> Array:
     """How far each agent's share is from the one it likes, radians [B, N]; 0 where nobody gets anything."""
-    kind = _of_kind(own)
-    plain = abs(kind.arctan2(of_others, own) - angle)
+    kind = _of_kind(given)
+    plain = abs(kind.arctan2(of_others, given) - angle)
     shorter = kind.where(plain > pi, 2 * pi - plain, plain)
-    return kind.where((own == 0) & (of_others == 0), kind.zeros_like(own), shorter)
+    return kind.where((given == 0) & (of_others == 0), kind.zeros_like(given), shorter)
 
 
 def _of_kind(array: Array) -> Any:
@@ -174,7 +168,6 @@ def _of_kind(array: Array) -> Any:
 
 
 def _double(array: Array) -> Array:
-    """A copy in float64."""
     return array.to(torch.float64, copy=True) if isinstance(array, Tensor) else array.astype(np.float64)
 
 
@@ -206,7 +199,8 @@ class WantedRewards:
         self._listed = listed
         kinds: Any = dict.fromkeys(listed) if listed else [preferences]
         self._columns = {
-            own: [agent for agent, other in enumerate(listed or ()) if other == own] for own in kinds
+            preference: [agent for agent, other in enumerate(listed or ()) if other == preference]
+            for preference in kinds
         }
         self._smoothed: dict[Preference, Array] = {}
         self._agents: int | None = None
@@ -220,8 +214,8 @@ class WantedRewards:
                 f"preferences has {len(self._listed)} entries; allowed: one preference for all agents, "
                 f"or one for each of {agents}"
             )
-        for own in self._columns:
-            check_preference("preferences", own, agents)
+        for preference in self._columns:
+            check_preference("preferences", preference, agents)
         self._agents = agents
 
     def add(self, rewards: Array, ended: Array) -> Array:
@@ -240,29 +234,29 @@ class WantedRewards:
         for preference, columns in self._columns.items():
             before = self._before(preference, rewards)
             with np.errstate(all="ignore"):
-                own, after = _wanted(preference, rewards, before)
+                of_preference, after = _wanted(preference, rewards, before)
             if after is not None:
                 after[ended] = 0
                 self._smoothed[preference] = after
             if not self._listed:
-                wanted = own
+                wanted = of_preference
             else:
-                wanted = _of_kind(own).zeros_like(_single(rewards)) if wanted is None else wanted
-                wanted[:, columns] = _single(own)[:, columns]
+                wanted = _of_kind(of_preference).zeros_like(_single(rewards)) if wanted is None else wanted
+                wanted[:, columns] = _single(of_preference)[:, columns]
         self.now = wanted
         return wanted
 
     def _before(self, preference: Preference, rewards: Array) -> Array | None:
         """What is remembered, as the same kind of array as rewards."""
-        kept = self._smoothed.get(preference)
-        if kept is None:
+        smoothed = self._smoothed.get(preference)
+        if smoothed is None:
             return None
-        if kept.shape != rewards.shape:
+        if smoothed.shape != rewards.shape:
             raise ValueError(
-                f"rewards is {list(rewards.shape)}; allowed: {list(kept.shape)}, as in the turn before, "
+                f"rewards is {list(rewards.shape)}; allowed: {list(smoothed.shape)}, as in the turn before, "
                 "or clear() before"
             )
-        return _like(kept, rewards)
+        return _like(smoothed, rewards)
 
     def clear(self, worlds: Array | None = None) -> None:
         """Forgets the episodes of the marked worlds, bool [B]; by default of all."""
@@ -270,28 +264,31 @@ class WantedRewards:
         if worlds is None:
             self._smoothed = {}
             return
-        for preference, kept in self._smoothed.items():
-            left = kept.clone() if isinstance(kept, Tensor) else kept.copy()
-            left[_like(worlds, kept)] = 0
+        for preference, smoothed in self._smoothed.items():
+            left = smoothed.clone() if isinstance(smoothed, Tensor) else smoothed.copy()
+            left[_like(worlds, smoothed)] = 0
             self._smoothed[preference] = left
 
     def state_dict(self) -> dict[str, Tensor]:
         """What is remembered: "smoothed" float64 [K, B, N], for each of the K preferences that remember, in
         the order of their first agents; empty if nothing is."""
-        kept = [torch.as_tensor(self._smoothed[own]) for own in self._columns if own in self._smoothed]
-        return {"smoothed": torch.stack(kept)} if kept else {}
+        tables = [
+            torch.as_tensor(self._smoothed[preference])
+            for preference in self._columns
+            if preference in self._smoothed
+        ]
+        return {"smoothed": torch.stack(tables)} if tables else {}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Continues from a state that `state_dict` returned."""
-        remember = [own for own in self._columns if isinstance(own, InequityAversion)]
-        kept = state.get("smoothed")
-        if kept is not None and (kept.ndim != 3 or len(kept) != len(remember)):
+        remember = [preference for preference in self._columns if isinstance(preference, InequityAversion)]
+        smoothed = state.get("smoothed")
+        if smoothed is not None and (smoothed.ndim != 3 or len(smoothed) != len(remember)):
             raise ValueError(
-                f'"smoothed" of the state is {list(kept.shape)}; allowed: [{len(remember)}, worlds, agents], '
-                "a table for each preference that remembers"
+                f'"smoothed" of the state is {list(smoothed.shape)}; allowed: [{len(remember)}, worlds, '
+                "agents], a table for each preference that remembers"
             )
         self.now = None
-        self._smoothed = {} if kept is None else dict(zip(remember, kept.clone(), strict=True))
+        self._smoothed = {} if smoothed is None else dict(zip(remember, smoothed.clone(), strict=True))
 
 
 class PreferenceTransform(Transform):
@@ -338,11 +335,10 @@ class PreferenceTransform(Transform):
         return tensordict_reset
 
     def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
-        """The rewards may be any number."""
         given = reward_spec[self.in_keys[0]] if isinstance(reward_spec, Composite) else None
         if given is None or len(given.shape) < 2 or given.shape[-1] != 1:
-            found = None if given is None else list(given.shape)
-            raise ValueError(f"the rewards are {found}; allowed: [..., agents, 1], at {self.in_keys[0]!r}")
+            shape = None if given is None else list(given.shape)
+            raise ValueError(f"the rewards are {shape}; allowed: [..., agents, 1], at {self.in_keys[0]!r}")
         self.wants.check_agents(given.shape[-2])
         reward_spec[self.out_keys[0]] = Unbounded(shape=given.shape, dtype=torch.float32, device=given.device)
         return reward_spec
@@ -359,7 +355,6 @@ class PreferenceTransform(Transform):
         return self.wants.state_dict().get("smoothed", torch.zeros(0))
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Continues from it."""
         self.wants.load_state_dict({"smoothed": state} if state.numel() else {})
 
 
@@ -370,7 +365,6 @@ class PreferenceWrapper(BaseParallelWrapper[str, Any, Any]):
     reward of 0.
 
     Args:
-        env: the environment, e.g. `cprl.envs.parallel_env(game)`.
         preferences: what all agents want; or a preference for each of `env.possible_agents`.
     """
 
@@ -395,7 +389,6 @@ class PreferenceWrapper(BaseParallelWrapper[str, Any, Any]):
     def step(
         self, actions: dict[str, Any]
     ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        """Plays one turn."""
         seen, given, terminations, truncations, infos = self.env.step(actions)
         everyone = self.env.possible_agents
         of_turn = np.array([[given.get(agent, 0.0) for agent in everyone]], np.float32)
@@ -403,5 +396,7 @@ class PreferenceWrapper(BaseParallelWrapper[str, Any, Any]):
         infos = {
             agent: {**infos.get(agent, {}), "env_reward": float(reward)} for agent, reward in given.items()
         }
-        rewards = {agent: float(own) for agent, own in zip(everyone, wanted, strict=True) if agent in given}
+        rewards = {
+            agent: float(reward) for agent, reward in zip(everyone, wanted, strict=True) if agent in given
+        }
         return seen, rewards, terminations, truncations, infos

@@ -8,6 +8,7 @@ to say what the fast learners compute, and what these are tested against.
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
+from dataclasses import replace
 from math import prod
 from typing import Any, Final
 
@@ -22,14 +23,13 @@ from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.objectives.value import GAE
 
-from cprl.commons.spaces import Spaces
 from cprl.custom import Custom, made
-from cprl.learners.engine import Engine, ListEngine, MakeLoss, targets_of, torch_optimizer
-from cprl.learners.lanes import NOISE, SAMPLING, Lanes, seed_of
+from cprl.learners.engine import Engine, ListEngine, MakeLoss, UpdateRule, targets_of, torch_optimizer
+from cprl.learners.lanes import NOISE, SAMPLING, Lanes, LearningAgents, Method, seed_of
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.ring import Noise, torch_dtype
 from cprl.learners.rollouts import ACTOR, CRITIC, RolloutLearner, states_in
-from cprl.learners.settings import DQNSettings, Optimizer, RolloutSettings
+from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.learners.transitions import LaneTurn
 from cprl.learners.trial import EngineName, refuse_other_advantages, refuse_other_outputs
 from cprl.networks.agent import parts_of
@@ -50,24 +50,13 @@ class StockEngine(ListEngine):
         self,
         networks: Sequence[nn.Module],
         make_loss: MakeLoss,
+        rule: UpdateRule,
         *,
         target_networks: Sequence[nn.Module] | None = None,
-        optimizer: Optimizer,
-        learning_rate: float,
-        adam_eps: float,
-        tau: float | None = None,
-        loss_share: float = 1.0,
-        max_grad_norm: float | None = None,
     ) -> None:
-        how: dict[str, Any] = {"optimizer": optimizer, "learning_rate": learning_rate, "adam_eps": adam_eps}
-        super().__init__(networks, make_loss, loss_share=loss_share, max_grad_norm=max_grad_norm, **how)
-        self.optimizers = [
-            torch_optimizer(
-                optimizer, loss.parameters(), learning_rate=learning_rate, eps=adam_eps, fused=None
-            )
-            for loss in self.losses
-        ]
-        self.updaters = [_target_updater(loss, tau) for loss in self.losses]
+        super().__init__(networks, make_loss, replace(rule, tau=None))
+        self.optimizers = [torch_optimizer(rule, loss.parameters(), fused=None) for loss in self.losses]
+        self.updaters = [_target_updater(loss, rule.tau) for loss in self.losses]
         self._start_targets(target_networks or (), make_loss)  # the updaters have made them copies
 
     def update(self, ring: "Any") -> Tensor:
@@ -88,7 +77,6 @@ class StockEngine(ListEngine):
 
 
 def _target_updater(loss: LossModule, tau: float | None) -> TargetNetUpdater | None:
-    """The target updater of a loss; None if the loss has no targets."""
     if not targets_of(loss):
         return None
     # HardUpdate copies at every (interval + 1)-th step.
@@ -99,21 +87,15 @@ class StockBuffers:
     """A `TensorDictReplayBuffer` for each agent, of a `LazyTensorStorage`.
 
     Args:
-        make_sampler: makes an agent's sampler.
         noise_shape: of the numbers that the loss reads with each transition; () for none.
-        device: the torch device of the buffers.
     """
 
     def __init__(
-        self,
-        lanes: Lanes,
-        settings: DQNSettings,
-        make_sampler: MakeSampler,
-        noise_shape: Sequence[int],
-        device: torch.device,
+        self, lanes: Lanes, settings: DQNSettings, make_sampler: MakeSampler, noise_shape: Sequence[int]
     ) -> None:
-        self._lanes, self._settings, self._make_sampler, self._device = lanes, settings, make_sampler, device
-        of_batch = settings.batch_size, noise_shape, device
+        self._lanes, self._settings, self._make_sampler = lanes, settings, make_sampler
+        self._device = torch.device(lanes.who.device)
+        of_batch = settings.batch_size, noise_shape, self._device
         self._noise = [Noise([seed], *of_batch) for seed in lanes.seeds(NOISE) if noise_shape]
         self._clear()
 
@@ -122,7 +104,7 @@ class StockBuffers:
         return len(self.each[0])
 
     def _clear(self) -> None:
-        self._generators = _generators(self._lanes, self._device)
+        self._generators = _generators(self._lanes)
         self.each = [self._buffer(lane, generator) for lane, generator in enumerate(self._generators)]
         self._last: list[TensorDict] = []  # turns that `MultiStepTransform` holds back
 
@@ -186,14 +168,13 @@ class StockBuffers:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from these entries."""
         self._clear()
         self._last = [_nested(turn) for turn in state["last"]]
         for lane, buffer in enumerate(self.each):
             self._hold_back(lane)
             _load(buffer, self._generators[lane], state["buffers"][lane])
-        for noise, kept in zip(self._noise, state["noise"], strict=True):
-            noise.rng.load_state_dict(kept)
+        for noise, numbers in zip(self._noise, state["noise"], strict=True):
+            noise.rng.load_state_dict(numbers)
 
 
 class TorchRLReplayLearner(ReplayLearner):
@@ -201,19 +182,17 @@ class TorchRLReplayLearner(ReplayLearner):
 
     They explore through `LaneActor`, not `EGreedyModule`, which uses torch's global generator: a replica's
     actions would depend on the replicas that train beside it.
-
-    Arguments that are not listed are those of `ReplayLearner`.
-
-    Args:
-        make_sampler: makes an agent's sampler; by default a `RandomSampler`.
     """
 
     takes_transforms = True
     engine: StockEngine
 
-    def __init__(self, spaces: Spaces, *, make_sampler: MakeSampler | None = None, **how: Any) -> None:
+    def __init__(
+        self, who: LearningAgents, method: Method, *, make_sampler: MakeSampler | None = None
+    ) -> None:
+        _refuse_sharing(who)
         self._make_sampler = make_sampler or _random_sampler
-        super().__init__(spaces, **how)
+        super().__init__(who, method)
 
     def _refuse_other_sequences(self) -> None:
         steps = self.settings.sequence_steps
@@ -230,25 +209,29 @@ class TorchRLReplayLearner(ReplayLearner):
     def _make_engine(
         self,
         networks: Sequence[nn.Module],
-        make_loss: MakeLoss,
+        targets: Sequence[nn.Module] | None,
         trial: TensorDict,
         *,
         name: EngineName | None,
         compile: bool,
-        target_networks: Sequence[nn.Module] | None,
     ) -> Engine:
+        make_loss = self._lanes.method.make_loss
         refuse_other_outputs(make_loss(deepcopy(networks[0])), trial[0])
-        return StockEngine(networks, make_loss, target_networks=target_networks, **self._of_engine())
+        return StockEngine(networks, make_loss, self._rule(), target_networks=targets)
 
     def _make_buffer(self) -> StockBuffers:
-        device = torch.device(self._shapes["device"])
-        _check_buffers(self._lanes, self.settings, device)
-        return StockBuffers(
-            self._lanes, self.settings, self._make_sampler, self._shapes["noise_shape"], device
-        )
+        _check_buffers(self._lanes, self.settings)
+        return StockBuffers(self._lanes, self.settings, self._make_sampler, self._form.noise_shape)
 
     def update(self) -> Tensor | None:
         return super().update() if len(self.buffer) else None
+
+
+def _refuse_sharing(who: LearningAgents) -> None:
+    if who.share_parameters:
+        raise ValueError(
+            'share_parameters is True; allowed with engine="torchrl", which trains independent agents: False'
+        )
 
 
 def _random_sampler(lane: int) -> RandomSampler:
@@ -261,23 +244,21 @@ class TorchRLRolloutLearner(RolloutLearner):
 
     Every `rollout_steps` steps TorchRL's `GAE` adds advantages, and the loss is taken `epochs` times over
     minibatches from a `TensorDictReplayBuffer` with a `SamplerWithoutReplacement`.
-
-    Arguments that are not listed are those of `RolloutLearner`.
-
-    Args:
-        make_sampler: makes an agent's sampler of minibatches; by default a `SamplerWithoutReplacement`.
     """
 
     engine: StockEngine
 
-    def __init__(self, spaces: Spaces, *, make_sampler: MakeSampler | None = None, **how: Any) -> None:
-        super().__init__(spaces, **how)
+    def __init__(
+        self, who: LearningAgents, method: Method, *, make_sampler: MakeSampler | None = None
+    ) -> None:
+        _refuse_sharing(who)
+        super().__init__(who, method)
         settings = self.settings
         self.estimators = [_gae(parts[CRITIC], settings) for parts in self.engine.parts]
-        self._generators = _generators(self._lanes, self._device)
+        self._generators = _generators(self._lanes)
         self.buffers = [
             TensorDictReplayBuffer(
-                storage=LazyTensorStorage(settings.rollout_steps, device=self._device),
+                storage=LazyTensorStorage(settings.rollout_steps, device=who.device),
                 sampler=make_sampler(lane) if make_sampler else SamplerWithoutReplacement(),
                 batch_size=settings.minibatch_size,
                 generator=generator,
@@ -286,20 +267,20 @@ class TorchRLRolloutLearner(RolloutLearner):
         ]
 
     def _make_engine(
-        self, networks: Sequence[nn.Module], make_loss: MakeLoss, *, name: EngineName | None, compile: bool
+        self, networks: Sequence[nn.Module], *, name: EngineName | None, compile: bool
     ) -> Engine:
         if states_in(networks[0]):
             raise ValueError(
                 'the networks are recurrent; allowed with engine="torchrl", whose minibatches are single '
                 'turns: MLP, Conv, Custom; engine="compiled" and "eager" learn from sequences'
             )
-        network = deepcopy(networks[0])
+        network, make_loss = deepcopy(networks[0]), self._lanes.method.make_loss
         loss, parts, trial = make_loss(network), list(parts_of(network).values()), self._trial(1)[0]
         refuse_other_advantages(loss, self.settings)
         _gae(parts[CRITIC], self.settings)(trial)
         _add_old_policy(trial, parts[ACTOR])
         refuse_other_outputs(loss, trial)
-        return StockEngine(networks, make_loss, **self._of_engine())
+        return StockEngine(networks, make_loss, UpdateRule.of(self.settings))
 
     def update(self) -> Tensor | None:
         if self._size < self.rollout_steps:
@@ -322,16 +303,18 @@ class TorchRLRolloutLearner(RolloutLearner):
     def state_dict(self) -> dict[str, Any]:
         """The full state of all agents. The buffers are refilled from each rollout, so only the states of
         their generators are stored."""
-        return {**super().state_dict(), "generators": [own.get_state() for own in self._generators]}
+        return {
+            **super().state_dict(),
+            "generators": [generator.get_state() for generator in self._generators],
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         super().load_state_dict(state)
-        for generator, kept in zip(self._generators, state["generators"], strict=True):
-            generator.set_state(kept.cpu())
+        for generator, drawn in zip(self._generators, state["generators"], strict=True):
+            generator.set_state(drawn.cpu())
 
 
 def _gae(critic: nn.Module, settings: RolloutSettings) -> GAE:
-    """TorchRL's GAE with a critic's current weights."""
     return GAE(
         gamma=settings.gamma,
         lmbda=settings.gae_lambda,
@@ -350,8 +333,9 @@ def _add_old_policy(rollout: TensorDict, actor: nn.Module) -> None:
     rollout.update({"logits": logits, "action_log_prob": chosen})
 
 
-def _generators(lanes: Lanes, device: torch.device) -> list[torch.Generator]:
+def _generators(lanes: Lanes) -> list[torch.Generator]:
     """A random number generator for the sampling of each agent, seeded by its own seed alone."""
+    device = lanes.who.device
     return [torch.Generator(device).manual_seed(seed_of(seed)) for seed in lanes.seeds(SAMPLING)]
 
 
@@ -365,12 +349,9 @@ def _transitions(turn: Mapping[str, Any], size: list[int]) -> TensorDict:
     return TensorDict({**now, "next": TensorDict(following, size)}, size)
 
 
-def _check_buffers(lanes: Lanes, settings: DQNSettings, device: torch.device) -> None:
+def _check_buffers(lanes: Lanes, settings: DQNSettings) -> None:
     """Checks memory in advance: stock storage holds the observations before and after each transition, and
     its pages are only committed as they fill, so a machine with too little would fail hours later.
-
-    Raises:
-        TooLargeError: if the device has less memory than the buffers need.
     """
     spaces = lanes.spaces
     observation = prod(spaces.observation_shape) * torch_dtype(spaces.observation_dtype).itemsize
@@ -381,7 +362,7 @@ def _check_buffers(lanes: Lanes, settings: DQNSettings, device: torch.device) ->
         f"the replay buffers of {len(lanes)} agents x {settings.buffer_size:,} transitions",
         wanted,
         'a smaller buffer_size or batch_size, fewer replicas, or engine="compiled", which needs half',
-        device=device,
+        device=lanes.who.device,
     )
 
 
@@ -406,9 +387,9 @@ def _transformed(batch: TensorDict, transforms: Sequence[Custom]) -> TensorDict:
 def _state_of(buffer: TensorDictReplayBuffer, generator: torch.Generator) -> dict[str, Any]:
     """The full state of a replay buffer, with the written transitions only: the state dict of
     `TensorDictReplayBuffer` includes all allocated memory."""
-    kept = len(buffer)
-    transitions = buffer.storage.get(slice(0, kept)) if kept else None
-    if transitions is not None and kept < buffer.storage.max_size:
+    size = len(buffer)
+    transitions = buffer.storage.get(slice(0, size)) if size else None
+    if transitions is not None and size < buffer.storage.max_size:
         transitions = transitions.clone()
     return {
         "transitions": {} if transitions is None else _plain(transitions),
@@ -420,7 +401,6 @@ def _state_of(buffer: TensorDictReplayBuffer, generator: torch.Generator) -> dic
 
 
 def _load(buffer: TensorDictReplayBuffer, generator: torch.Generator, state: Mapping[str, Any]) -> None:
-    """Fills an empty replay buffer from what `_state_of` gave."""
     if state["transitions"]:
         transitions = _nested(state["transitions"]).to(buffer.storage.device)
         buffer.storage.set(torch.arange(len(transitions)), transitions)

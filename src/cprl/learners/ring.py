@@ -8,6 +8,7 @@ TensorDicts with the keys that TorchRL's losses read.
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from math import prod
 from typing import Any, Final, NamedTuple
 
@@ -34,6 +35,37 @@ class Horizon(NamedTuple):
 
     steps: int
     gamma: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransitionForm:
+    """What a lane stores of a turn, and what is sampled of it."""
+
+    observation_shape: tuple[int, ...]
+    """(C, X, Y); (S, C, X, Y) if a lane is a team of S agents."""
+    observation_dtype: str = "uint8"
+    action_shape: tuple[int, ...] = ()
+    """Of a lane's action: () for one agent, (S,) for a team."""
+    reward_shape: tuple[int, ...] = ()
+    """Of a lane's reward: (S,) for a team whose members have their own, else ()."""
+    noise_shape: tuple[int, ...] = ()
+    """Of the uniform numbers that the loss reads with each transition: the entry "noise", float32
+    [L, b, *noise_shape]; () for none."""
+    horizon: Horizon | None = None
+    """Steps and discount of n-step returns, sampled in place of rewards; None for single steps."""
+    state_cells: int = 0
+    """The numbers K of the state of a lane's recurrent network; 0 for one without."""
+    sequence_steps: int = 1
+    """Turns of sampled sequences; 1 for transitions."""
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return torch_dtype(self.observation_dtype)
+
+    def stored_bytes(self, lanes: int, transitions: int) -> int:
+        row = prod(self.observation_shape) * self.dtype.itemsize + 4 * self.state_cells
+        beside = 8 * prod(self.action_shape) + 4 * prod(self.reward_shape) + 8 + 1 + 1
+        return lanes * (_rows(transitions) * row + transitions * beside)
 
 
 def gather(fields: Fields, index: Tensor, rows: int, horizon: Horizon | None = None) -> TensorDict:
@@ -92,8 +124,8 @@ def sequences(fields: Fields, index: Tensor, rows: int, steps: int) -> TensorDic
     lane = torch.arange(lanes, device=index.device)[:, None]
     row, states = fields["row"][places, lane], fields[STATE]
     for owner, at in ((batch, row), (batch["next"], row + 1)):
-        found = states.index_select(0, (lane * rows + at % rows).reshape(-1))
-        owner.set(STATE, found.reshape(*places.shape, *states.shape[1:]))
+        rows_read = states.index_select(0, (lane * rows + at % rows).reshape(-1))
+        owner.set(STATE, rows_read.reshape(*places.shape, *states.shape[1:]))
     turns: TensorDict = batch.reshape(lanes, size, steps)
     ends = (turns["next", "done"] | turns["next", "terminated"]).squeeze(-1)
     is_init = torch.cat([torch.ones_like(ends[..., :1]), ends[..., :-1]], -1)
@@ -147,21 +179,6 @@ def torch_dtype(name: str) -> torch.dtype:
     return dtype
 
 
-def storage_bytes(
-    lanes: int,
-    transitions: int,
-    observation_shape: Sequence[int],
-    *,
-    action_shape: Sequence[int] = (),
-    reward_shape: Sequence[int] = (),
-    item_bytes: int = 1,
-    state_cells: int = 0,
-) -> int:
-    """Bytes that a `Ring` allocates, with `item_bytes` for one number of an observation; else as `Ring`."""
-    windows = _rows(transitions) * (prod(observation_shape) * item_bytes + 4 * state_cells)
-    return lanes * (windows + transitions * (8 * prod(action_shape) + 4 * prod(reward_shape) + 8 + 1 + 1))
-
-
 def _rows(transitions: int) -> int:
     """Observation rows per lane: one per transition, those for the ends of episodes, and at most two per step
     until the next check for overwritten rows."""
@@ -174,14 +191,7 @@ def steps_ahead(count: int) -> int:
 
 
 class Noise:
-    """Uniform numbers in 0..1 for losses that sample: a batch of them for each update and lane.
-
-    Args:
-        seeds: the seed of each of the L lanes; a lane's numbers depend on it alone.
-        batch_size: transitions b of a lane's batch.
-        shape: of the numbers of a transition.
-        device: the device of the batches.
-    """
+    """Uniform numbers in 0..1 for losses that sample: a batch of them for each update and lane."""
 
     def __init__(
         self, seeds: Sequence[Sequence[int]], batch_size: int, shape: Sequence[int], device: torch.device
@@ -191,7 +201,6 @@ class Noise:
         self.rng = LaneRng(seeds, count, ahead=steps_ahead(count))
 
     def next(self) -> Tensor:
-        """The numbers of the next batch, float32 [L, b, *shape]."""
         return self.rng.next().view(self._size).to(self._device, torch.float32)
 
 
@@ -203,16 +212,7 @@ class Ring:
         seeds: the sampling seed of each of the L lanes; a lane's samples depend on it alone.
         transitions: the capacity per lane, T.
         batch_size: transitions b sampled per lane, or sequences.
-        observation_shape: (C, X, Y); (S, C, X, Y) if a lane is a team of S agents.
-        action_shape: the shape of a lane's action: () for one agent, (S,) for a team.
-        reward_shape: the shape of a lane's reward: (S,) for a team whose members have their own, else ().
-        noise_shape: of the uniform numbers that the loss reads with each transition: the entry "noise",
-            float32 [L, b, *noise_shape]; () for none.
-        noise_seeds: the seed of the numbers of each lane; by default `seeds`.
-        horizon: steps and discount of n-step returns, sampled in place of rewards; None for single steps.
-        state_cells: the numbers K of the state of a lane's recurrent network; 0 for one without.
-        sequence_steps: turns of sampled sequences; 1 for transitions.
-        device: the device of the tensors.
+        noise_seeds: the seed of the noise of each lane; by default `seeds`.
 
     The size is logged before allocation, under "cprl", if it is a mebibyte or more.
 
@@ -222,35 +222,21 @@ class Ring:
 
     def __init__(
         self,
+        form: TransitionForm,
         *,
         seeds: Sequence[Sequence[int]],
         transitions: int,
         batch_size: int,
-        observation_shape: Sequence[int],
-        action_shape: Sequence[int] = (),
-        reward_shape: Sequence[int] = (),
-        noise_shape: Sequence[int] = (),
         noise_seeds: Sequence[Sequence[int]] | None = None,
-        observation_dtype: str = "uint8",
-        horizon: Horizon | None = None,
-        state_cells: int = 0,
-        sequence_steps: int = 1,
         device: str | torch.device = "cpu",
     ) -> None:
-        self.horizon, self.sequence_steps, self.capacity = horizon, sequence_steps, transitions
+        self.horizon, self.sequence_steps, self.capacity = form.horizon, form.sequence_steps, transitions
         self.lanes, self.rows, self.device = len(seeds), _rows(transitions), torch.device(device)
-        lanes, dtype = self.lanes, torch_dtype(observation_dtype)
-        needed = storage_bytes(
-            lanes,
-            transitions,
-            observation_shape,
-            action_shape=action_shape,
-            reward_shape=reward_shape,
-            item_bytes=dtype.itemsize,
-            state_cells=state_cells,
+        lanes, shape, dtype = self.lanes, form.observation_shape, form.dtype
+        windows = lanes * batch_size * form.sequence_steps * 2
+        _check_memory(
+            form.stored_bytes(lanes, transitions), windows * prod(shape) * (dtype.itemsize + 4), self
         )
-        windows = lanes * batch_size * sequence_steps * 2
-        _check_memory(needed, windows * prod(observation_shape) * (dtype.itemsize + 4), self)
 
         def allocate(*shape: int, kind: torch.dtype) -> Tensor:
             if self.device.type != "cpu":
@@ -260,9 +246,9 @@ class Ring:
             return torch.from_numpy(np.zeros(shape, array_of(torch.empty(0, dtype=kind)).dtype))
 
         self.fields: Fields = {
-            "observation": allocate(lanes * self.rows, *observation_shape, kind=dtype),
-            "action": allocate(transitions, lanes, *action_shape, kind=torch.int64),
-            "reward": allocate(transitions, lanes, *reward_shape, kind=torch.float32),
+            "observation": allocate(lanes * self.rows, *shape, kind=dtype),
+            "action": allocate(transitions, lanes, *form.action_shape, kind=torch.int64),
+            "reward": allocate(transitions, lanes, *form.reward_shape, kind=torch.float32),
             "done": allocate(transitions, lanes, kind=torch.bool),
             "terminated": allocate(transitions, lanes, kind=torch.bool),
             "row": allocate(transitions, lanes, kind=torch.int64),
@@ -270,8 +256,8 @@ class Ring:
         """Observations [L x rows, ...], actions and rewards [T, L, ...], the rest [T, L]; `row` counts the
         observations that a lane has written. A state [L x rows, K] stands in the row of the observation that
         the lane saw next."""
-        if state_cells:
-            self.fields[STATE] = allocate(lanes * self.rows, state_cells, kind=torch.float32)
+        if form.state_cells:
+            self.fields[STATE] = allocate(lanes * self.rows, form.state_cells, kind=torch.float32)
         self._of_rows = [name for name in self.fields if name in ("observation", STATE)]
         # Steps are written with numpy on the CPU: for so few numbers torch takes five times as long.
         self._arrays = {name: array_of(field) for name, field in self.fields.items()}
@@ -283,7 +269,9 @@ class Ring:
         self._written = 0
         self.rng = LaneRng(seeds, batch_size)
         self.noise = (
-            Noise(noise_seeds or seeds, batch_size, noise_shape, self.device) if noise_shape else None
+            Noise(noise_seeds or seeds, batch_size, form.noise_shape, self.device)
+            if form.noise_shape
+            else None
         )
 
     def __len__(self) -> int:
@@ -362,10 +350,10 @@ class Ring:
     def state_dict(self) -> dict[str, Any]:
         """The written part of all fields, and the states of random numbers; once the ring is full, the
         tensors themselves, not copies."""
-        kept = len(self)
+        written = len(self)
         used = min(self.rows, int(self._next_row.max()) + 1)
         stored = {
-            **{name: _part(array, array[:kept]) for name, array in self.fields.items()},
+            **{name: _part(array, array[:written]) for name, array in self.fields.items()},
             **{name: _part(rows, rows[:, :used]) for name, rows in self._by_row().items()},
             "next_row": torch.as_tensor(self._next_row),
             "begins": torch.as_tensor(self._begins),
@@ -376,7 +364,6 @@ class Ring:
         return {"storage": stored, "sampler": self.rng.state_dict(), **noise}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from the state of a ring with the same sizes."""
         self.rng.load_state_dict(state["sampler"])
         if self.noise is not None:
             self.noise.rng.load_state_dict(state["noise"])

@@ -1,6 +1,6 @@
 """RolloutLearner: independent on-policy agents, all of them in one update."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from math import prod
 from typing import Any, Final, NamedTuple
@@ -10,16 +10,15 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from cprl.commons.spaces import Spaces
-from cprl.learners.engine import COMPILED_STEPS, Engine, MakeLoss
-from cprl.learners.lanes import SAMPLING, WEIGHTS, LaneLearner, Lanes, MakeTeam, StartFrom, Teams
-from cprl.learners.preferences import Preference
-from cprl.learners.ring import steps_ahead, torch_dtype
+from cprl.learners.engine import COMPILED_STEPS, Engine, UpdateRule
+from cprl.learners.lanes import SAMPLING, WEIGHTS, LaneLearner, Lanes, LearningAgents, Method
+from cprl.learners.ring import TransitionForm, steps_ahead, torch_dtype
 from cprl.learners.settings import RolloutSettings
 from cprl.learners.transitions import LaneTurn, refuse_other_dtype, wanted_in
 from cprl.learners.trial import (
     TRIAL_LANES,
     EngineName,
+    fitting_engine,
     make_engine,
     reads,
     refuse_other_advantages,
@@ -73,15 +72,11 @@ class States:
     states in Kapturowski et al., "Recurrent Experience Replay in Distributed Reinforcement Learning" (2019).
 
     Args:
-        shapes: of the states of one lane, see `states_in`.
         sequence: turns T' of a minibatch.
-        device: where.
     """
 
-    def __init__(
-        self, shapes: Mapping[str, tuple[int, ...]], lanes: Lanes, *, sequence: int, device: Any
-    ) -> None:
-        self._lanes, self._sequence = lanes, sequence
+    def __init__(self, shapes: Mapping[str, tuple[int, ...]], lanes: Lanes, *, sequence: int) -> None:
+        self._lanes, self._sequence, device = lanes, sequence, lanes.who.device
         self._first = {name: torch.zeros(len(lanes), *shape, device=device) for name, shape in shapes.items()}
         self._ended = torch.ones(len(lanes), dtype=torch.bool, device=device)
         """Whether the episode of a lane ended with the last turn of the rollout before."""
@@ -95,12 +90,7 @@ class States:
         self._first[NAMES[ACTOR]].copy_(self._lanes.recurrent_state(batch))
 
     def evaluate(self, engine: Engine, columns: Mapping[str, Tensor]) -> Evaluated:
-        """Evaluates a full rollout, and keeps the critic's states for the next one.
-
-        Args:
-            engine: the networks.
-            columns: the fields of the rollout, [L, T, ...].
-        """
+        """Evaluates a full rollout, and keeps the critic's states for the next one."""
         began, states = self._began(columns["done"]), {}
         logits, states[NAMES[ACTOR]], _ = self._in_order(engine, columns, began, ACTOR)
         value, states[NAMES[CRITIC]], after = self._in_order(engine, columns, began, CRITIC)
@@ -117,8 +107,6 @@ class States:
         """The value of the state after the latest turn.
 
         Args:
-            engine: the networks.
-            columns: the fields of the rollout, [L, T, ...].
             size: the turns that it has so far; 0 directly after a rollout.
             seen_next: the observations after the latest turn, [L, 1, ...].
         """
@@ -155,13 +143,11 @@ class States:
         return order.unsqueeze(-1) * self._sequence + torch.arange(self._sequence)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The tensors themselves, not copies."""
         return {**self._first, "ended": self._ended}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Continues from a state."""
-        for name, own in self.state_dict().items():
-            own.copy_(state[name])
+        for name, value in self.state_dict().items():
+            value.copy_(state[name])
 
 
 class RolloutLearner(LaneLearner):
@@ -171,70 +157,37 @@ class RolloutLearner(LaneLearner):
     `epochs` epochs. Each lane shuffles its own minibatches, and learns exactly as it would alone. Minibatches
     of recurrent networks are consecutive steps, and the update of more than `COMPILED_STEPS` is not compiled.
 
-    Arguments that are not listed are those of `ReplayLearner`.
-
     Args:
-        make_network: makes an agent's "actor" and "critic", see `cprl.algorithms.on_policy`.
-        make_team: for agents that learn as a team: makes its "actor" and "critic" from the networks of its
-            members, see `cprl.algorithms.teams`; a lane is then the team of a replica.
-
-    Raises:
-        TooLargeError: if the device has less memory than rollouts and networks take.
+        method: makes networks that are "actor" and "critic", see `cprl.algorithms.on_policy`.
     """
 
     settings: RolloutSettings
 
     def __init__(
         self,
-        spaces: Spaces,
+        who: LearningAgents,
+        method: Method,
         *,
-        agents: Sequence[int],
-        replicas: int,
-        settings: RolloutSettings,
-        make_network: Callable[[], nn.Module],
-        make_loss: MakeLoss,
-        make_team: MakeTeam | None = None,
-        seed: int = 0,
-        first_replica: int = 0,
-        reward_kind: Preference = "individual",
         engine: EngineName | None = None,
         compile: bool = True,
-        start_from: StartFrom | None = None,
-        share_parameters: bool = False,
-        device: str | torch.device = "cpu",
     ) -> None:
-        super().__init__(
-            spaces, settings, agents=agents, replicas=replicas, seed=seed, reward_kind=reward_kind
-        )
-        how: dict[str, Any] = {
-            "agents": agents,
-            "replicas": replicas,
-            "seed": seed,
-            "first_replica": first_replica,
-            "make_network": make_network,
-            "stochastic": True,
-            "start_from": start_from,
-            "share_parameters": share_parameters,
-        }
-        self._lanes = Teams(spaces, make_team=make_team, **how) if make_team else Lanes(spaces, **how)
-        self._device = torch.device(device)
-        networks = self._lanes.new_networks(WEIGHTS, device)
+        super().__init__(who, method)
+        settings: RolloutSettings = method.settings
+        networks = self._lanes.new_networks(WEIGHTS)
         refuse_other_parts(networks[0])
-        shapes = states_in(networks[0])
-        sequence = settings.minibatch_size
-        self._states = States(shapes, self._lanes, sequence=sequence, device=device) if shapes else None
-        self.engine = self._make_engine(networks, make_loss, name=engine, compile=compile)
+        shapes, sequence = states_in(networks[0]), settings.minibatch_size
+        self._states = States(shapes, self._lanes, sequence=sequence) if shapes else None
+        self.engine = self._make_engine(networks, name=engine, compile=compile)
         self.actor = self._lanes.actor(self.engine, compile=compile)
         steps = settings.rollout_steps
         self.rng = LaneRng(self._lanes.seeds(SAMPLING), steps, ahead=steps_ahead(steps))
-        self._rollout = rollout_fields(spaces, self._lanes, (steps,), self._device)
+        self._rollout = rollout_fields(self._lanes, (steps,))
         self._size = 0
 
     def _make_engine(
-        self, networks: Sequence[nn.Module], make_loss: MakeLoss, *, name: EngineName | None, compile: bool
+        self, networks: Sequence[nn.Module], *, name: EngineName | None, compile: bool
     ) -> Engine:
-        """The engine of all lanes."""
-        settings, shapes = self.settings, states_in(networks[0])
+        settings, shapes, make_loss = self.settings, states_in(networks[0]), self._lanes.method.make_loss
         loss = make_loss(deepcopy(networks[0]))
         refuse_other_advantages(loss, settings)
         self._reads_logits = reads(loss, "logits")
@@ -243,31 +196,22 @@ class RolloutLearner(LaneLearner):
             actions=self.spaces.actions if self._reads_logits else None,
             states=shapes,
         )
+        name = name or fitting_engine(networks[:TRIAL_LANES], make_loss, trial)
         is_short = not shapes or settings.minibatch_size <= COMPILED_STEPS
-        engine = make_engine(
-            name, networks, make_loss, compile=compile and is_short, trial=trial, **self._of_engine()
-        )
+        rule = UpdateRule.of(settings)
+        engine = make_engine(name, networks, make_loss, rule, compile=compile and is_short)
         return self._lanes.by_lane(engine)
 
-    def _of_engine(self) -> dict[str, Any]:
-        """The arguments of an engine that the settings say."""
-        names = "optimizer", "learning_rate", "adam_eps", "max_grad_norm"
-        return {name: getattr(self.settings, name) for name in names}
-
     def _trial(self, lanes: int) -> TensorDict:
-        """Synthetic transitions of so many lanes."""
-        return trial_batch(
-            lanes,
-            self._lanes.observation_shape,
-            self.spaces.actions,
-            action_shape=self._lanes.action_shape,
+        form = TransitionForm(
+            observation_shape=self._lanes.observation_shape,
             observation_dtype=self.spaces.observation_dtype,
-            device=self._device,
+            action_shape=self._lanes.action_shape,
         )
+        return trial_batch(lanes, form, self.spaces.actions, device=self.who.device)
 
     @property
     def rollout_steps(self) -> int:
-        """The length of a rollout, in steps."""
         return self.settings.rollout_steps
 
     def begin(self) -> None:
@@ -277,7 +221,6 @@ class RolloutLearner(LaneLearner):
             self._states.forget()
 
     def store(self, batch: TensorDictBase) -> None:
-        """Stores one step of every replica, as the collector yields it."""
         refuse_full(self._size, self.rollout_steps)
         if self._states is not None and not self._size:
             self._states.begin(batch)
@@ -330,7 +273,6 @@ class RolloutLearner(LaneLearner):
         )
 
     def _evaluated(self, columns: Mapping[str, Tensor]) -> Evaluated:
-        """What the networks give for a rollout, [L, T, ...]."""
         if self._states is not None:
             return self._states.evaluate(self.engine, columns)
         logits = self.engine.outputs(columns["observation"], part=ACTOR)
@@ -339,7 +281,6 @@ class RolloutLearner(LaneLearner):
         return Evaluated(logits, value, next_value, {})
 
     def _columns(self) -> dict[str, Tensor]:
-        """The fields of the rollout, [L, T, ...]."""
         return {name: field.transpose(0, 1) for name, field in self._rollout.items()}
 
     def values(self, batch: TensorDictBase) -> Tensor:
@@ -405,22 +346,23 @@ def _like(column: Tensor, value: Tensor) -> Tensor:
     return column.reshape(*column.shape, *[1] * (value.ndim - column.ndim))
 
 
-def rollout_fields(
-    spaces: Spaces, lanes: Lanes, size: tuple[int, ...], device: torch.device
-) -> dict[str, Tensor]:
+def rollout_fields(lanes: Lanes, size: tuple[int, ...]) -> dict[str, Tensor]:
     """The fields of a `LaneTurn` for so many steps, zeros [*size, L, ...] each.
 
     Args:
-        spaces: the dtype of observations.
-        lanes: the shapes of the fields of one lane.
         size: the number of steps; with several rollouts, their number first.
-        device: where.
-
-    Raises:
-        TooLargeError: if the device has less memory than they take.
     """
-    shape, dtype = lanes.observation_shape, torch_dtype(spaces.observation_dtype)
-    check_rollouts((prod(size), len(lanes)), shape, dtype, device)
+    shape, dtype, device = (
+        lanes.observation_shape,
+        torch_dtype(lanes.spaces.observation_dtype),
+        lanes.who.device,
+    )
+    check_memory(
+        f"the rollouts of {len(lanes)} learners x {prod(size):,} steps",
+        prod(size) * len(lanes) * (2 * prod(shape) * (dtype.itemsize + 4) + 64),
+        "fewer rollout_steps or fewer replicas",
+        device=device,
+    )
     forms: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
         "observation": (shape, dtype),
         "action": (lanes.action_shape, torch.int64),
@@ -436,13 +378,11 @@ def rollout_fields(
 
 
 def refuse_full(stored: int, steps: int) -> None:
-    """Raises a ValueError if all steps of a rollout are stored already."""
     if stored == steps:
         raise ValueError(f"the rollout already has {steps} steps; call update() before store()")
 
 
 def write_turn(fields: Mapping[str, Tensor], at: tuple[int, ...], turn: LaneTurn) -> None:
-    """Writes a step of all lanes at a place of `rollout_fields`."""
     for name, field in fields.items():
         column = torch.as_tensor(getattr(turn, name))
         if name in ("observation", "next_observation"):
@@ -450,27 +390,7 @@ def write_turn(fields: Mapping[str, Tensor], at: tuple[int, ...], turn: LaneTurn
         field[at] = column
 
 
-def check_rollouts(
-    size: tuple[int, int], shape: Sequence[int], dtype: torch.dtype, device: str | torch.device
-) -> None:
-    """Raises a TooLargeError if a device has too little memory for rollouts.
-
-    Args:
-        size: the number of steps T and of lanes L.
-        shape: the shape of an observation.
-        dtype: its dtype; updates read it as float32.
-        device: the device of rollouts and updates.
-    """
-    check_memory(
-        f"the rollouts of {size[1]} learners x {size[0]:,} steps",
-        prod(size) * (2 * prod(shape) * (dtype.itemsize + 4) + 64),
-        "fewer rollout_steps or fewer replicas",
-        device=device,
-    )
-
-
 def refuse_other_parts(network: nn.Module) -> None:
-    """Raises a ValueError if the networks of an agent are not "actor" and "critic"."""
     parts = list(parts_of(network))
     if not isinstance(network, AgentNetworks) or parts[:2] != ["actor", "critic"]:
         raise ValueError(f'an agent has the networks {parts}; allowed: "actor" and "critic"')

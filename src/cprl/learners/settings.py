@@ -151,11 +151,15 @@ class RolloutSettings(Value):
                 f"RolloutSettings.minibatch_size is {self.minibatch_size}; it must divide rollout_steps, "
                 f"{self.rollout_steps}"
             )
-        if self.normalize_advantage and self.rollout_steps == 1:
-            raise ValueError(
-                "RolloutSettings.rollout_steps is 1; allowed with normalize_advantage: 2 or more, because "
-                "one advantage has no standard deviation"
-            )
+        _refuse_one_advantage(self)
+
+
+def _refuse_one_advantage(settings: "RolloutSettings | LOLASettings") -> None:
+    if settings.normalize_advantage and settings.rollout_steps == 1:
+        raise ValueError(
+            f"{type(settings).__name__}.rollout_steps is 1; allowed with normalize_advantage: 2 or more, "
+            "because one advantage has no standard deviation"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,8 +224,4 @@ class LOLASettings(Value):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.normalize_advantage and self.rollout_steps == 1:
-            raise ValueError(
-                "LOLASettings.rollout_steps is 1; allowed with normalize_advantage: 2 or more, because one "
-                "advantage has no standard deviation"
-            )
+        _refuse_one_advantage(self)

@@ -12,7 +12,7 @@ window that does not show every apple is none, as on most boards (`tests/test_ta
 """
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -23,9 +23,7 @@ from torch import Tensor, nn
 
 from cprl import keys
 from cprl.commons.spaces import Spaces
-from cprl.learners.base import BaseLearner
-from cprl.learners.lanes import EVALUATION, EXPLORATION, StartFrom, lane_names, lane_seeds
-from cprl.learners.preferences import Preference
+from cprl.learners.lanes import EVALUATION, EXPLORATION, BaseLearner, LearningAgents
 from cprl.learners.settings import TabularSettings
 from cprl.learners.transitions import lane_turn, wanted_in
 from cprl.policies.tabular import NEVER_MET, QTables, TableNetwork, TabularActor, observed_entries, states_of
@@ -36,51 +34,35 @@ class TabularLearner(BaseLearner):
 
     A `cprl.learners.base.Learner`; its tables are in the CPU's memory.
 
-    Arguments that are not listed are those of `ReplayLearner`.
-
     Args:
-        start_from: the tables with which lanes start, by the lane's name; each value counts as never updated.
+        who: with the tables with which lanes start in `start_from`; each value counts as never updated.
 
     Raises:
         MemoryError: from `store`, if an agent visits more than `settings.max_states` states.
     """
 
-    def __init__(
-        self,
-        spaces: Spaces,
-        *,
-        agents: Sequence[int],
-        replicas: int,
-        settings: TabularSettings,
-        seed: int = 0,
-        first_replica: int = 0,
-        reward_kind: Preference = "individual",
-        start_from: StartFrom | None = None,
-    ) -> None:
-        super().__init__(
-            spaces, settings, agents=agents, replicas=replicas, seed=seed, reward_kind=reward_kind
-        )
-        start, self._numbers = start_from or {}, range(first_replica, first_replica + replicas)
-        self.tables = QTables(self.lanes, spaces.actions, max_states=settings.max_states)
-        for lane, name in enumerate(lane_names(replicas=self._numbers, agents=self.agents)):
-            if name in start:
-                self.tables.add_lane(lane, *(start[name][own].numpy() for own in ("states", "values")))
+    def __init__(self, who: LearningAgents, settings: TabularSettings) -> None:
+        super().__init__(who, settings)
+        self.tables = QTables(self.lanes, who.spaces.actions, max_states=settings.max_states)
+        for lane, name in enumerate(who.names):
+            if name in who.start_from:
+                start = who.start_from[name]
+                self.tables.add_lane(lane, start["states"].numpy(), start["values"].numpy())
         self.actor = self._actor(EXPLORATION, worlds=1)
         self.actor.epsilon = settings.epsilon(0)
-        self._observed, self._every_lane = observed_entries(spaces), range(self.lanes)
+        self._observed, self._every_lane = observed_entries(who.spaces), range(self.lanes)
         self._turns: deque[dict[str, NDArray[Any]]] = deque()
 
     @property
     def lanes(self) -> int:
-        """The number of lanes L = R x S."""
         return self.replicas * len(self.agents)
 
     def _actor(self, purpose: int, *, worlds: int) -> TabularActor:
-        seeds = lane_seeds(self.seed, replicas=self._numbers, agents=self.agents, purpose=purpose)
-        return TabularActor(self.tables, self.spaces, seeds=seeds, agents=len(self.agents), worlds=worlds)
+        return TabularActor(
+            self.tables, self.spaces, seeds=self.who.seeds(purpose), agents=len(self.agents), worlds=worlds
+        )
 
     def evaluation_actor(self, worlds: int) -> TabularActor:
-        """An actor with the same tables and `epsilon_evaluation`, for `worlds` worlds of each replica."""
         actor = self._actor(EVALUATION, worlds=worlds)
         actor.epsilon = self.settings.epsilon_evaluation
         return actor
@@ -120,7 +102,6 @@ class TabularLearner(BaseLearner):
         return torch.from_numpy(error**2).view(self.replicas, len(self.agents))
 
     def finite(self) -> Tensor:
-        """Whether the values of each agent's table are finite, bool [R, S]."""
         sound = np.ones(self.lanes, np.bool_)
         if not np.isfinite(self.tables.values[: self.tables.size].sum()):
             sound = np.array([np.isfinite(self.tables.of_lane(lane)[1]).all() for lane in self._every_lane])
@@ -133,17 +114,15 @@ class TabularLearner(BaseLearner):
         return torch.from_numpy(self.tables.values[rows].max(1)).view(self.replicas, len(self.agents))
 
     def networks(self) -> dict[str, nn.Module]:
-        """A copy of each lane's current table as a network, by "replica_0/agent_0" and so on."""
         made: dict[str, nn.Module] = {}
-        for name, own in self._network_states().items():
+        for name, table in self._network_states().items():
             made[name] = table_network(self.spaces)
-            made[name].load_state_dict(own)
+            made[name].load_state_dict(table)
         return made
 
     def _network_states(self) -> dict[str, dict[str, Tensor]]:
-        """The state dict of each lane's `TableNetwork`."""
         states = {}
-        for lane, name in enumerate(lane_names(replicas=self._numbers, agents=self.agents)):
+        for lane, name in enumerate(self.who.names):
             seen, values, _ = self.tables.of_lane(lane)
             states[name] = {"states": torch.from_numpy(seen), "values": torch.from_numpy(values)}
         return states
@@ -165,19 +144,17 @@ class TabularLearner(BaseLearner):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from the state of a learner made with the same arguments."""
         self.tables.load_state_dict(state["tables"])
         self.actor.rng.load_state_dict(state["exploration"])
         self.steps = int(state["steps"])
         self.actor.epsilon = self.settings.epsilon(self.steps)
         self._turns = deque(
-            {name: own.numpy().copy() for name, own in turn.items()} for turn in state["turns"]
+            {name: field.numpy().copy() for name, field in turn.items()} for turn in state["turns"]
         )
         self.wants.load_state_dict(state["wants"])
 
 
 def table_network(spaces: Spaces) -> TableNetwork:
-    """See `Tabular.make_network`."""
     names = observed_entries(spaces)
     if names != ("observation",):
         raise ValueError(

@@ -1,5 +1,6 @@
 """Transitions of single agents, under TorchRL's default keys, which its losses read."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,11 +32,10 @@ class LaneTurn(NamedTuple):
     """After it, likewise."""
 
 
-def lane_turn(agents: tuple[int, ...], batch: TensorDictBase, rewards: Any = None) -> LaneTurn:
+def lane_turn(agents: Sequence[int], batch: TensorDictBase, rewards: Any = None) -> LaneTurn:
     """One transition of each of some agents of every replica.
 
     Args:
-        agents: the indices of the S agents.
         batch: entries of `cprl.keys` at the root and under "next", with batch size [R].
         rewards: the rewards that all agents want, [R, N], see `wanted_in`; by default those of the batch.
 
@@ -71,12 +71,8 @@ def lane_turn(agents: tuple[int, ...], batch: TensorDictBase, rewards: Any = Non
     )
 
 
-def joint_actions(agents: tuple[int, ...], batch: TensorDictBase) -> Any:
+def joint_actions(agents: Sequence[int], batch: TensorDictBase) -> Any:
     """The actions of all N agents in one turn, as each of some agents of every replica sees them.
-
-    Args:
-        agents: the indices of the S agents.
-        batch: a turn of every replica, see `lane_turn`.
 
     Returns:
         int64 [R x S, N]: first a lane's own action, then the others' in the order of their indices. They are
@@ -84,16 +80,12 @@ def joint_actions(agents: tuple[int, ...], batch: TensorDictBase) -> Any:
     """
     actions = array_of(keys.entry(keys.entry(batch, keys.AGENTS), "action"))
     everyone = actions.shape[1]
-    order = [[own, *(other for other in range(everyone) if other != own)] for own in agents]
+    order = [[agent, *(other for other in range(everyone) if other != agent)] for agent in agents]
     return actions[:, order].reshape(len(actions) * len(agents), everyone)
 
 
 def wanted_in(wants: WantedRewards, batch: TensorDictBase) -> Any:
     """The rewards that agents want in one turn of every replica; called once for each turn, in order.
-
-    Args:
-        wants: what they want, and remember.
-        batch: a turn of every replica, see `lane_turn`.
 
     Returns:
         [R, N], a numpy array on the CPU, else a tensor.
@@ -118,7 +110,6 @@ def transitions_of(agent: int, batch: TensorDictBase) -> TensorDict:
     """The transitions of one agent from a collector's batch.
 
     Args:
-        agent: the index of the agent.
         batch: entries of `cprl.keys` at the root and under "next", with any batch size.
 
     Returns:
@@ -147,10 +138,10 @@ def transitions_of(agent: int, batch: TensorDictBase) -> TensorDict:
     ).reshape(-1)
 
 
-def refuse_other_dtype(found: Any, allowed: Any) -> None:
+def refuse_other_dtype(dtype: Any, allowed: Any) -> None:
     """Raises a ValueError for observations of another dtype than learners store; they would be rounded."""
-    if found != allowed:
+    if dtype != allowed:
         raise ValueError(
-            f"observations are {found}; allowed: {allowed}, from Spaces.observation_dtype: make the learner "
+            f"observations are {dtype}; allowed: {allowed}, from Spaces.observation_dtype: make the learner "
             "with the Spaces of the transformed environment"
         )

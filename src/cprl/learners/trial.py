@@ -10,7 +10,7 @@
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
-from typing import Any, Final, Literal, get_args
+from typing import Final, Literal, get_args
 
 import torch
 from tensordict import TensorDict
@@ -23,12 +23,13 @@ from cprl.learners.engine import (
     FunctionalEngine,
     ListEngine,
     MakeLoss,
+    UpdateRule,
     groups_of,
     own_targets,
     targets_of,
     total,
 )
-from cprl.learners.ring import STATE, Horizon, Ring
+from cprl.learners.ring import STATE, Ring, TransitionForm
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.learners.transitions import LaneTurn, array_of
 from cprl.system.compat import promise_targets
@@ -41,40 +42,13 @@ TRIAL_LANES: Final = 2
 TRIAL_TRANSITIONS: Final = 16
 TRIAL_UPDATES: Final = 3
 """Enough to show stale weights or targets."""
-TRIAL_STEP: Final = {"learning_rate": 0.1, "adam_eps": 1.0}
+TRIAL_RULE: Final = UpdateRule(learning_rate=0.1, adam_eps=1.0)
 """With these values Adam's first step changes a weight by 0.1 g / (abs(g) + 1), where g is its gradient."""
 
 
-def make_engine(
-    name: EngineName | None,
-    networks: Sequence[nn.Module],
-    make_loss: MakeLoss,
-    *,
-    compile: bool,
-    trial: TensorDict,
-    **how: Any,
-) -> Engine:
-    """The engine of all lanes.
-
-    Args:
-        name: which engine; None for the first that passes a trial, in the order of `EngineName`.
-        networks: the lanes' networks.
-        make_loss: makes a lane's loss from its network.
-        compile: whether torch compiles the update; ignored for "list".
-        trial: a synthetic batch for the first `TRIAL_LANES` lanes, see `trial_batch`.
-        how: the other arguments of `FunctionalEngine`.
-    """
-    name = name or fitting_engine(networks[:TRIAL_LANES], make_loss, trial)
-    return _make(name, networks, make_loss, compile=compile, **how)
-
-
 def fitting_engine(networks: Sequence[nn.Module], make_loss: MakeLoss, trial: TensorDict) -> EngineName:
-    """The first engine that agrees with the plain list on a trial; warns if only the list itself is left.
-
-    Args:
-        networks: the networks of some lanes; the trial uses copies.
-        make_loss: makes a lane's loss from its network.
-        trial: a synthetic batch of these lanes.
+    """The first engine, in the order of `EngineName`, that agrees with the plain list on a trial; warns if
+    only the list itself is left.
     """
     try:
         reference = _tried("list", networks, make_loss, trial)
@@ -85,14 +59,12 @@ def fitting_engine(networks: Sequence[nn.Module], make_loss: MakeLoss, trial: Te
         raise ValueError(
             f"the loss reads an entry that its batches do not have: {error}; they have {entries}"
         ) from error
-    own_numbers = _changed_buffers(networks[0], make_loss, trial)
+    changed = _changed_buffers(networks[0], make_loss, trial)
     reasons = []
     for name in get_args(EngineName)[:-1]:
         try:
-            if own_numbers:
-                raise ValueError(
-                    f"agents would share buffers that the loss changes: {', '.join(own_numbers)}"
-                )
+            if changed:
+                raise ValueError(f"agents would share buffers that the loss changes: {', '.join(changed)}")
             results = _tried(name, networks, make_loss, trial)
             if _agree(results, reference) or _agree_in_double(name, networks, make_loss, trial):
                 fitting: EngineName = name
@@ -114,11 +86,11 @@ def _changed_buffers(network: nn.Module, make_loss: MakeLoss, trial: TensorDict)
     loss = make_loss(deepcopy(network))
     own_targets(loss)
     weights = tuple(f"{name}." for name in groups_of(loss))
-    numbers = {name: own for name, own in loss.named_buffers() if not name.startswith(weights)}
-    before = {name: own.clone() for name, own in numbers.items()}
+    numbers = {name: buffer for name, buffer in loss.named_buffers() if not name.startswith(weights)}
+    before = {name: buffer.clone() for name, buffer in numbers.items()}
     with torch.random.fork_rng():
         loss(trial[0].clone())
-    return [name for name, own in numbers.items() if not torch.equal(own, before[name])]
+    return [name for name, buffer in numbers.items() if not torch.equal(buffer, before[name])]
 
 
 def _agree(results: Sequence[Tensor], reference: Sequence[Tensor]) -> bool:
@@ -139,21 +111,22 @@ def _agree_in_double(
     return _agree(results, reference)
 
 
-def trial_batch(lanes: int, observation_shape: Sequence[int], actions: int, **shapes: Any) -> TensorDict:
+def trial_batch(
+    lanes: int, form: TransitionForm, actions: int, *, device: str | torch.device = "cpu"
+) -> TensorDict:
     """Synthetic transitions [lanes, 8], or sequences, always the same; an episode ends with every eighth
-    turn. The other arguments are those of a `Ring`."""
-    horizon: Horizon | None = shapes.get("horizon")
-    ahead = horizon.steps if horizon else shapes.get("sequence_steps", 1)
+    turn."""
+    ahead = form.horizon.steps if form.horizon else form.sequence_steps
     ring = Ring(
+        form,
         seeds=[(lane,) for lane in range(lanes)],
         transitions=TRIAL_TRANSITIONS + ahead - 1,
         batch_size=8,
-        observation_shape=observation_shape,
-        **shapes,
+        device=device,
     )
     fields, chance = ring.fields, torch.Generator().manual_seed(0)
     for step in range(ring.capacity):
-        seen = torch.randint(256, (2, lanes, *observation_shape), generator=chance).to(torch.uint8)
+        seen = torch.randint(256, (2, lanes, *form.observation_shape), generator=chance).to(torch.uint8)
         if fields["observation"].dtype != torch.uint8:
             seen = (seen > 127).to(fields["observation"].dtype)
         action = torch.randint(actions, fields["action"].shape[1:], generator=chance)
@@ -193,13 +166,27 @@ def trial_rollout(
     return batch
 
 
-def _make(
-    name: EngineName, networks: Sequence[nn.Module], make_loss: MakeLoss, *, compile: bool, **how: Any
+def make_engine(
+    name: EngineName,
+    networks: Sequence[nn.Module],
+    make_loss: MakeLoss,
+    rule: UpdateRule,
+    *,
+    target_networks: Sequence[nn.Module] | None = None,
+    compile: bool,
 ) -> Engine:
+    """The engine of this name over the networks of all lanes; `compile` is ignored for "list"."""
     if name == "list":
-        return ListEngine(networks, make_loss, **how)
-    axis, flat = name.startswith("lane_axis"), name == "lane_axis_flat"
-    return FunctionalEngine(networks, make_loss, lane_axis=axis, flat=flat, compile=compile, **how)
+        return ListEngine(networks, make_loss, rule, target_networks=target_networks)
+    return FunctionalEngine(
+        networks,
+        make_loss,
+        rule,
+        target_networks=target_networks,
+        lane_axis=name.startswith("lane_axis"),
+        flat=name == "lane_axis_flat",
+        compile=compile,
+    )
 
 
 def _tried(
@@ -211,7 +198,7 @@ def _tried(
         The losses of the updates; then for each lane its acting weights afterwards, the sum of all its
         weights and the sum of their squares.
     """
-    engine = _make(name, deepcopy(list(networks)), make_loss, compile=False, **TRIAL_STEP)
+    engine = make_engine(name, deepcopy(list(networks)), make_loss, TRIAL_RULE, compile=False)
     results = []
     for _ in range(TRIAL_UPDATES):
         results.append(engine.update_from(trial.clone()))
@@ -272,7 +259,6 @@ def refuse_on_policy(loss: LossModule) -> None:
 
 
 def _refuse_without_targets(loss: LossModule, settings: DQNSettings) -> None:
-    """Raises a ValueError for settings of targets, if a loss has none."""
     for name, default in (("tau", None), ("own_target_weights", False)):
         if getattr(settings, name) != default and not targets_of(loss):
             raise ValueError(
@@ -284,7 +270,8 @@ def _refuse_without_targets(loss: LossModule, settings: DQNSettings) -> None:
 def refuse_other_advantages(loss: LossModule, settings: RolloutSettings) -> None:
     """Raises a ValueError if a loss needs other advantages than those of `RolloutLearner`."""
     name = type(loss).__name__
-    if loss.value_type not in _OF_ROLLOUTS and not _is_gae(loss.value_type):
+    kind = loss.value_type
+    if kind not in _OF_ROLLOUTS and not (isinstance(kind, type) and issubclass(kind, GAE)):
         raise ValueError(
             f"{name} has the value estimator {_name(loss.value_type)}; allowed: GAE, which RolloutLearner "
             "computes: leave make_value_estimator out, and set gamma and gae_lambda in the settings"
@@ -300,19 +287,12 @@ def refuse_other_advantages(loss: LossModule, settings: RolloutSettings) -> None
 
 
 def refuse_other_outputs(loss: LossModule, batch: TensorDict) -> None:
-    """Raises a ValueError if a loss returns no entry that is a loss.
-
-    Args:
-        loss: the loss of one lane; it is called.
-        batch: a synthetic batch of one lane, [b].
-    """
     promise_targets(loss)
     with torch.no_grad(), torch.random.fork_rng(devices=[]):
         total(loss(batch.clone()), loss)
 
 
 def reads(loss: LossModule, key: str) -> bool:
-    """Whether an entry is among the keys that a loss reads."""
     try:
         listed: Iterable[object] = getattr(loss, "in_keys", None) or ()
     except NotImplementedError:
@@ -321,12 +301,7 @@ def reads(loss: LossModule, key: str) -> bool:
 
 
 def _estimators(loss: LossModule) -> list[ValueEstimatorBase]:
-    """The value estimator that a loss was constructed with, if any."""
     return [child for child in loss.children() if isinstance(child, ValueEstimatorBase)]
-
-
-def _is_gae(kind: object) -> bool:
-    return isinstance(kind, type) and issubclass(kind, GAE)
 
 
 def _name(kind: object) -> str:

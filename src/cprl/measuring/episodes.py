@@ -11,13 +11,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from cprl import arguments, keys
+from cprl import keys
 from cprl.commons.game import Game
 from cprl.commons.yields import sustainable_yield
 from cprl.envs.unwrap import agent_count, commons_of
 from cprl.institutions import COUNTS, Institution
 from cprl.measuring import institutions, social
 from cprl.measuring.metrics import FIELDS, INSTITUTIONAL, OF_INSTITUTIONS, OPTIONAL, reported_by, reported_in
+from cprl.values import Positive, checked
 
 Array = NDArray[Any]
 Turns = dict[str, Array]
@@ -128,8 +129,6 @@ class EpisodeTracker:
     batch must have them. Fields and metrics that need other entries are left out of episodes.
 
     Args:
-        worlds: the number of worlds B of a batch.
-        agents: the number of agents N of each world.
         sustainable_yield: apples per step that the map can sustain; with first_stock, adds yield_share.
         first_stock: apples on the board at the start of an episode.
         institutions: those of the game, which say what is measured of them, see
@@ -148,8 +147,8 @@ class EpisodeTracker:
         first_stock: float | None = None,
         institutions: Sequence[Institution] = (),
     ) -> None:
-        self.worlds = arguments.integer("worlds", worlds, 1, 2**32)
-        self.agents = arguments.integer("agents", agents, 1, 2**20)
+        self.worlds = checked("worlds", worlds, Positive)
+        self.agents = checked("agents", agents, Positive)
         self.reported: tuple[str, ...] | None = None
         """The optional entries of this game; None before the first batch."""
         self._yield = {"sustainable_yield": sustainable_yield, "first_stock": first_stock}
@@ -182,7 +181,6 @@ class EpisodeTracker:
         return np.zeros((self.worlds, self.agents)) if returns is None else returns.copy()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Copies of what the running episodes add up to."""
         return {name: torch.tensor(array) for name, array in self._arrays().items()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
@@ -217,7 +215,6 @@ class EpisodeTracker:
         return {"episode": self._episode, **self._running}
 
     def _begin(self, reported: tuple[str, ...], widths: Mapping[str, int]) -> None:
-        """Allocates the arrays for a game that reports these entries."""
         if "harvest" not in reported and self._yield["sustainable_yield"] is not None:
             raise ValueError(
                 "sustainable_yield is given; allowed: None, because yield_share needs a harvest, which the "
@@ -376,7 +373,7 @@ def metrics_of(env: EnvBase, reported: Collection[str]) -> tuple[str, ...]:
     return tuple(
         name
         for name in institutions.metrics_for(institutions_of(env))
-        if set(institutions.NEEDS[name]) <= set(reported)
+        if set(institutions.METRICS[name].needs) <= set(reported)
     )
 
 
@@ -403,13 +400,7 @@ def _widths_in(tensordict: TensorDictBase) -> dict[str, int]:
 
 
 class _TurnReader:
-    """Reads the turns of batches that have the same entries, worlds and agents.
-
-    Args:
-        reported: the optional entries that the game reports, see `cprl.measuring.metrics`.
-        worlds: the number of worlds B of a batch.
-        agents: the number of agents N of each world.
-    """
+    """Reads the turns of batches that have the same entries, worlds and agents."""
 
     def __init__(
         self, reported: Collection[str], *, worlds: int, agents: int, widths: Mapping[str, int]
@@ -450,7 +441,6 @@ class _TurnReader:
         return turns
 
     def _missing(self, tensordict: TensorDictBase) -> ValueError:
-        """The error for a batch that lacks an entry."""
         needed: dict[Any, str] = {keys.DONE: "done"}
         needed |= {("next", name): f"next, {name}" for name in self._of_worlds}
         needed |= {("next", keys.AGENTS, name): f"next, agents, {name}" for name in self._of_agents}
@@ -466,18 +456,11 @@ class _TurnReader:
         """Checks the shapes of a batch, once per batch size, because checking takes longer than counting."""
         if len(size) not in (1, 2) or size[0] != self._worlds:
             raise ValueError(f"the batch is {list(size)}; allowed: [{self._worlds}] or [{self._worlds}, T]")
-        one, agents = (1,), (self._agents,)
-        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
-            ("harvest", "fired", "in_play", "decision"), agents
-        )
-        shapes |= {"reward": agents + one, "hit_by": agents * 2, "tagged_by": agents * 2}
-        shapes |= dict.fromkeys(("fines", "transfers", "violated"), agents)
-        shapes |= {
-            "counts": (self._agents, self.widths.get("counts", 0)),
-            "in_force": (self.widths.get("in_force", 0),),
-        }
+        sizes = {"N": self._agents, "C": self.widths.get("counts"), "V": self.widths.get("in_force"), "1": 1}
+        axes = {entry: axes or "1" for entry, axes, _ in _RUNNING.values()}
+        axes |= {"reward": "N1", "decision": "N"}
         for name, array in turns.items():
-            allowed = (*size, *shapes.get(name, one))
+            allowed = (*size, *(sizes[axis] for axis in axes.get(name, "1")))
             if array.shape != allowed:
                 raise ValueError(f'"{name}" of the batch is {list(array.shape)}; allowed: {list(allowed)}')
         self._checked = size

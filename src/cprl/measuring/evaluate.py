@@ -22,8 +22,6 @@ def evaluate(env: EnvBase, policy: Policy, *, explore: bool = False) -> list[Epi
         env: B worlds, batch size [B]; all are reset. A world of a `CommonsEnv` that has ended does not change
             until all have ended. In any other environment, including one with transforms, it is reset and
             plays on, and only its first episode counts.
-        policy: writes the actions of all agents, e.g. `cprl.policies.assignment.AgentPolicies`.
-        explore: whether actors explore; else they act greedily.
 
     Returns:
         B episodes, in the order of worlds.
@@ -51,7 +49,6 @@ def _until_ended(env: CommonsEnv, policy: Policy) -> Iterator[TensorDictBase]:
 
 
 def _again_and_again(env: EnvBase, policy: Policy) -> Iterator[TensorDictBase]:
-    """Steps all worlds, and resets each world that has ended."""
     moment = env.reset()
     while True:
         batch, moment = env.step_and_maybe_reset(policy(moment))

@@ -14,7 +14,7 @@ Sources: Ostrom, "Governing the Commons" (1990), whose principles each metric be
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Final
+from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor
@@ -33,61 +33,66 @@ from cprl.institutions import (
     Vote,
 )
 from cprl.measuring import social
+from cprl.measuring.social import SHARE
 
-NEEDS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+
+class Metric(NamedTuple):
+    """A metric, said once: what it is called and made of, and where it says something."""
+
+    words: str
+    unit: str
+    needs: tuple[str, ...]
+    """Which entries of a turn it is computed from."""
+    kinds: tuple[type[Institution], ...] = ()
+    """The institutions without which it says nothing; empty for one that concerns every institution."""
+    counted: tuple[str, ...] = ()
+    """Which of `cprl.institutions.COUNTS` it is computed from."""
+
+
+_NET: Final = ("harvest", "fines", "transfers")
+_COUNTS: Final = ("counts",)
+_GROUPS: Final = (Levies,)
+METRICS: Final[Mapping[str, Metric]] = MappingProxyType(
     {
-        "fines": ("fines",),
-        "transfers": ("transfers",),
-        "violations": ("violated",),
-        "violations_per_step": ("violated", "in_play"),
-        "trespasses": ("counts",),
-        "excess_bites": ("counts",),
-        "closed_bites": ("counts",),
-        "own_share_of_bites": ("counts",),
-        "detection_rate": ("counts",),
-        "recidivism": ("counts",),
-        "sanctions_per_violation": ("counts",),
-        "unjust_share_of_tags": ("counts", "tagged_by"),
-        "net_equality": ("harvest", "fines", "transfers"),
-        "equality_within": ("harvest",),
-        "equality_between": ("harvest",),
-        "net_equality_within": ("harvest", "fines", "transfers"),
-        "net_equality_between": ("harvest", "fines", "transfers"),
+        "fines": Metric("fines of all", "apples", ("fines",)),
+        "transfers": Metric("transfers to all", "apples", ("transfers",)),
+        "violations": Metric("violations", "turns", ("violated",)),
+        "violations_per_step": Metric("violations per turn in play", SHARE, ("violated", "in_play")),
+        "trespasses": Metric("trespasses", "turns", _COUNTS, (Boundaries,), ("trespasses",)),
+        "excess_bites": Metric("taken above a quota", "bites", _COUNTS, (Quota,), ("excess_bites",)),
+        "closed_bites": Metric(
+            "taken in closed seasons and patches",
+            "bites",
+            _COUNTS,
+            (ClosedSeason, ClosedPatches),
+            ("closed_bites",),
+        ),
+        "own_share_of_bites": Metric(
+            "bites where one may bite", SHARE, _COUNTS, (Boundaries,), ("own_bites", "foreign_bites")
+        ),
+        "detection_rate": Metric(
+            "violations detected", SHARE, _COUNTS, (Monitoring,), ("detections", "violations")
+        ),
+        "recidivism": Metric(
+            "violations after a sanction",
+            SHARE,
+            _COUNTS,
+            (GraduatedSanctions,),
+            ("returns_to_violation", "violations"),
+        ),
+        "sanctions_per_violation": Metric(
+            "sanctions per violation", "ratio", _COUNTS, (GraduatedSanctions,), ("sanctions", "violations")
+        ),
+        "unjust_share_of_tags": Metric(
+            "unjust tags", SHARE, ("counts", "tagged_by"), (Mediation,), ("unjust_tags",)
+        ),
+        "net_equality": Metric("equality of net incomes", SHARE, _NET),
+        "equality_within": Metric("equality within groups", SHARE, ("harvest",), _GROUPS),
+        "equality_between": Metric("equality between groups", SHARE, ("harvest",), _GROUPS),
+        "net_equality_within": Metric("equality of net incomes within groups", SHARE, _NET, _GROUPS),
+        "net_equality_between": Metric("equality of net incomes between groups", SHARE, _NET, _GROUPS),
     }
 )
-"""Which entries of a turn each metric is computed from."""
-
-OF_GROUPS: Final = tuple(name for name in NEEDS if name.endswith(("_within", "_between")))
-"""The metrics that need to know which agents belong together."""
-
-KINDS: Final[Mapping[str, tuple[type[Institution], ...]]] = MappingProxyType(
-    {
-        "trespasses": (Boundaries,),
-        "own_share_of_bites": (Boundaries,),
-        "excess_bites": (Quota,),
-        "closed_bites": (ClosedSeason, ClosedPatches),
-        "detection_rate": (Monitoring,),
-        "recidivism": (GraduatedSanctions,),
-        "sanctions_per_violation": (GraduatedSanctions,),
-        "unjust_share_of_tags": (Mediation,),
-        **dict.fromkeys(OF_GROUPS, (Levies,)),
-    }
-)
-"""The institutions without which a metric says nothing; all others concern every institution."""
-
-COUNTED: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
-    {
-        "trespasses": ("trespasses",),
-        "excess_bites": ("excess_bites",),
-        "closed_bites": ("closed_bites",),
-        "own_share_of_bites": ("own_bites", "foreign_bites"),
-        "detection_rate": ("detections", "violations"),
-        "recidivism": ("returns_to_violation", "violations"),
-        "sanctions_per_violation": ("sanctions", "violations"),
-        "unjust_share_of_tags": ("unjust_tags",),
-    }
-)
-"""Which of `cprl.institutions.COUNTS` each metric is computed from."""
 
 Groups = Sequence[Sequence[int]]
 """The indices of the agents of each group; each agent belongs to one group."""
@@ -97,23 +102,23 @@ _ROUNDING: Final = 1e-6
 
 
 def metrics_for(institutions: Sequence[Institution]) -> tuple[str, ...]:
-    """The metrics of `NEEDS` that say something of a game with these institutions; of a game with none, whose
-    entries are somebody's own, all but those of groups."""
+    """The metrics that say something of a game with these institutions; of a game with none, whose entries
+    are somebody's own, all but those of groups."""
     if not institutions:
-        return tuple(name for name in NEEDS if name not in OF_GROUPS)
+        return tuple(name for name, metric in METRICS.items() if metric.kinds != _GROUPS)
     voted_on = [institution.on for institution in institutions if isinstance(institution, Vote)]
     return tuple(
         name
-        for name in NEEDS
-        if name not in KINDS
-        or any(isinstance(institution, KINDS[name]) for institution in (*institutions, *voted_on))
+        for name, metric in METRICS.items()
+        if not metric.kinds
+        or any(isinstance(institution, metric.kinds) for institution in (*institutions, *voted_on))
     )
 
 
 def counts_for(institutions: Sequence[Institution]) -> tuple[str, ...]:
     """The names of `cprl.institutions.COUNTS` that say something of a game with these institutions; of a game
     with none, whose entries are somebody's own, all."""
-    needed = {name for metric in metrics_for(institutions) for name in COUNTED.get(metric, ())}
+    needed = {name for metric in metrics_for(institutions) for name in METRICS[metric].counted}
     return tuple(name for name in COUNTS if name == "violations" or name in needed)
 
 
@@ -133,7 +138,7 @@ def summary(
     tags: Tensor | None = None,
     groups: Groups | None = None,
 ) -> dict[str, Tensor]:
-    """Those metrics of `NEEDS` by name whose arguments are given, each float64 [...].
+    """Those of `METRICS` by name whose arguments are given, each float64 [...].
 
     Args:
         harvest: apples of each agent.
@@ -143,7 +148,7 @@ def summary(
         counts: by the names of `cprl.institutions.COUNTS`; metrics of those that are lacking are left out.
         in_play_steps: turns in which it was in play.
         tags: how often it tagged somebody.
-        groups: agents that belong together, for `OF_GROUPS`.
+        groups: agents that belong together, for the metrics of groups.
     """
     metrics: dict[str, Tensor] = {}
     for name, values in (("fines", fines), ("transfers", transfers), ("violations", violations)):
@@ -155,8 +160,8 @@ def summary(
         totals = ("trespasses", "excess_bites", "closed_bites")
         metrics |= {name: total(counts[name]) for name in totals if name in counts}
         for name, ratio in _RATIOS.items():
-            if counts.keys() >= set(COUNTED[name]):
-                metrics[name] = ratio(*(counts[count] for count in COUNTED[name]))
+            if counts.keys() >= set(METRICS[name].counted):
+                metrics[name] = ratio(*(counts[count] for count in METRICS[name].counted))
         if tags is not None and "unjust_tags" in counts:
             metrics["unjust_share_of_tags"] = unjust_share_of_tags(counts["unjust_tags"], tags)
     incomes = {} if harvest is None else {"": harvest}
@@ -167,7 +172,7 @@ def summary(
         for kind, income in incomes.items():
             metrics[f"{kind}equality_within"] = equality_within(income, groups).nanmean(-1)
             metrics[f"{kind}equality_between"] = equality_between(income, groups)
-    return {name: metrics[name] for name in NEEDS if name in metrics}
+    return {name: metrics[name] for name in METRICS if name in metrics}
 
 
 def total(values: Tensor) -> Tensor:

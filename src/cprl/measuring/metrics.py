@@ -13,42 +13,14 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import keys
-from cprl.measuring import social
+from cprl.measuring import institutions, social
 
-SHARE: Final = "0 to 1"
-NAMES: Final = {
-    "collective_return": ("collective return", "apples"),
-    "efficiency": ("efficiency", "apples per step"),
-    "equality": ("equality (1 - Gini)", SHARE),
-    "sustainability": ("sustainability", "steps"),
-    "survival_steps": ("survival", "steps"),
-    "peace": ("peace", "agents"),
-    "peacefulness": ("peacefulness", "steps in play per agent"),
-    "stock_left": ("stock left at the end", "apples"),
-    "yield_share": ("yield share of the steps played", "ratio"),
+NAMES: Final = {**social.NAMES, "stock_left": ("stock left at the end", "apples")}
+"""The words and the unit of each number of an episode."""
+_WORDS: Final = {
+    **NAMES,
+    **{f"institutions/{name}": (metric.words, metric.unit) for name, metric in institutions.METRICS.items()},
 }
-"""The words and the unit of each metric of an episode."""
-INSTITUTION_NAMES: Final = {
-    "fines": ("fines of all", "apples"),
-    "transfers": ("transfers to all", "apples"),
-    "violations": ("violations", "turns"),
-    "violations_per_step": ("violations per turn in play", SHARE),
-    "trespasses": ("trespasses", "turns"),
-    "excess_bites": ("taken above a quota", "bites"),
-    "closed_bites": ("taken in closed seasons and patches", "bites"),
-    "own_share_of_bites": ("bites where one may bite", SHARE),
-    "detection_rate": ("violations detected", SHARE),
-    "recidivism": ("violations after a sanction", SHARE),
-    "sanctions_per_violation": ("sanctions per violation", "ratio"),
-    "unjust_share_of_tags": ("unjust tags", SHARE),
-    "net_equality": ("equality of net incomes", SHARE),
-    "equality_within": ("equality within groups", SHARE),
-    "equality_between": ("equality between groups", SHARE),
-    "net_equality_within": ("equality of net incomes within groups", SHARE),
-    "net_equality_between": ("equality of net incomes between groups", SHARE),
-}
-"""The same of the metrics of institutions, without the prefix `institutions/`."""
-_WORDS: Final = {**NAMES, **{f"institutions/{name}": words for name, words in INSTITUTION_NAMES.items()}}
 
 
 def title(name: str) -> str:
@@ -60,7 +32,7 @@ def unit(name: str) -> str:
     """The unit after a value, e.g. "steps"; "" where a range stands for one. A single agent's return is in
     apples."""
     word = "apples" if name.startswith("return_") else _WORDS.get(name, ("", ""))[1]
-    return "" if word == SHARE else word
+    return "" if word == social.SHARE else word
 
 
 def with_unit(name: str, *, rewards: str = "") -> str:
@@ -77,10 +49,6 @@ def with_unit(name: str, *, rewards: str = "") -> str:
 OPTIONAL: Final = ("harvest", "in_play", "fired", "hit_by", "tagged_by", "stock")
 """The optional entries, by the last part of their keys in `cprl.keys`; all but "stock" are in "agents"."""
 
-OF_INSTITUTIONS: Final = ("fines", "transfers", "violated", "counts", "in_force")
-"""The entries of games with institutions, likewise; all but "in_force" are in "agents". A game without
-institutions has none of them and lacks nothing."""
-
 METRICS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {name: social.NEEDS[name] for name in social.METRICS}
 )
@@ -88,14 +56,9 @@ METRICS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
 
 FIELDS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
-        "harvest": ("harvest",),
-        "in_play_steps": ("in_play",),
-        "shots": ("fired",),
-        "hits": ("hit_by",),
-        "tagged": ("tagged_by",),
-        "tagged_by": ("tagged_by",),
-        "stock_left": ("stock",),
-        "depletion_step": ("stock",),
+        **{"harvest": ("harvest",), "in_play_steps": ("in_play",), "shots": ("fired",), "hits": ("hit_by",)},
+        **dict.fromkeys(("tagged", "tagged_by"), ("tagged_by",)),
+        **dict.fromkeys(("stock_left", "depletion_step"), ("stock",)),
     }
 )
 """The entries that each field of `Episode` needs; other fields need none."""
@@ -109,7 +72,10 @@ INSTITUTIONAL: Final[Mapping[str, str]] = MappingProxyType(
         "in_force": "in_force",
     }
 )
-"""The entry of `OF_INSTITUTIONS` that each field of `Episode` about institutions needs."""
+"""The entry that each field of `Episode` about institutions needs."""
+OF_INSTITUTIONS: Final = tuple(INSTITUTIONAL.values())
+"""These entries; all but "in_force" are in "agents". A game without institutions has none of them and lacks
+nothing."""
 
 
 def reported_by(env: EnvBase) -> tuple[str, ...]:
@@ -127,12 +93,7 @@ def reported_in(tensordict: TensorDictBase) -> tuple[str, ...]:
 
 
 def available(needs: Mapping[str, tuple[str, ...]], reported: Collection[str]) -> tuple[str, ...]:
-    """The names whose entries are all reported, in order.
-
-    Args:
-        needs: the entries by name, e.g. `FIELDS`.
-        reported: the entries of `OPTIONAL` that the game reports.
-    """
+    """The names whose entries are all reported, in order."""
     return tuple(name for name, entries in needs.items() if set(entries) <= set(reported))
 
 

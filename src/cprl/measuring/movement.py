@@ -48,13 +48,7 @@ class Trace:
 def trace(
     env: CommonsEnv, policy: Callable[[TensorDictBase], TensorDictBase], *, explore: bool = True
 ) -> Trace:
-    """Plays the next episode of each world and records the positions of all agents.
-
-    Args:
-        env: B worlds; all are reset.
-        policy: Writes the actions of all agents.
-        explore: Whether actors explore with their epsilon.
-    """
+    """Plays the next episode of each world and records the positions of all agents."""
     steps: list[tuple[Array, ...]] = []
     tags: list[Array] = []
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
@@ -122,9 +116,6 @@ def visitors(visits: ArrayLike) -> Array:
     It is exp H(agent | cell): with p(i, c) = visits[i, c] / N, of the N agents that were in play, the entropy
     of who it is that one meets in a cell, mean over the cells by how often one meets somebody there. NaN
     without agents.
-
-    Args:
-        visits: shares [..., N, H, W].
     """
     shares = np.asarray(visits, np.float64)
     agents = _in_play(shares)
@@ -143,9 +134,6 @@ def exclusion(visits: ArrayLike) -> Array:
     It is 1 - H(agent | cell) / log N, or the information about who an agent is that its cell gives, as a
     share of all that there is; equal to the Jensen-Shannon divergence of the N distributions over cells,
     divided by log N (J. Lin, "Divergence measures based on the Shannon entropy", 1991).
-
-    Args:
-        visits: shares [..., N, H, W].
     """
     agents = _in_play(visits)
     exclusions = np.full(agents.shape, np.nan)
@@ -158,9 +146,6 @@ def exclusion(visits: ArrayLike) -> Array:
 def owners(visits: ArrayLike) -> Array:
     """The agent that spends the largest share of its time in each cell, int64 [..., H, W]; of equal ones the
     first, and -1 where nobody was.
-
-    Args:
-        visits: shares [..., N, H, W].
     """
     shares = np.asarray(visits, np.float64)
     agents: Array = np.where(shares.any(-3), shares.argmax(-3), -1)
@@ -200,7 +185,6 @@ def defence(trace: Trace, visits: ArrayLike) -> Array:
     was tagged.
 
     Args:
-        trace: played episodes.
         visits: shares [N, H, W], or [B, N, H, W].
     """
     worlds = trace.row.shape[1]

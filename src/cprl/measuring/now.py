@@ -5,10 +5,10 @@ course of a training is known.
 """
 
 from collections.abc import Mapping
+from copy import copy
 from math import isfinite
 from typing import Any, Final
 
-from cprl import arguments
 from cprl.measuring.series import Recent
 
 BEGINS: Final = "begins"
@@ -50,7 +50,6 @@ class Now:
     never exploring: their running mean is judged from the tenth episode on.
 
     Args:
-        agents: the number of agents of the group.
         random_play: r, in the unit of the values; None for the first running mean instead.
     """
 
@@ -81,8 +80,6 @@ class Now:
             value: of the episode, e.g. the collective return as a mean over replicas; finite.
             epsilons: of each learner that has one at the end of the episode, by its name; NaN is left out.
         """
-        if not isfinite(value):
-            raise arguments.refusal("value", value, "a finite number")
         self.mean = self._recent.add(value)
         if self._recent.count >= FEWEST:
             self._course = self._followed(self._course)
@@ -123,23 +120,16 @@ class Now:
 
     def state_dict(self) -> dict[str, Any]:
         """All that came so far; not `random_play`, which is an argument."""
-        return {
-            "label": self.label,
-            "mean": self.mean,
-            "course": self._course,
-            "peak": self.peak,
-            "top": self._top,
-            "low": self._low,
-            "first": self._first,
-            "explored": self.explored,
-            "epsilons": dict(self._epsilons),
-            "recent": self._recent.state_dict(),
-        }
+        state = {name: copy(getattr(self, field)) for name, field in _STATE.items()}
+        return {**state, "recent": self._recent.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a state that `state_dict` returned."""
-        self.label, self.mean = str(state["label"]), float(state["mean"])
-        self._course, self.peak = str(state["course"]), state["peak"]
-        self._top, self._low, self._first = state["top"], state["low"], state["first"]
-        self.explored, self._epsilons = state["explored"], dict(state["epsilons"])
+        for name, field in _STATE.items():
+            setattr(self, field, copy(state[name]))
         self._recent.load_state_dict(state["recent"])
+
+
+_STATE: Final = {name: name for name in ("label", "mean", "peak", "explored")} | {
+    name: f"_{name}" for name in ("course", "top", "low", "first", "epsilons")
+}
+"""Where each entry of a state is kept."""

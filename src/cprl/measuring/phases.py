@@ -99,7 +99,6 @@ def phases(episodes: ArrayLike, metrics: Mapping[str, ArrayLike], changes: Seque
     Args:
         episodes: The index of each episode, [E], increasing.
         metrics: float [E] or [R, E] by name; at least `METRICS`.
-        changes: The change points, see `change_points`.
 
     Raises:
         ValueError: If a phase has fewer than two episodes.
@@ -127,7 +126,6 @@ def phases(episodes: ArrayLike, metrics: Mapping[str, ArrayLike], changes: Seque
 
 
 def _curves(metrics: Mapping[str, ArrayLike]) -> dict[str, Values]:
-    """Each metric, [R, E]."""
     return {name: np.atleast_2d(np.asarray(curve, np.float64)) for name, curve in metrics.items()}
 
 

@@ -9,7 +9,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl import arguments
 from cprl.measuring.episodes import Episode
 from cprl.measuring.statistics import institution_metrics, social_metrics
 
@@ -35,21 +34,13 @@ def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence
             numbers |= {f"{agent}/{name}": float(value) for agent, value in zip(agents, values, strict=True)}
     named = {f"agent_{index}": agent for index, agent in enumerate(agents)}
     for name, value in learning.items():
-        arguments.object_of("a name in learning", name, str, "a text")
         of, slash, what = name.partition("/")
-        try:
-            numbers[f"{named.get(of, of)}{slash}{what}"] = float(value)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise arguments.refusal(f"learning[{name!r}]", value, "a number") from error
+        numbers[f"{named.get(of, of)}{slash}{what}"] = float(value)
     return numbers
 
 
 class Series:
-    """Collects the numbers of an episode until all replicas have ended it, so that replicas are comparable.
-
-    Args:
-        replicas: the number of replicas R.
-    """
+    """Collects the numbers of an episode until all replicas have ended it, so that they are comparable."""
 
     def __init__(self, replicas: int) -> None:
         self.replicas = replicas
@@ -117,10 +108,8 @@ class Recent:
         return fmean(defined) if defined else float("nan")
 
     def state_dict(self) -> dict[str, Any]:
-        """The values in the window, and how many came."""
         return {"last": list(self._last), "count": self.count}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continues from a state that `state_dict` returned."""
         last: Sequence[float] = state["last"]
         self._last, self.count = deque(last), int(state["count"])

@@ -11,27 +11,13 @@ Below, R_i is the sum of agent i's harvest over its episode, T the number of ste
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final
+from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor
 
-NEEDS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
-    {
-        "collective_return": ("harvest",),
-        "efficiency": ("harvest",),
-        "equality": ("harvest",),
-        "sustainability": ("harvest",),
-        "survival_steps": (),
-        "peace": ("in_play",),
-        "peacefulness": ("in_play",),
-        "yield_share": ("harvest",),
-    }
-)
-"""Which entries of a turn each metric is computed from; all need to know which steps were played."""
-
-METRICS: Final = tuple(name for name in NEEDS if name != "yield_share")
-"""What `summary` holds of a game that reports harvest and in_play, in this order."""
+SHARE: Final = "0 to 1"
+"""In place of a unit."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,7 +99,9 @@ def of_totals(
     if (sustainable_yield is None) != (first_stock is None):
         raise ValueError("sustainable_yield and first_stock belong together; allowed: both, or neither")
     lacking = {name for name in ("harvest", "in_play") if getattr(totals, _TOTAL_OF[name]) is None}
-    metrics = {name: metric(totals) for name, metric in _METRICS.items() if lacking.isdisjoint(NEEDS[name])}
+    metrics = {
+        name: metric.of(totals) for name, metric in _METRICS.items() if lacking.isdisjoint(metric.needs)
+    }
     if sustainable_yield is not None and first_stock is not None:
         if totals.harvest is None:
             raise ValueError("sustainable_yield is given and harvest is None; allowed: both, or neither")
@@ -143,7 +131,6 @@ def yield_share(totals: Totals, *, sustainable_yield: float | Tensor, first_stoc
     be harvested.
 
     Args:
-        totals: of the episodes.
         sustainable_yield: Apples per step that can be harvested forever; a number, or a tensor [...].
         first_stock: Apples on the board at the start of the episode; a number, or a tensor [...].
     """
@@ -193,15 +180,36 @@ def peacefulness(totals: Totals) -> Tensor:
     return in_play_steps.sum(-1) / in_play_steps.shape[-1]
 
 
-_METRICS: Final[Mapping[str, Callable[[Totals], Tensor]]] = {
-    "collective_return": collective_return,
-    "efficiency": efficiency,
-    "equality": equality,
-    "sustainability": sustainability,
-    "survival_steps": survival_steps,
-    "peace": peace,
-    "peacefulness": peacefulness,
+class Metric(NamedTuple):
+    """A metric, said once: what it is called and made of."""
+
+    words: str
+    unit: str
+    needs: tuple[str, ...]
+    """Which entries of a turn it is computed from; all need to know which steps were played."""
+    of: Callable[[Totals], Tensor]
+
+
+_METRICS: Final[Mapping[str, Metric]] = {
+    "collective_return": Metric("collective return", "apples", ("harvest",), collective_return),
+    "efficiency": Metric("efficiency", "apples per step", ("harvest",), efficiency),
+    "equality": Metric("equality (1 - Gini)", SHARE, ("harvest",), equality),
+    "sustainability": Metric("sustainability", "steps", ("harvest",), sustainability),
+    "survival_steps": Metric("survival", "steps", (), survival_steps),
+    "peace": Metric("peace", "agents", ("in_play",), peace),
+    "peacefulness": Metric("peacefulness", "steps in play per agent", ("in_play",), peacefulness),
 }
+METRICS: Final = tuple(_METRICS)
+"""What `summary` holds of a game that reports harvest and in_play, in this order."""
+NEEDS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {name: metric.needs for name, metric in _METRICS.items()} | {"yield_share": ("harvest",)}
+)
+"""Which entries of a turn each metric is computed from."""
+NAMES: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
+    {name: (metric.words, metric.unit) for name, metric in _METRICS.items()}
+    | {"yield_share": ("yield share of the steps played", "ratio")}
+)
+"""The words and the unit of each metric."""
 _TOTAL_OF: Final = {"harvest": "harvest", "in_play": "in_play_steps"}
 
 

@@ -78,43 +78,43 @@ def course_of(run: Path) -> Course:
 
 def in_sentences(course: Course) -> str:
     """Four sentences: the peak, what came after it, how long boards last, and what that means."""
-    own = course
-    last = min(LAST_EPISODES, own.episodes)
-    if own.is_tragedy:
+    last = min(LAST_EPISODES, course.episodes)
+    if course.is_tragedy:
         meaning = (
             "Each agent learned to take what pays now, and all of them, trained, end worse off than agents "
             "who never learned: the tragedy of the commons."
         )
-    elif own.last_return > own.random_return:
+    elif course.last_return > course.random_return:
         meaning = "They end better off than agents who never learned: no tragedy so far."
     else:
         meaning = "They end no better off than agents who never learned."
     return " ".join(
         [
-            f"The agents began at {own.first_return:.0f} apples an episode, all together, and reached "
-            f"{own.peak_return:.0f} around episode {own.peak_episode + PEAK_EPISODES // 2}, "
-            f"{_peak_beside_random(own)}.",
-            f"In the last {last} episodes they got {own.last_return:.0f}{_last_beside_peak_and_random(own)}.",
-            f"Boards that can last {own.longest_steps} steps now last {own.last_survival_steps:.0f}.",
+            f"The agents began at {course.first_return:.0f} apples an episode, all together, and reached "
+            f"{course.peak_return:.0f} around episode {course.peak_episode + PEAK_EPISODES // 2}, "
+            f"{_peak_beside_random(course)}.",
+            f"In the last {last} episodes they got {course.last_return:.0f}"
+            f"{_last_beside_peak_and_random(course)}.",
+            f"Boards that can last {course.longest_steps} steps now last {course.last_survival_steps:.0f}.",
             meaning,
         ]
     )
 
 
-def _peak_beside_random(own: Course) -> str:
+def _peak_beside_random(course: Course) -> str:
     """Nothing is a number of times what random play gets where that gets nothing."""
-    if not own.random_return:
+    if not course.random_return:
         return "where random play gets none"
-    over = own.peak_return / own.random_return
-    return f"{over:.1f} times the {own.random_return:.0f} ± {own.random_error:.0f} of random play"
+    over = course.peak_return / course.random_return
+    return f"{over:.1f} times the {course.random_return:.0f} ± {course.random_error:.0f} of random play"
 
 
-def _last_beside_peak_and_random(own: Course) -> str:
+def _last_beside_peak_and_random(course: Course) -> str:
     """Shares of the peak and of random play; of nothing there are none."""
     parts = []
-    if own.peak_return:
-        parts.append(f"{abs(own.last_return / own.peak_return - 1):.0%} below that peak")
-    if own.random_return:
-        change = own.last_return / own.random_return - 1
+    if course.peak_return:
+        parts.append(f"{abs(course.last_return / course.peak_return - 1):.0%} below that peak")
+    if course.random_return:
+        change = course.last_return / course.random_return - 1
         parts.append(f"{abs(change):.0%} {'less' if change < 0 else 'more'} than random play gets")
     return f", {' and '.join(parts)}" if parts else ""

@@ -39,12 +39,10 @@ _CHARACTER_IN: Final = 0.075
 
 
 def bands_of(phases: Sequence[Phase]) -> Bands:
-    """Bands of phases that were found."""
     return [(phase.first, phase.last, phase.label or UNNAMED) for phase in phases]
 
 
 def draw_bands(panel: Axes, bands: Bands) -> None:
-    """Draws bands behind the curves of a panel."""
     for first, last, name in bands:
         panel.axvspan(first, last, **_look(name, "#e6e6e6"), zorder=0, linewidth=0)
         panel.axvline(last, color="#999999", linewidth=0.6, zorder=0.5)
@@ -162,7 +160,8 @@ def training_curve(
     heights = [STRIP_IN * len(strips)] * bool(strips) + list(HEIGHTS_IN[: len(panels)])
     figure, every = style.new_figure(heights, title=title)
     strip, drawn = every[: len(strips) > 0], every[len(strips) > 0 :]
-    dashed = _random_label(panels)
+    levels = [f"{panel.random:,.4g} {panel.unit}".strip() for panel in panels if panel.random is not None]
+    dashed = f"random play, {', '.join(levels)}"
     for axes, panel in zip(drawn, panels, strict=True):
         draw_bands(axes, ours)
         _draw(axes, panel, window, dashed)
@@ -186,8 +185,8 @@ def _panels(curves: dict[str, Values], random: list[Episode] | None) -> list[_Pa
     fines of a game with institutions."""
     of_institutions = [_panel(name, curves[name], random) for name in OF_INSTITUTIONS if name in curves]
     if "collective_return" in curves:
-        shown = ("collective_return", "survival_steps")
-        return [*(_panel(name, curves[name], random) for name in shown), *of_institutions]
+        names = ("collective_return", "survival_steps")
+        return [*(_panel(name, curves[name], random) for name in names), *of_institutions]
     returns = sum(curve for name, curve in curves.items() if name.startswith("return_"))
     level = fmean(float(episode.return_.sum()) for episode in random) if random else None
     values = np.asarray(returns)
@@ -222,7 +221,6 @@ def _of_institutions(episode: Episode) -> dict[str, float]:
 
 
 def _draw(axes: Axes, panel: _Panel, window: int, dashed: str) -> None:
-    """Draws every episode, the running means and random play."""
     replicas, episodes = panel.values.shape
     several = replicas > 1
     dot = "." if episodes < 3 else None  # a line needs two points
@@ -242,11 +240,6 @@ def _draw(axes: Axes, panel: _Panel, window: int, dashed: str) -> None:
     axes.set_ylabel(panel.title)
     if panel.values.min() >= 0:
         axes.set_ylim(0, None)
-
-
-def _random_label(panels: list[_Panel]) -> str:
-    levels = [f"{panel.random:,.4g} {panel.unit}".strip() for panel in panels if panel.random is not None]
-    return f"random play, {', '.join(levels)}"
 
 
 def _mark_peak(axes: Axes, panel: _Panel, window: int) -> None:

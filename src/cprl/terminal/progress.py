@@ -85,7 +85,6 @@ class ProgressBar:
             self._show(waited)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Shows the return and epsilon of an episode that has ended."""
         self._episodes += 1
         self._steps_this_episode = 0
         self._last_steps = episode.steps

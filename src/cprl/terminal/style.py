@@ -14,9 +14,9 @@ from matplotlib.patches import Rectangle
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.text import Text
 
-from cprl import arguments
 from cprl.commons.colours import agent_colour
 from cprl.runs.files import refuse_to_write_over, write_atomically
+from cprl.values import refusal
 
 DPI: Final = 150
 COLOURS: Final = 128
@@ -51,11 +51,7 @@ _DASHES: Final = ("-", (0, (6, 2)), (0, (4, 1, 1, 1)), (0, (1, 1)))
 
 
 def new_figure(heights_in: Sequence[float], *, title: str) -> tuple[Figure, list[Axes]]:
-    """An empty figure with one panel below the other, and the same episodes in all.
-
-    Args:
-        heights_in: the height of each panel in inches, at least one.
-    """
+    """An empty figure with one panel below the other, and the same episodes in all."""
     lines = fill(title, TITLE_CHARACTERS)
     height = sum(heights_in) + 1.9 + 0.2 * lines.count("\n")
     figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
@@ -109,7 +105,6 @@ def head(figure: Figure, title: str, note: str) -> None:
 
 
 def wrapped(title: str, width_in: float) -> str:
-    """The title of a panel of a width on several lines."""
     return fill(title, int(width_in / CHARACTER_IN))
 
 
@@ -117,16 +112,12 @@ def picture_path(path: str | Path, name: str = "path") -> Path:
     """The path of a picture to be, whose folder may be missing; a picture that is there is drawn anew."""
     path = Path(path)
     if path.suffix != ".png":
-        raise arguments.refusal(name, str(path), "a file whose name ends in .png")
+        raise refusal(name, str(path), "a file whose name ends in .png")
     return path
 
 
 def check_picture(path: str | Path, name: str = "path") -> Path:
-    """`picture_path` of a new picture, checked before hours of work.
-
-    Raises:
-        FileExistsError: if the file exists.
-    """
+    """`picture_path` of a new picture, checked before hours of work."""
     path = picture_path(path, name)
     refuse_to_write_over(path)
     return path

@@ -33,19 +33,23 @@ def institutions_table(played: Mapping[str, Sequence[Episode]]) -> Table | None:
     table.add_column()
     for name in played:
         table.add_column(name, justify="right", no_wrap=True)
-    measured = {policy: [institution_metrics(episode) for episode in own] for policy, own in played.items()}
+    measured = {
+        policy: [institution_metrics(episode) for episode in episodes] for policy, episodes in played.items()
+    }
     for metric in institution_metrics(first):
-        values = [metrics[metric] for own in measured.values() for metrics in own]
+        values = [metrics[metric] for episodes in measured.values() for metrics in episodes]
         if "equality" in metric or not all(map(isnan, values)):
-            table.add_row(_title(metric), *(_mean(own, metric, 2) for own in measured.values()))
+            table.add_row(_title(metric), *(_mean(episodes, metric, 2) for episodes in measured.values()))
     fields = {name: word for name, word in _OF_AGENTS.items() if getattr(first, name) is not None}
     if fields:
         table.add_section()
         table.add_row(f"of each agent: {' / '.join(fields.values())}")
     for agent in range(len(first.return_)) if fields else ():
         cells = [
-            " / ".join(f"{fmean(getattr(one, name)[agent] for one in own):.1f}" for name in fields)
-            for own in played.values()
+            " / ".join(
+                f"{fmean(getattr(episode, name)[agent] for episode in episodes):.1f}" for name in fields
+            )
+            for episodes in played.values()
         ]
         table.add_row(f"  agent {agent}", *cells)
     return table
@@ -98,11 +102,11 @@ def summarise(
     missing = left_out(next(iter(played.values()))[0].reported)
     if missing:
         console.print(missing, soft_wrap=True)
-    kept = [name for name in KEPT if (run / name).exists()]
-    console.print(f"Saved in {run}: {', '.join(kept)}", soft_wrap=True)
+    files = [name for name in KEPT if (run / name).exists()]
+    console.print(f"Saved in {run}: {', '.join(files)}", soft_wrap=True)
     if figure:
         console.print(f"Training curve: {figure}", soft_wrap=True)
-    if "run.rrd" in kept:
+    if "run.rrd" in files:
         watch = printed(to_watch(run / "run.rrd"))
         console.print(f"Watch again: {watch}", soft_wrap=True)
 
@@ -111,18 +115,22 @@ def _table(title: str, played: Mapping[str, list[Episode]]) -> Table:
     """A column for each policy, a row for each number; the first policy is the baseline."""
     table = Table(title=title, caption="means over episodes ± their standard errors")
     table.add_column(no_wrap=True)
-    for nth, name in enumerate(played):
-        table.add_column(name if nth or len(played) == 1 else f"{name} (baseline)", justify="right")
-    has_harvest = all(episode.harvest is not None for own in played.values() for episode in own)
+    for place, name in enumerate(played):
+        table.add_column(name if place or len(played) == 1 else f"{name} (baseline)", justify="right")
+    has_harvest = all(episode.harvest is not None for episodes in played.values() for episode in episodes)
     name = "collective return, apples" if has_harvest else RETURN
     _add_returns(table, name, played, _harvests if has_harvest else _returns)
-    if has_harvest and any(_differ(own) for own in played.values()):
+    if has_harvest and any(_differ(episodes) for episodes in played.values()):
         _add_returns(table, f"{RETURN}, rewards", played, _returns)
-    measured = {policy: [social_metrics(episode) for episode in own] for policy, own in played.items()}
+    measured = {
+        policy: [social_metrics(episode) for episode in episodes] for policy, episodes in played.items()
+    }
     known = next(iter(measured.values()))[0]
     for metric, digits in METRICS.items():
         if metric in known:
-            table.add_row(metric_title(metric), *(_mean(own, metric, digits) for own in measured.values()))
+            table.add_row(
+                metric_title(metric), *(_mean(episodes, metric, digits) for episodes in measured.values())
+            )
     table.add_row("episodes", *(str(len(episodes)) for episodes in played.values()))
     return table
 
@@ -145,7 +153,7 @@ def _add_returns(
     table: Table, name: str, played: Mapping[str, list[Episode]], of: Callable[[Episode], float]
 ) -> None:
     """Adds the mean of a return with its standard error, and how many times the baseline's it is."""
-    values = {policy: [of(episode) for episode in own] for policy, own in played.items()}
+    values = {policy: [of(episode) for episode in episodes] for policy, episodes in played.items()}
     table.add_row(name, *(_with_error(value) for value in values.values()))
     if len(played) == 1:
         return
@@ -159,7 +167,6 @@ def _who(policy: str) -> str:
 
 
 def _with_error(values: list[float]) -> str:
-    """A single episode has no standard error."""
     error = f" ± {stdev(values) / len(values) ** 0.5:.1f}" if len(values) > 1 else ""
     return f"{fmean(values):.1f}{error}"
 
@@ -174,9 +181,8 @@ def _mean(measured: list[dict[str, float]], name: str, digits: int) -> str:
 
 
 def _notes(played: Mapping[str, list[Episode]]) -> Iterator[str]:
-    """Why numbers are undefined."""
-    for policy, own in played.items():
-        if all(episode.harvest is not None and not episode.harvest.any() for episode in own):
+    for policy, episodes in played.items():
+        if all(episode.harvest is not None and not episode.harvest.any() for episode in episodes):
             yield f"{policy}: nobody harvested anything, so equality and sustainability are undefined"
     baseline = next(iter(played))
     of = _returns if played[baseline][0].harvest is None else _harvests

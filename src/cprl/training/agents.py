@@ -21,7 +21,7 @@ from cprl.envs.unwrap import commons_of
 from cprl.experiment import Experiment
 from cprl.learners.base import Learner
 from cprl.learners.decisions import Bandit, BanditDecider, stored_decisions
-from cprl.learners.lanes import EVALUATION, EXHIBITION, EXPLORATION, lane_name, lane_seeds
+from cprl.learners.lanes import EVALUATION, EXHIBITION, EXPLORATION, LearningAgents, lane_name, lane_seeds
 from cprl.learners.preferences import named
 from cprl.networks.agent import acting_part
 from cprl.networks.finite import all_finite
@@ -504,20 +504,18 @@ class Population:
     def _learner(
         self, spec: Learning | Team, agents: tuple[int, ...], engine: Any, start: Mapping[str, Any]
     ) -> Learner:
-        more: dict[str, Any] = {"start_from": start} if start else {}
-        if isinstance(spec, Team) and spec.share_parameters:
-            more["share_parameters"] = True
-        learner = _algorithm_of(spec).make_learner(
+        who = LearningAgents(
             self.spaces,
             agents=agents,
-            reward_kind=spec.reward,
             replicas=self.replicas,
             seed=self.seed,
             first_replica=self._numbers.start,
-            engine=engine,
+            reward_kind=spec.reward,
+            start_from=start,
+            share_parameters=isinstance(spec, Team) and spec.share_parameters,
             device=self._device,
-            **more,
         )
+        learner = _algorithm_of(spec).make_learner(who, engine)
         wants = getattr(learner, "wants", None)
         if not isinstance(spec.reward, str) and getattr(wants, "preferences", None) != spec.reward:
             algorithm = spec.algorithm

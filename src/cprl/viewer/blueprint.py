@@ -26,9 +26,8 @@ def fates(curves: Curves) -> Any:
     if not isinstance(curves, Scene):
         return None
     wall = _panels("All replicas; framed: died in its last episode", "wall", curves, curves.replicas)
-    return row(
-        "Replicas", wall if has_wall(curves) else None, _drawn("Apples on the board, over the turn", "turn")
-    )
+    stock = _flat("Apples on the board, over the turn", "turn", BOUNDS)
+    return row("Replicas", wall if has_wall(curves) else None, stock)
 
 
 def places(curves: Curves) -> Any:
@@ -37,7 +36,7 @@ def places(curves: Curves) -> Any:
     return row(
         "Places and shares",
         _panels(name, "visits", curves, len(curves.agents)) if isinstance(curves, Scene) else None,
-        _drawn("Lorenz curve: harvest in %", "lorenz") if has_lorenz(curves) else None,
+        _flat("Lorenz curve: harvest in %", "lorenz", BOUNDS) if has_lorenz(curves) else None,
     )
 
 
@@ -47,13 +46,7 @@ def _panels(name: str, origin: str, scene: Scene, count: int) -> Any:
     return _flat(name, origin, bounds)
 
 
-def _drawn(name: str, origin: str) -> Any:
-    """A view of a plot that is drawn with `Axes`."""
-    return _flat(name, origin, BOUNDS)
-
-
 def _flat(name: str, origin: str, bounds: tuple[tuple[float, float], tuple[float, float]]) -> Any:
-
     visible = rrb.VisualBounds2D(x_range=bounds[0], y_range=bounds[1])
     return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=BACKGROUND, visual_bounds=visible)
 
@@ -76,17 +69,13 @@ def layout(curves: Curves, *, live: bool = False, ended: bool = False) -> Any:
         curves: the numbers that are plotted; a `Scene` if there is a board.
         live: whether it is the layout of the live view, which has the present policy's exhibition
             (`/exhibition`, in the live stream alone), and no room for phases before they are there.
-        ended: whether the run has ended, for the live view.
-
-    Returns:
-        A `rerun.blueprint.Blueprint`.
     """
     if isinstance(curves, Scene) and curves.is_replay:
         return _laid_out(_replay(curves), timeline="step", play_state="playing")
     strips = 3 if curves.has_phases and (ended or not live) else 1
     return _laid_out(
         rrb.Vertical(
-            _header(),
+            rrb.TextDocumentView(name="Now", origin="/header", titlebar=False),
             _top(curves, live=live),
             _strip(),
             _plots(curves),
@@ -120,11 +109,12 @@ def _replay(scene: Scene) -> Any:
         if institutions.has_institutions(scene)
         else []
     )
-
     return rrb.Horizontal(
-        rrb.Vertical(_world(), rrb.Tabs(_events(), _recipe(), active_tab=0), row_shares=[7, 2]),
         rrb.Vertical(
-            _windows(is_wide=True),
+            _board("Board", "world"), rrb.Tabs(_events(), _recipe(), active_tab=0), row_shares=[7, 2]
+        ),
+        rrb.Vertical(
+            _board(f"What agents see, {WINDOW_CAPTION}", "windows"),
             decisions(scene),
             _plot("Harvest so far, apples", *_of(scene.agents, "harvested")),
             _plot("Apples on the board", "turn/stock"),
@@ -135,38 +125,20 @@ def _replay(scene: Scene) -> Any:
     )
 
 
-def _header() -> Any:
-
-    return rrb.TextDocumentView(name="Now", origin="/header", titlebar=False)
-
-
 def _top(curves: Curves, *, live: bool) -> Any:
     """The board, the agents' windows and the events side by side; without a board the events alone."""
     if not isinstance(curves, Scene):
         return _events()
-    boards = _boards(live=live)
-    return rrb.Horizontal(boards, _windows(live=live), _events(), column_shares=[5, 3, 3])
-
-
-def _boards(*, live: bool) -> Any:
-    """The boards, in tabs if there are several: live, the present policy's and that of recorded frames."""
-    if not live:
-        return _world()
-    present = rrb.Spatial2DView(name="Present policy", origin="/exhibition", background=BACKGROUND)
-    return rrb.Tabs(present, _world("Recorded episodes"), active_tab=0)
-
-
-def _world(name: str = "Board") -> Any:
-
-    return rrb.Spatial2DView(name=name, origin="/world", background=BACKGROUND)
-
-
-def _windows(*, is_wide: bool = False, live: bool = False) -> Any:
-    """The windows, with the caption that fits; live they are those of the recorded episode."""
-    name = f"What agents see, {WINDOW_CAPTION}" if is_wide else "Windows: self blue, others red"
+    boards, windows = _board("Board", "world"), _board("Windows: self blue, others red", "windows")
     if live:
-        name = "Recorded: self blue, others red"
-    return rrb.Spatial2DView(name=name, origin="/windows", background=BACKGROUND)
+        present = _board("Present policy", "exhibition")
+        boards = rrb.Tabs(present, _board("Recorded episodes", "world"), active_tab=0)
+        windows = _board("Recorded: self blue, others red", "windows")
+    return rrb.Horizontal(boards, windows, _events(), column_shares=[5, 3, 3])
+
+
+def _board(name: str, origin: str) -> Any:
+    return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=BACKGROUND)
 
 
 def _events() -> Any:
@@ -183,7 +155,6 @@ def _strip() -> Any:
 
 
 def _plots(curves: Curves) -> Any:
-
     tabs = [tab for make in _TABS if (tab := make(curves)) is not None]
     tabs[2:2] = institutions.tabs(curves, _plot)
     return rrb.Tabs(*tabs, active_tab=0)
@@ -235,7 +206,6 @@ def _speed(curves: Curves) -> Any:
 
 
 def _recipe(curves: Curves | None = None) -> Any:
-
     return rrb.TextDocumentView(name="Recipe", origin="/recipe")
 
 

@@ -11,7 +11,6 @@ from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
@@ -23,10 +22,11 @@ from cprl.measuring.statistics import social_metrics
 from cprl.system.compile_clock import CLOCK
 from cprl.viewer.exhibition import Exhibited, Exhibition
 from cprl.viewer.frames import Filming, scene_of
+from cprl.viewer.institutions import has_institutions
 from cprl.viewer.logger import FILE_NAME, RerunLogger, free_name, recording_id
 from cprl.viewer.scenery import RANDOM_PLAY, Curves, curves_of, missing_in
 from cprl.viewer.story import Story, has_died
-from cprl.viewer.views import SAMPLED_EVERY, Turns, institution_views, views_of
+from cprl.viewer.views import SAMPLED_EVERY, Turns, in_words, log_institutions, views_of
 
 _PERIOD_S: Final = 1.0
 
@@ -72,9 +72,6 @@ def _of_institutions(episode: Episode) -> dict[str, float]:
 class Plots:
     """Logs the lines of each episode: social metrics, those of institutions and what agents get and pay
     with a running mean, all else as it is.
-
-    Args:
-        episodes: of the run; determines the window of running means.
     """
 
     def __init__(self, logger: RerunLogger, curves: Curves, *, episodes: int) -> None:
@@ -110,8 +107,8 @@ class Plots:
         return {name: recent.state_dict() for name, recent in self._recent.items()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        for name, own in state.items():
-            self._recent.setdefault(name, Recent(self.window)).load_state_dict(own)
+        for name, recent in state.items():
+            self._recent.setdefault(name, Recent(self.window)).load_state_dict(recent)
 
 
 EVERY: Final = 10
@@ -138,7 +135,7 @@ class Tags:
             self._last = [*self._last[1 - OVER :], np.zeros_like(self._last[0])]
 
     def state_dict(self) -> list[Any]:
-        return [own.tolist() for own in self._last]
+        return [matrix.tolist() for matrix in self._last]
 
     def load_state_dict(self, state: list[Any]) -> None:
         self._last = list(np.array(state, np.float64))
@@ -167,13 +164,11 @@ class ViewerCallback:
         run: the run's directory, where the recording is written. If there is one already, the new file is
             `run-2.rrd` and so on; the viewer shows them as one recording.
         env: a world for each replica, with transforms or without; the first is shown.
-        episodes: the number of episodes of the run; determines how often frames are recorded.
         live: "serve" or "spawn", see `cprl.viewer.streams`; None for the file alone.
         exhibited: what is exhibited live: the present policy and one world for it, see
             `cprl.viewer.exhibition`.
         file_name: the name of the recording instead of `run.rrd`; there must be no such file.
         is_replay: whether a stored policy is replayed, see `cprl.viewer.scenery.Scene`.
-        console: the console for the addresses; by default standard output.
     """
 
     def __init__(
@@ -188,7 +183,6 @@ class ViewerCallback:
         exhibited: tuple[Exhibited, EnvBase] | None = None,
         file_name: str | None = None,
         is_replay: bool = False,
-        console: Console | None = None,
     ) -> None:
         self.env = env
         self._agents, reported = agent_names(env), reported_by(env)
@@ -203,7 +197,6 @@ class ViewerCallback:
             exhibits=exhibited is not None and scene is not None,
             file_name=file_name or free_name(run),
             recording_id=recording_id(run, file_name or FILE_NAME),
-            console=console,
         )
         self.filming = Filming(commons, self.logger, scene, episodes=episodes)
         """Which episodes are recorded frame by frame."""
@@ -225,7 +218,8 @@ class ViewerCallback:
         self._every = max(1, min(LONGEST, episodes // _IMAGES))
         """Episodes from one image of the views to the next."""
         self._ended = self._logged = 0
-        self._institutions = institution_views(self.logger, commons)
+        if has_institutions(curves):
+            log_institutions(self.logger, commons)
         has_tags = curves.has_tags and len(self._agents) > 1
         turns = self._views.get("turns")
         self._sampled = gcd(SAMPLED_EVERY, turns.stride) if isinstance(turns, Turns) else 1
@@ -266,9 +260,9 @@ class ViewerCallback:
         """Logs the numbers of an episode, and its events, once all replicas have ended it."""
         if episode.world == 0:
             self._log_death(episode)
-            if self._institutions is not None and episode.episode % self._every == 0:
+            if episode.episode % self._every == 0 and (words := in_words(episode, self.logger.curves)):
                 self.logger.at(step=self._step, episode=episode.episode)
-                self._institutions.on_episode(episode)
+                self.logger.log_text(f"episode {episode.episode:,}: {words}")
             self._episode, self.filming.shows_next = episode.episode + 1, False
         if self._tags is not None and episode.tagged_by is not None:
             self._tags.add(episode.tagged_by)
@@ -286,7 +280,6 @@ class ViewerCallback:
         self.filming.choose(self._episode)
 
     def _show_status(self, status: str) -> None:
-        """Shows a status in the header of the live view; from any thread."""
         if self.story is not None and self._episode == 0:
             self.logger.show_live("header", self.story.beginning(status))
 
@@ -343,11 +336,7 @@ class ViewerCallback:
         return None if self.story is None else self.story.baseline
 
     def finished(self, played: Mapping[str, Sequence[Episode]]) -> None:
-        """Shows that the run is finished, and closes the file; a live view stays open until the end.
-
-        Args:
-            played: the episodes of its evaluation, "trained" and "random".
-        """
+        """Shows that the run is finished, and closes the file; a live view stays open until the end."""
         self.filming.send()
         self._close_views()
         if self.story is not None:
@@ -355,7 +344,6 @@ class ViewerCallback:
         self.logger.close_file()
 
     def log_event(self, event: str) -> None:
-        """Logs an event as text."""
         self.logger.log_text(event)
 
     def play_on(self, stop: Event) -> None:

@@ -9,87 +9,21 @@ from threading import Event
 from typing import Any, Final, Protocol
 
 import numpy as np
-import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv
 
-from cprl.commons.colours import (
-    APPLE,
-    BEAM,
-    FIRST_AGENT,
-    GROUND,
-    MARK,
-    PALETTE,
-    Colour,
-    agent_colour,
-    class_name,
-    picture_colour,
-)
 from cprl.commons.game import Game
-from cprl.commons.picture import INK_COLOUR, MARK_COLOUR
-from cprl.commons.world import Bytes
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.envs.stepping import begin_states
 from cprl.envs.unwrap import commons_of
-from cprl.system.compat import rows_made, send_chunk, send_made
+from cprl.system.compat import send_chunk
 from cprl.viewer.frames import FrameRecorder
 from cprl.viewer.logger import components
-from cprl.viewer.scenery import BACKGROUND, Scene, packed
-from cprl.viewer.stage import (
-    BEAM_OPACITY,
-    OUT_STROKE_CELLS,
-    RADIUS_CELLS,
-    RIM_CELLS,
-    Frames,
-    Strokes,
-    alone_of,
-    boards,
-    centres_of,
-    image_form,
-    marks,
-    numbers,
-    numbers_and_headings,
-    squares,
-)
+from cprl.viewer.scenery import BACKGROUND, Scene
+from cprl.viewer.stage import IMAGES, RIM_CELLS, Frames, board_columns, board_styles, image_form
 from cprl.viewer.streams import Live
-
-
-def ragged(form: Any, counts: NDArray[np.integer[Any]], values: NDArray[Any]) -> Any:
-    """Rows of numbers, lines or bytes, as `cprl.system.compat.send_chunk` takes them.
-
-    Args:
-        form: the `pyarrow` type of the column: lists of numbers, of lists of numbers, or of lists of points.
-        counts: how many entries each row has, [T].
-        values: the entries of all rows one after the other, in C order: [entries], [entries, length] or
-            [entries, length, 2], with the dtype that the type says.
-    """
-    ends = np.zeros(len(counts) + 1, np.int32)
-    np.cumsum(counts, out=ends[1:])
-    return _listed(form, ends, _entries(form.value_type, values))
-
-
-def _entries(form: Any, values: NDArray[Any]) -> Any:
-
-    if values.ndim == 1:
-        return pa.Array.from_buffers(form, len(values), [None, pa.py_buffer(values)])
-    count, length = values.shape[:2]
-    if pa.types.is_fixed_size_list(form):
-        inner = _entries(form.value_type, values.reshape(-1))
-        return pa.Array.from_buffers(form, count, [None], children=[inner])
-    ends = np.arange(count + 1, dtype=np.int32) * np.int32(length)
-    return _listed(form, ends, _entries(form.value_type, values.reshape(count * length, *values.shape[2:])))
-
-
-def _listed(form: Any, ends: NDArray[np.int32], entries: Any) -> Any:
-
-    return pa.Array.from_buffers(form, len(ends) - 1, [None, pa.py_buffer(ends)], children=[entries])
-
-
-_BOARD: Final = "exhibition/board"
-_LIT_APPLE: Final = MARK
-"""The class of an apple under a beam; boards have no other use for it."""
 
 _CAPTION_CELLS, _ROOM_CELLS = 0.4, 2.4
 """The distances from the board to the caption and to the line that gives it room, in cells."""
@@ -99,11 +33,11 @@ _THIN: Final = 0.01
 def send_fixed(recording: Any, *, scene: Scene) -> None:
     """Sends what never changes, to the server that keeps it for viewers that come later.
 
-    The format of the image is not among it, but in each frame: a viewer that gets it after a frame, for the
+    The formats of images are not among it, but in each frame: a viewer that gets one after a frame, for the
     first time or again, shows no board until the next frame.
     """
-    picture = rr.SegmentationImage.from_fields(opacity=1.0, draw_order=-10.0)
-    recording.log(_BOARD, _classes(len(scene.agents)), picture, static=True)
+    for entity, parts in board_styles().items():
+        recording.log(f"exhibition/{entity}", *parts, static=True)
     low = scene.height + 2 * RIM_CELLS + _ROOM_CELLS
     line = [(0.0, low), (scene.width + 2 * RIM_CELLS, low)]  # hidden; the view makes room for what it shows
     room = rr.LineStrips2D([line], radii=_THIN, colors=[BACKGROUND])
@@ -113,110 +47,43 @@ def send_fixed(recording: Any, *, scene: Scene) -> None:
     recording.log("exhibition/caption", caption, static=True)
 
 
-def _classes(agents: int) -> Any:
-    """Names and colours of the classes on the exhibited board."""
-    known = {kind: (class_name(kind), picture_colour(kind)) for kind in range(FIRST_AGENT + agents)}
-    known[BEAM] = "beam", _lit(GROUND)
-    known[_LIT_APPLE] = "apple under a beam", _lit(APPLE)
-    return rr.AnnotationContext(
-        [rr.AnnotationInfo(id=kind, label=label, color=colour) for kind, (label, colour) in known.items()]
-    )
+def send_frames(
+    recording: Any,
+    *,
+    scene: Scene,
+    frames: Frames,
+    caption: str,
+    wait: Callable[[float], bool],
+    lasting_s: float,
+) -> None:
+    """Sends frames one by one.
 
-
-def _lit(kind: int) -> Colour:
-    """The colour of a class under a beam."""
-    pairs = zip(PALETTE[BEAM], PALETTE[kind], strict=True)
-    red, green, blue = (round(BEAM_OPACITY * over + (1 - BEAM_OPACITY) * under) for over, under in pairs)
-    return red, green, blue
-
-
-class LiveBoard:
-    """Sends the board with its agents as one entity, each frame as one row.
-
-    Whatever is done here in Python keeps the training from going on. So a frame is an image, with classes of
-    their own for cells under a beam, and lines in one column; rows are made once for all frames, and Rerun's
-    native part sends them. Squares of agents out of play have no labels, unlike in a recording.
+    Args:
+        frames: of `FrameRecorder.take`, [T, ...].
+        wait: waits so many seconds; returns whether to leave out the rest.
+        lasting_s: seconds over which they are spread.
     """
+    text = rr.Points2D.columns(labels=np.array([caption]))
+    send_chunk(recording, "exhibition/caption", {}, components(text))
+    rows = _rows(scene, frames)
+    for sent, row in enumerate(rows, 1):
+        for entity, parts in row:
+            send_chunk(recording, f"exhibition/{entity}", {}, parts)
+        if sent < len(rows) and wait(lasting_s / len(rows)):
+            return
 
-    def __init__(self, scene: Scene) -> None:
 
-        self._scene, agents = scene, len(scene.agents)
-        hues = np.array([packed(agent_colour(agent)) for agent in range(agents)], np.uint32)
-        ink, mark = (np.full(agents, packed(colour), np.uint32) for colour in (INK_COLOUR, MARK_COLOUR))
-        kinds = (
-            (numbers_and_headings(agents), 0, ink, RADIUS_CELLS),
-            (marks(agents), 0, mark, RADIUS_CELLS),
-            (squares(agents), 1, hues, OUT_STROKE_CELLS),
-            (numbers(agents), 2, hues, RADIUS_CELLS),
-        )
-        self._strokes = Strokes(
-            np.concatenate([strokes.owner for strokes, *_ in kinds]),
-            np.concatenate([strokes.shape for strokes, *_ in kinds], 1),
-        )
-        lines = [len(strokes.owner) for strokes, *_ in kinds]
-        self._when = np.repeat([when for _, when, _, _ in kinds], lines)
-        """When each line is drawn: its agent is in play 0, out 1, or out with its cell to itself 2."""
-        self._colours = np.concatenate([colours[strokes.owner] for strokes, _, colours, _ in kinds])
-        self._radii = np.repeat(np.array([radius for *_, radius in kinds], np.float32), lines)
-        size = scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS
-        picture = rr.SegmentationImage.columns(buffer=np.zeros((1, 1), np.uint8))
-        self._form = components(rr.SegmentationImage.columns(format=[image_form(size)]))
-        """The format of the image, as one row."""
-        drawn = rr.LineStrips2D.columns(strips=np.zeros((1, 2, 2), np.float32), colors=[0], radii=[0.0])
-        kept = {own.component_descriptor(): own.as_arrow_array().type for own in (*picture, *drawn)}
-        self._forms = {kind.component.partition(":")[2]: (kind, form) for kind, form in kept.items()}
-
-    def send(
-        self, recording: Any, *, frames: Frames, caption: str, wait: Callable[[float], bool], lasting_s: float
-    ) -> None:
-        """Sends frames one by one.
-
-        Args:
-            frames: of `FrameRecorder.take`, [T, ...].
-            wait: waits so many seconds; returns whether to leave out the rest.
-            lasting_s: seconds over which they are spread.
-        """
-        text = rr.Points2D.columns(labels=np.array([caption]))
-        send_chunk(recording, "exhibition/caption", {}, components(text))
-        rows = rows_made(_BOARD, self.columns(frames))
-        for at, row in enumerate(rows, 1):
-            send_made(recording, row)
-            if at < len(rows) and wait(lasting_s / len(rows)):
-                return
-
-    def columns(self, frames: Frames) -> Mapping[Any, Any]:
-        """The rows of T frames as `pyarrow` arrays, by component descriptor."""
-        pictures, (lines, line, counts) = self._pictures(frames), self._lines(frames)
-        parts: dict[str, tuple[NDArray[Any], NDArray[Any]]] = {
-            "buffer": (np.ones(len(pictures), np.int32), pictures.reshape(len(pictures), -1)),
-            "strips": (counts, lines),
-            "colors": (counts, self._colours[line]),
-            "radii": (counts, self._radii[line]),
-        }
-        made = {kind: row.take([0] * len(pictures)) for kind, row in self._form.items()}
-        for name, (of_row, values) in parts.items():
-            kind, form = self._forms[name]
-            made[kind] = ragged(form, of_row, values)
-        return made
-
-    def _pictures(self, frames: Frames) -> Bytes:
-        """Images of classes, uint8 [T, H + 2, W + 2]; a beam that covers an agent is behind it."""
-        pictures = boards(self._scene, frames)
-        inner = pictures[:, RIM_CELLS:-RIM_CELLS, RIM_CELLS:-RIM_CELLS]
-        covered = frames["beams"]
-        if covered.any():
-            inner[covered & (inner == GROUND)] = BEAM
-            inner[covered & (inner == APPLE)] = _LIT_APPLE
-        return pictures
-
-    def _lines(self, frames: Frames) -> tuple[NDArray[np.float32], NDArray[np.intp], NDArray[np.intp]]:
-        """The lines of all frames one after the other, float32 [lines, P, 2], which line each is, and how
-        many each frame has."""
-        in_play, owner = frames["in_play"], self._strokes.owner
-        alone = in_play if in_play.all() else alone_of(frames)  # nobody is out, so neither is read
-        drawn = np.stack([in_play, ~in_play, alone & ~in_play])[self._when, :, owner].T
-        lines, counts = self._strokes.placed_lines(centres_of(frames), frames["heading"], drawn)
-        return lines, np.nonzero(drawn)[1], counts
+def _rows(scene: Scene, frames: Frames) -> list[list[tuple[str, dict[Any, Any]]]]:
+    """What each frame changes: entities, and their `pyarrow` arrays by component descriptor."""
+    rows: list[list[tuple[str, dict[Any, Any]]]] = [[] for _ in frames["step"]]
+    form = image_form((scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS))
+    for entity, (numbers, columns) in board_columns(scene, frames).items():
+        arrays = components(columns)
+        if entity in IMAGES:
+            arrays |= components(rr.SegmentationImage.columns(format=[form] * len(numbers)))
+        for place, number in enumerate(numbers):
+            rows[number].append((entity, {kind: array.slice(place, 1) for kind, array in arrays.items()}))
+    return rows
 
 
 BATCH_S: Final = 2.0
@@ -287,7 +154,7 @@ class Exhibition:
                 f"the exhibition has a {type(env).__name__} of batch size {list(env.batch_size)}; allowed: "
                 "one world of a CommonsEnv, with transforms or without"
             )
-        self._policy, self._env, self._trained, self._board = policy, env, trained, LiveBoard(scene)
+        self._policy, self._env, self._trained, self._scene = policy, env, trained, scene
         self._live, self._clock, self._closing = live, clock, Event()
         self._wait = wait or self._slept
         self._recorder = FrameRecorder(
@@ -369,16 +236,24 @@ class Exhibition:
 
     def _send(self, frames: Mapping[str, NDArray[Any]], caption: str) -> None:
         if self._live.exhibition is not None:
-            shown = partial(self._board.send, frames=frames, caption=caption)
-            self._live.exhibition.do(partial(shown, wait=self._wait, lasting_s=BATCH_S))
+            self._live.exhibition.do(
+                partial(
+                    send_frames,
+                    scene=self._scene,
+                    frames=frames,
+                    caption=caption,
+                    wait=self._wait,
+                    lasting_s=BATCH_S,
+                )
+            )
 
 
 def caption_of(policy: Exhibited, episode: int) -> str:
     """What is shown: "present policy, episode 1,234, epsilon 0.31", without the last for agents that have no
     epsilon."""
     policy.explore_as_now()
-    shown = list(dict.fromkeys(f"{epsilon:.2f}" for epsilon in policy.epsilons))
-    chance = f", epsilon {' to '.join(dict.fromkeys((shown[0], shown[-1])))}" if shown else ""
+    chances = list(dict.fromkeys(f"{epsilon:.2f}" for epsilon in policy.epsilons))
+    chance = f", epsilon {' to '.join(dict.fromkeys((chances[0], chances[-1])))}" if chances else ""
     return f"{'trained' if policy.is_trained else 'present'} policy, episode {episode:,}{chance}"
 
 
@@ -394,5 +269,6 @@ def _before_the_first_step(game: Game) -> dict[str, NDArray[Any]]:
         "col": col,
         "heading": heading,
         "in_play": np.ones(game.agents, np.bool_),
+        "tagged_by": np.full(game.agents, -1, np.int32),
     }
     return {name: array[None] for name, array in one.items()}

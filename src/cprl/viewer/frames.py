@@ -32,9 +32,7 @@ class FrameRecorder:
     Windows show the observations of the `CommonsEnv` itself, without transforms.
 
     Args:
-        episodes: the number of episodes of the run; determines how often frames are recorded.
         capacity: the largest number of frames to keep; by default an episode, at most 5,000.
-        has_windows: whether frames have the agents' windows; else these are empty.
     """
 
     def __init__(
@@ -77,12 +75,12 @@ class FrameRecorder:
 
     def add_board(self, *, step: int = 0, episode: int = 0) -> None:
         """Copy a frame of the board as it is, e.g. when an episode begins."""
-        shown = self.env.worlds.show(self.env.output)
-        frame = {"step": step, "episode": episode, "beams": shown.board == BEAM, "tagged_by": self._tagged_by}
+        board = self.env.worlds.show(self.env.output)
+        frame = {"step": step, "episode": episode, "beams": board.board == BEAM, "tagged_by": self._tagged_by}
         if self._has_windows:
-            frame["windows"] = shown.observation
+            frame["windows"] = board.observation
         for name in ("stock", "row", "col", "heading", "in_play", "harvested"):
-            frame[name] = getattr(shown, name)
+            frame[name] = getattr(board, name)
         for name, value in frame.items():
             self._arrays[name][self.pending] = value
         self.pending += 1
@@ -144,11 +142,6 @@ def frame_bytes(scene: Scene) -> float:
 class Filming:
     """Logs the frames of the first world in every k-th episode, including the first and the last, and in the
     episode after each new best.
-
-    Args:
-        env: the environment without its transforms; None for no frames.
-        scene: the contents of the board; None for no frames.
-        episodes: the number of episodes of the run; determines how often frames are recorded.
     """
 
     def __init__(
@@ -171,7 +164,6 @@ class Filming:
         return is_chosen and episode <= self._last
 
     def choose(self, episode: int) -> None:
-        """Records from now on if the frames of this episode are recorded."""
         self.is_on = self.is_shown(episode)
 
     def add(self, batch: TensorDictBase, *, step: int, episode: int) -> int | None:
@@ -189,7 +181,6 @@ class Filming:
         return frame
 
     def send(self) -> None:
-        """Sends the frames that wait."""
         frames = None if self._recorder is None else self._recorder.take()
         if frames is not None:
             self._logger.log_frames(frames)

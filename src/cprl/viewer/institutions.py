@@ -6,7 +6,7 @@ from typing import Any, Final
 import rerun as rr
 
 from cprl.commons.colours import agent_colour
-from cprl.measuring.metrics import INSTITUTION_NAMES
+from cprl.measuring.institutions import METRICS
 from cprl.measuring.series import OF_AGENTS
 from cprl.viewer.panels import row
 from cprl.viewer.scenery import BLUE, GREEN, GREY, ORANGE, PURPLE, RANDOM_PLAY, VERMILION, Curves, running
@@ -41,7 +41,6 @@ Plot = Callable[..., Any]
 
 
 def has_institutions(curves: Curves) -> bool:
-    """Whether the game reports anything of institutions."""
     return bool(curves.institutions or curves.in_force)
 
 
@@ -62,7 +61,7 @@ def tabs(curves: Curves, plot: Plot) -> list[Any]:
     ]
     shares, equalities = (_entities(names, curves) for names in (SHARES, EQUALITIES))
     baseline = [f"{RANDOM_PLAY}/institutions/net_equality"]
-    decided = [f"institutions/in_force_{nth}" for nth in range(len(curves.in_force))]
+    decided = [f"institutions/in_force_{ballot}" for ballot in range(len(curves.in_force))]
     rules = [
         plot("Shares of violations, bites, tags", *shares, share=True) if shares else None,
         plot("Equality of net incomes", *equalities, *baseline, share=True) if equalities else None,
@@ -79,13 +78,13 @@ def lines(curves: Curves) -> dict[str, Any]:
     """The names, colours and widths of the lines, by entity; none for a game without institutions."""
     styles = {
         f"institutions/{name}": running(
-            INSTITUTION_NAMES[name][0], COLOURS.get(name, GREY), curves.replicas, alone=name in SHARES
+            METRICS[name].words, COLOURS.get(name, GREY), curves.replicas, alone=name in SHARES
         )
         for name in curves.institutions
     }
-    for nth, title in enumerate(curves.in_force):
-        colour = IN_FORCE[nth % len(IN_FORCE)]
-        styles[f"institutions/in_force_{nth}"] = running(title, colour, curves.replicas)
+    for ballot, title in enumerate(curves.in_force):
+        colour = IN_FORCE[ballot % len(IN_FORCE)]
+        styles[f"institutions/in_force_{ballot}"] = running(title, colour, curves.replicas)
     for name in curves.institutions:
         styles[f"{RANDOM_PLAY}/institutions/{name}"] = rr.SeriesLines(
             names=["random play"], colors=[GREY], widths=[1.0]

@@ -12,15 +12,14 @@ import numpy as np
 import rerun as rr
 import torch
 from numpy.typing import NDArray
-from rich.console import Console
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
-from cprl.checks import shown
 from cprl.runs.files import read_json
 from cprl.runs.recipe import RECIPE_FILE
 from cprl.system.compat import send_chunk
-from cprl.system.output import console as safe_console
+from cprl.system.output import console
+from cprl.values import shown
 from cprl.viewer.blueprint import layout
 from cprl.viewer.scenery import Curves, Scene
 from cprl.viewer.stage import columns, fixed
@@ -41,7 +40,7 @@ FILE_NAME: Final = "run.rrd"
 
 def free_name(run: Path) -> str:
     """run.rrd, or run-2.rrd and so on if the run has a recording already."""
-    names = (FILE_NAME if nth == 1 else f"run-{nth}.rrd" for nth in itertools.count(1))
+    names = (FILE_NAME if number == 1 else f"run-{number}.rrd" for number in itertools.count(1))
     return next(name for name in names if not (run / name).exists())
 
 
@@ -50,7 +49,7 @@ def recording_id(run: Path, file_name: str) -> str | None:
     if not (run / RECIPE_FILE).exists():
         return None
     recipe = read_json(run / RECIPE_FILE)
-    same = {name: own for name, own in recipe.items() if name not in ("experiment", "extended")}
+    same = {name: value for name, value in recipe.items() if name not in ("experiment", "extended")}
     return str(uuid.uuid5(uuid.NAMESPACE_URL, file_name + json.dumps(same, sort_keys=True)))
 
 
@@ -75,14 +74,14 @@ def as_table(recipe: Mapping[Any, Any]) -> str:
 def _places(value: Any, place: str) -> Iterator[tuple[str, Any]]:
     """Each value that holds no others, with its dotted place."""
     if isinstance(value, Mapping) and value:
-        for name, own in value.items():
-            yield from _places(own, f"{place}.{name}" if place else str(name))
-    elif isinstance(value, list | tuple) and any(isinstance(own, Mapping) for own in value):
-        for index, own in enumerate(value):
-            if index and own == value[0]:
+        for name, entry in value.items():
+            yield from _places(entry, f"{place}.{name}" if place else str(name))
+    elif isinstance(value, list | tuple) and any(isinstance(entry, Mapping) for entry in value):
+        for index, entry in enumerate(value):
+            if index and entry == value[0]:
                 yield f"{place}.{index}", f"as {place}.0"
             else:
-                yield from _places(own, f"{place}.{index}")
+                yield from _places(entry, f"{place}.{index}")
     else:
         yield place, value
 
@@ -104,12 +103,10 @@ def _cell(text: str) -> str:
 
 
 def numbers_in(data: Any) -> NDArray[Any]:
-    """The numbers of a tensor, an array or a list, [n]."""
     return np.asarray(data.detach().cpu() if isinstance(data, Tensor) else data).reshape(-1)
 
 
 def images_of(video: Tensor) -> NDArray[np.uint8]:
-    """The images of a video, uint8 [T, H, W, C]."""
     clip = torch.as_tensor(video).cpu()
     clip = clip[0] if clip.ndim == 5 else clip
     if clip.ndim != 4:
@@ -139,7 +136,7 @@ def components(columns: Iterable[Any]) -> dict[Any, Any]:
 
 def timelines(at: Iterable[Any]) -> dict[str, Any]:
     """`times` as `cprl.system.compat.send_chunk` takes them."""
-    return {own.timeline_name(): own.as_arrow_array() for own in at}
+    return {column.timeline_name(): column.as_arrow_array() for column in at}
 
 
 def log_now(recording: Any, name: str, what: Any, now: tuple[int, int, int]) -> None:
@@ -203,14 +200,11 @@ class RerunLogger(Logger):
     one fails, the logger warns once, drops it and continues with the other.
 
     Args:
-        log_dir: the run's directory, where the recording is written.
-        scene: the contents of the board; needed to log frames.
         curves: the numbers that are plotted, if there is no scene, which has them too.
         live: "serve" or "spawn", see `cprl.viewer.streams.open_live`; None for the file alone. The recording
             and the page of the web viewer are served on 127.0.0.1 only.
         exhibits: whether viewers are sent an exhibition too, see `cprl.viewer.exhibition`.
         recording_id: the viewer shows files with the same id as one recording; by default a new id.
-        console: the console for the addresses; by default standard output.
 
     Raises:
         FileExistsError: if the recording exists.
@@ -227,7 +221,6 @@ class RerunLogger(Logger):
         exhibits: bool = False,
         file_name: str = FILE_NAME,
         recording_id: str | None = None,
-        console: Console | None = None,
     ) -> None:
         self.scene = scene
         self.curves = scene or curves or Curves(agents=())
@@ -239,7 +232,7 @@ class RerunLogger(Logger):
             )
         self.live = Live()
         """What viewers are sent; nothing where the recording is written to a file alone."""
-        self._live, self._exhibits, self._console = live, exhibits, console or safe_console()
+        self._live, self._exhibits = live, exhibits
         self._streams: list[Stream] = []
         self.frames = 0
         """Frames recorded so far, including those in earlier files of the recording."""
@@ -263,7 +256,7 @@ class RerunLogger(Logger):
             )
             streams.append(self.live.stream)
             for where, address in self.addresses.items():
-                self._console.print(f"Watch live ({where}): {address}", soft_wrap=True, highlight=False)
+                console().print(f"Watch live ({where}): {address}", soft_wrap=True, highlight=False)
         self._streams = [stream for stream in streams if stream is not None]
         self.do(lambda recording: recording.send_recording_name(self.exp_name))
         for entity, parts in fixed(self.curves).items():
@@ -273,7 +266,6 @@ class RerunLogger(Logger):
 
     @property
     def addresses(self) -> dict[str, str]:
-        """How to watch live: "browser" and "native"; empty where it is not served."""
         return self.live.addresses
 
     def do(self, what: Callable[[Any], object], *, live_only: bool = False) -> None:
@@ -291,7 +283,6 @@ class RerunLogger(Logger):
 
     @property
     def is_live(self) -> bool:
-        """Whether there is a stream to viewers."""
         return any(isinstance(stream, LiveStream) for stream in self._streams)
 
     def log_row(self, name: str, what: Any) -> None:
@@ -361,7 +352,6 @@ class RerunLogger(Logger):
             self._send(entity, at, what)
 
     def log_text(self, text: str, level: str = "INFO") -> None:
-        """Logs an event at the time set by `at`."""
         at = times([self._now[0]], [self._now[1]], [self.frames])
         self._send("log", at, rr.TextLog.columns(text=[text], level=[level]))
 

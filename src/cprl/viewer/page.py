@@ -41,9 +41,6 @@ class Page:
 
     `rerun.serve_web_viewer` listens on all interfaces; this listens on 127.0.0.1, and answers only requests
     that name it or localhost as their host. The viewer's files, 43 MB, are read when a browser first asks.
-
-    Args:
-        recordings: files that viewers may load; none where they connect to a served recording.
     """
 
     def __init__(self, recordings: Sequence[Path] = ()) -> None:
@@ -56,9 +53,10 @@ class Page:
 
     @property
     def recordings(self) -> list[str]:
-        """The addresses of the recordings."""
         here = f"http://{LOCALHOST}:{self.port}/recordings"
-        return [f"{here}/{number}/{quote(own.name)}" for number, own in enumerate(self._recordings)]
+        return [
+            f"{here}/{number}/{quote(recording.name)}" for number, recording in enumerate(self._recordings)
+        ]
 
     def address(self, *sources: str) -> str:
         """The address of the page that shows these sources in one viewer, by default the recordings."""
@@ -99,81 +97,45 @@ class _Server(ThreadingHTTPServer):
         """A browser that goes away is no error."""
 
 
-class LocalHandler(BaseHTTPRequestHandler):
-    """What servers on 127.0.0.1 share: for whom they answer, and the files of the web viewer."""
+class _Handler(BaseHTTPRequestHandler):
+    recordings: Sequence[Path] = ()
 
-    def is_for_us(self) -> bool:
-        """Whether a request names 127.0.0.1 or localhost as its host; else it is refused."""
-        if urlsplit(f"//{self.headers.get('Host', '')}").hostname in (LOCALHOST, "localhost"):
-            return True
-        self.send_error(403, f"allowed hosts: {LOCALHOST}, localhost")  # a name elsewhere made to lead here
-        return False
+    def do_GET(self) -> None:
+        """Answers with a file of the web viewer, or a recording, to who names 127.0.0.1 or localhost."""
+        if urlsplit(f"//{self.headers.get('Host', '')}").hostname not in (LOCALHOST, "localhost"):
+            self.send_error(403, f"allowed hosts: {LOCALHOST}, localhost")  # a name made to lead here
+            return
+        path = urlsplit(self.path).path.lstrip("/") or "index.html"
+        for number, recording in enumerate(self.recordings):
+            if unquote(path) == f"recordings/{number}/{recording.name}":
+                with recording.open("rb") as file:
+                    self._begin("application/octet-stream", os.fstat(file.fileno()).st_size)
+                    shutil.copyfileobj(file, self.wfile)
+                return
+        if path not in _FILES:
+            self.send_error(404)
+            return
+        try:
+            with _ONE_AT_A_TIME:
+                content = web_viewer()[path]
+        except (OSError, HTTPException, TimeoutError) as error:
+            self.send_error(503, "Rerun's web viewer cannot be read", str(error))
+            return
+        self._begin(_FILES[path], len(content))
+        self.wfile.write(content)
 
-    def begin(self, kind: str, size: int, *, may: str | None = None) -> None:
-        """Sends the headers of a file.
-
-        Args:
-            may: what the browser lets it load, a Content-Security-Policy; None for anything.
-        """
+    def _begin(self, kind: str, size: int) -> None:
         self.send_response(200)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(size))
         self.send_header("rerun-final-length", str(size))  # of which the page shows how much it has loaded
-        if may is not None:
-            self.send_header("Content-Security-Policy", may)
         self.end_headers()
-
-    def send_viewer(self, name: str, *, may: str | None = None, with_content: bool = True) -> None:
-        """Answers with a file of the web viewer, or says that there is none; see `begin`."""
-        try:
-            found = _viewer_file(name)
-        except (OSError, HTTPException, TimeoutError) as error:
-            self.send_error(503, "Rerun's web viewer cannot be read", str(error))
-            return
-        if found is None:
-            self.send_error(404)
-            return
-        kind, content = found
-        self.begin(kind, len(content), may=may)
-        if with_content:
-            self.wfile.write(content)
 
     def log_message(self, format: str, *args: Any) -> None:
         """Nothing: the terminal is the command's."""
 
 
-class _Handler(LocalHandler):
-    recordings: Sequence[Path] = ()
-
-    def do_GET(self) -> None:
-        """Answers with a file of the web viewer, or a recording."""
-        if not self.is_for_us():
-            return
-        path = urlsplit(self.path).path.lstrip("/") or "index.html"
-        recording = self._recording(path)
-        if recording is None:
-            self.send_viewer(path)
-            return
-        with recording.open("rb") as file:
-            self.begin("application/octet-stream", os.fstat(file.fileno()).st_size)
-            shutil.copyfileobj(file, self.wfile)
-
-    def _recording(self, path: str) -> Path | None:
-        for number, own in enumerate(self.recordings):
-            if unquote(path) == f"recordings/{number}/{own.name}":
-                return own
-        return None
-
-
 _ONE_AT_A_TIME: Final = Lock()
-
-
-def _viewer_file(name: str) -> tuple[str, mmap.mmap] | None:
-    """The type and content of a file of the web viewer, read when it is first asked for; None of others."""
-    if name not in _FILES:
-        return None
-    with _ONE_AT_A_TIME:
-        return _FILES[name], web_viewer()[name]
 
 
 @cache
@@ -229,14 +191,12 @@ def viewer_binary() -> Path:
 
 
 def free_port() -> int:
-    """A free port of 127.0.0.1."""
     with socket.socket() as probe:
         probe.bind((LOCALHOST, 0))
         return int(probe.getsockname()[1])
 
 
 def has_display() -> bool:
-    """Whether a window can open here."""
     if not sys.platform.startswith("linux"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

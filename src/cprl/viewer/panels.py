@@ -1,6 +1,5 @@
 """Places in the viewer: several boards in one image, and plots whose horizontal axis is no timeline."""
 
-from collections.abc import Sequence
 from math import ceil
 from typing import Any, Final
 
@@ -20,12 +19,7 @@ WINDOWS_WIDE: Final = 1.7
 def window_corners(
     agents: int, window: tuple[int, int], *, wide: float = WINDOWS_WIDE
 ) -> list[tuple[int, int]]:
-    """The top-left corner (row, col) of each agent's window in a mosaic with cells as large as possible.
-
-    Args:
-        window: (X, Y).
-        wide: the width of the viewer's area, divided by its height.
-    """
+    """The top-left corner (row, col) of each agent's window in a mosaic with cells as large as possible."""
     rows, cols = (length + WINDOWS_APART_PIXELS for length in window)
 
     def cell_size(columns: int) -> float:
@@ -36,7 +30,6 @@ def window_corners(
 
 
 def mosaic_size(agents: int, window: tuple[int, int]) -> tuple[int, int]:
-    """The rows and columns of the mosaic, in pixels."""
     corners = window_corners(agents, window)
     return max(row for row, _ in corners) + window[0], max(col for _, col in corners) + window[1]
 
@@ -74,7 +67,6 @@ class Panels:
     """The places of equal boards in one image.
 
     Args:
-        size: the rows and columns of a board, in pixels.
         columns: how many stand side by side; by default so many that they are as large as possible.
     """
 
@@ -104,7 +96,6 @@ class Panels:
 
     @property
     def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """What a view shows, x and y."""
         rows, columns = self.shape
         return (-0.5, columns + 0.5), (-0.5, rows + 0.5)
 
@@ -115,13 +106,12 @@ class Panels:
             positions=tops.astype(np.float32), radii=[0.0], colors=[(220, 220, 220)], show_labels=True
         )
 
-    def frames(self, colours: Sequence[tuple[int, int, int]] = ()) -> Any:
-        """A frame around each board, as Rerun's static part of `Boxes2D`, without colours where they vary."""
+    def frames(self) -> Any:
+        """A frame around each board, as Rerun's static part of `Boxes2D`; colours vary."""
         return rr.Boxes2D.from_fields(
             centers=(self.corners[:, ::-1] + np.array(self.size[::-1]) / 2).astype(np.float32),
             half_sizes=np.tile(np.array(self.size[::-1], np.float32) / 2, (len(self.corners), 1)),
             radii=[0.25],
-            colors=list(colours) or None,
             show_labels=False,
         )
 
@@ -133,7 +123,6 @@ def decision_panels(agents: int, actions: int, window: tuple[int, int]) -> Panel
 
 
 def row(name: str, *views: Any) -> Any:
-    """The views that are there side by side, as a tab; None if there is none."""
     there = [view for view in views if view is not None]
     return rrb.Horizontal(*there, name=name) if there else None
 
@@ -169,7 +158,7 @@ class Axes:
         rim = self.placed([0, 0, self.ends[0]], [self.ends[1], 0, 0])
         below = [(*self.placed(tick, 0)[:1], PLOT_HIGH + 1.0) for tick in ticks[0]]
         left = [(-10.0, self.placed(0, tick)[1] - 6.0) for tick in ticks[1]]
-        texts = [*map(_short, ticks[0]), *map(_short, ticks[1]), self.name]
+        texts = [*(f"{tick:g}" for of_axis in ticks for tick in of_axis), self.name]
         points = [*below, *left, (PLOT_WIDE / 2, PLOT_HIGH + 13.0)]
         lines = rr.LineStrips2D(
             [*upright, *level, rim], colors=[*[_FAINT] * count, _GREY], radii=[*[0.1] * count, 0.3]
@@ -178,7 +167,6 @@ class Axes:
 
 
 def titled(text: str) -> Any:
-    """A title above a plot, as Rerun's archetype."""
     return rr.Points2D([TITLE], labels=[text], radii=0.0, colors=_TEXT, show_labels=True)
 
 
@@ -187,7 +175,3 @@ def _ticks(end: float) -> list[float]:
     size = 10 ** np.floor(np.log10(end))
     step = next(part * size for part in (0.1, 0.2, 0.25, 0.5, 1.0, 2.0) if end / (part * size) <= 5)
     return [step * index for index in range(int(end / step + 1e-9) + 1)]
-
-
-def _short(number: float) -> str:
-    return f"{number:g}"

@@ -46,9 +46,6 @@ class Decisions:
     Bars of action values end at the best of the moment and begin as far below the median as that is above, so
     that one poor action does not make all others look alike; bars of probabilities are from 0 to 1. Agents
     that have neither, scripted ones and those at random, say so.
-
-    Args:
-        window: (X, Y) of a window.
     """
 
     def __init__(
@@ -86,13 +83,12 @@ class Decisions:
                 seen = [observation[:, list(agents)]]
                 if actor.state_cells:
                     seen.append(batch[keys.RECURRENT_STATE_BEFORE][:, list(agents), : actor.state_cells])
-                found = actor.preferences(*seen)
-                if found is not None:
-                    values[list(agents)] = found[0].double().numpy(force=True)
+                preferences = actor.preferences(*seen)
+                if preferences is not None:
+                    values[list(agents)] = preferences[0].double().numpy(force=True)
         self._rows.append((values, batch[keys.ACTION][0].numpy(force=True).copy()))
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Sends the rows of the episode."""
         if not self._rows:
             return
         values, taken = (np.stack(part) for part in zip(*self._rows, strict=True))
@@ -178,7 +174,6 @@ def _range(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np
 
 
 def _kind(actor: nn.Module) -> str:
-    """What an actor chooses by."""
     if not isinstance(actor, LaneActor):
         return "scripted, has no values"
     if actor.values is None:
@@ -199,7 +194,6 @@ class Offences:
     """
 
     def __init__(self, logger: RerunLogger, env: CommonsEnv, *, names: Sequence[str]) -> None:
-
         self._logger, self._env, self._names = logger, env, tuple(names)
         self._paid: list[NDArray[np.float64]] = []
         self._marked: list[NDArray[np.bool_]] = []
@@ -215,19 +209,18 @@ class Offences:
         """Notes the payments of the turn, and where those are who broke a rule in it."""
         agents, count = batch["next", keys.AGENTS], len(self._names)
         fines, transfers, violated = (
-            np.zeros(count) if (own := agents.get(name, None)) is None else own[0].numpy(force=True)
+            np.zeros(count) if (entry := agents.get(name, None)) is None else entry[0].numpy(force=True)
             for name in ("fines", "transfers", "violated")
         )
         self._paid.append(np.stack([-fines.astype(np.float64), transfers.astype(np.float64)]))
         if bool(batch["next", keys.DONE][0, 0]):
             return  # the board is already that of the next episode
-        shown = self._env.worlds.show(self._env.output)
+        board = self._env.worlds.show(self._env.output)
         self._marked.append(violated.astype(np.bool_, copy=True))
-        centres = np.stack([shown.col, shown.row], -1).astype(np.float32)
+        centres = np.stack([board.col, board.row], -1).astype(np.float32)
         self._centres.append(centres + RIM_CELLS + 0.5)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Sends the rows of the episode."""
         turns, frames = len(self._paid), len(self._marked)
         if not frames:
             return
@@ -235,10 +228,10 @@ class Offences:
         nothing = np.zeros(turns, np.int64)
         paid = np.stack(self._paid)  # [T, paid or given, N]
         for agent, name in enumerate(self._names):
-            for nth, kind in enumerate((PAID, GIVEN)):
+            for side, kind in enumerate((PAID, GIVEN)):
                 at = steps, nothing, np.minimum(steps - 1, frames - 1)
                 self._logger.log_columns(
-                    f"{name}/{kind}", at, rr.Scalars.columns(scalars=paid[:, nth, agent].copy())
+                    f"{name}/{kind}", at, rr.Scalars.columns(scalars=paid[:, side, agent].copy())
                 )
         marked, centres = np.stack(self._marked), np.stack(self._centres)
         strips = centres[marked][:, None] + _DIAMOND
@@ -267,8 +260,8 @@ def events(batch: TensorDictBase) -> list[str]:
     paid = [0.0] * count if fines is None else fines[0].tolist()
     broke = [False] * count if violated is None else violated[0].tolist()
     tagged = [False] * count if tagged_by is None else tagged_by[0].any(-1).tolist()
-    told = [fined(agent, paid[agent]) for agent in range(count) if broke[agent]]
-    return told + [
+    violations = [fined(agent, paid[agent]) for agent in range(count) if broke[agent]]
+    return violations + [
         f"agent {agent} fined {paid[agent]:.4g}"
         for agent in range(count)
         if tagged[agent] and not broke[agent] and paid[agent] > 0

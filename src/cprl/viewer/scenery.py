@@ -14,7 +14,6 @@ from cprl.commons.colours import (
     PALETTE,
     Colour,
     agent_colour,
-    class_colour,
     class_name,
     picture_colour,
 )
@@ -123,18 +122,8 @@ def has_wall(curves: Curves) -> bool:
     return isinstance(curves, Scene) and curves.replicas > 1
 
 
-def classes(curves: Curves) -> Any:
-    """Names and colours of the classes on boards."""
-    return _classes(curves, picture_colour)
-
-
-def window_classes(curves: Curves) -> Any:
-    """Names of the classes in windows, in the study's colours."""
-    return _classes(curves, class_colour)
-
-
-def _classes(curves: Curves, colour_of: Callable[[int], Colour]) -> Any:
-
+def classes(curves: Curves, colour_of: Callable[[int], Colour] = picture_colour) -> Any:
+    """Names and colours of the classes on boards, or by another function in windows."""
     known = [
         rr.AnnotationInfo(id=kind, label=class_name(kind), color=colour_of(kind))
         for kind in range(FIRST_AGENT + len(curves.agents))
@@ -184,15 +173,10 @@ def _darker(colour: tuple[int, int, int], share: float) -> tuple[int, ...]:
     return tuple(round(share * part) for part in colour)
 
 
-def packed(colour: Colour) -> int:
-    """An opaque colour as Rerun's 0xRRGGBBAA."""
-    red, green, blue = colour
-    return red << 24 | green << 16 | blue << 8 | 255
-
-
 def state_colours(curves: Curves) -> dict[str, Any]:
     """The colours of live labels and phases, by entity."""
-    names, colours = list(STATES), np.array([packed(colour) for colour in STATES.values()], np.uint32)
+    packed = [red << 24 | green << 16 | blue << 8 | 255 for red, green, blue in STATES.values()]
+    names, colours = list(STATES), np.array(packed, np.uint32)  # 0xRRGGBBAA
     configuration = rr.StateConfiguration(values=names, labels=names, colors=colours)
     strips = STRIPS if curves.has_phases else STRIPS[:1]
     return dict.fromkeys(strips, configuration)

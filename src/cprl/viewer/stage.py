@@ -9,12 +9,21 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from cprl.commons.colours import APPLE, BEAM, FIRST_AGENT, GROUND, WALL, agent_colour, agent_mark
+from cprl.commons.colours import (
+    APPLE,
+    BEAM,
+    FIRST_AGENT,
+    GROUND,
+    WALL,
+    agent_colour,
+    agent_mark,
+    class_colour,
+)
 from cprl.commons.decoding import UNSEEN
 from cprl.commons.picture import DIGIT_HIGH, INK_COLOUR, MARK_COLOUR, POINTS, number_paths
 from cprl.commons.world import Bools, Bytes
 from cprl.viewer.panels import mosaic, mosaic_size, window_corners
-from cprl.viewer.scenery import Curves, Scene, classes, lines, state_colours, window_classes
+from cprl.viewer.scenery import Curves, Scene, classes, lines, state_colours
 
 RADIUS_CELLS: Final = 0.045
 """Half the width of a line, in cells."""
@@ -54,12 +63,7 @@ class Strokes:
         Returns:
             The lines one after the other, float32 [lines, P, 2], and how many each frame has, [T].
         """
-        return self.placed_lines(centres, heading, drawn[:, self.owner])
-
-    def placed_lines(
-        self, centres: Floats, heading: NDArray[np.integer], drawn: NDArray[np.bool_]
-    ) -> tuple[Floats, NDArray[np.intp]]:
-        """`placed` for the lines that are drawn, bool [T, S], in place of agents."""
+        drawn = drawn[:, self.owner]
         frame, line = np.nonzero(drawn)
         agent = self.owner[line]
         lines = self.shape[heading[frame, agent], line] + centres[frame, agent][:, None]
@@ -76,7 +80,6 @@ def numbers_and_headings(agents: int) -> Strokes:
 
 @cache
 def numbers(agents: int) -> Strokes:
-    """The number of each agent in the middle of its cell."""
     middle = [
         (agent, np.broadcast_to(digit * _scale(agent, room=0.7), (4, POINTS, 2)))
         for agent in range(agents)
@@ -87,7 +90,6 @@ def numbers(agents: int) -> Strokes:
 
 @cache
 def marks(agents: int) -> Strokes:
-    """The second marks, from agent 4 on."""
     return _strokes([(agent, line) for agent in range(agents) for line in _mark(agent_mark(agent))])
 
 
@@ -139,7 +141,6 @@ def _scale(agent: int, *, room: float) -> float:
 
 
 def _mark(mark: str) -> list[Floats]:
-    """The lines of a mark, along the edge of the cell."""
     edge, corner = 0.5 - RADIUS_CELLS, 0.25
     if mark == "ring":
         return [_turned((-edge, -edge), (edge, -edge), (edge, edge), (-edge, edge), (-edge, -edge))]
@@ -157,6 +158,8 @@ def _mark(mark: str) -> list[Floats]:
 RIM_CELLS: Final = 1
 """The width of the wall shown around the board, in cells."""
 BEAM_OPACITY: Final = 0.7
+IMAGES: Final = ("board", "beams")
+"""The parts of a board that are images of classes; all others are lines and boxes."""
 
 Frames = Mapping[str, NDArray[Any]]
 """Columns of `FrameRecorder.take`, [T, ...] each, with windows as classes of `classes_seen`."""
@@ -172,26 +175,25 @@ def fixed(curves: Curves) -> dict[str, list[Any]]:
     sizes of images and the agents' frames."""
     styles = lines(curves) | state_colours(curves)
     header = rr.TextDocument.from_fields(media_type=rr.MediaType.MARKDOWN)
-    parts = {"/": [classes(curves)], **{entity: [own] for entity, own in styles.items()}, "header": [header]}
+    parts = {
+        "/": [classes(curves)],
+        **{entity: [style] for entity, style in styles.items()},
+        "header": [header],
+    }
     return parts | (_fixed_on_board(curves) if isinstance(curves, Scene) else {})
 
 
 def _fixed_on_board(scene: Scene) -> dict[str, list[Any]]:
-
     form, image = image_form, rr.SegmentationImage.from_fields
-    board = form((scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS))
+    board = image(format=form((scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS)))
     agents, (rows, columns) = len(scene.agents), scene.window
     colours = [agent_colour(agent) for agent in range(agents)]
     corners = np.array(window_corners(agents, scene.window), np.float32)[:, ::-1]
+    styles = board_styles().items()
     return {
-        "world/board": [image(format=board, opacity=1.0, draw_order=-10.0)],
-        "world/beams": [image(format=board, opacity=BEAM_OPACITY, draw_order=-5.0)],
-        "world/agents": [rr.LineStrips2D.from_fields(colors=[INK_COLOUR], radii=[RADIUS_CELLS])],
-        "world/marks": [rr.LineStrips2D.from_fields(colors=[MARK_COLOUR], radii=[RADIUS_CELLS])],
-        "world/out": [rr.Boxes2D.from_fields(radii=[OUT_STROKE_CELLS], show_labels=False)],
-        "world/out/numbers": [rr.LineStrips2D.from_fields(radii=[RADIUS_CELLS])],
+        **{f"world/{name}": [*parts, board] if name in IMAGES else parts for name, parts in styles},
         "windows": [
-            window_classes(scene),
+            classes(scene, class_colour),
             image(format=form(mosaic_size(agents, scene.window)), opacity=1.0),
         ],
         "windows/frames": [
@@ -207,40 +209,53 @@ def _fixed_on_board(scene: Scene) -> dict[str, list[Any]]:
     }
 
 
+def board_styles() -> dict[str, list[Any]]:
+    """How the parts of a board look, by the names of `board_columns`; the forms of images are left out."""
+    image, lines = rr.SegmentationImage.from_fields, rr.LineStrips2D.from_fields
+    return {
+        "board": [image(opacity=1.0, draw_order=-10.0)],
+        "beams": [image(opacity=BEAM_OPACITY, draw_order=-5.0)],
+        "agents": [lines(colors=[INK_COLOUR], radii=[RADIUS_CELLS])],
+        "marks": [lines(colors=[MARK_COLOUR], radii=[RADIUS_CELLS])],
+        "out": [rr.Boxes2D.from_fields(radii=[OUT_STROKE_CELLS], show_labels=False)],
+        "out/numbers": [lines(radii=[RADIUS_CELLS])],
+    }
+
+
 def columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
     """The contents of T frames, by entity: the frames that have a row there, and the columns of these rows.
 
     Beams and the marks of agents out of play have rows only for the first frame and where they change.
     """
     everywhere = np.arange(len(frames["step"]))
-    shown = {**board_columns(scene, frames), "windows": (everywhere, _pictures(mosaic(frames["windows"])))}
+    contents = {f"world/{name}": rows for name, rows in board_columns(scene, frames).items()}
+    contents["windows"] = everywhere, _pictures(mosaic(frames["windows"]))
     if scene.is_replay:
         stock = frames["stock"].sum(1, dtype=np.float64)
-        shown["turn/stock"] = everywhere, rr.Scalars.columns(scalars=stock)
+        contents["turn/stock"] = everywhere, rr.Scalars.columns(scalars=stock)
         for agent, name in enumerate(scene.agents):
             harvested = frames["harvested"][:, agent].astype(np.float64)
-            shown[f"{name}/harvested"] = everywhere, rr.Scalars.columns(scalars=harvested)
-    return shown
+            contents[f"{name}/harvested"] = everywhere, rr.Scalars.columns(scalars=harvested)
+    return contents
 
 
 def board_columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
-    """`columns` of the board alone."""
+    """`columns` of the parts of the board alone, by name."""
     count, agents = frames["in_play"].shape
     everywhere = np.arange(count)
-    shown = {
-        "world/board": (everywhere, _pictures(boards(scene, frames))),
-        "world/agents": (everywhere, _lines(numbers_and_headings(agents), frames)),
+    contents = {
+        "board": (everywhere, _pictures(boards(scene, frames))),
+        "agents": (everywhere, _lines(numbers_and_headings(agents), frames)),
     }
     if len(marks(agents).owner):
-        shown["world/marks"] = everywhere, _lines(marks(agents), frames)
+        contents["marks"] = everywhere, _lines(marks(agents), frames)
     covered = beam_pictures(frames["beams"])
     changed = _changes(covered)
-    shown["world/beams"] = changed, _pictures(covered[changed])
-    return shown | _out(frames)
+    contents["beams"] = changed, _pictures(covered[changed])
+    return contents | _out(frames)
 
 
 def _pictures(images: Bytes) -> Any:
-    """Images of classes, uint8 [T, rows, columns], as columns."""
     return rr.SegmentationImage.columns(buffer=images.reshape(len(images), -1))
 
 
@@ -272,7 +287,6 @@ def _with_rim(pictures: Bytes, kind: int) -> Bytes:
 
 
 def _lines(strokes: Strokes, frames: Frames) -> Any:
-    """Lines of the agents in play."""
     lines, counts = strokes.placed(centres_of(frames), frames["heading"], frames["in_play"])
     return rr.LineStrips2D.columns(strips=lines).partition(counts)
 
@@ -297,7 +311,7 @@ def _out(frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
     lines, counts = strokes.placed(centres, frames["heading"][changed], alone)
     owner = strokes.owner[np.nonzero(alone[:, strokes.owner])[1]]
     digits = rr.LineStrips2D.columns(strips=lines, colors=rgb[owner]).partition(counts)
-    return {"world/out": (changed, squares), "world/out/numbers": (changed, digits)}
+    return {"out": (changed, squares), "out/numbers": (changed, digits)}
 
 
 def alone_of(frames: Frames) -> Bools:

@@ -67,7 +67,6 @@ class Header:
     """"apples" or "return"."""
 
     def begins(self, status: str) -> str:
-        """Before the first episode has ended."""
         return f"# Episode 1 of {self.episodes:,} · {status}"
 
     def line(
@@ -76,7 +75,6 @@ class Header:
         """After an episode.
 
         Args:
-            episode: its number, from 1 on.
             died: boards that died early in the episode; None or NaN for a game that reports no stock.
         """
         beside = "" if random_play is None else f" (random play {_number(random_play)})"
@@ -94,7 +92,6 @@ class Header:
         )
 
     def ended(self, mean: float) -> str:
-        """At the end of a training without an evaluation."""
         return f"# Finished, {self.episodes:,} episodes · {self._amount(mean)} at the end"
 
     def stopped(self, episode: int, mean: float) -> str:
@@ -144,7 +141,6 @@ class EventDetector:
 
     @property
     def returns(self) -> list[float]:
-        """The collective return of each episode so far."""
         return [mean[0] for mean in self._means]
 
     def add(self, means: Mapping[str, float]) -> list[str]:
@@ -180,7 +176,7 @@ class EventDetector:
         return {"means": [list(mean) for mean in self._means], "best": self._best}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self._means = [list(own) for own in state["means"]]
+        self._means = [list(mean) for mean in state["means"]]
         self._best = float(state["best"])
 
 
@@ -215,17 +211,14 @@ class Story:
 
     @property
     def baseline(self) -> float | None:
-        """The mean of random play, once it is known."""
         return None if self._random is None else self._random.mean
 
     def begins(self, status: str) -> None:
-        """Says in the header what happens before the first episode has ended, e.g. "begins"."""
         if self._ended == 0:
             self._logger.log_document("header", self.beginning(status))
             self._logger.flush()
 
     def beginning(self, status: str) -> str:
-        """The header before the first episode has ended."""
         return self._text(self._header.begins(status))
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
@@ -235,13 +228,7 @@ class Story:
         self._logger.log_text(f"random play {self._in_words(self._random)}")
 
     def on_episode(self, episode: int, of_all: Mapping[str, Values], died: float | None) -> list[str]:
-        """Logs the end of an episode in all replicas, at the logger's time; returns its events.
-
-        Args:
-            episode: its number, from 0 on.
-            of_all: its numbers, [R] by name.
-            died: boards that died early; None for a game that reports no stock.
-        """
+        """Logs the end of an episode in all replicas, at the logger's time; returns its events."""
         self._ended = episode + 1
         means = {name: mean_of(values) for name, values in of_all.items()}
         events = self._label(episode, means)
@@ -305,8 +292,8 @@ class Story:
     def _tell_phases(self) -> None:
         if self._detector is None or not self._curves.has_phases:
             return
-        found = {round(phase.first): phase.label or ANOTHER for phase in self._detector.phases()}
-        self._logger.log_states(_FOUND, found)
+        labels = {round(phase.first): phase.label or ANOTHER for phase in self._detector.phases()}
+        self._logger.log_states(_FOUND, labels)
         published = published_phases(self._game)
         within = {first: label for first, label in published.items() if first < self._ended}
         if within:
@@ -319,12 +306,12 @@ class Story:
     def _text(self, line: str, *, of_mean: int | None = None) -> str:
         return f"{line}\n\n{self._header.notes(window=self._window, of_mean=of_mean)}"
 
-    def _in_words(self, own: Played) -> str:
-        error = f" ± {own.error:.2g}" if isfinite(own.error) else ""
-        died = "" if own.died is None else f", {own.died:,} boards died early"
+    def _in_words(self, numbers: Played) -> str:
+        error = f" ± {numbers.error:.2g}" if isfinite(numbers.error) else ""
+        died = "" if numbers.died is None else f", {numbers.died:,} boards died early"
         return (
-            f"{own.mean:.1f}{error} {self._header.unit} in {own.episodes:,} fresh episodes (mean and its "
-            f"standard error){died}"
+            f"{numbers.mean:.1f}{error} {self._header.unit} in {numbers.episodes:,} fresh episodes (mean and "
+            f"its standard error){died}"
         )
 
     def state_dict(self) -> dict[str, Any]:
@@ -347,6 +334,8 @@ class Story:
 
 def published_phases(game: Game | None) -> dict[int, str]:
     """The phases of the study's figures by the episode in which they begin; empty for another game."""
-    if all(game != presets.game(board, variant=own) for board, own in presets.GAMES if board == "commons"):
+    if all(
+        game != presets.game(board, variant=variant) for board, variant in presets.GAMES if board == "commons"
+    ):
         return {}
     return dict(zip((0, *PHASES_BEGIN), PHASES, strict=True))

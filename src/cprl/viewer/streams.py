@@ -16,11 +16,11 @@ from typing import Any, Final, TypeAlias, TypeVar
 
 import rerun as rr
 
-from cprl import arguments
 from cprl.system.compat import end_recordings, keep_native
 from cprl.system.output import printed
+from cprl.values import checked
 from cprl.viewer.page import LOCALHOST, Page, free_port, has_display, viewer
-from cprl.viewer.watching import SERVED
+from cprl.viewer.watching import Served
 
 T = TypeVar("T")
 
@@ -135,11 +135,7 @@ Row: TypeAlias = tuple[int, int, int, list[float] | str]
 
 
 class Stream:
-    """One recording stream. If it fails, it warns once, and the run continues without it.
-
-    Args:
-        period_s: seconds between two batches of buffered numbers.
-    """
+    """One recording stream. If it fails, it warns once, and the run continues without it."""
 
     def __init__(self, name: str, recording: Any, *, period_s: float) -> None:
         self.name, self.recording, self.period_s = name, recording, period_s
@@ -154,7 +150,6 @@ class Stream:
 
     @property
     def is_due(self) -> bool:
-        """Whether the buffered numbers should be sent now."""
         return time.perf_counter() - self._sent > self.period_s
 
     def take(self) -> dict[str, list[Row]]:
@@ -289,10 +284,8 @@ def open_live(
     Args:
         live: "serve": serves the recording on free ports of 127.0.0.1; viewers can connect at any time and
             get the history. "spawn": the same, and starts Rerun's native viewer.
-        period_s: seconds between two batches of buffered numbers.
-        exhibits: whether there is an exhibition.
     """
-    arguments.choice("live", live, SERVED)
+    checked("live", live, Served)
     recording = _recording(application, recording_id)
     stream, *grpc = _serve("live view", recording, blueprint, period_s, SERVER_MEMORY)
     exhibition = None

@@ -19,7 +19,7 @@ from cprl.envs.commons_env import CommonsEnv
 from cprl.institutions import Boundaries
 from cprl.measuring.episodes import Episode
 from cprl.system.compat import send_chunk
-from cprl.viewer.institutions import has_institutions, lines
+from cprl.viewer.institutions import lines
 from cprl.viewer.logger import RerunLogger, components, timelines, times
 from cprl.viewer.panels import Axes, Panels, titled
 from cprl.viewer.scenery import BACKGROUND, GREEN, GREY, ORANGE, STATES, Curves, Scene, has_lorenz, has_wall
@@ -77,13 +77,13 @@ class Looks:
         """Copies the arrays as they are now."""
         at = self._count
         self._count = at + 1
-        for array, kept in self._pairs:
-            kept[at] = array if self._on_cpu else self._read(array)
+        for array, copies in self._pairs:
+            copies[at] = array if self._on_cpu else self._read(array)
 
     def take(self) -> list[NDArray[Any]]:
         """The copies [T, ...] of each array, good until the next `add`; there are none afterwards."""
         count, self._count = self._count, 0
-        return [kept[:count] for _, kept in self._pairs]
+        return [copies[:count] for _, copies in self._pairs]
 
 
 WALL_BYTES: Final = 4_000_000
@@ -110,7 +110,6 @@ class Wall(View):
     """
 
     def __init__(self, env: CommonsEnv, logger: RerunLogger, *, scene: Scene, recorded_steps: int) -> None:
-
         self._env, self._logger, self._scene = env, logger, scene
         self._panels = Panels(scene.replicas, (scene.height + 2, scene.width + 2))
         rows, columns = self._panels.shape
@@ -216,7 +215,7 @@ class Visits(View):
 
     def _count(self) -> None:
         """Counts where the agents in play were."""
-        row, col, in_play = (kept[:, 0] for kept in self._looks.take())
+        row, col, in_play = (copies[:, 0] for copies in self._looks.take())
         cells = self._agents + row * self._size[1] + col
         self._counts += np.bincount(cells[in_play], minlength=len(self._counts))
 
@@ -274,12 +273,8 @@ class Turns(View):
         """[R, points, 2], turn and stock of the episodes that are being played."""
         self._ended: list[list[tuple[float, float]]] = [[] for _ in range(replicas)]
         self._died = [False] * replicas
-        self._axes = Axes(
-            "turn of the episode", x_end=game.rules.episode_steps, y_end=max(1, len(game.map.sites))
-        )
-        lines, texts = self._axes.drawn()
-        logger.log_static("turn/axes", lines)
-        logger.log_static("turn/axes/texts", texts)
+        ends = {"x_end": game.rules.episode_steps, "y_end": max(1, len(game.map.sites))}
+        self._axes = _axes(logger, "turn", "turn of the episode", **ends)
 
     def on_step(self, step: int, episode: int, frame: int | None) -> None:
         if step % self.stride:
@@ -290,7 +285,7 @@ class Turns(View):
 
     def _place(self) -> None:
         """Places the points that were noted, the latest last: it stays where two have the same place."""
-        turn, stock = (kept[..., 0] for kept in self._looks.take())
+        turn, stock = (copies[..., 0] for copies in self._looks.take())
         point = self._every_replica, turn // self.stride
         self._playing[(*point, 0)], self._playing[(*point, 1)] = turn, stock
 
@@ -304,14 +299,14 @@ class Turns(View):
         playing[1:] = np.nan  # the first point is already that of the next episode, which begins alike
 
     def log(self, first: int, last: int) -> None:
-        shown = [replica for replica, line in enumerate(self._ended) if len(line) > 1]
-        if not shown:
+        replicas = [replica for replica, line in enumerate(self._ended) if len(line) > 1]
+        if not replicas:
             return
-        strips = [self._axes.placed(*np.array(self._ended[replica]).T) for replica in shown]
-        colours = [STATES["tragedy"] if self._died[replica] else GREY for replica in shown]
+        strips = [self._axes.placed(*np.array(self._ended[replica]).T) for replica in replicas]
+        colours = [STATES["tragedy"] if self._died[replica] else GREY for replica in replicas]
         self._logger.log_row("turn/lines", rr.LineStrips2D(strips, colors=colours, radii=0.5))
         died = sum(self._died)
-        text = f"last episode of each replica: {died} of {len(shown)} boards died (orange)"
+        text = f"last episode of each replica: {died} of {len(replicas)} boards died (orange)"
         self._logger.log_row("turn/title", titled(text))
 
     def state_dict(self) -> dict[str, Any]:
@@ -323,6 +318,14 @@ class Turns(View):
         self._playing[:] = state["playing"]
         self._ended = [[(turn, stock) for turn, stock in line] for line in state["ended"]]
         self._died = list(state["died"])
+
+
+def _axes(logger: RerunLogger, origin: str, x: str, *, x_end: float, y_end: float) -> Axes:
+    """The axes of a plot, which are logged once."""
+    axes = Axes(x, x_end=x_end, y_end=y_end)
+    for entity, drawn in zip(("axes", "axes/texts"), axes.drawn(), strict=True):
+        logger.log_static(f"{origin}/{entity}", drawn)
+    return axes
 
 
 def lorenz_curve(harvest: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -352,10 +355,7 @@ class Lorenz(View):
         self._logger, self._agents = logger, agents
         self._sums: dict[int, NDArray[np.float64]] = {}
         self._first: tuple[list[float], str] | None = None
-        self._axes = Axes("agents, the poorest first, %", x_end=100, y_end=100)
-        lines, texts = self._axes.drawn()
-        logger.log_static("lorenz/axes", lines)
-        logger.log_static("lorenz/axes/texts", texts)
+        self._axes = _axes(logger, "lorenz", "agents, the poorest first, %", x_end=100, y_end=100)
 
     def on_episode(self, episode: Episode) -> None:
         if episode.harvest is not None and episode.harvest.sum() > 0:
@@ -374,7 +374,7 @@ class Lorenz(View):
         earliest, began = np.array(self._first[0]), self._first[1]
         share = np.linspace(0, 100, self._agents + 1)
         curves = share / 100, earliest, curve
-        strips = [self._axes.placed(share, 100 * own) for own in curves]
+        strips = [self._axes.placed(share, 100 * shares) for shares in curves]
         lines = rr.LineStrips2D(strips, colors=[GREY, GREEN, ORANGE], radii=[0.3, 0.5, 1.0])
         self._logger.log_row("lorenz", lines)
         text = (
@@ -400,28 +400,12 @@ _OPACITY: Final = 170
 _INSET_CELLS, _BORDER_CELLS = 0.08, 0.04
 
 
-def institution_views(logger: RerunLogger, env: CommonsEnv | None) -> "InstitutionViews | None":
-    """What a recording shows of institutions; None for a game without them."""
-    if not has_institutions(logger.curves):
-        return None
-    return InstitutionViews(logger, logger.curves, regions=[] if env is None else regions_of(env))
-
-
-class InstitutionViews:
-    """Logs what a recording shows of institutions besides the numbers of episodes."""
-
-    def __init__(self, logger: RerunLogger, curves: Curves, *, regions: Regions) -> None:
-        self._logger, self._curves = logger, curves
-        for entity, style in lines(curves).items():
-            logger.log_static(entity, style)
-        if regions and isinstance(curves, Scene):
-            logger.log_static("world/regions", borders(regions))
-
-    def on_episode(self, episode: Episode) -> None:
-        """Logs an event of an episode, at the logger's time: what was decided, broken and paid."""
-        told = in_words(episode, self._curves)
-        if told:
-            self._logger.log_text(f"episode {episode.episode:,}: {told}")
+def log_institutions(logger: RerunLogger, env: CommonsEnv | None) -> None:
+    """Logs the styles of what institutions plot, and the regions of a board."""
+    for entity, style in lines(logger.curves).items():
+        logger.log_static(entity, style)
+    if logger.scene is not None and env is not None and (regions := regions_of(env)):
+        logger.log_static("world/regions", borders(regions))
 
 
 def in_words(episode: Episode, curves: Curves) -> str:
@@ -435,31 +419,31 @@ def in_words(episode: Episode, curves: Curves) -> str:
         broken = int(episode.violations.sum())
         parts.append(f"{broken:,} violation{'s' * (broken > 1)}")
     fines = [] if episode.fines is None else episode.fines.tolist()
-    parts.append(", ".join(f"agent {nth} fined {own:.4g}" for nth, own in enumerate(fines) if own > 0))
+    parts.append(", ".join(f"agent {agent} fined {fine:.4g}" for agent, fine in enumerate(fines) if fine > 0))
     return "; ".join(part for part in parts if part)
 
 
 def regions_of(env: CommonsEnv) -> Regions:
     """The regions of all `Boundaries` of a game; those that are open to all are none."""
-    found: Regions = []
+    regions: Regions = []
     for institution in env.game.institutions:
         if isinstance(institution, Boundaries):
             signs = np.array([list(line) for line in institution.regions])
             of_agents = [institution.signs_of(agent) for agent in range(env.game.agents)]
             for sign in sorted(set("".join(of_agents))):
                 owners = [agent for agent, ours in enumerate(of_agents) if sign in ours]
-                found.append((owners, signs == sign))
-    return found
+                regions.append((owners, signs == sign))
+    return regions
 
 
 def borders(regions: Regions) -> Any:
     """The borders of regions in the hue of their owner, or grey where several share one, as lines."""
     strips, colours = [], []
     for owners, cells in regions:
-        found = _borders(cells)
-        strips += found
+        sides = _borders(cells)
+        strips += sides
         hue = agent_colour(owners[0]) if len(owners) == 1 else GREY
-        colours += [(*hue, _OPACITY)] * len(found)
+        colours += [(*hue, _OPACITY)] * len(sides)
     return rr.LineStrips2D(strips, colors=colours, radii=_BORDER_CELLS, draw_order=-4.0)
 
 

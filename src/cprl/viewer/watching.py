@@ -4,16 +4,16 @@ import signal
 from collections.abc import Callable
 from threading import Event, current_thread, main_thread
 from types import FrameType
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal, get_args
 
-from cprl import arguments
 from cprl.system.output import console
+from cprl.values import checked
 
 if TYPE_CHECKING:
     from cprl.viewer.logger import RerunLogger
 
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
-SERVED: Final = ("serve", "spawn")
+Served = Literal["serve", "spawn"]
 
 
 def check_watch(watch: str, *, can_be_off: bool = True) -> None:
@@ -21,14 +21,13 @@ def check_watch(watch: str, *, can_be_off: bool = True) -> None:
 
     Args:
         watch: "file", or live as well, see `open_live`; "off" for no recording.
-        can_be_off: whether "off" is allowed.
     """
-    arguments.choice("watch", watch, ("file", *(("off",) if can_be_off else ()), *SERVED))
+    checked("watch", watch, Literal["file", "off"] | Served if can_be_off else Literal["file"] | Served)
 
 
 def check_linger(linger: bool, watch: str) -> None:
     """Refuses to linger where nothing is served, before the run starts."""
-    if linger and watch not in SERVED:
+    if linger and watch not in get_args(Served):
         raise ValueError(
             f'linger is True, but watch is "{watch}", which serves nothing; allowed: watch "serve" or "spawn"'
         )
@@ -39,17 +38,14 @@ def check_linger(linger: bool, watch: str) -> None:
 def linger(logger: "RerunLogger", play_on: Callable[[Event], None] | None = None) -> None:
     """Says where the recording stays served, waits for Ctrl-C (SIGINT) or SIGTERM, and closes the recording;
     a second signal in the meantime changes nothing.
-
-    Args:
-        play_on: called meanwhile; returns when the event is set, or when there is nothing to play.
     """
     if not logger.is_served:
         console().print("The recording is no longer served.")
         return
-    asked = Event()
+    stopping = Event()
 
     def stop(number: int, frame: FrameType | None) -> None:
-        asked.set()
+        stopping.set()
 
     usual = {number: signal.signal(number, stop) for number in _SIGNALS}
     try:
@@ -59,8 +55,8 @@ def linger(logger: "RerunLogger", play_on: Callable[[Event], None] | None = None
             highlight=False,
         )
         if play_on is not None:
-            play_on(asked)
-        while not asked.wait(1.0):
+            play_on(stopping)
+        while not stopping.wait(1.0):
             pass
         logger.shutdown()
     finally:

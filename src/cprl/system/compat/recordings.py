@@ -33,22 +33,6 @@ def send_chunk(
     )
 
 
-def rows_made(entity: str, components: Mapping[Any, Any]) -> list[Any]:
-    """The rows of `pyarrow` arrays of equal length, by component descriptor, as static chunks for
-    `send_made`."""
-    make = _binding("ChunkInternal").from_columns
-    count = len(next(iter(components.values())))
-    return [
-        make(entity, {}, {kind: own.slice(row, 1) for kind, own in components.items()})
-        for row in range(count)
-    ]
-
-
-def send_made(recording: Any, made: Any) -> None:
-    """Sends a chunk that has been made before, in a fifth of the time of `send_chunk` on cold caches."""
-    _binding("send_chunks")(made, recording.to_native())
-
-
 def keep_native(recording: Any, keep: Callable[..., object] = ctypes.pythonapi.Py_IncRef) -> None:
     """In place of a recording's end, which waits for a viewer: its native part, the private `inner`, stays
     until the process ends.
