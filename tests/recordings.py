@@ -5,11 +5,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rerun as rr
+from dqn_parts import make_learner
 from rerun.chunk import RrdReader
 
-from cprl import Game, Rules, maps
+from cprl import CommonsEnv, Game, Rules, maps
+from cprl.algorithms import DQN
 from cprl.commons.colours import COLOURS
 from cprl.commons.decoding import classes_seen
+from cprl.learners.settings import DQNSettings
+from cprl.policies.lanes import RandomActor
+from cprl.training import train
+from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.scenery import Scene
 
 GAME = Game(
@@ -69,3 +75,14 @@ def frames(count, *, first_step=1):
         shown.append(frame)
     taken = {name: np.stack([vars(frame)[name] for frame in shown]) for name in vars(shown[0])}
     return {**taken, "windows": classes_seen(GAME, taken["windows"])}, shown
+
+
+def watched_training(run):
+    """Records a training of four episodes of an agent that learns beside a random one."""
+    settings = DQNSettings(buffer_size=200, learning_rate=1e-3)
+    learner = make_learner(
+        DQN(settings=settings), GAME.spaces, agents=(0,), replicas=1, seed=1, engine="torchrl"
+    )
+    env = CommonsEnv(GAME, seed=1)
+    with ViewerCallback(run, env, title="run", episodes=4) as viewer:
+        train(env, {(0,): learner}, others={1: RandomActor(8)}, episodes=4, callbacks=[viewer])

@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from recordings import watched_training
 from rerun.chunk import RrdReader
-from test_rerun_logger import trained
 
 from cprl.commands import main as cli
 from cprl.measuring import institutions
@@ -24,7 +24,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def test_every_logged_name_has_its_line_in_the_docs_and_the_other_way_round(tmp_path):
-    trained(tmp_path, watched=True)
+    watched_training(tmp_path)
     logged = set()
     for chunk in RrdReader(tmp_path / "run.rrd").stream():
         batch = chunk.to_record_batch()

@@ -8,19 +8,13 @@ import numpy as np
 import pytest
 import rerun as rr
 import torch
-from dqn_parts import make_learner
-from recordings import GAME, SCENE, column, frames, static, strict_rerun
+from recordings import GAME, SCENE, column, frames, static, strict_rerun, watched_training
 from rerun.chunk import RrdReader
 from tensordict import TensorDict
 
 from cprl import CommonsEnv, Observation
-from cprl.algorithms import DQN
 from cprl.commons.colours import APPLE, BEAM, COLOURS, FIRST_AGENT, GROUND, OTHER, PALETTE, SELF, WALL
 from cprl.commons.decoding import UNSEEN, classes_seen
-from cprl.learners.settings import DQNSettings
-from cprl.policies.lanes import RandomActor
-from cprl.training import train
-from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.panels import mosaic, window_corners
 from cprl.viewer.scenery import Scene
@@ -264,13 +258,7 @@ def test_a_stream_that_fails_is_dropped_with_one_warning_and_the_other_goes_on(t
 
 @pytest.mark.integration
 def test_a_watched_training_records_every_turn(tmp_path):
-    settings = DQNSettings(buffer_size=200, learning_rate=1e-3)
-    learner = make_learner(
-        DQN(settings=settings), GAME.spaces, agents=(0,), replicas=1, seed=1, engine="torchrl"
-    )
-    env = CommonsEnv(GAME, seed=1)
-    with ViewerCallback(tmp_path, env, title="run", episodes=4) as viewer:
-        train(env, {(0,): learner}, others={1: RandomActor(8)}, episodes=4, callbacks=[viewer])
+    watched_training(tmp_path)
     path = tmp_path / "run.rrd"
     steps, _ = column(path, "world/board", "SegmentationImage:buffer")
     episodes, _ = column(path, "world/board", "SegmentationImage:buffer", "episode")
