@@ -10,11 +10,10 @@ import re
 from ast import literal_eval
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from itertools import product
 from math import exp, log
 from posixpath import normpath
-from typing import Annotated, Any, Final, Literal, TypeAlias, get_type_hints
+from typing import Annotated, Any, Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,22 @@ from cprl.commons.maps import Map
 from cprl.custom import Custom, allowing, custom_targets
 from cprl.envs.make_env import game_of, stored_game
 from cprl.experiment import Experiment
-from cprl.values import KINDS, MOST_NUMBER, Range, Value, fits, from_config, refusal, shown, to_config, words
+from cprl.values import (
+    KINDS,
+    MOST_INT32,
+    MOST_NUMBER,
+    Range,
+    Value,
+    checked,
+    fits,
+    from_config,
+    hints_of,
+    meant,
+    refusal,
+    shown,
+    to_config,
+    words,
+)
 
 ALL: Final = "*"
 
@@ -40,7 +54,7 @@ def changed(experiment: Experiment, changes: Mapping[str, Any]) -> Experiment:
     """
     table = experiment.to_config()
     for path in sorted(changes, key=lambda path: (path.count("."), ALL not in path)):
-        value = plain(changes[path])
+        value = _plain(changes[path])
         for holder, name in places(table, path):
             held = holder[name]
             if isinstance(value, str) and isinstance(held, Mapping) and held.get("kind") == "Map":
@@ -54,13 +68,6 @@ def changed(experiment: Experiment, changes: Mapping[str, Any]) -> Experiment:
             return Experiment.from_config(table)
     except ValueError as error:
         raise ValueError(f"with {', '.join(changes)}: {error}") from error
-
-
-def plain(value: Any) -> Any:
-    """Return arrays, lists and ranges as tuples, and numbers of numpy and torch as Python's."""
-    if not isinstance(value, type) and callable(getattr(value, "tolist", None)):
-        value = value.tolist()
-    return tuple(map(plain, value)) if isinstance(value, list | tuple | range) else value
 
 
 def values_at(experiment: Experiment, path: str) -> list[Any]:
@@ -97,10 +104,8 @@ def _named(holder: Any, name: str, at: list[str]) -> list[tuple[Any, Any]]:
         names = [key for key in holder if key != "kind"]
     if name in names:
         return [(holder, int(name) if isinstance(holder, list) else name)]
-    close = get_close_matches(name, names, n=1)
-    meant = f" (did you mean {close[0]!r}?)" if close else ""
     has = f"{where} has {', '.join(names)}" if names else f"{where} is {shown(holder)}"
-    raise ValueError(f"the path {path} matches nothing{meant}; {has}")
+    raise ValueError(f"the path {path} matches nothing{meant(name, names)}; {has}")
 
 
 def normalised(path: object) -> str:
@@ -110,9 +115,16 @@ def normalised(path: object) -> str:
     return path.replace("-", "_")
 
 
-Number = Annotated[float, Range(-MOST_NUMBER, MOST_NUMBER)]
-Above0 = Annotated[float, Range(1e-300, MOST_NUMBER)]
-Whole = Annotated[int, Range(-(2**53), 2**31 - 1)]
+def _plain(value: Any) -> Any:
+    """Lists and arrays as tuples, numpy's numbers as Python's."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    return tuple(map(_plain, value)) if isinstance(value, list | tuple | range) else value
+
+
+Number: TypeAlias = Annotated[float, Range(-MOST_NUMBER, MOST_NUMBER)]
+NumberAbove0: TypeAlias = Annotated[float, Range(1e-300, MOST_NUMBER)]
+WholeNumber: TypeAlias = Annotated[int, Range(-(2**53), MOST_INT32)]
 
 
 @dataclass(frozen=True)
@@ -124,7 +136,7 @@ class Uniform(Value, stored=False):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_order(self)
+        _refuse_reversed(self)
 
     def at(self, share: float) -> float:
         """Return the number below which this share of all lies, 0..1."""
@@ -135,12 +147,12 @@ class Uniform(Value, stored=False):
 class LogUniform(Value, stored=False):
     """Numbers above 0 from `low` to `high` whose logarithms are equally likely, e.g. learning rates."""
 
-    low: Above0
-    high: Above0
+    low: NumberAbove0
+    high: NumberAbove0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_order(self)
+        _refuse_reversed(self)
 
     def at(self, share: float) -> float:
         """See `Uniform.at`."""
@@ -151,22 +163,22 @@ class LogUniform(Value, stored=False):
 class Integers(Value, stored=False):
     """Whole numbers from `low` to `high`, both included, equally likely."""
 
-    low: Whole
-    high: Whole
+    low: WholeNumber
+    high: WholeNumber
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_order(self)
+        _refuse_reversed(self)
 
     def at(self, share: float) -> int:
         """See `Uniform.at`."""
         return min(self.low + int(share * (self.high - self.low + 1)), self.high)
 
 
-def _check_order(distribution: Any) -> None:
-    kind = type(distribution).__name__
+def _refuse_reversed(distribution: "Distribution") -> None:
     if distribution.low > distribution.high:
-        raise refusal(f"{kind}.low", distribution.low, f"up to its high, {distribution.high}")
+        name = f"{type(distribution).__name__}.low"
+        raise refusal(name, distribution.low, f"up to its high, {distribution.high}")
 
 
 Distribution: TypeAlias = Uniform | LogUniform | Integers
@@ -189,20 +201,20 @@ class Level:
 
 def checked_factors(factors: Mapping[str, Any]) -> dict[str, Factor]:
     """Return factors as a study keeps them: paths without "-", values as tuples."""
-    checked: dict[str, Factor] = {}
+    normal: dict[str, Factor] = {}
     for name, factor in factors.items():
         if isinstance(factor, Mapping) and factor:
-            checked[name] = {
+            normal[name] = {
                 level: {normalised(path): value for path, value in changes.items()}
                 for level, changes in factor.items()
             }
             continue
-        path, values = normalised(name), plain(factor)
+        path, values = normalised(name), _plain(factor)
         if isinstance(factor, Distribution):
-            checked[path] = factor
+            normal[path] = factor
         elif isinstance(values, tuple) and values:
             is_run = _RUN.fullmatch(path)  # which Frozen keeps like this, so that levels keep their names
-            checked[path] = tuple(normpath(run) if run else run for run in values) if is_run else values
+            normal[path] = tuple(normpath(run) if run else run for run in values) if is_run else values
         else:
             raise refusal(
                 f"factors[{name!r}]",
@@ -210,7 +222,7 @@ def checked_factors(factors: Mapping[str, Any]) -> dict[str, Factor]:
                 "the values of the field that its path names, as a list; a table of named levels, each a "
                 "table of values by path; or a distribution of cprl.studies.factors",
             )
-    return checked
+    return normal
 
 
 def levels_of(name: str, factor: Factor) -> list[Level]:
@@ -327,18 +339,18 @@ _RUN: Final = re.compile(r"agents\.(\*|\d+)(\.start_from)?\.run")
 """A path that names the run of a `Frozen` agent."""
 
 
-def factors_of(experiment: Experiment, words: Iterable[str]) -> dict[str, Factor]:
+def factors_of(experiment: Experiment, flags: Iterable[str]) -> dict[str, Factor]:
     """Return the factors that words of a command line say, for a `Study` of this experiment.
 
     Args:
-        words: "PATH=VALUES" each; values with commas between them, or a distribution with its range.
+        flags: "PATH=VALUES" each; values with commas between them, or a distribution with its range.
     """
     factors: dict[str, Factor] = {}
-    for word in words:
-        path, equals, text = word.partition("=")
+    for flag in flags:
+        path, equals, text = flag.partition("=")
         pieces = [piece.strip() for piece in _BETWEEN.split(text)]
         if not equals or not path or not all(pieces):
-            raise refusal("--vary", word, "PATH=VALUE,VALUE..., e.g. game.rules.freeze-steps=5,25,100")
+            raise refusal("--vary", flag, "PATH=VALUE,VALUE..., e.g. game.rules.freeze-steps=5,25,100")
         path = normalised(path)
         if path in factors:
             raise ValueError(f"--vary has {path} twice; allowed: once, with all its values")
@@ -359,7 +371,7 @@ def _types_at(experiment: Experiment, path: str) -> list[Any]:
     for holder, name in places(table, path):
         is_table = isinstance(holder, Mapping)
         kind = Experiment if holder is table else KINDS.get(holder.get("kind", "")) if is_table else None
-        hints.append(Any if kind in (None, Custom) else get_type_hints(kind)[name])
+        hints.append(Any if kind in (None, Custom) else hints_of(kind)[name])
     return hints
 
 
@@ -371,18 +383,15 @@ _CONSTANTS: Final = {"true": True, "false": False, "none": None}
 
 
 def _value(text: str, hints: Sequence[Any], path: str) -> Any:
-    """Return a value that every place of a path can have: with whole numbers as such where the field has
-    them, and one number for a list of one."""
+    """Return a value that every place of a path can have; one number may stand for a list of one."""
     value = _literal(text)
-    if Any in hints:
-        return value
-    number = _as_float(value)
-    for candidate in (number, value, (number,), (value,), text):
+    for candidate in (value, (value,), text):
         if all(fits(candidate, hint) or (hint is Map and candidate == text) for hint in hints):
-            return candidate
+            return candidate if hints[0] is Map else checked(path, candidate, hints[0])
+    allowed = " and ".join(map(words, dict.fromkeys(hints)))
     raise ValueError(
-        f"at the path {path} is {text!r}; allowed: {' and '.join(map(words, dict.fromkeys(hints)))}, by "
-        "what a command line can say; a Study in Python can have any"
+        f"at the path {path} is {text!r}; allowed: {allowed}, by what a command line can say; a Study in "
+        "Python can have any"
     )
 
 
@@ -396,9 +405,3 @@ def _literal(text: str) -> Any:
         return _CONSTANTS[text.lower()] if text.lower() in _CONSTANTS else literal_eval(text)
     except (ValueError, SyntaxError, TypeError):
         return text
-
-
-def _as_float(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return tuple(map(_as_float, value))
-    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value

@@ -28,11 +28,11 @@ from cprl.runs.files import RunLock
 from cprl.studies.executors import Executor
 from cprl.studies.factors import Distribution, Factor, Integers, LogUniform, levels_of
 from cprl.studies.run import StudyResult, run_study
-from cprl.studies.study import RUNS, Study, directory_of, level_text, named, short_names, unlike
+from cprl.studies.study import RUNS, Replicas, Study, directory_of, level_text, named, short_names, unlike
 from cprl.studies.tables.comparing import LAST
 from cprl.studies.trials import Outcome, trials_of
 from cprl.system.output import say
-from cprl.values import MOST_INT32, Range, checked, refusal
+from cprl.values import DirectoryName, Positive, Range, Value, refusal
 
 FOLDER, JOURNAL = "optuna", "journal.log"
 """The folder of Optuna's storage in the search's directory, and its file."""
@@ -64,7 +64,7 @@ class Point:
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
+class Search(Value, stored=False):
     """What is searched, and by which metric.
 
     Args:
@@ -83,28 +83,24 @@ class Search:
 
     experiment: Experiment
     factors: Mapping[str, Factor]
-    points: int = field(kw_only=True)
+    points: Annotated[int, Range(1, 100_000)] = field(kw_only=True)
     metric: str = field(default="collective_return", kw_only=True)
     direction: Direction = field(default="maximise", kw_only=True)
     over: Episodes = field(default="evaluation", kw_only=True)
-    last: int = field(default=30, kw_only=True)
-    at_once: int = field(default=4, kw_only=True)
+    last: Positive = field(default=30, kw_only=True)
+    at_once: Annotated[int, Range(1, 4096)] = field(default=4, kw_only=True)
     sampler: SamplerName | Callable[[int], Any] = field(default="tpe", kw_only=True)
-    replicas: int | None = field(default=None, kw_only=True)
-    block: int = field(default=BLOCK, kw_only=True)
-    name: str = field(default="", kw_only=True)
+    replicas: Replicas | None = field(default=None, kw_only=True)
+    block: Replicas = field(default=BLOCK, kw_only=True)
+    name: DirectoryName | Literal[""] = field(default="", kw_only=True)
 
     def __post_init__(self) -> None:
-        for name, most in (("points", 100_000), ("last", MOST_INT32), ("at_once", 4096)):
-            checked(name, getattr(self, name), Annotated[int, Range(1, most)])
-        checked("direction", self.direction, Direction)
-        checked("over", self.over, Episodes)
-        if not callable(self.sampler):
-            checked("sampler", self.sampler, SamplerName)
+        super().__post_init__()
         game = self.experiment.game
         if isinstance(game, Game) and not (game.institutions and self.metric.startswith("institutions/")):
-            metrics = (*social.METRICS, *(f"return_{agent}" for agent in range(game.agents)))
-            checked("metric", self.metric, Literal[metrics])
+            metrics = [*social.METRICS, *(f"return_{agent}" for agent in range(game.agents))]
+            if self.metric not in metrics:
+                raise refusal("metric", self.metric, ", ".join(metrics))
         one = self._one_point()
         object.__setattr__(self, "factors", one.factors)
         object.__setattr__(self, "name", one.name)

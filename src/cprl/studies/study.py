@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from itertools import chain, count
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal, TypeAlias
 
 from cprl.arguments import BLOCK
 from cprl.custom import trust
@@ -31,7 +31,7 @@ from cprl.studies.factors import (
     grid,
     with_runs_moved,
 )
-from cprl.values import DirectoryName, Range, checked, refusal, shown, without_defaults
+from cprl.values import DirectoryName, Range, Value, refusal, shown, without_defaults
 
 CONDITION_FORMAT: Final = 1
 """Of checksums: counted up when a default of any value of `cprl.values.KINDS`, or of `Experiment`, changes,
@@ -43,7 +43,6 @@ SEEDS_APART: Final = 1000
 """Between the seeds of two blocks of replicas; evaluation plays worlds of the next seed."""
 CONDITION: Final = "condition"
 """The column of named conditions."""
-Replicas = Annotated[int, Range(1, 2**20)]
 UNCHANGED: Final = "unchanged"
 """The one condition of a study without factors."""
 
@@ -85,8 +84,12 @@ class Block:
     """Of the run."""
 
 
+Replicas: TypeAlias = Annotated[int, Range(1, 2**20)]
+"""How many replicas something has."""
+
+
 @dataclass(frozen=True, eq=False)
-class Study:
+class Study(Value, stored=False):
     """One experiment under several conditions: a grid, random draws, or named conditions.
 
     Args:
@@ -109,12 +112,12 @@ class Study:
     experiment: Experiment
     factors: Mapping[str, Factor] = field(default_factory=dict)
     conditions: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, kw_only=True)
-    draws: int | None = field(default=None, kw_only=True)
+    draws: Annotated[int, Range(1, MOST_CONDITIONS)] | None = field(default=None, kw_only=True)
     design: Design = field(default="random", kw_only=True)
-    replicas: int | None = field(default=None, kw_only=True)
-    block: int = field(default=BLOCK, kw_only=True)
+    replicas: Replicas | None = field(default=None, kw_only=True)
+    block: Replicas = field(default=BLOCK, kw_only=True)
     reference: str | None = field(default=None, kw_only=True)
-    name: str = field(default="", kw_only=True)
+    name: DirectoryName | Literal[""] = field(default="", kw_only=True)
     question: str = field(default="", kw_only=True)
     expectation: str = field(default="", kw_only=True)
 
@@ -124,6 +127,7 @@ class Study:
         )
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         values = {
             "factors": checked_factors(self.factors),
             "conditions": {name: dict(levels) for name, levels in self.conditions.items()},
@@ -132,17 +136,11 @@ class Study:
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
-        checked("name", self.name, DirectoryName)
-        checked("design", self.design, Design)
-        checked("replicas", self.replicas, Replicas)
-        checked("block", self.block, Replicas)
         if self.factors and self.conditions:
             raise ValueError("a study has factors and conditions; allowed: one of them")
-        if self.draws is not None:
-            checked("draws", self.draws, Annotated[int, Range(1, MOST_CONDITIONS)])
-            if not self.factors:
-                raise ValueError("draws is given without factors; allowed: factors to draw from")
-        elif self.design != "random":
+        if self.draws is not None and not self.factors:
+            raise ValueError("draws is given without factors; allowed: factors to draw from")
+        if self.draws is None and self.design != "random":
             raise refusal("design", self.design, "with draws, how many combinations it has")
         if self.blocks[-1].seed > MOST_SEED:
             raise ValueError(f"the experiment's seed is {self.experiment.seed}; allowed: a lower one")
@@ -275,8 +273,8 @@ class Study:
                 start = str(directory)
                 values = with_runs_moved(values, lambda run: os.path.relpath(os.path.join(start, run)))
             experiment = Experiment.from_config(values["experiment"])
-            factors = {name: factor_from_config(name, factor) for name, factor in values["factors"].items()}
-            conditions = {name: changes_from_config(levels) for name, levels in values["conditions"].items()}
+            factors = {name: factor_from_config(name, part) for name, part in values["factors"].items()}
+            conditions = {name: changes_from_config(part) for name, part in values["conditions"].items()}
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"the study has no table that it could have: {error!r}") from error
         plain = {name: table[name] for name in _PLAIN if name in table}
