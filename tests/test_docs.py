@@ -126,13 +126,17 @@ def test_the_collector_of_several_processes_runs_as_a_script(tmp_path):
     assert done.stdout
 
 
+OF_RECIPES = ("run", "sweep", "search", "--version")
+"""Commands whose options a recipe adds."""
+
+
 def command_lines():
     """What a shell would run of the subcommands of `cprl`, but for those whose options a recipe adds."""
     for page in PAGES:
         for block in re.findall(r"```sh\n(.*?)```", page.read_text(), re.DOTALL):
             for line in block.replace("\\\n", " ").splitlines():
                 words = shlex.split(re.split(r" [>|] ", line)[0], comments=True)
-                if words and Path(words[0]).name == "cprl" and words[1] not in ("run", "sweep", "--version"):
+                if words and Path(words[0]).name == "cprl" and words[1] not in OF_RECIPES:
                     yield pytest.param(words[1:], id=f"{page.name}: {' '.join(words[1:])}"[:80])
 
 

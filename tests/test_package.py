@@ -31,7 +31,7 @@ NEED_NOTHING = (
 """Command lines of which every answer is known before any run is read."""
 ALL_THAT_NEED_NOTHING = (
     *([name, "--help"] for name in cli.COMMANDS),
-    *([name, "none", "--episods", "3"] for name in cli.COMMANDS if name != "sweep"),
+    *([name, "none", "--episods", "3"] for name in cli.COMMANDS if name not in ("sweep", "search")),
     *([name, "runs/none"] for name in cli.COMMANDS if name not in ("export", "docs")),
     *(["export", "runs/none", "copy"], ["table", "runs/none", "--by", "seed"], ["docs", "--port", "-1"]),
     *(["recipe", "commons"], ["sweep", "comons", "--vary", "seed=1,2"]),

@@ -1,4 +1,4 @@
-"""`cprl sweep` and `study_main`: studies from a command line."""
+"""`cprl sweep`, `search` and `study_main`: studies from a command line."""
 
 import json
 import os
@@ -16,10 +16,11 @@ from tiny_study import FREEZE, GAMMA, TINY
 from cprl import Study
 from cprl.commands import main as cli
 from cprl.commands.studies import StudyOptions, carry_out, executor_of, recipe_of, study_main
+from cprl.commands.studies import search as search_words
 from cprl.commands.studies import sweep as sweep_words
 from cprl.runs.files import RunLockedError
 from cprl.runs.recipe import start_run
-from cprl.studies import InProcess, Processes, Ray, read_study
+from cprl.studies import InProcess, Integers, Processes, Ray, read_study
 from cprl.studies.run import Driver
 from cprl.studies.trials import trials_of
 from cprl.system.shipped import cprl_here
@@ -93,7 +94,7 @@ def test_the_end_of_the_training_that_is_compared_may_be_longer():
         if last == 10:
             before = written_at("here/runs")
     assert "95% intervals over replicas by Student's t" in summary
-    assert "as that of about one in twenty would by chance" in summary
+    assert "Bold: not 0 by Holm's method for" in summary
     assert written_at("here/runs") == before
     with pytest.raises(ValueError, match="last is 9"):
         sweep(f"{line.replace('here', 'elsewhere')} --last 9")
@@ -167,15 +168,10 @@ def test_a_failed_condition_does_not_end_the_study_and_is_listed_with_what_tries
         ("nowhere.py --vary x=1", "the recipe is nowhere.py"),
         ("nowhere --vary x=1", "is not the recipe of a run"),
         (f"mine.py --vary {FREEZE}=2,2", "are equal"),
-        ("mine.py --vary turns=5,10", "turns is an argument of the recipe, the same in all conditions"),
+        ("mine.py --vary turns=5,10", "the path turns matches nothing"),
         ("mine.py --vary seed=1,2", "which the study itself decides"),
-        (f"mine.py --vary {FREEZE}=integers(1,9)", "has a range"),
-        (f"mine.py --vary {FREEZE}=2 --maximise peace", "--maximise is for a search"),
-        (f"mine.py --vary {FREEZE}=2 --at-once 2", "--at-once is for a search"),
-        (f"mine.py --vary {FREEZE}=2 --search 3 --draws 3", "--draws is not for a search"),
-        (f"mine.py --vary {FREEZE}=2 --search 3 --maximise peace --minimise peace", "allowed: one of them"),
-        (f"mine.py --vary {FREEZE}=2 --search 3 --only freeze_steps=2", "--only is for studies"),
-        (f"mine.py --vary {FREEZE}=2 --search 3 --keep-checkpoints", "--keep-checkpoints is for studies"),
+        (f"mine.py --vary {FREEZE}=integers(1,9)", "with draws=N"),
+        (f"mine.py --vary {FREEZE}=2 --design sobol", "design is 'sobol'"),
         (f"mine.py --vary {FREEZE}=2 --reference best", "reference is 'best'"),
         (f"mine.py --vary {FREEZE}=2 --jobs 0", "--jobs is 0"),
         (f"mine.py --vary {FREEZE}=2 --jobs 2 --on here", "--jobs is 2 with --on here"),
@@ -189,16 +185,67 @@ def test_what_cannot_be_is_refused_before_anything_is_written(here, line, messag
     assert sorted(path.name for path in here.iterdir() if path.name != "__pycache__") == ["mine.py"]
 
 
-def test_flags_of_a_single_run_are_unknown(capsys):
+@pytest.mark.parametrize(
+    ("command", "flags"),
+    [(sweep_words, "--resume"), (sweep_words, "--points 3"), (search_words, "--only freeze_steps=2")],
+)
+def test_flags_of_other_commands_are_unknown(command, flags, capsys):
     with pytest.raises(SystemExit, match="2"):
-        sweep(f"mine.py --vary {FREEZE}=2 --resume")
-    assert "--resume" in "".join(capsys.readouterr())
+        command(["mine.py", "--vary", f"{FREEZE}=2,3", *flags.split()])
+    assert flags.split()[0] in "".join(capsys.readouterr())
 
 
+def test_a_design_draws_the_conditions_of_a_sweep(capsys):
+    sweep(f"mine.py --vary {FREEZE}=integers(1,8) --draws 8 --design latin_hypercube --dry-run")
+    said = capsys.readouterr().out
+    assert all(f"freeze_steps={steps}, replica 0  missing" in said for steps in range(1, 9))
+
+
+def test_a_search_is_a_command_of_its_own(monkeypatch, capsys, here):
+    words = ["mine.py", "--vary", f"{FREEZE}=integers(1,9)", "--vary", f"{GAMMA}=0.5,0.9", "--turns", "7"]
+    words += [
+        "--points",
+        "7",
+        "--metric",
+        "peace",
+        "--direction",
+        "minimise",
+        "--at-once",
+        "2",
+        "--block",
+        "3",
+    ]
+    search_words([*words, "--dry-run"])
+    assert "7 points of game.rules.freeze_steps: Integers(low=1, high=9)" in capsys.readouterr().out
+    assert sorted(path.name for path in here.iterdir() if path.name != "__pycache__") == ["mine.py"]
+
+    def searched(search, out, *, last, **options):
+        factors = {FREEZE: Integers(1, 9), GAMMA: (0.5, 0.9)}
+        assert (search.points, search.metric, search.direction) == (7, "peace", "minimise")
+        assert (search.at_once, search.block, search.factors, last) == (2, 3, factors, 30)
+        assert search.experiment.game.rules.episode_steps == 7
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("cprl.studies.run_search", searched)
+    with pytest.raises(SystemExit, match="130"):
+        search_words(words)
+    assert "search mine.py --vary 'game.rules.freeze_steps=integers(1,9)'" in capsys.readouterr().out
+
+
+@pytest.mark.integration
+def test_a_search_says_its_best_points(capsys):
+    pytest.importorskip("optuna")
+    search_words(["mine.py", "--vary", f"{FREEZE}=2,5", "--points", "2", "--episodes", "1", "--out", "here"])
+    said = capsys.readouterr().out
+    assert "tiny: 2 points; the highest collective_return, means over replicas:" in said
+    assert "freeze_steps=" in said.partition("means over replicas:")[2]
+
+
+@pytest.mark.parametrize("command", [sweep_words, search_words])
 @pytest.mark.parametrize("words", ["", "--help", "mine.py --help"])
-def test_help_says_how_values_are_written_and_what_a_command_line_cannot_change(words, capsys):
+def test_help_says_how_values_are_written_and_what_a_command_line_cannot_change(command, words, capsys):
     with pytest.raises(SystemExit) as ended:
-        sweep(words)
+        command(shlex.split(words))
     assert ended.value.code == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "commas stand between values" in said
@@ -275,7 +322,7 @@ def test_help_of_a_study_says_what_it_asks_and_expects(capsys):
 
 
 def test_what_a_study_refuses_is_said_in_a_line():
-    with pytest.raises(SystemExit, match=r"^mine\.py: replicas is 0"):
+    with pytest.raises(SystemExit, match=r"^mine\.py: .*replicas is 0"):
         study_main(STUDY, ["recipes/mine.py", "--replicas", "0"])
 
 

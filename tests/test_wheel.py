@@ -135,7 +135,7 @@ COMMANDS = {
 
 def test_every_command_has_a_miniature(bare):
     listed = re.search(r"\{([a-z,\s]+)\}", bare.cprl("--help"))
-    assert set("".join(listed[1].split()).split(",")) == {*COMMANDS, "watch", "play", "egta"}
+    assert set("".join(listed[1].split()).split(",")) == {*COMMANDS, "watch", "play", "egta", "search"}
 
 
 @pytest.mark.parametrize("name", list(COMMANDS))

@@ -29,7 +29,7 @@ from cprl.commands.play_stored import (
 from cprl.commands.recipe import TAKES_NOTHING_OVER, Allow, ended_by_sigterm, in_a_sentence, make_importable
 from cprl.commands.recipes import recipe as print_recipe
 from cprl.commands.recipes import refuse_unknown, run_by_name
-from cprl.commands.studies import runs_table, sweep
+from cprl.commands.studies import runs_table, search, sweep
 from cprl.presets import Variant, check_board
 from cprl.runs.recipe import read_recipe, started_by
 from cprl.system.output import printed, say
@@ -226,6 +226,7 @@ COMMANDS: Final[Mapping[str, Callable[..., None]]] = {
     "scenarios": scenarios,
     "exploit": exploit,
     "sweep": sweep,
+    "search": search,
     "table": runs_table,
 }
 """The subcommands, in the order in which `cprl --help` lists them."""
@@ -236,9 +237,9 @@ def main() -> None:
     if sys.argv[1:] == ["--version"]:
         say(f"cprl {version('cprl')}")
         return
-    if sys.argv[1:2] == ["sweep"]:
-        with in_a_sentence("cprl sweep"):
-            sweep(sys.argv[2:])
+    if sys.argv[1:2] in (["sweep"], ["search"]):
+        with in_a_sentence(f"cprl {sys.argv[1]}"):
+            {"sweep": sweep, "search": search}[sys.argv[1]](sys.argv[2:])
         return
     if run_by_name():
         return

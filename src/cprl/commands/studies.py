@@ -1,16 +1,15 @@
-"""`cprl sweep` and `cprl table`, and `study_main`: the command line of a recipe that describes a study."""
+"""`cprl sweep`, `search` and `table`, and `study_main`: the command line of a recipe of a study."""
 
 import importlib.util
-import inspect
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar
 
 import tyro
 
@@ -23,14 +22,10 @@ from cprl.system.shipped import command_of, is_shipped, named_command, program_o
 
 if TYPE_CHECKING:
     from cprl.experiment import Experiment
-    from cprl.studies import Search, Study, StudyTable
-    from cprl.studies.tables.comparing import Cells
-if TYPE_CHECKING:
-    from cprl.studies import Search, SearchResult, Study, StudyResult
+    from cprl.studies import SearchResult, Study, StudyResult, StudyTable
     from cprl.studies.executors import Executor
-    from cprl.studies.trials import Outcome, Trial
+    from cprl.studies.tables.comparing import Cells
 
-PROGRAM: Final = "cprl sweep"
 _RECIPE: Final = (
     "A Python file with a function `experiment`, the name of a recipe (cprl recipe lists them), a "
     "recipe.json, or the directory of a run."
@@ -40,18 +35,20 @@ _TRAINING: Final = "training"
 _TABLE_SUFFIXES: Final = (".parquet", ".csv", ".md")
 Part = Literal["training", "evaluation", "random"]
 _NOTE: Final = (
-    "cprl sweep runs a recipe under several conditions. With --vary PATH=VALUES any value below is varied: "
+    "With --vary PATH=VALUES any value below is varied: "
     'commas stand between values, "x" or spaces between the numbers of one value (hidden-cells=32x32,64x64). '
     "agents.*.PATH means every agent that learns, agents.0.PATH one. Values may also be True, False, None, "
-    "names, and boards by their names. With --draws or --search a range may stand in their place: "
+    "names, and boards by their names. In a search and with --draws a range may stand in their place: "
     "uniform(LOW,HIGH), loguniform(LOW,HIGH) or integers(LOW,HIGH). Every other flag below is the same in "
     "all conditions; --replicas are those of each condition."
 )
+Words = tyro.conf.UseAppendAction[tuple[str, ...]]
+"""--vary A --vary B."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class StudyOptions:
-    """How a study is run and compared; nothing of it changes a run."""
+class TrialOptions:
+    """How trials are run and compared; nothing of it changes a run."""
 
     out: Path | None = None
     """The study's directory; by default studies/NAME. The same line continues a study that was stopped, and
@@ -60,12 +57,6 @@ class StudyOptions:
     """The directory of the runs, which several studies may share; by default runs/ in the study's."""
     jobs: int | None = None
     """Trials that run at the same time."""
-    only: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Run a condition alone, or those with some levels: "gamma=0.9", "gamma=0.9, freeze_steps=5"; may be
-    repeated. The others stay as they are, so that several machines can share a study."""
-    keep_checkpoints: bool = False
-    """Keep the state of each training, buffers included (an agent's takes as much as its buffer), so that the
-    same study with more --episodes goes on from there."""
     on: Literal["here", "processes", "ray"] | None = None
     """Where trials are run: one after the other in this process, in processes on this machine, or by Ray
     (extra "ray"); by default here, and in processes with more than one of --jobs."""
@@ -77,39 +68,25 @@ class StudyOptions:
     """Episodes at the end of the training that these compare; of long trainings rather 500."""
     dry_run: bool = False
     """List all conditions, trials and their states; run and write nothing."""
-    allow: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    allow: Words = ()
     """A class of somebody's own that stored runs may import, "module:Class"; may be repeated."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepOptions(StudyOptions):
-    """What is varied, and how it is run."""
+class StudyOptions(TrialOptions):
+    """How a study is run."""
 
-    vary: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """PATH=VALUE,VALUE,... e.g. game.rules.freeze-steps=5,25,100; repeated, every combination is run."""
-    draws: int | None = None
-    """So many random combinations instead of all."""
-    block: int = BLOCK
-    """Replicas that one run trains side by side; with fewer, more processes share the work."""
-    reference: str | None = None
-    """The name of the condition that others are compared with, e.g. "freeze_steps=25"."""
-    search: int | None = None
-    """Find good values in so many points proposed by Optuna (extra "optuna"), instead of running all."""
-    maximise: str | None = None
-    """With --search: the metric that shall be high; by default collective_return."""
-    minimise: str | None = None
-    """With --search: the metric that shall be low."""
-    over: Literal["evaluation", "training"] = "evaluation"
-    """With --search: the episodes that count, those of the evaluation or the last 30 of the training."""
-    sampler: Literal["tpe", "random", "gp"] = "tpe"
-    """With --search: how points are proposed."""
-    at_once: int = 4
-    """With --search: points that are proposed together; a multiple of --jobs keeps all of them busy."""
+    only: Words = ()
+    """Run a condition alone, or those with some levels: "gamma=0.9", "gamma=0.9, freeze_steps=5"; may be
+    repeated. The others stay as they are, so that several machines can share a study."""
+    keep_checkpoints: bool = False
+    """Keep the state of each training, buffers included (an agent's takes as much as its buffer), so that the
+    same study with more --episodes goes on from there."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MainOptions(StudyOptions):
-    """How a study is run."""
+    """How the study of a recipe is run."""
 
     replicas: int | None = None
     """Of each condition; by default those of the study."""
@@ -117,6 +94,47 @@ class MainOptions(StudyOptions):
     """Of each condition; by default those of the study."""
     block: int | None = None
     """Replicas that one run trains side by side; with fewer, more processes share the work."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepOptions(StudyOptions):
+    """What is varied, and how it is run."""
+
+    vary: Words = ()
+    """PATH=VALUE,VALUE,... e.g. game.rules.freeze-steps=5,25,100; repeated, every combination is run."""
+    draws: int | None = None
+    """So many random combinations instead of all."""
+    design: Literal["random", "latin_hypercube", "sobol"] = "random"
+    """With --draws: how they are drawn, by chance or evenly."""
+    block: int = BLOCK
+    """Replicas that one run trains side by side; with fewer, more processes share the work."""
+    reference: str | None = None
+    """The name of the condition that others are compared with, e.g. "freeze_steps=25"."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchOptions(TrialOptions):
+    """What is searched, and how it is run."""
+
+    vary: Words = ()
+    """PATH=VALUE,VALUE,... or PATH=loguniform(LOW,HIGH); may be repeated."""
+    points: int = 30
+    """How many points Optuna (extra "optuna") proposes."""
+    metric: str = "collective_return"
+    """The metric whose best value is searched."""
+    direction: Literal["maximise", "minimise"] = "maximise"
+    """Whether it shall be high or low."""
+    over: Literal["evaluation", "training"] = "evaluation"
+    """The episodes that count, those of the evaluation or the last 30 of the training."""
+    sampler: Literal["tpe", "random", "gp"] = "tpe"
+    """How points are proposed."""
+    at_once: int = 4
+    """Points that are proposed together; a multiple of --jobs keeps all of them busy."""
+    block: int = BLOCK
+    """Replicas that one run trains side by side; with fewer, more processes share the work."""
+
+
+RecipeOptions = TypeVar("RecipeOptions", SweepOptions, SearchOptions)
 
 
 def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
@@ -142,38 +160,98 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
 
     with in_a_sentence(script):
         options = tyro.cli(read, args=command[1:], prog=script, description=_about(study), config=_CONFIG)
-        given = {own: getattr(options, own) for own in ("replicas", "block")}
-        changed = {own: value for own, value in given.items() if value is not None}
-        wanted = replace(study, **changed) if changed else study
+        given = {"replicas": options.replicas, "block": options.block}
+        study = replace(study, **{name: value for name, value in given.items() if value is not None})
         if options.episodes is not None:
-            wanted = _of_episodes(wanted, options.episodes)
-        return carry_out(wanted, options, command)
+            study = _of_episodes(study, options.episodes)
+        return carry_out(study, options, command)
 
 
 def _of_episodes(study: "Study", episodes: int) -> "Study":
     """A study with other episodes than its own."""
     shorter = replace(study, experiment=replace(study.experiment, episodes=episodes))
-    for own in shorter.all_conditions:
-        if own.experiment.episodes != episodes:
+    for condition in shorter.all_conditions:
+        if condition.experiment.episodes != episodes:
             raise ValueError(
-                f"--episodes is {episodes}, and the study's condition {own.name} says "
-                f"{own.experiment.episodes}; allowed: --episodes where no condition says how many"
+                f"--episodes is {episodes}, and the study's condition {condition.name} says "
+                f"{condition.experiment.episodes}; allowed: --episodes where no condition says how many"
             )
     return shorter
 
 
 def sweep(words: Sequence[str], /) -> None:
-    """Runs a recipe under several conditions, or searches for good values: cprl sweep RECIPE --vary ...
+    """Runs a recipe under several conditions: cprl sweep RECIPE --vary ...
 
     Args:
         words: what stands after `cprl sweep`: first a Python file with a function `experiment`, the name of
             a recipe that comes with cprl, a recipe.json, or the directory of a run; then options.
     """
+    experiment, options = _read(words, SweepOptions(), "cprl sweep")
+
+    from cprl.studies import Study
+    from cprl.studies.factors import factors_of
+
+    study = Study(
+        experiment,
+        factors_of(experiment, options.vary),
+        draws=options.draws,
+        design=options.design,
+        reference=options.reference,
+        block=options.block,
+    )
+    carry_out(study, options, ["cprl", "sweep", *words])
+
+
+def search(words: Sequence[str], /) -> None:
+    """Searches for good values by Optuna: cprl search RECIPE --vary ... --points 30
+
+    Args:
+        words: what stands after `cprl search`, see `sweep`.
+    """
+    experiment, options = _read(words, SearchOptions(), "cprl search")
+
+    from cprl.studies import Search, run_search
+    from cprl.studies.factors import factors_of
+    from cprl.studies.study import directory_of
+
+    wanted = Search(
+        experiment,
+        factors_of(experiment, options.vary),
+        points=options.points,
+        metric=options.metric,
+        direction=options.direction,
+        over=options.over,
+        at_once=options.at_once,
+        sampler=options.sampler,
+        block=options.block,
+    )
+    command, executor = ["cprl", "search", *words], executor_of(options)
+    if options.dry_run:
+        factors = ", ".join(f"{name}: {factor}" for name, factor in wanted.factors.items())
+        out = directory_of(wanted.study_of([]), options.out)
+        say(f"{wanted.points} points of {factors}, found one after the other, in {out}; nothing was written")
+        return
+    with _interruptible(command):
+        result = run_search(
+            wanted,
+            options.out,
+            on=executor,
+            runs=options.runs,
+            results=options.figures,
+            last=options.last,
+            again=_published(command),
+        )
+    _say_best(result)
+    _say_result(result, command)
+
+
+def _read(words: Sequence[str], options: RecipeOptions, program: str) -> "tuple[Experiment, RecipeOptions]":
+    """The experiment of a recipe and the options that stand after it; prints the help that they ask for."""
     if not words or words[0] in ("-h", "--help"):
-        _print_help()
+        _print_help(options, program)
     if words[0].startswith("-"):
         raise ValueError(
-            f"the first word after cprl sweep is {words[0]}; allowed: a recipe, e.g. cprl sweep "
+            f"the first word after {program} is {words[0]}; allowed: a recipe, e.g. {program} "
             "recipes/commons.py --vary game.rules.freeze-steps=5,25,100"
         )
     source = recipe_named(words[0]).path if is_shipped(words[0]) else Path(words[0])
@@ -181,71 +259,29 @@ def sweep(words: Sequence[str], /) -> None:
     allow += [word.removeprefix("--allow=") for word in words if word.startswith("--allow=")]
     sys.path[:0] = [str(source.resolve().parent)] if source.suffix == ".py" and source.is_file() else []
     sys.path[:0] = [os.getcwd()] if allow else []
-    make = recipe_of(source, allow)
-    program = f"{PROGRAM} {words[0]}"
-    experiment, options = parse_with(make, words[1:], SweepOptions(), program=program, note=_NOTE)
-    _refuse_arguments(options.vary, make)
-    carry_out(wanted(experiment, options), options, ["cprl", "sweep", *words])
+    make, begin = recipe_of(source, allow), f"{program} runs a recipe under several conditions. {_NOTE}"
+    experiment, options = parse_with(make, words[1:], options, program=f"{program} {words[0]}", note=begin)
 
-
-def _refuse_arguments(vary: Sequence[str], make_experiment: "Callable[..., Experiment]") -> None:
-    """Raises a ValueError where an argument of the recipe is varied, and no field of the experiment."""
-    from cprl.experiment import Experiment
-
-    own = {*inspect.signature(make_experiment).parameters} - {field.name for field in fields(Experiment)}
-    for word in vary:
-        name = word.partition("=")[0].replace("-", "_")
-        if name in own:
-            raise ValueError(
-                f"the path {name} matches nothing: {name} is an argument of the recipe, the same in all "
-                "conditions; allowed: a field of the experiment, e.g. game.rules.freeze_steps"
-            )
-
-
-def wanted(experiment: "Experiment", options: SweepOptions) -> "Study | Search":
-    """The study or search that a sweep is."""
-    from cprl.studies import Search, Study
-    from cprl.studies.factors import Distribution, factors_of
+    from cprl.custom import trust
 
     if not options.vary:
         raise ValueError("nothing is varied; allowed: --vary PATH=VALUE,VALUE..., at least once")
-    factors = factors_of(experiment, options.vary)
-    how: dict[str, Any] = {"block": options.block}
-    if options.search is None:
-        for own in ("maximise", "minimise", *_OF_SEARCH):
-            if getattr(options, own) != getattr(SweepOptions(), own):
-                raise ValueError(f"--{own.replace('_', '-')} is for a search; allowed: with --search POINTS")
-        ranges = [name for name, own in factors.items() if isinstance(own, Distribution)]
-        if ranges and options.draws is None:
-            raise ValueError(f"{ranges[0]} has a range; allowed: values, or a range with --draws or --search")
-        return Study(experiment, factors, draws=options.draws, reference=options.reference, **how)
-    for own in ("draws", "reference"):
-        if getattr(options, own) is not None:
-            raise ValueError(f"--{own} is not for a search; allowed: one of --{own} and --search")
-    if options.maximise is not None and options.minimise is not None:
-        raise ValueError("--maximise and --minimise are given; allowed: one of them")
-    return Search(
-        experiment,
-        factors,
-        points=options.search,
-        metric=options.maximise or options.minimise or "collective_return",
-        direction="maximise" if options.minimise is None else "minimise",
-        **{own: getattr(options, own) for own in _OF_SEARCH},
-        **how,
-    )
+    trust(*options.allow)
+    return experiment, options
 
 
-def _print_help() -> None:
+def _print_help(options: RecipeOptions, program: str) -> None:
     """Prints what holds for every recipe, and ends the process."""
+    kind: Any = type(options)
 
     def read(
         recipe: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(help=_RECIPE)],
-        options: Annotated[SweepOptions, tyro.conf.arg(name="")] = _DEFAULTS,
+        options: Annotated[kind, tyro.conf.arg(name="")] = options,
     ) -> None:
         """Never called."""
 
-    about = f"{_NOTE} The flags of a recipe are listed by cprl sweep RECIPE --help."
-    tyro.cli(read, args=["--help"], prog=PROGRAM, description=about, config=_CONFIG)
+    about = f"{_NOTE} The flags of a recipe are listed by {program} RECIPE --help."
+    tyro.cli(read, args=["--help"], prog=program, description=about, config=_CONFIG)
 
 
 def recipe_of(source: Path, allow: Sequence[str] = ()) -> "Callable[..., Experiment]":
@@ -257,11 +293,11 @@ def recipe_of(source: Path, allow: Sequence[str] = ()) -> "Callable[..., Experim
         allow: the user's own code, "module:Class", that a recipe.json may import.
     """
     if source.suffix != ".py" or source.is_dir():
-        directory, kept = source if source.is_dir() else source.parent, read_recipe(source)
+        directory, content = source if source.is_dir() else source.parent, read_recipe(source)
 
         from cprl.experiment import Experiment
 
-        stored = Experiment.from_recipe(kept, allow=allow, directory=directory)
+        stored = Experiment.from_recipe(content, allow=allow, directory=directory)
 
         def experiment() -> Experiment:
             return stored
@@ -413,152 +449,136 @@ def _write(table: "StudyTable", compared: "Sequence[Cells]", out: Path) -> None:
 
 
 def _about(study: "Study") -> str:
-    parts = [study.question, f"Expected: {study.expectation}" if study.expectation else ""]
-    names = ", ".join(own.name for own in study.all_conditions[:_LISTED])
-    more = f" and {len(study.all_conditions) - _LISTED} more" if study.all_conditions[_LISTED:] else ""
-    parts.append(f"{len(study.all_conditions)} conditions: {names}{more}; {study.replicas} replicas of each.")
+    conditions = study.all_conditions
+    names = ", ".join(condition.name for condition in conditions[:_LISTED])
+    more = f" and {len(conditions) - _LISTED} more" if conditions[_LISTED:] else ""
+    parts = [
+        study.question,
+        f"Expected: {study.expectation}" if study.expectation else "",
+        f"{len(conditions)} conditions: {names}{more}; {study.replicas} replicas of each.",
+    ]
     return "\n\n".join(filter(None, parts))
 
 
 _LISTED: Final = 20
-_CONFIG: Final = (tyro.conf.HelptextFromCommentsOff,)
-_DEFAULTS: Final = SweepOptions()
-_OF_SEARCH: Final = ("over", "sampler", "at_once")
-
-
+"""Conditions that `--help` of a study names."""
 _BEST: Final = 10
 """Points of a search that are printed."""
+_CONFIG: Final = (tyro.conf.HelptextFromCommentsOff,)
 
 
-def executor_of(options: StudyOptions) -> "Executor":
-    """Where trials are run."""
+def executor_of(options: TrialOptions) -> "Executor":
+    """Return where trials are run."""
     from cprl.studies.executors import InProcess, Processes, Ray
 
-    jobs, on = options.jobs, options.on
-    if jobs is not None:
-        integer("--jobs", jobs, 1, 4096)
-    on = on or ("processes" if (jobs or 1) > 1 else "here")
+    jobs = 1 if options.jobs is None else integer("--jobs", options.jobs, 1, 4096)
+    on = options.on or ("processes" if jobs > 1 else "here")
     if options.address is not None and on != "ray":
         raise ValueError(f"--address is for --on ray, and this is --on {on}; allowed: one with the other")
-    if on == "here":
-        if (jobs or 1) > 1:
-            raise ValueError(f"--jobs is {jobs} with --on here; allowed: 1, or --on processes")
-        return InProcess()
+    if on == "here" and jobs > 1:
+        raise ValueError(f"--jobs is {jobs} with --on here; allowed: 1, or --on processes")
     if on == "ray":
-        return Ray(options.address, jobs=jobs)
+        return Ray(options.address, jobs=options.jobs)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return Processes(jobs or cores)
+    return InProcess() if on == "here" else Processes(options.jobs or cores)
 
 
-def carry_out(what: "Study | Search", options: StudyOptions, command: Sequence[str]) -> Path:
-    """Runs a study or a search as the command line asks for it, and says what came of it.
+def carry_out(study: "Study", options: StudyOptions, command: Sequence[str]) -> Path:
+    """Run a study as the command line asks for it, say what came of it, and return its directory.
 
     Args:
         command: the command line, script first, which is said where it can be used again.
-
-    Returns:
-        The study's directory.
 
     Raises:
         SystemExit: with code 1 where trials have failed, and 130 or 143 where it was interrupted.
     """
     from cprl.custom import trust
-    from cprl.studies import Search, run_search, run_study
+    from cprl.studies import run_study
 
-    executor, again = executor_of(options), printed(command_of(command))
-    if isinstance(what, Search):
-        for flag, value in {"--only": options.only, "--keep-checkpoints": options.keep_checkpoints}.items():
-            if value:
-                raise ValueError(
-                    f"{flag} is for studies, and this is a search; allowed: one without the other"
-                )
+    executor = executor_of(options)
     if options.dry_run:
-        return _list(what, options)
+        return _list(study, options)
     trust(*options.allow)
-    names = ("runs", "last")
-    how: dict[str, Any] = {"on": executor, **{own: getattr(options, own) for own in names}}
-    program, *words = named_command(command)
-    whole = without_options(words, ["--only"])  # what a part of a study lacks, it lacks
-    how |= {"results": options.figures, "again": printed([without_directories(program), *whole])}
-    with _interruptible(again):
-        result: StudyResult | SearchResult
-        if isinstance(what, Search):
-            result = run_search(what, options.out, **how)
-            _say_best(result)
-        else:
-            how |= {"only": options.only, "keep_checkpoints": options.keep_checkpoints}
-            result = run_study(what, options.out, **how)
-    say(result.out)
-    if result.failed:
-        _say_failed(result, again)
-        sys.exit(1)
+    with _interruptible(command):
+        result = run_study(
+            study,
+            options.out,
+            on=executor,
+            runs=options.runs,
+            only=options.only,
+            keep_checkpoints=options.keep_checkpoints,
+            results=options.figures,
+            last=options.last,
+            again=_published(command),
+        )
+    _say_result(result, command)
     return result.out
 
 
-def _list(what: "Study | Search", options: StudyOptions) -> Path:
+def _published(command: Sequence[str]) -> str:
+    """The line that runs what a study lacks, whole and as its summary has it, which names no place."""
+    program, *words = named_command(command)
+    return printed([without_directories(program), *without_options(words, ["--only"])])
+
+
+def _list(study: "Study", options: StudyOptions) -> Path:
     """Prints all trials and their states."""
-    from cprl.studies import Search, Study
     from cprl.studies.progress import Overview, table_of
     from cprl.studies.run import trials_with
     from cprl.studies.status import BEAT_S
     from cprl.studies.study import RUNS, STATUS, directory_of
     from cprl.studies.trials import trials_of
 
-    study = Study(what.experiment, name=what.name) if isinstance(what, Search) else what
     out = directory_of(study, options.out)
-    if isinstance(what, Search):
-        factors = ", ".join(f"{name}: {own}" for name, own in what.factors.items())
-        say(f"{what.points} points of {factors}, found one after the other, in {out}; nothing was written")
-        return out
-    trials = trials_with(trials_of(study), options.only)
     runs = out / RUNS if options.runs is None else options.runs
-    overview = Overview(trials, runs, out / STATUS)
+    overview = Overview(trials_with(trials_of(study), options.only), runs, out / STATUS)
     now = overview.look()
     if now.counts["unfinished"]:  # those that run say something new within a second
         time.sleep(1.5 * BEAT_S)
         now = overview.look()
     console(width=None if sys.stdout.isatty() else 160).print(table_of(now, title=study.name))
-    names = ", ".join(study.columns)
-    say(
-        f"{len(study.all_conditions)} conditions ({names}), {study.replicas} replicas each, in {runs}; "
-        "nothing was written"
-    )
+    about = f"{len(study.all_conditions)} conditions ({', '.join(study.columns)}), {study.replicas} replicas"
+    say(f"{about} each, in {runs}; nothing was written")
     return out
 
 
 def _say_best(result: "SearchResult") -> None:
-    search = result.search
-    words = {"maximise": "highest", "minimise": "lowest"}[search.direction]
-    say(f"{search.name}: {len(result.points)} points; the {words} {search.metric}, means over replicas:")
+    wanted = result.search
+    best = "highest" if wanted.direction == "maximise" else "lowest"
+    say(f"{wanted.name}: {len(result.points)} points; the {best} {wanted.metric}, means over replicas:")
     for point in result.ranked[:_BEST]:
         say(f"  {point.value:10.6g}  {point.name}")
-    refused = [own for own in result.points if own.reason]
+    refused = [point for point in result.points if point.reason]
     if refused:
         say(f"  {len(refused)} points were refused, e.g. {refused[0].name}: {refused[0].reason}")
 
 
-def _say_failed(result: "StudyResult | SearchResult", again: str) -> None:
-    """Lists the trials that failed, where to look, and what to do."""
+def _say_result(result: "StudyResult", command: Sequence[str]) -> None:
+    """Says where a study is; of trials that failed why, where to look and what to do, and exits."""
     from cprl.studies.status import Status
     from cprl.studies.study import STATUS
 
-    trials: dict[str, Trial] = {trial.name: trial for trial in result.trials}
-    outcomes: dict[str, Outcome] = {own.name: own for own in result.failed}
-    lines = [f"{len(outcomes)} of {len(trials)} trials failed; the others are kept:"]
+    say(result.out)
+    if not result.failed:
+        return
+    labels = {trial.name: trial.label for trial in result.trials}
+    outcomes = {outcome.name: outcome for outcome in result.failed}
+    lines = [f"{len(outcomes)} of {len(labels)} trials failed; the others are kept:"]
     for name, outcome in outcomes.items():
         status = Status(result.out / STATUS, name)
         where = status.failed if status.failed.exists() else status.log
-        lines += [f"  {trials[name].label}: {outcome.reason}", f"    {where}", f"    {outcome.command}"]
-    say("\n".join([*lines, f"To try them again: {again}"]))
+        lines += [f"  {labels[name]}: {outcome.reason}", f"    {where}", f"    {outcome.command}"]
+    say("\n".join([*lines, f"To try them again: {printed(command_of(command))}"]))
+    sys.exit(1)
 
 
 @contextmanager
-def _interruptible(again: str) -> Iterator[None]:
+def _interruptible(command: Sequence[str]) -> Iterator[None]:
     """Says what is kept, and what continues, where the block is ended by Ctrl-C (SIGINT) or SIGTERM."""
     try:
         with ended_by_sigterm():
             yield
     except (KeyboardInterrupt, SystemExit) as error:
-        kept = [note for note in getattr(error, "__notes__", []) if not note.startswith(RESUMES)]
-        say("\n".join(["Interrupted.", *kept, f"To continue: {again}"]))
+        notes = [note for note in getattr(error, "__notes__", []) if not note.startswith(RESUMES)]
+        say("\n".join(["Interrupted.", *notes, f"To continue: {printed(command_of(command))}"]))
         sys.exit(130 if isinstance(error, KeyboardInterrupt) else error.code)
