@@ -22,9 +22,9 @@ def play(board, **rules):
     return Play(board, agent_1_right_moves_agent_0=True, **rules)
 
 
-def picture(shown):
+def picture(play):
     """The whole board as it is painted."""
-    rows = shown.batch.boards(shown.output)[0]
+    rows = play.batch.boards(play.output)[0]
     return "\n".join("".join(SIGN_OF_NAME[CLASS_NAMES[kind]] for kind in row) for row in rows)
 
 
@@ -107,9 +107,9 @@ def test_an_agent_that_an_institution_kept_from_firing_has_no_beam_where_it_stoo
 def test_a_loaded_state_shows_the_beam_where_it_was_fired():
     played = play(".>...<\n.A....", beam_width_cells=1, hits_to_tag=2).turn("beam", "right")
     other = Batch(played.game, 1)
-    shown = other.load(played.batch.state(), other.new_output())
-    assert np.array_equal(shown.observation, played.output.observation)
-    assert np.array_equal(other.boards(shown), played.batch.boards(played.output))
+    output = other.load(played.batch.state(), other.new_output())
+    assert np.array_equal(output.observation, played.output.observation)
+    assert np.array_equal(other.boards(output), played.batch.boards(played.output))
 
 
 def test_only_states_of_games_with_the_fault_say_who_was_moved_after_firing():

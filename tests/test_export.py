@@ -23,17 +23,17 @@ from cprl.runs.export import export_results
 
 
 @pytest.mark.integration
-def test_what_is_kept_says_the_same_as_the_run(run, tmp_path):
-    folder = export_results(run, tmp_path / "kept")
+def test_an_export_says_the_same_as_the_run(run, tmp_path):
+    folder = export_results(run, tmp_path / "exported")
     assert export_results(run, folder) == folder, "again over the same"
-    kept, whole = read_episodes(folder).to_pydict(), read_episodes(run)
+    exported, whole = read_episodes(folder).to_pydict(), read_episodes(run)
     ordered = whole.sort_by([(name, "ascending") for name in ("replica", "episode", "agent")]).to_pydict()
-    assert set(kept) == set(ordered)
+    assert set(exported) == set(ordered)
     for name, values in ordered.items():
-        np.testing.assert_array_equal(np.float32(kept[name]), np.float32(values), err_msg=name)
-    mine, theirs = cprl.load(folder), cprl.load(run)
-    assert mine.game == theirs.game
-    assert sorted(mine.networks) == sorted(theirs.networks)
+        np.testing.assert_array_equal(np.float32(exported[name]), np.float32(values), err_msg=name)
+    copy, original = cprl.load(folder), cprl.load(run)
+    assert copy.game == original.game
+    assert sorted(copy.networks) == sorted(original.networks)
     assert not list(folder.rglob("training-*"))
     (run / "report.json").rename(tmp_path / "aside")
     with pytest.raises(FileNotFoundError, match=r"report\.json does not exist: has the run ended\?"):
@@ -44,19 +44,18 @@ def test_what_is_kept_says_the_same_as_the_run(run, tmp_path):
 
 @pytest.mark.integration
 def test_an_export_never_replaces_a_run(run, tmp_path):
-    other = tmp_path / "other"
-    copytree(run, other)
+    other = copytree(run, tmp_path / "other")
     before = {path: path.read_bytes() for path in other.rglob("*") if path.is_file()}
     for folder, why in ((run, "the run itself"), (other, "a run of its own: it has run.rrd")):
         with pytest.raises(ValueError, match=rf"folder is .*, {why}.*; allowed: a new folder, or one with"):
             export_results(run, folder)
     assert {path: path.read_bytes() for path in other.rglob("*") if path.is_file()} == before
-    kept = export_results(run, tmp_path / "kept")
-    content = json.loads((kept / "recipe.json").read_text())
+    exported = export_results(run, tmp_path / "exported")
+    content = json.loads((exported / "recipe.json").read_text())
     content["experiment"]["seed"] += 1
-    (kept / "recipe.json").write_text(json.dumps(content))
+    (exported / "recipe.json").write_text(json.dumps(content))
     with pytest.raises(ValueError, match=r"which holds another run: experiment\.seed was 1, is 0"):
-        export_results(run, kept)
+        export_results(run, exported)
 
 
 @pytest.mark.integration
@@ -65,8 +64,8 @@ def test_exported_results_find_the_runs_of_frozen_agents(run, tmp_path):
     agents = (loaded.agents[0], Frozen(os.path.relpath(run), 0))
     among = cprl.run(replace(loaded, agents=agents, episodes=2), tmp_path / "deep" / "er" / "among")
     folder = export_results(among, tmp_path / "small")
-    mine, theirs = (cprl.load(own).agent(1).network.state_dict() for own in (among, folder))
-    assert all(torch.equal(mine[name], theirs[name]) for name in mine)
+    before, after = (cprl.load(path).agent(1).network.state_dict() for path in (among, folder))
+    assert all(torch.equal(before[name], after[name]) for name in before)
     assert export_results(among, folder) == folder, "again over the same"
 
 
@@ -99,8 +98,8 @@ def test_a_stored_policy_plays_again_and_every_step_is_recorded(run, tmp_path, c
         film(run, episode=-1)
     monkeypatch.setattr("sys.argv", ["cprl", "film", str(run), "--out", str(tmp_path / "c.rrd")])
     cli.main()
-    told = capsys.readouterr().out
-    assert f"Watch: {Path(sys.executable).with_name('rerun')} {tmp_path / 'c.rrd'}" in told
+    watch = f"Watch: {Path(sys.executable).with_name('rerun')} {tmp_path / 'c.rrd'}"
+    assert watch in capsys.readouterr().out
 
 
 def test_watch_opens_all_recordings_of_a_run_as_one(tmp_path, monkeypatch, capsys):

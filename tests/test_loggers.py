@@ -92,39 +92,30 @@ def test_numbers_that_are_undefined_are_not_written(tmp_path):
 
 
 @pytest.mark.parametrize("error", [None, RuntimeError("stop")])
-def test_a_logger_is_closed_at_the_end_and_by_an_error(error, tmp_path):
-    class Own(CSVLogger):
-        """A logger of the user's."""
-
+def test_a_logger_of_the_users_is_taken_as_it_is_and_closed_at_the_end_and_by_an_error(error, tmp_path):
+    class Noting(CSVLogger):
         is_closed = False
 
         def shutdown(self):
             self.is_closed = True
 
-    callback = LoggerCallback(Own("own", str(tmp_path)))
-    with contextlib.suppress(RuntimeError), callback:
+    logger = Noting("noting", str(tmp_path))
+    check_logger(logger)
+    assert make_logger(logger, tmp_path) is logger
+    with contextlib.suppress(RuntimeError), LoggerCallback(logger) as callback:
         play(MatrixGame(1), tit_for_tat, 5, callbacks=[callback])
-        assert not callback.logger.is_closed
+        assert not logger.is_closed
         if error:
             raise error
-    assert callback.logger.is_closed
-
-
-def test_any_logger_that_is_made_already_is_taken(tmp_path):
-    class Own(CSVLogger):
-        """A logger of the user's."""
-
-    own = Own("own", str(tmp_path))
-    check_logger(own)
-    assert make_logger(own, tmp_path) is own
-    with pytest.raises(TypeError, match="logger is a dict without log_metrics"):
-        LoggerCallback({})
+    assert logger.is_closed
 
 
 def test_a_logger_that_cannot_be_made_is_refused_by_name_before_anything_is_written(tmp_path, monkeypatch):
     for name in ("mlflow", "csv"):
         with pytest.raises(ValueError, match="logger"):
             check_logger(name)
+    with pytest.raises(TypeError, match="logger is a dict without log_metrics"):
+        LoggerCallback({})
     monkeypatch.setattr(loggers, "find_spec", lambda name: None)
     for name in ("tensorboard", "wandb"):
         with pytest.raises(ModuleNotFoundError, match=f"needs the package {name}: pip install {name}"):

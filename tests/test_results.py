@@ -64,12 +64,12 @@ def test_each_agent_of_each_episode_has_a_row(tmp_path):
     with EpisodeTable(tmp_path / "episodes.parquet") as table:
         table.add(an_episode(0, world=3))
         table.add(an_episode(1), an_episode(2), replica=8)
-    told = pq.read_table(tmp_path / "episodes.parquet")
+    rows = pq.read_table(tmp_path / "episodes.parquet")
     columns = [(name, kind) for name, kind in COLUMNS.items() if name != "wanted_return"]  # of trainings
-    assert told.schema == pa.schema([*columns, *((name, pa.float64()) for name in social.METRICS)])
-    assert len(told) == 6
-    assert told["replica"].to_pylist() == [3, 3, 8, 8, 8, 8]
-    second = told.slice(1, 1).to_pylist()[0]
+    assert rows.schema == pa.schema([*columns, *((name, pa.float64()) for name in social.METRICS)])
+    assert len(rows) == 6
+    assert rows["replica"].to_pylist() == [3, 3, 8, 8, 8, 8]
+    second = rows.slice(1, 1).to_pylist()[0]
     assert np.isnan(second.pop("equality"))
     assert second == {
         **dict.fromkeys(set(social.METRICS) - {"equality"}, 0.25),
@@ -87,7 +87,7 @@ def test_each_agent_of_each_episode_has_a_row(tmp_path):
         "depletion_step": -1,
         "terminated": False,
     }
-    assert told["terminated"].to_pylist() == [False, False, True, True, False, False]
+    assert rows["terminated"].to_pylist() == [False, False, True, True, False, False]
 
 
 def test_what_was_added_can_be_read_while_the_run_goes_on_and_when_it_is_over(tmp_path):
@@ -95,9 +95,9 @@ def test_what_was_added_can_be_read_while_the_run_goes_on_and_when_it_is_over(tm
         for number in range(3):
             table.add(an_episode(number))
             assert episode_numbers(read_episodes(tmp_path)) == list(range(number + 1))
-        going_on = read_episodes(tmp_path)
+        before = read_episodes(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["episodes.parquet", "manifest.json"]
-    assert str(read_episodes(tmp_path).to_pylist()) == str(going_on.to_pylist())
+    assert str(read_episodes(tmp_path).to_pylist()) == str(before.to_pylist())
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
@@ -118,8 +118,8 @@ def test_a_run_killed_at_any_moment_keeps_every_episode_it_added(tmp_path):
         added = len(pipe.read())
     assert os.WTERMSIG(status) == signal.SIGKILL
     assert added > 0
-    kept = episode_numbers(read_episodes(tmp_path))
-    assert kept in (list(range(added)), list(range(added + 1)))  # it may die between adding and saying so
+    # It may die between adding and saying so.
+    assert episode_numbers(read_episodes(tmp_path)) in (list(range(added)), list(range(added + 1)))
 
 
 def test_a_journal_cut_at_any_byte_keeps_every_whole_episode(tmp_path):
@@ -157,7 +157,7 @@ def test_a_run_that_crashes_closes_its_table(tmp_path):
     assert len(pq.read_table(tmp_path / "episodes.parquet")) == 2
 
 
-def test_a_full_disk_is_told_and_loses_nothing_that_was_added(tmp_path):
+def test_a_full_disk_is_named_and_loses_nothing_that_was_added(tmp_path):
     table = EpisodeTable(tmp_path / "episodes.parquet")
     table.add(an_episode(0))
     with full_disk(700, table.journal), pytest.raises(OSError, match=r"the 2 earlier rows are in .*arrows"):
@@ -209,7 +209,7 @@ def test_a_run_without_episodes_leaves_an_empty_table(tmp_path):
     assert read_episodes(tmp_path)["equality"].to_pylist() == []
 
 
-def test_a_directory_without_a_table_is_told(tmp_path):
+def test_a_directory_without_a_table_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="is this a run"):
         read_episodes(tmp_path)
 
@@ -231,23 +231,23 @@ def recipe(directory: Path) -> dict[str, object]:
 def test_a_run_begins_with_its_recipe(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["train.py", "--name", "a b", "--out", "a place"])
     run = start_run(tmp_path / "deep" / "run", "tragedy", recipe)
-    told = json.loads((run / "recipe.json").read_text())
+    written = json.loads((run / "recipe.json").read_text())
     assert [path.name for path in run.iterdir()] == ["recipe.json"]
-    assert told["recipe"] == "tragedy"
-    assert told["experiment"] == {"seed": 3, "in": "run"}
-    assert told["versions"]["torch"] == torch.__version__
-    assert set(told["versions"]) == {
+    assert written["recipe"] == "tragedy"
+    assert written["experiment"] == {"seed": 3, "in": "run"}
+    assert written["versions"]["torch"] == torch.__version__
+    assert set(written["versions"]) == {
         "python", "cprl", "torch", "torchrl", "tensordict", "numpy", "numba", "rerun-sdk",
     }  # fmt: skip
-    assert told["started"].startswith(time.strftime("%Y-"))
-    assert told["command"] == "train.py --name 'a b'"
+    assert written["started"].startswith(time.strftime("%Y-"))
+    assert written["command"] == "train.py --name 'a b'"
 
 
 @pytest.mark.parametrize(
-    ("script", "told"), [("recipes/commons.py", "recipes/commons.py"), ("elsewhere.py", "elsewhere.py")]
+    ("script", "shown_as"), [("recipes/commons.py", "recipes/commons.py"), ("elsewhere.py", "elsewhere.py")]
 )
 def test_the_command_of_a_recipe_does_not_say_where_on_this_machine_things_are(
-    script, told, tmp_path, monkeypatch
+    script, shown_as, tmp_path, monkeypatch
 ):
     here = tmp_path / "checkout"
     here.mkdir()
@@ -255,7 +255,7 @@ def test_the_command_of_a_recipe_does_not_say_where_on_this_machine_things_are(
     absolute = here / script if "/" in script else tmp_path / script
     monkeypatch.setattr(sys, "argv", [str(absolute), "--seed", "3", f"--out={tmp_path}/run"])
     run = start_run(tmp_path / "run", "commons", recipe)
-    assert json.loads((run / "recipe.json").read_text())["command"] == f"{told} --seed 3"
+    assert json.loads((run / "recipe.json").read_text())["command"] == f"{shown_as} --seed 3"
     assert str(tmp_path) not in (run / "recipe.json").read_text()
 
 
@@ -299,7 +299,7 @@ def test_the_commit_of_the_code_is_known_and_whether_a_tracked_file_was_changed(
 
 
 def test_somebody_elses_git_folder_says_nothing_of_the_code(tmp_path, monkeypatch):
-    a_checkout(tmp_path, "mine.py")
+    a_checkout(tmp_path, "theirs.py")
     installed = tmp_path / ".venv" / "site-packages" / "cprl"
     installed.mkdir(parents=True)
     (installed / "__init__.py").write_text("")
@@ -307,8 +307,8 @@ def test_somebody_elses_git_folder_says_nothing_of_the_code(tmp_path, monkeypatc
     here = git_state()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("GIT_DIR", str(tmp_path / ".git"))
-    kept = json.loads((start_run(tmp_path / "run", "tragedy", recipe) / "recipe.json").read_text())
-    assert kept["git"] == here, "that of cprl, wherever the process stands"
+    written = json.loads((start_run(tmp_path / "run", "tragedy", recipe) / "recipe.json").read_text())
+    assert written["git"] == here, "that of cprl, wherever the process stands"
 
 
 def test_a_wheel_says_from_which_commit_it_was_built(tmp_path):

@@ -1,19 +1,25 @@
 """A run's directory: never written over, gone on with only by the same recipe."""
 
 import json
+import os
 import shlex
+import subprocess
 import sys
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 
 import pytest
+from tiny_study import TINY
 
+import cprl
 from cprl import presets
 from cprl.algorithms import DQN
 from cprl.custom import Custom
+from cprl.evaluation.film import film
 from cprl.experiment import Experiment
 from cprl.population import Frozen, Learning
-from cprl.runs.recipe import read_recipe, refuse_another_run, resume_command, start_run
+from cprl.runs.export import export_results
+from cprl.runs.recipe import read_recipe, refuse_another_run, resume_command, runs_in, start_run
 from cprl.studies.factors import changed
 from cprl.system.shipped import cprl_here
 
@@ -28,35 +34,24 @@ EXPERIMENT = Experiment(
 )
 
 
-def begin(run, experiment=EXPERIMENT, **how):
-    return start_run(run, experiment.name, experiment.to_recipe, **how)
+def begin(run, experiment=EXPERIMENT, **options):
+    return start_run(run, experiment.name, experiment.to_recipe, **options)
 
 
 def resume(run, experiment=EXPERIMENT):
     return refuse_another_run(run, experiment.to_recipe, Experiment)
 
 
-def test_a_field_that_a_later_version_added_to_experiments_is_no_difference(tmp_path):
-    run = begin(tmp_path / "run")
-    (run / "episodes.arrows").touch()
-    whole = read_recipe(run)
-    has_default = {own.name for own in fields(Experiment) if own.default is not MISSING} - {"episodes"}
-    assert {"update_every", "seed", "on_nan"} <= has_default
-    for name in has_default & {*whole["experiment"]}:
-        less = {own: value for own, value in whole["experiment"].items() if own != name}
-        (run / "recipe.json").write_text(json.dumps({**whole, "experiment": less}))
-        default = replace(EXPERIMENT, **{name: Experiment.__dataclass_fields__[name].default})
-        assert resume(run, default) == 3, name
-    less = {own: value for own, value in whole["experiment"].items() if own != "update_every"}
-    (run / "recipe.json").write_text(json.dumps({**whole, "experiment": less}))
-    with pytest.raises(ValueError, match=r"experiment\.update_every was not there, is 7"):
-        resume(run, replace(EXPERIMENT, update_every=7))
+def edited(run, edit):
+    """Changes the recipe of a run by hand."""
+    recipe = read_recipe(run)
+    edit(recipe)
+    (run / "recipe.json").write_text(json.dumps(recipe))
 
 
 def test_a_stopped_run_is_resumed_by_the_same_recipe(tmp_path):
     run = begin(tmp_path / "run")
     written = (run / "recipe.json").read_text()
-    (run / "episodes.arrows").touch()
     assert resume(run) == 3
     assert resume(run, replace(EXPERIMENT, episodes=5)) == 3, "it can be extended"
     assert (run / "recipe.json").read_text() == written
@@ -74,12 +69,36 @@ def test_the_recipe_of_a_run_is_its_experiment(tmp_path, monkeypatch):
     assert read_recipe(run / "recipe.json") == recipe
 
 
-@pytest.mark.parametrize("name", ["x.json", "recipe.json", "x.rrd", "a b", "-x", "~x", "a=b,c", "[0]*", "é"])
+EVERY_SIGN = os.fsdecode("".join(map(chr, [*range(1, 47), *range(48, 127)])).encode() + b"\xff") + "é"
+"""All of ASCII that a name may have, a byte that is no UTF-8, and a letter that is no ASCII."""
+
+
+@pytest.mark.parametrize("name", ["x.json", "recipe.json", "x.rrd", "x.py", "-x", "~x", "a=b,c", "[0]*"])
 def test_the_directory_of_a_run_may_have_any_name(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = begin(Path(name))
     assert run == Path(name)
     assert Experiment.from_recipe(read_recipe(run), directory=run) == EXPERIMENT
+    assert runs_in([run]) == [run]
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", [EVERY_SIGN, "-x"], ids=["every sign", "-x"])
+def test_a_run_in_a_directory_of_any_name_is_trained_resumed_by_its_line_exported_and_filmed(
+    name, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    started = cprl.run(TINY, Path(name))
+    (started / "report.json").unlink()
+    line = resume_command(started)
+    subprocess.run(f"{line} --watch off", shell=True, check=True, capture_output=True, timeout=120)
+    assert (started / "report.json").exists()
+    exported = export_results(started, Path(f"{name} exported"))
+    among = replace(TINY, agents=(TINY.agents[0], Frozen(os.fspath(exported), 0)))
+    loaded = cprl.load(cprl.run(among, Path(f"{name} among"), watch="off", figures=False))
+    assert loaded.agent(1).network is not None
+    assert cprl.evaluate_run(exported, episodes=1).measures("trained")
+    assert film(started, Path("film.rrd"), replica=0, episode=0)[0].exists()
 
 
 @pytest.mark.parametrize(
@@ -87,7 +106,7 @@ def test_the_directory_of_a_run_may_have_any_name(name, tmp_path, monkeypatch):
     [
         ({"seed": 2}, r"was started with another recipe: experiment\.seed was 1, is 2$"),
         ({"episodes": 2}, "has 3 episodes"),
-        ({"name": "two_complex"}, "is a run of 'commons'; this is 'two_complex'"),
+        ({"name": "two_complex"}, r"experiment\.name was .commons., is .two_complex.$"),
         (
             {"game": presets.game("commons", variant="as_run")},
             r"experiment\.game\.rules\.hits_to_tag was 1, is 2; .*; and 4 more$",
@@ -102,31 +121,34 @@ def test_another_recipe_is_refused_by_what_differs(change, message, tmp_path):
 
 def test_fields_that_a_later_version_has_are_no_difference_while_they_have_their_default(tmp_path):
     """A version that did not know a field did what its default says."""
-    run = begin(tmp_path / "run")
-    recipe = json.loads((run / "recipe.json").read_text())
-    for agent in recipe["experiment"]["agents"][:2]:
-        del agent["algorithm"]["settings"]["steps_per_update"]
-    del recipe["experiment"]["game"]["rules"]["walls_block_sight"]
-    (run / "recipe.json").write_text(json.dumps(recipe))
-    assert resume(run) == EXPERIMENT.episodes
-    settings = "agents.0.algorithm.settings"
+    defaults = {field.name: field.default for field in fields(Experiment) if field.default is not MISSING}
+    assert {"update_every", "seed", "on_nan"} <= defaults.keys()
+    default = replace(EXPERIMENT, **{**defaults, "episodes": EXPERIMENT.episodes})
+    run = begin(tmp_path / "run", default)
+
+    def without_later_fields(recipe):
+        for name in defaults.keys() - {"episodes"}:
+            recipe["experiment"].pop(name, None)
+        for agent in recipe["experiment"]["agents"][:2]:
+            del agent["algorithm"]["settings"]["steps_per_update"]
+        del recipe["experiment"]["game"]["rules"]["walls_block_sight"]
+
+    edited(run, without_later_fields)
+    assert resume(run, default) == EXPERIMENT.episodes
+    with pytest.raises(ValueError, match=r"experiment\.update_every was not there, is 7"):
+        resume(run, replace(default, update_every=7))
     with pytest.raises(ValueError, match=r"settings\.steps_per_update was not there, is 4$"):
-        resume(run, changed(EXPERIMENT, {f"{settings}.steps_per_update": 4}))
-    del recipe["experiment"]["agents"][0]["algorithm"]["settings"]
-    (run / "recipe.json").write_text(json.dumps(recipe))
+        resume(run, changed(default, {"agents.0.algorithm.settings.steps_per_update": 4}))
+    edited(run, lambda recipe: recipe["experiment"]["agents"][0]["algorithm"].pop("settings"))
     with pytest.raises(ValueError, match=r"algorithm\.settings was not there, is "):
-        resume(run)
+        resume(run, default)
 
 
 def test_a_run_of_another_format_is_not_resumed(tmp_path):
-    run = begin(tmp_path, EXPERIMENT)
-    recipe = read_recipe(run)
-    (run / "recipe.json").write_text(json.dumps({**recipe, "format": 1}))
+    run = begin(tmp_path / "run")
+    edited(run, lambda recipe: recipe.update(format=1))
     with pytest.raises(ValueError, match="format"):
-        resume(tmp_path)
-    (run / "recipe.json").write_text('{"recipe": "commons", "arguments": {}}')
-    with pytest.raises(ValueError, match=r"recipe\.json"):
-        resume(tmp_path)
+        resume(run)
 
 
 def test_where_nothing_can_be_resumed_that_is_said(tmp_path):

@@ -31,6 +31,7 @@ from cprl.measuring.episodes import Episode, tracker_of
 from cprl.policies.assignment import AgentPolicies
 from cprl.runs.files import refuse_to_write_over
 from cprl.system.memory import check_memory
+from cprl.system.output import legible
 from cprl.training import train
 from cprl.training.agents import LoadedRun, load
 from cprl.viewer.callback import ViewerCallback
@@ -96,7 +97,7 @@ def film(
     target = Path(run) / f"film-{replica}-{episode}.rrd" if out is None else Path(out)
     refuse_to_write_over(target)
     target.parent.mkdir(parents=True, exist_ok=True)
-    title = f"{Path(run).name}, agents of replica {replica}, fresh episode {episode}"
+    title = f"{legible(Path(run).name)}, agents of replica {replica}, fresh episode {episode}"
     try:
         return target, _recorded(fresh, target, title)
     except BaseException:  # a recording of half an episode would stand in the way of the next attempt
@@ -282,7 +283,7 @@ def _titles(fresh: Sequence[FreshEpisode]) -> Sequence[str]:
     for candidates in (titles, names):
         if len(set(candidates)) == len(fresh):
             return [title[0].upper() + title[1:] for title in candidates]
-    return [population.run.path.resolve().name for population in fresh]
+    return [legible(population.run.path.resolve().name) for population in fresh]
 
 
 def _commons(fresh: FreshEpisode) -> CommonsEnv:

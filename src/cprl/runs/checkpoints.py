@@ -12,30 +12,30 @@ from types import FrameType
 from typing import Any, Final, NoReturn, Protocol, Self
 
 import torch
-from rich.console import Console
 
 from cprl.runs.files import (
     TRAINING_STATE_FORMAT,
     RunLock,
     checksum,
-    place_atomically,
     refuse_missing,
     refuse_newer,
-    refuse_special,
     remove_partial,
     rename_listed,
+    verify,
+    write_atomically,
 )
 from cprl.runs.recipe import resume_command as command_to_resume
 from cprl.runs.recipe import write_more_episodes
-from cprl.system.output import RESUMES
-from cprl.system.output import console as safe_console
+from cprl.system.output import RESUMES, say
 
 FOLDER: Final = "checkpoints"
+REPORT: Final = "report.json"
+"""Written when everything of a run is finished."""
 EVERY_S: Final = 300.0
 KEPT: Final = 2
 """Checkpoints that are kept: the newest, and one more in case it is unreadable."""
 
-_NAME: Final = re.compile(r"(training|ending)-(\d{12})-([0-9a-f]{32})\.pt")
+_NAME: Final = re.compile(r"(training|ending)-(\d{12})-[0-9a-f]{32}\.pt")
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -56,12 +56,9 @@ class HasState(Protocol):
 class Checkpointer:
     """Saves the state of a training every `every_s` seconds, and when it is stopped; a context manager.
 
-    Within its block the run is locked, see `RunLock`. A checkpoint is written to a temporary file, synced to
-    disk and then renamed; its name includes the checksum of its content. On the first SIGINT or SIGTERM the
-    checkpointer finishes the current step, saves the state, prints the command that resumes and raises what
-    `interruption` makes of the signal; the second signal ends the process at once. Once the training is over,
-    the first signal raises it.
-
+    Within its block the run is locked, see `RunLock`. On the first SIGINT or SIGTERM the checkpointer
+    finishes the step, saves the state, prints the command that resumes and raises what `interruption` makes
+    of the signal; the second signal ends the process at once. Once the training is over, the first raises it.
     The checkpoints stay until `done` is called, when whatever follows the training is finished too.
 
     Args:
@@ -69,10 +66,7 @@ class Checkpointer:
         every_s: seconds between checkpoints, above 0.
         keep_ending: whether the state in which the first replica has played its last episode is kept even
             after `done`: from there a training of more episodes continues bit for bit.
-        take_over: whether to take the lock that a process on another host left behind.
-        resume_command: the command line that resumes, printed when the run is stopped; by default that of
-            this process.
-        console: the console for messages; by default standard output.
+        resume_command: the command line that resumes; by default that of `cprl run`.
     """
 
     def __init__(
@@ -83,14 +77,12 @@ class Checkpointer:
         keep_ending: bool = True,
         take_over: bool = False,
         resume_command: str | None = None,
-        console: Console | None = None,
     ) -> None:
         if not every_s > 0:
             raise ValueError(f"every_s is {every_s}; allowed: a number above 0")
         self.run, self.folder = run, run / FOLDER
-        self.every_s, self.keep_ending, self._take_over = every_s, keep_ending, take_over
+        self.every_s, self.keep_ending = every_s, keep_ending
         self.resume_command = command_to_resume(run) if resume_command is None else resume_command
-        self.console = console or safe_console()
         self.has_begun = False
         """Whether a training has begun, or was resumed."""
         self._saved = time.monotonic()
@@ -99,12 +91,12 @@ class Checkpointer:
         """The signal."""
         self._has_ending = not keep_ending
         self._place: tuple[int, int] | None = None
-        self._lock: RunLock | None = None
+        self._lock = RunLock(run, take_over=take_over)
         self._sound: Path | None = None
         self._usual: dict[int, Any] = {}
 
     def restore(self, training: HasState) -> None:
-        """Restores the newest readable checkpoint, if there is one."""
+        """Restore the newest readable checkpoint, if there is one."""
         reasons: list[str] = []
         cause: Exception | None = None
         for path in reversed(checkpoints_in(self.folder)):
@@ -113,19 +105,18 @@ class Checkpointer:
             except ValueError as error:
                 reasons.append(str(error))
                 cause = error
-                continue
             except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
                 reasons.append(f"{path} does not hold the state of this training: {error!r}")
                 cause = error
-                continue
-            for reason in reasons:
-                self.console.print(f"Passed over: {reason}", soft_wrap=True)
-            self.console.print(f"Resuming from step {training.steps:,}: {path}", soft_wrap=True)
-            self._saved = time.monotonic()
-            self._sound = path if _is_sound(training) else None
-            self._has_ending |= training.is_ending
-            self.has_begun = True
-            return
+            else:
+                for reason in reasons:
+                    say(f"Passed over: {reason}")
+                say(f"Resuming from step {training.steps:,}: {path}")
+                self._saved = time.monotonic()
+                self._sound = path if _is_sound(training) else None
+                self._has_ending |= training.is_ending
+                self.has_begun = True
+                return
         if reasons:
             raise ValueError("no checkpoint can be read: " + "; ".join(reasons)) from cause
         self.has_begun = True
@@ -135,9 +126,7 @@ class Checkpointer:
         ends = training.is_ending and not self._has_ending
         if self._asked_to_stop is not None:
             path = self.save(training, kind="ending" if ends else "training")
-            self.console.print(
-                f"Stopped; everything up to step {training.steps:,} is saved in {path}", soft_wrap=True
-            )
+            say(f"Stopped; everything up to step {training.steps:,} is saved in {path}")
             self._stop_now(self._asked_to_stop)
         self._is_training = not training.is_over
         if ends:
@@ -156,19 +145,19 @@ class Checkpointer:
         """
         self._refuse_deleted()
         self.folder.mkdir(exist_ok=True)
-        path = place_atomically(
+        path = write_atomically(
             self.folder / kind,
             lambda file: torch.save(training.state_dict(), file),
-            lambda partial: self.folder / f"{kind}-{training.steps:012d}-{checksum(partial)}.pt",
+            name=lambda partial: f"{kind}-{training.steps:012d}-{checksum(partial)}.pt",
         )
         if _is_sound(training):
             self._sound = path
         elif self._sound is not None and self._sound.exists():
-            kept = self._sound.with_name(f"sound-{self._sound.name}")
+            last_sound = self._sound.with_name(f"sound-{self._sound.name}")
             try:
-                os.link(self._sound, kept)
+                os.link(self._sound, last_sound)
             except OSError:  # a file system without hard links
-                self._sound.replace(kept)
+                self._sound.replace(last_sound)
             self._sound = None
         same = [old for old in checkpoints_in(self.folder) if is_ending(old) == (kind == "ending")]
         for old in same[: -1 if kind == "ending" else -KEPT]:
@@ -177,27 +166,21 @@ class Checkpointer:
         return path
 
     def done(self) -> None:
-        """Deletes the checkpoints, but for the one of `keep_ending`: weights and episodes are saved
-        separately, and whatever follows the training is finished."""
+        """Delete the checkpoints, but for that of `keep_ending`: all that follows the training is there."""
         for path in checkpoints_in(self.folder):
             if not (self.keep_ending and is_ending(path)):
                 path.unlink()
 
     def _refuse_deleted(self) -> None:
-        """Ends a run whose directory was deleted, or made again by somebody else; nothing is recreated."""
-        try:
-            found = self.run.stat()
-        except FileNotFoundError:
-            found = None
-        if self._place and (found is None or self._place != (found.st_dev, found.st_ino)):
+        """End a run whose directory was deleted, or made again by somebody else; nothing is recreated."""
+        if self._place is not None and self._place != _place_of(self.run):
             what = "the directory was deleted while the run was written; the run ends"
             raise FileNotFoundError(errno.ENOENT, what, str(self.run))
 
     def __enter__(self) -> Self:
         self.run.mkdir(exist_ok=True)
-        self._lock = RunLock(self.run, take_over=self._take_over).__enter__()
-        found = self.run.stat()
-        self._place = (found.st_dev, found.st_ino)
+        self._lock.__enter__()
+        self._place = _place_of(self.run)
         remove_partial(self.run, self.folder, self.run / "evaluation", self.run / "figures")
         # Python handles signals in the main thread only; in other threads handlers stay as they are.
         for number in _SIGNALS if current_thread() is main_thread() else ():
@@ -207,8 +190,7 @@ class Checkpointer:
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
         for number, usual in self._usual.items():
             signal.signal(number, usual)
-        if self._lock is not None:
-            self._lock.__exit__(kind, error, traceback)
+        self._lock.__exit__(kind, error, traceback)
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         if self._asked_to_stop is not None:
@@ -217,13 +199,13 @@ class Checkpointer:
             return
         self._asked_to_stop = number
         if self._is_training:
-            self.console.print("Stopping after this step; signal again to stop at once.")
+            say("Stopping after this step; signal again to stop at once.")
             return
-        self.console.print("Stopped after the training, which is saved.")
+        say("Stopped after the training, which is saved.")
         self._stop_now(number)
 
     def _stop_now(self, number: int) -> NoReturn:
-        self.console.print(f"{RESUMES}{self.resume_command}", soft_wrap=True, highlight=False)
+        say(f"{RESUMES}{self.resume_command}")
         raise interruption(number)
 
 
@@ -237,10 +219,19 @@ def _is_sound(training: HasState) -> bool:
     return bool(getattr(training, "is_sound", True))
 
 
+def _place_of(folder: Path) -> tuple[int, int] | None:
+    """What tells a folder from any that is made in its place; None where there is none."""
+    try:
+        status = folder.stat()
+    except FileNotFoundError:
+        return None
+    return status.st_dev, status.st_ino
+
+
 def checkpoints_in(folder: Path) -> list[Path]:
-    """The checkpoints of a run, oldest first."""
-    found = folder.iterdir() if folder.is_dir() else iter(())
-    return sorted((path for path in found if _NAME.fullmatch(path.name)), key=steps_of)
+    """Return the checkpoints of a run, oldest first."""
+    paths = folder.iterdir() if folder.is_dir() else iter(())
+    return sorted((path for path in paths if _NAME.fullmatch(path.name)), key=steps_of)
 
 
 def steps_of(path: Path) -> int:
@@ -254,38 +245,34 @@ def is_ending(path: Path) -> bool:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """The state in a checkpoint; runs no code of the file."""
-    name = _NAME.fullmatch(path.name)
-    if name is None:
+    """Read the state in a checkpoint; runs no code of the file."""
+    if not _NAME.fullmatch(path.name):
         raise ValueError(f"{path} is not a checkpoint; allowed: a name like training-<steps>-<checksum>.pt")
-    refuse_special(path)
-    try:
-        found = checksum(path)
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read: {error}") from error
-    if found != name[3]:
-        raise ValueError(f"{path} is truncated or was changed: its checksum is {found}, not {name[3]}")
-    try:
-        state = torch.load(path, weights_only=True)
-    except Exception as error:
-        raise ValueError(f"{path} is not the state of a training: {error}") from error
-    if not isinstance(state, dict):
-        raise ValueError(f"{path} is not the state of a training, but a {type(state).__name__}")
+    state = read_tensors(path, "is not the state of a training")
     refuse_newer(path, state, TRAINING_STATE_FORMAT)
     return state
 
 
-REPORT: Final = "report.json"
-"""Written when everything of a run is finished."""
-_RESULTS: Final = (
-    REPORT,
-    *(f"{FOLDER}/{name}.pt" for name in ("final", "transforms", "decisions")),
-    "evaluation",
-)
+def read_tensors(path: Path, refusal: str) -> dict[str, Any]:
+    """Read what `torch.save` wrote, tensors by name, checked for damage; runs no code of the file.
+
+    Args:
+        refusal: what a message says of a file that holds something else.
+    """
+    try:
+        verify(path)
+        content = torch.load(path, weights_only=True)
+    except ValueError:
+        raise
+    except Exception as error:  # of whatever kind torch finds for what a file may hold
+        raise ValueError(f"{path} {refusal}: {error}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} {refusal}, but a {type(content).__name__}")
+    return content
 
 
 def refuse_to_extend(run: Path, episodes: int, callbacks: Iterable[Any]) -> None:
-    """Checks that a run of more episodes would equal one that had been begun with so many.
+    """Check that a run of more episodes would equal one that had been begun with so many.
 
     Args:
         episodes: how many it has so far.
@@ -300,16 +287,15 @@ def refuse_to_extend(run: Path, episodes: int, callbacks: Iterable[Any]) -> None
                 "episodes, so that a longer training may differ from the first episode on; if it does not: "
                 "is_extendable = True in its class"
             )
-    kept = checkpoints_in(run / FOLDER)
-    endings = [path for path in kept if is_ending(path)]
+    checkpoints = checkpoints_in(run / FOLDER)
+    endings = [path for path in checkpoints if is_ending(path)]
     if endings:
         read_checkpoint(endings[-1])
     elif (run / REPORT).exists() or (run / FOLDER / "final.pt").exists():
         raise ValueError(
-            f"{run} keeps no state of its training to extend it from: it was run without keep_checkpoint, or "
-            "by an earlier cprl"
+            f"{run} keeps no state of its training to extend it from: it was run without keep_checkpoint"
         )
-    elif kept and max(read_checkpoint(kept[-1])["played"]) >= episodes:
+    elif checkpoints and max(read_checkpoint(checkpoints[-1])["played"]) >= episodes:
         raise ValueError(
             f"{run} was stopped while its last replicas played their last episodes, and keeps no state from "
             "before; finish it with as many episodes as it has"
@@ -322,7 +308,7 @@ def depends_on_episodes(callback: Any) -> bool:
 
 
 def extend(run: Path, before: int, episodes: int) -> None:
-    """Makes a run one of more episodes, to be resumed; results so far are kept under a name with the number
+    """Make a run one of more episodes, to be resumed; results so far are kept under a name with the number
     of their episodes: `checkpoints/final-4800.pt`, `evaluation-4800/`, `report-4800.json`.
 
     It can be repeated if it was interrupted. The recipe changes last.
@@ -332,13 +318,14 @@ def extend(run: Path, before: int, episodes: int) -> None:
         before: the number of episodes so far.
         episodes: the number to be.
     """
-    for name in _RESULTS:
+    weights = [f"{FOLDER}/{name}.pt" for name in ("final", "transforms", "decisions")]
+    for name in (REPORT, *weights, "evaluation"):
         path = run / name
         if path.exists():
             rename_listed(run, name, path.with_stem(f"{path.stem}-{before}").relative_to(run).as_posix())
-    kept = checkpoints_in(run / FOLDER)
-    last = max((steps_of(path) for path in kept if is_ending(path)), default=None)
-    for path in kept:
+    checkpoints = checkpoints_in(run / FOLDER)
+    last = max((steps_of(path) for path in checkpoints if is_ending(path)), default=None)
+    for path in checkpoints:
         if last is not None and steps_of(path) > last:
             path.unlink()
     write_more_episodes(run, episodes)

@@ -1,5 +1,6 @@
 """The episodes of a run as curves: a number for each replica and episode, smoothed as in the study."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -8,8 +9,6 @@ import pyarrow as pa
 import torch
 from numpy.typing import NDArray
 
-from cprl import arguments
-from cprl.checks import checked, count
 from cprl.institutions import COUNTS
 from cprl.measuring import phases, social
 from cprl.measuring.institutions import summary
@@ -22,7 +21,7 @@ SMOOTHED_EPISODES: Final = 100
 
 
 def curves_of(run: Path) -> dict[str, Values]:
-    """Every metric that a run's game reports, and each agent's return as `return_0` and so on.
+    """Read every metric that a run's game reports, and each agent's return as `return_0` and so on.
 
     Those of institutions are there as `institutions/fines` and so on, but for the share of unjust tags, since
     a table does not say who tagged, and for groups.
@@ -36,62 +35,51 @@ def curves_of(run: Path) -> dict[str, Values]:
 
 def as_curves(table: pa.Table) -> dict[str, Values]:
     """Like `curves_of`, from a table of `read_episodes`."""
-    replica, episode, agent = (table[name].to_numpy() for name in ("replica", "episode", "agent"))
-    replicas, row = np.unique(replica, return_inverse=True)
-    episodes = min(int(episode[row == nth].max()) for nth in range(len(replicas))) + 1
-    everywhere = episode < episodes
-    names = [name for name in table.column_names if name in social.METRICS or name == "yield_share"]
-    curves: dict[str, Values] = {}
-
-    def fill(name: str, column: str, which: NDArray[Any]) -> None:
-        curves[name] = np.full((len(replicas), episodes), np.nan)
-        curves[name][row[which], episode[which]] = table[column].to_numpy()[which]
-
-    for name in names:
-        fill(name, name, everywhere & (agent == 0))
-    for number in np.unique(agent):
-        fill(f"return_{number}", "return", everywhere & (agent == number))
-    return curves | _of_institutions(table, (len(replicas), episodes), row, everywhere)
-
-
-def _of_institutions(
-    table: pa.Table, size: tuple[int, int], row: NDArray[Any], everywhere: NDArray[Any]
-) -> dict[str, Values]:
-    """The curves of institutions, [R, E] by name; none for a game without them."""
-    kept = [name for name in table.column_names if name in OF_INSTITUTIONS]
     episode, agent = table["episode"].to_numpy(), table["agent"].to_numpy()
-    if not kept:
+    replicas, replica = np.unique(table["replica"].to_numpy(), return_inverse=True)
+    episodes = min(int(episode[replica == row].max()) for row in range(len(replicas))) + 1
+    ended = episode < episodes
+    cells = replica[ended], episode[ended], agent[ended]
+
+    def values(name: str) -> Values:
+        """A column as [R, E, N]."""
+        column = np.full((len(replicas), episodes, int(agent.max()) + 1), np.nan)
+        column[cells] = table[name].to_numpy()[ended]
+        return column
+
+    metrics = [name for name in table.column_names if name in social.METRICS or name == "yield_share"]
+    curves = {name: values(name)[..., 0].copy() for name in metrics}
+    returns = values("return")
+    curves |= {f"return_{number}": returns[..., number].copy() for number in np.unique(agent)}
+    return curves | _of_institutions(table.column_names, values)
+
+
+def _of_institutions(names: Sequence[str], values: Callable[[str], Values]) -> dict[str, Values]:
+    """The curves of institutions, [R, E] by name; none for a game without them."""
+    if not {*names} & {*OF_INSTITUTIONS}:
         return {}
 
-    def values(name: str) -> torch.Tensor:
-        """A column as [R, E, N]."""
-        found = np.zeros((*size, int(agent.max()) + 1))
-        at = row[everywhere], episode[everywhere], agent[everywhere]
-        found[at] = table[name].to_numpy()[everywhere]
-        return torch.from_numpy(found)
+    def tensors(columns: Sequence[str]) -> dict[str, Any]:
+        return {name: torch.from_numpy(values(name)) for name in columns if name in names}
 
-    others = ("harvest", "in_play_steps", "fines", "transfers", "violations")
-    given: dict[str, Any] = {name: values(name) for name in others if name in table.column_names}
+    given = tensors(("harvest", "in_play_steps", "fines", "transfers", "violations"))
     if "violations" in given:
-        given["counts"] = {name: values(name) for name in COUNTS if name in table.column_names}
-    curves = {name: found.numpy() for name, found in summary(**given).items()}
-    decided = [name for name in table.column_names if name.startswith("in_force_")]
-    curves |= {name: values(name)[..., 0].numpy() for name in decided}
+        given["counts"] = tensors(COUNTS)
+    curves = {name: curve.numpy() for name, curve in summary(**given).items()}
+    curves |= {name: values(name)[..., 0] for name in names if name.startswith("in_force_")}
     return {f"institutions/{name}": curve for name, curve in curves.items()}
 
 
 def running_mean(values: Values, window: int = SMOOTHED_EPISODES) -> Values:
-    """Means over `window` consecutive values, each at the position of the first, [..., len - window + 1].
+    """Return means over `window` consecutive values, each at the position of the first,
+    [..., len - window + 1].
 
     With fewer values, the mean of all. Undefined values are skipped; NaN where no value is defined.
     """
-    values = arguments.floats("values", values)
-    if not values.ndim:
-        raise arguments.refusal("values", values.item(), "an array of numbers, [..., E]")
-    window = min(checked("window", window, count(1)), values.shape[-1])
-    defined = ~np.isnan(values)
-    sums = np.cumsum(_after_a_zero(np.where(defined, values, 0.0)), -1)
-    counts = np.cumsum(_after_a_zero(defined.astype(np.float64)), -1)
+    window = min(window, values.shape[-1])
+    is_defined = ~np.isnan(values)
+    sums = np.cumsum(_after_a_zero(np.where(is_defined, values, 0.0)), -1)
+    counts = np.cumsum(_after_a_zero(is_defined.astype(np.float64)), -1)
     with np.errstate(invalid="ignore"):
         means: Values = (sums[..., window:] - sums[..., :-window]) / (
             counts[..., window:] - counts[..., :-window]

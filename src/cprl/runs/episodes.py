@@ -5,12 +5,11 @@ During a run every episode is appended at once to a journal, `episodes.arrows`, 
 """
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from errno import EIO, ENOENT
 from functools import partial
 from io import BytesIO
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Self
 
@@ -26,22 +25,21 @@ from cprl.runs.files import (
     RECIPE_FORMAT,
     read_json,
     refuse_newer,
-    refuse_special,
     refuse_to_write_over,
     verify,
     write_atomically,
     write_listed,
 )
-from cprl.runs.journal import Content, Journal, read_journal, write_journal
+from cprl.runs.journal import Journal, read_journal, write_journal
 
 FILE_NAME: Final = "episodes.parquet"
 
 _ROWS_PER_GROUP: Final = 2**16
-_EMPTY: Final = Content(None, [], [])
+"""Parquet files with row groups of a few rows are slow to read."""
 
 
 class EpisodeTable:
-    """Writes a table of episodes; a context manager.
+    """Writes a table of episodes; a context manager, and a callback of `cprl.training`.
 
     Episodes are safe once `add` has returned, even if the process is killed by SIGKILL; after a power failure
     those up to the last `state_dict` are, which syncs them to the disk. After an OSError (a full disk) all
@@ -61,81 +59,74 @@ class EpisodeTable:
         self, path: str | os.PathLike[str], *, resumable: bool = False, run: Path | None = None
     ) -> None:
         self.path = Path(path)
-        self.journal = _journal_of(self.path)
+        self.journal = self.path.with_suffix(".arrows")
         self._run = self.path.parent if run is None else Path(run)
-        self._resumable = resumable
+        self._resumable, self._is_closed = resumable, False
         for table in () if resumable else (self.path, self.journal):
             if table.exists():
                 raise FileExistsError(f"{table} exists and is not overwritten; use another directory")
         if self.path.exists() and not self.journal.exists():
             _reopen(self.path, self.journal)
-        self._is_placed = not self.journal.exists()
-        self._file = Journal(self.journal)
-        self._schema: pa.Schema | None = None
-        self._rows, self._is_closed = 0, False
+        self._file = None if self.journal.exists() else Journal(self.journal)
 
     def state_dict(self) -> dict[str, int]:
         """The number of rows, which are on the disk once it returns."""
+        if self._file is None:
+            return {"rows": 0}
         self._file.sync()
-        return {"rows": self._rows}
+        return {"rows": self._file.rows}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Continues after the given number of rows of its journal; later rows are dropped."""
-        rows, found, batches = int(state["rows"]), 0, 0
-        content = read_journal(self.journal) if rows else _EMPTY
-        for batch in content.batches:
-            if found >= rows:
-                break
-            found, batches = found + batch.num_rows, batches + 1
-        if found != rows:
-            raise ValueError(f"{self.journal} holds {found} rows up to there; the checkpoint has {rows}")
-        self._file.cut(content, batches)
-        self._schema, self._rows, self._is_placed = content.schema, rows, True
+        """Continue after the given number of rows of its journal; later rows are dropped."""
+        file = Journal(self.journal, rows=int(state["rows"]))
+        if self._file is not None:
+            self._file.close()
+        self._file = file
+
+    def _placed(self) -> Journal:
+        """The journal; without a checkpoint of the last attempt it starts over."""
+        if self._file is None:
+            self._file = Journal(self.journal)
+        return self._file
 
     def add(self, *episodes: Episode, replica: int | None = None) -> None:
-        """Appends episodes; the first one of a table determines the columns and metrics of all.
+        """Append episodes; the first one of a table determines the columns and metrics of all.
 
         Args:
             replica: the index of their replica; by default each episode's world.
         """
         if not episodes:
             return
-        if not self._is_placed:  # there is no checkpoint of the last attempt: start over
-            self.load_state_dict({"rows": 0})
+        file = self._placed()
         try:
-            if self._schema is None:
-                self._begin(schema_of(episodes[0]))
-            assert self._schema is not None
-            rows = rows_of(episodes, replica, self._schema)
-            self._file.append(rows)
+            file.append(rows_of(episodes, replica, file.schema or schema_of(episodes[0])))
         except OSError as error:
-            kept = f"the {self._rows} earlier rows are in {self.journal}"
             raise OSError(
-                error.errno, f"{error.strerror or error}: could not add episodes; {kept}"
+                error.errno,
+                f"{error.strerror or error}: could not add episodes; the {file.rows} earlier rows are in "
+                f"{self.journal}",
             ) from error
-        self._rows += rows.num_rows
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Does nothing: a table stores whole episodes. With `on_episode` a callback of `cprl.training`."""
+        """Do nothing: a table stores whole episodes."""
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Adds an episode."""
+        """Add an episode."""
         self.add(episode)
 
     def close(self) -> None:
-        """Converts the journal to the parquet file. A second call does nothing.
+        """Convert the journal to the parquet file. A second call does nothing.
 
         Raises:
             OSError: if that fails; all episodes are in the journal, unless somebody deleted it.
         """
         if self._is_closed:
             return
-        if self._schema is None:
-            self._begin(whole_schema())
-        self._file.close()
+        file = self._placed()
+        file.close()
         try:
             name = self.path.relative_to(self._run).as_posix()
-            write_listed(self._run, name, lambda file: _merge(self.journal, file, rows=self._rows))
+            write_listed(self._run, name, partial(_merge, self.journal, rows=file.rows))
         except FileNotFoundError as error:
             raise FileNotFoundError(ENOENT, f"{error.strerror}: was {self.journal} deleted?") from error
         except OSError as error:
@@ -150,14 +141,10 @@ class EpisodeTable:
         return self
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
-        if self._resumable and error is not None:
-            self._file.close()
-        else:
+        if not self._resumable or error is None:
             self.close()
-
-    def _begin(self, schema: pa.Schema) -> None:
-        self._file.begin(schema)
-        self._schema = schema
+        elif self._file is not None:
+            self._file.close()
 
 
 def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
@@ -172,7 +159,7 @@ def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
         refuse_newer(recipe, read_json(recipe), RECIPE_FORMAT)
     try:
         # The journal first: while it exists it holds every row, and a merge does not change it.
-        return _as_table(read_journal(_journal_of(path)))
+        return _table_in(path.with_suffix(".arrows"))
     except FileNotFoundError:
         if not path.exists():
             raise FileNotFoundError(f"{path} and its journal do not exist: is this a run?") from None
@@ -180,13 +167,12 @@ def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
 
 
 def read_table(path: str | os.PathLike[str]) -> pa.Table:
-    """A parquet file of a run, checked against its manifest.
+    """A parquet file of a run, checked for damage.
 
     Raises:
         FileNotFoundError: if there is no such file.
     """
     path = Path(path)
-    refuse_special(path)
     verify(path)
     try:
         with open(path, "rb") as file:
@@ -212,49 +198,25 @@ def as_table(episodes: Sequence[Episode], replica: int) -> pa.Table:
     return pa.Table.from_batches([rows_of(episodes, replica, schema_of(episodes[0]))])
 
 
-def _journal_of(path: Path) -> Path:
-    return path.with_suffix(".arrows")
-
-
-def _as_table(content: Content) -> pa.Table:
-    schema = whole_schema() if content.schema is None else content.schema
-    return pa.Table.from_batches(content.batches, schema)
+def _table_in(journal: Path) -> pa.Table:
+    """The rows of a journal; of an empty one, none of all columns."""
+    table = read_journal(journal)
+    return whole_schema().empty_table() if table is None else table
 
 
 def _reopen(path: Path, journal: Path) -> None:
-    """Writes the journal of a finished table again, a batch for each episode."""
+    """Write the journal of a finished table again, a batch for each episode."""
     table = read_table(path).combine_chunks()
-    firsts = np.flatnonzero(table["agent"].to_numpy() == 0).tolist()
-    episodes = (
-        table.slice(first, end - first).combine_chunks().to_batches()[0]
-        for first, end in pairwise([*firsts, table.num_rows])
-    )
-    write_journal(journal, episodes, table.schema)
+    agents = max(table["agent"].to_pylist(), default=0) + 1
+    write_journal(journal, table.to_batches(max_chunksize=agents))
 
 
 def _merge(journal: Path, target: BinaryIO, *, rows: int) -> None:
-    """Writes the journal as a parquet file."""
-    content, merged = read_journal(journal), 0
-    schema = _as_table(content).schema
-    with pq.ParquetWriter(target, schema) as writer:
-        for table in _large_tables(content.batches):
-            writer.write_table(table)
-            merged += table.num_rows
-    if merged != rows:
-        raise OSError(EIO, f"{journal} holds {merged} rows of the {rows} that were added")
-
-
-def _large_tables(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
-    """The batches in groups, because parquet files with row groups of a few rows are slow to read."""
-    group, rows = list[pa.RecordBatch](), 0
-    for batch in batches:
-        group.append(batch)
-        rows += batch.num_rows
-        if rows >= _ROWS_PER_GROUP:
-            yield pa.Table.from_batches(group)
-            group, rows = [], 0
-    if group:
-        yield pa.Table.from_batches(group)
+    """Write the journal as a parquet file."""
+    table = _table_in(journal)
+    if table.num_rows != rows:
+        raise OSError(EIO, f"{journal} holds {table.num_rows} rows of the {rows} that were added")
+    pq.write_table(table, target, row_group_size=_ROWS_PER_GROUP)
 
 
 COLUMNS: Final = {
@@ -278,10 +240,6 @@ COLUMNS: Final = {
 Values of the whole episode are repeated in the row of each agent. Values that the game does not report have
 no column; nor has the wanted return outside of a training. It is null for agents that do not learn."""
 
-_WANTED: Final = "wanted_return"
-_LATER: Final = {_WANTED, "yield_share"}
-"""Columns that tables of earlier versions lack."""
-
 OF_INSTITUTIONS: Final = {
     "decision": pa.int32(),
     "fines": pa.float64(),
@@ -299,20 +257,17 @@ LEFT_OUT: Final = b"left_out"
 
 def whole_schema() -> pa.Schema:
     """All columns and metrics, for a table without an episode."""
-    return _schema(COLUMNS, (), (*social.METRICS, "yield_share"))
+    return _schema([*COLUMNS, *social.METRICS, "yield_share"])
 
 
-def _schema(columns: Iterable[str], more: Iterable[str], metrics: Iterable[str]) -> pa.Schema:
-    return pa.schema(
-        {name: COLUMNS[name] for name in columns}
-        | {name: OF_INSTITUTIONS.get(name, pa.float64()) for name in more}
-        | dict.fromkeys(metrics, pa.float64())
-    )
+def _schema(names: Iterable[str]) -> pa.Schema:
+    kinds = {**COLUMNS, **OF_INSTITUTIONS}
+    return pa.schema({name: kinds.get(name, pa.float64()) for name in names})
 
 
 def schema_of(episode: Episode) -> pa.Schema:
     """The columns that an episode has; the schema's metadata names those that it lacks."""
-    schema = _schema(_columns_of(episode), _of_institutions(episode), episode.metrics)
+    schema = _schema([*_columns_of(episode), *_of_institutions(episode), *episode.metrics])
     missing = left_out(episode.reported)
     return schema.with_metadata({LEFT_OUT: missing}) if missing else schema
 
@@ -323,13 +278,14 @@ def _columns_of(episode: Episode) -> list[str]:
 
 def _of_institutions(episode: Episode) -> dict[str, Any]:
     """The values of the columns of institutions, [N] or a number; none for a game without them."""
-    payments = {"fines": episode.fines, "transfers": episode.transfers, "violations": episode.violations}
-    payments["decision"] = episode.decision
-    found = {**(episode.counts or {}), **{name: own for name, own in payments.items() if own is not None}}
+    values: dict[str, Any] = {**(episode.counts or {})}
+    for name in ("fines", "transfers", "violations", "decision"):
+        if getattr(episode, name) is not None:
+            values[name] = getattr(episode, name)
     in_force: list[float] = [] if episode.in_force is None else episode.in_force.tolist()
     return {
-        **{name: found[name] for name in OF_INSTITUTIONS if name in found},
-        **{f"in_force_{nth}": value for nth, value in enumerate(in_force)},
+        **{name: values[name] for name in OF_INSTITUTIONS if name in values},
+        **{f"in_force_{place}": value for place, value in enumerate(in_force)},
     }
 
 
@@ -341,12 +297,10 @@ def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema)
         replica: the index of their replica; None for each episode's world.
         schema: what `schema_of` gave for the first episode of the table.
     """
-    of_each = [_cells(episode, episode.world if replica is None else replica) for episode in episodes]
-    for cells in of_each:
-        for name in _LATER - set(schema.names):  # a table that an earlier cprl began goes on without it
-            cells.pop(name, None)
-        if cells.keys() != set(schema.names):
-            more, lacks = cells.keys() - set(schema.names), set(schema.names) - cells.keys()
+    values = [_values(episode, episode.world if replica is None else replica) for episode in episodes]
+    for columns in values:
+        if columns.keys() != set(schema.names):
+            more, lacks = columns.keys() - set(schema.names), set(schema.names) - columns.keys()
             raise ValueError(
                 f"the episode has the extra columns {sorted(more)} and lacks {sorted(lacks)}; allowed: the "
                 "columns of the table's first episode"
@@ -354,32 +308,29 @@ def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema)
     return pa.record_batch(
         [
             pa.array(
-                np.concatenate([cells[column.name] for cells in of_each]),
-                column.type,
-                from_pandas=column.name == _WANTED,  # no number, of agents that do not learn, is null
+                np.concatenate([columns[field.name] for columns in values]),
+                field.type,
+                from_pandas=field.name == "wanted_return",  # NaN, of agents that do not learn, is null
             )
-            for column in schema
+            for field in schema
         ],
         schema=schema,
     )
 
 
-def _cells(episode: Episode, replica: int) -> dict[str, Any]:
+def _values(episode: Episode, replica: int) -> dict[str, Any]:
     """The values of each column, [N]."""
-    own = {name: getattr(episode, name, None) for name in _columns_of(episode)}
     agents = np.arange(len(episode.return_))
-    cells: dict[str, Any] = {
-        **own,
+    values: dict[str, Any] = {
+        **{name: getattr(episode, name, None) for name in _columns_of(episode)},
         "replica": replica,
         "agent": agents,
         "return": episode.return_,
         **_of_institutions(episode),
         **episode.metrics,
     }
-    return {name: np.broadcast_to(cell, agents.shape) for name, cell in cells.items()}
+    return {name: np.broadcast_to(value, agents.shape) for name, value in values.items()}
 
-
-_COMPRESSED: Final = {"compression": "zstd", "compression_level": 19}
 
 Label = Mapping[str, str | int]
 """The values of the first columns, by name."""
@@ -393,7 +344,9 @@ def labelled(parts: Iterable[tuple[Label, int, Sequence[Episode]]]) -> pa.Table:
     """
     tables = []
     for label, replica, episodes in parts:
-        table = as_table([replace(episode, episode=nth) for nth, episode in enumerate(episodes)], replica)
+        table = as_table(
+            [replace(episode, episode=number) for number, episode in enumerate(episodes)], replica
+        )
         for place, (name, value) in enumerate(label.items()):
             kind = pa.string() if isinstance(value, str) else pa.int32()
             table = table.add_column(place, pa.field(name, kind), pa.array([value] * len(table), kind))
@@ -402,7 +355,7 @@ def labelled(parts: Iterable[tuple[Label, int, Sequence[Episode]]]) -> pa.Table:
 
 
 def write_table(path: Path, table: pa.Table, *, over: bool = False) -> None:
-    """Writes a parquet file atomically, in little room.
+    """Write a parquet file atomically, in little room.
 
     Raises:
         FileExistsError: if the file exists and is not to be replaced.
@@ -410,26 +363,25 @@ def write_table(path: Path, table: pa.Table, *, over: bool = False) -> None:
     if not over:
         refuse_to_write_over(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    how = small(table)
-    write_atomically(path, lambda file: pq.write_table(table, file, **how))
+    write_atomically(path, lambda file: write_small(table, file))
 
 
-def small(table: pa.Table) -> dict[str, Any]:
-    """How parquet holds a table in little room: each column by dictionary, split into bytes, or as it is,
+def write_small(table: pa.Table, file: BinaryIO) -> None:
+    """Write a table as parquet in little room: each column by dictionary, split into bytes, or as it is,
     whichever is smallest."""
-    chosen: dict[str, list[str]] = {"use_dictionary": [], "use_byte_stream_split": []}
+    encodings: dict[str, list[str]] = {"use_dictionary": [], "use_byte_stream_split": []}
     for field in table.schema:
-        ways: list[dict[str, Any]] = [{"use_dictionary": True}, {"use_dictionary": False}]
+        choices: list[dict[str, bool]] = [{"use_dictionary": True}, {"use_dictionary": False}]
         if pa.types.is_integer(field.type) or pa.types.is_floating(field.type):
-            ways.append({"use_dictionary": False, "use_byte_stream_split": True})
-        best = min(ways, key=partial(_size, table.select([field.name])))
-        for way, columns in chosen.items():
-            if best.get(way):
+            choices.append({"use_dictionary": False, "use_byte_stream_split": True})
+        best = min(choices, key=partial(_size, table.select([field.name])))
+        for encoding, columns in encodings.items():
+            if best.get(encoding):
                 columns.append(field.name)
-    return {**_COMPRESSED, **chosen}
+    pq.write_table(table, file, compression="zstd", compression_level=19, **encodings)
 
 
-def _size(column: pa.Table, how: Mapping[str, Any]) -> int:
-    written = BytesIO()
-    pq.write_table(column, written, compression="zstd", compression_level=3, **how)  # which is quick
-    return written.tell()
+def _size(column: pa.Table, encoding: Mapping[str, bool]) -> int:
+    file = BytesIO()
+    pq.write_table(column, file, compression="zstd", compression_level=3, **encoding)  # which is quick
+    return file.tell()

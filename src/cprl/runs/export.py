@@ -3,26 +3,32 @@
 import json
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from cprl.runs.episodes import FILE_NAME, read_episodes, read_table, small
-from cprl.runs.files import refuse_links, refuse_missing, unlist, verify, write_listed
+from cprl.runs.checkpoints import FOLDER, REPORT
+from cprl.runs.episodes import FILE_NAME, read_episodes, read_table, write_small
+from cprl.runs.files import LOCK_FILE, refuse_links, refuse_missing, remove_listed, verify, write_listed
 from cprl.runs.recipe import RECIPE_FILE, read_recipe
 from cprl.runs.weights import DECISIONS, TRANSFORMS
 from cprl.runs.weights import FIELD as FROZEN
 from cprl.values import differences
 
-_IF_ANY = tuple(f"checkpoints/{name}" for name in (TRANSFORMS, DECISIONS))
-_WHOLE = ("recipe.json", "report.json")
-_WEIGHTS = "checkpoints/final.pt"
+_WHOLE: Final = (RECIPE_FILE, REPORT)
+_WEIGHTS: Final = f"{FOLDER}/final.pt"
+_OF_AGENTS: Final = (_WEIGHTS, f"{FOLDER}/{TRANSFORMS}", f"{FOLDER}/{DECISIONS}")
+_OF_RUNS: Final = (LOCK_FILE, "run.rrd", "episodes.arrows", "logs", f"{FOLDER}/*-*.pt")
+"""Files that a run leaves and an export does not."""
 
 
 def export_results(run: Path, folder: Path, *, weights: bool = True) -> Path:
-    """Copies the files of a finished run that a report needs: recipe, episodes, evaluation, weights.
+    """Copy the files of a finished run that a report needs: recipe, episodes, evaluation, weights.
+
+    The runs of `Frozen` agents are not copied: the recipe names them from the folder on, so a folder that is
+    moved finds them where it would find a run beside it.
 
     Args:
         folder: the target, new, empty, or with an earlier copy of a run of the same experiment, whose files
@@ -30,9 +36,6 @@ def export_results(run: Path, folder: Path, *, weights: bool = True) -> Path:
         weights: whether trained weights are copied, which are most of a short run. Without them a report has
             what the training and its evaluation tell; nothing can play the agents, and `cprl.load` refuses
             the copy.
-
-    The runs of `Frozen` agents are not copied: the recipe names them from the folder on, so a folder that is
-    moved finds them where it would find a run beside it.
 
     Returns:
         The folder, which `cprl.load`, `read_episodes` and a report accept like the run itself. Metrics and
@@ -49,34 +52,26 @@ def export_results(run: Path, folder: Path, *, weights: bool = True) -> Path:
         if not (run / name).exists():
             raise FileNotFoundError(f"{run / name} does not exist: has the run ended?")
     refuse_missing(run)
-    of_agents = (_WEIGHTS, *_IF_ANY)
-    copied = [name for name in (*_WHOLE, *(of_agents if weights else ())) if (run / name).exists()]
-    for name in copied:
+    of_agents = [name for name in _OF_AGENTS if weights and (run / name).exists()]
+    for name in of_agents:
         verify(run / name)
     folder.mkdir(parents=True, exist_ok=True)
-    for name in {*of_agents} - {*copied}:  # of an earlier copy
-        unlist(folder, name)
-        (folder / name).unlink(missing_ok=True)
-    for name in copied:
-        _copy(run / name, folder, name)
+    for name in {*_OF_AGENTS} - {*of_agents}:  # of an earlier copy
+        remove_listed(folder, name)
     moved = _with_frozen_moved(recipe, run, folder)
-    if FROZEN in recipe:
-        moved[FROZEN] = {os.path.relpath(run / own, folder): digest for own, digest in recipe[FROZEN].items()}
+    contents = {name: (run / name).read_bytes() for name in (*_WHOLE, *of_agents)}
     if moved != recipe:
-        content = (json.dumps(moved, indent=2) + "\n").encode()
-        write_listed(folder, RECIPE_FILE, lambda file: file.write(content))
+        contents[RECIPE_FILE] = (json.dumps(moved, indent=2) + "\n").encode()
+    for name, content in contents.items():
+        write_listed(folder, name, lambda file, content=content: file.write(content))
     _write(read_episodes(run), folder, FILE_NAME)
     for path in sorted((run / "evaluation").glob("*.parquet")):
         _write(read_table(path), folder, f"evaluation/{path.name}")
     return folder
 
 
-_OF_RUNS: Final = ("run.lock", "run.rrd", "episodes.arrows", "logs", "checkpoints/*-*.pt")
-"""Files that a run leaves and an export does not."""
-
-
 def _refuse_another(folder: Path, run: Path, recipe: Mapping[str, Any]) -> None:
-    """Refuses to write over what is no earlier copy of such a run."""
+    """Refuse to write over what is no earlier copy of such a run."""
     allowed = "allowed: a new folder, or one with an earlier export of the same experiment"
     if folder.exists() and folder.resolve() == run.resolve():
         raise ValueError(f"folder is {folder}, the run itself; {allowed}")
@@ -85,37 +80,35 @@ def _refuse_another(folder: Path, run: Path, recipe: Mapping[str, Any]) -> None:
             raise ValueError(f"folder is {folder}, a run of its own: it has {path.name}; {allowed}")
     if (folder / RECIPE_FILE).exists():
         there = _with_frozen_moved(read_recipe(folder), folder, run)
-        differ = differences(_experiment(there), _experiment(recipe), "experiment")
+        for_any_length = ({**table["experiment"], "episodes": 0} for table in (there, recipe))
+        differ = differences(*for_any_length, "experiment")
         if differ:
             raise ValueError(f"folder is {folder}, which holds another run: {differ[0]}; {allowed}")
 
 
-def _experiment(recipe: Mapping[str, Any]) -> Any:
-    """What the recipe says of the experiment, but for how long it is."""
-    return {**(recipe.get("experiment") or recipe), "episodes": 0}
+def _with_frozen_moved(recipe: Mapping[str, Any], run: Path, folder: Path) -> dict[str, Any]:
+    """A recipe whose runs of `Frozen` agents are relative to `folder`, where they were to `run`."""
 
+    def moved(path: str) -> str:
+        return os.path.relpath(run / path, folder)
 
-def _with_frozen_moved(table: Any, run: Path, folder: Path) -> Any:
-    """A recipe whose paths of `Frozen` agents, which are relative to `run`, are relative to `folder`."""
-    if isinstance(table, list):
-        return [_with_frozen_moved(own, run, folder) for own in table]
-    if not isinstance(table, Mapping):
-        return table
-    moved = {name: _with_frozen_moved(own, run, folder) for name, own in table.items()}
-    if moved.get("kind") == "Frozen" and isinstance(moved.get("run"), str):
-        moved["run"] = os.path.relpath(run / moved["run"], folder)
-    return moved
+    def walk(value: Any) -> Any:
+        if isinstance(value, list):
+            return [walk(entry) for entry in value]
+        if not isinstance(value, Mapping):
+            return value
+        table = {name: walk(entry) for name, entry in value.items()}
+        is_stored = table.get("kind") == "Frozen" and isinstance(table.get("run"), str)
+        return {**table, "run": moved(table["run"])} if is_stored else table
 
-
-def _copy(path: Path, folder: Path, name: str) -> None:
-    content = path.read_bytes()
-    write_listed(folder, name, lambda file: file.write(content))
+    table: dict[str, Any] = walk(recipe)
+    if FROZEN in table:
+        table[FROZEN] = {moved(path): digest for path, digest in table[FROZEN].items()}
+    return table
 
 
 def _write(table: pa.Table, folder: Path, name: str) -> None:
-    ordered = table.sort_by([(name, "ascending") for name in ("replica", "episode", "agent")])
-    kinds = pa.schema(
-        [(own.name, pa.float32() if own.type == pa.float64() else own.type) for own in table.schema]
-    ).with_metadata(table.schema.metadata)
-    smaller = ordered.cast(kinds)
-    write_listed(folder, name, lambda file: pq.write_table(smaller, file, **small(smaller)))
+    ordered = table.sort_by([(key, "ascending") for key in ("replica", "episode", "agent")])
+    kinds = {field.name: pa.float32() if field.type == pa.float64() else field.type for field in table.schema}
+    small = ordered.cast(pa.schema(kinds, table.schema.metadata))
+    write_listed(folder, name, partial(write_small, small))

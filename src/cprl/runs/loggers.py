@@ -21,7 +21,7 @@ FOLDER: Final = "logs"
 
 
 def check_logger(logger: object) -> None:
-    """Checks the name of a logger; call it before anything is written.
+    """Check the name of a logger before anything is written.
 
     Args:
         logger: a name in `PACKAGES`; other objects are not checked.
@@ -38,7 +38,7 @@ def check_logger(logger: object) -> None:
 
 
 def make_logger(logger: str | Logger, run: str | Path) -> Logger:
-    """Makes a TorchRL logger by its name; a logger is returned as it is.
+    """Make a TorchRL logger by its name; a logger is returned as it is.
 
     "tensorboard" writes to `logs/tensorboard`; "wandb" to `logs/wandb` and to a W&B run with the name of the
     directory, which a resumed run continues. The environment variables `WANDB_PROJECT` and `WANDB_MODE` set
@@ -52,12 +52,19 @@ def make_logger(logger: str | Logger, run: str | Path) -> Logger:
     check_logger(logger)
     folder = Path(run) / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
-    if logger == "tensorboard":
-        made: Logger = get_logger("tensorboard", str(folder), "tensorboard")
-        return made
-    name = Path(run).resolve().name
-    made = get_logger("wandb", str(folder), name, wandb_kwargs={"id": _wandb_id(folder)})
+    name, options = logger, dict[str, Any]()
+    if logger == "wandb":
+        name, options = Path(run).resolve().name, {"wandb_kwargs": {"id": _wandb_id(folder)}}
+    made: Logger = get_logger(logger, str(folder), name, **options)
     return made
+
+
+def _wandb_id(folder: Path) -> str:
+    """The id of the W&B run, the same when a run is resumed."""
+    path = folder / "wandb_id.txt"
+    if not path.exists():
+        path.write_text(uuid.uuid4().hex[:8], encoding="utf-8")
+    return path.read_text(encoding="utf-8")
 
 
 class LoggerCallback:
@@ -88,23 +95,24 @@ class LoggerCallback:
         self._steps, self._steps_then, self._then = 0, 0, time.perf_counter()
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Counts the environment steps of each replica."""
+        """Count the environment steps of each replica."""
         self._steps += 1 if batch.batch_dims == 1 else batch.batch_size[1]
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Writes the numbers of an episode once all replicas have ended it."""
+        """Write the numbers of an episode once all replicas have ended it."""
         agents = self._agents or [f"agent_{agent}" for agent in range(len(episode.return_))]
         numbers = numbers_of(episode, learning, agents)
-        of_all = self._series.add(episode.episode, episode.world, numbers)
-        if of_all is not None:
-            self._log(episode.episode, of_all)
+        by_replica = self._series.add(episode.episode, episode.world, numbers)
+        if by_replica is not None:
+            self._log(episode.episode, by_replica)
 
-    def _log(self, episode: int, of_all: Mapping[str, Values]) -> None:
-        written = {name: mean_of(values) for name, values in of_all.items()}
+    def _log(self, episode: int, by_replica: Mapping[str, Values]) -> None:
+        written = {name: mean_of(values) for name, values in by_replica.items()}
         if self._series.replicas > 1:
-            for name, values in of_all.items():
+            for name, values in by_replica.items():
                 if name.startswith(("social/", "institutions/")) or name.endswith("/return"):
-                    written |= {f"replica_{nth}/{name}": float(value) for nth, value in enumerate(values)}
+                    for replica, value in enumerate(values):
+                        written[f"replica_{replica}/{name}"] = float(value)
         if self._steps:
             now, steps = time.perf_counter(), (self._steps - self._steps_then) * self._series.replicas
             written["time/env_steps"] = float(self._steps)
@@ -119,7 +127,7 @@ class LoggerCallback:
         return {"steps": self._steps, "series": self._series.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a state."""
+        """Continue from a state."""
         self._steps = self._steps_then = int(state["steps"])
         self._then = time.perf_counter()
         self._series.load_state_dict(state["series"])
@@ -130,11 +138,3 @@ class LoggerCallback:
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
         self.logger.flush()
         self.logger.shutdown()
-
-
-def _wandb_id(folder: Path) -> str:
-    """The id of the W&B run, the same when a run is resumed."""
-    path = folder / "wandb_id.txt"
-    if not path.exists():
-        path.write_text(uuid.uuid4().hex[:8], encoding="utf-8")
-    return path.read_text(encoding="utf-8")

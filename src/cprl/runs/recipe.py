@@ -15,20 +15,17 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.arguments import refusal
-from cprl.checks import shown
-from cprl.custom import source_of
+from cprl.custom import custom_targets, source_of
 from cprl.runs.files import LOCK_FILE, RECIPE_FORMAT, RunLock, digest_of, read_json, refuse_newer, write_json
 from cprl.system.output import ERR, console, printed
 from cprl.system.process import cpu
 from cprl.system.shipped import PROGRAM, command_of, cprl_here
+from cprl.values import differences, refusal, shown
 
 RECIPE_FILE: Final = "recipe.json"
 
 _RESUMES: Final = ("--resume", "--no-resume", "--take-over", "--no-take-over")
 _DIRECTORIES: Final = ("--out", "--runs")
-LONGEST_PATH: Final = 500
-"""The largest number of characters of a path that an error shows whole."""
 _NAMED: Final = 5
 """The largest number of differences between two recipes that an error names."""
 
@@ -56,28 +53,26 @@ def start_run(
     *,
     command: Sequence[str] | None = None,
 ) -> Path:
-    """Makes the directory of a run and writes its recipe.
+    """Make the directory of a run and write its recipe: the experiment, versions, the git commit of the code
+    of cprl, the type of processor, the time, and the command without local directories.
 
     Args:
         out: the directory, new or empty; None for `runs/<name>-<YYYYmmdd-HHMMSS>` in the working directory.
         to_recipe: makes the recipe for a directory, e.g. `cprl.Experiment.to_recipe`.
         command: the command line, script first; by default that of `started_by`, or of this process.
 
-    Returns:
-        The directory. Its `recipe.json` holds the recipe, versions, the git commit of the code of cprl (see
-        `cprl.runs.recipe.git_state`), the type of processor, the time, and the command without `--out` and
-        without the directory of the script.
-
     Raises:
         FileExistsError: if `out` is not empty.
         RunLockedError: if another process is just starting a run there.
     """
     if Path(name).name != name or "\0" in name:
-        raise ValueError(f"name is {shown(name)}; allowed: the name of a directory, without slashes")
-    out = None if out is None else Path(out)
+        raise refusal("name", name, "the name of a directory, without slashes")
     started = datetime.now().astimezone()
-    is_new = out is None or not out.exists()
-    directory = _new_directory(name, started) if out is None else _made_directory(out)
+    is_new = out is None or not Path(out).exists()
+    directory = _new_directory(name, started) if out is None else Path(out)
+    if not is_new:
+        _refuse_contents(directory)
+    directory.mkdir(parents=True, exist_ok=True)
     try:
         with RunLock(directory):
             _refuse_contents(directory)
@@ -98,11 +93,27 @@ def start_run(
     return directory
 
 
+def _new_directory(name: str, started: datetime) -> Path:
+    """runs/<name>-<time>, with the suffix -2, -3 and so on for runs that start in the same second."""
+    for number in count(1):
+        suffix = "" if number == 1 else f"-{number}"
+        directory = Path("runs", f"{name}-{started:%Y%m%d-%H%M%S}{suffix}")
+        with suppress(FileExistsError):
+            directory.mkdir(parents=True)
+            return directory
+    raise AssertionError("count never ends")
+
+
+def _refuse_contents(directory: Path) -> None:
+    if any(path.name != LOCK_FILE for path in directory.iterdir()):
+        raise FileExistsError(f"{directory} is not empty; allowed: a new or empty directory")
+
+
 def refuse_another_run(
     out: Path | None, to_recipe: Callable[[Path], Mapping[str, Any]], kind: Any = None
 ) -> int:
-    """Refuses to resume what was not begun with the same recipe; only the number of episodes may grow,
-    and `on_nan` be another.
+    """Refuse to resume what was not begun with the same recipe; only the number of episodes may grow, and
+    `on_nan` be another.
 
     Args:
         out: the directory of the stopped run.
@@ -114,42 +125,82 @@ def refuse_another_run(
     """
     if out is None:
         raise ValueError("resume requires the directory of the run as out")
-    kept, now = read_recipe(out), to_recipe(out)
-    if kept.get("recipe") != now["recipe"]:
-        raise ValueError(f"{out} is a run of {kept.get('recipe')!r}; this is {now['recipe']!r}")
-    if kept.get("format") != now["format"]:
-        raise ValueError(
-            f"{out} has a recipe of the format {shown(kept.get('format'))}; allowed: {now['format']}"
-        )
-    from cprl.values import differences
-
-    before, asked = kept["experiment"], now["experiment"]
+    before, now = recipe_config(read_recipe(out), where=out), to_recipe(out)["experiment"]
     free = {"episodes": 0, "on_nan": ""}
-    differ = differences({**before, **free}, {**asked, **free}, "experiment", kind)
+    differ = differences({**before, **free}, {**now, **free}, "experiment", kind)
     if differ:
         more = f"; and {len(differ) - _NAMED} more" if len(differ) > _NAMED else ""
         raise ValueError(f"{out} was started with another recipe: {'; '.join(differ[:_NAMED])}{more}")
     episodes = before.get("episodes")
-    if not isinstance(episodes, int) or episodes > asked["episodes"]:
+    if not isinstance(episodes, int) or episodes > now["episodes"]:
         raise ValueError(
-            f"{out} has {episodes} episodes, which cannot become {asked['episodes']}; allowed: as many, or "
+            f"{out} has {episodes} episodes, which cannot become {now['episodes']}; allowed: as many, or "
             "more to extend it"
         )
     return episodes
 
 
+def read_recipe(run: Path) -> dict[str, Any]:
+    """Read the recipe that `start_run` wrote.
+
+    Args:
+        run: the run's directory, or the file itself.
+    """
+    path = Path(run) if Path(run).is_file() else Path(run) / RECIPE_FILE
+    try:
+        recipe = read_json(path)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path} is not the recipe of a run: {error!r}") from error
+    refuse_newer(path, recipe, RECIPE_FORMAT)
+    if not isinstance(recipe.get("experiment"), dict):
+        raise ValueError(f'{path} is not the recipe of a run: it has no table "experiment"')
+    return recipe
+
+
+def recipe_config(recipe: Mapping[str, Any], *, where: object = "the recipe") -> dict[str, Any]:
+    """The experiment of a recipe, as `Experiment.to_config` gives it.
+
+    Args:
+        where: what the recipe is called in messages.
+    """
+    refuse_newer(where, recipe, RECIPE_FORMAT)
+    if recipe.get("format") != RECIPE_FORMAT or not isinstance(recipe.get("experiment"), Mapping):
+        raise ValueError(
+            f"{where} has the format {shown(recipe.get('format'))}; allowed: {RECIPE_FORMAT}, with a table "
+            '"experiment"'
+        )
+    return dict(recipe["experiment"])
+
+
+def runs_in(paths: Iterable[Path | str]) -> list[Path]:
+    """The runs among paths: each is a run's directory, or one that holds runs, in order."""
+    runs: list[Path] = []
+    for folder in map(Path, paths):
+        is_run = (folder / RECIPE_FILE).exists()
+        inside = [folder] if is_run else sorted(recipe.parent for recipe in folder.glob(f"*/{RECIPE_FILE}"))
+        if not inside:
+            raise ValueError(f"{folder} is no run; allowed: directories of runs, or one that holds some")
+        runs += inside
+    if not runs:
+        raise refusal("runs", paths, "at least one directory of a run")
+    places = [run.resolve() for run in runs]
+    for run, place in zip(runs, places, strict=True):
+        if places.count(place) > 1:
+            raise ValueError(f"{run} is there twice; allowed: each run once")
+    return runs
+
+
 def write_more_episodes(run: Path, episodes: int) -> None:
-    """Writes into a run's recipe that it is extended to so many episodes, and by which versions."""
+    """Write into a run's recipe that it is extended to so many episodes, and by which versions."""
     recipe = read_recipe(run)
     earlier = {"episodes": recipe["experiment"]["episodes"], **_circumstances(recipe)}
-    recipe |= _code_text(recipe)
     recipe["experiment"]["episodes"] = episodes
-    recipe["extended"] = [*recipe.get("extended", []), earlier]
+    recipe |= {**_code_text(recipe), "extended": [*recipe.get("extended", []), earlier]}
     write_json(run / RECIPE_FILE, recipe)
 
 
 def write_on_nan(run: Path, on_nan: str) -> None:
-    """Writes into a run's recipe what now happens where a number is not finite."""
+    """Write into a run's recipe what now happens where a number is not finite."""
     recipe = read_recipe(run)
     if recipe["experiment"].get("on_nan") != on_nan:
         recipe["experiment"]["on_nan"] = on_nan
@@ -157,37 +208,30 @@ def write_on_nan(run: Path, on_nan: str) -> None:
 
 
 def changed_circumstances(run: Path) -> list[str]:
-    """What differs now from when a run was started: versions, git commit, processor, the user's own code; a
-    sentence for each.
-
-    Numbers may then differ from those of an undisturbed run.
-    """
-    from cprl.values import differences
-
+    """Return what differs now from when a run was started, so that its numbers may differ from those of an
+    undisturbed run: versions, git commit, processor, the user's own code; a sentence for each."""
     recipe = read_recipe(run)
-    now = _circumstances(recipe)
     return [
-        line
-        for name in now
-        for line in differences(recipe.get(name), now[name], name)
+        difference
+        for name, now in _circumstances(recipe).items()
         if recipe.get(name) is not None
+        for difference in differences(recipe[name], now, name)
     ]
 
 
 def write_changed_circumstances(run: Path) -> None:
-    """Writes into a run's recipe under which versions, git commit, processor and code of the user's own it is
+    """Write into a run's recipe under which versions, git commit, processor and code of the user's own it is
     resumed, if they are not those of its last process."""
     recipe = read_recipe(run)
     now = _circumstances(recipe)
-    before = recipe.get("resumed") or [recipe]
-    if any(before[-1].get(name) != now[name] for name in now):
-        recipe["resumed"] = [*recipe.get("resumed", []), now]
-        recipe |= _code_text(recipe)
+    before = (recipe.get("resumed") or [recipe])[-1]
+    if any(before.get(name) != now[name] for name in now):
+        recipe |= {**_code_text(recipe), "resumed": [*recipe.get("resumed", []), now]}
         write_json(run / RECIPE_FILE, recipe)
 
 
 def say_changes(run: Path, changes: Sequence[str]) -> None:
-    """Warns on standard error where a run is used under other circumstances than those it was made under."""
+    """Warn on standard error where a run is used under other circumstances than those it was made under."""
     if changes:
         console(ERR).print(
             f"Warning: {run} was begun under other versions or other code, so that numbers may differ from "
@@ -200,7 +244,7 @@ def say_changes(run: Path, changes: Sequence[str]) -> None:
 def changed_code(recipe: Mapping[str, Any]) -> list[str]:
     """Return the modules of the user's own that have another text now than when a run or a part of it began.
 
-    Those of which the recipe of an earlier cprl has no checksum, and those that are gone, count as unchanged.
+    Those of which the recipe has no checksum, and those that are gone, count as unchanged.
     """
     now = _code(recipe)
     parts = (recipe, *recipe.get("extended", ()), *recipe.get("resumed", ()))
@@ -226,30 +270,38 @@ def _code_text(recipe: Mapping[str, Any]) -> dict[str, dict[str, str]]:
 
 def _sources(recipe: Mapping[str, Any]) -> dict[str, str]:
     """The text of each module that a `Custom` of a recipe names, without packages whose versions it has."""
-    from cprl.custom import custom_targets
-
     modules = {target.partition(":")[0] for target in custom_targets(recipe.get("experiment"))}
-    texts = {own: source_of(own) for own in sorted(modules) if own.partition(".")[0] not in PACKAGES}
+    texts = {name: source_of(name) for name in sorted(modules) if name.partition(".")[0] not in PACKAGES}
     return {module: text for module, text in texts.items() if text is not None}
 
 
+def versions() -> dict[str, str | None]:
+    """Return the versions of Python and of `PACKAGES`; None for packages that are not installed."""
+    numbers: dict[str, str | None] = dict.fromkeys(("python", *PACKAGES))
+    numbers["python"] = platform.python_version()
+    for package in PACKAGES:
+        with suppress(PackageNotFoundError):
+            numbers[package] = version(package)
+    return numbers
+
+
 def resume_command(run: Path, command: Sequence[str] | None = None) -> str:
-    """The command line that resumes a run.
+    """Return the command line that resumes a run.
 
     Args:
         command: the command line that started or resumed it, script first; by default that of `started_by`.
             A run that was started from Python without one is resumed by `cprl run`.
     """
     command = command or _COMMAND.get()
+    directory = f"./{run}" if str(run).startswith("-") else str(run)  # not to be read as a flag
     if command is None:
-        from cprl.custom import custom_targets
-
         path = run / RECIPE_FILE
         targets = custom_targets(read_json(path).get("experiment")) if path.exists() else []
         allow = [word for target in targets for word in ("--allow", target)]
-        return printed([*cprl_here(), "run", str(run), "--resume", *allow])
-    kept = [word for word in without_options(command, _DIRECTORIES) if word.replace("_", "-") not in _RESUMES]
-    return printed([*command_of(kept), "--out", str(run), "--resume"])
+        return printed([*cprl_here(), "run", directory, "--resume", *allow])
+    words = without_options(command, _DIRECTORIES)
+    words = command_of([word for word in words if word.replace("_", "-") not in _RESUMES])
+    return printed([*words, "--out", directory, "--resume"])
 
 
 def _command(words: Sequence[str]) -> str:
@@ -270,99 +322,13 @@ def without_directories(program: str) -> str:
 
 def without_options(words: Sequence[str], options: Sequence[str]) -> list[str]:
     """The words of a command line without some options, such as "--out", and the value of each."""
-    given, left = list(words), []
-    while given:
-        word = given.pop(0)
-        if word in options and given:
-            given.pop(0)
-        elif not word.startswith(tuple(f"{own}=" for own in options)):
-            left.append(word)
-    return left
-
-
-def read_recipe(run: Path) -> dict[str, Any]:
-    """The recipe that `start_run` wrote.
-
-    Args:
-        run: the run's directory, or the file itself.
-    """
-    path = Path(run) if Path(run).is_file() else Path(run) / RECIPE_FILE
-    try:
-        recipe = read_json(path)
-        is_newer = isinstance(recipe.get("format"), int) and recipe["format"] > RECIPE_FORMAT
-        if not is_newer and not isinstance(recipe.get("experiment"), dict):
-            raise TypeError('no table "experiment"')
-    except (OSError, ValueError, TypeError) as error:
-        name = path if len(str(path)) <= LONGEST_PATH else shown(str(path))
-        raise ValueError(f"{name} is not the recipe of a run: {error!r}") from error
-    refuse_newer(path, recipe, RECIPE_FORMAT)
-    return recipe
-
-
-def runs_in(paths: Iterable[Path | str]) -> list[Path]:
-    """The runs among paths: each is a run's directory, or one that holds runs, in order."""
-    runs: list[Path] = []
-    for path in paths:
-        folder = Path(path)
-        is_run = (folder / RECIPE_FILE).exists()
-        inside = [folder] if is_run else sorted(recipe.parent for recipe in folder.glob(f"*/{RECIPE_FILE}"))
-        if not inside:
-            raise ValueError(f"{folder} is no run; allowed: directories of runs, or one that holds some")
-        runs += inside
-    if not runs:
-        raise refusal("runs", paths, "at least one directory of a run")
-    places = [run.resolve() for run in runs]
-    for run, place in zip(runs, places, strict=True):
-        if places.count(place) > 1:
-            raise ValueError(f"{run} is there twice; allowed: each run once")
-    return runs
-
-
-def versions() -> dict[str, str | None]:
-    """The versions of Python and of `PACKAGES`; None for packages that are not installed."""
-    found: dict[str, str | None] = {"python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = None
-    return found
-
-
-def _new_directory(name: str, started: datetime) -> Path:
-    """runs/<name>-<time>, with the suffix -2, -3 and so on for runs that start in the same second."""
-    stem = f"{name}-{started:%Y%m%d-%H%M%S}"
-    for nth in count(1):
-        directory = Path("runs") / (stem if nth == 1 else f"{stem}-{nth}")
-        try:
-            directory.mkdir(parents=True)
-        except FileExistsError:
-            continue
-        return directory
-    raise AssertionError("count never ends")
-
-
-def _made_directory(directory: Path) -> Path:
-    if directory.exists():
-        _refuse_contents(directory)
-    directory.mkdir(parents=True, exist_ok=True)
-    return directory
-
-
-def _refuse_contents(directory: Path) -> None:
-    if any(path.name != LOCK_FILE for path in directory.iterdir()):
-        raise FileExistsError(f"{directory} is not empty; allowed: a new or empty directory")
-
-
-def recipe_config(recipe: Mapping[str, Any]) -> dict[str, Any]:
-    """The experiment of a recipe, as `Experiment.to_config` gives it."""
-    refuse_newer("the recipe", recipe, RECIPE_FORMAT)
-    if recipe.get("format") != RECIPE_FORMAT or not isinstance(recipe.get("experiment"), Mapping):
-        raise ValueError(
-            f"the recipe has the format {shown(recipe.get('format'))}; allowed: {RECIPE_FORMAT}, with "
-            'a table "experiment"'
-        )
-    return dict(recipe["experiment"])
+    rest, others = iter(words), []
+    for word in rest:
+        if word in options:
+            next(rest, None)
+        elif not word.startswith(tuple(f"{option}=" for option in options)):
+            others.append(word)
+    return others
 
 
 BUILT_FROM: Final = "commit.json"
@@ -374,7 +340,7 @@ _OF_ANOTHER: Final = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
 
 
 def git_state(package: Path = _PACKAGE) -> dict[str, str | bool] | None:
-    """The commit of the code of cprl, and whether a tracked file differed from it.
+    """Return the commit of the code of cprl, and whether a tracked file differed from it.
 
     Where this process stands does not count: the git folder of somebody's own project says nothing of cprl.
 
@@ -397,10 +363,10 @@ def git_state(package: Path = _PACKAGE) -> dict[str, str | bool] | None:
 
 def _git(folder: Path, *arguments: str) -> str | None:
     """The output of git in a folder; None if there is no git, no checkout or no commit."""
-    own = {name: value for name, value in os.environ.items() if name not in _OF_ANOTHER}
+    environment = {name: value for name, value in os.environ.items() if name not in _OF_ANOTHER}
     words = ["git", "-C", str(folder), *arguments]
     try:
-        done = subprocess.run(words, capture_output=True, text=True, check=True, timeout=10, env=own)
+        done = subprocess.run(words, capture_output=True, text=True, check=True, timeout=10, env=environment)
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()

@@ -1,4 +1,4 @@
-"""Saves and loads the weights of networks."""
+"""Saves and loads what agents have learned: the weights of their networks, and what goes with them."""
 
 import os
 from collections.abc import Iterable, Mapping
@@ -8,13 +8,18 @@ from typing import Any, Final, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from cprl.checks import shown
-from cprl.runs.checkpoints import FOLDER, REPORT, checkpoints_in, read_checkpoint
-from cprl.runs.files import checksum, refuse_missing, refuse_special, verify, write_listed
+from cprl.runs.checkpoints import FOLDER, REPORT, checkpoints_in, read_checkpoint, read_tensors
+from cprl.runs.files import checksum, refuse_missing, write_listed
+from cprl.values import refusal
+
+TRANSFORMS: Final = "transforms.pt"
+"""The file in `checkpoints/` with the state of the environment's transforms."""
+DECISIONS: Final = "decisions.pt"
+"""The file in `checkpoints/` with the values of what agents decide, by the agent's name."""
 
 
 def save_weights(run: Path, networks: Mapping[str, nn.Module], *, name: str = "final") -> Path:
-    """Writes the weights of each agent's network atomically, and lists them in the run's manifest.
+    """Write the weights of each agent's network atomically, and list them in the run's manifest.
 
     Args:
         networks: the networks by the agent's name.
@@ -23,54 +28,39 @@ def save_weights(run: Path, networks: Mapping[str, nn.Module], *, name: str = "f
     Returns:
         `checkpoints/<name>.pt` of the run, which `load_weights` reads.
     """
-    if not isinstance(name, str) or not name or Path(name).name != name or "\0" in name:
-        raise ValueError(f"name is {shown(name)}; allowed: the name of a file, without slashes and suffix")
-    run = Path(run)
+    if not name or Path(name).name != name or "\0" in name:
+        raise refusal("name", name, "the name of a file, without slashes and suffix")
     weights = {agent: network.state_dict() for agent, network in networks.items()}
-    return write_listed(run, f"checkpoints/{name}.pt", lambda file: torch.save(weights, file))
-
-
-TRANSFORMS: Final = "transforms.pt"
-"""The file in `checkpoints/` with the state of the environment's transforms."""
+    return _save(run, f"{name}.pt", weights)
 
 
 def save_transforms(run: Path, state: Mapping[str, Any]) -> None:
-    """Writes the state of an environment's transforms atomically; writes no file if they have none."""
+    """Write the state of an environment's transforms atomically; no file if they have none."""
     if state:
-        write_listed(run, f"checkpoints/{TRANSFORMS}", lambda file: torch.save(dict(state), file))
-
-
-DECISIONS: Final = "decisions.pt"
-"""The file in `checkpoints/` with the values of what agents decide, by the agent's name."""
+        _save(run, TRANSFORMS, state)
 
 
 def save_decisions(run: Path, values: Mapping[str, Tensor]) -> None:
-    """Writes the values of agents' decisions atomically; writes no file if they learn none.
+    """Write the values of agents' decisions atomically; no file if they learn none.
 
     Args:
         values: float64 [C] by the agent's name, see `cprl.learners.decisions.BanditDecider.learned`.
     """
-    run = Path(run)
     if values:
-        write_listed(run, f"checkpoints/{DECISIONS}", lambda file: torch.save(dict(values), file))
+        _save(run, DECISIONS, values)
+
+
+def _save(run: Path, name: str, content: Mapping[str, Any]) -> Path:
+    write_listed(Path(run), f"{FOLDER}/{name}", lambda file: torch.save(dict(content), file))
+    return Path(run) / FOLDER / name
 
 
 def load_weights(path: Path) -> dict[str, Any]:
-    """The state dict of each agent's network, or the state of each transform; loads tensors only, and runs no
-    code of the file."""
-    refuse_special(path)
-    if path.exists():
-        verify(path)
-    try:
-        content = torch.load(path, weights_only=True)
-    except Exception as error:  # of whatever kind torch finds for what a file may hold
-        raise ValueError(f"{path} holds no weights: {error}") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{path} holds no weights, but a {type(content).__name__}")
-    return content
+    """Load the state dict of each agent's network, or state of each transform; runs no code of the file."""
+    return read_tensors(path, "holds no weights")
 
 
-class Kept(NamedTuple):
+class StoredWeights(NamedTuple):
     """What a run keeps of its agents."""
 
     path: Path
@@ -83,8 +73,8 @@ class Kept(NamedTuple):
     """The values of what each lane decides."""
 
 
-def kept_of(run: Path, name: str | None = None) -> Kept:
-    """What a run keeps of its agents.
+def weights_in(run: Path, name: str | None = None) -> StoredWeights:
+    """Load what a run keeps of its agents.
 
     Args:
         name: of a file in its `checkpoints/`, without suffix; None for the final one, or the newest readable
@@ -94,17 +84,15 @@ def kept_of(run: Path, name: str | None = None) -> Kept:
     folder = run / FOLDER
     path = folder / f"{name or 'final'}.pt"
     if name is None and not path.exists():
-        return _from_checkpoint(run, path)
-    beside = (_beside(folder / own, name) for own in (TRANSFORMS, DECISIONS))
-    return Kept(path, load_weights(path), *beside)
-
-
-def _beside(path: Path, name: str | None) -> dict[str, Any]:
-    """What a file beside the weights holds; that of as many episodes, of a run that was extended."""
-    if name is not None and name.startswith("final"):
-        of_name = path.with_stem(name.replace("final", path.stem))
-        path = of_name if of_name.exists() else path
-    return load_weights(path) if path.exists() else {}
+        return _from_checkpoint(run)
+    # Those of as many episodes, of a run that was extended.
+    suffix = name.removeprefix("final") if name is not None and name.startswith("final") else ""
+    contents = []
+    for beside in (folder / TRANSFORMS, folder / DECISIONS):
+        earlier = beside.with_stem(f"{beside.stem}{suffix}")
+        beside = earlier if earlier.exists() else beside
+        contents.append(load_weights(beside) if beside.exists() else {})
+    return StoredWeights(path, load_weights(path), *contents)
 
 
 def lacks_weights(run: Path) -> bool:
@@ -115,26 +103,28 @@ def lacks_weights(run: Path) -> bool:
     return True
 
 
-def _from_checkpoint(run: Path, final: Path) -> Kept:
+def _from_checkpoint(run: Path) -> StoredWeights:
+    final = run / FOLDER / "final.pt"
     if lacks_weights(run):
         raise ValueError(
             f"{run} keeps no weights: its results were exported without them, or {final} was lost; allowed: "
             "the run itself, or an export with weights"
         )
-    reasons = []
+    reasons = [f"{final} is not there, nor a readable checkpoint: has {run} been trained?"]
     for checkpoint in reversed(checkpoints_in(run / FOLDER)):
         try:
             state = read_checkpoint(checkpoint)
-            of_learners = [learner["networks"] for learner in state["learners"]]
+            networks = [learner["networks"] for learner in state["learners"]]
         except (ValueError, KeyError) as error:
             reasons.append(str(error))
             continue
-        networks = {lane: own for networks in of_learners for lane, own in networks.items()}
-        decisions = state.get("decisions", {}).get("_extra_state", {}).get("learned", {})
-        return Kept(checkpoint, networks, state.get("env", {}).get("transforms", {}), decisions)
-    raise ValueError(
-        "; ".join([f"{final} is not there, nor a readable checkpoint: has {run} been trained?", *reasons])
-    )
+        return StoredWeights(
+            checkpoint,
+            {lane: weights for by_lane in networks for lane, weights in by_lane.items()},
+            state.get("env", {}).get("transforms", {}),
+            state.get("decisions", {}).get("_extra_state", {}).get("learned", {}),
+        )
+    raise ValueError("; ".join(reasons))
 
 
 FIELD: Final = "frozen"
@@ -142,15 +132,15 @@ FIELD: Final = "frozen"
 
 
 def partners_of(run: Path, partners: Iterable[str]) -> dict[str, dict[str, str]]:
-    """What the recipe of a run says of which weights of other runs play in it; those that have not ended keep
-    changing, and are left out.
+    """Return what the recipe of a run says of which weights of other runs play in it; those that have not
+    ended keep changing, and are left out.
 
     Args:
         run: the directory of the run that begins.
     """
-    final = {own: Path(own) / FOLDER / "final.pt" for own in partners}
-    found = {os.path.relpath(own, run): checksum(path) for own, path in final.items() if path.exists()}
-    return {FIELD: found} if found else {}
+    final = {os.path.relpath(partner, run): Path(partner) / FOLDER / "final.pt" for partner in partners}
+    digests = {partner: checksum(path) for partner, path in final.items() if path.exists()}
+    return {FIELD: digests} if digests else {}
 
 
 def weights_of(recipe: Mapping[str, Any], run: Path, partner: str) -> str | None:

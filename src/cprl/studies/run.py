@@ -5,12 +5,12 @@ import json
 import time
 from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Final
 
-from cprl.runs.files import LOCK_FILE, StudyLock, remove_partial
+from cprl.runs.files import RunLock, holder_of, remove_partial
 from cprl.studies.executors import Executor, InProcess
 from cprl.studies.progress import Progress
 from cprl.studies.status import PATIENCE_S, Status, is_silent
@@ -143,7 +143,8 @@ class Driver:
         """
         self.out.mkdir(parents=True, exist_ok=True)
         content = json.dumps(study.to_config(self.out), sort_keys=True).encode()
-        with StudyLock(self.out, hashlib.blake2b(content, digest_size=6).hexdigest()) as lock:
+        digest = hashlib.blake2b(content, digest_size=6).hexdigest()
+        with RunLock(self.out, study=digest) as lock:
             if lock.is_alone:
                 remove_partial(self.out, self.out / STATUS, self.out / "figures")
             elif self.progress:
@@ -215,11 +216,7 @@ def _outcomes(tasks: Sequence[Task], executor: Executor) -> Generator[Outcome, N
 
 def _others(out: Path) -> str:
     """Who runs a study too."""
-    holder = {}
-    with suppress(OSError, ValueError):
-        holder = json.loads((out / LOCK_FILE).read_bytes())
-    who = f", process {holder['pid']} on {holder.get('host')}" if "pid" in holder else ""
     return (
-        f"{out} is run by somebody else too{who}, or was when its host went down: each trial is run by "
-        "whoever begins it first, the other goes on with the rest"
+        f"{out} is run by somebody else too, {holder_of(out)}, or was when its host went down: each trial is "
+        "run by whoever begins it first, the other goes on with the rest"
     )

@@ -83,6 +83,11 @@ def console(output: Output = OUT, *, width: int | None = None) -> Console:
     return Console(file=cast(TextIO, output), width=width, markup=False, emoji=False)
 
 
+def legible(name: str) -> str:
+    """Return the name of a file or folder, which may hold any bytes, as a text that UTF-8 can hold."""
+    return name.encode(errors="replace").decode()
+
+
 def say(*what: object) -> None:
     """Prints a line, like `print`; what cannot be a text is shortened."""
     OUT.write(" ".join(map(_text, what)) + "\n")

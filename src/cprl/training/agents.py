@@ -46,7 +46,7 @@ from cprl.population import (
 from cprl.runs.checkpoints import FOLDER
 from cprl.runs.episodes import read_episodes
 from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, say_changes
-from cprl.runs.weights import kept_of, weights_of
+from cprl.runs.weights import weights_in, weights_of
 from cprl.values import shown
 
 
@@ -203,7 +203,7 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
     except ValueError as error:
         raise ValueError(f"{run / RECIPE_FILE}: {error}") from error
     say_changes(run, [f"the text of {module}, which its recipe keeps" for module in changed_code(recipe)])
-    kept_weights = kept_of(run, weights)
+    kept_weights = weights_in(run, weights)
     networks: dict[str, nn.Module] = {}
     loaded = LoadedRun(
         path=run,
@@ -214,7 +214,7 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
         transforms_state=kept_weights.transforms,
         decisions=kept_weights.decisions,
     )
-    with torch.random.fork_rng(devices=[]):  # networks draw weights at first, which the kept ones replace
+    with torch.random.fork_rng(devices=[]):  # networks draw weights at first, which the stored ones replace
         networks |= _networks(loaded, kept_weights.networks)
     return loaded
 

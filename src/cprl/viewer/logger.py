@@ -18,7 +18,7 @@ from torchrl.record.loggers import Logger
 from cprl.runs.files import read_json
 from cprl.runs.recipe import RECIPE_FILE
 from cprl.system.compat import send_chunk
-from cprl.system.output import console
+from cprl.system.output import console, legible
 from cprl.values import shown
 from cprl.viewer.blueprint import layout
 from cprl.viewer.scenery import Curves, Scene
@@ -358,7 +358,7 @@ class RerunLogger(Logger):
     def log_hparams(self, cfg: Any) -> None:
         """Logs a mapping, as a table, or a Markdown text, as the recipe of the run."""
         text = cfg if isinstance(cfg, str) else as_table(dict(cfg))
-        self.log_static("recipe", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+        self.log_static("recipe", rr.TextDocument(legible(text), media_type=rr.MediaType.MARKDOWN))
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
         """Logs uint8 [(1), T, C, H, W] as T images at consecutive steps from `step` on.

@@ -1,6 +1,7 @@
 """The streams of one recording, to a file and live: each may fail without harm to the run."""
 
 import atexit
+import os
 import shutil
 import subprocess
 import time
@@ -17,7 +18,7 @@ from typing import Any, Final, TypeAlias, TypeVar
 import rerun as rr
 
 from cprl.system.compat import end_recordings, keep_native
-from cprl.system.output import printed
+from cprl.system.output import legible, printed
 from cprl.values import checked
 from cprl.viewer.page import LOCALHOST, Page, free_port, has_display, viewer
 from cprl.viewer.watching import Served
@@ -266,7 +267,12 @@ def open_file(
         _warn_of(f"file {path}", f"{free:,} bytes are free there, {NEEDED_BYTES:,} are needed")
         return None
     recording = _recording(application, recording_id)
-    recording.save(path, default_blueprint=blueprint)
+    try:
+        recording.save(path, default_blueprint=blueprint)
+    except UnicodeEncodeError:  # Rerun takes no folder whose name is not in UTF-8
+        folder = os.open(path.parent, os.O_RDONLY)
+        recording.save(f"/proc/self/fd/{folder}/{path.name}", default_blueprint=blueprint)
+        os.close(folder)
     return Stream("file", recording, period_s=period_s)
 
 
@@ -332,7 +338,7 @@ def _warn_of(what: str, why: object) -> None:
 def _recording(application: str, recording_id: str, *, send_properties: bool = True) -> Any:
     recording = rr.RecordingStream(
         application,
-        recording_id=recording_id,
+        recording_id=legible(recording_id),
         send_properties=send_properties,
         batcher_config=rr.ChunkBatcherConfig(flush_num_rows=1),  # columns would overtake rows that wait
     )
