@@ -183,10 +183,10 @@ def test_the_defaults_of_the_checksums_format_have_not_changed():
 
 def test_blocks_have_seeds_of_their_own_and_pairs_the_same_in_every_condition():
     trials = trials_of(Study(TINY, {FREEZE: [5, 25]}, replicas=5, block=2))
-    found = [(trial.condition.name, trial.experiment.seed, trial.experiment.replicas) for trial in trials]
+    blocks_of = [(trial.condition.name, trial.experiment.seed, trial.experiment.replicas) for trial in trials]
     blocks = [(0, 2), (1000, 2), (2000, 1)]
     names = ("freeze_steps=5", "freeze_steps=25")
-    assert found == [(name, *block) for block in blocks for name in names]
+    assert blocks_of == [(name, *block) for block in blocks for name in names]
 
 
 def test_the_first_block_is_the_run_of_the_recipe_itself():
@@ -557,6 +557,6 @@ def test_the_studies_of_the_programs_versions_share_their_runs(shipped):
     assert {name.partition("-")[2] for name in trials[8:]} == {"s1000-r4"}
     for study, count in ((combat, 6), (experiment_5, 2)):
         learns = [condition.experiment.agents[0].algorithm for condition in study.all_conditions[:count]]
-        assert {(own.settings.optimizer, own.loss_function) for own in learns} == {("adam", "l2")}
+        assert {(dqn.settings.optimizer, dqn.loss_function) for dqn in learns} == {("adam", "l2")}
     for checksum, name in {"dab4a686bb41": "published_schedule", "2919eaddb858": "dip"}.items():
         assert trials_of(shipped(name))[0].name == f"{checksum}-s0-r8", "of docs/results"

@@ -103,10 +103,10 @@ def test_results_without_weights_are_reported_but_never_played(run, tmp_path):
     assert "Exported without weights" not in everything
     of_play = ("it tags when near", "its policy circles", "| shots per 1000 steps, all agents |")
     assert all(name in everything and name not in text for name in of_play)
-    (kept,) = [line for line in everything.splitlines() if line.startswith("| it prevents depletion |")]
-    assert kept in text, "claims on the training stay"
+    (claim,) = [line for line in everything.splitlines() if line.startswith("| it prevents depletion |")]
+    assert claim in text, "claims on the training stay"
     again = export_results(folder, tmp_path / "copy", weights=False)
-    tables = [(own / "episodes.parquet").read_bytes() for own in (again, folder)]
+    tables = [(copy / "episodes.parquet").read_bytes() for copy in (again, folder)]
     assert tables[0] == tables[1]
     export_results(run, folder)
     (folder / "checkpoints" / "final.pt").unlink()
@@ -139,18 +139,18 @@ def test_runs_of_one_experiment_are_pooled_where_it_is_asked_for(run, other, tmp
     longer = export_results(run, tmp_path / "longer")
     with_field(longer, "experiment", lambda experiment: {**experiment, "seed": 2000, "update_every": 2})
     text = write_report([run, longer, other], tmp_path / "pooled", pool=True).read_text()
-    mine, theirs = (as_curves(read_episodes(own))["collective_return"].mean(1) for own in (run, other))
-    assert len(mine) == 2
+    ours, theirs = (as_curves(read_episodes(each))["collective_return"].mean(1) for each in (run, other))
+    assert len(ours) == 2
     assert len(theirs) == 3
-    assert f"| four+other | 4 | 184.07 | {estimate(np.concatenate([mine, theirs]))} |" in text
-    assert f"| longer | 4 | 184.07 | {estimate(mine)} |" in text, "of another experiment"
+    assert f"| four+other | 4 | 184.07 | {estimate(np.concatenate([ours, theirs]))} |" in text
+    assert f"| longer | 4 | 184.07 | {estimate(ours)} |" in text, "of another experiment"
     assert "as runs of one experiment: four and other as four+other.\n" in text
     before, after = text.split("## Share of the possible")
     assert "| four | two_against_random" in before, "each run has its training and its command"
     assert "| four |" not in after
     assert (tmp_path / "pooled" / "figures" / "four+other_return_1.png").exists()
     apart = write_report([run, other], tmp_path / "apart").read_text()
-    assert f"| four | 4 | 184.07 | {estimate(mine)} |" in apart, "nothing is pooled unless it is asked for"
+    assert f"| four | 4 | 184.07 | {estimate(ours)} |" in apart, "nothing is pooled unless it is asked for"
     none = write_report([run, longer], tmp_path / "none", pool=True).read_text()
     assert "Nothing is pooled: no two runs have experiments equal but for name, seed" in none
 
@@ -206,16 +206,16 @@ def with_field(run, name, changed):
 
 @pytest.mark.integration
 def test_runs_that_are_not_the_studys_have_no_columns_for_what_was_published(run, tmp_path):
-    own = export_results(run, tmp_path / "fishery")
-    content = json.loads((own / "recipe.json").read_text())
-    (own / "recipe.json").write_text(json.dumps({**content, "recipe": "fishery"}))
-    text = write_report([own], tmp_path).read_text()
+    fishery = export_results(run, tmp_path / "fishery")
+    content = json.loads((fishery / "recipe.json").read_text())
+    (fishery / "recipe.json").write_text(json.dumps({**content, "recipe": "fishery"}))
+    text = write_report([fishery], tmp_path).read_text()
     before, after = text.split("## Runs")[0], text.split("## Collective return")[1]
     assert "published" not in before + after, "in between stands the command, which may say anything"
     assert "| fishery | " in after
     assert "| shots per 1000 steps, all agents | " in text
     assert "(figures/fishery_collective_return.png)" in (tmp_path / "figures.md").read_text()
-    both = write_report([own, export_results(run, tmp_path / "two_against_random")], tmp_path).read_text()
+    both = write_report([fishery, export_results(run, tmp_path / "two_against_random")], tmp_path).read_text()
     assert "| fishery |" not in both.split("## Appendix A")[1].split("## Collective return")[0]
 
 
@@ -238,7 +238,7 @@ def test_agents_of_which_none_learns_are_not_called_trained(run, tmp_path):
 def test_a_report_imports_code_of_ones_own_where_it_is_allowed(tmp_path, capsys):
     game = cprl.Game(map=cprl.maps.parse(">.A.\n.A.<"), rules=cprl.Rules(episode_steps=5))
     target = "torchrl.envs:StepCounter"
-    own = cprl.Experiment(
+    experiment = cprl.Experiment(
         name="counted",
         game=game,
         agents=[Scripted("random")] * 2,
@@ -247,7 +247,7 @@ def test_a_report_imports_code_of_ones_own_where_it_is_allowed(tmp_path, capsys)
         engine="eager",
         transforms=(Custom(target, {}),),
     )
-    run = cprl.run(own, tmp_path / "counted", watch="off", allow=[target])
+    run = cprl.run(experiment, tmp_path / "counted", watch="off", allow=[target])
     with pytest.raises(ValueError, match=target):
         write_report([run], tmp_path / "report")
     assert "| counted |" in write_report([run], tmp_path / "report", allow=[target]).read_text()
@@ -291,14 +291,14 @@ def test_measures_of_training_know_rich_and_poor():
         "return_1": flat,
         "survival_steps": 900 * flat,
     }
-    found = of_training(curves)
+    measures = of_training(curves)
     assert (
-        found["return of the poorest agent over that of the richest, last 500 episodes"].tolist()
+        measures["return of the poorest agent over that of the richest, last 500 episodes"].tolist()
         == [1 / 3] * 3
     )
-    assert found["mean collective return over training"].tolist() == [4.0] * 3
+    assert measures["mean collective return over training"].tolist() == [4.0] * 3
     dip, peak = "depth of the deepest dip before episode 600", "episode of the highest collective return"
-    assert all(any(name.startswith(own) for name in found) for own in (dip, peak))
+    assert all(any(name.startswith(start) for name in measures) for start in (dip, peak))
     short = of_training({name: values[:, :20] for name, values in curves.items()})
     assert list(short) == [
         "mean collective return over training",
@@ -319,10 +319,10 @@ def test_agents_at_play_are_measured_replica_by_replica():
         played=np.ones(shape[:2], bool),
         board=(3, 9),
     )
-    found = of_play(played, replicas=2)
-    assert found["shots per 1000 steps, all agents"].tolist() == [250.0, 0.0]
-    assert found["overlap of the cells that two agents visit"].tolist() == [0.0, 1.0]
-    nearness = found["steps to the nearest other when firing, over that in all steps"]
+    measures = of_play(played, replicas=2)
+    assert measures["shots per 1000 steps, all agents"].tolist() == [250.0, 0.0]
+    assert measures["overlap of the cells that two agents visit"].tolist() == [0.0, 1.0]
+    nearness = measures["steps to the nearest other when firing, over that in all steps"]
     np.testing.assert_array_equal(nearness, [1.0, np.nan], "in replica 1 nobody fired")
 
 
@@ -335,14 +335,14 @@ def recipe(name):
 
 @pytest.mark.integration
 def test_reproduce_runs_what_is_missing_and_reports(tmp_path, monkeypatch, capsys):
-    asked = []
+    commands = []
 
-    def in_miniature(command, **how):
-        asked.append(command)
+    def in_miniature(command, **options):
+        commands.append(command)
         name = Path(command[1]).stem
         at = Path(command[command.index("--out") + 1])
         small = {"replicas": 2, "episodes": 5, "evaluation_episodes": 1, "engine": "eager"}
-        if "--resume" not in command and len(asked) == 1:
+        if "--resume" not in command and len(commands) == 1:
             at.mkdir()
             (at / "recipe.json").write_text("{}")  # it was stopped
             return type("Done", (), {"returncode": 0})
@@ -360,15 +360,15 @@ def test_reproduce_runs_what_is_missing_and_reports(tmp_path, monkeypatch, capsy
         ),
     )
     monkeypatch.setattr(reproduce, "subprocess", SimpleNamespace(run=in_miniature, STDOUT=None))
-    how = {"runs": tmp_path / "runs", "results": tmp_path / "results", "only": ("single_basic",)}
+    options = {"runs": tmp_path / "runs", "results": tmp_path / "results", "only": ("single_basic",)}
     with pytest.raises(ChildProcessError, match=r"single_basic ended with 0 and is not finished; see .*log"):
-        reproduce.main(**how)
-    report = reproduce.main(**how)
-    assert "--resume" in asked[1]
+        reproduce.main(**options)
+    report = reproduce.main(**options)
+    assert "--resume" in commands[1]
     assert "| single_basic | 1 | 32.47 | " in report.read_text()
     assert "(figures/single_basic_collective_return.png)" in report.with_name("figures.md").read_text()
-    reproduce.main(**how)
-    assert "--resume" in asked[2], "its recipe says whether what is finished is this experiment"
+    reproduce.main(**options)
+    assert "--resume" in commands[2], "its recipe says whether what is finished is this experiment"
     with pytest.raises(ValueError, match="there is no experiment 'fishery'; allowed: commons, single_basic"):
         reproduce.main(runs=tmp_path, only=("fishery",))
 
@@ -381,7 +381,7 @@ def test_reproduce_refuses_a_finished_run_of_another_recipe_with_the_words_of_it
     for name in ("recipe.json", "report.json"):
         (finished / name).write_text("{}")
 
-    def refuse(command, *, stdout, **how):
+    def refuse(command, *, stdout, **options):
         assert command[-1] == "--resume"
         stdout.write("single_basic.py: it was started with another recipe: episodes 9 and 5\n")
         return SimpleNamespace(returncode=1)
@@ -452,11 +452,11 @@ def society(levels, *, replicas=8, seed=0):
 def test_ours_are_running_means_over_the_window_of_the_published_curve(tmp_path, recipe, window):
     """Of 0, 1, 2 .. the mean over the w episodes from e on is e + (w - 1) / 2."""
     ramp = np.tile(np.arange(3000.0), (2, 1))
-    found = curves.beside(a_result(tmp_path, recipe, {"collective_return": ramp}), "collective_return")
-    np.testing.assert_allclose(found.ours, np.tile(found.at + (window - 1) / 2, (2, 1)))
+    compared = curves.beside(a_result(tmp_path, recipe, {"collective_return": ramp}), "collective_return")
+    np.testing.assert_allclose(compared.ours, np.tile(compared.at + (window - 1) / 2, (2, 1)))
     at, values = curve(published_experiment(recipe).curves["collective_return"])
-    kept = at <= 3000 - window
-    np.testing.assert_array_equal(found.published, values[kept])
+    inside = at <= 3000 - window
+    np.testing.assert_array_equal(compared.published, values[inside])
     short = {"collective_return": ramp[:, :window]}
     assert curves.beside(a_result(tmp_path, recipe, short), "collective_return") is None
 
@@ -466,8 +466,8 @@ def test_a_run_repeats_the_study_if_its_game_and_agents_do_whatever_its_name():
     learner = Learning(DQN(settings=replace(presets.dqn_settings("two_complex"), gamma=0.999)))
 
     def number(agents, game=game, name="trial"):
-        found = study_of(name, SimpleNamespace(game=game, agents=agents))
-        return found and found.number
+        study = study_of(name, SimpleNamespace(game=game, agents=agents))
+        return study and study.number
 
     assert number((learner, learner)) == 3
     assert number((learner, Scripted("random"))) == 4
@@ -490,8 +490,8 @@ def test_a_run_repeats_the_study_if_its_game_and_agents_do_whatever_its_name():
 
 
 def test_a_longer_training_is_compared_over_as_many_episodes_as_the_study_had(tmp_path):
-    whole = {name: own.repeat(2, 1)[:, :6000] for name, own in society(FELL).items()}
-    longer = {name: np.concatenate([own, np.zeros((8, 3000))], 1) for name, own in whole.items()}
+    whole = {name: curve.repeat(2, 1)[:, :6000] for name, curve in society(FELL).items()}
+    longer = {name: np.concatenate([curve, np.zeros((8, 3000))], 1) for name, curve in whole.items()}
 
     def row(metrics):
         result = a_result(tmp_path, "single_basic", metrics)
@@ -502,26 +502,26 @@ def test_a_longer_training_is_compared_over_as_many_episodes_as_the_study_had(tm
 
 
 def test_claims_on_more_episodes_than_there_were_have_no_verdict(tmp_path):
-    short = {name: own[:, :300] for name, own in society(FELL).items()}
+    short = {name: curve[:, :300] for name, curve in society(FELL).items()}
     short |= {"return_0": short["collective_return"], "return_1": short["collective_return"] / 2}
 
-    def told(claims_of, recipe, *others, curves=short):
+    def said(claims_of, recipe, *others, curves=short):
         result = a_result(tmp_path, recipe, curves)
         result.measures = SimpleNamespace(training=of_training(curves), trained={}, random={})
         result.of_agents = lambda column: curves["equality"][..., None].repeat(2, -1)
         return {one.claim: one.verdict for one in claims_of(result, *others)}
 
     few = "too few episodes"
-    assert set(told(of_experiment_1, "single_basic").values()) == {few}
-    assert told(of_experiment_2, "single_complex") == {"no dip": few}
-    two = told(of_experiment_3, "two_complex", [])
+    assert set(said(of_experiment_1, "single_basic").values()) == {few}
+    assert said(of_experiment_2, "single_complex") == {"no dip": few}
+    two = said(of_experiment_3, "two_complex", [])
     assert two == {"both earn almost the same": few, "two manage the resource sustainably": few}
-    assert set(told(of_experiment_4, "two_against_random", []).values()) == {few}
-    four = told(of_experiment_5, "commons")
+    assert set(said(of_experiment_4, "two_against_random", []).values()) == {few}
+    four = said(of_experiment_5, "commons")
     assert four["survival falls to 612 steps"] == few
-    longer = {name: own[:, :2000] for name, own in society(FELL).items()}
-    assert told(of_experiment_5, "commons", curves=longer)["survival falls to 612 steps"] != few
-    early = told(of_experiment_1, "single_basic", curves=longer)
+    longer = {name: curve[:, :2000] for name, curve in society(FELL).items()}
+    assert said(of_experiment_5, "commons", curves=longer)["survival falls to 612 steps"] != few
+    early = said(of_experiment_1, "single_basic", curves=longer)
     assert early.pop("then it recovers") == few, "before 6,000 episodes"
     assert few not in early.values()
 
@@ -555,19 +555,19 @@ def runs_like_ours(number, rng, *, spread=1.0, heavy=False):
     noise = np.cumsum(np.pad(rng.normal(size=(number, POINTS + WINDOW - 1)), ((0, 0), (1, 0))), axis=1)
     level = rng.standard_t(3, (number, 1)) if heavy else rng.normal(size=(number, 1))
     drift = np.cumsum(rng.normal(size=(number, POINTS)), axis=1) / np.sqrt(POINTS)
-    own = (noise[:, WINDOW:] - noise[:, :-WINDOW]) / np.sqrt(WINDOW) + spread * (level + drift)
-    return 100 + 60 * np.tanh(np.arange(POINTS) / 80) + 8 * own
+    course = (noise[:, WINDOW:] - noise[:, :-WINDOW]) / np.sqrt(WINDOW) + spread * (level + drift)
+    return 100 + 60 * np.tanh(np.arange(POINTS) / 80) + 8 * course
 
 
-def false_alarms(replicas, runs, *, repetitions=200, **how):
+def false_alarms(replicas, runs, *, repetitions=200, **options):
     """The share of curves drawn as ours are that are contradicted."""
     rng = np.random.default_rng([replicas, runs])
-    found = []
+    alarms = []
     for _ in range(repetitions):
-        drawn = runs_like_ours(replicas + runs, rng, **how)
+        drawn = runs_like_ours(replicas + runs, rng, **options)
         verdict = verdicts.of_curve(drawn[replicas:].mean(0), drawn[:replicas], runs=runs).verdict
-        found.append(verdict == CONTRADICTED)
-    return np.mean(found)
+        alarms.append(verdict == CONTRADICTED)
+    return np.mean(alarms)
 
 
 @pytest.mark.integration
@@ -585,9 +585,9 @@ def test_a_curve_a_fifth_above_ours_with_little_spread_is_contradicted(runs):
     rng = np.random.default_rng(1)
     for _ in range(30):
         drawn = runs_like_ours(8 + runs, rng, spread=0.5)
-        found = verdicts.of_curve(1.25 * drawn[8:].mean(0), drawn[:8], runs=runs)
-        assert found.verdict == CONTRADICTED
-        assert found.deviation > found.limit > found.others[0]
+        judged = verdicts.of_curve(1.25 * drawn[8:].mean(0), drawn[:8], runs=runs)
+        assert judged.verdict == CONTRADICTED
+        assert judged.deviation > judged.limit > judged.others[0]
 
 
 def test_a_curve_that_dips_elsewhere_is_contradicted_if_no_replica_dips_there():
@@ -620,8 +620,8 @@ def test_replicas_that_are_all_equal_are_held_against_the_error_of_reading():
 def test_the_deviation_is_the_distance_in_standard_errors():
     # Two others, 0 and 2: mean 1, variance 2; of one run 2 (1 + 1 / 2) = 3, and the distances are 3 and 0.
     others = np.array([[0.0, 0.0], [2.0, 2.0]])
-    found = verdicts.deviation(np.array([4.0, 1.0]), others, runs=1)
-    assert found == pytest.approx(np.sqrt((9 / 3 + 0) / 2))
+    deviation = verdicts.deviation(np.array([4.0, 1.0]), others, runs=1)
+    assert deviation == pytest.approx(np.sqrt((9 / 3 + 0) / 2))
 
 
 def test_a_number_is_contradicted_outside_the_prediction_interval():
@@ -660,8 +660,8 @@ def replicas(course, *, number=20, noise=25.0, seed=0):
     """Replicas of a course through (episode, level), the same for all metrics, each about a level of its own
     that wanders over 100 episodes, as those of experiment 5 do."""
     rng = np.random.default_rng(seed)
-    own = rng.normal(0, noise, (number, len(EPISODES) + 99))
-    sums = np.cumsum(np.pad(own, ((0, 0), (1, 0))), axis=1)
+    steps = rng.normal(0, noise, (number, len(EPISODES) + 99))
+    sums = np.cumsum(np.pad(steps, ((0, 0), (1, 0))), axis=1)
     wandering = (sums[:, 100:] - sums[:, :-100]) / 10
     level = np.interp(EPISODES, *zip(*course, strict=True))
     return dict.fromkeys(METRICS, level + wandering)
@@ -673,15 +673,15 @@ RECOVERED = [(0, 300), (600, 560), (1500, 340), (2600, 470), (4799, 470)]
 @pytest.mark.parametrize(
     ("course", "changed", "has_tragedy", "has_combat"),
     [
-        (RECOVERED, {"peacefulness": lambda own: np.minimum(own, 520)}, True, True),
+        (RECOVERED, {"peacefulness": lambda metric: np.minimum(metric, 520)}, True, True),
         # A level that only wanders does not recover.
         ([(0, 300), (600, 560), (1500, 340), (4799, 340)], {}, True, False),
         ([(0, 450), (4799, 450)], {}, False, False),
         ([(0, 300), (4799, 560)], {}, False, False),
         # One metric that does not fall is enough.
-        (RECOVERED, {"survival_steps": lambda own: np.full_like(own, 1000.0)}, False, False),
+        (RECOVERED, {"survival_steps": lambda metric: np.full_like(metric, 1000.0)}, False, False),
         # A recovery in more peace than before.
-        (RECOVERED, {"peacefulness": lambda own: own + np.where(EPISODES > 1700, 300, 0)}, True, False),
+        (RECOVERED, {"peacefulness": lambda metric: metric + np.where(EPISODES > 1700, 300, 0)}, True, False),
         # A training that ends with its tragedy.
         ([(0, 560), (4799, 300)], {}, True, False),
     ],
@@ -690,11 +690,11 @@ def test_combat_is_a_fall_that_is_half_made_good_without_peace(course, changed, 
     metrics = replicas(course)
     for name, change in changed.items():
         metrics[name] = change(metrics[name])
-    found = combat(metrics)
-    assert set(found.tragedy) == {has_tragedy}
-    assert set(found.combat) == {has_combat}
+    judged = combat(metrics)
+    assert set(judged.tragedy) == {has_tragedy}
+    assert set(judged.combat) == {has_combat}
     if has_combat:
-        assert np.abs(found.tragedy_at + 150 - 1500).max() < 400
+        assert np.abs(judged.tragedy_at + 150 - 1500).max() < 400
 
 
 def test_a_prediction_interval_is_wider_than_that_of_the_mean_by_the_scatter_of_the_runs():
@@ -756,12 +756,12 @@ def drawn_curve(window, noise, seed, *, wandering):
 @pytest.mark.parametrize("wandering", [0.0, 0.05])
 def test_the_windows_of_made_up_curves_are_found(window, wandering):
     """All of 420: 7 windows, without and with a level that wanders, 3 levels of noise, 10 seeds."""
-    found = [
+    windows = [
         estimate_window(*drawn_curve(window, noise, seed, wandering=wandering)).window_episodes
         for noise in (10, 30, 60)
         for seed in range(10)
     ]
-    assert found == [window] * 30
+    assert windows == [window] * 30
 
 
 def test_the_curves_have_known_points_of_the_figures():
@@ -837,6 +837,6 @@ def test_known_harvests_lie_below_their_bounds():
 @pytest.mark.slow
 @pytest.mark.parametrize("board", presets.BOARDS)
 def test_known_harvests_are_those_that_are_computed(board):
-    found, known = computed(presets.game(board, variant="as_run")), KNOWN[board, "as_run"]
-    assert found.best_known == pytest.approx(known.best_known, abs=0.05)
-    assert found.at_most == pytest.approx(known.at_most, abs=0.05)
+    anew, known = computed(presets.game(board, variant="as_run")), KNOWN[board, "as_run"]
+    assert anew.best_known == pytest.approx(known.best_known, abs=0.05)
+    assert anew.at_most == pytest.approx(known.at_most, abs=0.05)
