@@ -29,6 +29,7 @@ from torchrl.envs.utils import check_env_specs
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.envs import spaces_of
 from cprl.evaluation.evaluate import run_table
+from cprl.evaluation.lanes import Fresh
 from cprl.measuring import EpisodeTracker, social
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.metrics import FIELDS, METRICS, OPTIONAL, available, left_out, reported_by
@@ -311,7 +312,8 @@ def test_the_table_of_an_evaluation_says_what_is_left_out():
 
     class Evaluation:
         run = type("Run", (), {"path": Path("run"), "algorithms": {}, "replicas": [0]})
-        trained, random, seed, greedy = {0: episodes}, {0: episodes}, 1, True
+        trained, random = {0: episodes}, {0: episodes}
+        fresh = Fresh(replicas=(0,), episodes=2, seed=1, greedy=True)
 
         def measures(self, policy):
             return social_measures({0: episodes})
