@@ -42,6 +42,10 @@ _NOTE: Final = (
     "uniform(LOW,HIGH), loguniform(LOW,HIGH) or integers(LOW,HIGH). Every other flag below is the same in "
     "all conditions; --replicas are those of each condition."
 )
+_ABOUT: Final = {
+    "cprl sweep": "Runs a recipe under several conditions.",
+    "cprl search": "Searches for good values of a recipe's experiment by Optuna, point by point.",
+}
 Words = tyro.conf.UseAppendAction[tuple[str, ...]]
 """--vary A --vary B."""
 
@@ -259,8 +263,8 @@ def _read(words: Sequence[str], options: RecipeOptions, program: str) -> "tuple[
     allow += [word.removeprefix("--allow=") for word in words if word.startswith("--allow=")]
     sys.path[:0] = [str(source.resolve().parent)] if source.suffix == ".py" and source.is_file() else []
     sys.path[:0] = [os.getcwd()] if allow else []
-    make, begin = recipe_of(source, allow), f"{program} runs a recipe under several conditions. {_NOTE}"
-    experiment, options = parse_with(make, words[1:], options, program=f"{program} {words[0]}", note=begin)
+    make, note = recipe_of(source, allow), f"{_ABOUT[program]} {_NOTE}"
+    experiment, options = parse_with(make, words[1:], options, program=f"{program} {words[0]}", note=note)
 
     from cprl.custom import trust
 
@@ -280,7 +284,7 @@ def _print_help(options: RecipeOptions, program: str) -> None:
     ) -> None:
         """Never called."""
 
-    about = f"{_NOTE} The flags of a recipe are listed by {program} RECIPE --help."
+    about = f"{_ABOUT[program]} {_NOTE} The flags of a recipe are listed by {program} RECIPE --help."
     tyro.cli(read, args=["--help"], prog=program, description=about, config=_CONFIG)
 
 
