@@ -15,9 +15,9 @@ import cprl
 from cprl import Experiment, presets
 from cprl.algorithms import DQN, PPO, QMIX, DQNSettings, RolloutSettings
 from cprl.commands import main as cli
-from cprl.commands.recipe import RunOptions, applied, docs, flags_of, parse, recipe_main
+from cprl.commands.recipe import RunOptions, parse, recipe_main
 from cprl.custom import Custom, allowing
-from cprl.institutions import GraduatedSanctions, Quota
+from cprl.institutions import Boundaries, GraduatedSanctions, Quota
 from cprl.learners.preferences import Exchange
 from cprl.networks import MLP
 from cprl.population import Learning, Scripted, Team
@@ -143,7 +143,7 @@ def test_to_take_over_a_run_that_is_not_resumed_is_refused(tmp_path):
     with pytest.raises(SystemExit, match=said):
         recipe_main(experiment, ["recipes/mine.py", "--take-over", "--out", str(tmp_path / "new")])
     with pytest.raises(ValueError, match=said):
-        cli.run(tmp_path, take_over=True)
+        cli.run(tmp_path, options=RunOptions(take_over=True))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -163,28 +163,32 @@ def test_an_argument_runs_of_a_recipes_own_is_refused_since_no_line_that_resumes
         read("--runs 3", hides)
 
 
-def test_help_lists_the_recipes_own_arguments_first_and_equal_agents_once(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    with pytest.raises(SystemExit):
-        read("--help")
-    said = capsys.readouterr().out
-    words = " ".join(word for word in said.split() if word != "│")
+def help_of(make, capsys, flag="--help"):
+    with pytest.raises(SystemExit) as ended:
+        read(flag, make)
+    assert ended.value.code == 0
+    return " ".join(word for word in capsys.readouterr().out.split() if word != "│")
+
+
+def test_help_lists_what_people_change_after_the_recipes_own_arguments(capsys):
+    words = help_of(experiment, capsys)
     assert "Two agents that learn alike, one that does otherwise" in words
-    assert (
-        "What is not listed cannot be changed on the command line, but in a copy of the recipe: the" in words
-    )
-    assert (
-        "the kind of an agent (Learning, Team, Scripted, Frozen), of its algorithm (DQN, PPO and so" in words
-    )
-    places = [
-        words.index(f"--{name} ") for name in ("spare", "out", "episodes", "game.map", "agents.0.reward")
-    ]
-    assert places == sorted(places)
+    flags = [word for word in words.split() if word.startswith("--")]
+    first, second = flags.index("--spare"), flags.index("--episodes")
+    assert first < flags.index("--out") < second < flags.index("--game.rules.freeze-steps")
+    assert {"--agents", "--game.map", "--game.institutions", "--seed", "--replicas"} <= set(flags)
+    assert len(flags) < 24
+    assert "--help-all lists all flags" in words
+    assert "a number of its own. (default: 3)" in words
+
+
+def test_all_help_lists_every_number_and_equal_agents_once(capsys):
+    words = help_of(experiment, capsys, "--help-all")
+    assert "What is not listed cannot be changed on the command line" in words
     assert "--agents.1.reward" not in words
     assert "--agents.2.algorithm.clip-epsilon" in words
     assert "--callbacks" not in words
-    assert "a number of its own. (default: 3)" in words
-    assert f"{docs(cprl.Rules)['episode_steps']} (default: 1000)" in words
+    assert "Turns of an episode" in words or "(default: 1000)" in words
 
 
 @pytest.mark.integration
@@ -253,18 +257,74 @@ class Gathering(Dilemma):
 
 def test_a_team_has_flags():
     team = Team(QMIX(settings=DQNSettings()), agents=(0, 2))
-    given = flags_of(team)[1]
-    assert applied(team, given) == team
-    assert applied(team, replace(given, agents=(1, 2))) == replace(team, agents=(1, 2))
-
-
-def test_each_field_is_explained_in_a_sentence():
-    assert docs(Gathering) == {"yield_per_step": "apples"}
-    assert docs(RolloutSettings)["gae_lambda"] == (
-        "Lambda of generalised advantage estimation (Schulman et al. 2016)"
+    three = replace(
+        experiment(),
+        game=replace(experiment().game, map=cprl.maps.parse(">A>A>")),
+        agents=(team, Scripted("greedy")),
     )
-    assert docs(DQNSettings)["epsilon_start"] == "Probability of a random action at the start"
-    assert set(docs(Experiment)) == set(Experiment.__dataclass_fields__)
+    given, _ = read("--agents.0.agents 1 2", lambda: three)
+    assert given.agents == (replace(team, agents=(1, 2)), Scripted("greedy"))
+
+
+GREEDY = (Scripted("greedy"),) * 4
+
+
+def alike(specs=GREEDY, institutions=()):
+    game = presets.game("commons")
+    return Experiment(name="alike", game=replace(game, institutions=institutions), agents=specs, episodes=1)
+
+
+@pytest.mark.parametrize("agents", [2, 4, 7])
+def test_agents_who_are_alike_can_be_any_number(agents):
+    given, _ = read(f"--agents {agents} --agents.1.policy random", alike)
+    assert given.agents == (Scripted("greedy"), Scripted("random"), *[Scripted("greedy")] * (agents - 2))
+    assert given.game.agents == agents
+    starts = presets.game("commons").map.starts
+    assert given.game.map.starts[:4] == starts[:agents]
+    assert not {(row, col) for row, col, _ in given.game.map.starts[4:]} & set(given.game.map.sites)
+
+
+def test_a_team_of_all_agents_grows_too():
+    team = alike((Team(QMIX(settings=DQNSettings()), agents=(0, 1, 2, 3)),))
+    given, _ = read("--agents 3", lambda: team)
+    assert given.agents == (replace(team.agents[0], agents=(0, 1, 2)),)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("--agents 3", "--agents is 3; allowed: where all agents are alike"),
+        ("--agents 0", "agents is 0"),
+        ("--agents 1000", "agents is 1000; allowed: at most"),
+        ("--game.institutions quoter", "--game.institutions is quoter; allowed: .*quota"),
+        ("--game.institutions boundaries", "--game.institutions is boundaries"),
+    ],
+)
+def test_a_shape_that_does_not_fit_is_refused(line, message):
+    make = experiment if line == "--agents 3" else alike
+    with pytest.raises(ValueError, match=message):
+        read(line, make)
+
+
+def test_institutions_are_given_by_their_names_with_flags_of_their_own():
+    line = "--game.institutions quota graduated_sanctions --game.institutions.quota.share 0.25"
+    given, _ = read(f"{line} --game.institutions.1.recovery-steps 7", alike)
+    quota, sanctions = given.game.institutions
+    assert quota == Quota(share=0.25)
+    assert sanctions == replace(GraduatedSanctions(), recovery_steps=7)
+    governed = alike(institutions=(Quota(),))
+    assert read("--game.institutions none", lambda: governed)[0].game.institutions == ()
+    assert read("--game.institutions.quota.share 1", lambda: governed)[0].game.institutions == (
+        Quota(share=1.0),
+    )
+
+
+def test_institutions_are_read_from_a_file(tmp_path):
+    institutions = (Boundaries.strips(height=12, width=24, agents=4), Quota(share=0.5))
+    table = alike(institutions=institutions).to_config()["game"]["institutions"]
+    (tmp_path / "rules.json").write_text(json.dumps(table))
+    given, _ = read(f"--game.institutions {tmp_path}/rules.json --game.institutions.1.fine 2", alike)
+    assert given.game.institutions == (institutions[0], replace(institutions[1], fine=2.0))
 
 
 @pytest.mark.integration
@@ -310,6 +370,9 @@ def test_a_recipe_runs_its_experiment(runs):
 
 def test_cprl_run_trains_the_experiment_of_a_recipe_or_resumes_its_run(runs, tmp_path, monkeypatch):
     run = start_run(tmp_path / "run", "mine", experiment().to_recipe, command=["recipes/mine.py"])
+    monkeypatch.setattr(sys, "argv", ["cprl", "run", str(run)])
+    with pytest.raises(SystemExit, match=r"^cprl: my_game:Callback would be imported.* --allow my_game:Call"):
+        cli.main()
     for words in (
         f"{run}/recipe.json --out elsewhere --watch off --allow my_game:Callback",
         f"{run} --allow my_game:Callback",
@@ -324,9 +387,6 @@ def test_cprl_run_trains_the_experiment_of_a_recipe_or_resumes_its_run(runs, tmp
         (None, False, "file"),
         (run, True, "file"),
     ]
-    monkeypatch.setattr(sys, "argv", ["cprl", "run", str(run)])
-    with pytest.raises(SystemExit, match=r"^cprl: my_game:Callback would be imported.* --allow my_game:Call"):
-        cli.main()
 
 
 @pytest.mark.parametrize("name", RECIPES)

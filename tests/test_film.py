@@ -16,8 +16,8 @@ from cprl.commands import main as cli
 from cprl.commons.colours import APPLE, GROUND, PALETTE, agent_colour
 from cprl.commons.picture import EMPTY_SITE_COLOUR
 from cprl.evaluation import film_pictures
+from cprl.evaluation.film import Style, film, film_video, fresh_episode
 from cprl.evaluation.film import _titles as titles_of
-from cprl.evaluation.film import film, film_video, fresh_episode
 from cprl.evaluation.film_pictures import EpisodePicture, nice
 from cprl.institutions import Monitoring, Quota
 from cprl.population import Scripted
@@ -90,7 +90,7 @@ def apples_in(picture):
 
 
 def test_a_gif_shows_the_board_die_and_ends_with_a_card_of_two_seconds(runs, tmp_path, drawn):
-    path, (played,) = film_video(runs / "greedy", tmp_path / "film.gif", width=300, fps=10)
+    path, (played,) = film_video(runs / "greedy", tmp_path / "film.gif", style=Style(width=300, fps=10))
     assert (played.steps, played.harvest.tolist(), played.stock_left) == (3, [2, 3], 0)
     pictures, durations = frames_of(path)
     assert [apples_in(picture) for picture in pictures[:-1]] == LEFT
@@ -104,13 +104,13 @@ def test_a_gif_shows_the_board_die_and_ends_with_a_card_of_two_seconds(runs, tmp
 
 
 def test_a_film_of_a_board_that_lives_says_what_is_left(runs, tmp_path, drawn):
-    _, (played,) = film_video(runs / "meadow", tmp_path / "film.gif", width=240)
+    _, (played,) = film_video(runs / "meadow", tmp_path / "film.gif", style=Style(width=240))
     apples = int(played.harvest.sum())
     assert drawn[-1][2:] == ("", f"{played.stock_left} of 4 apples left · {apples} apple{'s'[: apples != 1]}")
 
 
 def test_sites_without_an_apple_are_dim_squares(runs, tmp_path):
-    path, _ = film_video(runs / "greedy", tmp_path / "film.gif", width=300)
+    path, _ = film_video(runs / "greedy", tmp_path / "film.gif", style=Style(width=300))
     dead = sites_in(frames_of(path)[0][3])
     under_agents = [(0, 3), (2, 1)]
     empty = [dead[place] for place, site in enumerate(CORRIDORS.map.sites) if site not in under_agents]
@@ -119,7 +119,9 @@ def test_sites_without_an_apple_are_dim_squares(runs, tmp_path):
 
 
 def test_populations_play_side_by_side_on_one_clock(runs, tmp_path):
-    path, played = film_video(runs / "greedy", tmp_path / "both.gif", beside=[runs / "random"], width=480)
+    path, played = film_video(
+        runs / "greedy", tmp_path / "both.gif", beside=[runs / "random"], style=Style(width=480)
+    )
     assert [episode.steps for episode in played] == [3, 9]
     both, durations = frames_of(path)
     assert len(both) == 1 + 9 + 1
@@ -128,13 +130,13 @@ def test_populations_play_side_by_side_on_one_clock(runs, tmp_path):
     assert [apples_in(picture) for picture in left] == [*LEFT, *[0] * 6, 0]
     assert (left[3:-1] == left[3]).all(), "the dead board waits"
     assert all((now != before).any() for before, now in pairwise(right)), "the other plays"
-    _, alone = film_video(runs / "random", tmp_path / "alone.gif", width=240)
+    _, alone = film_video(runs / "random", tmp_path / "alone.gif", style=Style(width=240))
     assert alone[0].harvest.tolist() == played[1].harvest.tolist(), "as it plays alone"
 
 
 def test_boards_agents_and_clocks_may_differ_side_by_side(runs, tmp_path):
     path, played = film_video(
-        runs / "greedy", tmp_path / "film.mp4", beside=(runs / "meadow",), width=500, fps=5
+        runs / "greedy", tmp_path / "film.mp4", beside=(runs / "meadow",), style=Style(width=500, fps=5)
     )
     assert [(episode.steps, len(episode.harvest)) for episode in played] == [(3, 2), (12, 3)]
     high = EpisodePicture(MEADOW.map, steps=12, width=250).size[1]
@@ -159,21 +161,27 @@ def test_titles_are_what_tells_runs_apart(runs, tmp_path):
 
 def test_titles_of_your_own_stand_above_the_boards(runs, tmp_path, drawn):
     own = ["Été", "quotas, 50 %"]
-    film_video(runs / "greedy", tmp_path / "a.gif", beside=[runs / "greedy"], titles=own, width=480)
+    film_video(
+        runs / "greedy", tmp_path / "a.gif", beside=[runs / "greedy"], style=Style(titles=own, width=480)
+    )
     assert [title for _, title, _, _ in drawn[-2:]] == own
 
 
 def test_every_nth_turn_is_shown_and_always_the_last(runs, tmp_path):
-    path, _ = film_video(runs / "greedy", tmp_path / "own.gif", every=2, width=300)
+    path, _ = film_video(runs / "greedy", tmp_path / "own.gif", style=Style(every=2, width=300))
     assert [apples_in(picture) for picture in frames_of(path)[0][:-1]] == [LEFT[0], LEFT[2], LEFT[3]]
 
 
 def test_the_film_is_the_episode_that_the_recording_has(runs, tmp_path):
     _, recorded = film(runs / "random", tmp_path / "own.rrd", episode=3)
-    _, (filmed,) = film_video(runs / "random", tmp_path / "own.gif", episode=3, every=9, width=240)
+    _, (filmed,) = film_video(
+        runs / "random", tmp_path / "own.gif", episode=3, style=Style(every=9, width=240)
+    )
     assert filmed.harvest.tolist() == recorded.harvest.tolist()
     assert filmed.metrics == pytest.approx(recorded.metrics, nan_ok=True)
-    _, (other,) = film_video(runs / "random", tmp_path / "other.gif", episode=4, every=9, width=240)
+    _, (other,) = film_video(
+        runs / "random", tmp_path / "other.gif", episode=4, style=Style(every=9, width=240)
+    )
     assert other.metrics["sustainability"] != recorded.metrics["sustainability"]
 
 
@@ -208,7 +216,7 @@ def pictures_of(path, wide, high):
 
 
 def test_an_mp4_has_a_picture_for_each_turn_and_holds_the_card(runs, tmp_path):
-    path, _ = film_video(runs / "greedy", tmp_path / "own.mp4", width=240, fps=5)
+    path, _ = film_video(runs / "greedy", tmp_path / "own.mp4", style=Style(width=240, fps=5))
     pictures = pictures_of(path, *EpisodePicture(CORRIDORS.map, steps=9, width=240).size)
     assert len(pictures) == len(LEFT) + 2 * 5, "two seconds"
     greens = [(np.abs(picture.astype(int) - PALETTE[APPLE]) < 30).all(-1).sum() for picture in pictures]
@@ -234,7 +242,7 @@ def test_a_film_that_is_interrupted_leaves_no_file(runs, tmp_path, monkeypatch, 
 
     monkeypatch.setattr(EpisodePicture, "draw", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        film_video(runs / "random", tmp_path / name, width=240)
+        film_video(runs / "random", tmp_path / name, style=Style(width=240))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -19,7 +19,7 @@ import cprl
 from cprl import CommonsEnv, Custom, Experiment, Game, Rules, maps
 from cprl.evaluation import evaluate_run
 from cprl.evaluation.evaluate import run_table
-from cprl.evaluation.film import film, film_video
+from cprl.evaluation.film import Style, film, film_video
 from cprl.evaluation.film_pictures import EpisodePicture
 from cprl.institutions import Boundaries, GraduatedSanctions, Monitoring, Sanctioner, Tax, Vote
 from cprl.measuring.metrics import reported_by
@@ -209,7 +209,7 @@ def test_a_mark_is_a_diamond_around_the_agent(tmp_path):
 
 
 def test_a_film_marks_who_broke_a_rule_since_its_last_picture(whole, tmp_path):
-    path, (episode,) = film_video(whole, tmp_path / "film.gif", width=400, every=1, allow=ALLOW)
+    path, (episode,) = film_video(whole, tmp_path / "film.gif", allow=ALLOW, style=Style(width=400, every=1))
     assert episode.violations.sum() > 0
     pictures, _ = frames_of(path)
     picture = EpisodePicture(GAME.map, steps=30, width=400)

@@ -26,7 +26,7 @@ TAKES_SECONDS = ("torch", "numba", "pyarrow", "scipy", "matplotlib", "rerun")
 """Packages whose import takes the longest."""
 NEED_NOTHING = (
     *(["--version"], ["recipe"], ["evalute"], ["run", "comons"], ["evaluate", "none", "--episods", "3"]),
-    *(["evaluate", "none"], ["--help"]),
+    *(["evaluate", "none"], ["--help"], ["run", "commons", "--epsiodes", "3"], ["film", "--help"]),
 )
 """Command lines of which every answer is known before any run is read."""
 ALL_THAT_NEED_NOTHING = (
@@ -120,11 +120,10 @@ def test_help_and_mistakes_are_answered_before_what_takes_seconds_is_imported(li
     )
 
 
-def test_importing_cprl_is_enough_for_gymnasium_to_know_its_boards():
+@pytest.mark.parametrize("names", ["cprl, gymnasium", "gymnasium, cprl"])
+def test_importing_cprl_is_enough_for_gymnasium_to_know_its_boards(names):
     run_alone(
-        "import cprl, gymnasium, sys\n"
-        "gymnasium.spec('cprl/SingleBasic-v0')\n"
-        "assert 'torch' not in sys.modules"
+        f"import {names}, sys\ngymnasium.spec('cprl/SingleBasic-v0')\nassert 'torch' not in sys.modules"
     )
 
 

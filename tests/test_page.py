@@ -100,7 +100,7 @@ def test_without_a_display_or_on_request_a_run_is_served_until_it_is_interrupted
             logger.at(step=episode, episode=episode)
             logger.log_document("header", text)
     (tmp_path / "film.rrd").write_bytes(b"half a recording")
-    monkeypatch.setattr(cli, "has_display", lambda: serve)
+    monkeypatch.setattr(page, "has_display", lambda: serve)
     told = []
 
     def interrupted(seconds):

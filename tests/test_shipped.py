@@ -11,6 +11,7 @@ import pytest
 
 import cprl
 from cprl.commands import main as cli
+from cprl.commands.recipe import refuse_mistyped_flags
 from cprl.runs.recipe import resume_command, start_run
 from cprl.system import shipped
 from cprl.system.shipped import (
@@ -70,7 +71,9 @@ def test_a_recipe_is_printed_as_it_is(monkeypatch, capsys):
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("name", [name for name, own in shipped_recipes().items() if own.imports])
+@pytest.mark.parametrize(
+    "name", [name for name, shared in shipped_recipes().items() if "import_from" in shared.text()]
+)
 def test_a_printed_recipe_that_imports_others_finds_them_anywhere(name, elsewhere, monkeypatch):
     monkeypatch.setattr(sys, "path", ["before", str(elsewhere), *sys.path])
     script = ModuleType("__main__")
@@ -186,7 +189,7 @@ def test_a_file_or_a_run_of_that_name_comes_first_but_not_the_folder_of_a_study(
     [
         (
             "run comons --replicas 2",
-            "'comons' is no file, no directory of a run and no recipe of cprl; .* commons, ",
+            "'comons' is no file, .* .did you mean 'commons'.*allowed: .* mixed, ",
         ),
         ("run --episodes 2 commons", r"stands first, its flags behind it: cprl run commons \[FLAGS\]"),
         ("run study/base", "study/base runs nothing: other recipes import it; cprl recipe study/base"),
@@ -200,6 +203,26 @@ def test_what_cannot_be_run_is_refused_in_a_sentence(line, message, elsewhere, m
     with pytest.raises(SystemExit, match=message):
         call(monkeypatch, line)
     assert {path.name for path in elsewhere.iterdir()} == {"mine.py"}
+
+
+@pytest.mark.parametrize("line", ["--epsiodes 3", "--epsiodes=3", "--no-bean", "--callback a:B"])
+def test_a_mistyped_flag_is_refused_before_the_recipe_is_imported(line, monkeypatch, capsys):
+    monkeypatch.setattr(cli, "run_shipped", None)
+    with pytest.raises(SystemExit) as refused:
+        call(monkeypatch, f"run two_complex {line}")
+    assert refused.value.code == 2
+    assert f"there is no flag {line.partition('=')[0].split()[0]}" in capsys.readouterr().err
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", ["commons", "mixed", "two_complex", "study/theory/sharing"])
+def test_no_flag_that_a_recipe_has_is_taken_for_a_mistake(name, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        call(monkeypatch, f"run {name} --help-all")
+    flags = {word.strip(",") for word in capsys.readouterr().out.split() if word.startswith("--")}
+    assert {"--episodes", "--out", "--resume", "--no-resume"} < flags
+    refuse_mistyped_flags(recipe_named(name), sorted(flags))
 
 
 def test_what_shipped_recipes_are_asked_for_in_python_is_checked():

@@ -242,7 +242,7 @@ def test_a_search_says_its_best_points(capsys):
 
 
 @pytest.mark.parametrize("command", [sweep_words, search_words])
-@pytest.mark.parametrize("words", ["", "--help", "mine.py --help"])
+@pytest.mark.parametrize("words", ["", "--help", "mine.py --help-all"])
 def test_help_says_how_values_are_written_and_what_a_command_line_cannot_change(command, words, capsys):
     with pytest.raises(SystemExit) as ended:
         command(shlex.split(words))

@@ -36,7 +36,7 @@ REFERENCE: Final = {
     "viewer": "recordings for the Rerun viewer",
     "evaluation": "stored agents in fresh worlds and among each other",
     "studies": "one experiment under many conditions",
-    "config": "values as JSON tables, and back",
+    "values": "frozen values, whose annotations say what a field allows, as JSON tables and back",
 }
 """A page each, in reading order, and what it is about."""
 

@@ -32,10 +32,10 @@ from possible import shares_of
 from results import PooledResult, Result, pooled, read_result, table, told
 from tragedies import combat_section
 
-from cprl.arguments import SEED
 from cprl.commands.play_stored import check_runs
 from cprl.commands.recipe import Allow, in_a_sentence, make_importable
 from cprl.runs.files import write_atomically
+from cprl.system.defaults import SEED
 from cprl.system.output import say
 from cprl.system.process import prepare_process
 from cprl.system.shipped import is_cprl

@@ -30,10 +30,9 @@ A package imports only from those above it:
 """
 
 from importlib import import_module
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
-import gymnasium
+from cprl.system.libraries import when_imported
 
 if TYPE_CHECKING:
     from cprl import (
@@ -135,6 +134,8 @@ which `cprl --help` and mistyped commands need not wait for."""
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
+        from importlib.metadata import version
+
         return version("cprl")
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -150,7 +151,9 @@ def __dir__() -> list[str]:
 
 
 def _register() -> None:
-    """Registers the boards for one agent with `gymnasium.make`, which imports them when it makes one."""
+    """Register the boards for one agent with `gymnasium.make`, which imports them when it makes one."""
+    import gymnasium
+
     gymnasium.register("cprl/Commons-v0", entry_point="cprl.envs.gymnasium_env:CommonsGymnasiumEnv")
     for name, board in (("SingleBasic", "single_basic"), ("SingleComplex", "single_complex")):
         gymnasium.register(
@@ -158,4 +161,4 @@ def _register() -> None:
         )
 
 
-_register()
+when_imported("gymnasium", _register)

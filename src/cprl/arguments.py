@@ -1,12 +1,11 @@
 """Checks of single arguments, with the messages of `cprl.checks`: "x is ...; allowed: ...".
 
-Each raises a ValueError for what does not fit; none rounds. The defaults are those that functions and the
-command line share, which answers without importing the functions.
+Each raises a ValueError for what does not fit; none rounds.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from operator import index
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,26 +13,6 @@ from numpy.typing import NDArray
 from cprl.checks import is_number, plain, shown
 
 HIGHEST_SEED: Final = 2**64 - 1
-
-SEED: Final = 30_011
-"""The default seed of fresh worlds; no training of ours uses it, nor the next ones."""
-FILM_SEED: Final = 20_011
-"""The default seed of filmed episodes."""
-FILM_SUFFIXES: Final = (".gif", ".mp4")
-"""Of the names of films."""
-PLAY_SEED: Final = 40_011
-"""The default seed where a person plays."""
-BLOCK: Final = 8
-"""Replicas that one run trains side by side, if a study does not say."""
-LAST: Final = 30
-"""Episodes at the end of a training that are compared, unless something else is asked for."""
-WINDOW: Final = 10
-"""Episodes of a window of a study's table, unless something else is asked for."""
-EGTA_RESAMPLES: Final = 200
-"""Resamples of the replicas for intervals of an empirical game."""
-
-Diagonal = Literal["self", "cross_seed"]
-"""Whom a run's agents meet in the cross-play with their own run."""
 
 
 def refusal(name: str, value: object, allowed: str) -> ValueError:

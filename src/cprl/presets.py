@@ -8,12 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
-from cprl.commons import maps
-from cprl.commons.game import Game
-from cprl.commons.rules import Rules
 from cprl.values import checked, refusal
 
 if TYPE_CHECKING:
+    from cprl.commons.game import Game
     from cprl.envs.gymnasium_env import CommonsGymnasiumEnv
     from cprl.learners.settings import DQNSettings
 
@@ -65,8 +63,12 @@ def check_board(board: str) -> None:
         raise refusal("board", board, f"{', '.join(BOARDS)}, a run's directory, or a file with a drawing")
 
 
-def game(board: Board, *, variant: Variant = "published") -> Game:
+def game(board: Board, *, variant: Variant = "published") -> "Game":
     """A published board with its rules, in one of `VARIANTS`."""
+    from cprl.commons import maps
+    from cprl.commons.game import Game
+    from cprl.commons.rules import Rules
+
     _check(board, variant)
     quirks = {} if variant == "published" else _AS_RUN
     return Game(map=maps.named(board), rules=Rules(**quirks, **_BOARD_RULES[board, variant]))
@@ -106,6 +108,8 @@ def dqn_settings(board: Board, *, variant: Variant = "published") -> "DQNSetting
 
 def variant_of(played: object) -> Variant | None:
     """The variant of a published game, whether agents may fire or not; None for any other game."""
+    from cprl.commons.game import Game
+
     if not isinstance(played, Game) or played.institutions:
         return None
     for board, variant in GAMES:

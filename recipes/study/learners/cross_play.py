@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 import cprl
-from cprl.commands.play_stored import check_files
+from cprl.commands.play_stored import Files
 from cprl.commands.recipe import in_a_sentence
 from cprl.evaluation import draw_gains
 from cprl.runs.episodes import write_table
@@ -28,7 +28,7 @@ def main(
     """
     study, out = cprl.studies.read_study(comparison), out or comparison
     table, figure = out / "cross_play.parquet", out / "cross_play.png"
-    check_files(table, figure)
+    Files(out=table, figure=figure).check()
     out.mkdir(parents=True, exist_ok=True)
     trained = {own.condition.name: (runs or comparison / "runs") / own.name for own in trials_of(study)}
     played = cprl.crossplay(trained, episodes=episodes)

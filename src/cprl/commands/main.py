@@ -1,56 +1,105 @@
-"""The command `cprl`: what can be done with runs that are there. `cprl --version` prints its version."""
+"""The command `cprl`: what can be done with recipes and with runs that are there."""
 
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import replace
-from importlib.metadata import version
+from importlib import import_module
+from inspect import getdoc
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final
+from typing import Annotated, Any, Final
 
 import tyro
 
-from cprl.arguments import PLAY_SEED
-from cprl.commands.play_stored import (
-    check_runs,
-    crossplay,
-    egta,
-    evaluate,
-    exploit,
-    film,
-    scenarios,
-    schelling,
-    visits,
+from cprl.commands.recipe import (
+    RunOptions,
+    ended_by_sigterm,
+    in_a_sentence,
+    make_importable,
+    refuse_mistyped_flags,
+    refuse_to_take_over,
+    run_with,
 )
-from cprl.commands.recipe import TAKES_NOTHING_OVER, Allow, ended_by_sigterm, in_a_sentence, make_importable
-from cprl.commands.recipes import recipe as print_recipe
-from cprl.commands.recipes import refuse_unknown, run_by_name
-from cprl.commands.studies import runs_table, search, sweep
-from cprl.presets import Variant, check_board
-from cprl.runs.recipe import read_recipe, started_by
-from cprl.system.output import printed, say
-from cprl.system.process import obey_parent, prepare_process
-from cprl.viewer.page import Page, has_display, headers_of
+from cprl.system.output import OUT, printed, say
+from cprl.system.process import obey_parent
+from cprl.system.shipped import PROGRAM, is_shipped, recipe_named, recipe_names, run_shipped, shipped_recipes
+from cprl.values import meant
 
-# Commands import what they need once their words are checked: torch takes seconds, which a mistake need not.
+COMMANDS: Final[Mapping[str, str]] = {
+    "run": "main:run",
+    "recipe": "main:recipe",
+    "watch": "main:watch",
+    "film": "play_stored:film",
+    "play": "play_stored:play",
+    "export": "main:export",
+    "evaluate": "play_stored:evaluate",
+    "visits": "play_stored:visits",
+    "crossplay": "play_stored:crossplay",
+    "schelling": "play_stored:schelling",
+    "egta": "play_stored:egta",
+    "scenarios": "play_stored:scenarios",
+    "exploit": "play_stored:exploit",
+    "sweep": "studies:sweep",
+    "search": "studies:search",
+    "table": "studies:runs_table",
+}
+"""The functions of the commands, each in a module of this package, in the order in which `cprl --help` lists
+them. A command imports what it needs once its words are checked: torch takes seconds, which a mistake need
+not."""
+
+_OPTIONS: Final = RunOptions()
+
+
+def main() -> None:
+    """Carry out the command line; what cannot be done is said in a line, and ends with exit code 1."""
+    words = sys.argv[1:]
+    if words == ["--version"]:
+        from importlib.metadata import version
+
+        say(f"cprl {version('cprl')}")
+    elif not words or words[0] in ("-h", "--help"):
+        _print_help()
+        sys.exit(0)
+    elif words[0] not in COMMANDS:
+        hint = meant(words[0], COMMANDS)
+        print(
+            f"cprl: there is no command {words[0]!r}{hint}; allowed: {', '.join(COMMANDS)}", file=sys.stderr
+        )
+        sys.exit(2)
+    elif words[0] in ("sweep", "search"):  # whose flags are those of a recipe
+        with in_a_sentence(f"cprl {words[0]}"):
+            _function(words[0])(words[1:])
+    elif words[0] != "run" or not _is_run_by_name(words[1:]):
+        with in_a_sentence("cprl"), ended_by_sigterm():
+            function = _function(words[0])
+            config = (tyro.conf.HelptextFromCommentsOff,)
+            tyro.cli(function, args=words[1:], prog=f"cprl {words[0]}", config=config)
+
+
+def _function(command: str) -> Callable[..., Any]:
+    module, _, name = COMMANDS[command].partition(":")
+    function: Callable[..., Any] = getattr(import_module(f"cprl.commands.{module}"), name)
+    return function
+
+
+def _print_help() -> None:
+    """List the commands with the first sentence of what each does."""
+    abouts = {name: (getdoc(_function(name)) or "").partition("\n\n")[0] for name in COMMANDS}
+    lines = ["usage: cprl [-h] [--version] COMMAND ...", "", __doc__, ""]
+    lines += [f"  {name:<10}  {' '.join(about.split())}" for name, about in abouts.items()]
+    say("\n".join([*lines, "", "cprl COMMAND --help lists the flags of a command."]))
 
 
 def run(
     recipe: Path,
     /,
     *,
-    out: Path | None = None,
-    resume: bool = False,
+    options: Annotated[RunOptions, tyro.conf.arg(name="")] = _OPTIONS,
     episodes: int | None = None,
-    take_over: bool = False,
-    keep_checkpoint: bool = True,
-    watch: str = "file",
-    linger: bool = False,
-    allow: Allow = (),
     trial: Path | None = None,
 ) -> None:
     """Trains the experiment of a recipe or of a run anew, or resumes a run that was stopped.
@@ -60,103 +109,81 @@ def run(
 
     Args:
         recipe: a recipe.json, or the directory of a run.
-        out: the new run's directory; by default a new one under runs/, and with --resume the run itself.
-        resume: resume the run, bit for bit as if it had not been stopped.
+        options: --out is with --resume the run itself.
         episodes: instead of those of the recipe; with --resume more of them extend the run.
-        take_over: resume a run that a process on another host has locked.
-        keep_checkpoint: keep the state of the training of a finished run, so that it can be extended.
-        watch: "file", or live as well: "serve", "spawn"; "off" for no recording.
-        linger: keep the recording served after the run, until Ctrl-C; with --watch serve or spawn.
-        allow: code of your own, module:Class, that the recipe may import; may be repeated.
         trial: the file in which the run says every second how far it is, where a study started it: it draws
             no figure and ends with the process that has its standard input.
     """
     if trial is not None:
         obey_parent()
-    refuse_unknown(recipe)
-    if take_over and not resume:
-        raise ValueError(TAKES_NOTHING_OVER)
-    make_importable(allow)
-    directory, kept = recipe if recipe.is_dir() else recipe.parent, read_recipe(recipe)
+    _refuse_unknown(recipe)
+    refuse_to_take_over(options)
+    make_importable(options.allow)
+    from cprl.runs.recipe import read_recipe
+
+    directory, table = recipe if recipe.is_dir() else recipe.parent, read_recipe(recipe)
 
     from cprl.experiment import Experiment
-    from cprl.training.running import run as run_experiment
 
-    experiment = Experiment.from_recipe(kept, allow=allow, directory=directory)
-    if resume and out is None:
-        out = directory
+    experiment = Experiment.from_recipe(table, allow=options.allow, directory=directory)
+    if options.resume and options.out is None:
+        options = replace(options, out=directory)
     if episodes is not None:
         experiment = replace(experiment, episodes=episodes)
-    with ExitStack() as stack:
-        callbacks: tuple[object, ...] = ()
-        if trial is None:
-            stack.enter_context(started_by(sys.argv))
-        else:
-            from cprl.studies.status import process_of_trial
+    if trial is None:
+        say(run_with(experiment, options, command=sys.argv))
+        return
+    from cprl.studies.status import process_of_trial
+    from cprl.training.running import run as run_experiment
 
-            callbacks = (stack.enter_context(process_of_trial(trial, experiment)),)
-        done = run_experiment(
-            experiment,
-            out,
-            resume=resume,
-            take_over=take_over,
-            keep_checkpoint=keep_checkpoint,
-            watch=watch,
-            linger=linger,
-            allow=allow,
-            callbacks=callbacks,
-            figures=trial is None,
-        )
-    say(done)
+    with process_of_trial(trial, experiment) as callback:
+        say(run_experiment(experiment, **vars(options), callbacks=(callback,), figures=False))
 
 
-def play(
-    board: str,
-    /,
-    *,
-    agent: int = 0,
-    others: str | None = None,
-    replica: int = 0,
-    variant: Variant = "published",
-    steps: int | None = None,
-    seed: int = PLAY_SEED,
-    decision: int | None = None,
-    allow: Allow = (),
-) -> None:
-    """Lets you play in the terminal among trained or scripted agents, and measures the episode.
+def _is_run_by_name(words: Sequence[str]) -> bool:
+    """Run the recipe that words name, with its own flags, if they name one; refuse what is nothing at all."""
+    if not words or words[0].startswith("-"):
+        return False
+    name = words[0]
+    with in_a_sentence(f"{PROGRAM}{name}"):
+        if not is_shipped(name):
+            _refuse_unknown(Path(name))
+            return False
+        refuse_mistyped_flags(recipe_named(name), words[1:])
+        run_shipped(name, words[1:])
+    return True
+
+
+def _refuse_unknown(path: Path) -> None:
+    """Refuse what is no file or directory and so was meant as the name of a recipe, and a Python file."""
+    if path.suffix == ".py" and path.is_file():
+        line = printed(["python", str(path)])
+        raise ValueError(f"{path} is a recipe of your own, which Python runs: {line}")
+    if path.exists():
+        return
+    name = path.as_posix()
+    if name in shipped_recipes():
+        raise ValueError(f"the name of a recipe stands first, its flags behind it: {PROGRAM}{name} [FLAGS]")
+    raise ValueError(
+        f"{name!r} is no file, no directory of a run and no recipe of cprl{meant(name, shipped_recipes())}; "
+        f"allowed: those that are there, and the recipes {recipe_names()}"
+    )
+
+
+def recipe(name: str | None = None, /) -> None:
+    """Lists the recipes that come with cprl, or prints one to be copied: cprl recipe commons > mine.py.
 
     Args:
-        board: commons, two_complex, single_complex or single_basic; or the directory of a run, whose game it
-            is then; or a file with a drawing.
-        agent: yours.
-        others: the directory of a run, whose agents play, or random, greedy, sustainable, territorial,
-            aggressive or pacifist; by default the agents of the run that is the board, else greedy.
-        replica: of the run whose agents play.
-        variant: of the boards with a name: published, as_run or, of two_complex, as_run_10_april; see
-            docs/game.md.
-        steps: turns of the episode at most; by default those of the game.
-        seed: of all chance; the same seed and the same keys play the same again.
-        decision: what you vote for in a game with votes or elections, by its number; by default chance votes.
-        allow: code of your own, module:Class, that a run may import; see docs/experiments.md.
+        name: of the recipe that is printed.
     """
-    make_importable(allow)
-    check_board(board)
-
-    from cprl.evaluation.play import open_session, play_in_terminal
-
-    prepare_process(seed)
-    session = open_session(
-        board,
-        agent=agent,
-        others=others,
-        replica=replica,
-        variant=variant,
-        steps=steps,
-        seed=seed,
-        decision=decision,
-        allow=allow,
-    )
-    play_in_terminal(session)
+    if name is not None:
+        OUT.write(recipe_named(name).text())
+        OUT.flush()
+        return
+    recipes = [recipe for recipe in shipped_recipes().values() if recipe.runs]
+    width = max(len(recipe.name) for recipe in recipes)
+    for recipe in recipes:
+        say(f"{recipe.name:<{width}}  {recipe.about}")
 
 
 def watch(run: Path, /, *, serve: bool = False) -> None:
@@ -171,12 +198,11 @@ def watch(run: Path, /, *, serve: bool = False) -> None:
     files = [run] if run.is_file() else sorted(run.glob("*.rrd"))
     if not files:
         raise ValueError(f"{run} holds no recording (*.rrd); recipes write one unless watch is off")
+    from cprl.viewer.page import has_display, to_watch
+
     if serve or not has_display():
         _serve(files, why="" if serve else "There is no display: ")
         return
-
-    from cprl.viewer.page import to_watch
-
     command = to_watch(*files)
     if sys.platform == "win32":  # where execvp ends this process at once, and quotes nothing
         sys.exit(subprocess.call(command))
@@ -184,8 +210,8 @@ def watch(run: Path, /, *, serve: bool = False) -> None:
 
 
 def _serve(files: Sequence[Path], *, why: str) -> None:
-    """Serves recordings and the web viewer until Ctrl-C."""
-    from cprl.viewer.page import viewer
+    """Serve recordings and the web viewer until Ctrl-C."""
+    from cprl.viewer.page import Page, headers_of, viewer
 
     with TemporaryDirectory() as folder, suppress(KeyboardInterrupt):
         page = Page([*headers_of(files, Path(folder)), *files])
@@ -204,44 +230,9 @@ def export(run: Path, folder: Path, /, *, weights: bool = True) -> None:
         weights: also the trained weights. Without them a report tells of the training alone, and nothing can
             play the agents.
     """
-    check_runs(run)
+    from cprl.runs.recipe import read_recipe
 
+    read_recipe(run)
     from cprl.runs.export import export_results
 
     say(export_results(run, folder, weights=weights))
-
-
-COMMANDS: Final[Mapping[str, Callable[..., None]]] = {
-    "run": run,
-    "recipe": print_recipe,
-    "watch": watch,
-    "film": film,
-    "play": play,
-    "export": export,
-    "evaluate": evaluate,
-    "visits": visits,
-    "crossplay": crossplay,
-    "schelling": schelling,
-    "egta": egta,
-    "scenarios": scenarios,
-    "exploit": exploit,
-    "sweep": sweep,
-    "search": search,
-    "table": runs_table,
-}
-"""The subcommands, in the order in which `cprl --help` lists them."""
-
-
-def main() -> None:
-    """The command line; what cannot be done is said in a line, and ends with exit code 1."""
-    if sys.argv[1:] == ["--version"]:
-        say(f"cprl {version('cprl')}")
-        return
-    if sys.argv[1:2] in (["sweep"], ["search"]):
-        with in_a_sentence(f"cprl {sys.argv[1]}"):
-            {"sweep": sweep, "search": search}[sys.argv[1]](sys.argv[2:])
-        return
-    if run_by_name():
-        return
-    with in_a_sentence("cprl"), ended_by_sigterm():
-        tyro.extras.subcommand_cli_from_dict(dict(COMMANDS), description=__doc__)

@@ -1,34 +1,31 @@
 """What plays stored agents, none of which learns, in fresh worlds: `cprl film`, `evaluate`, `egta` ..."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import tyro
-from rich.table import Table
 
-from cprl.arguments import EGTA_RESAMPLES, FILM_SEED, FILM_SUFFIXES, SEED, Diagonal
 from cprl.commands.recipe import Allow, make_importable
-from cprl.commands.studies import StudyOptions, carry_out, executor_of
 from cprl.presets import Variant, check_board
-from cprl.runs.files import refuse_to_write_over
-from cprl.runs.recipe import read_recipe
+from cprl.system.defaults import EGTA_RESAMPLES, FILM_SEED, FILM_SUFFIXES, PLAY_SEED, SEED, Diagonal
 from cprl.system.output import OUT, console, printed, say
 from cprl.system.process import prepare_process
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    from rich.table import Table
 
 Policy = Literal["trained", "random"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fresh:
-    """How stored agents play fresh worlds."""
+    """Which fresh worlds are played, and how."""
 
-    episodes: int
+    episodes: int = 20
     """Of each replica, in each choice of who plays where."""
     greedy: bool = False
     """Whether stored agents play what they hold best, without exploring or drawing."""
@@ -40,33 +37,90 @@ class Fresh:
     """Code of your own, module:Class, that a run may import; see docs/experiments.md."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Files:
+    """Which files are written; none is written over."""
+
+    out: Path | None = None
+    """A parquet file to be, with every episode."""
+    figure: Path | None = None
+    """A PNG to be, see docs/evaluation.md."""
+
+    def check(self) -> None:
+        """Refuse what is there already before hours of work."""
+        if self.out is not None:
+            from cprl.runs.files import refuse_to_write_over
+
+            refuse_to_write_over(self.out)
+        if self.figure is not None:
+            from cprl.terminal.style import check_picture
+
+            check_picture(self.figure, "--figure")
+
+    def keep(self, table: "Callable[[], pa.Table]") -> None:
+        """Write the episodes."""
+        if self.out is not None:
+            from cprl.runs.episodes import write_table
+
+            write_table(self.out, table())
+
+    def tell(self, draw: Callable[[Path], Path] | None = None) -> None:
+        """Say where the episodes are, and draw the figure."""
+        if self.out is not None:
+            say(f"Episodes: {self.out}")
+        if self.figure is not None and draw is not None:
+            say(f"Figure: {draw(self.figure)}")
+
+
 FreshFlags = Annotated[Fresh, tyro.conf.arg(name="")]
+FileFlags = Annotated[Files, tyro.conf.arg(name="")]
 _TWENTY: Final = Fresh(episodes=20)
 _FIVE: Final = Fresh(episodes=5)
+_NO_FILES: Final = Files()
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmOptions:
+    """How a .gif or .mp4 shows an episode, see `cprl.evaluation.film.Style`."""
+
+    beside: tuple[Path, ...] = ()
+    """Of a .gif or .mp4: more runs, whose agents play beside them on one clock."""
+    titles: tuple[str, ...] = ()
+    """Of a .gif or .mp4: one for the run and one for each beside it; by default their institutions, or the
+    names of their experiments."""
+    every: int | None = None
+    """Of a .gif or .mp4: turns from one picture to the next; by default 1 for an .mp4, and for a .gif as many
+    as it takes for 300 pictures."""
+    fps: float | None = None
+    """Of a .gif or .mp4: pictures per second, at most 50; by default 15."""
+    width: int | None = None
+    """Of a .gif or .mp4, in pixels, at most 1920 and at least 240 for each run; by default 640 for each that
+    has room."""
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """The options that differ from the defaults."""
+        return {name: value for name, value in vars(self).items() if value not in (None, ())}
+
+
+_AS_USUAL: Final = FilmOptions()
 
 
 def film(
     run: Path,
     /,
     *,
-    beside: tuple[Path, ...] = (),
-    titles: tuple[str, ...] = (),
     replica: int = 0,
     episode: int = 0,
     seed: int = FILM_SEED,
     out: Path | None = None,
-    every: int | None = None,
-    fps: float | None = None,
-    width: int | None = None,
+    options: Annotated[FilmOptions, tyro.conf.arg(name="")] = _AS_USUAL,
     allow: Allow = (),
 ) -> None:
     """Lets the agents of a run play a fresh episode, recorded for the Rerun viewer or as a film.
 
     Args:
         run: the run's directory, or its results.
-        beside: of a .gif or .mp4: more runs, whose agents play beside them on one clock.
-        titles: of a .gif or .mp4: one for the run and one for each beside it; by default their institutions,
-            or the names of their experiments.
         replica: whose agents.
         episode: which of the fresh episodes; the same number plays the same again.
         seed: of the worlds and all chance. With the seed of cprl evaluate, 30011 by default, the world of its
@@ -75,38 +129,79 @@ def film(
         out: what is written: a recording for the viewer (.rrd), or a film of the board, the stock and the
             harvests (.gif, or .mp4, which wants the extra "film"); by default film-<replica>-<episode>.rrd in
             the run's directory.
-        every: of a .gif or .mp4: turns from one picture to the next; by default 1 for an .mp4, and for a .gif
-            as many as it takes for 300 pictures.
-        fps: of a .gif or .mp4: pictures per second, at most 50; by default 15.
-        width: of a .gif or .mp4, in pixels, at most 1920 and at least 240 for each run; by default 640 for
-            each that has room.
         allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
-    flags: dict[str, Any] = {"beside": beside, "titles": titles, "every": every, "fps": fps, "width": width}
-    given = {name: value for name, value in flags.items() if value not in (None, ())}
     if out is not None and out.suffix not in (".rrd", *FILM_SUFFIXES):
         raise ValueError(f"--out is {out}; allowed: a name that ends in .rrd, {', '.join(FILM_SUFFIXES)}")
     is_video = out is not None and out.suffix in FILM_SUFFIXES
-    if given and not is_video:
-        raise ValueError(f"--{next(iter(given))} is for films; allowed: with --out FILE.gif or FILE.mp4")
-    make_importable(allow)
-    check_runs(run, *beside)
+    if options.given and not is_video:
+        name = next(iter(options.given))
+        raise ValueError(f"--{name} is for films; allowed: with --out FILE.gif or FILE.mp4")
+    _begin(allow, run, *options.beside, seed=seed)
 
+    from cprl.evaluation.film import Style, film_video
     from cprl.evaluation.film import film as film_run
-    from cprl.evaluation.film import film_video
     from cprl.viewer.page import to_watch
 
-    prepare_process(seed)
     which: dict[str, Any] = {"replica": replica, "episode": episode, "seed": seed, "allow": allow}
-    if out is not None and is_video:
-        path, episodes = film_video(run, out, **which, **given)
-        for name, played in zip((run, *beside), episodes, strict=True):
-            say(f"{f'{name}: ' if beside else ''}{played.steps} steps, {played.outcome}")
-        say(f"{path}: {path.stat().st_size / 1000:.0f} kB")
-    else:
+    if out is None or not is_video:
         path, played = film_run(run, out, **which)
         say(f"{played.steps} steps, {played.outcome}")
         say(f"Watch: {printed(to_watch(path))}")
+        return
+    style = {name: value for name, value in options.given.items() if name != "beside"}
+    path, episodes = film_video(run, out, beside=options.beside, style=Style(**style), **which)
+    for name, played in zip((run, *options.beside), episodes, strict=True):
+        say(f"{f'{name}: ' if options.beside else ''}{played.steps} steps, {played.outcome}")
+    say(f"{path}: {path.stat().st_size / 1000:.0f} kB")
+
+
+def play(
+    board: str,
+    /,
+    *,
+    agent: int = 0,
+    others: str | None = None,
+    replica: int = 0,
+    variant: Variant = "published",
+    steps: int | None = None,
+    seed: int = PLAY_SEED,
+    decision: int | None = None,
+    allow: Allow = (),
+) -> None:
+    """Lets you play in the terminal among trained or scripted agents, and measures the episode.
+
+    Args:
+        board: commons, two_complex, single_complex or single_basic; or the directory of a run, whose game it
+            is then; or a file with a drawing.
+        agent: yours.
+        others: the directory of a run, whose agents play, or random, greedy, sustainable, territorial,
+            aggressive or pacifist; by default the agents of the run that is the board, else greedy.
+        replica: of the run whose agents play.
+        variant: of the boards with a name: published, as_run or, of two_complex, as_run_10_april; see
+            docs/game.md.
+        steps: turns of the episode at most; by default those of the game.
+        seed: of all chance; the same seed and the same keys play the same again.
+        decision: what you vote for in a game with votes or elections, by its number; by default chance votes.
+        allow: code of your own, module:Class, that a run may import; see docs/experiments.md.
+    """
+    check_board(board)
+    _begin(allow, seed=seed)
+
+    from cprl.evaluation.play import open_session, play_in_terminal
+
+    session = open_session(
+        board,
+        agent=agent,
+        others=others,
+        replica=replica,
+        variant=variant,
+        steps=steps,
+        seed=seed,
+        decision=decision,
+        allow=allow,
+    )
+    play_in_terminal(session)
 
 
 def evaluate(run: Path, /, *, fresh: FreshFlags = _TWENTY, out: Path | None = None) -> None:
@@ -116,18 +211,16 @@ def evaluate(run: Path, /, *, fresh: FreshFlags = _TWENTY, out: Path | None = No
         run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
         out: a parquet file to be, with every episode.
     """
-    make_importable(fresh.allow)
-    check_files(out)
-    check_runs(run)
+    files = Files(out=out)
+    _begin_fresh(fresh, files, run)
 
     from cprl.evaluation.evaluate import evaluate_run, run_table
 
-    prepare_process(fresh.seed)
     evaluation = evaluate_run(run, **vars(fresh))
-    _keep(evaluation.table, out)
-    print_tables(run_table(evaluation))
+    files.keep(evaluation.table)
+    print_tables([run_table(evaluation)])
     say(f"Weights: {evaluation.run.weights_from}")
-    tell_files(out)
+    files.tell()
 
 
 def visits(
@@ -140,20 +233,18 @@ def visits(
         figure: a PNG to be: a map for each agent of where it spends its time, in the first of the replicas.
         random: draw random agents in the same worlds instead.
     """
-    make_importable(fresh.allow)
     if random and figure is None:
         raise ValueError("--random says who is drawn; allowed: with --figure FILE.png")
-    check_files(figure=figure)
-    check_runs(run)
+    files = Files(figure=figure)
+    _begin_fresh(fresh, files, run)
 
     from cprl.evaluation.territory import draw_visits, territory_of, territory_table
 
-    prepare_process(fresh.seed)
-    found = territory_of(run, **vars(fresh))
-    print_tables(territory_table(found))
-    say(f"Weights: {found.run.weights_from}")
+    territory = territory_of(run, **vars(fresh))
+    print_tables([territory_table(territory)])
+    say(f"Weights: {territory.run.weights_from}")
     policy: Policy = "random" if random else "trained"
-    tell_files(None, figure, lambda path: draw_visits(found, path, policy=policy))
+    files.tell(lambda path: draw_visits(territory, path, policy=policy))
 
 
 def crossplay(
@@ -162,29 +253,27 @@ def crossplay(
     *,
     fresh: FreshFlags = _TWENTY,
     diagonal: Diagonal = "self",
-    out: Path | None = None,
-    figure: Path | None = None,
+    files: FileFlags = _NO_FILES,
 ) -> None:
     """Lets agents of each run play among those of each other run, and prints how all fare.
+
+    The figure shows what focal agents gain, and what it costs the background agents.
 
     Args:
         runs: directories of runs of the same game, or their results; NAME=PATH gives one another name.
         diagonal: whom a run's agents meet there: "self", those they were trained with, or "cross_seed", those
             of the run's next replica.
-        out: a parquet file to be, with every episode.
-        figure: a PNG to be: what focal agents gain, and what it costs the background agents.
     """
-    named = _named_runs(runs, fresh, out, figure)
+    named = _begin_named(fresh, files, runs)
 
     from cprl.evaluation.cross_play import agents_table, draw_gains, gains_tables, heading, matrices
     from cprl.evaluation.cross_play import crossplay as play_each_other
 
-    prepare_process(fresh.seed)
     played = play_each_other(named, diagonal=diagonal, **vars(fresh))
-    _keep(played.table, out)
+    files.keep(played.table)
     say(heading(played))
-    print_tables(*matrices(played), *gains_tables(played), agents_table(played))
-    tell_files(out, figure, lambda path: draw_gains(played, path))
+    print_tables([*matrices(played), *gains_tables(played), agents_table(played)])
+    files.tell(lambda path: draw_gains(played, path))
 
 
 def schelling(
@@ -197,11 +286,12 @@ def schelling(
     episodes: int = 5,
     replicas: int = 8,
     seed: int = SEED,
-    out: Path | None = None,
-    figure: Path | None = None,
+    files: FileFlags = _NO_FILES,
     allow: Allow = (),
 ) -> None:
     """Lets restrained and greedy agents play in all mixes, and prints which social dilemma they are in.
+
+    The figure is the Schelling diagram.
 
     Args:
         board: commons, two_complex, single_complex or single_basic; or the directory of a run, whose game it
@@ -214,21 +304,18 @@ def schelling(
         episodes: of each replica and choice of restrained agents; with N agents these are N (N - 1) + 2.
         replicas: of runs, their replicas from 0 on; of scripted agents, independent groups of episodes.
         seed: of the worlds and all chance; the same one gives the same numbers.
-        out: a parquet file to be, with every episode.
-        figure: a PNG to be: the Schelling diagram.
         allow: code of your own, module:Class, that a run may import; see docs/experiments.md.
     """
-    make_importable(allow)
-    check_files(out, figure)
+    files.check()
     check_board(board)
+    _begin(allow, seed=seed)
 
     from cprl.evaluation.populations import board_named
     from cprl.evaluation.schelling import draw_schelling, schelling_tables
     from cprl.evaluation.schelling import schelling as play_all_mixes
 
-    prepare_process(seed)
     game, run = board_named(board, variant, allow=allow)
-    found = play_all_mixes(
+    diagram = play_all_mixes(
         game if run is None else run,
         restrained=restrained,
         greedy=greedy,
@@ -237,9 +324,9 @@ def schelling(
         seed=seed,
         allow=allow,
     )
-    _keep(found.table, out)
-    print_tables(*schelling_tables(found))
-    tell_files(out, figure, lambda path: draw_schelling(found, path))
+    files.keep(diagram.table)
+    print_tables(schelling_tables(diagram))
+    files.tell(lambda path: draw_schelling(diagram, path))
 
 
 def egta(
@@ -249,21 +336,20 @@ def egta(
     fresh: FreshFlags = _FIVE,
     pairwise: bool = False,
     resamples: int = EGTA_RESAMPLES,
-    out: Path | None = None,
-    figure: Path | None = None,
+    files: FileFlags = _NO_FILES,
 ) -> None:
     """Lets agents of runs play in all compositions, and prints which runs last: equilibria, alpha-rank,
     replicator dynamics (extra "theory").
+
+    The figure shows the dynamics, and the shares by alpha-rank.
 
     Args:
         runs: directories of runs of the same game, or their results; NAME=PATH gives one another name.
         pairwise: play one agent of each run among those of each other, as `cprl crossplay` does: cheaper,
             and a reduction where there are more than two agents.
         resamples: of the replicas, for intervals.
-        out: a parquet file to be, with every episode.
-        figure: a PNG to be: the dynamics, and the shares by alpha-rank.
     """
-    named = _named_runs(runs, fresh, out, figure)
+    named = _begin_named(fresh, files, runs)
 
     from cprl.evaluation.cross_play import crossplay
     from cprl.evaluation.egta import analyse, draw_egta, egta_heading, egta_tables
@@ -271,14 +357,16 @@ def egta(
     from cprl.theory.solutions import check_extras
 
     check_extras()
-    prepare_process(fresh.seed)
-    how = vars(fresh)
-    game = pairwise_game(crossplay(named, **how)) if pairwise else play_empirical_game(named, **how)
-    _keep(lambda: game.episodes_table, out)
-    found = analyse(game, resamples=resamples)
+    game = (
+        pairwise_game(crossplay(named, **vars(fresh)))
+        if pairwise
+        else play_empirical_game(named, **vars(fresh))
+    )
+    files.keep(lambda: game.episodes_table)
+    analysis = analyse(game, resamples=resamples)
     say(egta_heading(game))
-    print_tables(*egta_tables(found))
-    tell_files(out, figure, lambda path: draw_egta(found, path))
+    print_tables(egta_tables(analysis))
+    files.tell(lambda path: draw_egta(analysis, path))
 
 
 def scenarios(
@@ -287,49 +375,65 @@ def scenarios(
     *,
     scenarios: tuple[str, ...] = (),
     fresh: FreshFlags = _FIVE,
-    out: Path | None = None,
-    figure: Path | None = None,
+    files: FileFlags = _NO_FILES,
 ) -> None:
     """Lets a run's agents play among agents that they never met, and prints how they fare beside random and
     greedy agents in their places.
 
+    The figure shows the returns in each scenario.
+
     Args:
         run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
         scenarios: their names, e.g. minority_among_greedy; by default all of the run's game.
-        out: a parquet file to be, with every episode.
-        figure: a PNG to be: the returns in each scenario.
     """
-    make_importable(fresh.allow)
-    check_files(out, figure)
-    check_runs(run)
+    _begin_fresh(fresh, files, run)
 
     from cprl.evaluation.scenarios import draw_scenarios, heading, run_scenarios, scenario_tables
 
-    prepare_process(fresh.seed)
     scores = run_scenarios(run, scenarios=scenarios, **vars(fresh))
-    _keep(scores.table, out)
+    files.keep(scores.table)
     say(heading(scores))
-    print_tables(*scenario_tables(scores))
+    print_tables(scenario_tables(scores))
     say(f"Weights: {scores.run.weights_from}")
-    tell_files(out, figure, lambda path: draw_scenarios(scores, path))
+    files.tell(lambda path: draw_scenarios(scores, path))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Responses:
+    """Which best responses are trained, and how they are measured."""
+
+    agents: tuple[int, ...] = (0,)
+    """Indices of the agents that are replaced, one at a time; each costs as many trainings."""
+    algorithms: tuple[str, ...] = ()
+    """What responses learn by: own, the algorithm of the replaced agent, DQN, PPO; by default own and PPO, or
+    DQN if that is PPO; see docs/exploitability.md."""
+    seeds: int = 3
+    """Trainings by each algorithm."""
+    training_episodes: int | None = None
+    """Of each; by default a quarter of those of the run."""
+    replicas: int | None = None
+    """How many of the run's replicas are responded to, the first ones; by default all."""
+    episodes: int = 20
+    """Fresh episodes of each replica to choose a response by, and as many to tell its gain by."""
+    seed: int = SEED
+    """Of the worlds of the latter; the former have the next one."""
+    device: str = "cpu"
+    """Where responses learn, e.g. cpu or cuda:0."""
+    allow: Allow = ()
+    """Code of your own, module:Class, that the run may import; see docs/experiments.md."""
+
+
+_RESPONSES: Final = Responses()
 
 
 def exploit(
     run: Path,
     /,
     *,
-    agents: tuple[int, ...] = (0,),
-    algorithms: tuple[str, ...] = (),
-    seeds: int = 3,
-    training_episodes: int | None = None,
-    replicas: int | None = None,
-    episodes: int = 20,
-    seed: int = SEED,
-    device: str = "cpu",
+    responses: Annotated[Responses, tyro.conf.arg(name="")] = _RESPONSES,
     out: Path | None = None,
     jobs: int | None = None,
     dry_run: bool = False,
-    allow: Allow = (),
 ) -> None:
     """Trains best responses to the agents of a run, and prints what they gain: how exploitable the run is.
 
@@ -337,112 +441,68 @@ def exploit(
 
     Args:
         run: the directory of a run that has ended, or its results.
-        agents: indices of the agents that are replaced, one at a time; each costs as many trainings.
-        algorithms: what responses learn by: own, the algorithm of the replaced agent, DQN, PPO; by default
-            own and PPO, or DQN if that is PPO; see docs/exploitability.md.
-        seeds: trainings by each algorithm.
-        training_episodes: of each; by default a quarter of those of the run.
-        replicas: how many of the run's replicas are responded to, the first ones; by default all.
-        episodes: fresh episodes of each replica to choose a response by, and as many to tell its gain by.
-        seed: of the worlds of the latter; the former have the next one.
-        device: where responses learn, e.g. cpu or cuda:0.
         out: the directory of trainings and results; by default exploit/NAME.
         jobs: processes that train at the same time, one for each place and algorithm.
         dry_run: list all trainings and their states; run and write nothing.
-        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
-    make_importable(allow)
-    check_runs(run)
+    allow = tuple(responses.allow)
+    _begin(allow, run, seed=responses.seed)
 
+    from cprl.commands.studies import StudyOptions, carry_out, executor_of
     from cprl.evaluation.exploit import TABLE, measure, plan_responses
     from cprl.evaluation.responses import exploitability_tables
     from cprl.studies.study import directory_of
 
-    prepare_process(seed)
-    plan = plan_responses(
-        run,
-        agents=agents,
-        algorithms=algorithms,
-        seeds=seeds,
-        training_episodes=training_episodes,
-        replicas=replicas,
-        episodes=episodes,
-        seed=seed,
-        device=device,
-        allow=allow,
-    )
+    plan = plan_responses(run, **vars(responses))
     folder = directory_of(plan.study, plan.out if out is None else out)
-    options = StudyOptions(out=folder, jobs=jobs, dry_run=dry_run, figures=False, allow=tuple(allow))
+    options = StudyOptions(out=folder, jobs=jobs, dry_run=dry_run, figures=False, allow=allow)
     executor_of(options)
     if not dry_run:
         plan.claim(folder)
     carry_out(plan.study, options, ["cprl", *sys.argv[1:]])
     if dry_run:
         return
-    print_tables(*exploitability_tables(measure(plan, folder)))
+    print_tables(exploitability_tables(measure(plan, folder)))
     say(f"Episodes: {folder / TABLE}")
 
 
-def _named_runs(
-    runs: Sequence[str], fresh: Fresh, out: Path | None, figure: Path | None
-) -> list[str] | dict[str, str]:
-    """The runs that words name, once they and the files to be are checked."""
-    make_importable(fresh.allow)
-    check_files(out, figure)
-    named = runs_by_name(runs)
-    check_runs(*(named.values() if isinstance(named, dict) else named))
+def _begin(allow: tuple[str, ...], *runs: Path | str, seed: int) -> None:
+    """Check that runs are there, before what plays their agents is imported; prepare the process."""
+    make_importable(allow)
+    check_runs(*runs)
+    prepare_process(seed)
+
+
+def _begin_fresh(fresh: Fresh, files: Files, *runs: Path | str) -> None:
+    files.check()
+    _begin(fresh.allow, *runs, seed=fresh.seed)
+
+
+def _begin_named(fresh: Fresh, files: Files, words: Sequence[str]) -> list[str] | dict[str, str]:
+    """Begin, and return the runs that words name."""
+    named = runs_by_name(words)
+    _begin_fresh(fresh, files, *(named.values() if isinstance(named, dict) else named))
     return named
 
 
-def _keep(table: "Callable[[], pa.Table]", out: Path | None) -> None:
-    """Writes a table of episodes where `--out` says so."""
-    if out is not None:
-        from cprl.runs.episodes import write_table
-
-        write_table(out, table())
-
-
-def check_files(out: Path | None = None, figure: Path | None = None) -> None:
-    """Checks what `--out` and `--figure` name before hours of work.
-
-    Raises:
-        FileExistsError: if a file exists.
-    """
-    if out is not None:
-        refuse_to_write_over(out)
-    if figure is not None:
-        from cprl.terminal.style import check_picture
-
-        check_picture(figure, "--figure")
-
-
 def check_runs(*runs: Path | str) -> None:
-    """Checks that runs are there, before what plays their agents is imported, which takes seconds."""
+    """Refuse what is no directory of a run."""
+    from cprl.runs.recipe import read_recipe
+
     for run in runs:
         read_recipe(Path(run))
 
 
-def tell_files(
-    out: Path | None, figure: Path | None = None, draw: Callable[[Path], Path] | None = None
-) -> None:
-    """Says where the episodes are, and draws the figure."""
-    if out is not None:
-        say(f"Episodes: {out}")
-    if figure is not None and draw is not None:
-        say(f"Figure: {draw(figure)}")
-
-
 def runs_by_name(words: Sequence[str]) -> list[str] | dict[str, str]:
-    """Runs as `crossplay` takes them: paths, or a table where one has a name, NAME=PATH."""
+    """Return runs as `crossplay` takes them: paths, or a table where one has a name, NAME=PATH."""
     pairs = []
     for word in words:
         name, equals, path = word.partition("=")
-        is_named = (
-            equals and name and "/" not in name and not Path(word).exists()
-        )  # a path may have "=" itself
+        # A path may have "=" itself.
+        is_named = equals and name and "/" not in name and not Path(word).exists()
         pairs.append((name, path) if is_named else ("", word))
     if not any(name for name, _ in pairs):
-        return [path for _, path in pairs]
+        return list(words)
     named = [(name or Path(path).resolve().name, path) for name, path in pairs]
     names = [name for name, _ in named]
     for name in names:
@@ -451,8 +511,8 @@ def runs_by_name(words: Sequence[str]) -> list[str] | dict[str, str]:
     return dict(named)
 
 
-def print_tables(*tables: Table) -> None:
-    """Prints tables; into a file or pipe as wide as they are."""
-    shown = console(width=None if OUT.isatty() else 250)
+def print_tables(tables: "Iterable[Table]") -> None:
+    """Print tables; into a file or pipe as wide as they are."""
+    terminal = console(width=None if OUT.isatty() else 250)
     for table in tables:
-        shown.print(table)
+        terminal.print(table)

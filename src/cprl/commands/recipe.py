@@ -7,38 +7,24 @@ Its own arguments stand first; every number of the experiment can be changed by 
 import ast
 import inspect
 import os
-import re
 import signal
 import sys
-import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
+from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from threading import current_thread, main_thread
-from types import FrameType, NoneType, UnionType
-from typing import (
-    TYPE_CHECKING,
-    Annotated,
-    Any,
-    Final,
-    Literal,
-    TypeVar,
-    Union,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 import tyro
 
-from cprl.checks import checked, instance
-from cprl.commons import maps
-from cprl.commons.maps import Map
-from cprl.custom import Custom
-from cprl.runs.recipe import started_by
+from cprl.commands.flags import RefusedError, Shape, ValueFlags, in_shape, numbered, shape_of
+from cprl.custom import trust
 from cprl.system.output import RESUMES, say
-from cprl.system.shipped import program_of
+from cprl.system.shipped import Recipe, program_of
+from cprl.values import meant, refusal
 
 if TYPE_CHECKING:
     from cprl.experiment import Experiment
@@ -47,15 +33,23 @@ OptionsT = TypeVar("OptionsT")
 Allow = tyro.conf.UseAppendAction[tuple[str, ...]]
 """--allow A --allow B."""
 
-TAKES_NOTHING_OVER: Final = "--take-over is for runs that are there; allowed: with --resume"
-
+_LISTED: Final = (
+    *("out", "resume", "watch", "episodes", "replicas", "seed", "map", "agents", "institutions"),
+    *("game.rules.episode_steps", "game.rules.freeze_steps"),
+    *("agents.0.policy", "agents.0.algorithm.settings.learning_rate", "agents.0.algorithm.settings.gamma"),
+)
+"""The flags that people change, which `--help` lists."""
+_SHORT_NOTE: Final = "--help-all lists all flags: every number of the experiment can be changed by its place."
 _NOTE: Final = (
     "Every value of the experiment below can be changed by its place. Agents that equal one before are not "
     "listed; they have the same arguments by their own number. What is not listed cannot be changed on the "
     "command line, but in a copy of the recipe: the kind of an agent (Learning, Team, Scripted, Frozen), of "
-    "its algorithm (DQN, PPO and so on), of its network and of what it wants; institutions that are not "
-    "there, transforms, callbacks, drawn boards."
+    "its algorithm (DQN, PPO and so on), of its network and of what it wants; transforms, callbacks, drawn "
+    "boards."
 )
+_HELP: Final = {"-h", "--help", "--help-all", "--help_all"}
+_CONFIG: Final = (tyro.conf.HelptextFromCommentsOff,)
+_LONGEST: Final = 1500
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,8 +69,8 @@ class RunOptions:
     """"file", or live as well: "serve", "spawn"; "off" for no recording."""
     linger: bool = False
     """Keep the recording served after the run is finished, until Ctrl-C; with watch "serve" or "spawn"."""
-    allow: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """A class of somebody's own that a frozen agent's run may import, "module:Class"; may be repeated."""
+    allow: Allow = ()
+    """Code of your own, "module:Class", that a stored run or a recipe.json may import; may be repeated."""
 
 
 def recipe_main(
@@ -85,7 +79,7 @@ def recipe_main(
     *,
     at_end: Callable[[Path], object] | None = None,
 ) -> Path:
-    """Runs the experiment of a recipe as the command line asks for it.
+    """Run the experiment of a recipe as the command line asks for it.
 
     Args:
         make_experiment: gives the experiment; its arguments become flags, so each has a type and a default,
@@ -97,20 +91,14 @@ def recipe_main(
         The run's directory.
 
     Raises:
-        ValueError: where `argv` is no list of texts.
         SystemExit: where the command line or an experiment is refused, with the reason; with code 130 or 143
             where SIGINT (Ctrl-C) or SIGTERM interrupted the run.
     """
     command = list(sys.argv if argv is None else argv)
     with in_a_sentence(program_of(command[0])):
         experiment, options = parse(make_experiment, command)
-        if options.take_over and not options.resume:
-            raise ValueError(TAKES_NOTHING_OVER)
-    from cprl.training.running import run
-
-    callbacks = [] if at_end is None else [_AtEnd(at_end)]
-    with in_a_sentence(program_of(command[0])), started_by(command):
-        return run(experiment, callbacks=callbacks, **vars(options))
+        callbacks = [] if at_end is None else [_AtEnd(at_end)]
+        return run_with(experiment, options, command=command, callbacks=callbacks)
 
 
 @dataclass(frozen=True)
@@ -118,6 +106,28 @@ class _AtEnd:
     """A callback that calls a function with the directory of a run that has finished."""
 
     on_finished: Callable[[Path], object]
+
+
+def run_with(
+    experiment: "Experiment",
+    options: RunOptions,
+    *,
+    command: Sequence[str],
+    callbacks: Sequence[object] = (),
+) -> Path:
+    """Run an experiment with the options of a command line."""
+    refuse_to_take_over(options)
+    from cprl.runs.recipe import started_by
+    from cprl.training.running import run
+
+    with started_by(command):
+        return run(experiment, callbacks=callbacks, **vars(options))
+
+
+def refuse_to_take_over(options: RunOptions) -> None:
+    """Refuse to take over a run that is not resumed."""
+    if options.take_over and not options.resume:
+        raise ValueError("--take-over is for runs that are there; allowed: with --resume")
 
 
 @contextmanager
@@ -171,12 +181,12 @@ def _shortened(text: str) -> str:
 def parse(
     make_experiment: "Callable[..., Experiment]", command: Sequence[str]
 ) -> "tuple[Experiment, RunOptions]":
-    """The experiment that a command line, script first, asks for, and how it is to be run.
+    """Return the experiment that a command line, script first, asks for, and how it is to be run.
 
     Raises:
         SystemExit: for `--help`, and for an argument that is unknown or of another type.
     """
-    return parse_with(make_experiment, command[1:], _OPTIONS, program=program_of(command[0]))
+    return parse_with(make_experiment, command[1:], RunOptions(), program=program_of(command[0]))
 
 
 def parse_with(
@@ -198,43 +208,54 @@ def parse_with(
     """
     from cprl.experiment import Experiment
 
-    given = list(words)
-    _check_names(make_experiment, options)
-    made, _ = tyro.cli(
-        make_experiment, args=given, prog=program, return_unknown_args=True, add_help=False, config=_CONFIG
+    _refuse_names(make_experiment, {*Experiment.__dataclass_fields__, *vars(options)})
+    is_help, is_short = bool(_HELP & {*words}), bool({"-h", "--help"} & {*words})
+    given = [word for word in words if word not in _HELP]
+
+    unshaped = Shape()
+
+    def first(
+        made: Annotated[Any, tyro.conf.arg(name="", constructor=make_experiment)],
+        shape: Annotated[Shape, tyro.conf.arg(name="")] = unshaped,
+    ) -> tuple[Any, Shape]:
+        return made, shape
+
+    (made, shape), _ = tyro.cli(
+        first, args=given, prog=program, return_unknown_args=True, add_help=False, config=_CONFIG
     )
-    checked("what the recipe makes", made, instance(Experiment, "an Experiment"))
-    kind, default = flags_of(made, all_agents=not {"-h", "--help"} & set(given))
-    options_kind: Any = type(options)
+    if not isinstance(made, Experiment):
+        raise refusal("what the recipe makes", made, "an Experiment")
+    start = in_shape(made, shape)
+    shaped = shape_of(start)
 
     def read(
-        own: Annotated[Any, tyro.conf.arg(name="", constructor=make_experiment)],
-        options: Annotated[options_kind, tyro.conf.arg(name="")] = options,
-        experiment: Annotated[kind, tyro.conf.arg(name="")] = default,  # type: ignore[valid-type]
-    ) -> tuple[Any, Any]:
+        made: Annotated[Any, tyro.conf.arg(name="", constructor=make_experiment)],
+        options: Annotated[Any, tyro.conf.arg(name="")] = options,
+        shape: Annotated[Shape, tyro.conf.arg(name="")] = shaped,
+        experiment: Annotated[Experiment, tyro.conf.arg(name="")] = start,
+    ) -> tuple[Experiment, Any]:
         return experiment, options
 
-    flags, read_options = tyro.cli(
-        read, args=given, prog=program, description=_description(make_experiment, note), config=_CONFIG
-    )
-    experiment: Experiment = applied(made, flags)
-    return experiment, read_options
+    notes = [_about(make_experiment), note, _SHORT_NOTE if is_short else _NOTE]
+    listed = _LISTED if isinstance(options, RunOptions) else (*_LISTED, *vars(options))
+    flags = ValueFlags(listed if is_short else None, is_help=is_help)
+    try:
+        return tyro.cli(
+            read,
+            args=[*numbered(given, start), *(["--help"] if is_help else [])],
+            prog=program,
+            description="\n\n".join(filter(None, notes)),
+            config=_CONFIG,
+            registry=flags,
+        )
+    except RefusedError as error:
+        raise ValueError(str(error)) from error.__cause__
 
 
-_LONGEST: Final = 1500
-_OPTIONS: Final = RunOptions()
-_CONFIG: Final = (tyro.conf.HelptextFromCommentsOff,)
-
-
-def _check_names(make_experiment: "Callable[..., Experiment]", options: Any) -> None:
-    from cprl.experiment import Experiment
-
-    taken = {
-        *Experiment.__dataclass_fields__,
-        *RunOptions.__dataclass_fields__,
-        *options.__dataclass_fields__,
-        "runs",  # the directory of a study's runs, which no recipe.json and no line that resumes keeps
-    }
+def _refuse_names(make_experiment: "Callable[..., Experiment]", taken: set[str]) -> None:
+    """Refuse a recipe with an argument of the name of a flag that every experiment has."""
+    # "runs" is the directory of a study's runs, which no recipe.json and no line that resumes keeps.
+    taken = {*taken, *RunOptions.__dataclass_fields__, "runs"}
     for name in inspect.signature(make_experiment).parameters:
         if name in taken:
             raise ValueError(
@@ -243,146 +264,53 @@ def _check_names(make_experiment: "Callable[..., Experiment]", options: Any) -> 
             )
 
 
-def _description(make_experiment: "Callable[..., Experiment]", note: str) -> str:
-    text = (inspect.getdoc(make_experiment) or "").partition("\nArgs:")[0].strip()
-    return "\n\n".join(filter(None, [text, note, " ".join(_NOTE.split())]))
+def _about(make_experiment: "Callable[..., Experiment]") -> str:
+    return (inspect.getdoc(make_experiment) or "").partition("\nArgs:")[0].strip()
+
+
+def refuse_mistyped_flags(recipe: Recipe, words: Sequence[str]) -> None:
+    """End the process with exit code 2 where the name of a flag is mistyped, before torch is imported.
+
+    Names with dots are places in the experiment, which needs torch: `parse` refuses those.
+    """
+    names = _names_of(recipe)
+    if names is None:
+        return
+    for word in words:
+        name = word.partition("=")[0].replace("_", "-")
+        if name.startswith("--") and "." not in name and name not in names:
+            print(
+                f"cprl run {recipe.name}: there is no flag {name}{meant(name, sorted(names))}; "
+                f"cprl run {recipe.name} --help-all lists all",
+                file=sys.stderr,
+            )
+            sys.exit(2)
+
+
+def _names_of(recipe: Recipe) -> set[str] | None:
+    """Return the flags of a recipe whose names have no dot; None of one that does not end with recipe_main.
+
+    They are read from the text of the recipe and of `Experiment`: importing them imports torch.
+    """
+    tree = ast.parse(recipe.path.read_text(encoding="utf-8"))
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and node.args]
+    makers = [ast.unparse(call.args[0]) for call in calls if ast.unparse(call.func).endswith("recipe_main")]
+    functions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+    experiment = find_spec("cprl.experiment")
+    if not makers or makers[0] not in functions or experiment is None or experiment.origin is None:
+        return None
+    arguments = functions[makers[0]].args
+    names = {argument.arg for argument in (*arguments.args, *arguments.kwonlyargs)}
+    for node in ast.parse(Path(experiment.origin).read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ClassDef) and node.name == "Experiment":
+            names |= {ast.unparse(line.target) for line in node.body if isinstance(line, ast.AnnAssign)}
+    names |= {*RunOptions.__dataclass_fields__, "agents"}
+    flags = {f"--{name.replace('_', '-')}" for name in names}
+    return {*flags, *(f"--no-{flag.removeprefix('--')}" for flag in flags), *_HELP}
 
 
 def make_importable(allow: tuple[str, ...]) -> None:
-    """Lets modules in the working directory be imported, as they are for a recipe that stands there."""
+    """Trust code of the user's own, and let modules in the working directory be imported."""
     if allow:
+        trust(*allow)
         sys.path.insert(0, os.getcwd())
-
-
-_DRAWN: Final = "as drawn"
-_BOARD: Final = "A board by its name; where agents start and apples grow."
-_SCALARS: Final = (bool, int, float, str, NoneType)
-
-
-def flags_type(name: str, of_fields: list[tuple[str, Any, Any]]) -> type[Any]:
-    """A dataclass of fields, each with its type and default."""
-    return make_dataclass(
-        name,
-        [(own, hint, field(default=default)) for own, hint, default in of_fields],
-        frozen=True,
-        kw_only=True,
-    )
-
-
-def flags_of(value: Any, *, all_agents: bool = True) -> tuple[Any, Any]:
-    """The type of a dataclass of the flags of a dataclass, and its default, which says the same.
-
-    Args:
-        all_agents: whether values of a tuple that equal one before have flags; for `--help` they have none.
-    """
-    kind, help_of = type(value), docs(type(value))
-    hints, of_fields = get_type_hints(kind), []
-    for own in fields(value):
-        held = getattr(value, own.name)
-        flag = _flag(held, hints[own.name], all_agents) if own.init else None
-        if flag is not None:
-            text = _BOARD if isinstance(held, Map) else help_of.get(own.name, " ")
-            nested = is_dataclass(flag[1]) or _are_dataclasses(flag[1])
-            hint: Any = flag[0] if nested else Annotated[flag[0], tyro.conf.arg(help=text)]
-            of_fields.append((own.name, hint, flag[1]))
-    made = flags_type(kind.__name__, of_fields)
-    return made, made()
-
-
-def applied(value: Any, flags: Any) -> Any:
-    """A value with what the flags of `flags_of` say."""
-    if isinstance(value, Map):
-        return value if flags == _DRAWN else maps.named(flags)
-    if _are_dataclasses(flags):
-        return tuple(applied(own, flag) for own, flag in zip(value, flags, strict=True))
-    if not is_dataclass(flags):
-        return flags
-    new: dict[str, Any] = {
-        own.name: applied(getattr(value, own.name), getattr(flags, own.name)) for own in fields(flags)
-    }
-    changes = {name: own for name, own in new.items() if own != getattr(value, name)}
-    return replace(value, **changes) if changes else value
-
-
-def docs(kind: type[Any]) -> dict[str, str]:
-    """What each field of a dataclass is, in a sentence: the text below it, or its line under "Args:"."""
-    found: dict[str, str] = {}
-    for base in reversed(kind.__mro__):
-        if not is_dataclass(base):
-            continue
-        arguments = (inspect.getdoc(base) or "").partition("\nArgs:\n")[2].partition("\n\n")[0]
-        found |= {name: _sentence(text) for name, text in _ARGS.findall(arguments)}
-        try:
-            (tree,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
-        except (OSError, TypeError, ValueError, SyntaxError):
-            continue  # of a class that was made without source
-        assert isinstance(tree, ast.ClassDef)
-        for own, below in zip(tree.body, tree.body[1:], strict=False):
-            if isinstance(own, ast.AnnAssign) and isinstance(own.target, ast.Name):
-                text = below.value if isinstance(below, ast.Expr) else None
-                if isinstance(text, ast.Constant) and isinstance(text.value, str):
-                    found[own.target.id] = _sentence(text.value)
-    return found
-
-
-_ARGS: Final = re.compile(r"^    (\w+): (.*(?:\n {8}.*)*)", re.MULTILINE)
-_SENTENCE_ENDS: Final = re.compile(r"(?<!e\.g)(?<!et al)[.](?= [^a-z0-9]|$)")
-
-
-def _sentence(text: str) -> str:
-    return _SENTENCE_ENDS.split(" ".join(text.split()), maxsplit=1)[0]
-
-
-def _flag(value: Any, hint: Any, all_agents: bool) -> tuple[Any, Any] | None:
-    """The type of a field's flags and their default; None where a command line cannot say it."""
-    from cprl.values import fits  # which needs torch, as flags do and mistakes do not
-
-    if isinstance(value, Custom):
-        return None
-    if isinstance(value, Map):
-        names = [name for name in maps.NAMES if maps.named(name) == value]
-        default = names[0] if names else _DRAWN
-        return Literal[tuple(dict.fromkeys([default, *maps.NAMES]))], default
-    if is_dataclass(value):
-        return flags_of(value, all_agents=all_agents)
-    if _are_dataclasses(value):
-        return _flags_of_all(value, all_agents)
-    simple = _simple(hint)
-    return None if simple in (None, NoneType) or not fits(value, simple) else (simple, value)
-
-
-def _flags_of_all(values: tuple[Any, ...], all_agents: bool) -> tuple[Any, Any] | None:
-    """Flags of each value by its number."""
-    if any(isinstance(value, Custom) for value in values):
-        return None
-    kinds, defaults = [], []
-    for place, value in enumerate(values):
-        listed = all_agents or value not in values[:place]
-        made, default = flags_of(value, all_agents=all_agents) if listed else (_Same, _Same())
-        kinds.append(made)
-        defaults.append(default)
-    return tuple[tuple(kinds)], tuple(defaults)  # type: ignore[misc]
-
-
-def _are_dataclasses(value: Any) -> bool:
-    return isinstance(value, tuple) and bool(value) and all(map(is_dataclass, value))
-
-
-@dataclass(frozen=True)
-class _Same:
-    """In place of the flags of a value that equals one before."""
-
-
-def _simple(hint: Any) -> Any:
-    """What a command line can say of a type: without nested tuples, tables and objects; None for nothing."""
-    origin, arguments = get_origin(hint), get_args(hint)
-    if hint in _SCALARS or origin is Literal:
-        return hint
-    if origin in (Union, UnionType):
-        kept = [simple for own in arguments if (simple := _simple(own)) is not None]
-        return Union[tuple(kept)] if kept else None  # noqa: UP007
-    if origin is tuple:
-        inner = [own if own is Ellipsis else _simple(own) for own in arguments]
-        flat = all(own is not None and get_origin(own) is not tuple for own in inner)
-        return tuple[tuple(inner)] if flat else None  # type: ignore[misc]
-    return None

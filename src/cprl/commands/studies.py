@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar
 
 import tyro
 
-from cprl.arguments import BLOCK, LAST, WINDOW, integer
 from cprl.commands.recipe import ended_by_sigterm, in_a_sentence, parse_with
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.runs.recipe import read_recipe, runs_in, without_directories, without_options
+from cprl.system.defaults import BLOCK, LAST, WINDOW
 from cprl.system.output import OUT, RESUMES, console, printed, say
 from cprl.system.shipped import command_of, is_shipped, named_command, program_of, recipe_named
+from cprl.values import Range, checked
 
 if TYPE_CHECKING:
     from cprl.experiment import Experiment
@@ -475,7 +476,7 @@ def executor_of(options: TrialOptions) -> "Executor":
     """Return where trials are run."""
     from cprl.studies.executors import InProcess, Processes, Ray
 
-    jobs = 1 if options.jobs is None else integer("--jobs", options.jobs, 1, 4096)
+    jobs = 1 if options.jobs is None else checked("--jobs", options.jobs, Annotated[int, Range(1, 4096)])
     on = options.on or ("processes" if jobs > 1 else "here")
     if options.address is not None and on != "ray":
         raise ValueError(f"--address is for --on ray, and this is --on {on}; allowed: one with the other")

@@ -6,7 +6,7 @@ heading. Everything outside the board is wall.
 
 from bisect import bisect_left, insort
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from inspect import cleandoc
 from itertools import chain
 from math import isqrt
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.world import DOWN, LEFT, RIGHT, UP
-from cprl.values import PositiveShare, Range, Seed, Share, Value, Where, checked
+from cprl.values import PositiveShare, Range, Seed, Share, Value, Where, checked, refusal
 
 Cell = tuple[int, int]
 Start = tuple[int, int, int]
@@ -200,6 +200,26 @@ def named(name: str) -> Map:
     board = parse(_DRAWINGS[name])
     starts = _NUMBERED_STARTS.get(name, board.starts)
     return Map(height=board.height, width=board.width, sites=board.sites, starts=starts, walls=board.walls)
+
+
+def with_agents(board: Map, agents: int) -> Map:
+    """Return a board with its first starts, or with more of them on the free ground nearest to the first.
+
+    Further agents look the way of the last one. Ground is free where no wall, site or start is; of two cells
+    equally near, the one that is read first comes first.
+    """
+    checked("agents", agents, Annotated[int, Range(1, LARGEST_BOARD_CELLS)])
+    taken = {*board.sites, *board.walls, *((row, col) for row, col, _ in board.starts)}
+    cells = [(row, col) for row in range(board.height) for col in range(board.width)]
+    top, left, _ = board.starts[0]
+    free = [cell for cell in cells if cell not in taken]
+    free.sort(key=lambda cell: abs(cell[0] - top) + abs(cell[1] - left))
+    if agents > board.agents + len(free):
+        allowed = f"at most {board.agents + len(free)} on this board, whose other cells are walls and sites"
+        raise refusal("agents", agents, allowed)
+    heading = board.starts[-1][2]
+    further = [(row, col, heading) for row, col in free[: max(0, agents - board.agents)]]
+    return replace(board, starts=(*board.starts[:agents], *further))
 
 
 Entrances = Literal["single", "multiple", "none", "unequal"]

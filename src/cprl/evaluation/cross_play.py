@@ -26,7 +26,6 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from cprl.arguments import Diagonal
 from cprl.evaluation.evaluate import (
     INTERVALS,
     SEED,
@@ -49,6 +48,7 @@ from cprl.measuring.statistics import (
     social_measures,
 )
 from cprl.runs.episodes import labelled
+from cprl.system.defaults import Diagonal
 from cprl.terminal.style import EMPTY, SHADES, SMALL_PT, draw_cell, head, picture_path, save, wrapped
 from cprl.training.agents import LoadedRun
 from cprl.values import Range, checked

@@ -19,10 +19,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from cprl import arguments
 from cprl.evaluation.empirical_game import EmpiricalGame
 from cprl.evaluation.evaluate import how_they_play, table_of
 from cprl.measuring.statistics import CONFIDENCE, Estimate, estimate
+from cprl.system.defaults import EGTA_RESAMPLES
 from cprl.terminal import style
 from cprl.theory.payoff_table import PayoffTable, Values, compositions
 from cprl.theory.solutions import (
@@ -62,7 +62,7 @@ class Analysis:
     """Where replicator dynamics end."""
 
 
-def analyse(game: EmpiricalGame, *, resamples: int = arguments.EGTA_RESAMPLES, seed: int = 0) -> Analysis:
+def analyse(game: EmpiricalGame, *, resamples: int = EGTA_RESAMPLES, seed: int = 0) -> Analysis:
     """Analyses an empirical game.
 
     Args:

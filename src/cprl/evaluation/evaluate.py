@@ -9,7 +9,6 @@ import pyarrow as pa
 import torch
 from rich.table import Table
 
-from cprl.arguments import SEED as SEED
 from cprl.commons.game import Game
 from cprl.custom import trust
 from cprl.envs.unwrap import agent_names
@@ -24,6 +23,7 @@ from cprl.measuring.statistics import (
     social_measures,
 )
 from cprl.runs.episodes import labelled
+from cprl.system.defaults import SEED as SEED
 from cprl.training.agents import LoadedRun, load
 from cprl.values import Positive, Seed, checked
 

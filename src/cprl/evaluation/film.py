@@ -12,8 +12,6 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import arguments, keys
-from cprl.arguments import FILM_SEED as SEED
-from cprl.arguments import FILM_SUFFIXES as SUFFIXES
 from cprl.commons.world import Bytes, Shown
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import commons_of
@@ -30,6 +28,8 @@ from cprl.evaluation.lanes import Turns
 from cprl.measuring.episodes import Episode, tracker_of
 from cprl.policies.assignment import AgentPolicies
 from cprl.runs.files import refuse_to_write_over
+from cprl.system.defaults import FILM_SEED as SEED
+from cprl.system.defaults import FILM_SUFFIXES as SUFFIXES
 from cprl.system.memory import check_memory
 from cprl.system.output import legible
 from cprl.training import train
@@ -184,18 +184,46 @@ _SAMPLES: Final = 24
 """The pictures from which a GIF's palette is taken."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Style:
+    """How a film shows an episode."""
+
+    titles: Sequence[str] = ()
+    """Of the run and those beside it, one each; by default the institutions of each, or the names of their
+    experiments."""
+    every: int | None = None
+    """Turns from one picture to the next; by default 1 for an .mp4, and for a .gif as many as it takes for
+    300 pictures."""
+    fps: float = DEFAULT_FPS
+    """Pictures per second, above 0, at most 50; in a .gif rounded to hundredths of a second a picture."""
+    width: int | None = None
+    """Of the pictures in pixels, at most 1920, and at least 240 for each run; by default 640 for each run
+    that has room. The height follows from the boards, each at most twice as high as its part is wide."""
+
+    def __post_init__(self) -> None:
+        if self.every is not None:
+            arguments.integer("every", self.every, 1)
+        allowed = f"a number above 0, at most {MOST_FPS:g}"
+        arguments.number("fps", self.fps, low=0.0, high=MOST_FPS, above=True, allowed=allowed)
+
+    def width_of_each(self, runs: int) -> int:
+        """The width of the part of each run."""
+        width = min(LARGEST_WIDTH, DEFAULT_WIDTH * runs) if self.width is None else self.width
+        return arguments.integer("width", width, SMALLEST_WIDTH * runs, LARGEST_WIDTH) // runs
+
+
+_USUAL: Final = Style()
+
+
 def film_video(
     run: str | Path,
     out: str | Path,
     *,
     beside: Sequence[str | Path] = (),
-    titles: Sequence[str] = (),
     replica: int = 0,
     episode: int = 0,
     seed: int = SEED,
-    every: int | None = None,
-    fps: float = DEFAULT_FPS,
-    width: int | None = None,
+    style: Style = _USUAL,
     allow: Sequence[str] = (),
 ) -> tuple[Path, tuple[Episode, ...]]:
     """Film an episode of a run's agents, beside those of other runs if there are any.
@@ -212,14 +240,6 @@ def film_video(
         out: the film, a .gif or, with imageio-ffmpeg, an .mp4; complete or absent.
         beside: more runs, whose agents are shown to the right of the first. Games may differ; where they do
             not, all play the same fresh world.
-        titles: of the run and those beside it, one each; by default the institutions of each, or the names of
-            their experiments.
-        every: turns from one picture to the next; by default 1 for an .mp4, and for a .gif as many as
-            it takes for 300 pictures.
-        fps: pictures per second, above 0, at most 50; in a .gif rounded to hundredths of a second a picture.
-        width: of the pictures in pixels, at most 1920, and at least 240 for each run; by default 640 for each
-            run that has room. The height follows from the boards, each at most twice as high as its part is
-            wide.
 
     Returns:
         The film, and the episode of each run.
@@ -235,21 +255,16 @@ def film_video(
     most_runs = LARGEST_WIDTH // SMALLEST_WIDTH
     if len(runs) > most_runs:
         raise arguments.refusal("beside", f"{len(runs) - 1} runs", f"at most {most_runs - 1}")
-    if titles and (len(titles) != len(runs) or not all(map(str.isprintable, titles))):
-        raise arguments.refusal("titles", titles, f"a line of text for each of {len(runs)} runs")
-    every = None if every is None else arguments.integer("every", every, 1)
-    allowed = f"a number above 0, at most {MOST_FPS:g}"
-    fps = arguments.number("fps", fps, low=0.0, high=MOST_FPS, above=True, allowed=allowed)
-    width = min(LARGEST_WIDTH, DEFAULT_WIDTH * len(runs)) if width is None else width
-    width = arguments.integer("width", width, SMALLEST_WIDTH * len(runs), LARGEST_WIDTH) // len(runs)
+    if style.titles and (len(style.titles) != len(runs) or not all(map(str.isprintable, style.titles))):
+        raise arguments.refusal("titles", style.titles, f"a line of text for each of {len(runs)} runs")
+    width = style.width_of_each(len(runs))
     refuse_to_write_over(path)
     if path.suffix == ".mp4":
         check_can_write_mp4(path)
     fresh = [fresh_episode(one, replica=replica, episode=episode, seed=seed, allow=allow) for one in runs]
-    panels = _panels(fresh, titles or _titles(fresh), width)
+    panels = _panels(fresh, style.titles or _titles(fresh), width)
     length = max(len(panel.moments) for panel in panels)
-    if every is None:
-        every = 1 if path.suffix == ".mp4" else ceil(length / GIF_FRAMES)
+    every = style.every or (1 if path.suffix == ".mp4" else ceil(length / GIF_FRAMES))
     chosen = sorted({*range(0, length, every), length - 1})
 
     def draw(turns: Sequence[int]) -> Iterator[Bytes]:
@@ -262,7 +277,7 @@ def film_video(
     wide, high = sum(panel.picture.size[0] for panel in panels), panels[0].picture.size[1]
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".mp4":
-        write_mp4(path, draw(chosen), (wide, high), fps=fps)
+        write_mp4(path, draw(chosen), (wide, high), fps=style.fps)
     else:
         check_memory(
             f"every is {every}: {len(chosen):,} pictures",
@@ -270,7 +285,7 @@ def film_video(
             "fewer or smaller pictures",
         )
         samples = chosen[:: ceil(len(chosen) / _SAMPLES)]
-        write_gif(path, draw(chosen), list(draw(samples)), fps=fps)
+        write_gif(path, draw(chosen), list(draw(samples)), fps=style.fps)
     return path, tuple(panel.played for panel in panels)
 
 

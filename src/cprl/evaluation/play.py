@@ -13,7 +13,6 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import keys
-from cprl.arguments import PLAY_SEED
 from cprl.commons.colours import APPLE, BEAM, PALETTE, WALL, Colour, agent_colour
 from cprl.commons.game import Game
 from cprl.commons.maps import SIGN_OF_HEADING
@@ -28,6 +27,7 @@ from cprl.measuring.metrics import title
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import Scripted
 from cprl.presets import Variant
+from cprl.system.defaults import PLAY_SEED
 from cprl.system.output import OUT, console, say
 from cprl.training.agents import Population
 from cprl.values import Range, checked, refusal

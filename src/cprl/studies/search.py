@@ -18,7 +18,6 @@ from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 
-from cprl.arguments import BLOCK
 from cprl.commons.game import Game
 from cprl.experiment import Experiment
 from cprl.measuring import social
@@ -31,6 +30,7 @@ from cprl.studies.run import StudyResult, run_study
 from cprl.studies.study import RUNS, Replicas, Study, directory_of, level_text, named, short_names, unlike
 from cprl.studies.tables.comparing import LAST
 from cprl.studies.trials import Outcome, trials_of
+from cprl.system.defaults import BLOCK
 from cprl.system.output import say
 from cprl.values import DirectoryName, Positive, Range, Value, refusal
 

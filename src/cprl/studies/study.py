@@ -10,7 +10,6 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeAlias
 
-from cprl.arguments import BLOCK
 from cprl.custom import trust
 from cprl.experiment import MOST_SEED, Experiment
 from cprl.population import stored_of
@@ -31,6 +30,7 @@ from cprl.studies.factors import (
     grid,
     with_runs_moved,
 )
+from cprl.system.defaults import BLOCK
 from cprl.values import DirectoryName, Range, Value, refusal, shown, without_defaults
 
 CONDITION_FORMAT: Final = 1

@@ -9,5 +9,6 @@ Modules:
     output         text for the terminal
     process        settings of the process that trains, and where compiled code is kept
     shipped        the recipes that come with cprl, and how a command is typed again
+    defaults       defaults that functions share with the command line
     times          where the time of a training and of a run goes
 """

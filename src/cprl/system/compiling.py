@@ -102,9 +102,9 @@ class Compiled:
             if self._difference(result, arguments, before, reference) is None:
                 return result
             self._put_back(arguments, [before[place] for place in self._changes])
-        own = with_own_code(self._plain)
+        copy = with_own_code(self._plain)
         try:
-            result, is_guarded = self._first_call(own, arguments)
+            result, is_guarded = self._first_call(copy, arguments)
         except Exception as error:
             self.enabled = False
             cure = _TO_MODULE_CURE if "torch.nn.Parameter()" in str(error) else ""
@@ -117,10 +117,10 @@ class Compiled:
         set_aside()
         difference = self._difference(result, arguments, before, reference)
         if difference is None:
-            if (code := compiled_code(own)) is not None:
-                self._compiled = without_lookup(own, code)
+            if (code := compiled_code(copy)) is not None:
+                self._compiled = without_lookup(copy, code)
                 if is_guarded:
-                    _share(self._plain, _Shared(self._form, own, self._compiled))
+                    _share(self._plain, _Shared(self._form, copy, self._compiled))
             return result
         self.enabled = False
         warnings.warn(
@@ -132,14 +132,14 @@ class Compiled:
         self._put_back(arguments, reference[1:])
         return reference[0]
 
-    def _first_call(self, own: FunctionType, arguments: Sequence[Any]) -> tuple[Any, bool]:
+    def _first_call(self, function: FunctionType, arguments: Sequence[Any]) -> tuple[Any, bool]:
         """Compiles and calls; the result, and whether torch can tell which arguments the code fits."""
         remember_vector_instructions()
         for further in ({}, NO_GUARDS):
             options = {**COMPILE_OPTIONS, **further}  # a copy, because torch removes entries
             # Sizes and numbers of other learners, which torch remembers, must not make those of this one
             # variables of its code: not dynamic.
-            self._compiled = torch.compile(own, fullgraph=True, dynamic=False, options=options)
+            self._compiled = torch.compile(function, fullgraph=True, dynamic=False, options=options)
             try:
                 with warnings.catch_warnings(), every_guard(), sound_local_buffers(), quiet_about_fallbacks():
                     for kind in (DeprecationWarning, FutureWarning):  # raised inside torch and TorchRL
@@ -166,17 +166,17 @@ class Compiled:
 
     def _copies(self, arguments: Sequence[Any]) -> list[Any]:
         """The arguments, with copies of those that the function changes."""
-        return [copied(own) if place in self._changes else own for place, own in enumerate(arguments)]
+        return [copied(value) if place in self._changes else value for place, value in enumerate(arguments)]
 
     def _outcome(self, arguments: Sequence[Any], *, seed: int | None = None) -> list[Any]:
         """The result of the plain function, and the changed arguments as copies; the arguments and torch's
         generators are left unchanged."""
-        own = self._copies(arguments)
+        copies = self._copies(arguments)
         with torch.random.fork_rng(devices=range(torch.cuda.device_count())):
             if seed is not None:
                 torch.manual_seed(seed)
-            result = self._plain(*own)
-        return [result, *(own[place] for place in self._changes)]
+            result = self._plain(*copies)
+        return [result, *(copies[place] for place in self._changes)]
 
     def _is_random(self, arguments: Sequence[Any]) -> bool:
         """Whether the result of the plain function depends on torch's seed."""
@@ -192,19 +192,19 @@ def _fitting(plain: FunctionType, form: Hashable, arguments: Sequence[Any]) -> I
 
 
 def _share(plain: FunctionType, compiled: _Shared) -> None:
-    kept = _shared.setdefault(plain.__code__, [])
-    kept.append(compiled)
-    del kept[:-MOST_SHARED]
+    newest = _shared.setdefault(plain.__code__, [])
+    newest.append(compiled)
+    del newest[:-MOST_SHARED]
 
 
 def copied(value: Any) -> Any:
     """A copy of a tensor, or of a list of tensors."""
-    return [copied(own) for own in value] if isinstance(value, list) else value.clone()
+    return [copied(tensor) for tensor in value] if isinstance(value, list) else value.clone()
 
 
 def tensors_in(value: Any) -> list[torch.Tensor]:
     """The tensors of a tensor or of nested lists, in order."""
-    return [tensor for own in value for tensor in tensors_in(own)] if isinstance(value, list) else [value]
+    return [tensor for part in value for tensor in tensors_in(part)] if isinstance(value, list) else [value]
 
 
 def largest_difference(results: Sequence[Any], reference: Sequence[Any]) -> float | None:

@@ -4,9 +4,12 @@
 """
 
 import re
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.machinery import ModuleSpec
+from importlib.util import find_spec
+from types import ModuleType
 
 
 def require(library: str, holder: object, *parts: str) -> None:
@@ -47,19 +50,59 @@ def missing(library: str, part: str) -> str:
 
 def fitting_versions(library: str) -> str:
     """The versions of a library that cprl asks for, e.g. "<2.14,>=2.13"; "" if it does not say."""
+    from importlib.metadata import PackageNotFoundError, requires
+
     try:
         wanted = requires("cprl") or []
     except PackageNotFoundError:
         wanted = []
     for requirement in wanted:
-        found = re.fullmatch(r"([\w.-]+)(?:\[[^\]]*\])?\s*([^;]*?)\s*(?:;.*)?", requirement)
-        if found is not None and found[1].lower() == library:
-            return found[2]
+        parts = re.fullmatch(r"([\w.-]+)(?:\[[^\]]*\])?\s*([^;]*?)\s*(?:;.*)?", requirement)
+        if parts is not None and parts[1].lower() == library:
+            return parts[2]
     return ""
 
 
 def _installed(library: str) -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
     try:
         return version(library)
     except PackageNotFoundError:
         return "(not installed)"
+
+
+def when_imported(name: str, call: Callable[[], object]) -> None:
+    """Call a function as soon as a module is imported: now if it is, else once it has been.
+
+    What cprl tells a library costs nothing where nobody uses that library.
+    """
+    if name in sys.modules:
+        call()
+    else:
+        sys.meta_path.insert(0, _Waiting(name, call))
+
+
+class _Waiting:
+    """Finds a module once, as Python does without it, and calls a function behind its import."""
+
+    def __init__(self, name: str, call: Callable[[], object]) -> None:
+        self._name, self._call = name, call
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        if fullname != self._name:
+            return None
+        sys.meta_path.remove(self)
+        spec = find_spec(fullname)
+        if spec is None or spec.loader is None:
+            return spec
+        execute = spec.loader.exec_module
+
+        def execute_and_call(module: ModuleType) -> None:
+            execute(module)
+            self._call()
+
+        spec.loader.exec_module = execute_and_call  # type: ignore[method-assign]
+        return spec

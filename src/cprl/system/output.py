@@ -5,11 +5,10 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from typing import Final, TextIO, cast
+from typing import TYPE_CHECKING, Final, TextIO, cast
 
-from rich.console import Console
-
-from cprl.checks import shown
+if TYPE_CHECKING:
+    from rich.console import Console
 
 PLAIN: Final = str.maketrans(
     {"±": "+-", "\u00d7": "x", "…": "...", "\u2013": "-", "\u2014": "-", "\u2212": "-"}
@@ -74,12 +73,14 @@ OUT: Final = Output(lambda: _behind(sys.stdout))
 ERR: Final = Output(lambda: _behind(sys.stderr))
 
 
-def console(output: Output = OUT, *, width: int | None = None) -> Console:
+def console(output: Output = OUT, *, width: int | None = None) -> "Console":
     """A console that no encoding can stop, by default on standard output.
 
     Square brackets and colons in texts are shown as they are: they may be those of a path or a name. What is
     to have a style is a `rich.text.Text`.
     """
+    from rich.console import Console
+
     return Console(file=cast(TextIO, output), width=width, markup=False, emoji=False)
 
 
@@ -89,18 +90,11 @@ def legible(name: str) -> str:
 
 
 def say(*what: object) -> None:
-    """Prints a line, like `print`; what cannot be a text is shortened."""
-    OUT.write(" ".join(map(_text, what)) + "\n")
+    """Print a line, like `print`."""
+    OUT.write(" ".join(map(str, what)) + "\n")
     OUT.flush()
 
 
 def printed(words: Sequence[str]) -> str:
     """A command line to be copied, quoted for the shell of this platform."""
     return subprocess.list2cmdline(words) if sys.platform == "win32" else shlex.join(words)
-
-
-def _text(value: object) -> str:
-    try:
-        return str(value)
-    except Exception:  # of whatever kind a user's object raises; one that holds itself, a RecursionError
-        return shown(value)

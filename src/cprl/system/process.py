@@ -13,7 +13,6 @@ from pathlib import Path
 from threading import Thread
 from typing import Final
 
-from cprl.checks import MOST_SEED, checked, count
 from cprl.system.output import OUT
 
 _M_TRIM_THRESHOLD: Final = -1
@@ -33,8 +32,6 @@ def prepare_process(seed: int) -> None:
     The networks are so small that a second thread slows them down, up to a hundredfold on a busy machine.
     Denormal numbers in Adam's moments of dead weights slow a long run by a factor of up to 1.9.
     """
-    checked("seed", seed, count(0, MOST_SEED))
-
     import torch
 
     torch.manual_seed(seed)
@@ -43,10 +40,10 @@ def prepare_process(seed: int) -> None:
     _keep_freed_memory()
     _keep_compiled_code()
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    own = logging.getLogger("cprl")
-    own.setLevel(logging.INFO)
-    if not own.handlers:
-        own.addHandler(logging.StreamHandler(OUT))
+    logger = logging.getLogger("cprl")
+    logger.setLevel(logging.INFO)
+    if not logger.handlers:
+        logger.addHandler(logging.StreamHandler(OUT))
 
 
 def obey_parent() -> None:

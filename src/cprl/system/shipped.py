@@ -8,12 +8,11 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path, PureWindowsPath
 from shutil import which
 from types import ModuleType
 from typing import Final
-
-from cprl.checks import shown
 
 PROGRAM: Final = "cprl run "
 """How the program of a shipped recipe begins, where a script has its path."""
@@ -21,45 +20,52 @@ PROGRAM: Final = "cprl run "
 _PACKAGE: Final = Path(__file__).parents[1]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Recipe:
     """A recipe that comes with cprl, or a module that recipes share."""
 
     name: str
     """Its path without ".py", e.g. "study/time_out"."""
     path: Path
-    about: str
-    """The first line of its docstring."""
-    runs: bool
-    """Whether it is run; otherwise other recipes import it."""
-    imports: tuple[str, ...]
-    """The modules of its folder that it imports."""
 
     @property
     def folder(self) -> str:
-        """The folder of its name, e.g. "studies"; "" for none."""
+        """The folder of its name, e.g. "study"; "" for none."""
         return self.name.rpartition("/")[0]
 
+    @cached_property
+    def source(self) -> str:
+        """Its text as it stands."""
+        return self.path.read_text(encoding="utf-8")
+
+    @property
+    def runs(self) -> bool:
+        """Whether it is run; otherwise other recipes import it."""
+        return 'if __name__ == "__main__":' in self.source
+
+    @property
+    def about(self) -> str:
+        """The first line of its docstring."""
+        return self.source.partition("\n")[0].strip('"')
+
     def text(self) -> str:
-        """Its source; one that imports modules of its folder gets a line by which any copy finds these."""
-        source = self.path.read_text(encoding="utf-8")
-        if not self.imports:
-            return source
-        lines = source.splitlines(keepends=True)
-        tree = ast.parse(source)
-        first = next(
-            node.lineno
-            for node in tree.body
-            if isinstance(node, ast.Import)
-            or (isinstance(node, ast.ImportFrom) and node.module != "__future__")
-        )
-        needed = ", ".join(f"{name}.py" for name in self.imports)
-        lines[first - 1 : first - 1] = [
-            "from cprl.system.shipped import import_from\n\n",
-            f"# {needed} of that folder; one beside this file comes first.\n",
-            f'import_from("{self.folder}")\n\n',
+        """Return its source, with a line by which a copy finds the modules of its folder that it imports."""
+        imports = [
+            node for node in ast.parse(self.source).body if isinstance(node, ast.Import | ast.ImportFrom)
         ]
-        return "".join(lines)
+        names = {alias.name for node in imports if isinstance(node, ast.Import) for alias in node.names}
+        names |= {node.module or "" for node in imports if isinstance(node, ast.ImportFrom)}
+        beside = sorted(names & {path.stem for path in self.path.parent.glob("*.py")})
+        if not self.folder or not beside:
+            return self.source
+        lines, first = self.source.splitlines(keepends=True), imports[0].lineno - 1
+        needed = ", ".join(f"{name}.py" for name in beside)
+        line = (
+            "from cprl.system.shipped import import_from\n\n"
+            f"# {needed} of that folder; one beside this file comes first.\n"
+            f'import_from("{self.folder}")\n\n'
+        )
+        return "".join([*lines[:first], line, *lines[first:]])
 
 
 def recipes_folder() -> Path:
@@ -78,21 +84,21 @@ def shipped_recipes() -> dict[str, Recipe]:
     """All recipes by name, and the modules that they share, in the order of their names."""
     folder = recipes_folder()
     paths = sorted(folder.rglob("*.py"), key=lambda path: (len(path.relative_to(folder).parts), path))
-    found = [_read(path, path.relative_to(folder).with_suffix("").as_posix()) for path in paths]
-    return {recipe.name: recipe for recipe in found}
+    names = [path.relative_to(folder).with_suffix("").as_posix() for path in paths]
+    return {name: Recipe(name, path) for name, path in zip(names, paths, strict=True)}
 
 
 def recipe_named(name: str) -> Recipe:
     """A recipe by its name."""
     recipes = shipped_recipes()
     if name not in recipes:
-        raise ValueError(f"there is no recipe {shown(name)}; allowed: {recipe_names()}")
+        raise ValueError(f"there is no recipe {name!r}; allowed: {recipe_names()}")
     return recipes[name]
 
 
 def recipe_names() -> str:
     """The names of all recipes that can be run, for messages."""
-    return ", ".join(own.name for own in shipped_recipes().values() if own.runs)
+    return ", ".join(recipe.name for recipe in shipped_recipes().values() if recipe.runs)
 
 
 def is_shipped(word: str) -> bool:
@@ -109,9 +115,9 @@ def run_shipped(name: str, words: Sequence[str]) -> None:
     recipe = recipe_named(name)
     if not recipe.runs:
         raise ValueError(f"{name} runs nothing: other recipes import it; cprl recipe {name} prints it")
-    module = ModuleType("__main__", recipe.about)
+    module = ModuleType("__main__")
     module.__file__ = str(recipe.path)
-    code = compile(recipe.path.read_text(encoding="utf-8"), str(recipe.path), "exec")
+    code = compile(recipe.source, str(recipe.path), "exec")
     before = sys.argv, sys.path[:], sys.modules["__main__"]
     sys.argv, sys.modules["__main__"] = [f"{PROGRAM}{name}", *words], module
     sys.path.insert(0, str(recipe.path.parent))
@@ -129,11 +135,11 @@ def import_from(folder: str) -> None:
     """
     folders = sorted({recipe.folder for recipe in shipped_recipes().values()} - {""})
     if folder not in folders:
-        raise ValueError(f"folder is {shown(folder)}; allowed: {', '.join(folders)}")
+        raise ValueError(f"folder is {folder!r}; allowed: {', '.join(folders)}")
     script = getattr(sys.modules["__main__"], "__file__", None)
     beside = None if script is None else Path(script).resolve().parent
     # Libraries may have put folders before that of the script, as Ray does.
-    places = [nth for nth, own in enumerate(sys.path) if own and Path(own).resolve() == beside]
+    places = [place for place, path in enumerate(sys.path) if path and Path(path).resolve() == beside]
     sys.path.insert(places[0] + 1 if places else 0, str(recipes_folder() / folder))
 
 
@@ -172,22 +178,3 @@ def cprl_here() -> list[str]:
     # In the folder of the script its name alone would be looked up on the path.
     is_below = script.is_relative_to(here) and script.parent != here
     return [str(script.relative_to(here) if is_below else script)]
-
-
-def _read(path: Path, name: str) -> Recipe:
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    runs = any(isinstance(node, ast.If) and "__name__" in ast.unparse(node.test) for node in tree.body)
-    about = (ast.get_docstring(tree) or "").partition("\n")[0]
-    imported = {
-        alias
-        for node in tree.body
-        for alias in (
-            [own.name for own in node.names]
-            if isinstance(node, ast.Import)
-            else [node.module or ""]
-            if isinstance(node, ast.ImportFrom)
-            else []
-        )
-    }
-    beside = {own.stem for own in path.parent.glob("*.py")} if "/" in name else set()
-    return Recipe(name=name, path=path, about=about, runs=runs, imports=tuple(sorted(imported & beside)))

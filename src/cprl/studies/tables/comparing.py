@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
-from cprl.arguments import LAST as LAST
 from cprl.arguments import choice, integer, refusal
 from cprl.measuring.metrics import title
 from cprl.measuring.statistics import CONFIDENCE, Estimate, difference, estimate, holm
 from cprl.studies.tables.table import NET, PARTS, RANDOM, TRAINING, StudyTable
+from cprl.system.defaults import LAST as LAST
 
 METRICS: Final = ("collective_return", NET, "equality", "sustainability", "survival_steps", "peacefulness")
 """Metrics that are compared, unless others are asked for, where a table has them."""

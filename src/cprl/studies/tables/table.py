@@ -34,10 +34,10 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cprl.arguments import WINDOW as WINDOW
 from cprl.runs.episodes import write_table
 from cprl.runs.files import STUDY_TABLE_FORMAT, refuse_newer
 from cprl.runs.recipe import versions
+from cprl.system.defaults import WINDOW as WINDOW
 
 METADATA: Final = b"cprl"
 """The key of all that a table holds beside its rows, see the fields of `StudyTable`."""

@@ -146,10 +146,10 @@ def remember_vector_instructions() -> None:
         mark = Path(cache_dir()) / f"usable_vectors_{sha256(text.encode()).hexdigest()[:16]}"
         if usable and mark.exists():
             return usable
-        found: list[Any] = find()
-        if usable and found == usable:
+        types: list[Any] = find()
+        if usable and types == usable:
             with suppress(OSError):
                 mark.touch()
-        return found
+        return types
 
     cpu_vec_isa.valid_vec_isa_list = remembered

@@ -47,8 +47,8 @@ class ReshapedLoss:
         """The function, of any shape."""
         raise NotImplementedError
 
-    def _reduce_loss(self, loss: torch.Tensor, **how: Any) -> Any:
-        return super()._reduce_loss(self.reshape_each(loss), **how)  # type: ignore[misc]
+    def _reduce_loss(self, loss: torch.Tensor, **options: Any) -> Any:
+        return super()._reduce_loss(self.reshape_each(loss), **options)  # type: ignore[misc]
 
 
 def updated_weights(loss: LossModule) -> list[str]:

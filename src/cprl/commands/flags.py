@@ -1,0 +1,242 @@
+"""Values as flags: each field of an experiment that words can say, e.g. --game.rules.freeze-steps 50.
+
+tyro reads dataclasses itself. The rule here tells it what it cannot know of a value that is there already: of
+which class each part is, and what no word can say and therefore stays.
+"""
+
+import json
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Union, get_args, get_origin
+
+import tyro
+from tyro.constructors import (
+    ConstructorRegistry,
+    StructConstructorSpec,
+    StructFieldSpec,
+    StructTypeInfo,
+)
+
+from cprl.custom import Custom
+from cprl.values import fits
+
+if TYPE_CHECKING:
+    from cprl.experiment import Experiment
+    from cprl.institutions import Institution
+    from cprl.population import AgentSpec
+
+
+class RefusedError(Exception):
+    """A value that words describe is refused; of no kind that tyro wraps into a text of its own."""
+
+
+class ValueFlags(ConstructorRegistry):
+    """How tyro reads the fields of a dataclass that has a default: as changes to it.
+
+    Args:
+        listed: the places that help lists, or what is above them; None for all. Help lists what stands in a
+            tuple once, though equal ones are there.
+        is_help: whether words ask for help, which alone leaves flags out.
+    """
+
+    def __init__(self, listed: Collection[str] | None = None, *, is_help: bool = False) -> None:
+        super().__init__()
+        self._listed, self._is_help = listed, is_help
+        self._places: dict[int, str] = {}
+        self._is_inside = False
+        self.struct_rule(self._changes)
+
+    def _changes(self, info: StructTypeInfo) -> StructConstructorSpec | None:
+        value = info.default
+        if self._is_inside or isinstance(value, type) or not is_dataclass(value):
+            return None
+        self._is_inside = True  # in what tyro's own rule says of a dataclass: defaults and help
+        try:
+            usual = ConstructorRegistry.get_struct_spec(info)
+        finally:
+            self._is_inside = False
+        assert isinstance(usual, StructConstructorSpec)
+        settable = {field.name for field in fields(value) if field.init}
+        place = self._places.get(id(value), "")
+        flags = [self._flag(field, place) for field in usual.fields if field.name in settable]
+
+        def changed(**given: Any) -> Any:
+            changes = {name: new for name, new in given.items() if new != getattr(value, name)}
+            try:
+                return replace(value, **changes) if changes else value
+            except ValueError as error:
+                raise RefusedError(str(error)) from error
+
+        return StructConstructorSpec(instantiate=changed, fields=tuple(flag for flag in flags if flag))
+
+    def _flag(self, field: StructFieldSpec, above: str) -> StructFieldSpec | None:
+        """The flags of a field of a value; None where no word can say it."""
+        value, place = field.default, f"{above}.{field.name}".lstrip(".")
+        kind: Any
+        if _is_code(value):
+            return None
+        if is_dataclass(value):
+            self._places.setdefault(id(value), place)
+            kind = type(value)
+        elif isinstance(value, tuple) and value and all(map(is_dataclass, value)):
+            for number, part in enumerate(value):
+                self._places.setdefault(id(part), f"{place}.{number}")
+            kinds = [
+                Annotated[type(part), tyro.conf.Suppress]
+                if self._is_help and part in value[:number]
+                else type(part)
+                for number, part in enumerate(value)
+            ]
+            kind = tuple[tuple(kinds)]  # type: ignore[misc]
+        else:
+            kind = _sayable(field.type, value)
+        if kind is None:
+            return None
+        if self._is_help and self._listed is not None and not self._is_listed(place):
+            kind = Annotated[kind, tyro.conf.Suppress]
+        return replace(field, type=kind)
+
+    def _is_listed(self, place: str) -> bool:
+        assert self._listed is not None
+        return any(f"{path}.".startswith(f"{place}.") for path in self._listed)
+
+
+def _is_code(value: Any) -> bool:
+    """Whether a value is, or holds, the name of somebody's own code."""
+    from cprl.commons.maps import Map
+
+    parts = value if isinstance(value, tuple) else (value,)
+    return any(isinstance(part, Custom | Map) for part in parts)
+
+
+def _sayable(hint: Any, value: Any) -> Any:
+    """The part of a type that words can say, if it is that of the value; else None."""
+    simple = _simple(hint)
+    return None if simple in (None, NoneType) or not fits(value, simple) else simple
+
+
+_WORDS: Final = (bool, int, float, str, NoneType)
+
+
+def _simple(hint: Any) -> Any:
+    """A type without objects, tables and nested tuples; None if nothing is left."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return hint if _simple(arguments[0]) == arguments[0] else _simple(arguments[0])
+    if origin in (Union, UnionType):
+        options = [simple for part in arguments if (simple := _simple(part)) is not None]
+        return Union[tuple(options)] if options else None  # noqa: UP007
+    if origin is tuple:
+        parts = [part if part is Ellipsis else _simple(part) for part in arguments]
+        return tuple[tuple(parts)] if None not in parts else None  # type: ignore[misc]
+    is_simple = hint in _WORDS or origin is Literal or (isinstance(hint, type) and issubclass(hint, Path))
+    return hint if is_simple else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shape:
+    """What decides which other flags there are, and is therefore read first."""
+
+    map: Annotated[str | None, tyro.conf.arg(name="game.map", metavar="NAME")] = None
+    """A board by its name: single_basic, single_complex, two_complex or commons."""
+    agents: int | None = None
+    """How many agents, where all are alike. A board has its first starts then, or more of them on free ground
+    around the first one."""
+    institutions: Annotated[
+        tuple[str, ...], tyro.conf.arg(name="game.institutions", metavar="NAME|FILE.json")
+    ] = ()
+    """Institutions by their names, e.g. quota monitoring, with flags of their own, e.g.
+    --game.institutions.quota.share 0.25; or a JSON file with a list of them as in a recipe.json; or none."""
+
+
+def in_shape(experiment: "Experiment", shape: Shape) -> "Experiment":
+    """Return an experiment on another board, with another number of agents or under other institutions."""
+    from cprl.commons import maps
+    from cprl.commons.game import Game
+
+    if shape == Shape():
+        return experiment
+    game, agents = experiment.game, experiment.agents
+    if not isinstance(game, Game):
+        raise ValueError("--game.map, --agents and --game.institutions are for games on a board of cprl")
+    board = game.map if shape.map is None else maps.named(shape.map)
+    if shape.agents is not None:
+        board = maps.with_agents(board, shape.agents)
+        agents = _as_many(agents, shape.agents)
+    institutions = _institutions(shape.institutions) if shape.institutions else game.institutions
+    return replace(experiment, game=replace(game, map=board, institutions=institutions), agents=agents)
+
+
+def _as_many(specs: "tuple[AgentSpec, ...]", agents: int) -> "tuple[AgentSpec, ...]":
+    """Return specifications of another number of agents who are alike."""
+    from cprl.population import Team
+
+    first = specs[0]
+    if len(specs) == 1 and isinstance(first, Team):
+        return (replace(first, agents=tuple(range(agents))),)
+    if isinstance(first, Team) or any(spec != first for spec in specs):
+        raise ValueError(
+            f"--agents is {agents}; allowed: where all agents are alike, which they are not here"
+        )
+    return (first,) * agents
+
+
+def _institutions(words: Sequence[str]) -> "tuple[Institution, ...]":
+    """Return the institutions that words name, or that a JSON file holds."""
+    from cprl.institutions import Institution
+    from cprl.values import KINDS, from_config
+
+    kinds = {_snake(name): kind for name, kind in KINDS.items() if issubclass(kind, Institution)}
+    made: list[Institution] = []
+    for word in () if tuple(words) == ("none",) else words:
+        if word.endswith(".json"):
+            tables = json.loads(Path(word).read_text(encoding="utf-8"))
+            for number, table in enumerate(tables if isinstance(tables, list) else [tables]):
+                made.append(from_config(table, f"{word}[{number}]"))
+        elif word.replace("-", "_") not in kinds:
+            raise ValueError(
+                f"--game.institutions is {word}; allowed: {', '.join(sorted(kinds))}, a file .json, or none"
+            )
+        else:
+            try:
+                made.append(kinds[word.replace("-", "_")]())
+            except TypeError as error:  # without an argument that has no default
+                raise ValueError(f"--game.institutions is {word}, {error}; allowed: a file .json") from error
+    return tuple(made)
+
+
+def _snake(name: str) -> str:
+    return re.sub("(?<=[a-z])(?=[A-Z])", "_", name).lower()
+
+
+def shape_of(experiment: "Experiment") -> Shape:
+    """Return the board, the number of agents and the institutions of an experiment, for help."""
+    from cprl.commons import maps
+    from cprl.commons.game import Game
+
+    game = experiment.game
+    if not isinstance(game, Game):
+        return Shape()
+    names = [name for name in maps.NAMES if maps.named(name) == game.map]
+    return Shape(
+        map=names[0] if names else "as drawn", agents=game.agents, institutions=tuple(_kinds(experiment))
+    )
+
+
+def numbered(words: Sequence[str], experiment: "Experiment") -> list[str]:
+    """Return words whose flags of institutions have a number in place of a name."""
+    above, kinds = "--game.institutions.", _kinds(experiment)
+    changed = []
+    for word in words:
+        name, dot, field = word.removeprefix(above).partition(".")
+        is_name = word.startswith(above) and kinds.count(name.replace("-", "_")) == 1
+        number = kinds.index(name.replace("-", "_")) if is_name else 0
+        changed.append(f"{above}{number}{dot}{field}" if is_name else word)
+    return changed
+
+
+def _kinds(experiment: "Experiment") -> list[str]:
+    return [_snake(type(part).__name__) for part in getattr(experiment.game, "institutions", ())]
