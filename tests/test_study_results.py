@@ -426,13 +426,6 @@ def summary_of_pairs(tmp_path, monkeypatch):
     return written
 
 
-def test_the_summary_of_runs_under_other_versions_says_so(tmp_path, summary_of_pairs):
-    for trial, cpu in zip(trials_of(PAIRED), ("Xeon", "Epyc"), strict=True):
-        write_run(tmp_path / "runs" / trial.name, trial.experiment, lambda *_: 1, cpu=cpu)
-    sentence = "- The runs were made under more than one processor: Xeon in 1 run; Epyc in 1 run"
-    assert sentence in summary_of_pairs()
-
-
 def test_the_summary_says_how_many_steps_each_replica_learned_from_where_the_runs_do(
     tmp_path, summary_of_pairs
 ):
