@@ -80,7 +80,9 @@ class LaneActor(ActorOfLanes):
         self._chance = 0.0 if stochastic else 1.0
         self._epsilon = torch.tensor(self._chance, dtype=torch.float64)
         self._seeds = seeds
-        self._explore = Compiled(type(self)._explored, what="agents act", enabled=compile)
+        # Of named arguments, since compiled code that is shared asks for those of a call by their names.
+        explored = LaneActor._explored_with if self.state_cells else LaneActor._explored
+        self._explore = Compiled(explored, what="agents act", enabled=compile)
 
     @property
     def epsilon(self) -> float:
@@ -149,9 +151,17 @@ class LaneActor(ActorOfLanes):
         chosen: list[Tensor] = self._explore(form, self, *numbers, *seen)
         return chosen
 
-    def _explored(self, numbers: Tensor, epsilon: Tensor, *seen: Tensor) -> list[Tensor]:
-        """Exploring actions, and of recurrent networks the states afterwards."""
-        values, *after = self._outputs(*seen)
+    def _explored(self, numbers: Tensor, epsilon: Tensor, observation: Tensor) -> list[Tensor]:
+        """Exploring actions."""
+        return self._chosen(numbers, epsilon, *self._outputs(observation))
+
+    def _explored_with(
+        self, numbers: Tensor, epsilon: Tensor, observation: Tensor, state: Tensor
+    ) -> list[Tensor]:
+        """Exploring actions of recurrent networks, and the states afterwards."""
+        return self._chosen(numbers, epsilon, *self._outputs(observation, state))
+
+    def _chosen(self, numbers: Tensor, epsilon: Tensor, values: Tensor, *after: Tensor) -> list[Tensor]:
         if self.stochastic:
             chosen = self._sampled(values, numbers)
         else:
