@@ -21,7 +21,7 @@ from cprl.commands.studies import sweep as sweep_words
 from cprl.runs.files import RunLockedError
 from cprl.runs.recipe import start_run
 from cprl.studies import InProcess, Integers, Processes, Ray, read_study
-from cprl.studies.run import Driver
+from cprl.studies.run import shared
 from cprl.studies.trials import trials_of
 from cprl.system.shipped import cprl_here
 
@@ -457,4 +457,4 @@ def test_where_nothing_can_be_locked_nobody_else_is_said_to_run_a_study(tmp_path
 
 def driven(study, out):
     """In which a study is run."""
-    return Driver(out, out / "runs", InProcess()).running(study)
+    return shared(study, out, progress=True)

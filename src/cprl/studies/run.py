@@ -81,12 +81,24 @@ def run_study(
     out = directory_of(study, out)
     folder = out / RUNS if runs is None else Path(runs)
     trials = trials_of(study)
-    chosen = trials_with(trials, only)
-    check_comparison(last)
-    driver = Driver(out, folder, on or InProcess(), keep_checkpoints, progress)
-    with driver.running(study):
-        failed = driver.run(chosen, study.name)
-        table = results_of(study, out, folder, last=last, again=again) if results else None
+    tasks = [
+        Task(
+            trial=trial,
+            runs=folder,
+            status=Status(out / STATUS, trial.name),
+            keep_checkpoint=keep_checkpoints,
+        )
+        for trial in trials_with(trials, only)
+    ]
+    checked("last", last, Annotated[int, Range(WINDOW, MOST_INT32)])
+    table = None
+    with shared(study, out, progress=progress):
+        folder.mkdir(parents=True, exist_ok=True)
+        failed = _run(tasks, on or InProcess(), study.name, progress=progress)
+        if results and any(trial.state(folder) == "finished" for trial in trials):
+            from cprl.studies.results import write_results  # with matplotlib
+
+            table = write_results(study, out, folder, last=last, again=again)
     return StudyResult(study, out, folder, tuple(trials), failed, table)
 
 
@@ -103,96 +115,58 @@ def trials_with(trials: Sequence[Trial], only: Sequence[str]) -> list[Trial]:
     return [trial for trial in trials if not only or trial.condition.name in chosen]
 
 
-def results_of(study: Study, out: Path, runs: Path, *, last: int, again: str) -> StudyTable | None:
-    """Writes table, summary and figures of what has finished, see `write_results`; None if nothing has."""
-    if all(trial.state(runs) != "finished" for trial in trials_of(study)):
-        return None
-    from cprl.studies.results import write_results  # with matplotlib
+@contextmanager
+def shared(study: Study, out: Path, *, progress: bool) -> Iterator[None]:
+    """Makes a study's directory, and locks it together with all who run the same study.
 
-    return write_results(study, out, runs, last=last, again=again)
-
-
-def check_comparison(last: int) -> None:
-    """Raises a ValueError for episodes that the table of a study does not tell apart."""
-    checked("last", last, Annotated[int, Range(WINDOW, MOST_INT32)])
-
-
-@dataclass(frozen=True)
-class Driver:
-    """What runs trials of a study.
-
-    Args:
-        out: the study's directory.
-        runs: that of its runs.
-        executor: where trials are run.
-        keep_checkpoints: see `run_study`, as the others.
+    Raises:
+        RunLockedError: where another study is run there.
     """
+    out.mkdir(parents=True, exist_ok=True)
+    content = json.dumps(study.to_config(out), sort_keys=True).encode()
+    with RunLock(out, study=hashlib.blake2b(content, digest_size=6).hexdigest()) as lock:
+        if lock.is_alone:
+            remove_partial(out, out / STATUS, out / "figures")
+        elif progress:
+            say(_others(out))
+        write_study(study, out)
+        yield
 
-    out: Path
-    runs: Path
-    executor: Executor
-    keep_checkpoints: bool = False
-    progress: bool = True
 
-    @contextmanager
-    def running(self, study: Study) -> Iterator[None]:
-        """Makes the study's directory, and locks it together with all who run the same study.
+def _run(tasks: Sequence[Task], executor: Executor, title: str, *, progress: bool) -> tuple[Outcome, ...]:
+    """Runs trials, shows how far they are, and returns those that failed.
 
-        Raises:
-            RunLockedError: where another study is run there.
-        """
-        self.out.mkdir(parents=True, exist_ok=True)
-        content = json.dumps(study.to_config(self.out), sort_keys=True).encode()
-        digest = hashlib.blake2b(content, digest_size=6).hexdigest()
-        with RunLock(self.out, study=digest) as lock:
-            if lock.is_alone:
-                remove_partial(self.out, self.out / STATUS, self.out / "figures")
-            elif self.progress:
-                say(_others(self.out))
-            self.runs.mkdir(parents=True, exist_ok=True)
-            write_study(study, self.out)
-            yield
+    Those that another process runs come last: all others first, then it waits for these. Those that were made
+    with other code of the user's own are moved aside and run anew.
 
-    def run(self, trials: Sequence[Trial], title: str) -> tuple[Outcome, ...]:
-        """Runs trials, shows how far they are, and returns those that failed.
-
-        Those that another process runs come last: all others first, then it waits for these. Those that were
-        made with other code of the user's own are moved aside and run anew.
-
-        Raises:
-            RunLockedError: where another process runs such a trial.
-        """
-        moved = [aside for trial in trials if (aside := move_aside(self.runs / trial.name)) is not None]
-        if moved and self.progress:
-            places = f"{moved[0]}{f' and {len(moved) - 1} more' if moved[1:] else ''}"
-            anew = f"{len(moved)} of {len(trials)} trials are run anew, as the user's own code has changed"
-            say(f"{anew}; what was there is kept: {places}")
-        tasks = [self._task(trial) for trial in trials]
-        for task in tasks:
-            task.status.tidy_up()
-        progress = Progress(trials, self.runs, self.out / STATUS, title=title, is_shown=self.progress)
-        failed = []
-        with progress, closing(_outcomes(tasks, self.executor)) as outcomes:
-            try:
-                for outcome in outcomes:
-                    progress.ended(outcome)
-                    failed += [outcome] if outcome.state == "failed" else []
-            except BaseException as error:
-                states = Counter(trial.state(self.runs) for trial in trials)
-                error.add_note(
-                    f"{states['finished']} of {len(trials)} trials are finished and {states['unfinished']} "
-                    f"begun; all of it is kept in {self.runs}, and the same study continues from there"
-                )
-                raise
-        return tuple(failed)
-
-    def _task(self, trial: Trial) -> Task:
-        return Task(
-            trial=trial,
-            runs=self.runs,
-            status=Status(self.out / STATUS, trial.name),
-            keep_checkpoint=self.keep_checkpoints,
-        )
+    Raises:
+        RunLockedError: where another process runs such a trial.
+    """
+    runs, status = tasks[0].runs, tasks[0].status.folder
+    moved = [aside for task in tasks if (aside := move_aside(task.directory)) is not None]
+    if moved and progress:
+        places = f"{moved[0]}{f' and {len(moved) - 1} more' if moved[1:] else ''}"
+        anew = f"{len(moved)} of {len(tasks)} trials are run anew, as the user's own code has changed"
+        say(f"{anew}; what was there is kept: {places}")
+    for task in tasks:
+        task.status.tidy_up()
+    trials, failed = [task.trial for task in tasks], []
+    with (
+        Progress(trials, runs, status, title=title, is_shown=progress) as table,
+        closing(_outcomes(tasks, executor)) as outcomes,
+    ):
+        try:
+            for outcome in outcomes:
+                table.ended(outcome)
+                failed += [outcome] if outcome.state == "failed" else []
+        except BaseException as error:
+            states = Counter(trial.state(runs) for trial in trials)
+            error.add_note(
+                f"{states['finished']} of {len(trials)} trials are finished and {states['unfinished']} "
+                f"begun; all of it is kept in {runs}, and the same study continues from there"
+            )
+            raise
+    return tuple(failed)
 
 
 def _outcomes(tasks: Sequence[Task], executor: Executor) -> Generator[Outcome, None, None]:
