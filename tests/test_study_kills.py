@@ -88,10 +88,14 @@ def is_of_trial(process):
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
-    """The runs of the edited study, of which the first one is a part, in one process that nobody killed."""
+    """Gives the runs of a study in one process that nobody killed, in which those of smaller ones are, too."""
     folder = tmp_path_factory.mktemp("undisturbed")
-    assert run_study(study_of(EDITED), folder, on=InProcess(), results=False).failed == ()
-    return folder / "runs"
+
+    def undisturbed(study):
+        assert run_study(study, folder, on=InProcess(), results=False).failed == ()
+        return folder / "runs"
+
+    return undisturbed
 
 
 def kill(driver, out, stage, on):
@@ -107,7 +111,8 @@ def test_a_study_that_is_killed_while_its_trials_train_ends_the_same(tmp_path, u
     out, on, factors = tmp_path / "study", ON[0], {FREEZE: [2], GAMMA: [0.5]}
     kill(started(out, on, factors), out, "trials train", on)
     assert started(out, on, factors).wait(300) == 0, printed(out)[-2000:]
-    assert_same_study(study_of(factors), out / "runs", undisturbed)
+    study = study_of(factors)
+    assert_same_study(study, out / "runs", undisturbed(study))
 
 
 @pytest.mark.slow
@@ -122,7 +127,7 @@ def test_a_study_that_is_killed_three_times_ends_the_same_and_an_edited_one_runs
     assert started(out, on).wait(600) == 0, printed(out)[-2000:]
     assert "\nwhole\n" in printed(out)
     assert len(runs_in(out, "finished")) == 8
-    assert_same_study(grid, out / "runs", undisturbed)
+    assert_same_study(grid, out / "runs", undisturbed(grid))
 
     before = {path: path.stat().st_mtime_ns for path in (out / "runs").rglob("*")}
     assert started(out, on, EDITED).wait(600) == 0, printed(out)[-2000:]
@@ -130,7 +135,7 @@ def test_a_study_that_is_killed_three_times_ends_the_same_and_an_edited_one_runs
     new = {trial.name for trial in trials_of(edited)} - {trial.name for trial in trials_of(grid)}
     assert len(new) == 4
     assert [attempts_of(out, trial) for trial in trials_of(edited) if trial.name in new] == [1] * 4
-    assert_same_study(edited, out / "runs", undisturbed)
+    assert_same_study(edited, out / "runs", undisturbed(edited))
 
 
 @pytest.mark.slow
