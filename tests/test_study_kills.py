@@ -88,7 +88,7 @@ def is_of_trial(process):
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
-    """Gives the runs of a study in one process that nobody killed, in which those of smaller ones are, too."""
+    """Gives the runs of a study in one process that nobody killed, and those of earlier, smaller ones."""
     folder = tmp_path_factory.mktemp("undisturbed")
 
     def undisturbed(study):
