@@ -51,7 +51,7 @@ _MODULES: Final = {
 }
 """Modules of a package that its page shows too, beside what the package exports."""
 
-INTERNAL: Final = {"checks", "arguments", "system", "runs", "terminal", "commands", "__main__"}
+INTERNAL: Final = {"system", "runs", "terminal", "commands", "__main__"}
 """Packages that no page shows: users reach what they hold by the names of `cprl` or by a command."""
 
 

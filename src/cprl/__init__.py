@@ -1,8 +1,6 @@
 """cprl: common-pool resources and multi-agent reinforcement learning on TorchRL.
 
 A package imports only from those above it:
-    checks       what users hand in, as tables by field: what fits, and how a refusal reads
-    arguments    the same for the arguments of a function
     custom       the user's own code, as a text that a recipe can keep, and what is allowed of it
     values       frozen values: a field's annotation says its range; tables that JSON holds, and back
     system       compilation, caches, memory, output, private parts of libraries

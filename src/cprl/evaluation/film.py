@@ -5,13 +5,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import ceil
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from cprl import arguments, keys
+from cprl import keys
 from cprl.commons.world import Bytes, Shown
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import commons_of
@@ -34,6 +34,7 @@ from cprl.system.memory import check_memory
 from cprl.system.output import legible
 from cprl.training import train
 from cprl.training.agents import LoadedRun, load
+from cprl.values import Natural, Positive, Range, Seed, Value, Where, checked, refusal
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.institutions import has_institutions
 from cprl.viewer.replay import Decisions, Offences, events
@@ -53,9 +54,9 @@ def fresh_episode(
     run: str | Path, *, replica: int = 0, episode: int = 0, seed: int = SEED, allow: Sequence[str] = ()
 ) -> FreshEpisode:
     """The world and the agents of an episode that is filmed; equal numbers give equal episodes."""
-    episode = arguments.integer("episode", episode, 0, 2**32 - 1)
-    replica = arguments.integer("replica", replica, 0)
-    seed = arguments.seed(seed)
+    episode = checked("episode", episode, Annotated[int, Range(0, 2**32 - 1)])
+    replica = checked("replica", replica, Natural)
+    seed = checked("seed", seed, Seed)
     loaded = load(run, allow=allow)
     if replica not in loaded.replicas:
         replicas = ", ".join(map(str, loaded.replicas))
@@ -92,7 +93,7 @@ def film(
         FileExistsError: if the recording exists.
     """
     if out is not None and Path(out).suffix != ".rrd":
-        raise arguments.refusal("out", str(out), "a .rrd; film_video makes a .gif or an .mp4")
+        raise refusal("out", str(out), "a .rrd; film_video makes a .gif or an .mp4")
     fresh = fresh_episode(run, replica=replica, episode=episode, seed=seed, allow=allow)
     target = Path(run) / f"film-{replica}-{episode}.rrd" if out is None else Path(out)
     refuse_to_write_over(target)
@@ -184,32 +185,30 @@ _SAMPLES: Final = 24
 """The pictures from which a GIF's palette is taken."""
 
 
+Fps = Annotated[float, Where(lambda fps: 0 < fps <= MOST_FPS, f"a number above 0, at most {MOST_FPS:g}")]
+
+
 @dataclass(frozen=True, kw_only=True)
-class Style:
+class Style(Value, stored=False):
     """How a film shows an episode."""
 
-    titles: Sequence[str] = ()
+    titles: tuple[str, ...] = ()
     """Of the run and those beside it, one each; by default the institutions of each, or the names of their
     experiments."""
-    every: int | None = None
+    every: Positive | None = None
     """Turns from one picture to the next; by default 1 for an .mp4, and for a .gif as many as it takes for
     300 pictures."""
-    fps: float = DEFAULT_FPS
-    """Pictures per second, above 0, at most 50; in a .gif rounded to hundredths of a second a picture."""
-    width: int | None = None
+    fps: Fps = DEFAULT_FPS
+    """Pictures per second; in a .gif rounded to hundredths of a second a picture."""
+    width: Positive | None = None
     """Of the pictures in pixels, at most 1920, and at least 240 for each run; by default 640 for each run
     that has room. The height follows from the boards, each at most twice as high as its part is wide."""
-
-    def __post_init__(self) -> None:
-        if self.every is not None:
-            arguments.integer("every", self.every, 1)
-        allowed = f"a number above 0, at most {MOST_FPS:g}"
-        arguments.number("fps", self.fps, low=0.0, high=MOST_FPS, above=True, allowed=allowed)
 
     def width_of_each(self, runs: int) -> int:
         """The width of the part of each run."""
         width = min(LARGEST_WIDTH, DEFAULT_WIDTH * runs) if self.width is None else self.width
-        return arguments.integer("width", width, SMALLEST_WIDTH * runs, LARGEST_WIDTH) // runs
+        allowed = Annotated[int, Range(SMALLEST_WIDTH * runs, LARGEST_WIDTH)]
+        return int(checked("width", width, allowed)) // runs
 
 
 _USUAL: Final = Style()
@@ -250,13 +249,13 @@ def film_video(
     """
     path = Path(out)
     if path.suffix not in SUFFIXES:
-        raise arguments.refusal("out", str(path), f"a file whose name ends in {' or '.join(SUFFIXES)}")
+        raise refusal("out", str(path), f"a file whose name ends in {' or '.join(SUFFIXES)}")
     runs = (run, *beside)
     most_runs = LARGEST_WIDTH // SMALLEST_WIDTH
     if len(runs) > most_runs:
-        raise arguments.refusal("beside", f"{len(runs) - 1} runs", f"at most {most_runs - 1}")
+        raise refusal("beside", f"{len(runs) - 1} runs", f"at most {most_runs - 1}")
     if style.titles and (len(style.titles) != len(runs) or not all(map(str.isprintable, style.titles))):
-        raise arguments.refusal("titles", style.titles, f"a line of text for each of {len(runs)} runs")
+        raise refusal("titles", style.titles, f"a line of text for each of {len(runs)} runs")
     width = style.width_of_each(len(runs))
     refuse_to_write_over(path)
     if path.suffix == ".mp4":

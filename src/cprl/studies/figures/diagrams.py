@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from cprl.arguments import refusal
 from cprl.measuring.now import DECLINE, HARVESTING, RECOVERY
 from cprl.studies.figures.levels import levels_note, replicas_text, short, title_of
 from cprl.studies.tables.comparing import LAST, Comparison, compare, differing, digits_for
@@ -18,6 +17,7 @@ from cprl.studies.tables.sources import NO_BETTER
 from cprl.studies.tables.table import TRAINING, Design, StudyTable
 from cprl.terminal.figures import COLOURS as PHASE_COLOURS
 from cprl.terminal.style import EMPTY, SHADES, SMALL_PT, draw_cell, head, picture_path, save, wrapped
+from cprl.values import refusal
 
 COLOURS: Final = {
     **PHASE_COLOURS,

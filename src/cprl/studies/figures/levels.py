@@ -13,7 +13,6 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from cprl.arguments import refusal
 from cprl.measuring.statistics import Estimate
 from cprl.studies.tables.comparing import (
     INTERVALS,
@@ -27,6 +26,7 @@ from cprl.studies.tables.comparing import (
 )
 from cprl.studies.tables.table import RANDOM, TRAINING, Design, StudyTable
 from cprl.terminal.style import CHARACTER_IN, MEAN, RANDOM_LINE, SMALL_PT, head, picture_path, save, wrapped
+from cprl.values import refusal
 
 MOST_CONDITIONS: Final = 60
 """A figure with a row for each condition has at most so many rows."""

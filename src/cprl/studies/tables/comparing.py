@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
-from cprl.arguments import choice, integer, refusal
 from cprl.measuring.metrics import title
 from cprl.measuring.statistics import CONFIDENCE, Estimate, difference, estimate, holm
 from cprl.studies.tables.table import NET, PARTS, RANDOM, TRAINING, StudyTable
 from cprl.system.defaults import LAST as LAST
+from cprl.values import Positive, checked, refusal
 
 METRICS: Final = ("collective_return", NET, "equality", "sustainability", "survival_steps", "peacefulness")
 """Metrics that are compared, unless others are asked for, where a table has them."""
@@ -102,8 +102,8 @@ def compare(table: StudyTable, metric: str, *, part: str = TRAINING, last: int =
         last: of training: episodes at its end; those of whole windows.
     """
     metrics_of(table, [metric])
-    choice("part", part, PARTS)
-    integer("last", last, 1)
+    checked("part", part, Literal[tuple(PARTS)])
+    checked("last", last, Positive)
     if part == TRAINING and last < table.window:
         raise refusal("last", last, f"at least {table.window}, the episodes of a window of the table")
     key = metric, part, last

@@ -6,7 +6,6 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.arguments import refusal
 from cprl.experiment import Experiment
 from cprl.runs.recipe import read_recipe, runs_in
 from cprl.studies.factors import ALL, normalised, values_at
@@ -14,7 +13,7 @@ from cprl.studies.study import UNNAMED, Condition, named, short_names
 from cprl.studies.tables.sources import REASONS, Source, plain_level, table_of
 from cprl.studies.tables.table import WINDOW, Design, Lacking, StudyTable, some
 from cprl.studies.trials import state_of
-from cprl.values import differences, to_config
+from cprl.values import differences, refusal, to_config
 
 _MOST_NAMED: Final = 5
 _NOT_COMPARED: Final = (*UNNAMED, "evaluation_episodes")

@@ -11,7 +11,6 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from cprl.arguments import integer
 from cprl.measuring import social
 from cprl.measuring.now import DECLINE, HARVESTING, LEAST_LOSS, LOST, RECOVERY, REGAINED, TRAGEDY
 from cprl.measuring.phases import FEWEST_EPISODES, UNNAMED
@@ -39,6 +38,7 @@ from cprl.studies.tables.table import (
 )
 from cprl.studies.trials import State, trials_of
 from cprl.terminal.course import BELOW_RANDOM, LAST_EPISODES, PEAK_EPISODES, PEAK_OVER_RANDOM
+from cprl.values import Positive, checked
 
 REASONS: Final[dict[State, str]] = {
     "missing": "was not begun",
@@ -142,7 +142,7 @@ def table_of(
         sources: the runs; what is damaged of them is listed as lacking.
         lacking: other runs, which are listed.
     """
-    integer("window", window, 1)
+    checked("window", window, Positive)
     measured: list[_Measured] = []
     damaged: list[Lacking] = []
     for source in sources:
