@@ -198,14 +198,13 @@ def test_what_is_nested_without_end_is_refused_in_a_sentence(deep):
     [
         "[" * 100_000 + "]" * 100_000,
         '{"experiment": ' + '{"a":' * 100_000 + "1" + "}" * 100_001,
-        '{"experiment": {"a": ' + "[" * 300 + "]" * 300 + "}}",
         '{"experiment": {"a": ' + "9" * 5000 + "}}",
         '{"experiment": ',
         "3",
         "null",
         '{"experiment": {}}\0',
     ],
-    ids=["deep list", "deep table", "rather deep", "many digits", "cut", "a number", "null", "a NUL"],
+    ids=["deep list", "deep table", "many digits", "cut", "a number", "null", "a NUL"],
 )
 def test_a_recipe_that_cannot_be_read_is_refused_with_its_path(text, tmp_path):
     path = tmp_path / "recipe.json"
