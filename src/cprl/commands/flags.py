@@ -50,7 +50,7 @@ class ValueFlags(ConstructorRegistry):
         self.struct_rule(self._changes)
 
     def _changes(self, info: StructTypeInfo) -> StructConstructorSpec | None:
-        value = info.default
+        value: Any = info.default
         if self._is_inside or isinstance(value, type) or not is_dataclass(value):
             return None
         self._is_inside = True  # in what tyro's own rule says of a dataclass: defaults and help
@@ -61,12 +61,13 @@ class ValueFlags(ConstructorRegistry):
         assert isinstance(usual, StructConstructorSpec)
         settable = {field.name for field in fields(value) if field.init}
         place = self._places.get(id(value), "")
+        made: Any = value
         flags = [self._flag(field, place) for field in usual.fields if field.name in settable]
 
         def changed(**given: Any) -> Any:
             changes = {name: new for name, new in given.items() if new != getattr(value, name)}
             try:
-                return replace(value, **changes) if changes else value
+                return replace(made, **changes) if changes else made
             except ValueError as error:
                 raise RefusedError(str(error)) from error
 

@@ -151,8 +151,8 @@ def film(
         return
     style = {name: value for name, value in options.given.items() if name != "beside"}
     path, episodes = film_video(run, out, beside=options.beside, style=Style(**style), **which)
-    for name, played in zip((run, *options.beside), episodes, strict=True):
-        say(f"{f'{name}: ' if options.beside else ''}{played.steps} steps, {played.outcome}")
+    for path_of_run, played in zip((run, *options.beside), episodes, strict=True):
+        say(f"{f'{path_of_run}: ' if options.beside else ''}{played.steps} steps, {played.outcome}")
     say(f"{path}: {path.stat().st_size / 1000:.0f} kB")
 
 

@@ -165,7 +165,7 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
 
     with in_a_sentence(script):
         options = tyro.cli(read, args=command[1:], prog=script, description=_about(study), config=_CONFIG)
-        given = {"replicas": options.replicas, "block": options.block}
+        given: dict[str, Any] = {"replicas": options.replicas, "block": options.block}
         study = replace(study, **{name: value for name, value in given.items() if value is not None})
         if options.episodes is not None:
             study = _of_episodes(study, options.episodes)

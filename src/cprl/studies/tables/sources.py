@@ -273,7 +273,7 @@ def _rows(design: Design, measured: Sequence[_Measured], marked: Mapping[str, st
                 blocks.append([array.reshape(-1) for array in np.broadcast_arrays(*codes, *windows, place)])
     columns = [np.concatenate(arrays) for arrays in zip(*blocks, strict=True)] or [np.zeros(0, np.int64)] * 9
     order = np.lexsort(columns[4::-1])  # the first five, the first one first
-    condition, replica, part, metric, episode, length, undefined, value, run = (
+    condition, replica, part_code, metric_code, episode, length, undefined, value, place_of_run = (
         column[order] for column in columns
     )
 
@@ -282,17 +282,17 @@ def _rows(design: Design, measured: Sequence[_Measured], marked: Mapping[str, st
 
     rows = {
         "condition": texts(names, condition),
-        "checksum": texts([source.checksum for source in sources], run),
+        "checksum": texts([source.checksum for source in sources], place_of_run),
     }
     for factor in design.factors:
         column = f"factor {factor}" if factor in COLUMNS else factor
         rows[column] = _levels(design.levels(factor)).take(pa.array(condition))
     rows |= {
-        "run": texts([source.name for source in sources], run),
-        "marks": texts([marked[source.name] for source in sources], run),
+        "run": texts([source.name for source in sources], place_of_run),
+        "marks": texts([marked[source.name] for source in sources], place_of_run),
         "replica": pa.array(replica, pa.int32()),
-        "part": texts(parts, part),
-        "metric": texts(metrics, metric),
+        "part": texts(parts, part_code),
+        "metric": texts(metrics, metric_code),
         "episode": pa.array(episode, pa.int32()),
         "window_episodes": pa.array(length, pa.int32()),
         "undefined": pa.array(undefined, pa.int32()),
