@@ -43,12 +43,21 @@ DQNS = (Learning(DQN(settings=REPLAY)), Learning(PPO(settings=ROLLOUT)), Scripte
 
 
 def experiment(**changes):
-    how = {"replicas": 2, "episodes": 5, "evaluation_episodes": 3, "engine": "eager", "seed": 4, **changes}
-    return cprl.Experiment(**{"name": "evaluated", "game": GAME, "agents": MIXED, "evaluate_every": 2, **how})
+    options = {
+        "replicas": 2,
+        "episodes": 5,
+        "evaluation_episodes": 3,
+        "engine": "eager",
+        "seed": 4,
+        **changes,
+    }
+    return cprl.Experiment(
+        **{"name": "evaluated", "game": GAME, "agents": MIXED, "evaluate_every": 2, **options}
+    )
 
 
-def run(experiment, out, **how):
-    return cprl.run(experiment, out, **{"watch": "off", "figures": False, **how})
+def run(experiment, out, **options):
+    return cprl.run(experiment, out, **{"watch": "off", "figures": False, **options})
 
 
 def rows(table):

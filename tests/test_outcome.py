@@ -34,7 +34,8 @@ EXPERIMENT = cprl.Experiment(
 
 def numbers(episodes):
     return [
-        (own.world, own.steps, own.return_.tolist(), own.harvest.tolist(), own.stock_left) for own in episodes
+        (episode.world, episode.steps, episode.return_.tolist(), episode.harvest.tolist(), episode.stock_left)
+        for episode in episodes
     ]
 
 
@@ -79,8 +80,8 @@ def test_random_play_of_a_game_with_transforms_or_of_somebody_elses_is_played_ag
 def test_a_run_has_the_same_outcome_watched_or_not_and_its_recording_shows_the_end(tmp_path):
     off, watched = (cprl.run(EXPERIMENT, tmp_path / watch, watch=watch) for watch in ("off", "file"))
     for policy in ("random", "trained"):
-        own, others = (read_table(run / "evaluation" / f"{policy}.parquet") for run in (off, watched))
-        assert own.equals(others)
+        unwatched, others = (read_table(run / "evaluation" / f"{policy}.parquet") for run in (off, watched))
+        assert unwatched.equals(others)
     headers = [text[0] for text in column(watched / "run.rrd", "header", "TextDocument:text")[1]]
     random, trained = (
         np.mean(np.array(read_table(watched / "evaluation" / f"{policy}.parquet")["collective_return"]))
@@ -120,9 +121,9 @@ def test_what_transforms_have_learned_is_the_same_for_everybody_who_is_evaluated
     load_transforms_state(env, {"transforms.0.seen": torch.tensor(100.0)})
     begun = []
 
-    def noting(env, policy, **how):
+    def noting(env, policy, **options):
         begun.append(transforms_state(env)["transforms.0.seen"].item())
-        return evaluate(env, policy, **how)
+        return evaluate(env, policy, **options)
 
     monkeypatch.setattr("cprl.training.outcome.evaluate", noting)
     evaluate_population(experiment, env, population)
