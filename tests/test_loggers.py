@@ -121,11 +121,3 @@ def test_a_logger_that_cannot_be_made_is_refused_by_name_before_anything_is_writ
         with pytest.raises(ModuleNotFoundError, match=f"needs the package {name}: pip install {name}"):
             make_logger(name, tmp_path / "run")
     assert not Path(tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(("name", "value"), [("mood", "good"), ("mood", [1.0, 2.0]), (3, 1.0)])
-def test_what_is_no_number_by_name_is_not_logged(tmp_path, batches, name, value):
-    tracker = EpisodeTracker(2, 2)
-    episode = next(episode for batch in batches for episode in tracker.add(batch))
-    with LoggerCallback(csv_of(tmp_path)) as callback, pytest.raises(ValueError, match="learning"):
-        callback.on_episode(episode, {name: value})

@@ -144,3 +144,17 @@ def test_the_command_works_by_the_name_of_the_package_too():
 
 def test_type_checkers_find_the_types():
     assert files("cprl").joinpath("py.typed").is_file()
+
+
+@pytest.mark.parametrize(
+    "before",
+    [
+        "import cprl, gymnasium",
+        "import gymnasium, cprl",
+        "import cprl; from importlib.util import find_spec; find_spec('gymnasium'); import gymnasium",
+    ],
+)
+def test_gymnasium_makes_the_boards_whichever_is_imported_first(before):
+    code = f"{before}; print(gymnasium.spec('cprl/SingleBasic-v0').entry_point)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == "cprl.presets:gymnasium_env", done.stderr

@@ -84,23 +84,29 @@ def when_imported(name: str, call: Callable[[], object]) -> None:
 
 
 class _Waiting:
-    """Finds a module once, as Python does without it, and calls a function behind its import."""
+    """Finds a module as Python does without it, and calls a function behind its import; looking for a module
+    does not import it."""
 
     def __init__(self, name: str, call: Callable[[], object]) -> None:
         self._name, self._call = name, call
+        self._is_looking = False
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        if fullname != self._name:
+        if fullname != self._name or self._is_looking:
             return None
-        sys.meta_path.remove(self)
-        spec = find_spec(fullname)
+        self._is_looking = True
+        try:
+            spec = find_spec(fullname)
+        finally:
+            self._is_looking = False
         if spec is None or spec.loader is None:
             return spec
         execute = spec.loader.exec_module
 
         def execute_and_call(module: ModuleType) -> None:
+            sys.meta_path.remove(self)
             execute(module)
             self._call()
 
