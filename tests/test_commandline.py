@@ -201,7 +201,7 @@ def test_a_value_of_several_kinds_has_the_fields_of_the_kind_that_it_is_and_no_s
     changed = Learning(DQN(settings=DQNSettings(), network=MLP(hidden_cells=(4, 4))), reward=Exchange(0.1))
     assert given.agents == (changed, *mixed.agents[1:])
     with pytest.raises(SystemExit):
-        read("--help", lambda: mixed)
+        read("--help-all", lambda: mixed)
     said = capsys.readouterr().out
     assert "subcommands" not in said
     assert "--agents.1.reward {individual,team}" in said
@@ -233,7 +233,7 @@ def test_what_a_command_line_cannot_say_stays_as_it_is():
         kept, seed=4, agents=(Learning(Custom("my:algorithm"), reward="team"), *base.agents[1:])
     )
     assert read("--game.institutions.1.share 0.5", lambda: kept)[0].game.institutions[1] == Quota(share=0.5)
-    for line in ("--game.institutions.0.freeze-steps 3", "--game.institutions.2.share 1", "--loggers wandb"):
+    for line in ("--game.institutions.2.share 1", "--loggers wandb"):
         with pytest.raises(SystemExit):
             read(line, lambda: kept)
 

@@ -27,7 +27,7 @@ import cprl
 from cprl import CommonsEnv, Experiment
 from cprl.algorithms import DQN, Tabular, TabularSettings
 from cprl.evaluation import crossplay, evaluate_run
-from cprl.learners import trial
+from cprl.learners import replay, rollouts, trial
 from cprl.learners.preferences import InequityAversion
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in
@@ -109,7 +109,8 @@ def test_every_engine_learns_what_a_list_of_torchrls_losses_does(name, way, monk
     found, fitting = [], trial.fitting_engine
 
     def learned(engine):
-        monkeypatch.setattr(trial, "fitting_engine", engine)
+        for learners in (replay, rollouts):
+            monkeypatch.setattr(learners, "fitting_engine", engine)
         agents = population(GROUPS[name])
         trained(agents, episodes=3)
         return weights(agents)
