@@ -409,8 +409,6 @@ def runs_table(
 
 def _table_in(runs: Sequence[Path], reference: str | None, window: int | None) -> "StudyTable":
     """The table of a study's directory."""
-    from cprl.studies import StudyTable
-
     path = runs[0] / "table.parquet"
     if len(runs) > 1 or not path.exists():
         raise ValueError(
@@ -419,6 +417,8 @@ def _table_in(runs: Sequence[Path], reference: str | None, window: int | None) -
         )
     if window is not None:
         raise ValueError("--window is for runs; allowed: with --by, as a study's table has its windows")
+    from cprl.studies import StudyTable
+
     table = StudyTable.read(path)
     if reference is None:
         return table
