@@ -46,7 +46,7 @@ from verdicts import CONTRADICTED, NOT_CONTRADICTED, curve_prediction, predictio
 import cprl
 from cprl import Game, Rules, maps, presets
 from cprl.algorithms import DQN
-from cprl.custom import Custom
+from cprl.custom import Custom, allowing
 from cprl.institutions import Tax
 from cprl.measuring.movement import Trace
 from cprl.measuring.statistics import estimate
@@ -247,7 +247,8 @@ def test_a_report_imports_code_of_ones_own_where_it_is_allowed(tmp_path, capsys)
         engine="eager",
         transforms=(Custom(target, {}),),
     )
-    run = cprl.run(experiment, tmp_path / "counted", watch="off", allow=[target])
+    with allowing([target]):
+        run = cprl.run(experiment, tmp_path / "counted", watch="off")
     with pytest.raises(ValueError, match=target):
         write_report([run], tmp_path / "report")
     assert "| counted |" in write_report([run], tmp_path / "report", allow=[target]).read_text()
