@@ -81,7 +81,9 @@ def test_a_trial_that_failed_says_why_and_can_be_repeated_by_hand_with_the_line_
     assert attempts_of(tmp_path, result.trials[0]) == 1
     (tmp_path / "only_here.py").write_text("class Callback:\n    def on_episode(self, *_): ...\n")
     command = log_of(tmp_path, result.trials[0]).partition("\n")[0].removeprefix("$ ")
-    subprocess.run(command, shell=True, cwd=tmp_path, check=True, capture_output=True)
+    paths = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": paths}
+    subprocess.run(command, shell=True, env=environment, check=True, capture_output=True)
     assert result.trials[0].state(result.runs) == "finished"
 
 
