@@ -188,7 +188,7 @@ def test_all_help_lists_every_number_and_equal_agents_once(capsys):
     assert "--agents.1.reward" not in words
     assert "--agents.2.algorithm.clip-epsilon" in words
     assert "--callbacks" not in words
-    assert "Turns of an episode" in words or "(default: 1000)" in words
+    assert "The number of turns after which an episode is truncated [W]. (default: 1000)" in words
 
 
 @pytest.mark.integration
@@ -233,6 +233,8 @@ def test_what_a_command_line_cannot_say_stays_as_it_is():
         kept, seed=4, agents=(Learning(Custom("my:algorithm"), reward="team"), *base.agents[1:])
     )
     assert read("--game.institutions.1.share 0.5", lambda: kept)[0].game.institutions[1] == Quota(share=0.5)
+    changed = read("--game.institutions.0.freeze-steps 3 9", lambda: kept)[0].game.institutions[0]
+    assert changed == replace(sanctions, freeze_steps=(3, 9)), "a row of numbers can be said, a table cannot"
     for line in ("--game.institutions.2.share 1", "--loggers wandb"):
         with pytest.raises(SystemExit):
             read(line, lambda: kept)
