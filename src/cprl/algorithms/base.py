@@ -209,8 +209,8 @@ class TeamAlgorithm(Algorithm, stored=False):
     """The smallest team that the algorithm supports."""
 
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
-        """Makes the networks of a team from those of its members: `AgentNetworks`, the acting `TeamNetwork`
-        first. Added networks are initialised from torch's generator."""
+        """Makes the networks of a team from those of its members: `AgentNetworks`, the acting
+        `cprl.networks.team.Team` first. Added networks are initialised from torch's generator."""
         raise NotImplementedError(f"{type(self).__name__} must define make_team(members, spaces)")
 
     def method(self, spaces: Spaces) -> Method:

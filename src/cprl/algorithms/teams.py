@@ -32,7 +32,7 @@ from cprl.learners.settings import LOLASettings
 from cprl.networks.agent import AgentNetworks
 from cprl.networks.mlp import MLP, Cells, MLPNetwork
 from cprl.networks.specification import Network
-from cprl.networks.team import CentralCritic, JointCritics, Mixing, team_network
+from cprl.networks.team import CentralCritic, JointCritics, Mixing, Team
 from cprl.objectives import LOLADiCELoss, LOLALoss
 from cprl.objectives.maddpg import NUMBERS, MADDPGLoss
 from cprl.objectives.td import DISTANCES
@@ -120,7 +120,7 @@ class IPPO(TeamAlgorithm, Clipped):
 
 
 def _team(members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
-    return team_network(members, observation_dims=len(spaces.observation_shape))
+    return Team(members, observation_dims=len(spaces.observation_shape))
 
 
 def _mixed(network: nn.Module, seen_by_mixer: Sequence[str]) -> LossModule:
@@ -169,7 +169,7 @@ class MADDPG(TeamAlgorithm, OffPolicy):
 
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
         dims = len(spaces.observation_shape)
-        actors = team_network(members, observation_dims=dims)
+        actors = Team(members, observation_dims=dims)
         return AgentNetworks({"actor": actors, "critic": self._critics(len(members), spaces)})
 
     def _critics(self, members: int, spaces: Spaces) -> JointCritics:
@@ -181,7 +181,7 @@ class MADDPG(TeamAlgorithm, OffPolicy):
         elif self.network is not None:
             features, cells = cells[-1], cells[-1:]
             each = [self.new_network(spaces, features, shape=everything) for _ in range(members)]
-            encoders = team_network(each, observation_dims=dims)
+            encoders = Team(each, observation_dims=dims)
         names = "relu_on_outputs", "glorot_uniform"
         options = {name: getattr(self.settings, name) for name in names}
         heads = [
@@ -189,7 +189,7 @@ class MADDPG(TeamAlgorithm, OffPolicy):
             for _ in range(members)
         ]
         return JointCritics(
-            team_network(heads, observation_dims=1),
+            Team(heads, observation_dims=1),
             encoders,
             observation_dims=dims - 1,
             highest=spaces.observation_scale,

@@ -29,7 +29,7 @@ StartFrom: TypeAlias = Mapping[str, Mapping[str, Tensor]]
 """The state dict of the acting network with which each lane starts, by the lane's name."""
 
 MakeTeam = Callable[[Sequence[nn.Module]], nn.Module]
-"""Makes the networks of a team from those of its members: `AgentNetworks`, that of `team_network` first.
+"""Makes the networks of a team from those of its members: `AgentNetworks`, a `cprl.networks.team.Team` first.
 Members that share parameters are one and the same network."""
 
 _SHARED: Final = 1

@@ -1,6 +1,6 @@
 """The networks of many lanes as one, whose parameters carry a lane axis."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence, Set
 from copy import deepcopy
 from typing import Any
 
@@ -15,15 +15,14 @@ class StackedMLP(nn.Module):
     """L networks like `MLPNetwork` whose parameters carry a lane axis, [L, in, out] and [L, 1, out].
 
     A lane is one agent of one replica. Lanes do not influence each other: output l depends on input l and
-    parameters l alone.
+    parameters l alone. R such stacks of S networks each stack to parameters [R, S, in, out], of L = R x S.
     """
 
     def __init__(self, networks: Sequence[MLPNetwork]) -> None:
         super().__init__()
         first = networks[0]
         forms = {(network.highest, network.relu_on_outputs, *_shapes(network)) for network in networks}
-        if len(forms) != 1:
-            raise ValueError(f"the networks of the lanes have {len(forms)} architectures; allowed: 1")
+        _refuse_other_forms(forms)
         self.highest, self.relu_on_outputs = first.highest, first.relu_on_outputs
         self.observation_dims, self.outputs = first.observation_dims, first.outputs
         self._names = [name for name, layer in first.named_modules() if isinstance(layer, nn.Linear)]
@@ -36,12 +35,23 @@ class StackedMLP(nn.Module):
         )
 
     @property
-    def lanes(self) -> int:
-        """The number of lanes L."""
-        return len(self.weights[0])
+    def lane_axis(self) -> int:
+        """The place of the axis of S lanes: 0, or 1 after an axis of R stacks."""
+        return self.weights[0].ndim - 3
+
+    def stacked(self, stacks: Sequence["StackedMLP"]) -> "StackedMLP":
+        """R such networks as one; copies."""
+        together = deepcopy(self)
+        for name in ("weights", "biases"):
+            by_layer = zip(*(getattr(stack, name) for stack in stacks), strict=True)
+            layers = [torch.stack([one.detach() for one in of_layer]) for of_layer in by_layer]
+            setattr(together, name, nn.ParameterList(layers))
+        return together
 
     def lane_state(self, lane: int) -> dict[str, Tensor]:
-        """Copies of the weights of one lane, as the state dict of its `MLPNetwork`."""
+        """Copies of the weights of one lane, as the state dict of its `MLPNetwork`, or of its stack."""
+        if self.lane_axis:
+            return {name: value[lane].clone() for name, value in self.state_dict().items()}
         state = {}
         for name, weight, bias in zip(self._names, self.weights, self.biases, strict=True):
             state[f"{name}.weight"] = weight[lane].detach().T.clone()
@@ -49,10 +59,15 @@ class StackedMLP(nn.Module):
         return state
 
     def forward(self, observation: Tensor) -> Tensor:
-        """uint8 [L, C, X, Y] or [L, b, C, X, Y] to [L, A] or [L, b, A], in the parameters' type."""
+        """uint8 [L, C, X, Y] or [L, ..., C, X, Y] to [L, A] or [L, ..., A], in the parameters' type; [R, S]
+        in place of [L] of R stacks."""
+        weights, biases = ([layer.flatten(0, -3) for layer in group] for group in (self.weights, self.biases))
         flat = observation.flatten(-self.observation_dims)
-        values = flat.reshape(self.lanes, -1, flat.shape[-1]).to(self.weights[0].dtype) / self.highest
-        values = through_layers(values, self.weights, self.biases, relu_on_outputs=self.relu_on_outputs)
+        values = flat.reshape(len(weights[0]), -1, flat.shape[-1]).to(weights[0].dtype) / self.highest
+        for place, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+            values = torch.baddbmm(bias, values.relu() if place else values, weight)
+        if self.relu_on_outputs:
+            values = values.relu()
         return values.reshape(*flat.shape[:-1], values.shape[-1])
 
 
@@ -65,8 +80,7 @@ class StackedModules(nn.Module):
         if next(first.buffers(), None) is not None:
             raise ValueError(f"a {type(first).__name__} has buffers; allowed: parameters alone")
         forms = {tuple((name, value.shape) for name, value in one.named_parameters()) for one in networks}
-        if len(forms) != 1:
-            raise ValueError(f"the networks of the lanes have {len(forms)} architectures; allowed: 1")
+        _refuse_other_forms(forms)
         self.lanes, self.observation_dims = len(networks), int(first.observation_dims)
         self.outputs = getattr(first, "outputs", None)
         self.state_shape = getattr(first, "state_shape", None)
@@ -101,17 +115,6 @@ class StackedModules(nn.Module):
             return tuple(given.reshape(*leading, *given.shape[len(apart) :]) for given in each)
         given = torch.vmap(output)(list(self.weights), observation.reshape(self.lanes, -1, *shape))
         return given.reshape(*leading, *given.shape[2:])
-
-
-def through_layers(
-    values: Tensor, weights: Iterable[Tensor], biases: Iterable[Tensor], *, relu_on_outputs: bool
-) -> Tensor:
-    """Passes [L, b, in] through layers of weights [L, in, out] and biases [L, 1, out], with ReLU between."""
-    first = True
-    for weight, bias in zip(weights, biases, strict=True):
-        values = torch.baddbmm(bias, values if first else values.relu(), weight)
-        first = False
-    return values.relu() if relu_on_outputs else values
 
 
 def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
@@ -163,6 +166,11 @@ def _over(network: Any) -> list[str]:
     them, and its own weights get a lane axis in front."""
     names = getattr(network, "stacks_over", ())
     return [name for name in names if getattr(network, name) is not None]
+
+
+def _refuse_other_forms(forms: Set[object]) -> None:
+    if len(forms) != 1:
+        raise ValueError(f"the networks of the lanes have {len(forms)} architectures; allowed: 1")
 
 
 def _shapes(network: MLPNetwork) -> tuple[tuple[int, ...], ...]:

@@ -1,8 +1,7 @@
 """Networks of teams: those of the members as one, and networks of the observations of all members."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from math import prod
 from typing import Any, ClassVar
 
 import torch
@@ -10,139 +9,64 @@ from torch import Tensor, nn
 from torchrl.modules import QMixer
 
 from cprl.networks.mlp import MLPNetwork
-from cprl.networks.recurrent import RecurrentNetwork, StackedRecurrent, state_shape_of
-from cprl.networks.stacked import StackedMLP, lane_state, through_layers
+from cprl.networks.recurrent import RecurrentNetwork, state_shape_of
+from cprl.networks.stacked import StackedMLP, lane_state, stack_lanes
 
 
-class RecurrentTeam(nn.Module):
-    """The recurrent networks of the S members of a team as one network, with the parameters of each member
-    along a first axis, or with those of one network that all of them share.
+class Team(nn.Module):
+    """The networks of the S members of a team as one.
+
+    Args:
+        networks: of each member; those who share parameters have one and the same.
+        observation_dims: the number of axes of one member's observation.
     """
-
-    def __init__(self, networks: Sequence[RecurrentNetwork]) -> None:
-        super().__init__()
-        first = networks[0]
-        self.shares = len(networks) > 1 and all(network is first for network in networks)
-        self.members: RecurrentNetwork | StackedRecurrent = (
-            first if self.shares else StackedRecurrent(networks)
-        )
-        self.observation_dims, self.outputs = 1 + first.observation_dims, first.outputs
-        self.state_shape = len(networks), *first.state_shape
-        """The shape of the states of a team, (S, K)."""
-
-    def forward(
-        self, observation: Tensor, state: Tensor, is_init: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """As `RecurrentNetwork.forward`: observations [..., S, *shape], states [..., S, K] and `is_init`
-        [..., T] to outputs [..., S, A] and states."""
-        seen = observation.movedim(-self.observation_dims, 0)
-        states = state.movedim(-2, 0)
-        begins = None if is_init is None else is_init.expand(len(seen), *is_init.shape)
-        outputs, after = self.members(seen, states, begins)
-        return outputs.movedim(0, -2), after.movedim(0, -2)
-
-    def member_state(self, state: dict[str, Tensor], member: int) -> dict[str, Tensor]:
-        """The state dict of a member's network, from the state dict of one team."""
-        one: Any = deepcopy(self)
-        one.load_state_dict(state)
-        if self.shares:
-            return {name: value.detach().clone() for name, value in one.members.state_dict().items()}
-        return lane_state(one.members, member)
-
-
-class TeamNetwork(nn.Module):
-    """The networks of the S members of a team as one network; members share no weights.
-
-    Parameters are [S, in, out] and [S, 1, out]. After `stacked` they have an axis of R teams first:
-    [R, S, in, out] and [R, S, 1, out].
-    """
-
-    def __init__(self, networks: Sequence[MLPNetwork]) -> None:
-        super().__init__()
-        self.members = StackedMLP(networks)
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """uint8 [..., S, C, X, Y] to [..., S, A], with R teams [R, ..., S, C, X, Y] to [R, ..., S, A]."""
-        of = self.members
-        weights, biases = ([each.flatten(0, -3) for each in group] for group in (of.weights, of.biases))
-        *teams, members = of.weights[0].shape[:-2]
-        flat = observation.flatten(-of.observation_dims)
-        by_team = flat.reshape(prod(teams), -1, members, flat.shape[-1])
-        by_member = by_team.transpose(1, 2).flatten(0, 1).to(weights[0].dtype) / of.highest
-        values = through_layers(by_member, weights, biases, relu_on_outputs=of.relu_on_outputs)
-        of_teams = values.view(prod(teams), members, *values.shape[1:]).transpose(1, 2)
-        return of_teams.reshape(*flat.shape[:-1], values.shape[-1])
-
-    def member_state(self, state: dict[str, Tensor], member: int) -> dict[str, Tensor]:
-        """The state dict of a member's network, from the state dict of one team."""
-        one = deepcopy(self)
-        one.load_state_dict(state)
-        return one.members.lane_state(member)
-
-    def stacked(self, teams: Sequence["TeamNetwork"]) -> "TeamNetwork":
-        """One network with the parameters of R teams along a first axis; copies."""
-        stack = deepcopy(self)
-        for name in ("weights", "biases"):
-            each = zip(*(getattr(team.members, name) for team in teams), strict=True)
-            together = [torch.stack([one.detach() for one in of_layer]) for of_layer in each]
-            setattr(stack.members, name, nn.ParameterList(together))
-        return stack
-
-    def lane_state(self, lane: int) -> dict[str, Tensor]:
-        """Copies of the weights of one team of a stack, as its state dict."""
-        return {name: value[lane].clone() for name, value in self.state_dict().items()}
-
-
-class SharedTeam(nn.Module):
-    """Like `TeamNetwork` for members that share one network, of any architecture."""
-
-    stacks_over: ClassVar = ("network",)
-
-    def __init__(self, network: nn.Module, *, observation_dims: int) -> None:
-        super().__init__()
-        self.network, self.observation_dims = network, 1 + observation_dims
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """[..., S, *shape] to [..., S, A]."""
-        given: Tensor = self.network(observation)
-        return given
-
-    def member_state(self, state: dict[str, Tensor], member: int) -> dict[str, Tensor]:
-        return {name.removeprefix("network."): value for name, value in state.items()}
-
-
-class ModuleTeam(nn.Module):
-    """Like `TeamNetwork` for members' networks of any architecture; evaluates them one after the other."""
 
     def __init__(self, networks: Sequence[nn.Module], *, observation_dims: int) -> None:
         super().__init__()
-        self.members, self._axis = nn.ModuleList(networks), -1 - observation_dims
-        self.observation_dims = 1 + observation_dims
+        first = networks[0]
+        self.shares = len(networks) > 1 and all(network is first for network in networks)
+        self.observation_dims, self.outputs = 1 + observation_dims, getattr(first, "outputs", None)
+        of_member = state_shape_of(first)
+        self.state_shape = None if of_member is None else (len(networks), *of_member)
+        """The shape of the states of a team, (S, K); None for networks without."""
+        stacks = all(isinstance(network, MLPNetwork | RecurrentNetwork) for network in networks)
+        self.members: Any = first
+        """A network that all share; a stack of S lanes; or, of other architectures, a list."""
+        if not self.shares:
+            self.members = stack_lanes(networks) if stacks else nn.ModuleList(networks)
 
-    def forward(self, observation: Tensor) -> Tensor:
-        """[..., S, *shape] to [..., S, A]."""
-        seen = observation.unbind(self._axis)
-        return torch.stack(
-            [member(observed) for member, observed in zip(self.members, seen, strict=True)], -2
-        )
+    @property
+    def stacks_over(self) -> tuple[str, ...]:
+        """See `cprl.networks.stacked.stack_lanes`; teams of other networks are vmapped."""
+        shares = self.shares and self.state_shape is None
+        return ("members",) if shares or isinstance(self.members, StackedMLP) else ()
 
-    def member_state(self, state: dict[str, Tensor], member: int) -> dict[str, Tensor]:
-        prefix = f"members.{member}."
-        return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+    def forward(self, observation: Tensor, *recurrent: Tensor) -> Any:
+        """Observations [..., S, *shape] to [..., S, A]; recurrent networks also read states [..., S, K] and
+        `is_init` [..., T], and return states, see `cprl.networks.recurrent`."""
+        if self.shares and not recurrent:
+            return self.members(observation)
+        if isinstance(self.members, nn.ModuleList):
+            by_member = observation.unbind(-self.observation_dims)
+            outputs = [member(seen) for member, seen in zip(self.members, by_member, strict=True)]
+            return torch.stack(outputs, -2)
+        axis = self.members.lane_axis if isinstance(self.members, StackedMLP) else 0
+        seen = observation.movedim(-self.observation_dims, axis)
+        if not recurrent:
+            return self.members(seen).movedim(axis, -2)
+        state, *is_init = recurrent
+        begins = (flags.expand(len(seen), *flags.shape) for flags in is_init)
+        given, after = self.members(seen, state.movedim(-2, 0), *begins)
+        return given.movedim(0, -2), after.movedim(0, -2)
 
-
-def team_network(
-    networks: Sequence[nn.Module], *, observation_dims: int
-) -> TeamNetwork | SharedTeam | ModuleTeam | RecurrentTeam:
-    """The networks of the members of a team as one; a `SharedTeam` if they are all the same object, and a
-    `RecurrentTeam` for recurrent ones."""
-    if all(isinstance(network, RecurrentNetwork) for network in networks):
-        return RecurrentTeam(networks)  # type: ignore[arg-type]
-    if len(networks) > 1 and all(network is networks[0] for network in networks):
-        return SharedTeam(networks[0], observation_dims=observation_dims)
-    if all(isinstance(network, MLPNetwork) for network in networks):
-        return TeamNetwork(networks)  # type: ignore[arg-type]
-    return ModuleTeam(networks, observation_dims=observation_dims)
+    def member_state(self, state: Mapping[str, Tensor], member: int) -> dict[str, Tensor]:
+        """The state dict of a member's network, from the state dict of one team."""
+        team = deepcopy(self)
+        team.load_state_dict(state)
+        if isinstance(team.members, nn.ModuleList) or self.shares:
+            network = team.members if self.shares else team.members[member]
+            return {name: value.detach().clone() for name, value in network.state_dict().items()}
+        return lane_state(team.members, member)
 
 
 class CentralCritic(nn.Module):
