@@ -1,7 +1,6 @@
 """Small runs of a study whose numbers are known, written as a training writes them."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 
@@ -99,8 +98,3 @@ def write_study(study, runs, apples, *, but=(), **options):
 
             write_run(runs / trial.name, trial.experiment, of, **options)
     return runs
-
-
-def with_seed(experiment, seed, **changes):
-    """The same experiment with another seed."""
-    return replace(experiment, seed=seed, **changes)

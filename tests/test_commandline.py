@@ -1,27 +1,35 @@
-"""A recipe's command line: its own arguments first, every number of its experiment by its place."""
+"""The command line: every number of an experiment by its place, recipes by name, any terminal."""
 
 import importlib.util
+import io
 import json
+import os
+import re
 import shlex
+import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import pytest
 from my_game import Dilemma
+from rich.table import Table
 
 import cprl
 from cprl import Experiment, presets
 from cprl.algorithms import DQN, PPO, QMIX, DQNSettings, RolloutSettings
 from cprl.commands import main as cli
-from cprl.commands.recipe import RunOptions, parse, recipe_main
-from cprl.custom import Custom, allowing
+from cprl.commands.recipe import RunOptions, parse, recipe_main, refuse_mistyped_flags
+from cprl.custom import Custom, allowed, allowing
 from cprl.institutions import Boundaries, GraduatedSanctions, Quota
 from cprl.learners.preferences import Exchange
 from cprl.networks import MLP
 from cprl.population import Learning, Scripted, Team
-from cprl.runs.recipe import start_run
+from cprl.runs.recipe import resume_command, start_run
+from cprl.system import shipped
+from cprl.system.output import Output, console, printed
+from cprl.system.shipped import command_of, cprl_here, import_from, is_shipped, recipe_named, shipped_recipes
 
 ROOT = Path(__file__).parents[1]
 RECIPES = sorted(
@@ -60,11 +68,8 @@ def recipe(name):
     return module
 
 
-def test_without_arguments_the_recipe_is_as_it_stands():
-    assert read("") == (experiment(), RunOptions())
-
-
 def test_every_number_is_changed_by_its_place():
+    assert read("") == (experiment(), RunOptions())
     given, options = read(
         "--replicas 2 --game.rules.freeze-steps 50 --agents.1.algorithm.settings.gamma 0.9 --variant as_run "
         "--agents.3.policy pacifist --agents.2.algorithm.settings.max-grad-norm None "
@@ -95,11 +100,9 @@ def test_every_number_is_changed_by_its_place():
         loggers=("tensorboard", "wandb"),
     )
     assert options == RunOptions(out=Path("here"), watch="serve")
-
-
-def test_a_recipes_own_arguments_come_before_the_changes_to_what_they_make():
     given, _ = read("--spare 7 --agents.1.algorithm.settings.target-every-episodes 9")
-    assert [spec.algorithm.settings.target_every_episodes for spec in given.agents[:2]] == [7, 9]
+    periods = [spec.algorithm.settings.target_every_episodes for spec in given.agents[:2]]
+    assert periods == [7, 9], "the recipe's own come before the changes to what they make"
 
 
 @pytest.mark.integration
@@ -147,20 +150,14 @@ def test_to_take_over_a_run_that_is_not_resumed_is_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_argument_of_a_recipes_own_must_not_hide_one_of_the_experiment():
-    def hides(*, seed: int = 0) -> Experiment:
-        return replace(experiment(), seed=seed)
+def test_an_argument_of_a_recipes_own_hides_none_of_the_experiment_and_of_lines_that_resume():
+    def hides_seed(*, seed: int = 0) -> Experiment: ...
 
-    with pytest.raises(ValueError, match="argument 'seed' of its own"):
-        read("", hides)
+    def hides_runs(*, runs: int = 1) -> Experiment: ...
 
-
-def test_an_argument_runs_of_a_recipes_own_is_refused_since_no_line_that_resumes_keeps_it():
-    def hides(*, runs: int = 1) -> Experiment:
-        return replace(experiment(), replicas=runs)
-
-    with pytest.raises(ValueError, match=r"argument 'runs' of its own, .*"):
-        read("--runs 3", hides)
+    for hides, name in ((hides_seed, "seed"), (hides_runs, "runs")):
+        with pytest.raises(ValueError, match=f"argument '{name}' of its own"):
+            read("", hides)
 
 
 def help_of(make, capsys, flag="--help"):
@@ -177,7 +174,7 @@ def test_help_lists_what_people_change_after_the_recipes_own_arguments(capsys):
     first, second = flags.index("--spare"), flags.index("--episodes")
     assert first < flags.index("--out") < second < flags.index("--game.rules.freeze-steps")
     assert {"--agents", "--game.map", "--game.institutions", "--seed", "--replicas"} <= set(flags)
-    assert len(flags) < 24
+    assert len(flags) < 25
     assert "--help-all lists all flags" in words
     assert "a number of its own. (default: 3)" in words
 
@@ -240,12 +237,6 @@ def test_what_a_command_line_cannot_say_stays_as_it_is():
             read(line, lambda: kept)
 
 
-def test_a_game_of_somebodys_own_has_flags_too():
-    own = replace(experiment(), game=Gathering(), agents=[Scripted()] * 2)
-    given, _ = read("--game.yield-per-step 3 --seed 1", lambda: own)
-    assert given == replace(own, game=Gathering(yield_per_step=3.0), seed=1)
-
-
 @dataclass(frozen=True)
 class Gathering(Dilemma):
     """A game of somebody's own.
@@ -257,13 +248,12 @@ class Gathering(Dilemma):
     yield_per_step: float = 1.0
 
 
-def test_a_team_has_flags():
-    team = Team(QMIX(settings=DQNSettings()), agents=(0, 2))
-    three = replace(
-        experiment(),
-        game=replace(experiment().game, map=cprl.maps.parse(">A>A>")),
-        agents=(team, Scripted("greedy")),
-    )
+def test_a_game_of_somebodys_own_and_a_team_have_flags():
+    own = replace(experiment(), game=Gathering(), agents=[Scripted()] * 2)
+    given, _ = read("--game.yield-per-step 3 --seed 1", lambda: own)
+    assert given == replace(own, game=Gathering(yield_per_step=3.0), seed=1)
+    team, game = Team(QMIX(settings=DQNSettings()), agents=(0, 2)), experiment().game
+    three = replace(own, game=replace(game, map=cprl.maps.parse(">A>A>")), agents=(team, Scripted("greedy")))
     given, _ = read("--agents.0.agents 1 2", lambda: three)
     assert given.agents == (replace(team, agents=(1, 2)), Scripted("greedy"))
 
@@ -286,29 +276,22 @@ def test_agents_who_are_alike_can_be_any_number(agents):
     assert not {(row, col) for row, col, _ in given.game.map.starts[4:]} & set(given.game.map.sites)
 
 
-def test_a_team_of_all_agents_grows_too():
+def test_a_shape_that_does_not_fit_is_refused_and_a_team_of_all_agents_grows():
     team = alike((Team(QMIX(settings=DQNSettings()), agents=(0, 1, 2, 3)),))
     given, _ = read("--agents 3", lambda: team)
     assert given.agents == (replace(team.agents[0], agents=(0, 1, 2)),)
+    for make, line, message in (
+        (experiment, "--agents 3", "--agents is 3; allowed: where all agents are alike"),
+        (alike, "--agents 0", "agents is 0"),
+        (alike, "--agents 1000", "agents is 1000; allowed: at most"),
+        (alike, "--game.institutions quoter", "--game.institutions is quoter; allowed: .*quota"),
+        (alike, "--game.institutions boundaries", "--game.institutions is boundaries"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read(line, make)
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("--agents 3", "--agents is 3; allowed: where all agents are alike"),
-        ("--agents 0", "agents is 0"),
-        ("--agents 1000", "agents is 1000; allowed: at most"),
-        ("--game.institutions quoter", "--game.institutions is quoter; allowed: .*quota"),
-        ("--game.institutions boundaries", "--game.institutions is boundaries"),
-    ],
-)
-def test_a_shape_that_does_not_fit_is_refused(line, message):
-    make = experiment if line == "--agents 3" else alike
-    with pytest.raises(ValueError, match=message):
-        read(line, make)
-
-
-def test_institutions_are_given_by_their_names_with_flags_of_their_own():
+def test_institutions_are_given_by_their_names_or_a_file_with_flags_of_their_own(tmp_path):
     line = "--game.institutions quota graduated_sanctions --game.institutions.quota.share 0.25"
     given, _ = read(f"{line} --game.institutions.1.recovery-steps 7", alike)
     quota, sanctions = given.game.institutions
@@ -316,12 +299,8 @@ def test_institutions_are_given_by_their_names_with_flags_of_their_own():
     assert sanctions == replace(GraduatedSanctions(), recovery_steps=7)
     governed = alike(institutions=(Quota(),))
     assert read("--game.institutions none", lambda: governed)[0].game.institutions == ()
-    assert read("--game.institutions.quota.share 1", lambda: governed)[0].game.institutions == (
-        Quota(share=1.0),
-    )
-
-
-def test_institutions_are_read_from_a_file(tmp_path):
+    changed, _ = read("--game.institutions.quota.share 1", lambda: governed)
+    assert changed.game.institutions == (Quota(share=1.0),)
     institutions = (Boundaries.strips(height=12, width=24, agents=4), Quota(share=0.5))
     table = alike(institutions=institutions).to_config()["game"]["institutions"]
     (tmp_path / "rules.json").write_text(json.dumps(table))
@@ -355,7 +334,9 @@ def runs(monkeypatch):
 
 def test_a_recipe_runs_its_experiment(runs):
     line = ["recipes/mine.py", "--seed", "3", "--out", "here", "--resume", "--allow", "a:B", "--allow", "c:D"]
-    assert recipe_main(experiment, line) == Path("a run")
+    with allowing(()):
+        assert recipe_main(experiment, line) == Path("a run")
+        assert {"a:B", "c:D"} <= set(allowed())
     ((given, out, how),) = runs
     assert given == replace(experiment(), seed=3)
     assert out == Path("here")
@@ -366,7 +347,6 @@ def test_a_recipe_runs_its_experiment(runs):
         "watch": "file",
         "linger": False,
         "callbacks": [],
-        "allow": ("a:B", "c:D"),
     }
 
 
@@ -397,3 +377,306 @@ def test_every_recipe_has_help(name, capsys):
         recipe_main(recipe(name).experiment, [f"recipes/{name}.py", "--help"])
     assert ended.value.code == 0
     assert f"usage: {name}.py [-h] [OPTIONS]" in capsys.readouterr().out
+
+
+# Recipes that come with cprl
+
+
+SHORT = (
+    "--engine eager --episodes 1 --replicas 1 --evaluation-episodes 1 --watch off "
+    "--game.rules.episode-steps 5"
+)
+
+
+@pytest.fixture
+def elsewhere(tmp_path, monkeypatch):
+    """A folder of somebody's own; modules that recipes share are forgotten at the end."""
+    monkeypatch.chdir(tmp_path)
+    before = set(sys.modules)
+    yield tmp_path
+    for name in set(sys.modules) - before:
+        if not name.startswith("cprl"):
+            sys.modules.pop(name)
+
+
+def call(monkeypatch, line):
+    monkeypatch.setattr(sys, "argv", ["cprl", *line.split()])
+    cli.main()
+
+
+def test_every_file_of_recipes_is_shipped_under_its_name():
+    files = {path.relative_to(ROOT / "recipes") for path in (ROOT / "recipes").rglob("*.py")}
+    assert {Path(f"{name}.py") for name in shipped_recipes()} == files
+    shared = {name for name, recipe in shipped_recipes().items() if not recipe.runs}
+    assert shared >= {"study/base", "study/learners/ways", "study/perolat/perolat_base", "study/verdicts"}
+    assert all(recipe.about.endswith((".", "?")) for recipe in shipped_recipes().values())
+
+
+def test_the_recipes_are_listed_with_a_line_each_and_printed_as_they_are(monkeypatch, capsys):
+    call(monkeypatch, "recipe")
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == sum(recipe.runs for recipe in shipped_recipes().values())
+    (line,) = [line for line in lines if line.startswith("study/time_out ")]
+    assert line.endswith(
+        "How long should a tagged agent stay out? The time-out, from one turn to most of an episode."
+    )
+    call(monkeypatch, "recipe commons")
+    assert capsys.readouterr().out == (ROOT / "recipes" / "commons.py").read_text()
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    "name", [name for name, shared in shipped_recipes().items() if "import_from" in shared.text()]
+)
+def test_a_printed_recipe_that_imports_others_finds_them_anywhere(name, elsewhere, monkeypatch):
+    monkeypatch.setattr(sys, "path", ["before", str(elsewhere), *sys.path])
+    script = ModuleType("__main__")
+    script.__file__ = str(elsewhere / "mine.py")
+    monkeypatch.setitem(sys.modules, "__main__", script)
+    code = compile(recipe_named(name).text(), "mine.py", "exec")
+    exec(code, {"__name__": "mine"})
+    folder = str(ROOT / "recipes" / recipe_named(name).folder)
+    assert sys.path.index(folder) == 2, "behind the folder of the script, whose own modules come first"
+
+
+@pytest.mark.integration
+def test_a_module_of_ones_own_comes_before_that_of_the_recipes(elsewhere):
+    (elsewhere / "mine.py").write_text(recipe_named("study/time_out").text())
+    (elsewhere / "base.py").write_text("raise SystemExit('my own base')")
+    done = subprocess.run([sys.executable, "mine.py", "--help"], capture_output=True, text=True)
+    assert (done.returncode, done.stderr.strip()) == (1, "my own base")
+
+
+@pytest.mark.integration
+def test_a_recipe_is_run_by_its_name_with_its_own_flags(elsewhere, monkeypatch, capsys):
+    call(monkeypatch, f"run two_complex --variant as_run --no-beam {SHORT} --out run")
+    experiment = cprl.load("run").experiment
+    assert experiment.name == "two_complex_no_beam"
+    assert experiment.game.rules.episode_steps == 5
+    assert "Training curve" in capsys.readouterr().out
+    kept = cprl.load("run").recipe
+    assert kept["command"].startswith("cprl run two_complex --variant as_run --no-beam --engine eager")
+    assert sys.argv == ["cprl", *f"run two_complex --variant as_run --no-beam {SHORT} --out run".split()]
+
+
+def test_the_line_that_resumes_a_recipe_run_by_its_name_is_that_command(tmp_path):
+    words = [f"{shipped.PROGRAM}study/time_out", "--seed", "3", "--out", "there"]
+    typed = f"{shlex.join(cprl_here())} run study/time_out"
+    assert resume_command(tmp_path, words) == f"{typed} --seed 3 --out {tmp_path} --resume"
+    recipe = start_run(tmp_path / "run", "x", lambda directory: {"experiment": {}}, command=words)
+    assert '"command": "cprl run study/time_out --seed 3"' in (recipe / "recipe.json").read_text()
+
+
+@pytest.fixture
+def python(tmp_path, monkeypatch):
+    """A Python in a folder `bin` of an environment, without the script `cprl`, and off the path."""
+    folder = tmp_path / "environment" / "bin"
+    folder.mkdir(parents=True)
+    monkeypatch.setattr(sys, "executable", str(folder / "python"))
+    monkeypatch.setenv("PATH", os.defpath)
+    return folder / "python"
+
+
+def install(python):
+    """The script `cprl` beside a Python."""
+    script = python.with_name("cprl")
+    script.write_text("#!/bin/sh")
+    script.chmod(0o755)
+    return script
+
+
+def test_the_command_is_called_by_name_on_the_path_else_by_path_else_by_its_module(
+    python, tmp_path, monkeypatch
+):
+    assert cprl_here() == [str(python), "-m", "cprl"]
+    script = install(python)
+    assert cprl_here() == [str(script)]
+    monkeypatch.chdir(tmp_path)
+    assert cprl_here() == ["environment/bin/cprl"]
+    monkeypatch.chdir(python.parent)
+    assert cprl_here() == [str(script)], "a shell does not look in the working directory"
+    monkeypatch.setenv("PATH", str(python.parent))
+    assert cprl_here() == ["cprl"]
+
+
+@pytest.mark.parametrize(
+    "program", ["cprl", ".venv/bin/cprl", "/elsewhere/bin/cprl", r"C:\venv\Scripts\cprl.exe", "cprl run mrun"]
+)
+def test_a_line_to_type_calls_the_command_however_it_was_called(program, python):
+    words = [program, *([] if program.endswith("mrun") else ["run", "mrun"]), "--seed", "3"]
+    assert command_of(words) == [str(python), "-m", "cprl", "run", "mrun", "--seed", "3"]
+    script = install(python)
+    assert command_of(words) == [str(script), "run", "mrun", "--seed", "3"]
+    assert command_of(["cprl/mine.py", "--seed", "3"]) == [str(python), "cprl/mine.py", "--seed", "3"]
+    script.unlink()
+    typed = f"{python} -m cprl run runs/a"
+    assert resume_command(Path("runs/a")) == f"{typed} --resume"
+    assert resume_command(Path("runs/a"), ["cprl", "run", "runs/a"]) == f"{typed} --out runs/a --resume"
+
+
+def test_a_study_is_run_and_a_recipe_swept_by_its_name(elsewhere, monkeypatch, capsys):
+    call(monkeypatch, "run study/time_out --dry-run --replicas 1")
+    assert "0 of 5 trials finished" in capsys.readouterr().out
+    call(monkeypatch, "sweep two_complex --vary game.rules.freeze-steps=2,5 --dry-run")
+    assert "2 conditions (game.rules.freeze_steps)" in capsys.readouterr().out
+
+
+def test_a_file_or_a_run_of_that_name_comes_first_but_not_the_folder_of_a_study(elsewhere):
+    assert is_shipped("commons")
+    (elsewhere / "studies" / "time_out").mkdir(parents=True)
+    assert is_shipped("study/time_out"), "where the study itself writes"
+    (elsewhere / "commons").mkdir()
+    (elsewhere / "commons" / "recipe.json").write_text("{}")
+    assert not is_shipped("commons")
+    (elsewhere / "mixed").write_text("{}")
+    assert not is_shipped("mixed")
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (
+            "run comons --replicas 2",
+            "'comons' is no file, .* .did you mean 'commons'.*allowed: .* mixed, ",
+        ),
+        ("run --episodes 2 commons", r"stands first, its flags behind it: cprl run commons \[FLAGS\]"),
+        ("run study/base", "study/base runs nothing: other recipes import it; cprl recipe study/base"),
+        ("run mine.py", r"mine\.py is a recipe of your own"),
+        ("recipe comons", "there is no recipe 'comons'"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_in_a_sentence(line, message, elsewhere, monkeypatch):
+    (elsewhere / "mine.py").write_text("")
+    with pytest.raises(SystemExit, match=message):
+        call(monkeypatch, line)
+    assert {path.name for path in elsewhere.iterdir()} == {"mine.py"}
+
+
+@pytest.mark.parametrize("line", ["--epsiodes 3", "--epsiodes=3", "--no-bean", "--callback a:B"])
+def test_a_mistyped_flag_is_refused_before_the_recipe_is_imported(line, monkeypatch, capsys):
+    monkeypatch.setattr(cli, "run_shipped", None)
+    with pytest.raises(SystemExit) as refused:
+        call(monkeypatch, f"run two_complex {line}")
+    assert refused.value.code == 2
+    assert f"there is no flag {line.partition('=')[0].split()[0]}" in capsys.readouterr().err
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", ["commons", "mixed", "two_complex", "study/theory/sharing"])
+def test_no_flag_that_a_recipe_has_is_taken_for_a_mistake(name, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        call(monkeypatch, f"run {name} --help-all")
+    flags = {word.strip(",") for word in capsys.readouterr().out.split() if re.match("--[a-z]", word)}
+    assert {"--episodes", "--out", "--resume", "--no-resume"} < flags
+    refuse_mistyped_flags(recipe_named(name), sorted(flags))
+
+
+def test_a_package_without_recipes_says_so(tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="folder is 'x'"):
+        import_from("x")
+    monkeypatch.setattr(shipped, "_PACKAGE", tmp_path / "src" / "cprl")
+    with pytest.raises(FileNotFoundError, match="the recipes of cprl are neither in"):
+        shipped.recipes_folder()
+    (tmp_path / "src" / "cprl" / "recipes").mkdir(parents=True)
+    assert shipped.recipes_folder() == tmp_path / "src" / "cprl" / "recipes", "as in a wheel"
+
+
+# Terminals and shells: another encoding and a tiny terminal end no training
+
+
+HERE = Path(__file__).parent
+TRAINS = f"""
+import sys; sys.path.insert(0, {str(HERE)!r})
+from pathlib import Path
+from recordings import GAME
+from test_watch import SETTINGS
+import cprl
+from cprl import Experiment, run
+from cprl.population import Learning
+from cprl.algorithms import DQN
+from cprl.learners.settings import DQNSettings
+agents = (Learning(DQN(settings=SETTINGS)),) * 2
+experiment = Experiment(
+    name="tiny", game=GAME, agents=agents, episodes=3, evaluation_episodes=1, engine="eager"
+)
+print(run(experiment, Path(sys.argv[1]), watch=sys.argv[2]))
+"""
+
+
+class Ascii(io.TextIOWrapper):
+    """An output that has letters, digits and little else."""
+
+    def __init__(self):
+        super().__init__(io.BytesIO(), encoding="ascii", newline="")
+
+
+def test_an_output_that_is_none_takes_everything():
+    shown = console(Output(lambda: None))
+    shown.print("text")
+    assert not shown.is_terminal
+
+
+def test_what_an_output_cannot_show_is_written_plainly():
+    stream = Ascii()
+    output = Output(lambda: stream)
+    console(output).print("12.0 ± 0.5 \u00d7 3 …  日")
+    stream.flush()
+    assert stream.buffer.getvalue().decode("ascii") == "12.0 +- 0.5 x 3 ...  ?\n"
+
+
+def test_square_brackets_and_colons_in_names_and_paths_are_shown_as_they_are():
+    stream = io.StringIO()
+    table = Table(title="a [b]", caption="c [d]")
+    table.add_column("column [e]")
+    table.add_row("row [/f] :apple:")
+    shown = console(Output(lambda: stream), width=120)
+    shown.print(table)
+    shown.print("To resume: --out runs/[g]", soft_wrap=True)
+    for name in ("a [b]", "c [d]", "column [e]", "row [/f] :apple:", "--out runs/[g]"):
+        assert name in stream.getvalue()
+
+
+def training(folder, *, watch="off", env=None):
+    """A small training in a process of its own; its exit code, standard output and standard error."""
+    script = folder / "train.py"
+    script.write_text(TRAINS, encoding="utf-8")
+    given = {name: value for name, value in os.environ.items() if not name.startswith(("LC_", "LANG"))}
+    command = f'"{sys.executable}" "{script}" "{folder / "run"}" {watch}'
+    ended = subprocess.run(
+        ["bash", "-c", command], capture_output=True, text=True, env={**given, **(env or {})}, check=False
+    )
+    assert (folder / "run" / "report.json").exists(), ended.stderr
+    for error in ("Traceback", "BrokenPipeError", "UnicodeEncodeError", "Exception ignored", "Logging error"):
+        assert error not in ended.stderr + ended.stdout
+    return ended.returncode, ended.stdout, ended.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "env",
+    [
+        {"PYTHONIOENCODING": "ascii"},
+        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+        {"COLUMNS": "1", "LINES": "1"},
+        {"TERM": "dumb"},
+        {"FORCE_COLOR": "1", "COLUMNS": "7", "PYTHONIOENCODING": "ascii"},
+    ],
+)
+def test_a_training_runs_in_any_terminal(env, tmp_path):
+    code, out, _ = training(tmp_path, watch="serve", env=env)
+    assert code == 0
+    assert "run" in out
+
+
+@pytest.mark.parametrize(
+    ("platform", "line"),
+    [
+        ("linux", r"""'C:\my runs\cprl' film 'it'"'"'s' a.gif"""),
+        ("darwin", r"""'C:\my runs\cprl' film 'it'"'"'s' a.gif"""),
+        ("win32", r""""C:\my runs\cprl" film it's a.gif"""),
+    ],
+)
+def test_a_command_to_be_copied_is_quoted_for_the_shell_of_the_platform(platform, line, monkeypatch):
+    monkeypatch.setattr(sys, "platform", platform)
+    assert printed([r"C:\my runs\cprl", "film", "it's", "a.gif"]) == line

@@ -1,5 +1,6 @@
-"""A run's directory: never written over, gone on with only by the same recipe."""
+"""What is kept of a run: never written over, resumed only by the same recipe, exported small and whole."""
 
+import contextlib
 import json
 import os
 import shlex
@@ -7,21 +8,39 @@ import subprocess
 import sys
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
+from shutil import copytree
 
+import numpy as np
+import pyarrow as pa
 import pytest
+import torch
+from matrix_game import MatrixGame, tit_for_tat
+from recordings import column
+from rerun.chunk import RrdReader
+from study_runs import an_episode
+from test_any_game import play
 from tiny_study import TINY
+from torchrl.record.loggers import CSVLogger
 
 import cprl
 from cprl import presets
 from cprl.algorithms import DQN
+from cprl.commands import main as cli
 from cprl.custom import Custom
 from cprl.evaluation.film import film
 from cprl.experiment import Experiment
+from cprl.measuring import EpisodeTracker
 from cprl.population import Frozen, Learning
+from cprl.runs import loggers
+from cprl.runs.curves import as_curves, running_mean
+from cprl.runs.episodes import EpisodeTable, read_episodes, read_table
 from cprl.runs.export import export_results
+from cprl.runs.files import remove_listed, rename_listed, verify, write_listed
+from cprl.runs.journal import Journal, read_journal
 from cprl.runs.recipe import read_recipe, refuse_another_run, resume_command, runs_in, start_run
 from cprl.studies.factors import changed
 from cprl.system.shipped import cprl_here
+from cprl.training.collectors import StepCollector
 
 AGENT = Learning(DQN(settings=presets.dqn_settings("commons")))
 EXPERIMENT = Experiment(
@@ -32,6 +51,8 @@ EXPERIMENT = Experiment(
     replicas=2,
     seed=1,
 )
+
+# The directory and its recipe
 
 
 def begin(run, experiment=EXPERIMENT, **options):
@@ -144,18 +165,16 @@ def test_fields_that_a_later_version_has_are_no_difference_while_they_have_their
         resume(run, default)
 
 
-def test_a_run_of_another_format_is_not_resumed(tmp_path):
+def test_where_nothing_can_be_resumed_that_is_said(tmp_path):
     run = begin(tmp_path / "run")
     edited(run, lambda recipe: recipe.update(format=1))
-    with pytest.raises(ValueError, match="format"):
-        resume(run)
-
-
-def test_where_nothing_can_be_resumed_that_is_said(tmp_path):
-    with pytest.raises(ValueError, match="resume requires the directory of the run as out"):
-        resume(None)
-    with pytest.raises(ValueError, match=r"recipe\.json is not the recipe of a run: FileNotFoundError"):
-        resume(tmp_path / "nothing")
+    for directory, message in (
+        (run, "format"),
+        (None, "resume requires the directory of the run as out"),
+        (tmp_path / "nothing", r"recipe\.json is not the recipe of a run: FileNotFoundError"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            resume(directory)
     for text in ("{", "[]", '{"arguments": 3}', '{"experiment": []}'):
         (tmp_path / "recipe.json").write_text(text)
         with pytest.raises(ValueError, match=r"recipe\.json is not the recipe of a run: "):
@@ -181,6 +200,362 @@ def test_the_line_that_resumes_is_the_one_that_began_with_the_runs_directory(giv
 def test_a_run_that_python_began_is_resumed_by_the_command_cprl(tmp_path):
     experiment = replace(EXPERIMENT, callbacks=(Custom("my:Callback"), Custom("my:Other")))
     run = begin(tmp_path / "run", experiment)
-    cprl = shlex.join(cprl_here())
-    assert resume_command(run) == f"{cprl} run {run} --resume --allow my:Callback --allow my:Other"
-    assert resume_command(tmp_path) == f"{cprl} run {tmp_path} --resume"
+    typed = shlex.join(cprl_here())
+    assert resume_command(run) == f"{typed} run {run} --resume --allow my:Callback --allow my:Other"
+    assert resume_command(tmp_path) == f"{typed} run {tmp_path} --resume"
+
+
+# The journal, and the files of a manifest
+
+
+ROWS = [
+    pa.record_batch({"replica": [number] * 3, "equality": [0.5, -1.25, number / 4]}) for number in range(4)
+]
+
+
+@pytest.fixture
+def journal(tmp_path):
+    path = tmp_path / "episodes.arrows"
+    write(Journal(path), ROWS)
+    return path
+
+
+def write(journal, batches):
+    for batch in batches:
+        journal.append(batch)
+    journal.close()
+
+
+def test_a_journal_continues_behind_as_many_rows_as_a_checkpoint_has(journal):
+    whole = journal.read_bytes()
+    for rows, message in ((5, "holds 6 rows up to there; the checkpoint has 5"), (15, "holds 12 rows")):
+        with pytest.raises(ValueError, match=message):
+            Journal(journal, rows=rows)
+    assert journal.read_bytes() == whole, "one that cannot be continued is left as it is"
+    write(Journal(journal, rows=6), ROWS[2:])
+    assert journal.read_bytes() == whole
+    write(Journal(journal), [])
+    assert journal.read_bytes() == b""
+
+
+@pytest.mark.integration
+def test_damage_hides_a_batch_with_those_behind_it_or_changes_values_but_nothing_else(journal):
+    data, whole = journal.read_bytes(), read_journal(journal)
+    for place in range(0, len(data), 3):
+        flipped = bytearray(data)
+        flipped[place] ^= 64
+        journal.write_bytes(flipped)
+        table = read_journal(journal)
+        assert table is None or table.num_rows <= whole.num_rows
+
+
+def test_a_stream_that_pyarrow_writes_is_a_journal(tmp_path):
+    path = tmp_path / "episodes.arrows"
+    with pa.OSFile(str(path), "wb") as file, pa.ipc.new_stream(file, ROWS[0].schema) as stream:
+        stream.write_batch(ROWS[0], custom_metadata={"crc32": "0"})
+    assert read_journal(path).to_batches() == ROWS[:1]
+
+
+def add(table, numbers):
+    for number in numbers:
+        table.add(an_episode(number, 0, 3.0))
+
+
+def test_a_finished_table_that_is_resumed_continues_behind_any_episode(tmp_path):
+    path = tmp_path / "episodes.parquet"
+    with EpisodeTable(path) as table:
+        add(table, range(5))
+    rows = read_episodes(tmp_path)
+    with EpisodeTable(path, resumable=True) as table:
+        table.load_state_dict({"rows": 4})
+        add(table, range(2, 5))
+    assert str(read_episodes(tmp_path).to_pylist()) == str(rows.to_pylist())
+    assert read_episodes(tmp_path).schema.equals(rows.schema, check_metadata=True)
+    assert not table.journal.exists()
+
+
+def test_a_table_syncs_its_journal_before_a_checkpoint_counts_its_rows_and_misses_a_deleted_one(
+    tmp_path, monkeypatch
+):
+    table = EpisodeTable(tmp_path / "episodes.parquet")
+    add(table, [0])
+    synced = []
+    monkeypatch.setattr(os, "fsync", lambda file: synced.append(os.fstat(file).st_ino))
+    assert table.state_dict() == {"rows": 2}
+    assert synced == [table.journal.stat().st_ino]
+    table.journal.unlink()
+    with pytest.raises(FileNotFoundError, match=r"was .*episodes\.arrows deleted\?"):
+        table.close()
+
+
+def test_a_listed_file_is_checked_by_its_path_wherever_it_is_moved_to(tmp_path):
+    write_listed(tmp_path, "evaluation/random.bin", lambda file: file.write(b"one"))
+    rename_listed(tmp_path, "evaluation", "evaluation-5")
+    path = tmp_path / "evaluation-5" / "random.bin"
+    verify(path)
+    path.write_bytes(b"two")
+    with pytest.raises(ValueError, match=r"random\.bin is damaged or was changed: its checksum is"):
+        verify(path)
+    remove_listed(tmp_path, "evaluation-5/random.bin")
+    path.write_bytes(b"two")
+    verify(path)  # what no manifest lists is not checked
+    (tmp_path / "manifest.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"manifest\.json is not the manifest of a run"):
+        verify(path)
+
+
+def test_what_is_no_table_is_refused_by_name(tmp_path):
+    (tmp_path / "a.parquet").write_bytes(b"PAR1 and no more")
+    os.mkfifo(tmp_path / "b.parquet")
+    for name, message in (("a", r"a\.parquet is not a table"), ("b", r"b\.parquet is not a file")):
+        with pytest.raises(ValueError, match=message):
+            read_table(tmp_path / f"{name}.parquet")
+
+
+def test_curves_are_those_of_each_replica_and_agent():
+    columns = {
+        "replica": [1, 1, 0, 0, 0, 0],
+        "episode": [0, 0, 0, 0, 1, 1],
+        "agent": [0, 1, 0, 1, 0, 1],
+        "return": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
+        "equality": [0.5, 0.5, float("nan"), float("nan"), 0.7, 0.7],
+    }
+    curves = as_curves(pa.table(columns))
+    assert curves["return_1"].tolist() == [[4.0], [2.0]], "the episodes that all replicas have ended"
+    np.testing.assert_array_equal(curves["equality"], [[np.nan], [0.5]])
+
+
+def test_running_means_stand_at_their_first_episode_and_leave_out_what_is_undefined():
+    assert running_mean(np.array([1.0, 2.0, 6.0, 4.0]), 2).tolist() == [1.5, 4.0, 5.0]
+    assert running_mean(np.array([[1.0, np.nan, 3.0]]), 2).tolist() == [[1.0, 3.0]]
+    assert running_mean(np.array([1.0, 2.0]), 5).tolist() == [1.5]
+
+
+# Exports
+
+
+@pytest.mark.integration
+def test_an_export_says_the_same_as_the_run(run, tmp_path):
+    folder = export_results(run, tmp_path / "exported")
+    assert export_results(run, folder) == folder, "again over the same"
+    exported, whole = read_episodes(folder).to_pydict(), read_episodes(run)
+    ordered = whole.sort_by([(name, "ascending") for name in ("replica", "episode", "agent")]).to_pydict()
+    assert set(exported) == set(ordered)
+    for name, values in ordered.items():
+        np.testing.assert_array_equal(np.float32(exported[name]), np.float32(values), err_msg=name)
+    copy, original = cprl.load(folder), cprl.load(run)
+    assert copy.game == original.game
+    assert sorted(copy.networks) == sorted(original.networks)
+    assert not list(folder.rglob("training-*"))
+    (run / "report.json").rename(tmp_path / "aside")
+    with pytest.raises(FileNotFoundError, match=r"report\.json does not exist: has the run ended\?"):
+        export_results(run, tmp_path / "other")
+    (tmp_path / "aside").rename(run / "report.json")
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.integration
+def test_an_export_never_replaces_a_run(run, tmp_path):
+    other = copytree(run, tmp_path / "other")
+    before = {path: path.read_bytes() for path in other.rglob("*") if path.is_file()}
+    for folder, why in ((run, "the run itself"), (other, "a run of its own: it has run.rrd")):
+        with pytest.raises(ValueError, match=rf"folder is .*, {why}.*; allowed: a new folder, or one with"):
+            export_results(run, folder)
+    assert {path: path.read_bytes() for path in other.rglob("*") if path.is_file()} == before
+    exported = export_results(run, tmp_path / "exported")
+    edited(exported, lambda recipe: recipe["experiment"].update(seed=1))
+    with pytest.raises(ValueError, match=r"which holds another run: experiment\.seed was 1, is 0"):
+        export_results(run, exported)
+
+
+@pytest.mark.integration
+def test_exported_results_find_the_runs_of_frozen_agents(run, tmp_path):
+    loaded = cprl.load(run).experiment
+    agents = (loaded.agents[0], Frozen(os.path.relpath(run), 0))
+    among = cprl.run(replace(loaded, agents=agents, episodes=2), tmp_path / "deep" / "er" / "among")
+    folder = export_results(among, tmp_path / "small")
+    before, after = (cprl.load(path).agent(1).network.state_dict() for path in (among, folder))
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert export_results(among, folder) == folder, "again over the same"
+
+
+# Recordings
+
+
+def views_of(path):
+    """The names of the views that a recording opens with."""
+    reader, component = RrdReader(path), "ViewBlueprint:display_name"
+    (layout,) = reader.blueprints()
+    batches = [chunk.to_record_batch() for chunk in reader.stream(store=layout)]
+    return [batch.column(component)[0].as_py()[0] for batch in batches if component in batch.schema.names]
+
+
+def test_a_stored_policy_plays_again_and_every_step_is_recorded(run, tmp_path, capsys, monkeypatch):
+    path, played = film(run, tmp_path / "a.rrd", replica=1, episode=3)
+    steps, boards = column(path, "/world/board", "SegmentationImage:buffer", "step")
+    assert steps == list(range(1, played.steps)), "after the last turn the board is a new one already"
+    assert len(boards[0][0]) == (24 + 2) * (7 + 2)
+    _, harvested = column(path, "/agent_0/harvested", "Scalars:scalars", "step")
+    assert 0 <= played.harvest[0] - harvested[-1][0] <= 1, "told turn by turn, all but the last turn"
+    views = ["Apples on the board", "Board", "Events", "Harvest so far, apples", "Recipe"]
+    assert sorted(views_of(path))[:5] == views, "no empty plots of a training"
+    assert len(views_of(path)) == 7, "and what the agents see, and what their policies say"
+    _, again = film(run, tmp_path / "b.rrd", replica=1, episode=3)
+    assert again.harvest.tolist() == played.harvest.tolist()
+    assert again.shots.tolist() == played.shots.tolist()
+    with pytest.raises(FileExistsError):
+        film(run, tmp_path / "a.rrd")
+    with pytest.raises(ValueError, match="episode is -1"):
+        film(run, episode=-1)
+    monkeypatch.setattr("sys.argv", ["cprl", "film", str(run), "--out", str(tmp_path / "c.rrd")])
+    cli.main()
+    watch = f"Watch: {Path(sys.executable).with_name('rerun')} {tmp_path / 'c.rrd'}"
+    assert watch in capsys.readouterr().out
+
+
+@pytest.fixture
+def opened(tmp_path, monkeypatch):
+    """The commands that this process is replaced by, with a display; there is a recording `run.rrd`."""
+    commands = []
+    monkeypatch.setenv("DISPLAY", ":9")  # without one it is served until Ctrl-C
+    monkeypatch.setattr(cli.os, "execvp", lambda program, command: commands.append(command))
+    (tmp_path / "run.rrd").touch()
+    return commands
+
+
+def test_watch_opens_all_recordings_of_a_run_as_one(tmp_path, opened, monkeypatch):
+    (tmp_path / "none").mkdir()
+    monkeypatch.setattr("sys.argv", ["cprl", "watch", str(tmp_path / "none")])
+    with pytest.raises(SystemExit, match=r"cprl: .* holds no recording"):
+        cli.main()
+    (tmp_path / "run-2.rrd").touch()
+    cli.watch(tmp_path)
+    assert opened[0][1:] == [str(tmp_path / "run-2.rrd"), str(tmp_path / "run.rrd")]
+
+
+def test_watch_waits_for_the_viewer_on_windows_where_no_program_replaces_another(
+    tmp_path, opened, monkeypatch
+):
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(cli.subprocess, "call", lambda command: opened.append(command) or 3)
+    monkeypatch.setattr("cprl.viewer.page.viewer", lambda: "rerun")
+    with pytest.raises(SystemExit) as ended:
+        cli.watch(tmp_path)
+    assert ended.value.code == 3
+    assert opened == [["rerun", str(tmp_path / "run.rrd")]]
+
+
+def test_watch_opens_the_viewer_of_the_package_where_no_command_is_at_hand(tmp_path, opened, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    cli.watch(tmp_path)
+    assert [Path(word).is_file() for word in opened[0]] == [True, True]
+
+
+def test_watch_refuses_a_file_that_is_no_recording(tmp_path):
+    (tmp_path / "recipe.json").touch()
+    with pytest.raises(ValueError, match=r"recipe\.json is no recording; allowed: .* that ends in \.rrd"):
+        cli.watch(tmp_path / "recipe.json")
+
+
+# Loggers
+
+
+def csv_of(folder):
+    return CSVLogger("csv", str(folder / "logs"))
+
+
+def files(folder):
+    """What stands in each file of scalars, but for the speed."""
+    scalars = folder / "logs" / "csv" / "scalars"
+    paths = {path.relative_to(scalars).with_suffix("").as_posix(): path for path in scalars.rglob("*.csv")}
+    return {name: path.read_text() for name, path in paths.items() if name != "time/env_steps_per_s"}
+
+
+def test_each_episode_is_written_as_the_mean_of_the_replicas_and_of_each(tmp_path):
+    with loggers.LoggerCallback(csv_of(tmp_path), replicas=2, agents=("row", "column")) as callback:
+        play(MatrixGame(2), tit_for_tat, 12, callbacks=[callback])
+    # Worlds play 5 and 6 turns: the first two episodes of both have ended after turns 6 and 12.
+    assert files(tmp_path) == {
+        "social/survival_steps": "0,5.5\n1,5.5\n",
+        "replica_0/social/survival_steps": "0,5.0\n1,5.0\n",
+        "replica_1/social/survival_steps": "0,6.0\n1,6.0\n",
+        "row/return": "0,4.5\n1,4.5\n",
+        "replica_0/row/return": "0,4.0\n1,4.0\n",
+        "replica_1/row/return": "0,5.0\n1,5.0\n",
+        "column/return": "0,9.0\n1,9.0\n",
+        "replica_0/column/return": "0,8.5\n1,8.5\n",
+        "replica_1/column/return": "0,9.5\n1,9.5\n",
+        "row/loss": "0,0.5\n1,0.5\n",
+        "time/env_steps": "0,6.0\n1,12.0\n",
+    }
+    rates = (tmp_path / "logs/csv/scalars/time/env_steps_per_s.csv").read_text().split()
+    assert all(float(rate.split(",")[1]) > 0 for rate in rates)
+
+
+def course(run, batches, *, first=0, state=None):
+    """Logs batches; returns the states of tracker and callback after each."""
+    tracker, callback = EpisodeTracker(2, 2), loggers.LoggerCallback(csv_of(run), replicas=2)
+    for each, before in zip((tracker, callback), state or (), strict=False):
+        each.load_state_dict(before)
+    states = []
+    for batch in batches[first:]:
+        callback.on_step(batch)
+        for episode in tracker.add(batch):
+            callback.on_episode(episode, {"agent_0/loss": float(episode.steps)})
+        states.append((tracker.state_dict(), callback.state_dict()))
+    return states
+
+
+def test_a_resumed_run_has_every_episode_once(tmp_path):
+    batches = [batch for batch, _ in zip(StepCollector(MatrixGame(2), tit_for_tat), range(40), strict=False)]
+    states = course(tmp_path / "whole", batches)
+    for checkpoint in (0, 4, 10, 11, 22, 35):
+        run = tmp_path / f"run {checkpoint}"
+        course(run, batches[: checkpoint + 1])
+        course(run, batches, first=checkpoint + 1, state=states[checkpoint])
+        assert files(run) == files(tmp_path / "whole")
+    assert files(tmp_path / "whole")["social/survival_steps"].count("\n") == 6
+
+
+def test_numbers_that_are_undefined_are_not_written(tmp_path):
+    class Undefined(loggers.LoggerCallback):
+        def on_episode(self, episode, learning):
+            super().on_episode(episode, {"agent_0/loss": float("nan"), "agent_0/epsilon": 0.25})
+
+    with Undefined(csv_of(tmp_path)) as callback:
+        play(MatrixGame(1), tit_for_tat, 5, callbacks=[callback])
+    assert "agent_0/loss" not in files(tmp_path)
+    assert files(tmp_path)["agent_0/epsilon"] == "0,0.25\n"
+
+
+@pytest.mark.parametrize("error", [None, RuntimeError("stop")])
+def test_a_logger_of_the_users_is_taken_as_it_is_and_closed_at_the_end_and_by_an_error(error, tmp_path):
+    class Noting(CSVLogger):
+        is_closed = False
+
+        def shutdown(self):
+            self.is_closed = True
+
+    logger = Noting("noting", str(tmp_path))
+    loggers.check_logger(logger)
+    assert loggers.make_logger(logger, tmp_path) is logger
+    with contextlib.suppress(RuntimeError), loggers.LoggerCallback(logger) as callback:
+        play(MatrixGame(1), tit_for_tat, 5, callbacks=[callback])
+        assert not logger.is_closed
+        if error:
+            raise error
+    assert logger.is_closed
+
+
+def test_a_logger_that_cannot_be_made_is_refused_by_name_before_anything_is_written(tmp_path, monkeypatch):
+    for name in ("mlflow", "csv"):
+        with pytest.raises(ValueError, match="logger"):
+            loggers.check_logger(name)
+    with pytest.raises(TypeError, match="logger is a dict without log_metrics"):
+        loggers.LoggerCallback({})
+    monkeypatch.setattr(loggers, "find_spec", lambda name: None)
+    for name in ("tensorboard", "wandb"):
+        with pytest.raises(ModuleNotFoundError, match=f"needs the package {name}: pip install {name}"):
+            loggers.make_logger(name, tmp_path / "run")
+    assert not Path(tmp_path / "run").exists()

@@ -31,6 +31,7 @@ SCRIPTED = replace(TINY, agents=(Scripted("greedy"),) * 2)
 ON_POLICY = Learning(PPO(settings=RolloutSettings()))
 OTHER = Dilemma(payoffs=((3.0, 0.5), (4.0, 1.0)))
 OWN_GAME = replace(TINY, game=Dilemma())
+NAN = float("nan")
 
 
 def checksums(study):
@@ -48,9 +49,14 @@ def there_and_back(study, directory=None, **options):
 # Paths
 
 
-def test_a_path_changes_one_field_and_nothing_else():
-    game = replace(TINY.game, rules=replace(TINY.game.rules, freeze_steps=7))
-    assert changed(TINY, {FREEZE: 7}) == replace(TINY, game=game)
+def test_paths_written_as_flags_are_too_change_their_fields_together_and_nothing_else():
+    rules = replace(TINY.game.rules, freeze_steps=7, regrow_prob=(0, 0.5))
+    new = changed(TINY, {FREEZE: 7, "game.rules.regrow-prob": [0, 0.5]})
+    assert new == replace(TINY, game=replace(TINY.game, rules=rules))
+    new = changed(TINY, {"agents.*.algorithm.settings.hidden-cells": [2]})
+    assert values_at(new, "agents.*.algorithm.settings.hidden_cells") == [(2,), (2,)]
+    four = changed(TINY, {"agents": [LEARNING] * 4, "game.map": "commons"})
+    assert (four.game.map, len(four.agents)) == (maps.named("commons"), 4), "neither would fit alone"
 
 
 @pytest.mark.parametrize(
@@ -67,18 +73,6 @@ def test_a_path_changes_one_field_and_nothing_else():
 )
 def test_a_star_in_agents_means_all_that_learn_and_a_number_wins_over_it(experiment, changes, gammas):
     assert values_at(changed(experiment, changes), GAMMA) == gammas
-
-
-def test_board_and_agents_change_at_once_though_neither_would_fit_alone():
-    four = changed(TINY, {"agents": [LEARNING] * 4, "game.map": "commons"})
-    assert four.game.map == maps.named("commons")
-    assert len(four.agents) == 4
-
-
-def test_a_path_may_be_written_as_the_flag_is_and_a_list_becomes_a_tuple():
-    new = changed(TINY, {"game.rules.regrow-prob": [0, 0.5], "agents.*.algorithm.settings.hidden-cells": [2]})
-    assert new.game.rules.regrow_prob == (0, 0.5)
-    assert values_at(new, "agents.*.algorithm.settings.hidden_cells") == [(2,), (2,)]
 
 
 @pytest.mark.parametrize(
@@ -133,9 +127,6 @@ def test_a_grid_has_every_combination_with_names_of_the_last_words():
     assert study.all_conditions[1].levels == {FREEZE: 5, GAMMA: 0.995}
     assert study.reference_name == "freeze_steps=25, gamma=0.995", "the one that changes nothing"
     assert study.columns == (FREEZE, GAMMA)
-
-
-def test_paths_with_the_same_last_word_keep_their_whole_names():
     (condition,) = Study(TINY, {OF_FIRST: [0.5], OF_SECOND: [0.25]}).all_conditions
     assert condition.name == f"{OF_FIRST}=0.5, {OF_SECOND}=0.25"
 
@@ -156,17 +147,13 @@ def test_a_number_that_another_condition_has_in_its_name_is_left_out():
 def test_a_condition_has_the_checksum_of_what_decides_its_numbers_and_of_nothing_else():
     same = [{"seed": 5}, {"replicas": 3}, {"name": "x"}, {"on_nan": "continue"}]
     assert {Condition(replace(TINY, **changes)).checksum for changes in same} == {Condition(TINY).checksum}
+    table = TINY.to_config()
+    del table["game"]["rules"]["walls_block_sight"]  # a field that only a later version has
+    assert Condition(Experiment.from_config(table)).checksum == Condition(TINY).checksum
     others = [TINY, replace(TINY, episodes=3), replace(TINY, evaluation_episodes=2)]
     others += [changed(TINY, {GAMMA: 0.9}), changed(TINY, {GAMMA: 1})]
     assert len({Condition(experiment).checksum for experiment in others}) == 5
     assert Condition(changed(TINY, {GAMMA: 1.0})).checksum == Condition(others[-1]).checksum
-
-
-def test_fields_that_have_their_default_do_not_count():
-    """A later version with further fields then gives the same checksum."""
-    table = TINY.to_config()
-    del table["game"]["rules"]["walls_block_sight"]
-    assert Condition(Experiment.from_config(table)).checksum == Condition(TINY).checksum
 
 
 def test_the_defaults_of_the_checksums_format_have_not_changed():
@@ -187,11 +174,11 @@ def test_blocks_have_seeds_of_their_own_and_pairs_the_same_in_every_condition():
     blocks = [(0, 2), (1000, 2), (2000, 1)]
     names = ("freeze_steps=5", "freeze_steps=25")
     assert blocks_of == [(name, *block) for block in blocks for name in names]
-
-
-def test_the_first_block_is_the_run_of_the_recipe_itself():
     (trial,) = trials_of(Study(replace(TINY, seed=3, replicas=2)))
-    assert trial.experiment == replace(TINY, seed=3, replicas=2)
+    assert trial.experiment == replace(TINY, seed=3, replicas=2), "the first is the run of the recipe itself"
+    few = trials_of(Study(TINY, {FREEZE: [5, 25]}, replicas=2, block=2))
+    more = trials_of(Study(TINY, {FREEZE: [5, 25, 50]}, replicas=4, block=2))
+    assert {trial.name for trial in few} < {trial.name for trial in more}, "which are kept"
 
 
 @pytest.mark.parametrize("starts", [False, True])
@@ -222,23 +209,14 @@ def test_each_block_has_the_stored_partners_of_its_own_replicas(starts):
         Study(playing(each), replicas=6)
 
 
-def test_more_replicas_and_levels_keep_the_runs_that_are_there():
-    few = trials_of(Study(TINY, {FREEZE: [5, 25]}, replicas=2, block=2))
-    more = trials_of(Study(TINY, {FREEZE: [5, 25, 50]}, replicas=4, block=2))
-    assert {trial.name for trial in few} < {trial.name for trial in more}
-
-
 @pytest.mark.parametrize("design", ["random", "sobol"])
 def test_draws_are_the_same_again_and_more_of_them_keep_the_first(design):
     factors = {GAMMA: Uniform(0.5, 0.9), FREEZE: Integers(1, 50), "a": {"x": {}, "y": {"episodes": 3}}}
     few, more = (Study(TINY, factors, draws=count, design=design) for count in (3, 6))
     assert checksums(more)[:3] == checksums(few)
     assert len({condition.levels[GAMMA] for condition in more.all_conditions}) == 6
-
-
-def test_draws_that_are_equal_are_drawn_again():
-    conditions = Study(TINY, {FREEZE: Integers(1, 3)}, draws=3).all_conditions
-    assert sorted(condition.levels[FREEZE] for condition in conditions) == [1, 2, 3]
+    conditions = Study(TINY, {FREEZE: Integers(1, 3)}, draws=3, design=design).all_conditions
+    assert sorted(condition.levels[FREEZE] for condition in conditions) == [1, 2, 3], "equal ones again"
 
 
 @settings(deadline=None, max_examples=30)
@@ -271,13 +249,10 @@ def test_an_even_design_has_a_draw_in_each_part_of_every_range(design):
     assert sorted(parts) == [0, 1, 2, 3]
 
 
-@pytest.mark.parametrize(
-    ("kind", "low", "high"),
-    [(Uniform, 2, 1), (LogUniform, 0, 1), (Integers, 0.5, 2), (Uniform, float("nan"), 1)],
-)
-def test_a_range_that_is_none_is_refused(kind, low, high):
-    with pytest.raises(ValueError, match=f"{kind.__name__}.low is "):
-        kind(low, high)
+def test_a_range_that_is_none_is_refused():
+    for kind, low, high in ((Uniform, 2, 1), (LogUniform, 0, 1), (Integers, 0.5, 2), (Uniform, NAN, 1)):
+        with pytest.raises(ValueError, match=f"{kind.__name__}.low is "):
+            kind(low, high)
 
 
 # JSON
@@ -298,6 +273,7 @@ GRID = Study(TINY, {FREEZE: [5, 25], "agents": [[LEARNING] * 2, [ON_POLICY, Scri
 )
 def test_a_study_becomes_json_and_comes_back_the_same(study):
     assert there_and_back(study) == study
+    assert Study.from_config({**study.to_config(), "pairing": True}) == study, "which earlier ones say"
 
 
 @pytest.mark.parametrize(
@@ -313,8 +289,6 @@ def test_a_game_of_ones_own_is_a_level(study):
     assert again == study
     assert again.all_conditions[1].experiment.game == OTHER, "no Custom, but the game"
 
-
-def test_a_game_that_a_study_cannot_keep_is_refused():
     class Inner(Dilemma):
         """Nobody can import it."""
 
@@ -364,23 +338,16 @@ def test_runs_are_kept_relative_to_the_study_and_other_texts_as_they_are(tmp_pat
             assert there.transforms == here.transforms
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_a_table_that_is_no_study_is_refused():
+    for change, message in (
         ({"factors": None}, "NoneType"),
         ({"factors": [["a", {"distribution": "Normal", "low": 0, "high": 1}]]}, "Normal"),
         ({"experiment": {"name": "x"}}, "lacks game, agents, episodes"),
         ({"pairing": False}, "pairing"),
         ({"format": 3}, "format"),
-    ],
-)
-def test_a_table_that_is_no_study_is_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        Study.from_config({**GRID.to_config(), **change})
-
-
-def test_a_stored_study_may_say_that_it_is_paired():
-    assert Study.from_config({**GRID.to_config(), "pairing": True}) == GRID
+    ):
+        with pytest.raises(ValueError, match=message):
+            Study.from_config({**GRID.to_config(), **change})
 
 
 # Words
@@ -468,18 +435,11 @@ def test_what_a_field_cannot_have_is_refused_by_its_path(word, message):
         read(word)
 
 
-def test_a_path_stands_once_however_it_is_written():
+def test_a_value_fits_every_place_of_a_path_a_star_means_those_who_learn_and_a_path_stands_once():
+    mixed = replace(TINY, agents=(LEARNING, ON_POLICY))
+    assert read(f"{GAMMA}=0.5", mixed) == read(f"{GAMMA}=0.5", MIXED) == (0.5,)
     with pytest.raises(ValueError, match=r"has game\.rules\.freeze_steps twice"):
         factors_of(TINY, ["game.rules.freeze-steps=1", "game.rules.freeze_steps=2"])
-
-
-def test_only_agents_that_learn_are_meant_by_a_star():
-    assert read(f"{GAMMA}=0.5", MIXED) == (0.5,)
-
-
-def test_a_value_fits_every_place_that_its_path_names():
-    mixed = replace(TINY, agents=(LEARNING, ON_POLICY))
-    assert read(f"{GAMMA}=0.5", mixed) == (0.5,)
     with pytest.raises(ValueError, match="matches nothing"):
         read(f"{OF_ALL}.buffer_size=7", mixed)
 

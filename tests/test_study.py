@@ -252,7 +252,8 @@ def test_a_report_imports_code_of_ones_own_where_it_is_allowed(tmp_path, capsys)
     with pytest.raises(ValueError, match=target):
         write_report([run], tmp_path / "report")
     assert "| counted |" in write_report([run], tmp_path / "report", allow=[target]).read_text()
-    report.main((run,), out=tmp_path / "again", allow=(target,))
+    with allowing([target]):
+        report.main((run,), out=tmp_path / "again")
     assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "again" / "tables.md")
     with pytest.raises(ValueError, match="at least one run"):
         report.main(())

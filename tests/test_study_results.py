@@ -1,4 +1,4 @@
-"""What a study's table says: means, differences, phases, figures and the summary; numbers worked by hand."""
+"""What comes out of a study: table, means, differences, phases, figures, summary; numbers worked by hand."""
 
 import json
 import shutil
@@ -7,40 +7,36 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 from study_runs import EXPERIMENT, TIME_OUT, write_run, write_study
 
 from cprl import Study
 from cprl.commands import main as cli
-from cprl.measuring.statistics import difference, estimate
+from cprl.measuring.statistics import difference
+from cprl.runs.recipe import runs_in, write_changed_circumstances
+from cprl.studies import figures, results
 from cprl.studies.factors import Uniform
-from cprl.studies.figures import courses as courses_module
-from cprl.studies.figures import diagrams
-from cprl.studies.figures import levels as levels_module
-from cprl.studies.figures.courses import courses
-from cprl.studies.figures.diagrams import grids, heat_map, phase_diagram
-from cprl.studies.figures.levels import (
-    by_condition,
-    by_factor,
-    is_logarithmic,
-    is_numeric,
-    is_one,
-    names_of,
-    places_of,
-    replicas_text,
-)
-from cprl.studies.results import write_results
+from cprl.studies.status import Status
 from cprl.studies.tables.comparing import Cells, cells, compare, markdown, metrics_of
-from cprl.studies.tables.sources import design_of, ending, study_table
-from cprl.studies.tables.table import StudyTable
+from cprl.studies.tables.pooled import pooled_table
+from cprl.studies.tables.sources import circumstances_of, design_of, ending, study_table
+from cprl.studies.tables.table import METADATA, StudyTable
 from cprl.studies.trials import trials_of
 
 SEES = "game.rules.window_rows"
 GAMMA = "agents.*.algorithm.settings.gamma"
 NAN = float("nan")
+STUDY = Study(EXPERIMENT, {TIME_OUT: [5, 25]}, name="small", replicas=3, block=2)
+ONE = Study(EXPERIMENT, name="one")
 PAIRED = Study(EXPERIMENT, {TIME_OUT: [5, 25]}, name="pairs", replicas=3)
 GRID = Study(EXPERIMENT, {TIME_OUT: [1, 5, 25], SEES: [3, 5]}, name="grid", question="Why?", replicas=3)
+
+
+def ten_for_each_turn(condition, replica, number):
+    """10 apples for each turn of time-out, 100 for each replica and one for each episode."""
+    return 10 * condition.levels[TIME_OUT] + 100 * replica + number
 
 
 def harvest(condition, replica, number):
@@ -56,6 +52,11 @@ def table_of(runs, factors, apples=lambda *_: 1, *, replicas=2, written=None, **
 
 
 @pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    return write_study(STUDY, tmp_path_factory.mktemp("runs"), ten_for_each_turn)
+
+
+@pytest.fixture(scope="module")
 def pairs(tmp_path_factory):
     return study_table(PAIRED, write_study(PAIRED, tmp_path_factory.mktemp("pairs"), harvest))
 
@@ -64,6 +65,256 @@ def pairs(tmp_path_factory):
 def grid_runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("grid")
     return write_study(GRID, folder, harvest, but=("freeze_steps=5, window_rows=5",))
+
+
+# The rows of a table
+
+
+def rows_of(table, **wanted):
+    """The rows that have these values, as dictionaries; by default of the harvest in training."""
+    wanted = {"metric": "collective_return", "part": "training", **wanted}
+    return [row for row in table.rows.to_pylist() if wanted.items() <= row.items()]
+
+
+def test_a_row_is_a_window_of_a_metric_of_a_replica_under_a_condition(runs):
+    table = study_table(STUDY, runs)
+    rows = rows_of(table, condition="freeze_steps=25", replica=2)
+    # Replica 2 is the first of the second block. 250 + 200 + the mean of 0..9 is 454.5, of 10..19 464.5.
+    windows = [(row["episode"], row["window_episodes"], row["value"]) for row in rows]
+    assert windows == [(0, 10, 454.5), (10, 10, 464.5), (20, 10, 474.5), (30, 10, 484.5)]
+    trial = trials_of(STUDY)[-1]
+    assert (trial.block.first, trial.condition.name) == (2, "freeze_steps=25")
+    name, checksum = trial.name, trial.condition.checksum
+    assert {(row["run"], row["checksum"], row[TIME_OUT]) for row in rows} == {(name, checksum, 25)}
+    assert table.rows.schema.field(TIME_OUT).type == "int64"
+    for part, value in (("evaluation", 50 + 100 - 1), ("random", 4)):
+        (row,) = rows_of(table, condition="freeze_steps=5", replica=1, part=part)
+        assert (row["episode"], row["window_episodes"], row["value"]) == (0, 3, value)
+
+
+def test_episodes_stand_one_by_one_on_request_and_the_last_window_may_be_shorter(runs):
+    first = {"condition": "freeze_steps=5", "replica": 0}
+    each = study_table(STUDY, runs, window=1)
+    assert [row["value"] for row in rows_of(each, **first)] == [50.0 + number for number in range(40)]
+    assert [row["value"] for row in rows_of(each, **first, part="evaluation")] == [49.0] * 3
+    rows = rows_of(study_table(STUDY, runs, window=15), **first)
+    assert [(row["episode"], row["window_episodes"]) for row in rows] == [(0, 15), (15, 15), (30, 10)]
+    assert rows[-1]["value"] == 84.5, "50 + the mean of 30..39"
+
+
+def test_the_same_runs_give_the_same_file_to_the_bit_and_it_can_be_read_back(runs, tmp_path):
+    table = study_table(STUDY, runs)
+    first, second = (
+        each.write(tmp_path / f"{place}.parquet")
+        for place, each in enumerate((table, study_table(STUDY, runs)))
+    )
+    assert first.read_bytes() == second.read_bytes()
+    again = StudyTable.read(first)
+    assert str(again) == str(table)
+    assert (again.design, again.made, again.window) == (table.design, table.made, 10)
+    keys = table.rows.select(["condition", "replica", "part", "metric", "episode"])
+    assert keys.group_by(keys.column_names).aggregate([]).num_rows == len(table.rows), "no row twice"
+    metadata = json.loads(pq.read_schema(first).metadata[METADATA])
+    assert (metadata["design"]["name"], metadata["versions"]["numpy"]) == ("small", np.__version__)
+    for path in (next(runs.iterdir()) / "episodes.parquet", tmp_path / "none.parquet"):
+        with pytest.raises(ValueError, match=f"{path.name} is not the table of a study"):
+            StudyTable.read(path)
+
+
+def test_episodes_in_which_a_metric_is_undefined_are_counted_and_no_part_of_a_mean(tmp_path):
+    equality = lambda replica, number: NAN if number < 12 else number / 10  # noqa: E731
+    rows = rows_of(table_of(tmp_path, {}, written={"equality": equality}), replica=0, metric="equality")
+    assert [row["undefined"] for row in rows] == [10, 2, 0, 0]
+    assert np.isnan(rows[0]["value"])
+    assert rows[1]["value"] == pytest.approx((1.2 + 1.9) / 2)  # of episodes 12 to 19
+
+
+def test_what_is_not_finished_is_named_and_not_part_of_the_table(tmp_path):
+    unfinished, finished, failed, _ = trials_of(STUDY)
+    write_run(tmp_path / unfinished.name, unfinished.experiment, lambda *_: 1, is_finished=False)
+    write_run(tmp_path / finished.name, finished.experiment, lambda *_: 1)
+    (tmp_path / "status").mkdir()
+    Status(tmp_path / "status", failed.name).fail("ValueError: too hot", "trace")
+    table = study_table(STUDY, tmp_path, status=tmp_path / "status")
+    assert dict(table.replicas) == {"freeze_steps=5": 0, "freeze_steps=25": 2}
+    assert {(run.condition, run.replicas): run.reason for run in table.lacking} == {
+        ("freeze_steps=5", 2): "has not ended",
+        ("freeze_steps=5", 1): "failed: ValueError: too hot",
+        ("freeze_steps=25", 1): "was not begun",
+    }
+    assert "small: 2 replicas of 1 of 2 conditions" in str(table)
+    assert all(text in str(table) for text in ("3 runs are not in it", *map(str, table.lacking)))
+
+
+def test_two_trials_whose_directories_were_swapped_are_named_and_not_part_of_the_table(tmp_path):
+    write_study(STUDY, tmp_path, ten_for_each_turn)
+    one, other = (trial.name for trial in trials_of(STUDY)[:2])
+    for before, after in ((one, "aside"), (other, one), ("aside", other)):
+        (tmp_path / before).rename(tmp_path / after)
+    table = study_table(STUDY, tmp_path)
+    assert {lacking.name for lacking in table.lacking} == {one, other}
+    assert not {one, other} & set(table.rows["run"].to_pylist())
+
+
+def test_a_study_none_of_whose_runs_is_there_has_an_empty_table_and_a_summary_that_says_so(tmp_path):
+    table = results.write_results(GRID, tmp_path, tmp_path / "runs")
+    assert (len(table.rows), table.metrics, len(table.lacking)) == (0, (), 6)
+    assert len(StudyTable.read(tmp_path / "table.parquet").rows) == 0
+    text = (tmp_path / "summary.md").read_text()
+    assert "grid: 0 replicas of 0 of 6 conditions, 0 rows; 6 runs are not in it." in text
+    assert text.count("was not begun") == 6
+    assert not (tmp_path / "figures").exists()
+
+
+@pytest.mark.parametrize("name", ["episodes.parquet", "evaluation/trained.parquet"])
+def test_a_damaged_run_is_named_and_does_not_end_the_table(tmp_path, name):
+    write_study(STUDY, tmp_path, ten_for_each_turn)
+    broken = trials_of(STUDY)[0].name
+    (tmp_path / broken / name).write_bytes(b"PAR1")
+    table = study_table(STUDY, tmp_path)
+    (lacking,) = table.lacking
+    assert (lacking.name, lacking.reason[:12]) == (broken, "is damaged: ")
+    assert broken not in table.rows["run"].to_pylist()
+
+
+def test_a_run_with_fewer_episodes_than_its_experiment_is_named(tmp_path):
+    (trial,) = trials_of(ONE)
+    run = write_run(tmp_path / trial.name, replace(trial.experiment, episodes=20), lambda *_: 1)
+    recipe = json.loads((run / "recipe.json").read_text())
+    recipe["experiment"]["episodes"] = 40
+    (run / "recipe.json").write_text(json.dumps(recipe))
+    (lacking,) = study_table(ONE, tmp_path).lacking
+    assert r"episodes by replica in training: {0: 20, 1: 20}; allowed: 40 of each" in lacking.reason
+
+
+def made_under(folder, *circumstances):
+    """The table of three conditions whose runs were made under these, and the names of their trials."""
+    study = Study(EXPERIMENT, {TIME_OUT: [5, 25, 100]}, name="mixed")
+    for trial, made in zip(trials_of(study), circumstances, strict=True):
+        write_run(folder / trial.name, trial.experiment, lambda *_: 1, **made)
+    return study_table(study, folder), [trial.name for trial in trials_of(study)]
+
+
+def test_runs_of_other_versions_commits_and_processors_are_marked_and_named_in_a_sentence(tmp_path):
+    def made(torch="2.13.0", *, dirty=False, **resumed):
+        versions = {"python": "3.11.7", "torch": torch}
+        return {"versions": versions, "git": {"commit": "ab" * 20, "dirty": dirty}, "cpu": "Xeon", **resumed}
+
+    more = "The runs were made under more than one"
+    table, names = made_under(tmp_path / "a", made(), made("2.14.0"), made(dirty=True))
+    assert table.mixed == [
+        f"{more} version of torch: 2.13.0 in 2 runs; 2.14.0 in 1 run ({names[1]}).",
+        f"{more} git commit: abababababab in 2 runs; abababababab with changes in 1 run ({names[2]}).",
+    ]
+    marks = dict(zip(table.rows["run"].to_pylist(), table.rows["marks"].to_pylist(), strict=True))
+    assert marks == {names[0]: "", names[1]: "torch", names[2]: "git commit"}
+    assert all(sentence in str(table) for sentence in table.mixed)
+    resumed = made(resumed=[{**made(), "cpu": "Epyc"}])
+    (sentence,) = made_under(tmp_path / "b", made(), made(), resumed)[0].mixed
+    assert "more than one processor: Xeon in 2 runs; Xeon then Epyc in 1 run" in sentence
+
+
+def test_a_recipe_records_each_time_it_is_resumed_under_other_circumstances(tmp_path, monkeypatch):
+    made = {"versions": {"torch": "2.0"}, "git": None, "cpu": "Xeon"}
+    run = write_run(tmp_path / "run", EXPERIMENT, lambda *_: 1, **made)
+    for version in ("2.1", "2.1", "2.2"):
+        now = {**made, "versions": {"torch": version}}
+        monkeypatch.setattr("cprl.runs.recipe._circumstances", lambda recipe, now=now: now)
+        write_changed_circumstances(run)
+    resumed = json.loads((run / "recipe.json").read_text())["resumed"]
+    assert [now["versions"]["torch"] for now in resumed] == ["2.1", "2.2"]
+    assert circumstances_of(run) == {"torch": "2.0 then 2.1 then 2.2", "cpu": "Xeon"}
+
+
+def test_levels_that_are_no_numbers_are_texts_and_a_column_has_no_name_twice(tmp_path):
+    words = {"short": {TIME_OUT: 5}, "long": {TIME_OUT: 25}}
+    table = table_of(tmp_path, {"metric": words, "game.rules.regrow_prob": [(0.0, 0.1), (0.0, 0.2)]})
+    assert set(table.rows["factor metric"].to_pylist()) == {"short", "long"}
+    assert set(table.rows["game.rules.regrow_prob"].to_pylist()) == {"(0, 0.1)", "(0, 0.2)"}
+    assert len(set(table.rows.column_names)) == len(table.rows.column_names)
+
+
+def test_conditions_that_words_do_not_tell_apart_are_numbered_and_not_merged(tmp_path):
+    agent = EXPERIMENT.agents[0]
+    settings = replace(agent.algorithm.settings, gamma=0.5)
+    other = replace(agent, algorithm=replace(agent.algorithm, settings=settings))
+    study = Study(EXPERIMENT, {"agents": [(agent, agent), (other, other)]}, name="alike")
+    checksums = [condition.checksum for condition in study.all_conditions]
+    write_study(study, tmp_path, lambda condition, *_: checksums.index(condition.checksum))
+    table = study_table(study, tmp_path)
+    (first, levels), (second, other_levels) = table.design.conditions.items()
+    assert second == f"{first} #2"
+    assert other_levels["agents"] == f"{levels['agents']} #2"
+    for place, name in enumerate((first, second)):
+        assert {row["value"] for row in rows_of(table, condition=name, part="evaluation")} == {place}
+
+
+def test_a_condition_whose_name_ends_in_a_number_stays_itself():
+    levels = {"beam #2": {TIME_OUT: 7}, "beam": {}}
+    design = design_of(Study(EXPERIMENT, conditions=levels))
+    assert (list(design.conditions), design.reference) == (["beam #2", "beam"], "beam")
+    assert design_of(Study(EXPERIMENT, {"size": levels})).levels("size") == ["beam #2", "beam"]
+    agents = [[replace(EXPERIMENT.agents[0], reward=reward)] * 2 for reward in ("individual", "team")]
+    assert len(set(design_of(Study(EXPERIMENT, {"agents": agents})).levels("agents"))) == 2
+
+
+# Any runs at hand
+
+
+def at(time_out, seed, **changes):
+    """The experiment with a time-out and a seed."""
+    rules = replace(EXPERIMENT.game.rules, freeze_steps=time_out)
+    return replace(EXPERIMENT, seed=seed, game=replace(EXPERIMENT.game, rules=rules), **changes)
+
+
+def write_runs(folder, **experiments):
+    for name, experiment in experiments.items():
+        write_run(folder / name, experiment, lambda replica, number: 10 * replica)
+
+
+def test_any_runs_are_pooled_by_the_value_of_a_field_and_replicas_are_numbered_by_seed(tmp_path):
+    write_runs(tmp_path, a=at(25, 1), b=at(5, 1), c=at(5, 9, replicas=3))
+    write_run(tmp_path / "apart" / "d", at(7, 1), lambda *_: 1, is_finished=False)
+    table = pooled_table([tmp_path, tmp_path / "apart"], by=["game.rules.freeze-steps"])
+    assert dict(table.replicas) == {"freeze_steps=5": 5, "freeze_steps=7": 0, "freeze_steps=25": 2}
+    assert [lacking.reason for lacking in table.lacking] == ["has not ended"]
+    assert table.rows[TIME_OUT].to_pylist()[0] == 5
+    rows = rows_of(table, condition="freeze_steps=5", part="evaluation")
+    # Seed 1 has the replicas 0 and 1, seed 9 has 2 to 4; each has ten times its number in its run.
+    assert [(row["replica"], row["value"]) for row in rows] == [(0, 0), (1, 10), (2, 0), (3, 10), (4, 20)]
+    assert not table.design.is_paired, "seed 9 is in one condition alone"
+    assert pooled_table([tmp_path / "a", tmp_path / "b"], by=[TIME_OUT]).design.is_paired
+
+
+def test_the_same_seed_twice_under_the_same_condition_is_refused_by_name(tmp_path):
+    write_runs(tmp_path, a=at(5, 1), b=at(5, 1, episodes=20))
+    with pytest.raises(ValueError, match=r"a and .*b have the same seed, 1, .* they differ in episodes"):
+        pooled_table([tmp_path], by=[TIME_OUT])
+    assert len(pooled_table([tmp_path], by=[TIME_OUT, "episodes"]).design.conditions) == 2
+
+
+def test_what_pooled_runs_and_conditions_differ_in_beside_is_said(tmp_path):
+    write_runs(tmp_path, a=at(5, 1), b=at(5, 2, update_every=2), c=at(25, 1, episodes=20))
+    text = str(pooled_table([tmp_path], by=[TIME_OUT]))
+    assert "The runs pooled as freeze_steps=5 also differ in update_every." in text
+    assert "The conditions also differ in episodes." in text
+
+
+def test_runs_are_not_pooled_by_what_does_not_fit(tmp_path):
+    write_runs(tmp_path, a=EXPERIMENT)
+    (tmp_path / "none").mkdir()
+    for options, message in (
+        ({"by": ["game.rules.freez_steps"]}, "did you mean 'freeze_steps'"),
+        ({"by": ["seed"]}, "by is 'seed'"),
+        ({"by": ["name", "name"]}, "each once"),
+        ({"by": ["name"], "reference": "x"}, "reference is 'x'"),
+        ({"by": ["name"], "window": 0}, "window is 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            pooled_table([tmp_path / "a"], **options)
+    for paths, message in ((["none"], "none is no run"), (["a", "."], "a is there twice")):
+        with pytest.raises(ValueError, match=message):
+            runs_in([tmp_path / path for path in paths])
 
 
 # Comparisons
@@ -98,6 +349,9 @@ def test_conditions_are_compared_by_the_last_episodes_and_pairs_of_replicas(pair
     evaluated = compare(pairs, "collective_return", part="evaluation")
     assert evaluated.conditions[1].values == {0: 3, 1: 104, 2: 208}
     assert evaluated.episodes_text == "3 fresh episodes of the trained agents"
+    for name, value in (("metric", "wealth"), ("part", "sleep"), ("last", 5)):
+        with pytest.raises(ValueError, match=f"{name} is {value!r}"):
+            compare(pairs, **{"metric": "collective_return", name: value})
 
 
 def test_replicas_without_a_value_are_counted_and_pairs_are_those_that_both_have(tmp_path):
@@ -127,44 +381,25 @@ def test_a_table_in_markdown_has_replicas_intervals_and_differences(pairs):
 
 
 def test_differences_are_bold_that_differ_among_all_of_their_table(tmp_path):
-    def apples(condition, replica, number):
-        return (
-            100 * replica
-            + {5: 0, 25: (4, 5, 6)[replica], 100: (40, 41, 42)[replica]}[condition.levels[TIME_OUT]]
-        )
-
+    more = {5: (0, 0, 0), 25: (4, 5, 6), 100: (40, 41, 42)}
+    apples = lambda condition, replica, _: 100 * replica + more[condition.levels[TIME_OUT]][replica]  # noqa: E731
     table = table_of(tmp_path, {TIME_OUT: [5, 25, 100]}, apples, replicas=3)
     # 5 +- 1 and 41 +- 1 of 3 pairs: t is 8.66 and 71.0, p is 0.0131 and 0.0002; the equality is 0.5 in all.
     alone = cells([compare(table, "collective_return")], "differences")
     assert [row[2] for row in alone.rows] == ["**+5.00 [+2.52, +7.48]**", "**+41.0 [+38.5, +43.5]**"]
     assert "Holm's method for 2 comparisons" in alone.note
-    several = cells(
-        [compare(table, name) for name in ("collective_return", "equality", "peace")], "differences"
-    )
+    metrics = "collective_return", "equality", "peace"
+    several = cells([compare(table, metric) for metric in metrics], "differences")
     assert [row[2] for row in several.rows] == ["+5.00 [+2.52, +7.48]", "**+41.0 [+38.5, +43.5]**"]
     assert several.rows[0][3] == "+0.000 [+0.000, +0.000]"
     assert "for 6 comparisons" in several.note
     assert markdown(several)[-2:] == [several.note, ""]
 
 
-@pytest.mark.parametrize(
-    ("name", "written"),
-    [
-        ("a|b", r"a\|b"),
-        ("pay_$1_or_$_", r"pay_\$1_or_\$_"),
-        ("*a*", r"\*a\*"),
-        ("<b>", r"\<b>"),
-        ("a\nb", "a b"),
-    ],
-)
-def test_names_in_a_table_in_markdown_are_texts_and_take_one_line(name, written):
-    assert markdown(Cells("", ["condition", "x"], [[name, "**1**"]]))[2] == f"| {written} | **1** |"
-
-
-@pytest.mark.parametrize(("name", "value"), [("metric", "wealth"), ("part", "sleep"), ("last", 5)])
-def test_comparisons_that_do_not_fit_are_refused(pairs, name, value):
-    with pytest.raises(ValueError, match=f"{name} is {value!r}"):
-        compare(pairs, **{"metric": "collective_return", name: value})
+def test_names_in_a_table_in_markdown_are_texts_and_take_one_line():
+    names = {"a|b": r"a\|b", "pay_$1_$_": r"pay_\$1_\$_", "*a*": r"\*a\*", "<b>": r"\<b>", "a\nb": "a b"}
+    _, _, *lines, _ = markdown(Cells("", ["condition", "x"], [[name, "**1**"] for name in names]))
+    assert lines == [f"| {written} | **1** |" for written in names.values()]
 
 
 # Phases
@@ -214,24 +449,23 @@ def assert_drawn(path):
 @pytest.fixture
 def drawn(monkeypatch):
     """The figures that are drawn, instead of their files."""
-    figures = []
-    for module in (levels_module, courses_module, diagrams):
-        monkeypatch.setattr(module, "save", lambda figure, path, **how: figures.append(figure))
-    return figures
+    made = []
+    monkeypatch.setattr(figures, "save", lambda figure, path, **_: made.append(figure))
+    return made
 
 
 @pytest.mark.integration
 def test_figures_of_a_grid_are_drawn_with_a_condition_that_has_no_run(grid_runs, tmp_path):
     table = study_table(GRID, grid_runs)
-    (pair,) = grids(table.design)
+    (pair,) = figures.grids(table.design)
     assert pair == (TIME_OUT, SEES)
     for name, draw in {
-        "factor": lambda path: by_factor(table, TIME_OUT, path),
-        "levels": lambda path: by_condition(table, path),
-        "differences": lambda path: by_condition(table, path, kind="differences"),
-        "courses": lambda path: courses(table, path),
-        "map": lambda path: heat_map(table, pair, path),
-        "phases": lambda path: phase_diagram(table, pair, path),
+        "factor": lambda path: figures.by_factor(table, TIME_OUT, path),
+        "levels": lambda path: figures.by_condition(table, path),
+        "differences": lambda path: figures.by_condition(table, path, kind="differences"),
+        "courses": lambda path: figures.courses(table, path),
+        "map": lambda path: figures.heat_map(table, pair, path),
+        "phases": lambda path: figures.phase_diagram(table, pair, path),
     }.items():
         assert_drawn(draw(tmp_path / f"{name}.png"))
         with pytest.raises(ValueError, match=r"path is '.*\.pdf'"):
@@ -239,28 +473,36 @@ def test_figures_of_a_grid_are_drawn_with_a_condition_that_has_no_run(grid_runs,
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("name", ["_x", "pay_$1_or_$_", "[/]", "a|b"])
-def test_a_condition_of_any_name_is_in_the_legend_of_the_courses(name, tmp_path, drawn):
-    table = table_of(tmp_path, {}, conditions={name: {TIME_OUT: 1}, "other": {}}, replicas=1)
-    courses(table, tmp_path / "courses.png")
-    (legend,) = drawn[0].legends
-    assert any(name in text.get_text() for text in legend.get_texts())
+def test_conditions_of_any_name_are_in_the_legend_of_the_courses_and_have_a_panel_each_where_they_are_many(
+    tmp_path, drawn
+):
+    names = ["_x", "pay_$1_or_$_", "[/]", "a|b", "5", "6", "7"]
+    conditions = {name: {TIME_OUT: place + 6} for place, name in enumerate(names)}
+    for count in (4, 7):
+        few = dict(list(conditions.items())[:count])
+        table = table_of(tmp_path / str(count), {}, conditions=few, replicas=1)
+        figures.courses(table, tmp_path / "courses.png")
+    together, apart = drawn
+    texts = [text.get_text() for text in together.legends[0].get_texts()]
+    assert all(any(name in text for text in texts) for name in names[:4])
+    assert [axes.get_title() for axes in apart.axes if axes.get_visible()] == names[1:], "beside the first"
 
 
 def test_conditions_that_were_not_run_do_not_count_among_the_replicas_of_a_figure():
-    assert replicas_text({"as run": 8, "no beam": 8, "later": 0}) == "8 replicas each"
-    assert replicas_text({"as run": 16, "no beam": 8, "later": 0}) == "8 to 16 replicas each (n)"
-    assert replicas_text({"later": 0}) == "0 replicas each"
+    assert figures.replicas_text({"as run": 8, "no beam": 8, "later": 0}) == "8 replicas each"
+    assert figures.replicas_text({"as run": 16, "no beam": 8, "later": 0}) == "8 to 16 replicas each (n)"
+    assert figures.replicas_text({"later": 0}) == "0 replicas each"
 
 
 def test_figures_call_conditions_by_the_level_and_say_where_replicas_differ(pairs, tmp_path):
-    assert names_of(pairs) == {"freeze_steps=5": "5", "freeze_steps=25": "25"}
+    assert figures.names_of(pairs) == {"freeze_steps=5": "5", "freeze_steps=25": "25"}
     write_study(PAIRED, tmp_path, harvest, but=("freeze_steps=25",))
-    assert names_of(study_table(PAIRED, tmp_path)) == names_of(pairs), "what was not run has no number"
+    part = figures.names_of(study_table(PAIRED, tmp_path))
+    assert part == figures.names_of(pairs), "what was not run has no number"
     block = replace(PAIRED, block=2)
     write_study(block, tmp_path / "blocks", harvest)
     shutil.rmtree(tmp_path / "blocks" / trials_of(block)[1].name)
-    words = names_of(study_table(block, tmp_path / "blocks"))
+    words = figures.names_of(study_table(block, tmp_path / "blocks"))
     assert words == {"freeze_steps=5": "5 (n=3)", "freeze_steps=25": "25 (n=1)"}
 
 
@@ -268,10 +510,10 @@ def test_figures_call_conditions_by_the_level_and_say_where_replicas_differ(pair
 def test_random_draws_are_drawn_as_points_and_have_no_heat_map(tmp_path):
     factors = {GAMMA: Uniform(0.5, 0.9), TIME_OUT: [5, 25]}
     table = table_of(tmp_path / "runs", factors, harvest, draws=4, replicas=1)
-    assert grids(table.design) == {}
-    assert_drawn(by_factor(table, GAMMA, tmp_path / "gamma.png"))
+    assert figures.grids(table.design) == {}
+    assert_drawn(figures.by_factor(table, GAMMA, tmp_path / "gamma.png"))
     with pytest.raises(ValueError, match="factors"):
-        heat_map(table, (TIME_OUT, GAMMA), tmp_path / "map.png")
+        figures.heat_map(table, (TIME_OUT, GAMMA), tmp_path / "map.png")
 
 
 def dashes(figure):
@@ -286,7 +528,7 @@ def draw_random_play(folder, random):
     for trial in trials_of(study):
         by_chance = random(trial.condition.levels)
         write_run(folder / trial.name, trial.experiment, lambda *_: 0, random=by_chance)
-    by_factor(study_table(study, folder), TIME_OUT, "unlike.png")
+    figures.by_factor(study_table(study, folder), TIME_OUT, "unlike.png")
 
 
 @pytest.mark.integration
@@ -300,7 +542,7 @@ def test_random_play_under_unlike_rules_is_a_line_each_in_the_colour_of_its_cond
 
 @pytest.mark.integration
 def test_random_play_that_belongs_to_no_line_is_not_drawn(tmp_path, drawn, monkeypatch):
-    monkeypatch.setattr(levels_module, "_MOST_LINES", 1)
+    monkeypatch.setattr(figures, "_MOST_LINES", 1)
     draw_random_play(tmp_path / "unlike", lambda levels: levels[SEES])
     assert dashes(drawn[0]) == []
     draw_random_play(tmp_path / "same", lambda levels: levels[TIME_OUT])
@@ -310,57 +552,52 @@ def test_random_play_that_belongs_to_no_line_is_not_drawn(tmp_path, drawn, monke
 @pytest.mark.integration
 def test_a_figure_counts_the_episodes_in_which_a_metric_is_undefined(tmp_path, drawn):
     idle = {"equality": lambda replica, number: NAN if number == 39 else 0.5}
-    by_factor(table_of(tmp_path, {TIME_OUT: [1, 5]}, written=idle), TIME_OUT, "i.png", metrics=["equality"])
+    table = table_of(tmp_path, {TIME_OUT: [1, 5]}, written=idle)
+    figures.by_factor(table, TIME_OUT, "i.png", metrics=["equality"])
     assert "undefined in 4 of 120 episodes" in drawn[0].axes[0].get_title().replace("\n", " ")
 
 
 @pytest.mark.integration
 def test_a_course_below_0_is_drawn_whole(tmp_path, drawn):
     table = table_of(tmp_path, {TIME_OUT: [1, 5]}, lambda condition, *_: condition.levels[TIME_OUT] - 60)
-    courses(table, "courses.png")
+    figures.courses(table, "courses.png")
     assert drawn[0].axes[0].get_ylim()[0] < -59
     assert drawn[0].axes[1].get_ylim()[0] == 0
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("is_map", [True, False])
-def test_levels_are_mapped_in_the_order_in_which_they_were_given(tmp_path, drawn, is_map):
+@pytest.mark.parametrize("draw", [figures.heat_map, figures.phase_diagram])
+def test_levels_are_mapped_in_the_order_in_which_they_were_given(tmp_path, drawn, draw):
     words = {"tall": {SEES: 9}, "low": {SEES: 3}, "middle": {SEES: 5}}
-    table = table_of(tmp_path, {TIME_OUT: [25, 1], "view": words})
-    if is_map:
-        heat_map(table, (TIME_OUT, "view"), "map.png")
-    else:
-        phase_diagram(table, (TIME_OUT, "view"), "phases.png")
+    draw(table_of(tmp_path, {TIME_OUT: [25, 1], "view": words}), (TIME_OUT, "view"), "map.png")
     axes = drawn[0].axes[0]
     assert [label.get_text() for label in axes.get_xticklabels()] == ["tall", "low", "middle"]
     assert [label.get_text() for label in axes.get_yticklabels()] == ["25", "1"]
 
 
 def test_random_play_of_a_table_in_float32_is_that_of_one_in_float64():
-    exported = [estimate([float(np.float32(0.9055097465415143))]), None, estimate([0.9055097465415143])]
-    assert is_one(exported)
-    assert not is_one([*exported, estimate([0.9056])])
+    exported = [float(np.float32(0.9055097465415143)), 0.9055097465415143]
+    assert figures.is_one(exported)
+    assert not figures.is_one([*exported, 0.9056])
 
 
-def test_numbers_that_are_far_apart_stand_on_a_logarithmic_axis_and_names_on_none():
-    assert [is_logarithmic(levels) for levels in ([1, 5, 31], [1, 5, 30], [0, 100])] == [True, False, False]
-    assert [is_numeric(levels) for levels in ([1, 2.5], [1, "two"], [True, False])] == [True, False, False]
-
-
-def test_levels_that_are_too_close_for_their_names_stand_at_equal_distances():
-    assert places_of([0.5, 0.95, 0.99, 0.995]) == ({0.5: 0, 0.95: 1, 0.99: 2, 0.995: 3}, True)
-    assert places_of([0.5, 0.9, 0.7]) == ({0.5: 0.5, 0.7: 0.7, 0.9: 0.9}, False)
+def test_numbers_far_apart_stand_on_a_logarithmic_axis_and_close_ones_at_equal_distances():
+    assert [figures.is_logarithmic(levels) for levels in ([1, 5, 31], [1, 5, 30], [0, 9])] == [True, 0, 0]
+    assert [figures.is_numeric(levels) for levels in ([1, 2.5], [1, "two"], [True, False])] == [True, 0, 0]
+    close = figures.places_of([0.5, 0.95, 0.99, 0.995])
+    assert close == ({0.5: 0, 0.95: 1, 0.99: 2, 0.995: 3}, True)
+    assert figures.places_of([0.5, 0.9, 0.7]) == ({0.5: 0.5, 0.7: 0.7, 0.9: 0.9}, False)
 
 
 def test_a_factor_with_names_is_refused_as_an_axis_of_numbers(tmp_path):
     table = table_of(tmp_path / "runs", {"word": {"a": {TIME_OUT: 5}, "b": {TIME_OUT: 25}}})
     with pytest.raises(ValueError, match="factor is 'word'"):
-        by_factor(table, "word", tmp_path / "word.png")
+        figures.by_factor(table, "word", tmp_path / "word.png")
 
 
 def test_other_factors_are_held_at_the_levels_of_the_reference():
     study = Study(EXPERIMENT, {TIME_OUT: [1, 5], SEES: [3, 5], "update_every": [1, 2]}, name="three")
-    by_pair = grids(design_of(study))
+    by_pair = figures.grids(design_of(study))
     assert list(by_pair) == [(TIME_OUT, SEES), (TIME_OUT, "update_every"), (SEES, "update_every")]
     assert all("update_every=1" in name for name in by_pair[TIME_OUT, SEES].values())
     assert len(by_pair[TIME_OUT, SEES]) == 4
@@ -371,22 +608,24 @@ def test_other_factors_are_held_at_the_levels_of_the_reference():
 
 @pytest.mark.integration
 def test_the_results_of_a_study_are_a_table_a_summary_and_figures(grid_runs, tmp_path):
-    table = write_results(GRID, tmp_path, grid_runs, again="cprl sweep grid.py")
-    figures = {path.name for path in (tmp_path / "figures").iterdir()}
+    table = results.write_results(GRID, tmp_path, grid_runs, again="cprl sweep grid.py")
+    drawn = {path.name for path in (tmp_path / "figures").iterdir()}
     pair = "game_rules_freeze_steps_game_rules_window_rows"
-    assert figures == {
+    assert drawn == {
         "by_game_rules_freeze_steps.png", "by_game_rules_window_rows.png", "levels.png", "courses.png",
         "differences.png", f"map_{pair}_collective_return.png", f"map_{pair}_equality.png",
         f"phases_{pair}.png",
     }  # fmt: skip
     assert StudyTable.read(tmp_path / "table.parquet").summary == table.summary
-    text = (tmp_path / "summary.md").read_text()
-    assert "**Question.** Why?" in text
-    (lacking,) = table.lacking
-    assert f"- {lacking}" in text
-    assert "This line runs what is lacking: `cprl sweep grid.py`" in text
-    assert "| freeze_steps=25, window_rows=5 | 3 | 130" in text
-    assert all(f"(figures/{name})" in text for name in figures)
+    text, (lacking,) = (tmp_path / "summary.md").read_text(), table.lacking
+    for line in (
+        "**Question.** Why?",
+        f"- {lacking}",
+        "This line runs what is lacking: `cprl sweep grid.py`",
+        "| freeze_steps=25, window_rows=5 | 3 | 130",
+        *(f"(figures/{name})" for name in drawn),
+    ):
+        assert line in text
     assert not list(tmp_path.rglob("*.partial"))
 
 
@@ -399,45 +638,28 @@ def test_results_are_written_again_over_earlier_ones_and_none_of_those_is_left(t
     write_study(study, tmp_path / "runs", harvest)
     written = []
     for _ in range(2):
-        assert write_results(study, tmp_path, tmp_path / "runs").lacking == ()
+        assert results.write_results(study, tmp_path, tmp_path / "runs").lacking == ()
         written.append([(tmp_path / name).read_bytes() for name in ("summary.md", "table.parquet")])
     assert written[0] == written[1]
-    figures = {path.name for path in (tmp_path / "figures").iterdir()}
-    assert figures == {"levels.png", "courses.png", "mine.png"}
+    drawn = {path.name for path in (tmp_path / "figures").iterdir()}
+    assert drawn == {"levels.png", "courses.png", "mine.png"}
 
 
-def test_a_study_without_a_finished_run_has_a_summary_that_says_so(tmp_path):
-    write_results(GRID, tmp_path, tmp_path / "runs")
-    text = (tmp_path / "summary.md").read_text()
-    assert "grid: 0 replicas of 0 of 6 conditions, 0 rows; 6 runs are not in it." in text
-    assert text.count("was not begun") == 6
-    assert not (tmp_path / "figures").exists()
-
-
-@pytest.fixture
-def summary_of_pairs(tmp_path, monkeypatch):
-    """Writes the results of the paired study, without figures, and gives the summary."""
-    monkeypatch.setattr("cprl.studies.results._figures", lambda *_: iter(()))
-
-    def written():
-        write_results(PAIRED, tmp_path, tmp_path / "runs")
+def test_the_summary_says_how_many_steps_each_replica_learned_from_where_the_runs_do(tmp_path, monkeypatch):
+    def summary():
+        results.write_results(PAIRED, tmp_path, tmp_path / "runs")
         return (tmp_path / "summary.md").read_text()
 
-    return written
-
-
-def test_the_summary_says_how_many_steps_each_replica_learned_from_where_the_runs_do(
-    tmp_path, summary_of_pairs
-):
+    monkeypatch.setattr(results, "figures_of", lambda *_: iter(()))
     write_study(PAIRED, tmp_path / "runs", harvest)
-    assert "environment steps" not in summary_of_pairs(), "runs of before did not say"
+    assert "environment steps" not in summary(), "runs of before did not say"
     reports = [tmp_path / "runs" / trial.name / "report.json" for trial in trials_of(PAIRED)]
     for place, report in enumerate(reports):
         report.write_text(json.dumps({"steps": 1000 + place}))
-    lines = summary_of_pairs().split("| condition | episodes | environment steps |")[1].splitlines()[2:]
+    lines = summary().split("| condition | episodes | environment steps |")[1].splitlines()[2:]
     assert [line.split("|")[3].strip() for line in lines if line] == ["1,000", "1,001"]
     reports[0].write_text("{")
-    assert "1,000 |" not in summary_of_pairs(), "a damaged report ends no summary"
+    assert "1,000 |" not in summary(), "a damaged report ends no summary"
 
 
 # The command line
@@ -458,15 +680,15 @@ def table_command(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--by", "name", "--part", "evaluation", "--last", "30"], "--last .* without --part evaluation"),
-        (["--by", "name", "--part", "random", "--last", "30"], "--last .* without --part random"),
-        ([], r"cprl table RUN\.\.\. --by "),
-        (["--by", "name", "--summary"], "--summary .* without --by"),
+        ("--by name --part evaluation --last 30", "--last .* without --part evaluation"),
+        ("--by name --part random --last 30", "--last .* without --part random"),
+        ("", r"cprl table RUN\.\.\. --by "),
+        ("--by name --summary", "--summary .* without --by"),
     ],
 )
 def test_words_of_cprl_table_that_do_not_fit_are_refused_by_the_flag(words, message, table_command):
     with pytest.raises(SystemExit, match=message):
-        table_command(*words)
+        table_command(*words.split())
 
 
 def test_cprl_table_prints_any_runs_by_a_field_and_writes_them(table_command, capsys):
@@ -485,7 +707,7 @@ def test_cprl_table_prints_any_runs_by_a_field_and_writes_them(table_command, ca
 
 
 def test_cprl_table_of_a_study_says_and_writes_what_its_table_alone_gives(table_command, capsys):
-    table = write_results(PAIRED, "pairs", write_study(PAIRED, Path("runs"), harvest))
+    table = results.write_results(PAIRED, "pairs", write_study(PAIRED, Path("runs"), harvest))
     summary = Path("pairs/summary.md").read_text()
     Path("pairs/summary.md").unlink()
     capsys.readouterr()

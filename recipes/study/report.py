@@ -17,6 +17,7 @@ The modules of the report, in the order in which one reads them:
 """
 
 import shlex
+import sys
 from collections.abc import Sequence
 from datetime import timedelta
 from pathlib import Path
@@ -33,7 +34,7 @@ from results import PooledResult, Result, pooled, read_result, table, told
 from tragedies import combat_section
 
 from cprl.commands.play_stored import check_runs
-from cprl.commands.recipe import Allow, in_a_sentence, make_importable
+from cprl.commands.recipe import in_a_sentence, trusting
 from cprl.runs.files import write_atomically
 from cprl.system.defaults import SEED
 from cprl.system.output import say
@@ -204,9 +205,7 @@ def _figures(results: Sequence[Result], out: Path) -> list[str]:
     return lines
 
 
-def main(
-    runs: tuple[Path, ...], /, *, out: Path = Path("report"), pool: bool = False, allow: Allow = ()
-) -> None:
+def main(runs: tuple[Path, ...], /, *, out: Path = Path("report"), pool: bool = False) -> None:
     """Writes tables and figures of finished runs beside the published study.
 
     Args:
@@ -214,16 +213,14 @@ def main(
         out: where to: tables.md, figures.md and figures/.
         pool: runs whose experiments differ in nothing but name, seed, replicas and on_nan are one, of all
             their replicas.
-        allow: code of your own, module:Class, that a run may import; see docs/experiments.md.
     """
     if not runs:
         raise ValueError("the report wants at least one run: python recipes/study/report.py RUN...")
-    make_importable(allow)
     check_runs(*runs)
     prepare_process(SEED)
-    say(write_report(runs, out, pool=pool, allow=allow))
+    say(write_report(runs, out, pool=pool))
 
 
 if __name__ == "__main__":
     with in_a_sentence("report.py"):
-        tyro.cli(main)
+        tyro.cli(main, args=trusting(sys.argv[1:]))

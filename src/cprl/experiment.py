@@ -1,7 +1,6 @@
 """Experiment: everything that decides a training, as a value that a run's recipe holds."""
 
-import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -20,10 +19,9 @@ from cprl.population import (
     refuse_undecided,
     specs_by_agent,
     stored_of,
-    with_run_moved,
 )
 from cprl.runs.files import RECIPE_FORMAT, written_by_another
-from cprl.runs.recipe import recipe_config
+from cprl.runs.recipe import recipe_config, with_runs_moved
 from cprl.system.memory import Device
 from cprl.values import (
     DirectoryName,
@@ -124,8 +122,9 @@ class Experiment(Value, stored=False, called="experiment"):
         Args:
             directory: where the recipe is kept: runs of `Frozen` are then given relative to it.
         """
-        stored = self if directory is None else frozen_relative_to(self, directory)
-        return {"format": RECIPE_FORMAT, "recipe": self.name, "experiment": stored.to_config()}
+        table = self.to_config()
+        table = table if directory is None else with_runs_moved(table, ".", directory)
+        return {"format": RECIPE_FORMAT, "recipe": self.name, "experiment": table}
 
     @classmethod
     def from_recipe(
@@ -139,10 +138,11 @@ class Experiment(Value, stored=False, called="experiment"):
             directory: where the recipe is kept; runs of `Frozen` are then relative to where we stand.
         """
         try:
-            experiment = cls.from_config(recipe_config(recipe), allow=allow)
+            table = recipe_config(recipe)
+            table = table if directory is None else with_runs_moved(table, directory, ".")
+            return cls.from_config(table, allow=allow)
         except ValueError as error:
             raise ValueError(f"{error}{written_by_another(recipe)}") from error
-        return experiment if directory is None else frozen_from(experiment, directory)
 
     def __eq__(self, other: object) -> bool:
         return self.to_config() == other.to_config() if isinstance(other, Experiment) else NotImplemented
@@ -151,24 +151,9 @@ class Experiment(Value, stored=False, called="experiment"):
         return hash((self.name, self.episodes, self.replicas, self.seed))
 
 
-def frozen_relative_to(experiment: Experiment, directory: str | Path) -> Experiment:
-    """The same with the runs of `Frozen`, relative to where we stand, relative to a directory."""
-    return _with_runs(experiment, lambda run: os.path.relpath(run, directory))
-
-
-def frozen_from(experiment: Experiment, directory: str | Path) -> Experiment:
-    """The same with the runs of `Frozen`, relative to a directory, relative to where we stand."""
-    return _with_runs(experiment, lambda run: os.path.relpath(Path(directory) / run))
-
-
 def changes(before: Experiment, now: Experiment) -> list[str]:
     """How two experiments differ, a sentence for each place."""
     return differences(before.to_config(), now.to_config(), "experiment", Experiment)
-
-
-def _with_runs(experiment: Experiment, moved: Callable[[str], str]) -> Experiment:
-    agents = tuple(with_run_moved(spec, moved) for spec in experiment.agents)
-    return experiment if agents == experiment.agents else replace(experiment, agents=agents)
 
 
 _MOST_WORLDS: Final = 2**22

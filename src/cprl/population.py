@@ -218,8 +218,3 @@ def with_stored(spec: Any, changed: Callable[[Frozen], Frozen]) -> Any:
     if isinstance(spec, Learning | Team) and spec.start_from is not None:
         return replace(spec, start_from=changed(spec.start_from))
     return spec
-
-
-def with_run_moved(spec: Any, moved: Callable[[str], str]) -> Any:
-    """A specification of an agent whose stored run, if it has one, is in another directory."""
-    return with_stored(spec, lambda stored: replace(stored, run=moved(stored.run)))

@@ -5,5 +5,6 @@ Modules, in the order in which one reads them:
     recipe       recipe_main: the command line of a recipe
     flags        the fields of an experiment as flags
     play_stored  cprl film, play, evaluate, visits, crossplay, schelling, egta, scenarios and exploit
-    studies      cprl sweep, search and table; study_main: the command line of a recipe of a study
+    studies      cprl sweep and search; study_main: the command line of a recipe of a study
+    table        cprl table
 """

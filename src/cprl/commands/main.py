@@ -16,13 +16,14 @@ from typing import Annotated, Any, Final
 import tyro
 
 from cprl.commands.recipe import (
+    ALLOW,
     RunOptions,
     ended_by_sigterm,
     in_a_sentence,
-    make_importable,
     refuse_mistyped_flags,
     refuse_to_take_over,
     run_with,
+    trusting,
 )
 from cprl.system.output import OUT, printed, say
 from cprl.system.process import obey_parent
@@ -45,13 +46,14 @@ COMMANDS: Final[Mapping[str, str]] = {
     "exploit": "play_stored:exploit",
     "sweep": "studies:sweep",
     "search": "studies:search",
-    "table": "studies:runs_table",
+    "table": "table:table",
 }
 """The functions of the commands, each in a module of this package, in the order in which `cprl --help` lists
 them. A command imports what it needs once its words are checked: torch takes seconds, which a mistake need
 not."""
 
 _OPTIONS: Final = RunOptions()
+_ARGS: Final = "\n\nArgs:"
 
 
 def main() -> None:
@@ -76,8 +78,10 @@ def main() -> None:
     elif words[0] != "run" or not _is_run_by_name(words[1:]):
         with in_a_sentence("cprl"), ended_by_sigterm():
             function = _function(words[0])
+            about = f"{(getdoc(function) or '').partition(_ARGS)[0]}\n\n{ALLOW}"
             config = (tyro.conf.HelptextFromCommentsOff,)
-            tyro.cli(function, args=words[1:], prog=f"cprl {words[0]}", config=config)
+            others = trusting(words[1:])
+            tyro.cli(function, args=others, prog=f"cprl {words[0]}", description=about, config=config)
 
 
 def _function(command: str) -> Callable[..., Any]:
@@ -100,7 +104,7 @@ def run(
     *,
     options: Annotated[RunOptions, tyro.conf.arg(name="")] = _OPTIONS,
     episodes: int | None = None,
-    trial: Path | None = None,
+    trial: Annotated[Path | None, tyro.conf.Suppress] = None,
 ) -> None:
     """Trains the experiment of a recipe or of a run anew, or resumes a run that was stopped.
 
@@ -118,14 +122,13 @@ def run(
         obey_parent()
     _refuse_unknown(recipe)
     refuse_to_take_over(options)
-    make_importable(options.allow)
     from cprl.runs.recipe import read_recipe
 
     directory, table = recipe if recipe.is_dir() else recipe.parent, read_recipe(recipe)
 
     from cprl.experiment import Experiment
 
-    experiment = Experiment.from_recipe(table, allow=options.allow, directory=directory)
+    experiment = Experiment.from_recipe(table, directory=directory)
     if options.resume and options.out is None:
         options = replace(options, out=directory)
     if episodes is not None:

@@ -4,11 +4,10 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from cprl.commands.recipe import Allow, make_importable
 from cprl.presets import Variant, check_board
 from cprl.system.defaults import EGTA_RESAMPLES, FILM_SEED, FILM_SUFFIXES, PLAY_SEED, SEED, Diagonal
 from cprl.system.output import OUT, console, printed, say
@@ -33,8 +32,6 @@ class Fresh:
     """Of the worlds and all chance; the same one gives the same numbers."""
     replicas: tuple[int, ...] = ()
     """Their numbers; by default all that every run has."""
-    allow: Allow = ()
-    """Code of your own, module:Class, that a run may import; see docs/experiments.md."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,9 +71,6 @@ class Files:
 
 FreshFlags = Annotated[Fresh, tyro.conf.arg(name="")]
 FileFlags = Annotated[Files, tyro.conf.arg(name="")]
-_TWENTY: Final = Fresh(episodes=20)
-_FIVE: Final = Fresh(episodes=5)
-_NO_FILES: Final = Files()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,9 +97,6 @@ class FilmOptions:
         return {name: value for name, value in vars(self).items() if value not in (None, ())}
 
 
-_AS_USUAL: Final = FilmOptions()
-
-
 def film(
     run: Path,
     /,
@@ -114,8 +105,7 @@ def film(
     episode: int = 0,
     seed: int = FILM_SEED,
     out: Path | None = None,
-    options: Annotated[FilmOptions, tyro.conf.arg(name="")] = _AS_USUAL,
-    allow: Allow = (),
+    options: Annotated[FilmOptions, tyro.conf.arg(name="")] = FilmOptions(),
 ) -> None:
     """Lets the agents of a run play a fresh episode, recorded for the Rerun viewer or as a film.
 
@@ -129,7 +119,6 @@ def film(
         out: what is written: a recording for the viewer (.rrd), or a film of the board, the stock and the
             harvests (.gif, or .mp4, which wants the extra "film"); by default film-<replica>-<episode>.rrd in
             the run's directory.
-        allow: code of your own, module:Class, that the run may import; see docs/experiments.md.
     """
     if out is not None and out.suffix not in (".rrd", *FILM_SUFFIXES):
         raise ValueError(f"--out is {out}; allowed: a name that ends in .rrd, {', '.join(FILM_SUFFIXES)}")
@@ -137,13 +126,13 @@ def film(
     if options.given and not is_video:
         name = next(iter(options.given))
         raise ValueError(f"--{name} is for films; allowed: with --out FILE.gif or FILE.mp4")
-    _begin(allow, run, *options.beside, seed=seed)
+    _begin(run, *options.beside, seed=seed)
 
     from cprl.evaluation.film import Style, film_video
     from cprl.evaluation.film import film as film_run
     from cprl.viewer.page import to_watch
 
-    which: dict[str, Any] = {"replica": replica, "episode": episode, "seed": seed, "allow": allow}
+    which: dict[str, Any] = {"replica": replica, "episode": episode, "seed": seed}
     if out is None or not is_video:
         path, played = film_run(run, out, **which)
         say(f"{played.steps} steps, {played.outcome}")
@@ -156,55 +145,43 @@ def film(
     say(f"{path}: {path.stat().st_size / 1000:.0f} kB")
 
 
-def play(
-    board: str,
-    /,
-    *,
-    agent: int = 0,
-    others: str | None = None,
-    replica: int = 0,
-    variant: Variant = "published",
-    steps: int | None = None,
-    seed: int = PLAY_SEED,
-    decision: int | None = None,
-    allow: Allow = (),
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Session:
+    """Who plays among whom, see `cprl.evaluation.play.open_session`."""
+
+    agent: int = 0
+    """Yours."""
+    others: str | None = None
+    """The directory of a run, whose agents play, or random, greedy, sustainable, territorial, aggressive or
+    pacifist; by default the agents of the run that is the board, else greedy."""
+    replica: int = 0
+    """Of the run whose agents play."""
+    variant: Variant = "published"
+    """Of the boards with a name: published, as_run or, of two_complex, as_run_10_april; see docs/game.md."""
+    steps: int | None = None
+    """Turns of the episode at most; by default those of the game."""
+    seed: int = PLAY_SEED
+    """Of all chance; the same seed and the same keys play the same again."""
+    decision: int | None = None
+    """What you vote for in a game with votes or elections, by its number; by default chance votes."""
+
+
+def play(board: str, /, *, session: Annotated[Session, tyro.conf.arg(name="")] = Session()) -> None:
     """Lets you play in the terminal among trained or scripted agents, and measures the episode.
 
     Args:
         board: commons, two_complex, single_complex or single_basic; or the directory of a run, whose game it
             is then; or a file with a drawing.
-        agent: yours.
-        others: the directory of a run, whose agents play, or random, greedy, sustainable, territorial,
-            aggressive or pacifist; by default the agents of the run that is the board, else greedy.
-        replica: of the run whose agents play.
-        variant: of the boards with a name: published, as_run or, of two_complex, as_run_10_april; see
-            docs/game.md.
-        steps: turns of the episode at most; by default those of the game.
-        seed: of all chance; the same seed and the same keys play the same again.
-        decision: what you vote for in a game with votes or elections, by its number; by default chance votes.
-        allow: code of your own, module:Class, that a run may import; see docs/experiments.md.
     """
     check_board(board)
-    _begin(allow, seed=seed)
+    _begin(seed=session.seed)
 
     from cprl.evaluation.play import open_session, play_in_terminal
 
-    session = open_session(
-        board,
-        agent=agent,
-        others=others,
-        replica=replica,
-        variant=variant,
-        steps=steps,
-        seed=seed,
-        decision=decision,
-        allow=allow,
-    )
-    play_in_terminal(session)
+    play_in_terminal(open_session(board, **vars(session)))
 
 
-def evaluate(run: Path, /, *, fresh: FreshFlags = _TWENTY, out: Path | None = None) -> None:
+def evaluate(run: Path, /, *, fresh: FreshFlags = Fresh(), out: Path | None = None) -> None:
     """Lets all replicas of a run play fresh worlds, and prints the social metrics beside the random policy's.
 
     Args:
@@ -224,7 +201,7 @@ def evaluate(run: Path, /, *, fresh: FreshFlags = _TWENTY, out: Path | None = No
 
 
 def visits(
-    run: Path, /, *, fresh: FreshFlags = _TWENTY, figure: Path | None = None, random: bool = False
+    run: Path, /, *, fresh: FreshFlags = Fresh(), figure: Path | None = None, random: bool = False
 ) -> None:
     """Lets all replicas of a run play fresh worlds, and prints how far agents keep to cells of their own.
 
@@ -251,9 +228,9 @@ def crossplay(
     runs: tuple[str, ...],
     /,
     *,
-    fresh: FreshFlags = _TWENTY,
+    fresh: FreshFlags = Fresh(),
     diagonal: Diagonal = "self",
-    files: FileFlags = _NO_FILES,
+    files: FileFlags = Files(),
 ) -> None:
     """Lets agents of each run play among those of each other run, and prints how all fare.
 
@@ -276,18 +253,30 @@ def crossplay(
     files.tell(lambda path: draw_gains(played, path))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Mixes:
+    """Who plays in all mixes, see `cprl.evaluation.schelling.schelling`."""
+
+    restrained: str = "sustainable"
+    """Who plays restrained: random, greedy, sustainable, territorial, aggressive, pacifist, or a run's
+    directory, whose agents play."""
+    greedy: str = "greedy"
+    """Who plays greedy, of the same."""
+    episodes: int = 5
+    """Of each replica and choice of restrained agents; with N agents these are N (N - 1) + 2."""
+    replicas: int = 8
+    """Of runs, their replicas from 0 on; of scripted agents, independent groups of episodes."""
+    seed: int = SEED
+    """Of the worlds and all chance; the same one gives the same numbers."""
+
+
 def schelling(
     board: str,
     /,
     *,
-    restrained: str = "sustainable",
-    greedy: str = "greedy",
     variant: Variant = "published",
-    episodes: int = 5,
-    replicas: int = 8,
-    seed: int = SEED,
-    files: FileFlags = _NO_FILES,
-    allow: Allow = (),
+    mixes: Annotated[Mixes, tyro.conf.arg(name="")] = Mixes(),
+    files: FileFlags = Files(),
 ) -> None:
     """Lets restrained and greedy agents play in all mixes, and prints which social dilemma they are in.
 
@@ -296,34 +285,19 @@ def schelling(
     Args:
         board: commons, two_complex, single_complex or single_basic; or the directory of a run, whose game it
             is then; or a file with a drawing.
-        restrained: who plays restrained: random, greedy, sustainable, territorial, aggressive or pacifist, or
-            the directory of a run, whose agents play.
-        greedy: who plays greedy, likewise.
         variant: of the boards with a name: published, as_run or, of two_complex, as_run_10_april; see
             docs/game.md.
-        episodes: of each replica and choice of restrained agents; with N agents these are N (N - 1) + 2.
-        replicas: of runs, their replicas from 0 on; of scripted agents, independent groups of episodes.
-        seed: of the worlds and all chance; the same one gives the same numbers.
-        allow: code of your own, module:Class, that a run may import; see docs/experiments.md.
     """
     files.check()
     check_board(board)
-    _begin(allow, seed=seed)
+    _begin(seed=mixes.seed)
 
     from cprl.evaluation.populations import board_named
     from cprl.evaluation.schelling import draw_schelling, schelling_tables
     from cprl.evaluation.schelling import schelling as play_all_mixes
 
-    game, run = board_named(board, variant, allow=allow)
-    diagram = play_all_mixes(
-        game if run is None else run,
-        restrained=restrained,
-        greedy=greedy,
-        episodes=episodes,
-        replicas=replicas,
-        seed=seed,
-        allow=allow,
-    )
+    game, run = board_named(board, variant)
+    diagram = play_all_mixes(game if run is None else run, **vars(mixes))
     files.keep(diagram.table)
     print_tables(schelling_tables(diagram))
     files.tell(lambda path: draw_schelling(diagram, path))
@@ -333,10 +307,10 @@ def egta(
     runs: tuple[str, ...],
     /,
     *,
-    fresh: FreshFlags = _FIVE,
+    fresh: FreshFlags = Fresh(episodes=5),
     pairwise: bool = False,
     resamples: int = EGTA_RESAMPLES,
-    files: FileFlags = _NO_FILES,
+    files: FileFlags = Files(),
 ) -> None:
     """Lets agents of runs play in all compositions, and prints which runs last: equilibria, alpha-rank,
     replicator dynamics (extra "theory").
@@ -374,8 +348,8 @@ def scenarios(
     /,
     *,
     scenarios: tuple[str, ...] = (),
-    fresh: FreshFlags = _FIVE,
-    files: FileFlags = _NO_FILES,
+    fresh: FreshFlags = Fresh(episodes=5),
+    files: FileFlags = Files(),
 ) -> None:
     """Lets a run's agents play among agents that they never met, and prints how they fare beside random and
     greedy agents in their places.
@@ -419,18 +393,13 @@ class Responses:
     """Of the worlds of the latter; the former have the next one."""
     device: str = "cpu"
     """Where responses learn, e.g. cpu or cuda:0."""
-    allow: Allow = ()
-    """Code of your own, module:Class, that the run may import; see docs/experiments.md."""
-
-
-_RESPONSES: Final = Responses()
 
 
 def exploit(
     run: Path,
     /,
     *,
-    responses: Annotated[Responses, tyro.conf.arg(name="")] = _RESPONSES,
+    responses: Annotated[Responses, tyro.conf.arg(name="")] = Responses(),
     out: Path | None = None,
     jobs: int | None = None,
     dry_run: bool = False,
@@ -445,8 +414,7 @@ def exploit(
         jobs: processes that train at the same time, one for each place and algorithm.
         dry_run: list all trainings and their states; run and write nothing.
     """
-    allow = tuple(responses.allow)
-    _begin(allow, run, seed=responses.seed)
+    _begin(run, seed=responses.seed)
 
     from cprl.commands.studies import StudyOptions, carry_out, executor_of
     from cprl.evaluation.exploit import TABLE, measure, plan_responses
@@ -455,7 +423,7 @@ def exploit(
 
     plan = plan_responses(run, **vars(responses))
     folder = directory_of(plan.study, plan.out if out is None else out)
-    options = StudyOptions(out=folder, jobs=jobs, dry_run=dry_run, figures=False, allow=allow)
+    options = StudyOptions(out=folder, jobs=jobs, dry_run=dry_run, figures=False)
     executor_of(options)
     if not dry_run:
         plan.claim(folder)
@@ -466,16 +434,15 @@ def exploit(
     say(f"Episodes: {folder / TABLE}")
 
 
-def _begin(allow: tuple[str, ...], *runs: Path | str, seed: int) -> None:
+def _begin(*runs: Path | str, seed: int) -> None:
     """Check that runs are there, before what plays their agents is imported; prepare the process."""
-    make_importable(allow)
     check_runs(*runs)
     prepare_process(seed)
 
 
 def _begin_fresh(fresh: Fresh, files: Files, *runs: Path | str) -> None:
     files.check()
-    _begin(fresh.allow, *runs, seed=fresh.seed)
+    _begin(*runs, seed=fresh.seed)
 
 
 def _begin_named(fresh: Fresh, files: Files, words: Sequence[str]) -> list[str] | dict[str, str]:

@@ -6,9 +6,9 @@ Its own arguments stand first; every number of the experiment can be changed by 
 
 import ast
 import inspect
-import os
 import signal
 import sys
+from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -30,8 +30,12 @@ if TYPE_CHECKING:
     from cprl.experiment import Experiment
 
 OptionsT = TypeVar("OptionsT")
-Allow = tyro.conf.UseAppendAction[tuple[str, ...]]
-"""--allow A --allow B."""
+Words = tyro.conf.UseAppendAction[tuple[str, ...]]
+"""--vary A --vary B."""
+ALLOW: Final = (
+    "--allow module:Class trusts code of your own that a stored run or a recipe.json names, see "
+    "docs/experiments.md; it may be repeated."
+)
 
 _LISTED: Final = (
     *("out", "resume", "watch", "episodes", "replicas", "seed", "map", "agents", "institutions"),
@@ -69,8 +73,6 @@ class RunOptions:
     """"file", or live as well: "serve", "spawn"; "off" for no recording."""
     linger: bool = False
     """Keep the recording served after the run is finished, until Ctrl-C; with watch "serve" or "spawn"."""
-    allow: Allow = ()
-    """Code of your own, "module:Class", that a stored run or a recipe.json may import; may be repeated."""
 
 
 def recipe_main(
@@ -186,7 +188,8 @@ def parse(
     Raises:
         SystemExit: for `--help`, and for an argument that is unknown or of another type.
     """
-    return parse_with(make_experiment, command[1:], RunOptions(), program=program_of(command[0]))
+    words, program = trusting(command[1:]), program_of(command[0])
+    return parse_with(make_experiment, words, RunOptions(), program=program)
 
 
 def parse_with(
@@ -236,7 +239,7 @@ def parse_with(
     ) -> tuple[Experiment, Any]:
         return experiment, options
 
-    notes = [_about(make_experiment), note, _SHORT_NOTE if is_short else _NOTE]
+    notes = [_about(make_experiment), note, _SHORT_NOTE if is_short else _NOTE, ALLOW]
     listed = _LISTED if isinstance(options, RunOptions) else (*_LISTED, *vars(options))
     flags = ValueFlags(listed if is_short else None, is_help=is_help)
     try:
@@ -304,13 +307,19 @@ def _names_of(recipe: Recipe) -> set[str] | None:
     for node in ast.parse(Path(experiment.origin).read_text(encoding="utf-8")).body:
         if isinstance(node, ast.ClassDef) and node.name == "Experiment":
             names |= {ast.unparse(line.target) for line in node.body if isinstance(line, ast.AnnAssign)}
-    names |= {*RunOptions.__dataclass_fields__, "agents"}
+    names |= {*RunOptions.__dataclass_fields__, "allow"}
+    names -= {"game", "transforms", "callbacks"}  # whose places alone, or nothing, a word can say
     flags = {f"--{name.replace('_', '-')}" for name in names}
     return {*flags, *(f"--no-{flag.removeprefix('--')}" for flag in flags), *_HELP}
 
 
-def make_importable(allow: tuple[str, ...]) -> None:
-    """Trust code of the user's own, and let modules in the working directory be imported."""
-    if allow:
-        trust(*allow)
-        sys.path.insert(0, os.getcwd())
+def trusting(words: Sequence[str]) -> list[str]:
+    """Trust the user's own code that words of a command line allow, which may stand in the working directory,
+    and return the other words."""
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--allow", action="append", default=[])
+    options, others = parser.parse_known_args(words)
+    if options.allow:
+        trust(*options.allow)
+        sys.path.insert(0, str(Path.cwd()))
+    return others

@@ -1,4 +1,4 @@
-"""`cprl sweep`, `search` and `table`, and `study_main`: the command line of a recipe of a study."""
+"""`cprl sweep` and `search`, and `study_main`: the command line of a recipe of a study."""
 
 import importlib.util
 import os
@@ -7,34 +7,28 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar
 
 import tyro
 
-from cprl.commands.recipe import ended_by_sigterm, in_a_sentence, parse_with
-from cprl.runs.files import refuse_to_write_over, write_atomically
-from cprl.runs.recipe import read_recipe, runs_in, without_directories, without_options
-from cprl.system.defaults import BLOCK, LAST, WINDOW
-from cprl.system.output import OUT, RESUMES, console, printed, say
+from cprl.commands.recipe import Words, ended_by_sigterm, in_a_sentence, parse_with, trusting
+from cprl.runs.recipe import read_recipe, without_directories, without_options
+from cprl.system.defaults import BLOCK, LAST
+from cprl.system.output import console, printed, say
 from cprl.system.shipped import command_of, is_shipped, named_command, program_of, recipe_named
 from cprl.values import Range, checked
 
 if TYPE_CHECKING:
     from cprl.experiment import Experiment
-    from cprl.studies import SearchResult, Study, StudyResult, StudyTable
+    from cprl.studies import SearchResult, Study, StudyResult
     from cprl.studies.executors import Executor
-    from cprl.studies.tables.comparing import Cells
 
 _RECIPE: Final = (
     "A Python file with a function `experiment`, the name of a recipe (cprl recipe lists them), a "
     "recipe.json, or the directory of a run."
 )
 _MODULE: Final = "cprl_swept_recipe"
-_TRAINING: Final = "training"
-_TABLE_SUFFIXES: Final = (".parquet", ".csv", ".md")
-Part = Literal["training", "evaluation", "random"]
 _NOTE: Final = (
     "With --vary PATH=VALUES any value below is varied: "
     'commas stand between values, "x" or spaces between the numbers of one value (hidden-cells=32x32,64x64). '
@@ -47,8 +41,6 @@ _ABOUT: Final = {
     "cprl sweep": "Runs a recipe under several conditions.",
     "cprl search": "Searches for good values of a recipe's experiment by Optuna, point by point.",
 }
-Words = tyro.conf.UseAppendAction[tuple[str, ...]]
-"""--vary A --vary B."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,8 +65,6 @@ class TrialOptions:
     """Episodes at the end of the training that these compare; of long trainings rather 500."""
     dry_run: bool = False
     """List all conditions, trials and their states; run and write nothing."""
-    allow: Words = ()
-    """A class of somebody's own that stored runs may import, "module:Class"; may be repeated."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,9 +83,9 @@ class StudyOptions(TrialOptions):
 class MainOptions(StudyOptions):
     """How the study of a recipe is run."""
 
-    replicas: int | None = None
-    """Of each condition; by default those of the study."""
     episodes: int | None = None
+    """Of each condition; by default those of the study."""
+    replicas: int | None = None
     """Of each condition; by default those of the study."""
     block: int | None = None
     """Replicas that one run trains side by side; with fewer, more processes share the work."""
@@ -152,11 +142,9 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
         The study's directory.
 
     Raises:
-        ValueError: where `argv` is no list of texts, or `study` no study.
         SystemExit: where the command line is refused, with the reason; with code 1 where trials failed, and
             130 or 143 where SIGINT (Ctrl-C) or SIGTERM interrupted it.
     """
-
     command = list(sys.argv if argv is None else argv)
     script = program_of(command[0])
 
@@ -164,24 +152,26 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
         return options
 
     with in_a_sentence(script):
-        options = tyro.cli(read, args=command[1:], prog=script, description=_about(study), config=_CONFIG)
-        given: dict[str, Any] = {"replicas": options.replicas, "block": options.block}
-        study = replace(study, **{name: value for name, value in given.items() if value is not None})
-        if options.episodes is not None:
-            study = _of_episodes(study, options.episodes)
+        options = tyro.cli(
+            read, args=trusting(command[1:]), prog=script, description=_about(study), config=_CONFIG
+        )
+        changes = {name: value for name, value in _of_class(options).items() if value is not None}
+        episodes = changes.pop("episodes", None)
+        if episodes is not None:
+            changes["experiment"] = replace(study.experiment, episodes=episodes)
+        study = replace(study, **changes)
+        for condition in study.all_conditions if episodes is not None else ():
+            if condition.experiment.episodes != episodes:
+                raise ValueError(
+                    f"--episodes is {episodes}, and the study's condition {condition.name} says "
+                    f"{condition.experiment.episodes}; allowed: --episodes where no condition says how many"
+                )
         return carry_out(study, options, command)
 
 
-def _of_episodes(study: "Study", episodes: int) -> "Study":
-    """A study with other episodes than its own."""
-    shorter = replace(study, experiment=replace(study.experiment, episodes=episodes))
-    for condition in shorter.all_conditions:
-        if condition.experiment.episodes != episodes:
-            raise ValueError(
-                f"--episodes is {episodes}, and the study's condition {condition.name} says "
-                f"{condition.experiment.episodes}; allowed: --episodes where no condition says how many"
-            )
-    return shorter
+def _of_class(options: TrialOptions) -> dict[str, Any]:
+    """The options that the class of these has itself, which are fields of a `Study` or `Search`."""
+    return {name: getattr(options, name) for name in type(options).__annotations__ if name != "vary"}
 
 
 def sweep(words: Sequence[str], /) -> None:
@@ -196,14 +186,7 @@ def sweep(words: Sequence[str], /) -> None:
     from cprl.studies import Study
     from cprl.studies.factors import factors_of
 
-    study = Study(
-        experiment,
-        factors_of(experiment, options.vary),
-        draws=options.draws,
-        design=options.design,
-        reference=options.reference,
-        block=options.block,
-    )
+    study = Study(experiment, factors_of(experiment, options.vary), **_of_class(options))
     carry_out(study, options, ["cprl", "sweep", *words])
 
 
@@ -219,17 +202,7 @@ def search(words: Sequence[str], /) -> None:
     from cprl.studies.factors import factors_of
     from cprl.studies.study import directory_of
 
-    wanted = Search(
-        experiment,
-        factors_of(experiment, options.vary),
-        points=options.points,
-        metric=options.metric,
-        direction=options.direction,
-        over=options.over,
-        at_once=options.at_once,
-        sampler=options.sampler,
-        block=options.block,
-    )
+    wanted = Search(experiment, factors_of(experiment, options.vary), **_of_class(options))
     command, executor = ["cprl", "search", *words], executor_of(options)
     if options.dry_run:
         factors = ", ".join(f"{name}: {factor}" for name, factor in wanted.factors.items())
@@ -252,6 +225,7 @@ def search(words: Sequence[str], /) -> None:
 
 def _read(words: Sequence[str], options: RecipeOptions, program: str) -> "tuple[Experiment, RecipeOptions]":
     """The experiment of a recipe and the options that stand after it; prints the help that they ask for."""
+    words = trusting(words)
     if not words or words[0] in ("-h", "--help"):
         _print_help(options, program)
     if words[0].startswith("-"):
@@ -260,18 +234,13 @@ def _read(words: Sequence[str], options: RecipeOptions, program: str) -> "tuple[
             "recipes/commons.py --vary game.rules.freeze-steps=5,25,100"
         )
     source = recipe_named(words[0]).path if is_shipped(words[0]) else Path(words[0])
-    allow = [after for word, after in pairwise(words) if word == "--allow"]
-    allow += [word.removeprefix("--allow=") for word in words if word.startswith("--allow=")]
     sys.path[:0] = [str(source.resolve().parent)] if source.suffix == ".py" and source.is_file() else []
-    sys.path[:0] = [os.getcwd()] if allow else []
-    make, note = recipe_of(source, allow), f"{_ABOUT[program]} {_NOTE}"
-    experiment, options = parse_with(make, words[1:], options, program=f"{program} {words[0]}", note=note)
-
-    from cprl.custom import trust
-
+    note = f"{_ABOUT[program]} {_NOTE}"
+    experiment, options = parse_with(
+        recipe_of(source), words[1:], options, program=f"{program} {words[0]}", note=note
+    )
     if not options.vary:
         raise ValueError("nothing is varied; allowed: --vary PATH=VALUE,VALUE..., at least once")
-    trust(*options.allow)
     return experiment, options
 
 
@@ -289,20 +258,19 @@ def _print_help(options: RecipeOptions, program: str) -> None:
     tyro.cli(read, args=["--help"], prog=program, description=about, config=_CONFIG)
 
 
-def recipe_of(source: Path, allow: Sequence[str] = ()) -> "Callable[..., Experiment]":
+def recipe_of(source: Path) -> "Callable[..., Experiment]":
     """What makes the experiment of a recipe.
 
     Args:
         source: a Python file with a function `experiment`, which is imported and not run; a recipe.json; or
             the directory of a run.
-        allow: the user's own code, "module:Class", that a recipe.json may import.
     """
     if source.suffix != ".py" or source.is_dir():
         directory, content = source if source.is_dir() else source.parent, read_recipe(source)
 
         from cprl.experiment import Experiment
 
-        stored = Experiment.from_recipe(content, allow=allow, directory=directory)
+        stored = Experiment.from_recipe(content, directory=directory)
 
         def experiment() -> Experiment:
             return stored
@@ -322,135 +290,6 @@ def recipe_of(source: Path, allow: Sequence[str] = ()) -> "Callable[..., Experim
             raise ValueError(f"{source} describes a study, which is run by itself: {line}")
         raise ValueError(f"{source} has no function `experiment`; allowed: one that gives an Experiment")
     return made
-
-
-@dataclass(frozen=True, kw_only=True)
-class Compare:
-    """What of a table is compared."""
-
-    metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """What is compared, e.g. collective_return; may be repeated."""
-    part: Part = _TRAINING
-    """Of the runs: their training, their agents in fresh worlds, or random play in these."""
-    last: int | None = None
-    """Episodes at the end of the training that are compared, by default 30."""
-
-    def __post_init__(self) -> None:
-        if self.last is not None and self.part != _TRAINING:
-            raise ValueError(f"--last counts episodes of the training; allowed: without --part {self.part}")
-
-
-def runs_table(
-    runs: tuple[Path, ...],
-    /,
-    *,
-    by: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
-    compare: Annotated[Compare, tyro.conf.arg(name="")] = Compare(),
-    reference: str | None = None,
-    window: int | None = None,
-    out: Path | None = None,
-    csv: bool = False,
-    summary: bool = False,
-    allow: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
-) -> None:
-    """Compares any runs, grouped by fields of their experiments, with intervals over replicas.
-
-    Args:
-        runs: directories of runs, or of directories that hold them, with --by; or the directory of a study.
-        by: the path of a field, e.g. game.rules.freeze-steps, agents.*.algorithm.settings.gamma or name; may
-            be repeated.
-        reference: the name of the condition that others are compared with, e.g. freeze_steps=25; by default
-            the first, or that of the study.
-        window: episodes of a row of the table, of which --last compares whole ones, 10 by default; 1 for
-            episodes one by one; with --by.
-        out: a file to be: .parquet or .csv with every window of episodes, replica and metric, or .md with
-            what is printed.
-        csv: print every window of episodes, replica and metric as CSV, and nothing else.
-        summary: write summary.md of a study again, from its table alone.
-        allow: code of your own, module:Class, that a run's recipe may name; may be repeated.
-    """
-    if out is not None:
-        if out.suffix not in _TABLE_SUFFIXES:
-            raise ValueError(f"--out is {out}; allowed: a name that ends in {', '.join(_TABLE_SUFFIXES)}")
-        refuse_to_write_over(out)
-    if not runs:
-        raise ValueError("cprl table wants at least one run: cprl table RUN... --by FIELD")
-    if summary and by:
-        raise ValueError("--summary is of a study; allowed: without --by, cprl table STUDY --summary")
-    if by:
-        runs_in(runs)
-
-        from cprl.studies.tables.pooled import pooled_table
-
-        window = WINDOW if window is None else window
-        table = pooled_table(runs, by=by, window=window, reference=reference, allow=allow)
-    else:
-        table = _table_in(runs, reference, window)
-    if csv:
-        OUT.write(table.to_csv())
-        return
-
-    from cprl.studies.tables.comparing import rich_table
-
-    last = LAST if compare.last is None else compare.last
-    compared = _compared(table, compare.metric, compare.part, last)
-    terminal = console(width=None if OUT.isatty() else 250)
-    for cells in compared:
-        terminal.print(rich_table(cells))
-    say(str(table))
-    if summary:
-        from cprl.studies.results import write_summary
-
-        say(f"Written: {write_summary(table, runs[0], last=last)}")
-    if out is not None:
-        _write(table, compared, out)
-        say(f"Written: {out}")
-
-
-def _table_in(runs: Sequence[Path], reference: str | None, window: int | None) -> "StudyTable":
-    """The table of a study's directory."""
-    path = runs[0] / "table.parquet"
-    if len(runs) > 1 or not path.exists():
-        raise ValueError(
-            "cprl table wants a field that tells runs apart: cprl table RUN... --by game.rules.freeze-steps; "
-            "or the directory of one study with its table.parquet: cprl table STUDY"
-        )
-    if window is not None:
-        raise ValueError("--window is for runs; allowed: with --by, as a study's table has its windows")
-    from cprl.studies import StudyTable
-
-    table = StudyTable.read(path)
-    if reference is None:
-        return table
-    if reference not in table.design.conditions:
-        names = ", ".join(list(table.design.conditions)[:10])
-        raise ValueError(f"--reference is {reference}; allowed: the name of a condition: {names}")
-    return replace(table, design=replace(table.design, reference=reference))
-
-
-def _compared(table: "StudyTable", metrics: Sequence[str], part: Part, last: int) -> "list[Cells]":
-    """Levels, and differences where there is more than one condition."""
-    from cprl.studies.tables.comparing import cells, compare, metrics_of
-
-    comparisons = [compare(table, metric, part=part, last=last) for metric in metrics_of(table, metrics)]
-    if not comparisons:
-        return []
-    several = len(table.design.conditions) > 1
-    return [cells(comparisons), cells(comparisons, "differences")] if several else [cells(comparisons)]
-
-
-def _write(table: "StudyTable", compared: "Sequence[Cells]", out: Path) -> None:
-    if out.suffix == ".parquet":
-        table.write(out)
-        return
-    content = table.to_csv()
-    if out.suffix == ".md":
-        from cprl.studies.tables.comparing import markdown
-
-        lines = [line for cells in compared for line in (cells.heading, "", *markdown(cells))]
-        content = "\n".join([*lines, *str(table).split("\n"), ""])
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(out, lambda file: file.write(content.encode()))
 
 
 def _about(study: "Study") -> str:
@@ -497,13 +336,11 @@ def carry_out(study: "Study", options: StudyOptions, command: Sequence[str]) -> 
     Raises:
         SystemExit: with code 1 where trials have failed, and 130 or 143 where it was interrupted.
     """
-    from cprl.custom import trust
     from cprl.studies import run_study
 
     executor = executor_of(options)
     if options.dry_run:
         return _list(study, options)
-    trust(*options.allow)
     with _interruptible(command):
         result = run_study(
             study,
@@ -579,11 +416,10 @@ def _say_result(result: "StudyResult", command: Sequence[str]) -> None:
 
 @contextmanager
 def _interruptible(command: Sequence[str]) -> Iterator[None]:
-    """Says what is kept, and what continues, where the block is ended by Ctrl-C (SIGINT) or SIGTERM."""
+    """Note what continues where the block is ended by Ctrl-C (SIGINT) or SIGTERM."""
     try:
         with ended_by_sigterm():
             yield
     except (KeyboardInterrupt, SystemExit) as error:
-        notes = [note for note in getattr(error, "__notes__", []) if not note.startswith(RESUMES)]
-        say("\n".join(["Interrupted.", *notes, f"To continue: {printed(command_of(command))}"]))
-        sys.exit(130 if isinstance(error, KeyboardInterrupt) else error.code)
+        error.add_note(f"To continue: {printed(command_of(command))}")
+        raise

@@ -12,7 +12,7 @@ import pyarrow as pa
 from cprl.runs.checkpoints import FOLDER, REPORT
 from cprl.runs.episodes import FILE_NAME, read_episodes, read_table, write_small
 from cprl.runs.files import LOCK_FILE, refuse_links, refuse_missing, remove_listed, verify, write_listed
-from cprl.runs.recipe import RECIPE_FILE, read_recipe
+from cprl.runs.recipe import RECIPE_FILE, read_recipe, with_runs_moved
 from cprl.runs.weights import DECISIONS, TRANSFORMS
 from cprl.runs.weights import FIELD as FROZEN
 from cprl.values import differences
@@ -93,21 +93,10 @@ def _refuse_another(folder: Path, run: Path, recipe: Mapping[str, Any]) -> None:
 def _with_frozen_moved(recipe: Mapping[str, Any], run: Path, folder: Path) -> dict[str, Any]:
     """A recipe whose runs of `Frozen` agents are relative to `folder`, where they were to `run`."""
 
-    def moved(path: str) -> str:
-        return os.path.relpath(run / path, folder)
-
-    def walk(value: Any) -> Any:
-        if isinstance(value, list):
-            return [walk(entry) for entry in value]
-        if not isinstance(value, Mapping):
-            return value
-        table = {name: walk(entry) for name, entry in value.items()}
-        is_stored = table.get("kind") == "Frozen" and isinstance(table.get("run"), str)
-        return {**table, "run": moved(table["run"])} if is_stored else table
-
-    table: dict[str, Any] = walk(recipe)
+    table: dict[str, Any] = with_runs_moved(recipe, run, folder)
     if FROZEN in table:
-        table[FROZEN] = {moved(path): digest for path, digest in table[FROZEN].items()}
+        checksums = table[FROZEN].items()
+        table[FROZEN] = {os.path.relpath(run / path, folder): digest for path, digest in checksums}
     return table
 
 

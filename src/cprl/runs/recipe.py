@@ -3,6 +3,7 @@ the type of processor."""
 
 import os
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -170,6 +171,24 @@ def recipe_config(recipe: Mapping[str, Any], *, where: object = "the recipe") ->
             '"experiment"'
         )
     return dict(recipe["experiment"])
+
+
+STORED_RUN: Final = re.compile(r"agents\.(\*|\d+)(\.start_from)?\.run")
+"""A path, as studies have it, that names the run of a `Frozen` agent."""
+
+
+def with_runs_moved(table: Any, start: str | Path, end: str | Path, *, is_run: bool = False) -> Any:
+    """Return a table, of an experiment or of values by path, in which the runs of `Frozen` agents, relative
+    to `start`, are relative to `end`; an argument of the user's own that is called "run" stays."""
+    if isinstance(table, str) and is_run and not os.path.isabs(table):
+        return os.path.relpath(os.path.join(start, table), end)
+    if isinstance(table, list):
+        return [with_runs_moved(entry, start, end, is_run=is_run) for entry in table]
+    if not isinstance(table, Mapping) or table.get("kind") == "Custom":
+        return table
+    names = {name for name in table if is_run or STORED_RUN.fullmatch(name)}
+    names |= {"run"} if table.get("kind") == "Frozen" else set()
+    return {name: with_runs_moved(entry, start, end, is_run=name in names) for name, entry in table.items()}
 
 
 def runs_in(paths: Iterable[Path | str]) -> list[Path]:

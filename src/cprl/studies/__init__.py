@@ -9,8 +9,8 @@ Modules, in the order in which one reads them:
     progress     how far every trial is, in the terminal
     run          run_study: every trial of a study
     search       run_search: points that Optuna proposes, each run as a condition
-    tables       what came out, as one tidy table; means and differences; cprl table
-    figures      drawn of it
+    tables       what came out, as one tidy table; means and differences
+    figures      drawn of a table
     results      write_results: table, summary and figures of a study
 """
 

@@ -8,7 +8,7 @@ list. `*` stands for each value of a list; in `agents` for each agent that learn
 
 import re
 from ast import literal_eval
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from math import exp, log
@@ -23,6 +23,7 @@ from cprl.commons.maps import Map
 from cprl.custom import Custom, allowing, custom_targets
 from cprl.envs.make_env import game_of, stored_game
 from cprl.experiment import Experiment
+from cprl.runs.recipe import STORED_RUN
 from cprl.values import (
     KINDS,
     MOST_INT32,
@@ -213,7 +214,9 @@ def checked_factors(factors: Mapping[str, Any]) -> dict[str, Factor]:
         if isinstance(factor, Distribution):
             normal[path] = factor
         elif isinstance(values, tuple) and values:
-            is_run = _RUN.fullmatch(path)  # which Frozen keeps like this, so that levels keep their names
+            is_run = STORED_RUN.fullmatch(
+                path
+            )  # which Frozen keeps like this, so that levels keep their names
             normal[path] = tuple(normpath(run) if run else run for run in values) if is_run else values
         else:
             raise refusal(
@@ -313,30 +316,6 @@ def changes_from_config(table: Mapping[str, Any]) -> dict[str, Any]:
 def _value_of(path: str, table: Any) -> Any:
     value = from_config(table, path)
     return game_of(value) if path == "game" and isinstance(value, Custom) else value
-
-
-def with_runs_moved(table: Any, moved: Callable[[str], str], *, is_run: bool = False) -> Any:
-    """Return a table, of an experiment or of values by path, whose `Frozen` agents have their runs elsewhere;
-    an argument of the user's own that is called "run" stays."""
-    if isinstance(table, str):
-        return moved(table) if is_run else table
-    if isinstance(table, list):
-        return [with_runs_moved(entry, moved, is_run=is_run) for entry in table]
-    if not isinstance(table, Mapping) or table.get("kind") == "Custom":
-        return table
-    is_frozen = table.get("kind") == "Frozen"
-    return {
-        name: with_runs_moved(
-            entry,
-            moved,
-            is_run=is_run or (is_frozen and name == "run") or _RUN.fullmatch(name) is not None,
-        )
-        for name, entry in table.items()
-    }
-
-
-_RUN: Final = re.compile(r"agents\.(\*|\d+)(\.start_from)?\.run")
-"""A path that names the run of a `Frozen` agent."""
 
 
 def factors_of(experiment: Experiment, flags: Iterable[str]) -> dict[str, Factor]:

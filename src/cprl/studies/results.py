@@ -3,25 +3,20 @@
 The summary and the figures are made of the table: `write_summary` makes a summary again where runs are gone.
 """
 
-import re
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from cprl.runs.files import refuse_links, write_atomically
+from cprl.studies.figures import DRAWN, figures_of
 from cprl.studies.study import STATUS, Study
-from cprl.studies.tables.comparing import LAST, cell, cells, compare, markdown, metric_title, metrics_of
+from cprl.studies.tables.comparing import LAST, cell, cells, compare, markdown, metrics_of
 from cprl.studies.tables.sources import study_table
 from cprl.studies.tables.table import EVALUATION, RANDOM, TRAINING, WINDOW, StudyTable
 
 TABLE: Final = "table.parquet"
 SUMMARY: Final = "summary.md"
 FIGURES: Final = "figures"
-_MAPPED: Final = 2
-"""Metrics that have a heat map."""
-_DRAWN: Final = re.compile(r"(by_|map_|phases|levels|differences|courses).*\.png")
-"""The names of figures that are drawn here."""
 
 
 def write_results(
@@ -51,11 +46,11 @@ def write_results(
     for metric in metrics_of(table)[:1]:
         compare(table, metric, last=last)  # refuses before anything is written
     table.write(out / TABLE)
-    figures = {name: draw for name, _, draw in _figures(table, last)}
+    figures = {name: draw for name, _, draw in figures_of(table, last)}
     for name, draw in figures.items():
         draw(out / FIGURES / name)
     for path in (out / FIGURES).glob("*.png"):
-        if path.name not in figures and _DRAWN.fullmatch(path.name):  # of an earlier call
+        if path.name not in figures and DRAWN.fullmatch(path.name):  # of an earlier call
             path.unlink()
     write_summary(table, out, last=last, again=again)
     return table
@@ -79,7 +74,7 @@ def write_summary(table: StudyTable, out: Path, *, last: int = LAST, again: str 
         lines += ["## What is not in these results", "", *(f"- {run}" for run in table.lacking), "", line, ""]
     if table.metrics:
         lines += [*_compared(table, TRAINING, last), *_compared(table, EVALUATION, last), *_phases(table)]
-        figures = [figure for figure in _figures(table, last) if (out / FIGURES / figure[0]).exists()]
+        figures = [figure for figure in figures_of(table, last) if (out / FIGURES / figure[0]).exists()]
         lines += ["## Figures", ""] if figures else []
         for name, what, _ in figures:
             lines += [f"![{what}]({FIGURES}/{name})", ""]
@@ -87,43 +82,6 @@ def write_summary(table: StudyTable, out: Path, *, last: int = LAST, again: str 
     content = ("\n".join(lines).rstrip() + "\n").encode("utf-8", "replace")
     write_atomically(out / SUMMARY, lambda file: file.write(content))
     return out / SUMMARY
-
-
-def _figures(table: StudyTable, last: int) -> Iterator[tuple[str, str, Callable[[Path], Path]]]:
-    """What fits the study: the name of each figure's file, what it shows, and what draws it.
-
-    By each numeric factor, by condition where there are few, and over each two factors.
-    """
-    if not table.metrics:
-        return
-
-    from cprl.studies.figures.courses import courses
-    from cprl.studies.figures.diagrams import grids, heat_map, phase_diagram
-    from cprl.studies.figures.levels import MOST_CONDITIONS, by_condition, by_factor, is_numeric
-
-    design = table.design
-    for factor in design.factors:
-        if is_numeric(design.levels(factor)):
-            draw = partial(by_factor, table, factor, last=last)
-            yield f"by_{_file_name(factor)}.png", f"Outcome by {factor}", draw
-    if len(design.conditions) <= MOST_CONDITIONS:
-        yield "levels.png", "Outcome by condition", partial(by_condition, table, last=last)
-        yield "courses.png", "The course of the training", partial(courses, table)
-        if len(design.conditions) > 1 and table.replicas[design.reference]:
-            draw = partial(by_condition, table, kind="differences", last=last)
-            yield "differences.png", f"Differences from {design.reference}", draw
-    for pair in grids(design):
-        words, what = "_".join(map(_file_name, pair)), " and ".join(pair)
-        for metric in metrics_of(table)[:_MAPPED]:
-            draw = partial(heat_map, table, pair, metric=metric, last=last)
-            yield f"map_{words}_{metric}.png", f"{metric_title(metric)} by {what}", draw
-        title = f"In which phase most replicas end, by {what}"
-        yield f"phases_{words}.png", title, partial(phase_diagram, table, pair)
-
-
-def _file_name(factor: str) -> str:
-    """A factor as a part of a file's name."""
-    return re.sub(r"[^A-Za-z0-9]+", "_", factor.replace("*", "all")).strip("_")
 
 
 def _compared(table: StudyTable, part: str, last: int) -> list[str]:

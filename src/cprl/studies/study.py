@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
@@ -14,7 +13,7 @@ from cprl.custom import trust
 from cprl.experiment import MOST_SEED, Experiment
 from cprl.population import stored_of
 from cprl.runs.files import STUDY_FORMAT, read_json, refuse_newer, write_json
-from cprl.runs.recipe import RECIPE_FILE
+from cprl.runs.recipe import RECIPE_FILE, with_runs_moved
 from cprl.studies.factors import (
     MOST_CONDITIONS,
     Design,
@@ -28,7 +27,6 @@ from cprl.studies.factors import (
     factor_from_config,
     factor_to_config,
     grid,
-    with_runs_moved,
 )
 from cprl.system.defaults import BLOCK
 from cprl.values import DirectoryName, Range, Value, refusal, shown, without_defaults
@@ -240,7 +238,7 @@ class Study(Value, stored=False):
             "conditions": {name: changes_to_config(levels) for name, levels in self.conditions.items()},
         }
         if directory is not None:
-            table = with_runs_moved(table, lambda run: os.path.relpath(run, directory))
+            table = with_runs_moved(table, ".", directory)
         return {
             "format": STUDY_FORMAT,
             "experiment": table["experiment"],
@@ -270,8 +268,7 @@ class Study(Value, stored=False):
             values = {"experiment": table["experiment"]}
             values |= {name: dict(table[name]) for name in ("factors", "conditions")}
             if directory is not None:
-                start = str(directory)
-                values = with_runs_moved(values, lambda run: os.path.relpath(os.path.join(start, run)))
+                values = with_runs_moved(values, directory, ".")
             experiment = Experiment.from_config(values["experiment"])
             factors = {name: factor_from_config(name, part) for name, part in values["factors"].items()}
             conditions = {name: changes_from_config(part) for name, part in values["conditions"].items()}

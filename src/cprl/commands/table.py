@@ -1,0 +1,148 @@
+"""`cprl table`: any runs, or those of a study, compared."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final, Literal
+
+import tyro
+
+from cprl.runs.files import refuse_to_write_over, write_atomically
+from cprl.runs.recipe import runs_in
+from cprl.system.defaults import LAST, WINDOW
+from cprl.system.output import OUT, console, say
+
+if TYPE_CHECKING:
+    from cprl.studies import StudyTable
+    from cprl.studies.tables.comparing import Cells
+
+_TRAINING: Final = "training"
+_SUFFIXES: Final = (".parquet", ".csv", ".md")
+Part = Literal["training", "evaluation", "random"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compare:
+    """What of a table is compared."""
+
+    metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """What is compared, e.g. collective_return; may be repeated."""
+    part: Part = _TRAINING
+    """Of the runs: their training, their agents in fresh worlds, or random play in these."""
+    last: int | None = None
+    """Episodes at the end of the training that are compared, by default 30."""
+
+    def __post_init__(self) -> None:
+        if self.last is not None and self.part != _TRAINING:
+            raise ValueError(f"--last counts episodes of the training; allowed: without --part {self.part}")
+
+
+def table(
+    runs: tuple[Path, ...],
+    /,
+    *,
+    by: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    compare: Annotated[Compare, tyro.conf.arg(name="")] = Compare(),
+    reference: str | None = None,
+    window: int | None = None,
+    out: Path | None = None,
+    csv: bool = False,
+    summary: bool = False,
+) -> None:
+    """Compares any runs, grouped by fields of their experiments, with intervals over replicas.
+
+    Args:
+        runs: directories of runs, or of directories that hold them, with --by; or the directory of a study.
+        by: the path of a field, e.g. game.rules.freeze-steps, agents.*.algorithm.settings.gamma or name; may
+            be repeated.
+        reference: the name of the condition that others are compared with, e.g. freeze_steps=25; by default
+            the first, or that of the study.
+        window: episodes of a row of the table, of which --last compares whole ones, 10 by default; 1 for
+            episodes one by one; with --by.
+        out: a file to be: .parquet or .csv with every window of episodes, replica and metric, or .md with
+            what is printed.
+        csv: print every window of episodes, replica and metric as CSV, and nothing else.
+        summary: write summary.md of a study again, from its table alone.
+    """
+    if out is not None:
+        if out.suffix not in _SUFFIXES:
+            raise ValueError(f"--out is {out}; allowed: a name that ends in {', '.join(_SUFFIXES)}")
+        refuse_to_write_over(out)
+    if not runs:
+        raise ValueError("cprl table wants at least one run: cprl table RUN... --by FIELD")
+    if summary and by:
+        raise ValueError("--summary is of a study; allowed: without --by, cprl table STUDY --summary")
+    if by:
+        runs_in(runs)
+
+        from cprl.studies.tables.pooled import pooled_table
+
+        window = WINDOW if window is None else window
+        study_table = pooled_table(runs, by=by, window=window, reference=reference)
+    else:
+        study_table = _table_in(runs, reference, window)
+    if csv:
+        OUT.write(study_table.to_csv())
+        return
+
+    from cprl.studies.tables.comparing import rich_table
+
+    last = LAST if compare.last is None else compare.last
+    compared = _compared(study_table, compare.metric, compare.part, last)
+    terminal = console(width=None if OUT.isatty() else 250)
+    for cells in compared:
+        terminal.print(rich_table(cells))
+    say(str(study_table))
+    if summary:
+        from cprl.studies.results import write_summary
+
+        say(f"Written: {write_summary(study_table, runs[0], last=last)}")
+    if out is not None:
+        _write(study_table, compared, out)
+        say(f"Written: {out}")
+
+
+def _table_in(runs: Sequence[Path], reference: str | None, window: int | None) -> "StudyTable":
+    """The table of a study's directory."""
+    path = runs[0] / "table.parquet"
+    if len(runs) > 1 or not path.exists():
+        raise ValueError(
+            "cprl table wants a field that tells runs apart: cprl table RUN... --by game.rules.freeze-steps; "
+            "or the directory of one study with its table.parquet: cprl table STUDY"
+        )
+    if window is not None:
+        raise ValueError("--window is for runs; allowed: with --by, as a study's table has its windows")
+    from cprl.studies import StudyTable
+
+    table = StudyTable.read(path)
+    if reference is None:
+        return table
+    if reference not in table.design.conditions:
+        names = ", ".join(list(table.design.conditions)[:10])
+        raise ValueError(f"--reference is {reference}; allowed: the name of a condition: {names}")
+    return replace(table, design=replace(table.design, reference=reference))
+
+
+def _compared(table: "StudyTable", metrics: Sequence[str], part: Part, last: int) -> "list[Cells]":
+    """Levels, and differences where there is more than one condition."""
+    from cprl.studies.tables.comparing import cells, compare, metrics_of
+
+    comparisons = [compare(table, metric, part=part, last=last) for metric in metrics_of(table, metrics)]
+    if not comparisons:
+        return []
+    several = len(table.design.conditions) > 1
+    return [cells(comparisons), cells(comparisons, "differences")] if several else [cells(comparisons)]
+
+
+def _write(table: "StudyTable", compared: "Sequence[Cells]", out: Path) -> None:
+    if out.suffix == ".parquet":
+        table.write(out)
+        return
+    content = table.to_csv()
+    if out.suffix == ".md":
+        from cprl.studies.tables.comparing import markdown
+
+        lines = [line for cells in compared for line in (cells.heading, "", *markdown(cells))]
+        content = "\n".join([*lines, *str(table).split("\n"), ""])
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(out, lambda file: file.write(content.encode()))

@@ -1,0 +1,657 @@
+"""Figures of a study's table: a metric by a factor whose levels are numbers, conditions one below the other,
+the course of the training, and maps of two factors. `figures_of` says which of them fit a study.
+
+Points and lines are means over replicas with their 95 % intervals, faint points single replicas, dashes
+random play in the worlds of the evaluation.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import combinations
+from math import isclose, nan
+from pathlib import Path
+from textwrap import fill
+from typing import Any, Final
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize, to_hex
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
+
+from cprl.measuring.now import DECLINE, HARVESTING, RECOVERY
+from cprl.measuring.statistics import Estimate, curve_interval
+from cprl.runs.curves import SMOOTHED_EPISODES, running_mean
+from cprl.studies.tables.comparing import (
+    INTERVALS,
+    Compared,
+    Comparison,
+    Kind,
+    compare,
+    differing,
+    digits_for,
+    metric_title,
+    metrics_of,
+)
+from cprl.studies.tables.sources import NO_BETTER
+from cprl.studies.tables.table import RANDOM, TRAINING, Design, StudyTable
+from cprl.system.defaults import LAST
+from cprl.terminal.figures import COLOURS as PHASE_COLOURS
+from cprl.terminal.style import (
+    CHARACTER_IN,
+    EMPTY,
+    MEAN,
+    RANDOM_LINE,
+    SHADES,
+    SMALL_PT,
+    draw_cell,
+    head,
+    picture_path,
+    save,
+    wrapped,
+)
+from cprl.values import refusal
+
+MOST_CONDITIONS: Final = 60
+"""A figure with a row or panel for each condition has at most so many."""
+COLOURS: Final = ("#08519c", "#d95f02", "#1b9e77", "#7b3294", "#a50f15", "#8c6d31", "#e7298a", "#555555")
+"""Of conditions or lines that have names; numbers get a scale from dark to light."""
+_NAME_CHARACTERS: Final = 34
+"""The largest number of characters on a line of a condition's name; then it wraps."""
+_MAPPED: Final = 2
+"""Metrics that have a heat map."""
+
+
+def figures_of(table: StudyTable, last: int) -> Iterator[tuple[str, str, Callable[[Path], Path]]]:
+    """Yield what fits a study: the name of each figure's file, what it shows, and what draws it."""
+    if not table.metrics:
+        return
+    design = table.design
+    for factor in design.factors:
+        if is_numeric(design.levels(factor)):
+            draw = partial(by_factor, table, factor, last=last)
+            yield f"by_{_file_name(factor)}.png", f"Outcome by {factor}", draw
+    if len(design.conditions) <= MOST_CONDITIONS:
+        yield "levels.png", "Outcome by condition", partial(by_condition, table, last=last)
+        yield "courses.png", "The course of the training", partial(courses, table)
+        if len(design.conditions) > 1 and table.replicas[design.reference]:
+            draw = partial(by_condition, table, kind="differences", last=last)
+            yield "differences.png", f"Differences from {design.reference}", draw
+    for pair in grids(design):
+        words, what = "_".join(map(_file_name, pair)), " and ".join(pair)
+        for metric in metrics_of(table)[:_MAPPED]:
+            draw = partial(heat_map, table, pair, metric=metric, last=last)
+            yield f"map_{words}_{metric}.png", f"{metric_title(metric)} by {what}", draw
+        title = f"In which phase most replicas end, by {what}"
+        yield f"phases_{words}.png", title, partial(phase_diagram, table, pair)
+
+
+DRAWN: Final = re.compile(r"(by_|map_|phases|levels|differences|courses).*\.png")
+"""The names of these files."""
+
+
+def _file_name(factor: str) -> str:
+    return re.sub(r"[^A-Za-z0-9]+", "_", factor.replace("*", "all")).strip("_")
+
+
+# A metric by a factor
+
+_COLUMNS: Final = 3
+_MOST_LINES: Final = 8
+_CLOSEST: Final = 0.07
+"""The smallest distance of two levels, as a share of the axis, at which their names can be read."""
+_APART: Final = 30
+"""Levels whose largest is more than so many times the smallest stand on a logarithmic axis."""
+
+
+def by_factor(
+    table: StudyTable, factor: str, path: Path | str, *, metrics: Sequence[str] = (), last: int = LAST
+) -> Path:
+    """Draw metrics against a factor whose levels are numbers.
+
+    The axis is logarithmic where the largest level is more than 30 times the smallest. Up to eight levels,
+    some of which would then be too close to be told apart, stand at equal distances, which the axis says.
+    Conditions that are equal but for this factor are joined by a line, which has a colour of its own if there
+    are several. In random draws, where hardly any are, points stand alone: the other factors vary too. There
+    are no dashes where random play differs and points stand alone that have the same level.
+    """
+    design, path = table.design, picture_path(path)
+    numeric = [name for name in design.factors if is_numeric(design.levels(name))]
+    if factor not in numeric:
+        allowed = ", ".join(numeric) or "none, as no factor has levels that are numbers"
+        raise refusal("factor", factor, allowed)
+    comparisons = [compare(table, metric, last=last) for metric in metrics_of(table, metrics)]
+    lines, others = _lines(design, factor), [name for name in design.factors if name != factor]
+    only = [design.conditions[names[0]][others[0]] for names in lines.values()] if len(others) == 1 else []
+    colours = colours_of(list(lines), only or range(len(lines)))
+    level_of = {name: levels[factor] for name, levels in design.conditions.items()}
+    places, is_even = places_of(level_of.values())
+    columns = min(len(comparisons), _COLUMNS)
+    rows = -(-len(comparisons) // columns)
+    figure, panels = _panels(max(4.0 * columns, 6.0), 2.9 * rows + 1.3, rows, columns, len(comparisons))
+    for axes, comparison in zip(panels, comparisons, strict=True):
+        chance = _chance(table, comparison.metric)
+        at_levels = [[chance[name] for name in chance if level_of[name] == level] for level in places]
+        is_same = all(map(is_one, at_levels))
+        for label, names in lines.items():
+            at = [places[level_of[name]] for name in names]
+            style = "-" if design.is_grid and len(set(at)) == len(at) else "none"
+            for place, name in zip(at, names, strict=True):
+                compared = comparison.by_name[name]
+                _draw_spread(axes, place, compared.defined, compared.estimate, colours[label])
+            means = [_value(comparison.by_name[name].estimate) for name in names]
+            look: dict[str, Any] = {"marker": "o", "linestyle": style, "linewidth": 1.4, "zorder": 4}
+            axes.plot(at, means, color=colours[label], label=label or "mean and interval", **look)
+            if is_same or len(lines) > 1:
+                look = RANDOM_LINE if is_same else {**RANDOM_LINE, "color": colours[label]}
+                look = look if style == "-" else {**look, "linestyle": "none"}
+                by_chance = [chance.get(name, nan) for name in names]
+                axes.plot(at, by_chance, marker="_", markersize=9, **look)
+        if is_same or len(lines) > 1:
+            text = "random play" if is_same else "random play, in the colour of its conditions"
+            axes.plot([], [], label=text, **RANDOM_LINE)
+        _scale(axes, places, _replicas_by_level(table, factor), is_even=is_even)
+        axes.set_title(wrapped(title_of(comparison), 3.6), fontsize=SMALL_PT + 1)
+    for axes in panels[-_COLUMNS:]:
+        axes.set_xlabel(f"{factor}\n(levels at equal distances)" if is_even else factor, fontsize=SMALL_PT)
+    legend(figure, panels[0])
+    note = f"{replicas_text(table.replicas)}. {levels_note(comparisons[0])} Faint: single replicas."
+    if others and list(lines) == [""]:
+        note += f" Conditions differ in {', '.join(map(short, others))} too."
+    head(figure, f"{design.name}: outcome by {short(factor)}", note)
+    return save(figure, path)
+
+
+def places_of(levels: Iterable[float]) -> tuple[dict[float, float], bool]:
+    """Return where each level stands on an axis of numbers, in order, and whether at equal distances."""
+    ordered = sorted(set(levels))
+    at = np.log(ordered) if is_logarithmic(ordered) else np.array(ordered, np.float64)
+    is_crowded = np.diff(at).min(initial=np.inf) < _CLOSEST * np.ptp(at)
+    if is_crowded and len(ordered) <= _MOST_LINES:
+        return {level: float(place) for place, level in enumerate(ordered)}, True
+    return {level: level for level in ordered}, False
+
+
+def _replicas_by_level(table: StudyTable, factor: str) -> dict[float, int]:
+    counts: dict[float, int] = {}
+    for name, levels in table.design.conditions.items():
+        counts[levels[factor]] = counts.get(levels[factor], 0) + table.replicas[name]
+    return counts
+
+
+def _scale(
+    axes: Axes, places: Mapping[float, float], replicas: Mapping[float, int], *, is_even: bool
+) -> None:
+    """Set a tick for each level where there are few, with the number of replicas where it differs."""
+    if not is_even and is_logarithmic(list(places)):
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter("{x:g}")  # of matplotlib's own, formulas are texts like names
+        axes.xaxis.set_minor_locator(NullLocator())
+    if len(places) <= _MOST_LINES:
+        is_same = len(set(replicas.values())) == 1
+        texts = [f"{level:g}" + ("" if is_same else f"\nn={replicas[level]}") for level in places]
+        axes.set_xticks(list(places.values()), texts)
+
+
+def _lines(design: Design, factor: str) -> dict[str, list[str]]:
+    """Conditions that are equal but for a factor, in the order of its levels, by what they have in common."""
+    others = [name for name in design.factors if name != factor]
+    lines: dict[str, list[str]] = {}
+    for name, levels in design.conditions.items():  # lines are in the order of the conditions
+        common = ", ".join(f"{short(other)} {levels[other]}" for other in others) if design.is_grid else ""
+        lines.setdefault(common, []).append(name)
+    if len(lines) > _MOST_LINES:
+        lines = {"": list(design.conditions)}
+    level_of = {name: float(levels[factor]) for name, levels in design.conditions.items()}
+    return {common: sorted(names, key=lambda name: level_of[name]) for common, names in lines.items()}
+
+
+def is_numeric(levels: Sequence[Any]) -> bool:
+    """Whether levels stand on an axis of numbers: at least two, all numbers."""
+    return len(set(levels)) > 1 and all(
+        isinstance(level, int | float) and not isinstance(level, bool) for level in levels
+    )
+
+
+def is_logarithmic(levels: Sequence[float]) -> bool:
+    """Whether that axis is logarithmic."""
+    return min(levels) > 0 and max(levels) > _APART * min(levels)
+
+
+# Conditions one below the other
+
+
+def by_condition(table: StudyTable, path: Path | str, *, kind: Kind = "levels", last: int = LAST) -> Path:
+    """Draw conditions one below the other: means over replicas, or differences from the reference.
+
+    Args:
+        table: the table, of at most `MOST_CONDITIONS` conditions.
+        kind: "levels", with random play as dashes; or "differences", with a dashed line at 0.
+    """
+    design, path, is_levels = table.design, picture_path(path), kind == "levels"
+    conditions = [name for name in design.conditions if is_levels or name != design.reference]
+    if not is_levels and not table.replicas[design.reference]:
+        raise ValueError(f"the reference {design.reference} has no finished run; allowed: one that has")
+    if not 0 < len(conditions) <= MOST_CONDITIONS:
+        raise refusal("table", table, f"1 to {MOST_CONDITIONS} conditions, not {len(conditions)}")
+    comparisons = [compare(table, metric, last=last) for metric in metrics_of(table)]
+    first, names = comparisons[0], names_of(table)
+    rows_in = 0.34 if all("\n" not in names[name] for name in conditions) else 0.46
+    height, columns = rows_in * len(conditions) + 1.8, len(comparisons)
+    figure, panels = _panels(12.0, height, 1, columns, columns, sharey=True)
+    for axes, comparison in zip(panels, comparisons, strict=True):
+        chance = _chance(table, comparison.metric) if is_levels else {}
+        for place, name in enumerate(conditions):
+            _draw_row(axes, place, comparison.by_name[name], kind)
+            if name in chance:
+                look = {**RANDOM_LINE, "linestyle": (0, (2, 1))}
+                axes.plot([chance[name]] * 2, [place - 0.42, place + 0.42], **look)
+        if not is_levels:
+            axes.axvline(0, **RANDOM_LINE)
+        axes.set_title(wrapped(title_of(comparison), 9.5 / columns), fontsize=SMALL_PT)
+        axes.set_yticks(range(len(conditions)), [names[name] for name in conditions])
+        axes.locator_params(axis="x", nbins=3)
+        axes.grid(axis="y", color="#e6e6e6", linewidth=0.6)
+        axes.set_axisbelow(True)
+    panels[0].set_ylim(len(conditions) - 0.4, -0.6)
+    what = short(design.factors[0]) if len(design.factors) == 1 else "condition"
+    figure.supylabel(what, fontsize=SMALL_PT + 1)
+    title, note = f"{design.name}: outcome by condition", levels_note(first)
+    note += " Faint: single replicas. Dashed: random play."
+    if not is_levels:
+        title = f"{design.name}: difference from {' '.join(design.reference.splitlines())}"
+        pairing = f"{first.pairing_text[0].upper()}{first.pairing_text[1:]}"
+        note = f"{pairing}; means of {first.episodes_text}; {INTERVALS}."
+    head(figure, title, f"{replicas_text(table.replicas)}. {note}")
+    return save(figure, path)
+
+
+def _draw_row(axes: Axes, place: int, compared: Compared, kind: Kind) -> None:
+    mean = compared.estimate if kind == "levels" else compared.difference
+    if mean is None:
+        why = "no run" if not compared.replicas else "undefined" if compared.estimate is None else "no pairs"
+        box = {"facecolor": "white", "edgecolor": "none", "pad": 1}
+        middle: dict[str, Any] = {"ha": "center", "va": "center", "transform": axes.get_yaxis_transform()}
+        axes.text(0.5, place, why, fontsize=SMALL_PT, bbox=box, **middle)
+        return
+    _draw_spread(axes, place, compared.defined if kind == "levels" else [], mean, MEAN, across=True)
+    axes.plot([mean.value], [place], "o", color=MEAN, markersize=6, zorder=4)
+
+
+# Courses
+
+_USUAL: Final = ("collective_return", "survival_steps")
+"""Metrics whose courses are drawn unless something else is asked for."""
+_PART: Final = 20
+"""A running mean takes in at most one part in so many of a training, so that short ones keep their course."""
+_MOST_TOGETHER: Final = 6
+"""Conditions that one panel shows; more have a panel each, beside the reference."""
+_PANELS: Final = 4
+"""Of these in a row."""
+
+
+def courses(table: StudyTable, path: Path | str, *, metrics: Sequence[str] = ()) -> Path:
+    """Draw the mean over replicas in the course of the training, its 95 % interval, and random play.
+
+    Up to six conditions share panels, one for each metric; more have a panel each, of the first metric, with
+    the reference beside it in grey. Running means are over whole windows of the table and centred.
+
+    Args:
+        metrics: by default the collective return and survival; else the first that the table has.
+    """
+    path, design = picture_path(path), table.design
+    usual = [metric for metric in _USUAL if metric in table.metrics]
+    chosen = metrics_of(table, metrics or usual)[: len(metrics) or 2]
+    conditions = [name for name in design.conditions if table.replicas[name]]
+    if len(conditions) > MOST_CONDITIONS:
+        raise ValueError(f"the table has {len(conditions)} conditions; allowed: up to {MOST_CONDITIONS}")
+    names, factor = names_of(table), design.factors[0] if len(design.factors) == 1 else None
+    is_together = len(conditions) <= _MOST_TOGETHER
+    if is_together:
+        levels = [name if factor is None else design.conditions[name][factor] for name in conditions]
+        colours = colours_of(conditions, levels)
+        lines = {name: (colours[name], names[name]) for name in conditions}
+        views = [(metric, conditions, lines) for metric in chosen]
+        figure, panels = _panels(9.0, 2.9 * len(views) + 1.4, len(views), 1, len(views), sharex=True)
+    else:
+        reference = design.reference
+        beside = {reference: ("#777777", f"reference: {names[reference]}")} if reference in conditions else {}
+        own = "#08519c", "the condition of the panel"
+        others = [name for name in conditions if name != reference]
+        views = [(chosen[0], [name], {**beside, name: own}) for name in others]
+        rows = -(-len(views) // _PANELS)
+        figure, panels = _panels(12.0, 2.5 * rows + 1.6, rows, _PANELS, len(views), sharex=True, sharey=True)
+        figure.supylabel(metric_title(chosen[0]), fontsize=SMALL_PT + 1)
+    windows: set[int] = set()
+    for axes, (metric, of_panel, lines) in zip(panels, views, strict=True):
+        windows |= _draw_courses(axes, table, metric, lines)
+        chance = {name: value for name, value in _chance(table, metric).items() if name in of_panel}
+        is_same = is_one(chance.values())
+        for name, value in list(chance.items())[: 1 if is_same else None]:
+            colour = RANDOM_LINE["color"] if is_same else lines[name][0]
+            axes.axhline(value, **{**RANDOM_LINE, "color": colour, "linewidth": 1.4 if is_same else 1.0})
+        if chance:
+            text = "random play" if is_same else "random play, in the colour of its condition"
+            axes.plot([], [], **RANDOM_LINE, label=text if is_together else f"{text} under it")
+        if is_together:
+            axes.set_ylabel(metric_title(metric), fontsize=SMALL_PT + 1)
+        else:
+            axes.set_title(names[of_panel[0]], fontsize=SMALL_PT)
+    for axes in panels[-1 if is_together else -_PANELS :]:
+        axes.tick_params(labelbottom=True)
+        axes.set_xlabel("episode", fontsize=SMALL_PT + 1)
+    for group in [[axes] for axes in panels] if is_together else [panels]:
+        if all(axes.dataLim.y0 >= 0 for axes in group):
+            group[0].set_ylim(0, None)
+    legend(figure, panels[0], title=short(factor) if factor is not None and is_together else None)
+    over = f"{min(windows)} to {max(windows)}" if len(windows) > 1 else f"{max(windows)}"
+    smoothed = f"Centred running means over {over} episodes" if max(windows) > 1 else "Nothing is smoothed"
+    note = f"{smoothed}, then over replicas; bands: 95% intervals over replicas by Student's t."
+    head(figure, f"{design.name}: the course of the training", f"{replicas_text(table.replicas)}. {note}")
+    return save(figure, path)
+
+
+def _draw_courses(
+    axes: Axes, table: StudyTable, metric: str, lines: Mapping[str, tuple[str, str]]
+) -> set[int]:
+    """Draw the courses of conditions, each of a colour and with a label, and return over how many episodes
+    their running means are."""
+    windows = set()
+    for name, (colour, label) in lines.items():
+        grid = table.values(name, metric, TRAINING)
+        if grid is None:
+            continue
+        lengths = grid["window_episodes"]
+        length, episodes = int(lengths.max()), int(lengths.sum())
+        is_whole = lengths == length
+        count = max(1, min(SMOOTHED_EPISODES, episodes // _PART) // length)
+        middles = (grid["episode"][is_whole] + (length - 1) / 2).astype(np.float64)
+        at = running_mean(middles, count)
+        middle, low, high = curve_interval(running_mean(grid["value"][:, is_whole], count))
+        axes.fill_between(at, low, high, color=colour, alpha=0.2, linewidth=0)
+        label = " ".join(label.splitlines())
+        label = f"\N{ZERO WIDTH SPACE}{label}" if label.startswith("_") else label  # matplotlib would hide it
+        axes.plot(at, middle, color=colour, linewidth=2, marker="." if len(at) < 3 else None, label=label)
+        windows.add(min(count, int(is_whole.sum())) * length)
+    return windows or {1}
+
+
+# Maps of two factors
+
+PHASES: Final = {
+    **PHASE_COLOURS,
+    HARVESTING: "#c7e9c0",
+    RECOVERY: "#c6dbef",
+    DECLINE: "#d9c9b6",
+    NO_BETTER: "#cfcfcf",
+}
+"""Colours of phases, light enough for text before them."""
+_CELL_IN: Final = (1.05, 0.55)
+_WORD_CHARACTERS: Final = 24
+
+Grid = dict[tuple[Any, Any], str]
+"""Conditions by the levels of two factors."""
+
+
+def grids(design: Design) -> dict[tuple[str, str], Grid]:
+    """Return the conditions by each pair of factors, where the others are at the levels of the reference.
+
+    None for random draws, and pairs of which a factor has a single level left.
+    """
+    by_pair: dict[tuple[str, str], Grid] = {}
+    at = design.conditions[design.reference]
+    for one, other in combinations(design.factors, 2) if design.is_grid else ():
+        rest = [factor for factor in design.factors if factor not in (one, other)]
+        grid = {
+            (levels[one], levels[other]): name
+            for name, levels in design.conditions.items()
+            if all(levels[factor] == at[factor] for factor in rest)
+        }
+        if all(len(set(levels)) > 1 for levels in zip(*grid, strict=True)):
+            by_pair[one, other] = grid
+    return by_pair
+
+
+def heat_map(
+    table: StudyTable,
+    factors: tuple[str, str],
+    path: Path | str,
+    *,
+    metric: str = "collective_return",
+    last: int = LAST,
+) -> Path:
+    """Draw a metric over two factors: its mean with the number of replicas, and its difference.
+
+    Levels are in the order of the conditions. Differences are from the reference; those that are not 0 by
+    Holm's method for all of the table have a star.
+
+    Args:
+        factors: two of its factors; any others are at the levels of the reference.
+    """
+    path, comparison = picture_path(path), compare(table, metric, last=last)
+    grid, elsewhere = _grid_of(table.design, factors)
+    rows, columns = _levels_of(grid)
+    width = max(2 * _CELL_IN[0] * len(columns) + 3.4, 8.0)
+    figure, panels = _panels(width, _CELL_IN[1] * len(rows) + 2.3, 1, 2, 2, sharey=True)
+    levels, differences = _numbers(comparison, grid)
+    means = [value for value, _ in levels.values()]
+    reach = max((abs(value) for value, _ in differences.values()), default=1.0) or 1.0
+    scales = Normalize(min(means, default=0), max(means, default=1)), Normalize(-reach, reach)
+    titles = "mean over replicas (n)", "difference (* not 0 by Holm's method)"
+    for axes, numbers, scale, name, title in zip(
+        panels, (levels, differences), scales, ("viridis", "RdBu"), titles, strict=True
+    ):
+        shades = matplotlib.colormaps[name]
+        drawn = {at: (shades(scale(value)), text) for at, (value, text) in numbers.items()}
+        _draw_grid(axes, grid, factors, drawn)
+        axes.set_title(title, fontsize=SMALL_PT + 1)
+        bar = matplotlib.cm.ScalarMappable(scale, name)
+        figure.colorbar(bar, ax=axes).ax.tick_params(labelsize=SMALL_PT)
+    panels[0].set_ylabel(factors[0], fontsize=SMALL_PT)
+    note = f"{levels_note(comparison)} Differences from {table.design.reference}, {comparison.pairing_text}."
+    head(figure, f"{table.design.name}: {title_of(comparison)}", f"{note}{elsewhere}")
+    return save(figure, path, colours=SHADES)
+
+
+def phase_diagram(table: StudyTable, factors: tuple[str, str], path: Path | str) -> Path:
+    """Draw in which phase most replicas end over two factors."""
+    path = picture_path(path)
+    grid, elsewhere = _grid_of(table.design, factors)
+    rows, columns = _levels_of(grid)
+    figure, [axes] = _panels(max(1.3 * len(columns) + 2.5, 7.0), 0.6 * len(rows) + 2.2, 1, 1, 1)
+    phases = {}
+    for name, counts in table.endings.items():
+        label, number = next(iter(counts.items()))
+        phases[name] = PHASES[label], f"{wrapped(label, 1.1)}\n{number} of {sum(counts.values())}"
+    _draw_grid(axes, grid, factors, phases)
+    axes.set_ylabel(factors[0], fontsize=SMALL_PT)
+    note = f"{replicas_text(table.replicas)}. In which phase a replica ends: {'; '.join(table.ending_rules)}."
+    head(figure, f"{table.design.name}: phases at the end of the training", f"{note}{elsewhere}")
+    return save(figure, path)
+
+
+def _grid_of(design: Design, factors: tuple[str, str]) -> tuple[Grid, str]:
+    """The conditions of two factors, and a sentence on the others."""
+    by_pair = grids(design)
+    if tuple(factors) not in by_pair:
+        pairs = "; ".join(map(" and ".join, by_pair))
+        raise refusal("factors", factors, pairs or "none, as the conditions are no grid of two factors")
+    at = design.conditions[design.reference]
+    rest = [f"{short(factor)} {at[factor]}" for factor in design.factors if factor not in factors]
+    return by_pair[factors[0], factors[1]], f" Elsewhere: {', '.join(rest)}." if rest else ""
+
+
+def _levels_of(grid: Grid) -> tuple[Sequence[Any], Sequence[Any]]:
+    """The levels of both factors, rows and columns, in the order of the conditions."""
+    rows, columns = zip(*grid, strict=True)
+    return list(dict.fromkeys(rows)), list(dict.fromkeys(columns))
+
+
+Numbers = dict[str, tuple[float, str]]
+"""The number and the text of a cell, by condition."""
+
+
+def _numbers(comparison: Comparison, grid: Grid) -> tuple[Numbers, Numbers]:
+    """The means and the differences of a map."""
+    levels, differences, marked = {}, {}, differing([comparison])
+    for name in grid.values():
+        compared = comparison.by_name[name]
+        if compared.estimate is not None:
+            value = compared.estimate.value
+            levels[name] = value, f"{value:,.{digits_for(abs(value))}f}\nn={len(compared.defined)}"
+            if name == comparison.reference:
+                differences[name] = 0.0, "reference"
+        if compared.difference is not None:
+            value = compared.difference.value
+            star = " *" if (comparison.metric, name) in marked else ""
+            differences[name] = value, f"{value:+,.{digits_for(abs(value))}f}{star}"
+    return levels, differences
+
+
+def _draw_grid(
+    axes: Axes, grid: Grid, factors: tuple[str, str], drawn: Mapping[str, tuple[Any, str]]
+) -> None:
+    """Draw a cell for each condition, of a colour and with a text by its name, over two factors."""
+    rows, columns = _levels_of(grid)
+    for (row, column), name in grid.items():
+        draw_cell(axes, columns.index(column), rows.index(row), *drawn.get(name, (EMPTY, "no run")))
+    axes.set_xticks(range(len(columns)), [wrapped(_word(level), _CELL_IN[0]) for level in columns])
+    axes.set_yticks(range(len(rows)), [_word(level) for level in rows])
+    axes.set(xlim=(-0.5, len(columns) - 0.5), ylim=(-0.5, len(rows) - 0.5))
+    axes.set_xlabel(factors[1], fontsize=SMALL_PT)
+    axes.tick_params(length=0)
+
+
+def _word(level: Any) -> str:
+    text = f"{level:g}" if isinstance(level, float) else str(level)
+    return text if len(text) <= _WORD_CHARACTERS else f"{text[: _WORD_CHARACTERS - 1]}…"
+
+
+# What all of them share
+
+
+def _panels(
+    width_in: float, height_in: float, rows: int, columns: int, number: int, **shared: bool
+) -> tuple[Figure, list[Axes]]:
+    """An empty figure with so many panels in rows and columns."""
+    figure = Figure((width_in, height_in), layout="constrained")
+    panels = list(figure.subplots(rows, columns, squeeze=False, **shared).reshape(-1))
+    for axes in panels:
+        axes.tick_params(labelsize=SMALL_PT)
+    for axes in panels[number:]:
+        axes.set_visible(False)
+    return figure, panels[:number]
+
+
+def _chance(table: StudyTable, metric: str) -> dict[str, float]:
+    """Random play under each condition in which it was played and the metric is defined."""
+    compared = compare(table, metric, part=RANDOM).by_name.items()
+    return {name: level.estimate.value for name, level in compared if level.estimate is not None}
+
+
+def is_one(values: Iterable[float]) -> bool:
+    """Whether values are one number, but for the rounding of exported tables to float32."""
+    values = list(values)
+    return not values or isclose(min(values), max(values), rel_tol=1e-6)
+
+
+def _draw_spread(
+    axes: Axes,
+    place: float,
+    replicas: Iterable[float],
+    mean: Estimate | None,
+    colour: str,
+    *,
+    across: bool = False,
+) -> None:
+    """Draw each replica and the interval of their mean at a place: upright, or `across` as a row."""
+    values = list(replicas)
+    points, bounds = [place + 0.16 * across] * len(values), [] if mean is None else [mean.low, mean.high]
+    dots: dict[str, Any] = {"color": colour, "alpha": 0.25, "markersize": 5, "zorder": 2}
+    line: dict[str, Any] = {"color": colour, "linewidth": 2.3, "alpha": 0.7, "zorder": 3}
+    axes.plot(*((values, points) if across else (points, values)), ".", **dots)
+    axes.plot(*((bounds, [place] * len(bounds)) if across else ([place] * len(bounds), bounds)), **line)
+
+
+def _value(estimate: Estimate | None) -> float:
+    return nan if estimate is None else estimate.value
+
+
+def short(factor: str) -> str:
+    """A factor in a word, e.g. "freeze steps"."""
+    return factor.rpartition(".")[2].replace("_", " ")
+
+
+def names_of(table: StudyTable) -> dict[str, str]:
+    """What figures call each condition: the level alone where there is one factor; wrapped.
+
+    With the number of replicas where it is not the same for all.
+    """
+    design, names = table.design, list(table.design.conditions)
+    words = names
+    if len(design.factors) == 1:
+        levels = design.levels(design.factors[0])
+        words = [f"{level:,.6g}" if isinstance(level, float) else str(level) for level in levels]
+        words = words if len(set(words)) == len(words) else names
+    is_same = len(_counts(table.replicas)) == 1
+    counts = ["" if is_same else f" (n={table.replicas[name]})" for name in names]
+    return {
+        name: f"{fill(word, _NAME_CHARACTERS)}{count}"
+        for name, word, count in zip(names, words, counts, strict=True)
+    }
+
+
+def colours_of(names: Sequence[str], levels: Sequence[Any]) -> dict[str, str]:
+    """A colour for each of several lines: from dark to light where their levels are numbers."""
+    if len(names) > 2 and is_numeric(levels):
+        order = sorted(set(levels))
+        shades = matplotlib.colormaps["viridis"]
+        places = {level: 0.88 * place / (len(order) - 1) for place, level in enumerate(order)}
+        return {name: to_hex(shades(places[level])) for name, level in zip(names, levels, strict=True)}
+    return {name: COLOURS[place % len(COLOURS)] for place, name in enumerate(names)}
+
+
+def replicas_text(replicas: Mapping[str, int]) -> str:
+    """How many replicas conditions have, e.g. "8 replicas each", but for those that were not run."""
+    counts = _counts(replicas)
+    if len(counts) == 1:
+        return f"{counts[0]} replica{'s' * (counts[0] != 1)} each"
+    return f"{counts[0]} to {counts[-1]} replicas each (n)"
+
+
+def _counts(replicas: Mapping[str, int]) -> list[int]:
+    return sorted({number for number in replicas.values() if number}) or [0]
+
+
+def levels_note(comparison: Comparison) -> str:
+    """What points and intervals are."""
+    return f"Means of {comparison.episodes_text}, then over replicas; {INTERVALS}."
+
+
+def title_of(comparison: Comparison) -> str:
+    """A metric with its unit, and in how many episodes it is undefined, which are in no mean."""
+    undefined = sum(compared.undefined for compared in comparison.conditions)
+    episodes = sum(compared.episodes for compared in comparison.conditions)
+    name = metric_title(comparison.metric)
+    return f"{name}, undefined in {undefined:,} of {episodes:,} episodes" if undefined else name
+
+
+def legend(figure: Figure, axes: Axes, *, title: str | None = None) -> None:
+    """Draw a legend of a panel below the figure, each label once, in as many columns as there is room for."""
+    handles, labels = axes.get_legend_handles_labels()
+    entries = dict(zip(labels, handles, strict=True))
+    if not entries:
+        return
+    widest_in = CHARACTER_IN * (max(map(len, entries)) + 6)
+    figure.legend(
+        list(entries.values()),
+        list(entries),
+        loc="outside lower center",
+        ncols=max(1, min(len(entries), int(figure.get_figwidth() / widest_in))),
+        fontsize=SMALL_PT,
+        title=title,
+        title_fontsize=SMALL_PT,
+        frameon=False,
+    )
