@@ -552,13 +552,15 @@ def test_what_cannot_be_run_is_refused_in_a_sentence(line, message, elsewhere, m
     assert {path.name for path in elsewhere.iterdir()} == {"mine.py"}
 
 
-@pytest.mark.parametrize("line", ["--epsiodes 3", "--epsiodes=3", "--no-bean", "--callback a:B"])
+@pytest.mark.parametrize("line", ["--epsiodes 3", "--epsiodes=3", "--no-bean", "--callback a:B", "--gmae 3"])
 def test_a_mistyped_flag_is_refused_before_the_recipe_is_imported(line, monkeypatch, capsys):
     monkeypatch.setattr(cli, "run_shipped", None)
     with pytest.raises(SystemExit) as refused:
         call(monkeypatch, f"run two_complex {line}")
     assert refused.value.code == 2
-    assert f"there is no flag {line.partition('=')[0].split()[0]}" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"there is no flag {line.partition('=')[0].split()[0]}" in said
+    assert "'--game'" not in said, "which is no flag"
 
 
 @pytest.mark.integration

@@ -41,10 +41,17 @@ def recipe(name, folder=RECIPES):
     return module
 
 
+@pytest.fixture
+def of_learners(monkeypatch):
+    """Loads a recipe of the comparison of learners."""
+    folder = RECIPES / "study" / "learners"
+    monkeypatch.syspath_prepend(str(folder))
+    return lambda name: recipe(name, folder)
+
+
 @pytest.mark.parametrize("board", ["two_complex", "commons"])
-def test_every_way_to_learn_has_four_candidates_of_its_own(board, monkeypatch):
-    monkeypatch.syspath_prepend(str(RECIPES / "study" / "learners"))
-    study = recipe(f"tuning_{board}", RECIPES / "study" / "learners").STUDY
+def test_every_way_to_learn_has_four_candidates_of_its_own(board, of_learners):
+    study = of_learners(f"tuning_{board}").STUDY
     ways = Counter(condition.name.partition(":")[0] for condition in study.all_conditions)
     assert ways == dict.fromkeys(("DQN", "PPO", "IPPO", "VDN", "QMIX", "MAPPO", "MADDPG", "PR2", "LOLA"), 4)
     assert len({condition.checksum for condition in study.all_conditions}) == 36
@@ -53,12 +60,10 @@ def test_every_way_to_learn_has_four_candidates_of_its_own(board, monkeypatch):
 
 def tuned(study, values):
     """The table of a tuning in which each candidate got so much in fresh worlds."""
-    row = {"marks": "", "part": "evaluation", "metric": "collective_return", "episode": 0} | {
-        "window_episodes": 20,
-        "undefined": 0,
-    }
+    row = {"checksum": "", "run": "", "marks": "", "part": "evaluation", "metric": "collective_return"}
+    row |= {"episode": 0, "window_episodes": 20, "undefined": 0}
     rows = [
-        {"condition": name, "checksum": "", "run": "", "replica": replica, "value": value + replica, **row}
+        {"condition": name, "replica": replica, "value": value + replica, **row}
         for name, value in values.items()
         for replica in range(2)
     ]
@@ -66,48 +71,41 @@ def tuned(study, values):
     return StudyTable(design=design_of(study), rows=table, window=10, lacking=(), made={})
 
 
-def test_the_comparison_of_learners_takes_the_candidates_that_got_most(monkeypatch):
-    monkeypatch.syspath_prepend(str(RECIPES / "study" / "learners"))
-    ways = recipe("ways", RECIPES / "study" / "learners")
+def test_the_comparison_of_learners_takes_the_candidates_that_got_most_and_were_trained(of_learners, capsys):
+    ways = of_learners("ways")
     study = ways.tuning("two_complex")
     names = [condition.name for condition in study.all_conditions]
-    chosen = ways.winners(tuned(study, {name: -nth % 5 for nth, name in enumerate(names)}))
-    # -nth % 5 is 0 4 3 2, 1 0 4 3, ..: the second candidate of the first way, the third one of the second
+    chosen = ways.winners(tuned(study, {name: -place % 5 for place, name in enumerate(names)}))
+    # -place % 5 is 0 4 3 2, 1 0 4 3, ..: the second candidate of the first way, the third one of the second
     assert list(chosen) == list(ways.WAYS)
     assert f"DQN: {chosen['DQN']}" == names[1]
     assert f"PPO: {chosen['PPO']}" == names[6]
     compared = ways.comparison("two_complex", chosen, {"": 1200, "LOLA": 1500})
     by_name = {condition.name: condition.experiment for condition in compared.all_conditions}
     assert list(by_name) == [*ways.WAYS, "DQN as run"]
-    assert {name: own.episodes for name, own in by_name.items() if own.episodes != 1200} == {"LOLA": 1500}
-    assert {own.seed for own in by_name.values()} == {0}, "none of the tuning's"
+    assert {name for name, experiment in by_name.items() if experiment.episodes != 1200} == {"LOLA"}
+    assert by_name["LOLA"].episodes == 1500
+    assert {experiment.seed for experiment in by_name.values()} == {0}, "none of the tuning's"
     settings = by_name["PPO"].agents[0].algorithm.settings
     assert f"learning rate {settings.learning_rate}" in chosen["PPO"]
     as_run = by_name["DQN as run"].agents[0].algorithm.settings
     assert as_run == presets.dqn_settings("two_complex", variant="as_run")
-
-
-def test_candidates_that_were_not_trained_are_not_chosen(monkeypatch, capsys):
-    monkeypatch.syspath_prepend(str(RECIPES / "study" / "learners"))
-    ways = recipe("ways", RECIPES / "study" / "learners")
-    study = ways.tuning("two_complex")
-    first, *others = [condition.name for condition in study.all_conditions]
+    first, *others = names
     assert ways.winners(tuned(study, {first: 3})) == {"DQN": first.removeprefix("DQN: ")}
-    told = capsys.readouterr().out.splitlines()
-    assert told == [f"Not evaluated, and not chosen from: {name}" for name in others]
+    said = [f"Not evaluated, and not chosen from: {name}" for name in others]
+    assert capsys.readouterr().out.splitlines() == said
 
 
 @pytest.mark.integration
-def test_agents_of_a_study_of_learners_meet_in_a_cross_play(tmp_path, monkeypatch, capsys):
-    monkeypatch.syspath_prepend(str(RECIPES / "study" / "learners"))
-    ways = recipe("ways", RECIPES / "study" / "learners")
-    few = {name: ways.WAYS[name].candidates(1000) for name in ("DQN", "MAPPO")}
-    algorithms = {name: next(iter(own.values())) for name, own in few.items()}
-    how = {"episodes": 2, "evaluation_episodes": 1, "replicas": 2}
-    study = ways.study("two_complex", algorithms, name="few", question="", expectation="", **how)
+def test_agents_of_a_study_of_learners_meet_in_a_cross_play(tmp_path, monkeypatch, of_learners):
+    ways = of_learners("ways")
+    candidates = {name: ways.WAYS[name].candidates(1000).values() for name in ("DQN", "MAPPO")}
+    algorithms = {name: next(iter(algorithms)) for name, algorithms in candidates.items()}
+    options = {"name": "few", "question": "", "expectation": "", "replicas": 2}
+    study = ways.study("two_complex", algorithms, episodes=2, evaluation_episodes=1, **options)
     eager = replace(study, experiment=replace(study.experiment, engine="eager"))
     cprl.run_study(eager, tmp_path / "few", results=False, progress=False)
-    cross_play = recipe("cross_play", RECIPES / "study" / "learners")
+    cross_play = of_learners("cross_play")
     cross_play.main(tmp_path / "few", episodes=1)
     rows = pq.read_table(tmp_path / "few" / "cross_play.parquet").to_pydict()
     assert set(rows["focal"]) == {"DQN", "MAPPO"} == set(rows["background"])
@@ -139,14 +137,8 @@ def test_the_study_of_experiment_3_has_the_two_programs_and_each_difference_alon
 
 def run_recipe(name, out, *, own=None, watch="file", **changes):
     """Runs the experiment of a recipe, in miniature."""
-    experiment = recipe(name).experiment(**(own or {}))
-    changes = {"engine": "eager", **changes}
-    return cprl.run(replace(experiment, **changes), out, watch=watch)
-
-
-def run_in_miniature(tmp_path, capsys, **arguments):
-    run = recipe("own_loop").main(episodes=11, evaluation_episodes=3, out=tmp_path / "run", **arguments)
-    return run, capsys.readouterr().out
+    changes = {"replicas": 2, "evaluation_episodes": 1, "engine": "eager", **changes}
+    return cprl.run(replace(recipe(name).experiment(**(own or {})), **changes), out, watch=watch)
 
 
 @pytest.mark.parametrize(("kind", "herd"), [("herders", 2), ("appropriation", 8)])
@@ -189,8 +181,8 @@ LANES = {"single_basic": 1, "single_complex": 1, "two_complex": 2, "two_against_
     ],
 )
 def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, capsys):
-    how = {"replicas": 2, "episodes": 3, "evaluation_episodes": 2, "seed": 3}
-    run = run_recipe(name, tmp_path / "run", own={"variant": variant}, **how)
+    options = {"episodes": 3, "evaluation_episodes": 2, "seed": 3}
+    run = run_recipe(name, tmp_path / "run", own={"variant": variant}, **options)
     told = capsys.readouterr().out
     kept = json.loads((run / "recipe.json").read_text())
     assert kept["recipe"] == name
@@ -207,16 +199,16 @@ def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, caps
     assert " 0.05 ┃" in told
     for policy in ("random", "trained"):
         played = pq.read_table(run / "evaluation" / f"{policy}.parquet").to_pydict()
-        assert sorted(set(zip(played["replica"], played["episode"], strict=True))) == [
-            (r, e) for r in range(2) for e in range(2)
-        ]
+        pairs = sorted(set(zip(played["replica"], played["episode"], strict=True)))
+        assert pairs == [(r, e) for r in range(2) for e in range(2)]
     assert json.loads((run / "report.json").read_text())["training_s"] > 0
     if name == "commons":
         game, settings = presets.game("commons"), presets.dqn_settings("commons", variant=variant)
-        network = dqn_learner(
-            game.spaces, agents=[0], replicas=1, settings=settings, compile=False
-        ).networks()
-        restore_weights_of(network["replica_0/agent_0"], weights["replica_1/agent_2"])
+        plain = dqn_learner(game.spaces, agents=[0], replicas=1, settings=settings, compile=False)
+        network = plain.networks()["replica_0/agent_0"]
+        before = next(network.parameters()).clone()
+        network.load_state_dict(weights["replica_1/agent_2"])  # which fit an ordinary network of one agent
+        assert not torch.equal(before, next(network.parameters()))
 
 
 @pytest.mark.integration
@@ -235,8 +227,7 @@ def test_a_version_of_the_program_on_the_command_line_is_a_condition_of_the_stud
 
 @pytest.mark.integration
 def test_two_agents_without_the_beam_never_fire(tmp_path):
-    how = {"replicas": 2, "episodes": 1, "evaluation_episodes": 1, "watch": "off"}
-    run = run_recipe("two_complex", tmp_path / "run", own={"beam": False}, **how)
+    run = run_recipe("two_complex", tmp_path / "run", own={"beam": False}, episodes=1, watch="off")
     assert json.loads((run / "recipe.json").read_text())["recipe"] == "two_complex_no_beam"
     assert set(read_episodes(run).to_pydict()["shots"]) == {0}
 
@@ -250,9 +241,8 @@ def test_two_agents_without_the_beam_never_fire(tmp_path):
     ],
 )
 def test_swapping_the_loss_is_one_argument_and_each_leaves_a_run_that_plays_again(loss, tmp_path, capsys):
-    how = {"replicas": 2, "evaluation_episodes": 1, "watch": "off"}
     episodes = 5 if loss == "ppo" else 1  # a rollout is longer than an episode is here
-    run = run_recipe("swap_the_loss", tmp_path / "run", own={"loss": loss}, episodes=episodes, **how)
+    run = run_recipe("swap_the_loss", tmp_path / "run", own={"loss": loss}, episodes=episodes, watch="off")
     loaded, algorithm = cprl.load(run), recipe("swap_the_loss").LOSSES[loss]
     assert loaded.experiment.agents == (Learning(algorithm),) * 2
     explores = "trained, epsilon" in capsys.readouterr().out
@@ -266,8 +256,7 @@ def test_swapping_the_loss_is_one_argument_and_each_leaves_a_run_that_plays_agai
 
 @pytest.mark.integration
 def test_unlike_neighbours_train_in_one_loop_are_recorded_and_evaluated(tmp_path, capsys):
-    how = {"replicas": 2, "episodes": 5, "evaluation_episodes": 1}
-    run = run_recipe("mixed", tmp_path / "run", own={"neighbour": "greedy"}, **how)
+    run = run_recipe("mixed", tmp_path / "run", own={"neighbour": "greedy"}, episodes=5)
     first, second, third, last = cprl.load(run).experiment.agents
     assert first == second
     assert (type(first.algorithm), type(third.algorithm), last) == (DQN, PPO, Scripted("greedy"))
@@ -283,17 +272,9 @@ def test_unlike_neighbours_train_in_one_loop_are_recorded_and_evaluated(tmp_path
     assert {f"/agent_{agent}/loss" for agent in range(3)} <= told
 
 
-def restore_weights_of(network, state):
-    """Kept weights fit an ordinary network of one agent."""
-    before = next(network.parameters()).clone()
-    network.load_state_dict(state)
-    assert not torch.equal(before, next(network.parameters()))
-
-
 @pytest.mark.slow
 def test_fifty_episodes_of_commons_in_eight_replicas_are_those_of_each_alone(tmp_path):
-    how = {"episodes": 50, "evaluation_episodes": 1, "seed": 5}
-    run = run_recipe("commons", tmp_path / "all", replicas=8, engine="compiled", **how)
+    run = run_recipe("commons", tmp_path / "all", replicas=8, engine="compiled", episodes=50, seed=5)
     rows = read_episodes(run).to_pydict()
     returns = {}
     for replica, agent, episode, value in zip(
@@ -324,8 +305,7 @@ def test_fifty_episodes_of_commons_in_eight_replicas_are_those_of_each_alone(tmp
 
 @pytest.mark.integration
 def test_a_run_is_loaded_from_its_directory_alone(tmp_path):
-    how = {"replicas": 2, "episodes": 2, "evaluation_episodes": 1}
-    run = run_recipe("two_against_random", tmp_path / "run", own={"variant": "as_run"}, **how)
+    run = run_recipe("two_against_random", tmp_path / "run", own={"variant": "as_run"}, episodes=2)
     loaded = cprl.load(run)
     assert loaded.game == presets.game("two_complex", variant="as_run")
     settings = presets.dqn_settings("two_complex", variant="as_run")
@@ -344,8 +324,6 @@ def test_a_run_is_loaded_from_its_directory_alone(tmp_path):
 
 @pytest.mark.integration
 def test_a_run_that_was_stopped_is_loaded_from_its_newest_checkpoint(tmp_path, monkeypatch):
-    how = {"replicas": 2, "episodes": 3, "evaluation_episodes": 1}
-
     class StopError(Exception):
         pass
 
@@ -357,7 +335,7 @@ def test_a_run_that_was_stopped_is_loaded_from_its_newest_checkpoint(tmp_path, m
 
     monkeypatch.setattr(Checkpointer, "after_step", after_step)
     with pytest.raises(StopError):
-        run_recipe("two_against_random", tmp_path / "run", **how)
+        run_recipe("two_against_random", tmp_path / "run", episodes=3)
     loaded = cprl.load(tmp_path / "run")
     older, newest = checkpoints_in(tmp_path / "run" / "checkpoints")
     assert loaded.weights_from == newest
@@ -376,19 +354,14 @@ def test_a_run_that_was_stopped_is_loaded_from_its_newest_checkpoint(tmp_path, m
 
 
 @pytest.mark.integration
-def test_the_run_of_a_plain_agent_is_loaded_too(tmp_path, capsys):
-    run, _ = run_in_miniature(tmp_path, capsys)
+def test_the_run_of_a_plain_agent_is_loaded_too_or_says_which_file_cannot_be_read_and_why(tmp_path):
+    run = recipe("own_loop").main(episodes=11, evaluation_episodes=3, out=tmp_path / "run")
     network = cprl.load(run).networks["replica_0/agent_0"]
     save_weights(run, {"agent_0": network}, name="other")
     for weights in ("final", "other"):
         loaded = cprl.load(run, weights=weights)
         assert list(loaded.networks) == ["replica_0/agent_0"]
         assert len(evaluate(loaded.env(2), loaded.policy(worlds=2))) == 2
-
-
-@pytest.mark.integration
-def test_a_run_that_cannot_be_loaded_says_which_file_and_why(tmp_path, capsys):
-    run, _ = run_in_miniature(tmp_path, capsys)
     weights = run / "checkpoints" / "final.pt"
     content = weights.read_bytes()
     for spoilt in (content[:-300], b"something else", b""):
@@ -406,9 +379,9 @@ def test_a_run_that_cannot_be_loaded_says_which_file_and_why(tmp_path, capsys):
     (run / "checkpoints" / "best.pt").unlink(missing_ok=True)
     with pytest.raises(ValueError, match=r"best\.pt holds no weights: .*No such file"):
         cprl.load(run, weights="best")
-    told = json.loads((run / "recipe.json").read_text())
-    told["experiment"]["game"]["rules"]["hits_to_tag"] = 0
-    (run / "recipe.json").write_text(json.dumps(told))
+    content = json.loads((run / "recipe.json").read_text())
+    content["experiment"]["game"]["rules"]["hits_to_tag"] = 0
+    (run / "recipe.json").write_text(json.dumps(content))
     with pytest.raises(ValueError, match=r"recipe\.json: experiment\.game\.rules\.hits_to_tag is 0"):
         cprl.load(run)
     with pytest.raises(ValueError, match=r"recipe\.json is not the recipe of a run"):
@@ -430,11 +403,11 @@ def test_the_tragedy_ends_with_what_happened_and_what_to_try_next(tmp_path, caps
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("watch", ["telepathy", "connect rerun+http://127.0.0.1:9876/proxy"])
 @pytest.mark.parametrize(
-    "name", sorted({path.stem for path in RECIPES.glob("*.py")} - {"reproduce", "own_loop"})
+    "name", sorted(path.stem for path in RECIPES.glob("*.py") if path.stem != "own_loop")
 )
-def test_a_way_to_watch_that_is_none_is_refused_before_there_is_a_run(name, watch, tmp_path):
-    with pytest.raises(ValueError, match="watch"):
-        run_recipe(name, out=tmp_path / "run", watch=watch)
+def test_a_way_to_watch_that_is_none_is_refused_before_there_is_a_run(name, tmp_path):
+    for watch in ("telepathy", "connect rerun+http://127.0.0.1:9876/proxy"):
+        with pytest.raises(ValueError, match="watch"):
+            run_recipe(name, out=tmp_path / "run", watch=watch)
     assert not (tmp_path / "run").exists()

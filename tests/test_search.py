@@ -137,13 +137,17 @@ def test_an_edited_search_begins_anew_and_finds_the_runs_that_are_there(tmp_path
         searched(few, tmp_path)
 
 
-def test_points_that_come_twice_are_run_once(tmp_path):
+def test_points_that_come_twice_are_run_once_and_read_by_optunas_own_tools_and_as_a_study(tmp_path):
     executor = Counting()
     result = searched(Search(ONE, {FREEZE: [30, 50, 80]}, points=12), tmp_path, executor)
     assert len(executor.names) == len(set(executor.names)) <= 3
     assert len(result.points) == 12
     assert {point.value for point in result.points if point.name == "freeze_steps=30"} == {-10.0}
     assert len(result.study.all_conditions) == len(result.ranked) == len(executor.names)
+    trials = stored_in(tmp_path).trials
+    assert [trial.value for trial in trials] == [point.value for point in result.points]
+    assert [trial.params for trial in trials] == [point.levels for point in result.points]
+    assert read_study(tmp_path) == result.study
 
 
 @pytest.mark.integration
@@ -182,10 +186,6 @@ def test_a_search_begins_with_the_first_points_that_fit_and_is_refused_where_non
     assert [bool(point.reason) for point in result.points] == [True, True, True, False]
     with pytest.raises(ValueError, match=r"none of the search's 3 points fits"):
         searched(replace(search, points=3), tmp_path / "b")
-
-
-@pytest.mark.integration
-def test_a_search_is_refused_only_where_no_levels_fit_together():
     for seed in range(4):
         Search(replace(PPO_ONE, seed=seed), {"update_every": [3], STEPS: [20, 30]}, points=1)
     with pytest.raises(ValueError, match="update_every is 3"):
@@ -212,14 +212,6 @@ def test_what_has_failed_has_no_value_and_is_tried_again_next_time(tmp_path):
     assert len(mended.points) == 8
 
 
-def test_what_is_kept_is_read_by_optunas_own_tools_and_as_a_study(tmp_path):
-    result = searched(a_search(6), tmp_path)
-    trials = stored_in(tmp_path).trials
-    assert [trial.value for trial in trials] == [point.value for point in result.points]
-    assert [trial.params for trial in trials] == [point.levels for point in result.points]
-    assert read_study(tmp_path) == result.study
-
-
 @pytest.mark.integration
 def test_a_value_is_the_mean_over_replicas_of_the_episodes_asked_for(tmp_path, monkeypatch):
     monkeypatch.setattr("cprl.studies.search.value_of", value_of)
@@ -239,28 +231,19 @@ def test_a_value_is_the_mean_over_replicas_of_the_episodes_asked_for(tmp_path, m
     assert value_of(search, result.points[0], result.runs) is None
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"points": 0}, "points is 0"),
-        ({"metric": "luck"}, "metric is 'luck'"),
-        ({"metric": "return_2"}, "metric is 'return_2'"),
-        ({"direction": "up"}, "direction is 'up'"),
-        ({"over": "all"}, "over is 'all'"),
-        ({"sampler": "magic"}, "sampler is 'magic'"),
-        ({"at_once": 0}, "at_once is 0"),
-        ({"replicas": 0}, "replicas is 0"),
-        ({"factors": {"game.rules.freeze": [1]}}, "matches nothing"),
-        ({"factors": {FREEZE: Uniform(0.1, 0.2)}}, "freeze_steps"),
-        ({"factors": {}}, "draws is given without factors"),
-    ],
-)
-def test_what_cannot_be_searched_is_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        Search(ONE, **{"factors": {FREEZE: [1, 2]}, "points": 2, **options})
-
-
-def test_without_optuna_a_sentence_names_the_extra(tmp_path, monkeypatch):
+def test_what_cannot_be_searched_is_refused_and_without_optuna_a_sentence_names_the_extra(
+    tmp_path, monkeypatch
+):
+    for name, value, message in (
+        *((name, 0, f"{name} is 0") for name in ("points", "at_once", "replicas")),
+        *((name, "up", f"{name} is 'up'") for name in ("metric", "direction", "over", "sampler")),
+        ("metric", "return_2", "metric is 'return_2'"),
+        ("factors", {"game.rules.freeze": [1]}, "matches nothing"),
+        ("factors", {FREEZE: Uniform(0.1, 0.2)}, "freeze_steps"),
+        ("factors", {}, "draws is given without factors"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Search(ONE, **{"factors": {FREEZE: [1, 2]}, "points": 2, name: value})
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(ModuleNotFoundError, match=r'pip install "cprl\[optuna\]"'):
         run_search(a_search(), tmp_path / "out")

@@ -273,31 +273,21 @@ def test_a_report_lists_a_run_by_the_command_or_the_recipe_that_made_it(stored, 
     assert report._command(stored) == listed
 
 
-def test_a_report_counts_the_episodes_in_which_a_metric_is_undefined():
+def test_undefined_episodes_are_counted_and_a_dip_is_measured_from_the_peak_before_it():
     equality = np.array([[0.5, np.nan, 1.0], [np.nan, np.nan, 1.0]])
     assert undefined_in(equality) == ", undefined in 3 of 6 episodes"
     assert undefined_in(equality[:, 2:]) == ""
-
-
-def test_a_dip_is_measured_from_the_peak_before_it():
     assert dip_depth(np.array([[10.0, 20.0, 5.0, 30.0], [1.0, 2.0, 3.0, 4.0]])).tolist() == [0.75, 0.0]
     published = np.interp(np.arange(600), *curve("exp1/return"))[None]
     assert dip_depth(published)[0] == pytest.approx(1 - 104 / 146, abs=0.02)
 
 
 def test_measures_of_training_know_rich_and_poor():
-    flat = np.ones((3, 700))
-    curves = {
-        "collective_return": 4 * flat,
-        "return_0": 3 * flat,
-        "return_1": flat,
-        "survival_steps": 900 * flat,
-    }
+    levels = {"collective_return": 4, "return_0": 3, "return_1": 1, "survival_steps": 900}
+    curves = {name: level * np.ones((3, 700)) for name, level in levels.items()}
     measures = of_training(curves)
-    assert (
-        measures["return of the poorest agent over that of the richest, last 500 episodes"].tolist()
-        == [1 / 3] * 3
-    )
+    share = measures["return of the poorest agent over that of the richest, last 500 episodes"]
+    assert share.tolist() == [1 / 3] * 3
     assert measures["mean collective return over training"].tolist() == [4.0] * 3
     dip, peak = "depth of the deepest dip before episode 600", "episode of the highest collective return"
     assert all(any(name.startswith(start) for name in measures) for start in (dip, peak))
@@ -336,31 +326,21 @@ def recipe(name):
 
 
 @pytest.mark.integration
-def test_reproduce_runs_what_is_missing_and_reports(tmp_path, monkeypatch, capsys):
+def test_reproduce_runs_what_is_missing_and_reports(tmp_path, monkeypatch, shorter_episodes):
     commands = []
 
     def in_miniature(command, **options):
         commands.append(command)
-        name = Path(command[1]).stem
-        at = Path(command[command.index("--out") + 1])
+        run = Path(command[command.index("--out") + 1])
         small = {"replicas": 2, "episodes": 5, "evaluation_episodes": 1, "engine": "eager"}
-        if "--resume" not in command and len(commands) == 1:
-            at.mkdir()
-            (at / "recipe.json").write_text("{}")  # it was stopped
-            return type("Done", (), {"returncode": 0})
-        if not (at / "report.json").exists():
-            (at / "recipe.json").unlink(missing_ok=True)
-            cprl.run(replace(recipe(name).experiment(variant="as_run"), **small), at)
-        return type("Done", (), {"returncode": 0})
+        if len(commands) == 1:
+            run.mkdir()
+            (run / "recipe.json").write_text("{}")  # it was stopped
+        elif not (run / "report.json").exists():
+            (run / "recipe.json").unlink(missing_ok=True)
+            cprl.run(replace(recipe(Path(command[1]).stem).experiment(variant="as_run"), **small), run)
+        return SimpleNamespace(returncode=0)
 
-    game = presets.game
-    monkeypatch.setattr(
-        presets,
-        "game",
-        lambda board, *, variant="published": replace(
-            game(board, variant=variant), rules=replace(game(board, variant=variant).rules, episode_steps=20)
-        ),
-    )
     monkeypatch.setattr(reproduce, "subprocess", SimpleNamespace(run=in_miniature, STDOUT=None))
     options = {"runs": tmp_path / "runs", "results": tmp_path / "results", "only": ("single_basic",)}
     with pytest.raises(ChildProcessError, match=r"single_basic ended with 0 and is not finished; see .*log"):
@@ -600,10 +580,10 @@ def test_a_curve_that_dips_elsewhere_is_contradicted_if_no_replica_dips_there():
     assert verdicts.of_curve(drawn[8], drawn[:8]).verdict == NOT_CONTRADICTED
 
 
-@pytest.mark.parametrize("runs", [1, 2])
-def test_two_replicas_tell_nothing(runs):
+def test_two_replicas_tell_nothing():
     drawn = runs_like_ours(2, np.random.default_rng(3))
-    assert verdicts.of_curve(0 * drawn[0], drawn, runs=runs).verdict == "cannot be told with 2 runs"
+    for runs in (1, 2):
+        assert verdicts.of_curve(0 * drawn[0], drawn, runs=runs).verdict == "cannot be told with 2 runs"
     assert verdicts.of_number(1e9, np.array([1.0, 2.0])) == "cannot be told with 2 runs"
     assert verdicts.of_number(1.0, np.array([1.0])) == "cannot be told with 1 run"
 
@@ -619,14 +599,11 @@ def test_replicas_that_are_all_equal_are_held_against_the_error_of_reading():
     assert verdicts.of_curve(read, ours).verdict == CONTRADICTED
 
 
-def test_the_deviation_is_the_distance_in_standard_errors():
+def test_the_deviation_is_in_standard_errors_and_a_number_contradicted_outside_the_prediction_interval():
     # Two others, 0 and 2: mean 1, variance 2; of one run 2 (1 + 1 / 2) = 3, and the distances are 3 and 0.
     others = np.array([[0.0, 0.0], [2.0, 2.0]])
     deviation = verdicts.deviation(np.array([4.0, 1.0]), others, runs=1)
     assert deviation == pytest.approx(np.sqrt((9 / 3 + 0) / 2))
-
-
-def test_a_number_is_contradicted_outside_the_prediction_interval():
     values = np.array([1.0, 2.0, 3.0, 4.0, 5.0])  # of one run 3 +- 4.81, of two 3 +- 3.67
     assert verdicts.of_number(7.0, values) == NOT_CONTRADICTED
     assert verdicts.of_number(7.0, values, runs=2) == CONTRADICTED
@@ -649,13 +626,6 @@ def test_a_number_is_contradicted_outside_the_prediction_interval():
 def test_a_claim_is_judged_by_where_its_interval_lies(interval, bound, replicas, verdict):
     judge = verdicts.of_likeness if "within" in bound else verdicts.of_claim
     assert judge(*interval, **bound, replicas=replicas) == verdict
-
-
-def test_what_runs_show_as_a_rule_is_judged_by_the_share_that_do():
-    assert verdicts.of_share(share(8, 8)) == NOT_CONTRADICTED
-    assert verdicts.of_share(share(0, 8)) == CONTRADICTED
-    assert verdicts.of_share(share(2, 8)) == "cannot be told with 8 runs", "[0.03, 0.65] holds a half"
-    assert verdicts.of_share(share(30, 96)) == CONTRADICTED
 
 
 def replicas(course, *, number=20, noise=25.0, seed=0):
@@ -731,7 +701,7 @@ def test_a_curve_has_an_interval_where_two_replicas_are_defined():
     assert str(prediction(np.array([3.0]))) == ""
 
 
-def test_shares_have_the_interval_of_clopper_and_pearson():
+def test_shares_have_the_interval_of_clopper_and_pearson_and_are_judged_by_it():
     # None of 8: the upper bound p has (1 - p)**8 = 0.025, so p = 1 - 0.025**(1 / 8) = 0.3694.
     none, some, all_ = share(0, 8), share(2, 8), share(8, 8)
     assert (none.low, none.high) == (0.0, pytest.approx(0.3694, abs=1e-4))
@@ -739,6 +709,9 @@ def test_shares_have_the_interval_of_clopper_and_pearson():
     # 2 of 8: P(at least 2) at the lower bound and P(at most 2) at the upper one are 0.025 each.
     assert (some.low, some.high) == (pytest.approx(0.0319, abs=1e-4), pytest.approx(0.6509, abs=1e-4))
     assert str(some) == "2 of 8 [0.03, 0.65]"
+    assert verdicts.of_share(some) == "cannot be told with 8 runs", "[0.03, 0.65] holds a half"
+    assert verdicts.of_share(all_) == NOT_CONTRADICTED
+    assert verdicts.of_share(none) == verdicts.of_share(share(30, 96)) == CONTRADICTED
 
 
 def drawn_curve(window, noise, seed, *, wandering):
@@ -788,10 +761,15 @@ def test_a_curve_agrees_with_itself_and_not_with_its_mirror_image():
 
 
 @pytest.mark.integration
-def test_where_nothing_grows_a_planner_takes_all():
+def test_where_nothing_grows_a_planner_takes_all_whatever_institutions_and_beams_there_are():
     assert planned_harvest(ROW, Planner(), episodes=3).tolist() == [4.0, 4.0, 4.0]
     could = possible(ROW)
     assert (could.best_known, could.error, could.at_most, could.policy) == (4.0, 0.0, 4.0, "planner")
+    taxed = replace(ROW, institutions=(Tax(rate=0.5),))
+    assert planned_harvest(taxed, Planner(), episodes=2).tolist() == [4.0, 4.0]
+    game = presets.game("commons", variant="as_run")
+    quiet = replace(game, rules=replace(game.rules, may_fire=False), institutions=(Tax(),))
+    assert possible(quiet) == possible(game) == KNOWN["commons", "as_run"]
 
 
 @pytest.mark.integration
@@ -805,15 +783,6 @@ def test_a_planner_keeps_what_grows_and_takes_the_rest_at_the_end():
     assert planned_harvest(CROSS, Planner(), episodes=3).tolist() == harvest[:3].tolist(), (
         "whatever the batch"
     )
-
-
-@pytest.mark.integration
-def test_institutions_and_beams_do_not_change_what_a_board_could_give():
-    taxed = replace(ROW, institutions=(Tax(rate=0.5),))
-    assert planned_harvest(taxed, Planner(), episodes=2).tolist() == [4.0, 4.0]
-    game = presets.game("commons", variant="as_run")
-    quiet = replace(game, rules=replace(game.rules, may_fire=False), institutions=(Tax(),))
-    assert possible(quiet) == possible(game) == KNOWN["commons", "as_run"]
 
 
 def test_boards_with_a_name_are_looked_up_and_other_rules_are_not():

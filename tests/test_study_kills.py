@@ -12,8 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 from same_runs import assert_same_study, attempts_of, still_alive
-from test_executors import OFTEN_SAVED
-from tiny_study import FREEZE, GAMMA
+from tiny_study import FREEZE, GAMMA, OFTEN_SAVED
 
 from cprl import Study
 from cprl.studies import InProcess, run_study

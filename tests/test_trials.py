@@ -1,29 +1,39 @@
-"""A trial becomes a finished run, whatever was there: nothing, half a run, a failure, another's lock."""
+"""A trial becomes a finished run, whatever was there and whichever process dies; how far all of them are."""
 
+import io
 import json
 import os
 import shutil
+import signal
+import subprocess
 import sys
+import time
+from contextlib import nullcontext
 from dataclasses import replace
 from importlib import invalidate_caches
-from types import SimpleNamespace
+from threading import Thread
+from types import ModuleType, SimpleNamespace
 
+import psutil
 import pyarrow.compute as pc
 import pytest
-from same_runs import differences
+from rich.console import Console
+from same_runs import assert_same_study, attempts_of, differences, log_of, still_alive
 from study_runs import EXPERIMENT, TIME_OUT, write_run
-from tiny_study import FREEZE, TINY
+from tiny_study import FREEZE, OFTEN_SAVED, TINY
 
 import cprl
 from cprl import Custom, Study, run_study
 from cprl.runs.checkpoints import FOLDER as CHECKPOINTS
 from cprl.runs.episodes import read_episodes
-from cprl.runs.files import LOCK_FILE, RunLock, RunLockedError
+from cprl.runs.files import LOCK_FILE, RunLock, RunLockedError, write_json
 from cprl.runs.recipe import changed_circumstances, start_run
-from cprl.studies import Processes, read_study, run
+from cprl.studies import InProcess, Processes, Ray, executors, progress, read_study, run
+from cprl.studies.progress import Overview, Progress, table_of
 from cprl.studies.results import write_results
 from cprl.studies.run import trials_with
-from cprl.studies.status import PATIENCE_S, Status
+from cprl.studies.status import PATIENCE_S, Status, StatusFile
+from cprl.studies.study import STATUS
 from cprl.studies.trials import Outcome, Task, state_of, trials_of
 from cprl.training import running
 
@@ -73,18 +83,18 @@ def test_a_missing_trial_is_run_and_says_how_far_it_is_and_a_finished_one_is_lef
 
 
 @pytest.mark.integration
-def test_what_a_killed_process_left_before_its_recipe_is_no_obstacle(first, undisturbed):
-    (first.directory / "recipe.json.0123abcd.partial").write_text("{")
-    (first.directory / LOCK_FILE).write_text("")
-    assert first.run_here().state == "finished"
-    assert differences(first.directory, undisturbed) == []
-
-
-@pytest.mark.integration
-def test_a_trial_that_was_killed_before_its_first_checkpoint_starts_over(first, undisturbed):
-    ended = ("report.json", "manifest.json", "episodes.parquet", CHECKPOINTS, "evaluation")
-    shutil.copytree(undisturbed, first.directory, ignore=shutil.ignore_patterns(*ended), dirs_exist_ok=True)
-    assert state_of(first.directory) == "unfinished"
+@pytest.mark.parametrize("is_begun", [False, True])
+def test_what_a_process_left_that_was_killed_before_its_recipe_or_first_checkpoint_is_no_obstacle(
+    first, undisturbed, is_begun
+):
+    if is_begun:
+        ended = ("report.json", "manifest.json", "episodes.parquet", CHECKPOINTS, "evaluation")
+        ignored = shutil.ignore_patterns(*ended)
+        shutil.copytree(undisturbed, first.directory, ignore=ignored, dirs_exist_ok=True)
+        assert state_of(first.directory) == "unfinished"
+    else:
+        (first.directory / "recipe.json.0123abcd.partial").write_text("{")
+        (first.directory / LOCK_FILE).write_text("")
     assert first.run_here().state == "finished"
     assert differences(first.directory, undisturbed) == []
 
@@ -201,48 +211,41 @@ def test_a_trial_in_whose_directory_another_run_is_is_a_failure_by_name_and_no_p
     assert result.table is None
 
 
-def test_a_finished_run_with_fewer_episodes_is_another_trial_and_an_unfinished_one_is_continued(tmp_path):
-    (trial,) = trials_of(Study(EXPERIMENT))
+def test_a_finished_run_with_fewer_episodes_or_without_a_file_is_refused_and_an_unfinished_one_continued(
+    tmp_path,
+):
+    study = Study(EXPERIMENT)
+    (trial,) = trials_of(study)
     shorter = replace(trial.experiment, episodes=30)
     for state in ("finished", "unfinished"):
         write_run(tmp_path / state / trial.name, shorter, lambda *_: 1, is_finished=state == "finished")
     assert trial.state(tmp_path / "finished") == "refused"
     assert trial.state(tmp_path / "unfinished") == "unfinished"
-
-
-def test_a_finished_trial_that_lost_a_file_of_its_manifest_is_a_failure_by_that_file(tmp_path):
-    study = Study(EXPERIMENT)
-    (trial,) = trials_of(study)
     directory = write_run(tmp_path / "runs" / trial.name, trial.experiment, lambda *_: 1)
     (directory / "evaluation" / "trained.parquet").unlink()
     (failed,) = run_study(study, tmp_path, progress=False, results=False).failed
-    assert "evaluation/trained.parquet" in failed.reason
+    assert "evaluation/trained.parquet" in failed.reason, "which its manifest lists"
 
 
 @pytest.mark.parametrize("name", ["study.json", "run.lock", "table.parquet", "status", "figures"])
-def test_a_study_with_a_link_out_of_it_is_refused_by_the_link(name, tmp_path):
-    study = Study(EXPERIMENT)
-    (tmp_path / "study").mkdir()
-    (tmp_path / "outside").mkdir()
-    (tmp_path / "study" / name).symlink_to(
-        tmp_path / "outside" / "file" if "." in name else tmp_path / "outside"
-    )
+def test_a_study_with_a_link_out_of_it_is_refused_by_the_link_unless_its_runs_are_on_another_disk(
+    name, tmp_path
+):
+    study, outside = Study(EXPERIMENT), tmp_path / "outside"
+    for folder in ("study", "outside", "disk"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "study" / "runs").symlink_to(tmp_path / "disk")
+    result = run_study(study, tmp_path / "study", on=Written(study, 1.0), progress=False, results=False)
+    assert state_of(tmp_path / "disk" / result.trials[0].name) == "finished"
+    (tmp_path / "study" / "study.json").unlink()
+    (tmp_path / "study" / name).symlink_to(outside / "file" if "." in name else outside)
     for use in (
         lambda: run_study(study, tmp_path / "study", on=Written(study, 1.0), progress=False),
         lambda: write_results(study, tmp_path / "study", tmp_path / "runs"),
     ):
         with pytest.raises(ValueError, match=f"{name} is a symbolic link"):
             use()
-    assert list((tmp_path / "outside").iterdir()) == []
-
-
-def test_the_runs_of_a_study_may_be_a_link_to_another_disk(tmp_path):
-    study = Study(EXPERIMENT)
-    (tmp_path / "study").mkdir()
-    (tmp_path / "disk").mkdir()
-    (tmp_path / "study" / "runs").symlink_to(tmp_path / "disk")
-    result = run_study(study, tmp_path / "study", on=Written(study, 1.0), progress=False, results=False)
-    assert state_of(tmp_path / "disk" / result.trials[0].name) == "finished"
+    assert list(outside.iterdir()) == []
 
 
 class Written:
@@ -306,25 +309,19 @@ def test_a_study_runs_anew_what_was_made_with_other_code_and_keeps_what_was_ther
     assert str(earlier) in capsys.readouterr().out
 
 
-def test_a_trial_that_another_process_makes_with_other_code_is_refused_by_its_directory(
+def test_other_code_is_refused_where_another_process_makes_the_trial_and_unknown_where_no_checksum_is(
     tmp_path, write_module
 ):
     study = Study(OWN_CODE)
     write_module("class Callback: ...")
-    name = only_name(study)
-    run = write_run(tmp_path / "runs" / name, study.experiment, lambda *_: 1.0, is_finished=False)
+    name, executor = only_name(study), Written(study, 2.0)
+    run = write_run(tmp_path / "a/runs" / name, study.experiment, lambda *_: 1.0, is_finished=False)
     write_module("class Callback: apples = 2")
-    with RunLock(run), pytest.raises(RunLockedError, match=only_name(study)):
-        run_study(study, tmp_path, progress=False)
-
-
-def test_a_recipe_without_a_checksum_of_code_is_taken_as_it_is(tmp_path, write_module):
-    study = Study(OWN_CODE)
-    write_module("class Callback: ...")
-    run = write_run(tmp_path / "runs" / only_name(study), study.experiment, lambda *_: 1.0, code=None)
+    with RunLock(run), pytest.raises(RunLockedError, match=name):
+        run_study(study, tmp_path / "a", progress=False)
+    run = write_run(tmp_path / "b/runs" / name, study.experiment, lambda *_: 1.0, code=None)
     assert changed_circumstances(run) == []
-    executor = Written(study, 2.0)
-    run_study(study, tmp_path, on=executor, progress=False, results=False)
+    run_study(study, tmp_path / "b", on=executor, progress=False, results=False)
     assert executor.names == []
 
 
@@ -362,7 +359,7 @@ def test_loading_evaluating_and_resuming_warn_of_other_code_and_the_recipe_keeps
 
 
 @pytest.mark.integration
-def test_a_study_runs_what_is_missing_and_an_edited_one_keeps_what_is_there(tmp_path):
+def test_a_study_runs_what_is_missing_and_an_edited_or_another_one_keeps_what_is_there(tmp_path):
     first = run_study(STUDY, tmp_path, results=False)
     assert first.failed == ()
     assert read_study(tmp_path) == STUDY
@@ -372,14 +369,9 @@ def test_a_study_runs_what_is_missing_and_an_edited_one_keeps_what_is_there(tmp_
     assert len(run_study(edited, tmp_path, results=False).trials) == 3
     assert [report.stat().st_mtime_ns for report in reports] == before
     assert read_study(tmp_path) == edited
-
-
-@pytest.mark.integration
-def test_studies_may_share_their_runs(tmp_path):
-    run_study(STUDY, tmp_path / "a", runs=tmp_path / "pool", results=False)
-    shared = run_study(Study(TINY, {FREEZE: [25, 30]}), tmp_path / "b", runs=tmp_path / "pool", results=False)
-    assert shared.runs == tmp_path / "pool"
-    assert len(list((tmp_path / "pool").iterdir())) == 3
+    shared = run_study(Study(TINY, {FREEZE: [25, 30]}), tmp_path / "b", runs=first.runs, results=False)
+    assert shared.runs == first.runs
+    assert len(list(first.runs.iterdir())) == 4, "one more"
     assert not (tmp_path / "b" / "runs").exists()
 
 
@@ -412,3 +404,309 @@ def test_a_study_varies_code_of_ones_own_and_processes_import_it_from_where_this
     assert not result.failed
     recipe = json.loads(next(result.runs.glob("*/recipe.json")).read_text())
     assert recipe["experiment"]["transforms"][0]["arguments"] == {"per_step": 0.5}
+
+
+# Processes of trials
+
+
+TWO = Study(OFTEN_SAVED, {FREEZE: [2, 5]})
+SEVERAL = Study(replace(OFTEN_SAVED, episodes=40), {FREEZE: [2, 5, 10]})
+
+
+@pytest.fixture(scope="module")
+def both_undisturbed(tmp_path_factory):
+    """The runs of a study of one process that nobody killed."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    assert run_study(TWO, folder, on=InProcess(), results=False).failed == ()
+    return folder / "runs"
+
+
+@pytest.fixture
+def deaths(tmp_path, monkeypatch):
+    """Sets how many processes of trials die, the first ones that train."""
+    monkeypatch.setenv("DEATHS", str(tmp_path / "deaths"))
+    return (tmp_path / "deaths").write_text
+
+
+@pytest.mark.integration
+def test_a_trial_whose_process_is_killed_is_resumed_in_another_one_and_ends_the_same(
+    tmp_path, both_undisturbed, deaths
+):
+    deaths("1")
+    result = run_study(TWO, tmp_path, on=Processes(1), results=False)
+    assert result.failed == ()
+    assert_same_study(TWO, result.runs, both_undisturbed)
+    killed, other = result.trials
+    assert (attempts_of(tmp_path, killed), attempts_of(tmp_path, other)) == (2, 1)
+    assert "Resuming from step" in log_of(tmp_path, killed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("on", [Processes(1), Ray(jobs=1)], ids=["processes", "ray"])
+def test_a_trial_whose_processes_always_die_fails_alone(on, tmp_path, deaths, monkeypatch):
+    monkeypatch.setattr(executors, "ATTEMPTS", 2)
+    deaths("2")
+    result = run_study(SEVERAL, tmp_path, on=on, results=False)
+    (failed,) = result.failed
+    assert "its process died" in failed.reason
+    assert [attempts_of(tmp_path, trial) for trial in result.trials] == [2, 1, 1]
+    status = Status(tmp_path / STATUS, result.trials[0].name)
+    assert (failed.name, failed.reason) == (status.name, status.failure())
+
+
+@pytest.mark.integration
+def test_a_trial_that_failed_says_why_and_can_be_repeated_by_hand_with_the_line_in_its_log(
+    tmp_path, monkeypatch
+):
+    module = ModuleType("only_here")
+    module.Callback = type("Callback", (), {"on_episode": lambda *_: None, "__module__": "only_here"})
+    monkeypatch.setitem(sys.modules, "only_here", module)
+    experiment = replace(TINY, callbacks=(Custom("only_here:Callback"),))
+    result = run_study(Study(experiment), tmp_path, on=Processes(1), results=False)
+    (failed,) = result.failed
+    assert "No module named 'only_here'" in failed.reason
+    assert attempts_of(tmp_path, result.trials[0]) == 1
+    (tmp_path / "only_here.py").write_text("class Callback:\n    def on_episode(self, *_): ...\n")
+    command = log_of(tmp_path, result.trials[0]).partition("\n")[0].removeprefix("$ ")
+    paths = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": paths}
+    subprocess.run(command, shell=True, env=environment, check=True, capture_output=True)
+    assert result.trials[0].state(result.runs) == "finished"
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_by_ray_a_trial_whose_worker_is_killed_ends_the_same(tmp_path, both_undisturbed):
+    import ray
+
+    killed = []
+
+    def kill_a_worker():
+        while not list(tmp_path.glob("runs/*/checkpoints/training-*")):
+            time.sleep(0.02)
+        children = psutil.Process().children(recursive=True)
+        trial = next(process for process in children if "--trial" in process.cmdline())
+        killed.extend([trial, trial.parent()])
+        trial.parent().kill()
+
+    thread = Thread(target=kill_a_worker)
+    thread.start()
+    result = run_study(TWO, tmp_path, on=Ray(jobs=2), results=False)
+    thread.join()
+    assert result.failed == ()
+    assert still_alive(killed, 5) == []
+    assert_same_study(TWO, result.runs, both_undisturbed)
+    assert sum(attempts_of(tmp_path, trial) for trial in result.trials) == 3
+    assert not ray.is_initialized()
+
+
+class FakeProcess(nullcontext):
+    """A process that ends when it is stopped, and asks this one to stop whenever it is looked at."""
+
+    def __init__(self, signals):
+        super().__init__(self)
+        self.signals, self.stops = [*signals], []
+
+    def poll(self):
+        if self.signals:
+            os.kill(os.getpid(), self.signals.pop(0))
+            return None
+        return 143 if self.stops else None
+
+    def kill(self):
+        self.stops.append("kill")
+
+
+@pytest.mark.parametrize(
+    ("signals", "kind", "stops"),
+    [
+        ([signal.SIGINT], KeyboardInterrupt, ["ask"]),
+        ([signal.SIGTERM], SystemExit, ["ask"]),
+        ([signal.SIGINT, signal.SIGTERM], SystemExit, ["ask", "kill"]),
+    ],
+    ids=str,
+)
+def test_a_study_that_is_asked_to_stop_asks_its_processes_once_and_kills_them_if_asked_again(
+    signals, kind, stops, tmp_path, capsys, monkeypatch
+):
+    process = FakeProcess(signals)
+    monkeypatch.setattr(executors, "_started", lambda *_: process)
+    monkeypatch.setattr(executors, "_ask_to_stop", lambda process: process.stops.append("ask"))
+    with pytest.raises(kind) as ended:
+        run_study(Study(TINY, {FREEZE: [2, 5]}), tmp_path, on=Processes(1), results=False)
+    assert getattr(ended.value, "code", None) in (None, 143)
+    assert process.stops == stops
+    assert "2 trials are left" in capsys.readouterr().out
+
+
+def test_what_cannot_be_started_is_the_failure_of_its_trial(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "no-python"))
+    result = run_study(Study(TINY, {FREEZE: [2, 5]}), tmp_path, on=Processes(1), results=False)
+    assert [outcome.reason.split(":")[0] for outcome in result.failed] == ["FileNotFoundError"] * 2
+
+
+def test_an_executor_refuses_what_does_not_fit_and_ray_says_how_to_install_it(monkeypatch):
+    for kind, name, value in (
+        *((kind, "jobs", 0) for kind in (Processes, Ray)),
+        *((Ray, "address", ""), (Ray, "memory_bytes", 0)),
+    ):
+        with pytest.raises(ValueError, match=f"{kind.__name__}.{name} is {value!r}"):
+            kind(**{name: value})
+    monkeypatch.setattr(executors, "find_spec", lambda name: None)
+    with pytest.raises(ModuleNotFoundError, match=r'pip install "cprl\[ray\]"'):
+        Ray()
+
+
+def test_a_trial_asks_ray_for_a_tenth_more_than_the_largest_of_its_study_took(tmp_path):
+    small, big = (
+        Task(trial=trial, runs=tmp_path, status=Status(tmp_path, trial.name)) for trial in trials_of(TWO)
+    )
+    assert executors.bytes_of(small) == 1e9, "while nothing is known"
+    for task, taken in ((small, 2_000_000_000), (big, 3_000_000_000)):
+        task.status.path.write_text(f'{{"peak_bytes": {taken}}}')
+    assert executors.bytes_of(small) == pytest.approx(3.3e9)
+
+
+# Progress
+
+
+TRIALS = trials_of(Study(replace(TINY, episodes=10, replicas=2), {FREEZE: [2, 5, 9]}))
+
+
+@pytest.fixture
+def says(tmp_path):
+    """Writes what a trial says of itself, by its place."""
+    folder = tmp_path / "status"
+    folder.mkdir()
+
+    def write(place, **status):
+        path = Status(folder, TRIALS[place].name).path
+        write_json(path, {"pid": 7, "host": "here", "of": 20, **status})
+
+    return write
+
+
+@pytest.fixture
+def look(tmp_path, says):
+    """Looks at all trials; gives the snapshot, and its row of a trial."""
+    overview = Overview(TRIALS, tmp_path / "runs", tmp_path / "status")
+
+    def look(place=0):
+        snapshot = overview.look()
+        return snapshot, next(row for row in snapshot.rows if row.trial is TRIALS[place])
+
+    return look
+
+
+def test_the_time_left_is_that_of_the_speed_at_which_trials_say_they_play(says, look):
+    says(0, beat=1, episodes=0, steps=0, compiling_s=0.0)
+    says(1, beat=9, episodes=0, steps=0)
+    look()
+    says(1, beat=10, episodes=0, steps=0, compiling_s=31.0, is_compiling=True)
+    snapshot, row = look(1)
+    assert (row.state, row.note) == ("compiling", "for 31 s")
+    assert snapshot.left_s is None, "nothing is known yet"
+    says(0, beat=19, episodes=5, steps=99, episodes_per_s=0.5)
+    snapshot, row = look(0)
+    # 15 of this trial are left, and with those of the other two 55
+    assert (row.state, row.note) == ("running", "30 s left")
+    assert snapshot.left_s == pytest.approx(110.0)
+    assert snapshot.line == (
+        "0 of 3 trials finished, 2 running, 5 of 60 episodes, 1 compiling, 2 min left"
+    )  # 110 s in words
+
+
+def test_a_trial_says_its_speed_without_compiling_and_what_it_had_done_before(tmp_path, monkeypatch):
+    now, clock = SimpleNamespace(s=0.0), SimpleNamespace(total_s=0.0, is_running=False)
+    monkeypatch.setattr("cprl.studies.status.time", SimpleNamespace(monotonic=lambda: now.s))
+    monkeypatch.setattr("cprl.studies.status.CLOCK", clock)
+    file = StatusFile(Status(tmp_path, "trial"), TRIALS[0].experiment)
+
+    def speed():
+        file.write()
+        return json.loads((tmp_path / "trial.json").read_text())["episodes_per_s"]
+
+    now.s = 5.0
+    file.on_start(SimpleNamespace(steps=200, episodes_played=10))
+    assert speed() is None
+    now.s, clock.total_s = 39.0, 30.0
+    for _ in range(2):
+        file.on_episode(None, {})
+    assert speed() == pytest.approx(0.5), "2 episodes in 4 s of work"
+
+
+def test_a_trial_runs_while_it_says_something_new_whatever_the_clock_says(says, look, monkeypatch):
+    says(0, beat=500, episodes=4, steps=9)
+    assert look()[1].state == "missing", "perhaps the last words of a dead process"
+    says(0, beat=501, episodes=4, steps=9)
+    assert look()[1].state == "running"
+    says(0, beat=502, episodes=20, steps=9)
+    assert look()[1].state == "evaluating", "all are played, and it is not finished yet"
+    monkeypatch.setattr(progress, "SILENT_S", 0.0)
+    assert look()[1].state == "missing"
+
+
+def test_failures_have_their_reason_and_stand_before_those_that_are_missing(look, tmp_path):
+    Status(tmp_path / "status", TRIALS[2].name).fail("ValueError: of | chance", "trace")
+    snapshot, row = look(2)
+    assert snapshot.rows[0] is row
+    assert row.note == "ValueError: of | chance"
+
+
+@pytest.mark.integration
+def test_a_table_is_never_higher_than_a_screen_and_counts_the_rest(tmp_path):
+    many = trials_of(Study(TINY, {FREEZE: range(1, 101)}))
+    Status(tmp_path, many[77].name).fail("ValueError: no", "")
+    snapshot = Overview(many, tmp_path, tmp_path).look()
+    screen = Console(file=io.StringIO(), width=80, height=24)
+    screen.print(table_of(snapshot, title="mine", most=16))
+    lines = screen.file.getvalue().splitlines()
+    assert len(lines) == 19
+    assert lines[2].split() == ["freeze_steps=78,", "replica", "0", "failed", "0/2", "ValueError:", "no"]
+    assert lines[-2].strip() == "and 85 missing"
+    assert lines[-1].startswith("0 of 100 trials finished, 1 failed, 0 of 200 episodes")
+
+
+def test_what_trials_print_does_not_disturb_lines_that_come_while_they_run(tmp_path, capsys, monkeypatch):
+    printed = io.StringIO()
+    with Progress(TRIALS, tmp_path, tmp_path, title="mine") as table:
+        monkeypatch.setattr(sys, "stdout", printed)
+        print("noise")
+        Status(tmp_path, TRIALS[0].name).fail("ValueError: no", "")
+        table.ended(Outcome(TRIALS[0].name, "failed", "ValueError: no", True))
+        table.ended(Outcome(TRIALS[1].name, "finished"))
+    assert printed.getvalue() == "noise\n"
+    assert capsys.readouterr().out.splitlines() == [
+        "mine: 0 of 3 trials finished, 0 of 60 episodes",
+        "mine: freeze_steps=2, replicas 0-1 failed: ValueError: no (1 of 3)",
+        "mine: 0 of 3 trials finished, 1 failed, 0 of 60 episodes",
+    ]
+    monkeypatch.undo()
+    monkeypatch.setattr("cprl.studies.progress._TABLE_PERIOD_S", 0.01)
+    monkeypatch.setattr("cprl.studies.progress._LINE_PERIOD_S", 0.05)
+    with Progress(TRIALS, tmp_path, tmp_path, title="mine"):
+        time.sleep(0.5)
+    assert 3 <= len(capsys.readouterr().out.splitlines()) <= 14
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("wanted", [True, False])
+def test_in_a_terminal_one_table_is_drawn_again_and_again_where_progress_is_wanted(
+    wanted, tmp_path, monkeypatch
+):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    screen = Terminal()
+    monkeypatch.setattr(sys, "stdout", screen)
+    monkeypatch.setenv("TERM", "xterm")
+    study = Study(replace(TINY, episodes=1), {FREEZE: [2]})
+    run_study(study, tmp_path / "out", results=False, progress=wanted)
+    printed = screen.getvalue()
+    if wanted:
+        assert "\x1b[" in printed
+        assert "freeze_steps=2, replica 0" in printed
+        assert "1 of 1 trials finished, 1 of 1 episodes" in printed.splitlines()[-2]
+    else:
+        assert printed == ""

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from cprl import Experiment, Game, Rules, maps
+from cprl import Custom, Experiment, Game, Rules, maps
 from cprl.algorithms import DQN
 from cprl.learners.settings import DQNSettings
 from cprl.population import Learning, Scripted
@@ -26,6 +26,7 @@ TINY = Experiment(
     engine="eager",
 )
 MIXED = replace(TINY, agents=(LEARNING, Scripted("greedy")))
+OFTEN_SAVED = replace(TINY, episodes=60, callbacks=(Custom("often_saved:OftenSaved"),))
 
 FREEZE = "game.rules.freeze_steps"
 GAMMA = "agents.*.algorithm.settings.gamma"

@@ -172,7 +172,6 @@ def in_shape(experiment: "Experiment", shape: Shape) -> "Experiment":
 
 
 def _as_many(specs: "tuple[AgentSpec, ...]", agents: int) -> "tuple[AgentSpec, ...]":
-    """Return specifications of another number of agents who are alike."""
     from cprl.population import Team
 
     first = specs[0]
@@ -186,7 +185,6 @@ def _as_many(specs: "tuple[AgentSpec, ...]", agents: int) -> "tuple[AgentSpec, .
 
 
 def _institutions(words: Sequence[str]) -> "tuple[Institution, ...]":
-    """Return the institutions that words name, or that a JSON file holds."""
     from cprl.institutions import Institution
     from cprl.values import KINDS, from_config
 

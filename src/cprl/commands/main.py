@@ -21,7 +21,6 @@ from cprl.commands.recipe import (
     ended_by_sigterm,
     in_a_sentence,
     refuse_mistyped_flags,
-    refuse_to_take_over,
     run_with,
     trusting,
 )
@@ -91,7 +90,6 @@ def _function(command: str) -> Callable[..., Any]:
 
 
 def _print_help() -> None:
-    """List the commands with the first sentence of what each does."""
     abouts = {name: (getdoc(_function(name)) or "").partition("\n\n")[0] for name in COMMANDS}
     lines = ["usage: cprl [-h] [--version] COMMAND ...", "", __doc__, ""]
     lines += [f"  {name:<10}  {' '.join(about.split())}" for name, about in abouts.items()]
@@ -121,7 +119,6 @@ def run(
     if trial is not None:
         obey_parent()
     _refuse_unknown(recipe)
-    refuse_to_take_over(options)
     from cprl.runs.recipe import read_recipe
 
     directory, table = recipe if recipe.is_dir() else recipe.parent, read_recipe(recipe)
@@ -213,7 +210,6 @@ def watch(run: Path, /, *, serve: bool = False) -> None:
 
 
 def _serve(files: Sequence[Path], *, why: str) -> None:
-    """Serve recordings and the web viewer until Ctrl-C."""
     from cprl.viewer.page import Page, headers_of, viewer
 
     with TemporaryDirectory() as folder, suppress(KeyboardInterrupt):

@@ -446,7 +446,6 @@ def _begin_fresh(fresh: Fresh, files: Files, *runs: Path | str) -> None:
 
 
 def _begin_named(fresh: Fresh, files: Files, words: Sequence[str]) -> list[str] | dict[str, str]:
-    """Begin, and return the runs that words name."""
     named = runs_by_name(words)
     _begin_fresh(fresh, files, *(named.values() if isinstance(named, dict) else named))
     return named

@@ -74,6 +74,10 @@ class RunOptions:
     linger: bool = False
     """Keep the recording served after the run is finished, until Ctrl-C; with watch "serve" or "spawn"."""
 
+    def __post_init__(self) -> None:
+        if self.take_over and not self.resume:
+            raise ValueError("--take-over is for runs that are there; allowed: with --resume")
+
 
 def recipe_main(
     make_experiment: "Callable[..., Experiment]",
@@ -118,18 +122,11 @@ def run_with(
     callbacks: Sequence[object] = (),
 ) -> Path:
     """Run an experiment with the options of a command line."""
-    refuse_to_take_over(options)
     from cprl.runs.recipe import started_by
     from cprl.training.running import run
 
     with started_by(command):
         return run(experiment, callbacks=callbacks, **vars(options))
-
-
-def refuse_to_take_over(options: RunOptions) -> None:
-    """Refuse to take over a run that is not resumed."""
-    if options.take_over and not options.resume:
-        raise ValueError("--take-over is for runs that are there; allowed: with --resume")
 
 
 @contextmanager

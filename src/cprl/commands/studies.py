@@ -14,7 +14,7 @@ import tyro
 
 from cprl.commands.recipe import Words, ended_by_sigterm, in_a_sentence, parse_with, trusting
 from cprl.runs.recipe import read_recipe, without_directories, without_options
-from cprl.system.defaults import BLOCK, LAST
+from cprl.system.defaults import LAST
 from cprl.system.output import console, printed, say
 from cprl.system.shipped import command_of, is_shipped, named_command, program_of, recipe_named
 from cprl.values import Range, checked
@@ -65,6 +65,8 @@ class TrialOptions:
     """Episodes at the end of the training that these compare; of long trainings rather 500."""
     dry_run: bool = False
     """List all conditions, trials and their states; run and write nothing."""
+    block: int | None = None
+    """Replicas that one run trains side by side, by default 8; with fewer, more processes share the work."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,8 +89,6 @@ class MainOptions(StudyOptions):
     """Of each condition; by default those of the study."""
     replicas: int | None = None
     """Of each condition; by default those of the study."""
-    block: int | None = None
-    """Replicas that one run trains side by side; with fewer, more processes share the work."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,8 +101,6 @@ class SweepOptions(StudyOptions):
     """So many random combinations instead of all."""
     design: Literal["random", "latin_hypercube", "sobol"] = "random"
     """With --draws: how they are drawn, by chance or evenly."""
-    block: int = BLOCK
-    """Replicas that one run trains side by side; with fewer, more processes share the work."""
     reference: str | None = None
     """The name of the condition that others are compared with, e.g. "freeze_steps=25"."""
 
@@ -125,8 +123,6 @@ class SearchOptions(TrialOptions):
     """How points are proposed."""
     at_once: int = 4
     """Points that are proposed together; a multiple of --jobs keeps all of them busy."""
-    block: int = BLOCK
-    """Replicas that one run trains side by side; with fewer, more processes share the work."""
 
 
 RecipeOptions = TypeVar("RecipeOptions", SweepOptions, SearchOptions)
@@ -155,7 +151,7 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
         options = tyro.cli(
             read, args=trusting(command[1:]), prog=script, description=_about(study), config=_CONFIG
         )
-        changes = {name: value for name, value in _of_class(options).items() if value is not None}
+        changes = _given(options)
         episodes = changes.pop("episodes", None)
         if episodes is not None:
             changes["experiment"] = replace(study.experiment, episodes=episodes)
@@ -169,9 +165,10 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
         return carry_out(study, options, command)
 
 
-def _of_class(options: TrialOptions) -> dict[str, Any]:
-    """The options that the class of these has itself, which are fields of a `Study` or `Search`."""
-    return {name: getattr(options, name) for name in type(options).__annotations__ if name != "vary"}
+def _given(options: TrialOptions) -> dict[str, Any]:
+    """The options that are fields of a `Study` or `Search`: those that the class of these has itself."""
+    names = {"block", *type(options).__annotations__} - {"vary"}
+    return {name: value for name, value in vars(options).items() if name in names and value is not None}
 
 
 def sweep(words: Sequence[str], /) -> None:
@@ -186,7 +183,7 @@ def sweep(words: Sequence[str], /) -> None:
     from cprl.studies import Study
     from cprl.studies.factors import factors_of
 
-    study = Study(experiment, factors_of(experiment, options.vary), **_of_class(options))
+    study = Study(experiment, factors_of(experiment, options.vary), **_given(options))
     carry_out(study, options, ["cprl", "sweep", *words])
 
 
@@ -202,7 +199,7 @@ def search(words: Sequence[str], /) -> None:
     from cprl.studies.factors import factors_of
     from cprl.studies.study import directory_of
 
-    wanted = Search(experiment, factors_of(experiment, options.vary), **_of_class(options))
+    wanted = Search(experiment, factors_of(experiment, options.vary), **_given(options))
     command, executor = ["cprl", "search", *words], executor_of(options)
     if options.dry_run:
         factors = ", ".join(f"{name}: {factor}" for name, factor in wanted.factors.items())
@@ -245,7 +242,6 @@ def _read(words: Sequence[str], options: RecipeOptions, program: str) -> "tuple[
 
 
 def _print_help(options: RecipeOptions, program: str) -> None:
-    """Prints what holds for every recipe, and ends the process."""
     kind: Any = type(options)
 
     def read(
@@ -364,7 +360,6 @@ def _published(command: Sequence[str]) -> str:
 
 
 def _list(study: "Study", options: StudyOptions) -> Path:
-    """Prints all trials and their states."""
     from cprl.studies.progress import Overview, table_of
     from cprl.studies.run import trials_with
     from cprl.studies.status import BEAT_S

@@ -103,7 +103,6 @@ def table(
 
 
 def _table_in(runs: Sequence[Path], reference: str | None, window: int | None) -> "StudyTable":
-    """The table of a study's directory."""
     path = runs[0] / "table.parquet"
     if len(runs) > 1 or not path.exists():
         raise ValueError(
@@ -124,7 +123,6 @@ def _table_in(runs: Sequence[Path], reference: str | None, window: int | None) -
 
 
 def _compared(table: "StudyTable", metrics: Sequence[str], part: Part, last: int) -> "list[Cells]":
-    """Levels, and differences where there is more than one condition."""
     from cprl.studies.tables.comparing import cells, compare, metrics_of
 
     comparisons = [compare(table, metric, part=part, last=last) for metric in metrics_of(table, metrics)]

@@ -205,14 +205,12 @@ def _table_in(journal: Path) -> pa.Table:
 
 
 def _reopen(path: Path, journal: Path) -> None:
-    """Write the journal of a finished table again, a batch for each episode."""
     table = read_table(path).combine_chunks()
     agents = max(table["agent"].to_pylist(), default=0) + 1
     write_journal(journal, table.to_batches(max_chunksize=agents))
 
 
 def _merge(journal: Path, target: BinaryIO, *, rows: int) -> None:
-    """Write the journal as a parquet file."""
     table = _table_in(journal)
     if table.num_rows != rows:
         raise OSError(EIO, f"{journal} holds {table.num_rows} rows of the {rows} that were added")
@@ -319,7 +317,6 @@ def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema)
 
 
 def _values(episode: Episode, replica: int) -> dict[str, Any]:
-    """The values of each column, [N]."""
     agents = np.arange(len(episode.return_))
     values: dict[str, Any] = {
         **{name: getattr(episode, name, None) for name in _columns_of(episode)},

@@ -266,7 +266,6 @@ def _list(run: Path, changes: Mapping[str, str | None]) -> None:
 
 
 def _listed(run: Path) -> dict[str, str]:
-    """The checksum of each listed file, by its path in the run."""
     path = run / MANIFEST_FILE
     try:
         table = read_json(path)
@@ -325,7 +324,6 @@ class RunLock:
         return self
 
     def _lock(self, file: int) -> None:
-        """Lock the file and write who holds it, or share it with those who do."""
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -60,7 +60,6 @@ def make_logger(logger: str | Logger, run: str | Path) -> Logger:
 
 
 def _wandb_id(folder: Path) -> str:
-    """The id of the W&B run, the same when a run is resumed."""
     path = folder / "wandb_id.txt"
     if not path.exists():
         path.write_text(uuid.uuid4().hex[:8], encoding="utf-8")

@@ -277,7 +277,6 @@ def _circumstances(recipe: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _code(recipe: Mapping[str, Any]) -> dict[str, str]:
-    """The checksum of the text of each module that a `Custom` of a recipe names."""
     return {module: digest_of(text) for module, text in _sources(recipe).items()}
 
 
@@ -381,7 +380,6 @@ def git_state(package: Path = _PACKAGE) -> dict[str, str | bool] | None:
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
-    """The output of git in a folder; None if there is no git, no checkout or no commit."""
     environment = {name: value for name, value in os.environ.items() if name not in _OF_ANOTHER}
     words = ["git", "-C", str(folder), *arguments]
     try:

@@ -117,7 +117,6 @@ def normalised(path: object) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Lists and arrays as tuples, numpy's numbers as Python's."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     return tuple(map(_plain, value)) if isinstance(value, list | tuple | range) else value
@@ -270,7 +269,6 @@ def drawn(
 
 
 def _shares(dimensions: int, draws: int, seed: int, design: Design) -> Iterable[NDArray[np.float64]]:
-    """Return points of the unit cube."""
     most = _TRIES * draws
     if design == "random":
         return (np.random.default_rng([seed, number]).random(dimensions) for number in range(most))

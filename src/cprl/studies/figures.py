@@ -484,7 +484,6 @@ def _grid_of(design: Design, factors: tuple[str, str]) -> tuple[Grid, str]:
 
 
 def _levels_of(grid: Grid) -> tuple[Sequence[Any], Sequence[Any]]:
-    """The levels of both factors, rows and columns, in the order of the conditions."""
     rows, columns = zip(*grid, strict=True)
     return list(dict.fromkeys(rows)), list(dict.fromkeys(columns))
 
@@ -513,7 +512,6 @@ def _numbers(comparison: Comparison, grid: Grid) -> tuple[Numbers, Numbers]:
 def _draw_grid(
     axes: Axes, grid: Grid, factors: tuple[str, str], drawn: Mapping[str, tuple[Any, str]]
 ) -> None:
-    """Draw a cell for each condition, of a colour and with a text by its name, over two factors."""
     rows, columns = _levels_of(grid)
     for (row, column), name in grid.items():
         draw_cell(axes, columns.index(column), rows.index(row), *drawn.get(name, (EMPTY, "no run")))

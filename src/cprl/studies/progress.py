@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any, Final, Literal, Self
+from typing import Any, Final, Literal, NamedTuple, Self
 
 from rich.console import Group
 from rich.live import Live
@@ -36,8 +36,7 @@ ORDER: Final[tuple[TrialState, ...]] = (*AT_WORK, "failed", "unfinished", "missi
 """In which a table lists trials: what is under way first, what needs nobody last."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Row:
+class Row(NamedTuple):
     """How far one trial is."""
 
     trial: Trial
@@ -106,24 +105,22 @@ class Overview:
         state = "finished" if trial.name in self._finished else trial.state(self._runs)
         if state == "finished":
             self._finished.add(trial.name)
-            return Row(trial=trial, state="finished", episodes=of, of=of)
+            return Row(trial, "finished", of, of)
         words = self._listen(trial.name)
         is_known = state != "missing" or trial.name in self._since
         episodes = min(of, words.get("episodes", 0)) if is_known else 0
-        if time.monotonic() - self._since.get(trial.name, -SILENT_S) < SILENT_S:
-            return self._at_work(trial, words, episodes, of)
-        note = self._status[trial.name].failure() or (REASONS["refused"] if state == "refused" else "")
-        idle: TrialState = "failed" if note else "missing" if state == "missing" else "unfinished"
-        return Row(trial=trial, state=idle, episodes=episodes, of=of, note=note)
-
-    def _at_work(self, trial: Trial, words: Mapping[str, Any], episodes: int, of: int) -> Row:
-        state: TrialState = "running" if episodes < of else "evaluating"
-        per_s, note = words.get("episodes_per_s") or 0.0, ""
+        if time.monotonic() - self._since.get(trial.name, -SILENT_S) >= SILENT_S:
+            note = self._status[trial.name].failure() or (REASONS["refused"] if state == "refused" else "")
+            idle: TrialState = "failed" if note else "missing" if state == "missing" else "unfinished"
+            return Row(trial, idle, episodes, of, note=note)
+        per_s = words.get("episodes_per_s") or 0.0
         if words.get("is_compiling"):
-            state, note = "compiling", f"for {in_words(words.get('compiling_s', 0.0))}"
-        elif state == "running" and per_s:
-            note = f"{in_words((of - episodes) / per_s)} left"
-        return Row(trial=trial, state=state, episodes=episodes, of=of, per_s=per_s, note=note)
+            note = f"for {in_words(words.get('compiling_s', 0.0))}"
+            return Row(trial, "compiling", episodes, of, per_s, note)
+        if episodes == of:
+            return Row(trial, "evaluating", episodes, of, per_s)
+        note = f"{in_words((of - episodes) / per_s)} left" if per_s else ""
+        return Row(trial, "running", episodes, of, per_s, note)
 
     def _listen(self, name: str) -> Mapping[str, Any]:
         """What a trial says now; the first time it may be what a process said that is dead since."""

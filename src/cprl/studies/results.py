@@ -85,7 +85,6 @@ def write_summary(table: StudyTable, out: Path, *, last: int = LAST, again: str 
 
 
 def _compared(table: StudyTable, part: str, last: int) -> list[str]:
-    """Levels and differences of a part of the runs."""
     metrics = metrics_of(table)
     comparisons = [compare(table, metric, part=part, last=last) for metric in metrics]
     tables = [cells(comparisons)]
@@ -100,7 +99,6 @@ def _compared(table: StudyTable, part: str, last: int) -> list[str]:
 
 
 def _phases(table: StudyTable) -> list[str]:
-    """In which phase replicas end."""
     rows = []
     for condition in table.design.conditions:
         counts = table.endings.get(condition, {})
@@ -117,7 +115,6 @@ def _phases(table: StudyTable) -> list[str]:
 
 
 def _made(table: StudyTable) -> list[str]:
-    """Under which versions the runs were made."""
     first = next(iter(table.made.values()), {})
     lines = [f"- {sentence}" for sentence in table.mixed]
     lines = lines or [f"All under {', '.join(f'{name} {value}' for name, value in first.items())}."]
@@ -125,7 +122,6 @@ def _made(table: StudyTable) -> list[str]:
 
 
 def _lengths(table: StudyTable) -> list[str]:
-    """How long the runs of each condition were, where their reports say so."""
     rows = []
     for condition in table.design.conditions:
         if condition in table.lengths:

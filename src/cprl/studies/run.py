@@ -189,7 +189,6 @@ def _outcomes(tasks: Sequence[Task], executor: Executor) -> Generator[Outcome, N
 
 
 def _others(out: Path) -> str:
-    """Who runs a study too."""
     return (
         f"{out} is run by somebody else too, {holder_of(out)}, or was when its host went down: each trial is "
         "run by whoever begins it first, the other goes on with the rest"

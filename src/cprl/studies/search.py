@@ -275,7 +275,6 @@ class _Proposals:
         return point
 
     def _space(self) -> dict[str, Any]:
-        """The distribution of each factor as Optuna has it."""
         kinds = self._optuna.distributions
         return {
             name: kinds.IntDistribution(factor.low, factor.high)
@@ -330,7 +329,6 @@ def value_of(search: Search, point: Point, runs: Path) -> float | None:
 
 @contextmanager
 def _optuna() -> Iterator[Any]:
-    """Optuna, which prints errors alone."""
     try:
         import optuna
     except ModuleNotFoundError as error:

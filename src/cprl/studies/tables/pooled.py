@@ -102,7 +102,6 @@ def _groups(
 
 
 def _value_at(experiment: Experiment, path: str, run: Path) -> Any:
-    """The value of a field of a run; of several places all of them, if they differ."""
     try:
         values = values_at(experiment, path)
     except ValueError as error:
@@ -116,7 +115,6 @@ def _rank(value: Any) -> tuple[int, float]:
 
 
 def _refuse_seeds_twice(name: str, experiments: Experiments) -> None:
-    """Raises a ValueError where a condition would count a replica twice."""
     for (one, first), (other, second) in combinations(experiments.items(), 2):
         if first.seed == second.seed:
             places = _places(first, second)
@@ -128,7 +126,6 @@ def _refuse_seeds_twice(name: str, experiments: Experiments) -> None:
 
 
 def _firsts(experiments: Iterable[Experiment]) -> dict[int, int]:
-    """The number of the first replica of each seed."""
     most: dict[int, int] = {}
     for experiment in experiments:
         most[experiment.seed] = max(most.get(experiment.seed, 0), experiment.replicas)
@@ -164,7 +161,6 @@ def _places(one: Experiment, other: Experiment) -> list[str]:
 
 
 def _is_within(place: str, path: str) -> bool:
-    """Whether a place is that of a field, or within its value."""
     parts, wanted = place.split("."), path.split(".")
     matches = [part in (ALL, at) for part, at in zip(wanted, parts, strict=False)]
     return len(matches) == len(wanted) and all(matches)

@@ -214,7 +214,6 @@ def _measured(source: Source, window: int) -> _Measured:
 
 
 def _in_windows(values: Values, window: int) -> Windows:
-    """Values by episode, [R, E], in windows of so many."""
     firsts = np.arange(0, values.shape[1], window)
     lengths = np.diff(np.append(firsts, values.shape[1]))
     defined = ~np.isnan(values)
@@ -231,7 +230,6 @@ def _net(curves: Mapping[str, Values]) -> Values:
 
 
 def _refuse_gaps(table: pa.Table, source: Source, part: str) -> None:
-    """Raises a ValueError unless each episode of each replica is there once."""
     rows = np.stack([table[name].to_numpy() for name in ("replica", "episode", "agent")], axis=1)
     each, times = np.unique(rows, axis=0, return_counts=True)
     if (times > 1).any():
@@ -257,7 +255,6 @@ def _steps_of(run: Path) -> int | None:
 
 
 def _rows(design: Design, measured: Sequence[_Measured], marked: Mapping[str, str]) -> pa.Table:
-    """The sorted rows of a table; `marked` has the marks of each run by its name."""
     sources = [run.source for run in measured]
     numbers = [(source.condition, source.first + row) for source in sources for row in range(source.replicas)]
     for (name, number), times in Counter(numbers).items():

@@ -189,7 +189,6 @@ class StudyTable:
 
     @cached_property
     def _grids(self) -> dict[tuple[str, str, str], Grid]:
-        """The rows by condition, part and metric."""
         keys = ["condition", "part", "metric"]
         columns = ["replica", "episode", "window_episodes", "undefined", "value"]
         rows = self.rows.select(keys + columns).sort_by([("replica", "ascending"), ("episode", "ascending")])
