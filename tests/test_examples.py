@@ -49,11 +49,11 @@ def example(monkeypatch):
     return loaded
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_an_example_has_less_than_sixty_lines_and_a_row_in_the_docs(name):
-    assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) < 60
+def test_an_example_has_less_than_sixty_lines_and_a_row_in_the_docs():
     page = (EXAMPLES.parent / "docs" / "trainers.md").read_text()
-    assert f"| [`{name}.py`](../examples/{name}.py) |" in page
+    for name in NAMES:
+        assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) < 60, name
+        assert f"| [`{name}.py`](../examples/{name}.py) |" in page
 
 
 @pytest.mark.integration
@@ -81,21 +81,17 @@ def test_plain_ppo_finds_apples_that_always_come_back(name, example, monkeypatch
 
 
 @pytest.mark.integration
-def test_the_single_agent_is_compared_with_random_play(example, shorter_episodes, capsys):
-    played = example("single_agent").main(episodes=10)
-    assert set(played) == {"random", "greedy"}
-    assert min(played.values()) >= 0
-    assert "episode 10: harvest" in capsys.readouterr().out
-
-
-@pytest.mark.integration
-def test_the_single_agent_counts_no_apple_twice(example, monkeypatch):
+def test_the_single_agent_is_compared_with_random_play_and_counts_no_apple_twice(
+    example, monkeypatch, capsys
+):
     # Two apples, and none grows again: a world ends with the second bite, others play on.
     two = Game(map=maps.parse(">AA"), rules=Rules(regrow_prob=(0.0,), may_fire=False, episode_steps=40))
     monkeypatch.setattr(presets, "game", lambda _: two)
     played = example("single_agent").main(episodes=10)
+    assert set(played) == {"random", "greedy"}
     assert 0 < played["random"] <= 2
-    assert played["greedy"] <= 2
+    assert 0 <= played["greedy"] <= 2
+    assert "episode 10: harvest" in capsys.readouterr().out
 
 
 @pytest.mark.slow

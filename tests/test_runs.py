@@ -33,10 +33,9 @@ from cprl.measuring import EpisodeTracker
 from cprl.population import Frozen, Learning
 from cprl.runs import loggers
 from cprl.runs.curves import as_curves, running_mean
-from cprl.runs.episodes import EpisodeTable, read_episodes, read_table
+from cprl.runs.episodes import EpisodeTable, Journal, read_episodes, read_journal, read_table
 from cprl.runs.export import export_results
 from cprl.runs.files import remove_listed, rename_listed, verify, write_listed
-from cprl.runs.journal import Journal, read_journal
 from cprl.runs.recipe import read_recipe, refuse_another_run, resume_command, runs_in, start_run
 from cprl.studies.factors import changed
 from cprl.system.shipped import cprl_here
@@ -245,8 +244,7 @@ def test_damage_hides_a_batch_with_those_behind_it_or_changes_values_but_nothing
         flipped = bytearray(data)
         flipped[place] ^= 64
         journal.write_bytes(flipped)
-        table = read_journal(journal)
-        assert table is None or table.num_rows <= whole.num_rows
+        assert read_journal(journal).num_rows <= whole.num_rows
 
 
 def test_a_stream_that_pyarrow_writes_is_a_journal(tmp_path):

@@ -513,6 +513,8 @@ class FakeProcess(nullcontext):
             return None
         return 143 if self.stops else None
 
+    wait = poll
+
     def kill(self):
         self.stops.append("kill")
 

@@ -3,8 +3,7 @@
 Modules, in the order in which one reads them:
     files        files that are never left half written, their formats and checksums; one process writes a run
     recipe       the run's directory and recipe.json
-    journal      rows that are safe as soon as they are written
-    episodes     the table of episodes; several tables as one
+    episodes     the table of episodes and its journal, whose rows are safe as soon as they are written
     curves       tables as curves over episodes
     checkpoints  the state of a training, to resume from, or to extend
     weights      trained networks, the state of transforms, the values of decisions

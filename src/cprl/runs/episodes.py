@@ -1,15 +1,16 @@
 """The episodes of a run as a table: one row for each replica, episode and agent.
 
-During a run every episode is appended at once to a journal, `episodes.arrows`, see `cprl.runs.journal`.
-`EpisodeTable.close` converts the journal to `episodes.parquet`; `read_episodes` reads either.
+During a run every episode is appended at once to a journal, `episodes.arrows`: an Arrow stream, which unlike
+a parquet file needs no footer and so stays readable if the process is killed. `EpisodeTable.close` converts
+it to `episodes.parquet`; `read_episodes` reads either.
 """
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from errno import EIO, ENOENT
 from functools import partial
-from io import BytesIO
+from io import BytesIO, FileIO
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Self
 
@@ -25,17 +26,94 @@ from cprl.runs.files import (
     RECIPE_FORMAT,
     read_json,
     refuse_newer,
+    refuse_special,
     refuse_to_write_over,
+    sync_folder,
     verify,
     write_atomically,
     write_listed,
 )
-from cprl.runs.journal import Journal, read_journal, write_journal
 
 FILE_NAME: Final = "episodes.parquet"
 
 _ROWS_PER_GROUP: Final = 2**16
 """Parquet files with row groups of a few rows are slow to read."""
+
+
+class Journal:
+    """Appends batches to a journal.
+
+    Args:
+        path: the file; it is created where it does not exist.
+        rows: how many of its rows are kept; what follows them is dropped.
+    """
+
+    def __init__(self, path: Path, *, rows: int = 0) -> None:
+        self.rows, bytes_kept = 0, 0
+        self.schema: pa.Schema | None = None
+        """Of all batches; None before the first."""
+        for batch, end in batches_in(path) if rows else ():
+            self.schema, self.rows, bytes_kept = batch.schema, self.rows + batch.num_rows, end
+            if self.rows >= rows:
+                break
+        if self.rows != rows:
+            raise ValueError(f"{path} holds {self.rows} rows up to there; the checkpoint has {rows}")
+        exists = path.exists()
+        self._file = FileIO(path, "r+" if exists else "x")  # unbuffered: what is written survives the process
+        self._file.truncate(bytes_kept)
+        self._file.seek(bytes_kept)
+        if not exists:
+            sync_folder(path.parent)
+
+    def append(self, batch: pa.RecordBatch) -> None:
+        """Append all of a batch or nothing: behind half of one later ones would be unreadable."""
+        end = self._file.tell()
+        left = memoryview(_message(batch, is_first=self.schema is None))
+        try:
+            while left:
+                left = left[self._file.write(left) :]
+        except BaseException:
+            self._file.seek(end)
+            self._file.truncate()
+            raise
+        self.schema, self.rows = batch.schema, self.rows + batch.num_rows
+
+    def sync(self) -> None:
+        """Wait until all that was appended is on the disk."""
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the file. A second call does nothing."""
+        self._file.close()
+
+
+def batches_in(path: Path) -> Iterator[tuple[pa.RecordBatch, int]]:
+    """The whole batches of a journal, each with the byte at which it ends.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+    """
+    refuse_special(path)
+    source = pa.BufferReader(path.read_bytes())
+    try:
+        for batch in pa.ipc.open_stream(source):
+            batch.validate()
+            yield batch, source.tell()
+    except (pa.ArrowException, OSError):  # half a batch, or half the schema, at the end
+        return
+
+
+def read_journal(path: Path) -> pa.Table:
+    """The rows of a journal; of one without a whole batch, none of all columns."""
+    batches = [batch for batch, _ in batches_in(path)]
+    return pa.Table.from_batches(batches) if batches else whole_schema().empty_table()
+
+
+def _message(batch: pa.RecordBatch, *, is_first: bool) -> bytes:
+    """A batch as it stands in a stream, the first behind the schema."""
+    header = batch.schema.serialize().to_pybytes() if is_first else b""
+    message: bytes = header + batch.serialize().to_pybytes()
+    return message
 
 
 class EpisodeTable:
@@ -159,7 +237,7 @@ def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
         refuse_newer(recipe, read_json(recipe), RECIPE_FORMAT)
     try:
         # The journal first: while it exists it holds every row, and a merge does not change it.
-        return _table_in(path.with_suffix(".arrows"))
+        return read_journal(path.with_suffix(".arrows"))
     except FileNotFoundError:
         if not path.exists():
             raise FileNotFoundError(f"{path} and its journal do not exist: is this a run?") from None
@@ -198,20 +276,16 @@ def as_table(episodes: Sequence[Episode], replica: int) -> pa.Table:
     return pa.Table.from_batches([rows_of(episodes, replica, schema_of(episodes[0]))])
 
 
-def _table_in(journal: Path) -> pa.Table:
-    """The rows of a journal; of an empty one, none of all columns."""
-    table = read_journal(journal)
-    return whole_schema().empty_table() if table is None else table
-
-
 def _reopen(path: Path, journal: Path) -> None:
+    """Write the journal of a finished table again, a batch for each episode."""
     table = read_table(path).combine_chunks()
-    agents = max(table["agent"].to_pylist(), default=0) + 1
-    write_journal(journal, table.to_batches(max_chunksize=agents))
+    batches = table.to_batches(max_chunksize=max(table["agent"].to_pylist(), default=0) + 1)
+    messages = [_message(batch, is_first=place == 0) for place, batch in enumerate(batches)]
+    write_atomically(journal, lambda file: file.writelines(messages))
 
 
 def _merge(journal: Path, target: BinaryIO, *, rows: int) -> None:
-    table = _table_in(journal)
+    table = read_journal(journal)
     if table.num_rows != rows:
         raise OSError(EIO, f"{journal} holds {table.num_rows} rows of the {rows} that were added")
     pq.write_table(table, target, row_group_size=_ROWS_PER_GROUP)

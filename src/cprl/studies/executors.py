@@ -12,7 +12,7 @@ import sys
 import time
 import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
@@ -166,17 +166,22 @@ class Processes(Value, _SideBySide, stored=False):
         return self.jobs
 
     def exit_code(self, task: Task, stops: Sequence[int]) -> int:
-        heard = 0
+        def is_over() -> bool:
+            time.sleep(_LOOK_S)
+            return process.poll() is not None
+
         with _started(task.arguments, str(task.status.log), task.variables) as process:
-            while (code := process.poll()) is None:
-                time.sleep(_LOOK_S)
-                if heard < len(stops):
-                    heard = len(stops)
-                    if heard > 1:
-                        process.kill()
-                    else:
-                        _ask_to_stop(process)
-        return code
+            _attend(is_over, stops, lambda kill: process.kill() if kill else _ask_to_stop(process))
+            return process.wait()
+
+
+def _attend(is_over: Callable[[], object], stops: Sequence[int], stop: Callable[[bool], object]) -> None:
+    """Wait until a process is over, and stop it when this one is asked to, the second time by force."""
+    heard = 0
+    while not is_over():
+        if heard < len(stops):
+            heard = len(stops)
+            stop(heard > 1)
 
 
 def _started(arguments: Sequence[str], log: str, variables: Mapping[str, str]) -> "subprocess.Popen[bytes]":
@@ -271,11 +276,12 @@ class Ray(Value, _SideBySide, stored=False):
             memory = min(memory, max(nodes))  # more than any node has would wait forever
         work = ray.remote(num_cpus=1, memory=memory, max_retries=0)(_wait)
         reference = work.remote(task.arguments, os.path.abspath(task.status.log), task.variables)
-        heard, errors = 0, ray.exceptions
-        while not ray.wait([reference], timeout=_LOOK_S)[0]:
-            if heard < len(stops):
-                heard = len(stops)
-                ray.cancel(reference, force=heard > 1)
+        errors = ray.exceptions
+        _attend(
+            lambda: ray.wait([reference], timeout=_LOOK_S)[0],
+            stops,
+            lambda kill: ray.cancel(reference, force=kill),
+        )
         try:
             return int(ray.get(reference))
         except errors.TaskCancelledError:

@@ -7,6 +7,7 @@ list. `*` stands for each value of a list; in `agents` for each agent that learn
 """
 
 import re
+from abc import ABC, abstractmethod
 from ast import literal_eval
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -128,60 +129,55 @@ WholeNumber: TypeAlias = Annotated[int, Range(-(2**53), MOST_INT32)]
 
 
 @dataclass(frozen=True)
-class Uniform(Value, stored=False):
+class Distribution(Value, ABC, stored=False):
+    """Numbers from `low` to `high`."""
+
+    low: Any
+    high: Any
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.low > self.high:
+            raise refusal(f"{type(self).__name__}.low", self.low, f"up to its high, {self.high}")
+
+    @abstractmethod
+    def at(self, share: float) -> Any:
+        """Return the number below which this share of all lies, 0..1."""
+
+
+@dataclass(frozen=True)
+class Uniform(Distribution, stored=False):
     """Numbers from `low` to `high`, equally likely."""
 
     low: Number
     high: Number
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _refuse_reversed(self)
-
     def at(self, share: float) -> float:
-        """Return the number below which this share of all lies, 0..1."""
         return self.low + share * (self.high - self.low)
 
 
 @dataclass(frozen=True)
-class LogUniform(Value, stored=False):
+class LogUniform(Distribution, stored=False):
     """Numbers above 0 from `low` to `high` whose logarithms are equally likely, e.g. learning rates."""
 
     low: NumberAbove0
     high: NumberAbove0
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _refuse_reversed(self)
-
     def at(self, share: float) -> float:
-        """See `Uniform.at`."""
         return exp(log(self.low) + share * (log(self.high) - log(self.low)))
 
 
 @dataclass(frozen=True)
-class Integers(Value, stored=False):
+class Integers(Distribution, stored=False):
     """Whole numbers from `low` to `high`, both included, equally likely."""
 
     low: WholeNumber
     high: WholeNumber
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _refuse_reversed(self)
-
     def at(self, share: float) -> int:
-        """See `Uniform.at`."""
         return min(self.low + int(share * (self.high - self.low + 1)), self.high)
 
 
-def _refuse_reversed(distribution: "Distribution") -> None:
-    if distribution.low > distribution.high:
-        name = f"{type(distribution).__name__}.low"
-        raise refusal(name, distribution.low, f"up to its high, {distribution.high}")
-
-
-Distribution: TypeAlias = Uniform | LogUniform | Integers
 Factor: TypeAlias = Sequence[Any] | Mapping[str, Mapping[str, Any]] | Distribution
 """Values of the field that its path names; or levels by name, each with its changes; or a distribution."""
 DISTRIBUTIONS: Final[dict[str, type[Any]]] = {kind.__name__: kind for kind in (Uniform, LogUniform, Integers)}

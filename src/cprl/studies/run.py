@@ -185,7 +185,7 @@ def _outcomes(tasks: Sequence[Task], executor: Executor) -> Generator[Outcome, N
         while left and not ready:
             time.sleep(_POLL_S)
             left = [replace(task, take_over=next(silences[task.name])) for task in left]
-            ready = [task for task in left if not task.is_elsewhere]
+            ready = [task for task in left if task.settled() != Outcome(task.name, "elsewhere")]
 
 
 def _others(out: Path) -> str:

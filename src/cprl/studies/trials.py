@@ -213,12 +213,6 @@ class Task:
         """Variables of its process, which imports what this one does from where this one does."""
         return {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
 
-    @property
-    def is_elsewhere(self) -> bool:
-        """Whether another process runs it now."""
-        outcome = self.settled()
-        return outcome is not None and outcome.state == "elsewhere"
-
     def settled(self) -> Outcome | None:
         """What there is to say of a trial that cannot be run now; None of one that can.
 
