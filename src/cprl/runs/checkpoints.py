@@ -24,8 +24,7 @@ from cprl.runs.files import (
     verify,
     write_atomically,
 )
-from cprl.runs.recipe import resume_command as command_to_resume
-from cprl.runs.recipe import write_more_episodes
+from cprl.runs.recipe import resume_command, write_more_episodes
 from cprl.system.output import RESUMES, say
 
 FOLDER: Final = "checkpoints"
@@ -66,7 +65,6 @@ class Checkpointer:
         every_s: seconds between checkpoints, above 0.
         keep_ending: whether the state in which the first replica has played its last episode is kept even
             after `done`: from there a training of more episodes continues bit for bit.
-        resume_command: the command line that resumes; by default that of `cprl run`.
     """
 
     def __init__(
@@ -76,13 +74,12 @@ class Checkpointer:
         every_s: float = EVERY_S,
         keep_ending: bool = True,
         take_over: bool = False,
-        resume_command: str | None = None,
     ) -> None:
         if not every_s > 0:
             raise ValueError(f"every_s is {every_s}; allowed: a number above 0")
         self.run, self.folder = run, run / FOLDER
         self.every_s, self.keep_ending = every_s, keep_ending
-        self.resume_command = command_to_resume(run) if resume_command is None else resume_command
+        self.resume_command = resume_command(run)
         self.has_begun = False
         """Whether a training has begun, or was resumed."""
         self._saved = time.monotonic()
@@ -102,21 +99,19 @@ class Checkpointer:
         for path in reversed(checkpoints_in(self.folder)):
             try:
                 training.load_state_dict(read_checkpoint(path))
-            except ValueError as error:
-                reasons.append(str(error))
+            except (ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
+                other = f"{path} does not hold the state of this training: {error!r}"
+                reasons.append(str(error) if isinstance(error, ValueError) else other)
                 cause = error
-            except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
-                reasons.append(f"{path} does not hold the state of this training: {error!r}")
-                cause = error
-            else:
-                for reason in reasons:
-                    say(f"Passed over: {reason}")
-                say(f"Resuming from step {training.steps:,}: {path}")
-                self._saved = time.monotonic()
-                self._sound = path if _is_sound(training) else None
-                self._has_ending |= training.is_ending
-                self.has_begun = True
-                return
+                continue
+            for reason in reasons:
+                say(f"Passed over: {reason}")
+            say(f"Resuming from step {training.steps:,}: {path}")
+            self._saved = time.monotonic()
+            self._sound = path if _is_sound(training) else None
+            self._has_ending |= training.is_ending
+            self.has_begun = True
+            return
         if reasons:
             raise ValueError("no checkpoint can be read: " + "; ".join(reasons)) from cause
         self.has_begun = True

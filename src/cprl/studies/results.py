@@ -36,9 +36,6 @@ def write_results(
 
     Returns:
         The table. What is no part of it is named in it and in the summary.
-
-    Raises:
-        OSError: where it cannot be written; each file is then whole, an old one or a new one.
     """
     out = Path(out)
     refuse_links(out)
@@ -57,12 +54,7 @@ def write_results(
 
 
 def write_summary(table: StudyTable, out: Path, *, last: int = LAST, again: str = "") -> Path:
-    """Writes `summary.md` of a table alone, with the figures that are there.
-
-    Args:
-        last: episodes at the end of the training that are compared.
-        again: the command line that runs what is lacking.
-    """
+    """Writes `summary.md` of a table alone, with the figures that are there; see `write_results`."""
     design = table.design
     lines = [f"# {design.name}", ""]
     for word, text in (("Question", design.question), ("Expected before it was run", design.expectation)):

@@ -27,7 +27,6 @@ def pooled_table(
     by: Sequence[str],
     window: int = WINDOW,
     reference: str | None = None,
-    allow: Sequence[str] = (),
 ) -> StudyTable:
     """Return the table of any runs. Runs with the same values are pooled: their replicas count together.
 
@@ -38,14 +37,13 @@ def pooled_table(
         runs: directories of runs, or of directories that hold them; results that `cprl export` made too.
         by: paths of fields of an experiment, see `cprl.studies.factors`, e.g. "game.rules.freeze_steps"; a
             path with `*` stands for all values there, "name" for what the run's recipe is called.
-        allow: the user's own code, "module:Class", that a run's recipe may name.
     """
     fields = [normalised(path) for path in by]
     for path in fields:
         if path in ("seed", "replicas") or fields.count(path) > 1:
             raise refusal("by", path, "other fields than seed and replicas, each once")
     paths = runs_in(runs)
-    experiments = {run: Experiment.from_recipe(read_recipe(run), allow=allow, directory=run) for run in paths}
+    experiments = {run: Experiment.from_recipe(read_recipe(run), directory=run) for run in paths}
     conditions, groups = _groups(experiments, fields)
     for name, members in groups.items():
         _refuse_seeds_twice(name, members)
