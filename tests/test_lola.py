@@ -56,7 +56,7 @@ def play(learner, steps, seen=None):
 
 
 def actor_weights(stacks):
-    return [[value.detach().clone() for value in of] for of in stacks.parameters()]
+    return [[value.detach().clone() for value in network.parameters()] for network in stacks]
 
 
 def equal(some, others):
@@ -75,7 +75,7 @@ def test_an_update_takes_two_rollouts_of_the_present_weights_or_one_and_one_for_
 
 def test_dices_others_act_by_their_weights_ahead_and_what_is_stored_evaluated_and_kept_are_the_present_ones():
     learner = learner_of("dice")
-    engine, present = learner.engine, actor_weights(learner.engine.acting)
+    engine, present = learner.engine, actor_weights(learner.engine.actors)
     seen = torch.eye(4)[None, :2].expand(2, -1, -1).clone()
     before = learner.evaluation_actor(1).preferences(seen)
     play(learner, 12)
@@ -89,8 +89,8 @@ def test_dices_others_act_by_their_weights_ahead_and_what_is_stored_evaluated_an
         assert all(torch.equal(kept[name], value) for name, value in lane.items())
         assert torch.equal(lane["layers.2.bias"], present[1 - member][3][1, 0])
         play(learner, 12)
-    assert not equal(actor_weights(engine.acting)[0], present[0])
-    assert all(map(equal, actor_weights(engine.playing), actor_weights(engine.acting)))
+    assert not equal(actor_weights(engine.actors)[0], present[0])
+    assert all(map(equal, actor_weights(engine.playing), actor_weights(engine.actors)))
 
 
 def by_hand(learner, rollouts, gamma):
@@ -128,26 +128,25 @@ def undisturbed(estimator):
         critic_epochs=0,
         rollout_steps=30,
     )
-    for of in learner.engine.critics.parameters():
-        for value in of:
-            value.data.zero_()
+    for value in learner.engine.critics.parameters():
+        value.data.zero_()
     return learner
 
 
 def test_the_step_of_policy_gradients_is_lolas_gradient_of_the_two_rollouts():
     learner = undisturbed("policy_gradient")
-    start = actor_weights(learner.engine.acting)
+    start = actor_weights(learner.engine.actors)
     play(learner, 60)
     objectives = [by_hand(learner, [rollout], 0.9) for rollout in (0, 1)]
     slopes, _ = lola_gradients(objectives, start, rate=1.0)
-    for of, before, after in zip(slopes, start, actor_weights(learner.engine.acting), strict=True):
+    for of, before, after in zip(slopes, start, actor_weights(learner.engine.actors), strict=True):
         for slope, was, now in zip(of, before, after, strict=True):
             torch.testing.assert_close(now, was - 0.5 * slope, rtol=1e-4, atol=1e-5)
 
 
 def test_the_step_of_dice_differentiates_through_the_others_step_and_the_step_is_that_which_acts():
     learner = undisturbed("dice")
-    start = actor_weights(learner.engine.acting)
+    start = actor_weights(learner.engine.actors)
     play(learner, 30)
     first = by_hand(learner, [0], 0.9)
     ahead = looked_ahead(first, start, rate=1.0)
@@ -157,7 +156,7 @@ def test_the_step_of_dice_differentiates_through_the_others_step_and_the_step_is
     parameters = [[value.clone().requires_grad_() for value in of] for of in start]
     outer = [by_hand(learner, [rollout], 0.9) for rollout in (1, 2)]
     look_ahead_losses(first, outer, parameters, rate=1.0).sum().backward()
-    for of, after in zip(parameters, actor_weights(learner.engine.acting), strict=True):
+    for of, after in zip(parameters, actor_weights(learner.engine.actors), strict=True):
         for was, now in zip(of, after, strict=True):
             torch.testing.assert_close(now, was.detach() - 0.5 * was.grad, rtol=1e-4, atol=1e-5)
 
@@ -185,7 +184,7 @@ def test_critics_learn_and_advantages_are_normalised_where_asked_and_gradients_c
 
     def error():
         with torch.no_grad():
-            return float((learner.engine.critics.of_members(observation) - target).square().mean())
+            return float((learner.engine.critics(observation) - target).square().mean())
 
     first = error()
     for _ in range(200):
@@ -193,9 +192,9 @@ def test_critics_learn_and_advantages_are_normalised_where_asked_and_gradients_c
     assert error() < first / 2
     assert not equal(actor_weights(learner.engine.critics)[1], before[1])
     clipped = learner_of("policy_gradient", max_grad_norm=1e-3, optimizer="sgd", learning_rate=1.0)
-    start = actor_weights(clipped.engine.acting)
+    start = actor_weights(clipped.engine.actors)
     play(clipped, 24)
-    for was, now in zip(start, actor_weights(clipped.engine.acting), strict=True):
+    for was, now in zip(start, actor_weights(clipped.engine.actors), strict=True):
         moved = torch.cat([(b - a).flatten(1) for a, b in zip(was, now, strict=True)], 1).norm(dim=1)
         assert (moved < 1.01e-3).all()
         assert (moved > 0.9e-3).all()

@@ -1,10 +1,11 @@
-"""What matrix games and games of taking share: clock, memory, specs, and that experiments play them."""
+"""Matrix games and games of people who share: payments, what is seen, the clock, experiments that play them."""
 
 import json
 from dataclasses import replace
 from itertools import product
 from operator import attrgetter
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -17,14 +18,24 @@ from torchrl.envs.utils import check_env_specs
 
 import cprl
 from cprl import Custom, Experiment, Study
-from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
+from cprl.algorithms import (
+    DQN,
+    LOLA,
+    PPO,
+    DQNSettings,
+    LOLASettings,
+    RolloutSettings,
+    Tabular,
+    TabularSettings,
+)
 from cprl.commands.recipe import parse
 from cprl.envs import make_env, spaces_of
-from cprl.envs.matrix import MatrixEnv, MatrixGame, chicken, prisoners_dilemma, stag_hunt
-from cprl.envs.taking import TakingEnv, TakingGame
+from cprl.envs.matrix import MatrixGame, chicken, matching_pennies, prisoners_dilemma, stag_hunt
+from cprl.envs.stage_games import StageEnv
+from cprl.envs.taking import TakingGame
 from cprl.evaluation.evaluate import differences
 from cprl.experiment import changes
-from cprl.population import Learning, Scripted
+from cprl.population import Learning, Team
 from cprl.runs.episodes import read_episodes
 from cprl.runs.weights import load_weights
 from cprl.studies.trials import trials_of
@@ -62,6 +73,217 @@ def rewards(game, *actions):
     env = make_env(game, worlds=len(actions))
     now, _ = step(env, env.reset(), *actions)
     return now["next", "agents", "reward"][..., 0].tolist()
+
+
+C, D = 0, 1
+
+
+def number_seen(moment):
+    """The number of the joint action that each agent sees, [B][N]."""
+    return moment["agents", "observation"].argmax(-1).tolist()
+
+
+@pytest.mark.parametrize(
+    ("game", "cooperate", "exploited", "exploits", "defect"),
+    [
+        (prisoners_dilemma(), [-1, -1], [-3, 0], [0, -3], [-2, -2]),
+        (prisoners_dilemma(reward=3, sucker=0, temptation=4, punishment=1), [3, 3], [0, 4], [4, 0], [1, 1]),
+        (stag_hunt(), [4, 4], [0, 3], [3, 0], [1, 1]),
+        (chicken(), [3, 3], [1, 4], [4, 1], [0, 0]),
+        (matching_pennies(), [1, -1], [-1, 1], [-1, 1], [1, -1]),
+    ],
+)
+def test_published_games_pay_what_was_published(game, cooperate, exploited, exploits, defect):
+    found = rewards(game, (C, C), (C, D), (D, C), (D, D))
+    assert found == [cooperate, exploited, exploits, defect]
+
+
+def test_agents_see_the_last_joint_action_from_their_own_side():
+    env = make_env(IPD)
+    moment = env.reset()
+    assert moment["agents", "observation"][0].tolist() == [[0, 0, 0, 0, 1]] * 2, "none yet"
+    _, moment = step(env, moment, (D, C))
+    assert moment["agents", "observation"][0].tolist() == [[0, 0, 1, 0, 0], [0, 1, 0, 0, 0]]
+    _, moment = step(env, moment, (D, D))
+    assert number_seen(moment) == [[3, 3]]
+
+
+def test_of_three_agents_each_is_paid_its_own_payoff_and_sees_its_own_action_first():
+    assert rewards(THREE, (1, 0, 1), (0, 1, 0)) == [[15.0, 16.0, 17.0], [6.0, 7.0, 8.0]]  # 3 * (4 + 1), 3 * 2
+    env = make_env(THREE)
+    _, moment = step(env, env.reset(), (1, 0, 0))
+    assert moment["agents", "observation"].shape == (1, 3, 9)
+    assert number_seen(moment) == [[4, 1, 2]]  # 100, 001 (agents 1, 2, 0) and 010 (agents 2, 0, 1)
+
+
+def test_two_remembered_joint_actions_are_seen_the_last_one_first():
+    env = make_env(prisoners_dilemma(turns=9, memory=2))
+    _, moment = step(env, env.reset(), (C, D))
+    assert moment["agents", "observation"][0, 0].tolist() == [0, 1, 0, 0, 0, 0, 0, 0, 0, 1]
+    _, moment = step(env, moment, (D, D))
+    assert moment["agents", "observation"][0, 0].tolist() == [0, 0, 0, 1, 0, 0, 1, 0, 0, 0]
+
+
+def test_a_world_that_is_over_stays_as_it_is_and_pays_nothing():
+    env = make_env(prisoners_dilemma(turns=2), worlds=2)
+    moment = env.reset()
+    for _ in range(2):
+        moment = env.step(moment.set(("agents", "action"), torch.tensor([[C, D], [C, C]])))["next"]
+    mask = torch.tensor([[False], [True]])
+    moment = env.reset(moment.select("agents", *DONES).set("_reset", mask))
+    assert moment["done"].tolist() == [[True], [False]]
+    assert number_seen(moment) == [[1, 2], [4, 4]]
+    again = env.step(moment.set(("agents", "action"), torch.tensor([[D, D], [D, D]])))["next"]
+    assert again["agents", "reward"][..., 0].tolist() == [[0, 0], [-2, -2]]
+    assert again["truncated"].tolist() == [[True], [False]]
+    assert number_seen(again) == [[1, 2], [3, 3]]
+
+
+def lengths(env, episodes):
+    """How many turns each episode of each world lasts, and whether it terminated: [B] lists."""
+    found = [[] for _ in range(env.batch_size[0])]
+    moment, turns = env.reset(), [0] * len(found)
+    while min(map(len, found)) < episodes:
+        now, moment = step(env, moment, *[(C, C)] * len(found))
+        for world, ends in enumerate(now["next", "done"][:, 0].tolist()):
+            turns[world] += 1
+            if ends:
+                found[world].append((turns[world], bool(now["next", "terminated"][world])))
+                turns[world] = 0
+    return [episodes_of_world[:episodes] for episodes_of_world in found]
+
+
+def test_with_a_probability_to_continue_episodes_terminate_by_chance_or_are_truncated_by_the_clock():
+    env = make_env(prisoners_dilemma(turns=6, continue_prob=0.75), worlds=100)
+    found = [episode for world in lengths(env, 20) for episode in world]
+    assert {turns for turns, is_final in found if not is_final} == {6}
+    assert max(turns for turns, _ in found) == 6
+    # Of 2000 episodes, 0.75**6 = 17.8 % outlast 6 turns, and 25 % end at once; standard errors below 1 %.
+    assert np.mean([not is_final for _, is_final in found]) == pytest.approx(0.178, abs=0.03)
+    assert np.mean([turns == 1 for turns, _ in found]) == pytest.approx(0.25, abs=0.03)
+
+
+def test_lengths_follow_from_seed_and_world_alone():
+    game = prisoners_dilemma(turns=50, continue_prob=0.8)
+    whole = lengths(make_env(game, worlds=5, seed=7), 4)
+    assert lengths(make_env(game, worlds=1, seed=7, first_world=3), 4) == whole[3:4]
+    env = make_env(game, worlds=5, seed=1)
+    assert lengths(env, 4) != whole
+    env.set_seed(7)
+    assert lengths(env, 4) == whole
+
+
+def test_herders_are_paid_for_their_animals_what_these_are_worth():
+    # Animals 0.5 and 1.5: A = 2, v(2) = 10 - 4 = 6, less 1 each. 2 and 2: v(4) = 0, an animal costs 1.
+    assert rewards(PAIR, (1, 3), (4, 4), (0, 4)) == [[2.5, 7.5], [-2, -2], [0, 10]]
+
+
+def test_appropriators_are_paid_what_the_laboratory_paid():
+    # 8 tokens each: F(64) = 23 * 64 - 0.25 * 64^2 = 448, an eighth is 56, and 2 tokens outside pay 10.
+    # None in the resource: 10 tokens outside pay 50. 9 each: X = 72, v = 23 - 18 = 5, as outside.
+    nash, none, open_access = rewards(LAB, (16,) * 8, (0,) * 8, (18,) * 8)
+    assert (nash, none, open_access) == ([66.0] * 8, [50.0] * 8, [50.0] * 8)
+    # Half put in 4 and half 5: X = 36 is best for all, v = 14, 9 more than outside a token.
+    assert rewards(LAB, (8, 10) * 4) == [[86.0, 95.0] * 4]
+
+
+GAMES = st.builds(
+    lambda agents, top, power, cost, levels, cap: TakingGame(
+        SharingGame(agents=agents, worth=PowerWorth(top=top, power=power), cost=cost * top, most_each=cap),
+        levels=levels,
+    ),
+    agents=st.integers(1, 9),
+    top=st.floats(0.5, 50),
+    power=st.floats(1, 4),
+    cost=st.just(0.0) | st.floats(0.01, 0.9),
+    levels=st.integers(2, 30),
+    cap=st.none() | st.floats(0.01, 2),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(game=GAMES, seed=st.integers(0, 999))
+def test_rewards_are_the_payoffs_of_the_theory_and_its_equilibrium_can_be_taken(game, seed):
+    action = np.random.default_rng(seed).integers(0, game.levels, (4, game.agents))
+    env = make_env(game, worlds=4)
+    now, _ = step(env, env.reset(), *action.tolist())
+    expected = game.sharing.payoffs(np.array(game.amounts)[action])
+    assert np.allclose(now["next", "agents", "reward"][..., 0], expected, rtol=1e-6, atol=1e-6)
+    most, sharing = game.agents * game.most_each, game.sharing
+    assert 0 < sharing.optimum_total <= sharing.nash_total <= most * (1 + 1e-12)
+    limit = sharing.most_each
+    assert game.most_each == pytest.approx(min(2 * sharing.nash_total / game.agents, limit or np.inf))
+    assert (game.amounts[0], game.amounts[-1], len(game.amounts)) == (0, game.most_each, game.levels)
+
+
+def test_by_default_appropriators_choose_half_tokens_and_herders_have_the_equilibrium_in_the_middle():
+    assert LAB.amounts[:3] == (0, 0.5, 1)
+    assert LAB.most_each == 10
+    assert TakingGame(herders(5)).amounts[10] == pytest.approx(2.5355 / 5, abs=1e-4)
+    assert PAIR.amounts == (0, 0.5, 1, 1.5, 2)
+
+
+def test_agents_see_the_share_that_they_took_and_that_all_took():
+    env = make_env(PAIR)
+    moment = env.reset()
+    assert moment["agents", "observation"][0].tolist() == [[0, 0, 0]] * 2, "no turn yet"
+    _, moment = step(env, moment, (0, 0))
+    assert moment["agents", "observation"][0].tolist() == [[1, 0, 0]] * 2
+    _, moment = step(env, moment, (1, 4))
+    assert moment["agents", "observation"][0].tolist() == [[1, 0.25, 0.625], [1, 1, 0.625]]  # 5 of 8 levels
+    env = make_env(replace(PAIR, memory=2))
+    _, moment = step(env, env.reset(), (1, 4))
+    assert moment["agents", "observation"][0, 0].tolist() == [1, 0.25, 0.625, 0, 0, 0]
+    _, moment = step(env, moment, (2, 2))
+    assert moment["agents", "observation"][0, 0].tolist() == [1, 0.5, 0.5, 1, 0.25, 0.625]
+
+
+def test_agents_with_other_numbers_see_and_get_the_same_to_the_bit():
+    env, order = make_env(replace(LAB, levels=8), worlds=2), torch.randperm(8)
+    action = torch.randint(8, (8,), generator=torch.Generator().manual_seed(3))
+    now, _ = step(env, env.reset(), action.tolist(), action[order].tolist())
+    one, other = now["next", "agents"]
+    assert torch.equal(one["observation"][order], other["observation"])
+    assert torch.equal(one["reward"][order], other["reward"])
+
+
+def test_a_game_without_gain_can_be_played_with_amounts_of_ones_own():
+    assert rewards(TakingGame(herders(2, cost=11), levels=3, most=1.0), (1, 2)) == [[-1.625, -3.25]]
+
+
+def test_a_worth_of_the_users_own_is_a_game_by_the_name_of_the_function_that_makes_it():
+    with pytest.raises(ValueError, match=r"^experiment\.game\.sharing\.worth is a CallableWorth, which a re"):
+        replace(HERDERS, game=own_game())
+    experiment = replace(HERDERS, game=Custom("test_stage_games:own_game"))
+    back = Experiment.from_recipe(experiment.to_recipe(), allow=["test_stage_games:own_game"])
+    assert make_env(back.game).game == own_game()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: MatrixGame(((1.0, 2.0), (3.0, 4.0))), r"MatrixGame.payoffs has the shape \[2, 2\]"),
+        (lambda: MatrixGame(np.zeros((2, 3, 2))), r"MatrixGame.payoffs has the shape"),
+        (lambda: MatrixGame(np.zeros((1, 1, 2))), r"MatrixGame.payoffs has the shape"),
+        (lambda: MatrixGame(np.full((2, 2, 2), np.inf)), r"MatrixGame.payoffs has inf"),
+        (lambda: MatrixGame(np.zeros((300, 300, 2))), r"MatrixGame.payoffs has 180,000 numbers"),
+        (lambda: MatrixGame((((1, 1), (1, 1)), ((1, 1), (1,)))), r"MatrixGame.payoffs"),
+        (lambda: replace(IPD, turns=1, continue_prob=0.5), r"MatrixGame.continue_prob is 0.5"),
+        (lambda: prisoners_dilemma(temptation=-1.5), "temptation > reward > punishment > sucker"),
+        (lambda: stag_hunt(temptation=5), "reward > temptation > sucker"),
+        (lambda: chicken(punishment=2), "temptation > reward > sucker > punishment"),
+        (lambda: matching_pennies(stake=0), "stake is 0"),
+        (lambda: replace(LAB, most=10.5), r"TakingGame.most is 10.5"),
+        (lambda: replace(LAB, most=0), "TakingGame.most is 0"),
+        (lambda: TakingGame(herders(2, cost=11)), r"TakingGame.most is None"),
+        (lambda: replace(LAB, levels=1), "TakingGame.levels is 1"),
+        (lambda: TakingGame(herders(10**6)), r"TakingGame.levels is 21; allowed for 1,000,000 agents"),
+        (lambda: replace(LAB, turns=1, continue_prob=0.5), r"TakingGame.continue_prob is 0.5"),
+    ],
+)
+def test_games_that_cannot_be_played_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
 
 
 @EITHER_GAME
@@ -105,20 +327,13 @@ def test_it_is_an_environment_of_torchrl_that_can_be_put_where_it_was(game, worl
     assert spaces.observation_scale == 1.0
 
 
-@pytest.mark.parametrize(
-    ("kind", "game"),
-    [
-        (MatrixEnv, prisoners_dilemma(turns=4, continue_prob=0.6)),
-        (TakingEnv, replace(PAIR, turns=4, continue_prob=0.6)),
-        (TakingEnv, CHANCY),
-    ],
-)
-def test_the_lean_step_equals_torchrls_own(kind, game):
-    class Stock(kind):
+@pytest.mark.parametrize("game", [prisoners_dilemma(turns=4, continue_prob=0.6), CHANCY])
+def test_the_lean_step_equals_torchrls_own(game):
+    class Stock(StageEnv):
         _step_and_maybe_reset = EnvBase._step_and_maybe_reset
 
-    assert kind._step_and_maybe_reset is LeanStepEnv._step_and_maybe_reset
-    lean, stock = (made(game, 4, seed=3) for made in (kind, Stock))
+    assert StageEnv._step_and_maybe_reset is LeanStepEnv._step_and_maybe_reset
+    lean, stock = (made(game, 4, seed=3) for made in (StageEnv, Stock))
     torch.manual_seed(0)
     actions = [lean.action_spec["agents", "action"].rand() for _ in range(30)]
     steps, copies = rolled(lean, actions)
@@ -157,12 +372,6 @@ def rolled(env, actions):
         copies.append(step.clone())
     last = moment.exclude(("agents", "action"))  # which is overwritten
     return [*steps, last], [*copies, last.clone()]
-
-
-@EITHER_GAME
-def test_a_chance_to_continue_needs_several_turns(game):
-    with pytest.raises(ValueError, match=rf"{type(game).__name__}.continue_prob is 0.5"):
-        replace(game, turns=1, continue_prob=0.5)
 
 
 @pytest.mark.parametrize(
@@ -244,6 +453,8 @@ def test_its_recipe_holds_it_and_gives_it_back_without_importing_anything(experi
     assert back == experiment
     assert (back.game, hash(back.game)) == (experiment.game, hash(experiment.game))
     assert changes(experiment, other) == [change]
+    longer = differences(experiment.game, replace(experiment.game, turns=4))
+    assert longer == [f"{table['kind']}.turns 5 and 4"]
 
 
 @pytest.mark.integration
@@ -284,11 +495,6 @@ def test_a_population_trains_stops_resumes_loads_and_meets_another(
         cprl.crossplay([loaded, other_game], episodes=2)
 
 
-@EITHER_GAME
-def test_two_games_differ_in_the_fields_that_differ(game):
-    assert differences(game, replace(game, turns=4)) == [f"{type(game).__name__}.turns 3 and 4"]
-
-
 @pytest.mark.parametrize(
     ("experiment", "factors"),
     [
@@ -313,7 +519,60 @@ def test_their_numbers_are_flags_of_a_command_line():
     assert experiment.game == replace(HERDERS.game, turns=7, sharing=sharing)
 
 
-@pytest.mark.parametrize("experiment", [DILEMMA, HERDERS], ids=["matrix", "taking"])
-def test_scripted_policies_that_read_a_window_are_refused(experiment):
-    with pytest.raises(ValueError, match=r"Scripted\('greedy'\) reads the window of a cprl.Game"):
-        cprl.run(replace(experiment, agents=[Scripted("greedy"), Scripted()]), "never")
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    ("agents", "engine"),
+    [
+        pytest.param([Learning(Tabular(settings=TabularSettings()))] * 2, "eager", id="tables"),
+        pytest.param(DILEMMA.agents, "torchrl", marks=pytest.mark.slow, id="stock TorchRL"),
+        pytest.param(
+            *([Team(LOLA(settings=LOLASettings(rollout_steps=2, hidden_cells=(4,))), (0, 1))], "eager"),
+            marks=pytest.mark.slow,
+            id="LOLA",
+        ),
+    ],
+)
+def test_learners_of_every_kind_play_it(agents, engine, tmp_path):
+    experiment = replace(HERDERS, agents=agents, episodes=3, engine=engine)
+    run = cprl.load(cprl.run(experiment, tmp_path / "run", watch="off"))
+    evaluated = cprl.evaluate_run(run, episodes=2).measures()["agent_1/return"].estimate
+    assert -10 <= evaluated.value <= 50
+
+
+@pytest.mark.slow
+def test_independent_tables_end_at_the_equilibrium_and_one_agent_at_the_optimum(tmp_path):
+    """One agent takes 36 of 72 tokens; two, where each knows only what it got, 24 each."""
+    for agents, total in ((1, 36), (2, 48)):
+        sharing = appropriation(agents, tokens=60.0)
+        learner = TabularSettings(gamma=0.0, epsilon_decay_steps=5000, epsilon_end=0.02, epsilon_evaluation=0)
+        experiment = replace(
+            HERDERS,
+            game=TakingGame(sharing, levels=13, most=36.0 if agents == 1 else 48.0, turns=50, memory=0),
+            agents=[Learning(Tabular(settings=learner))] * agents,
+            replicas=8,
+            episodes=200,
+        )
+        run = cprl.load(cprl.run(experiment, tmp_path / str(agents), watch="off"))
+        episodes = cprl.evaluate_run(run, episodes=1).trained
+        paid = np.mean([episode.return_.sum() for replica in episodes.values() for episode in replica]) / 50
+        rent = paid - agents * sharing.payment
+        assert rent == pytest.approx(sharing.surplus(total), rel=0.03)
+
+
+@pytest.mark.slow
+def test_dqn_learns_to_defect_in_the_one_shot_dilemma(tmp_path):
+    """Defection is dominant, so five of five pairs end there: -2 each (a theorem, not a published figure)."""
+    settings = replace(SMALL, learning_rate=1e-2, buffer_size=1000, epsilon_decay_steps=500)
+    settings = replace(settings, epsilon_evaluation=0.0)
+    experiment = replace(
+        DILEMMA,
+        game=prisoners_dilemma(),
+        agents=[Learning(DQN(settings=settings))] * 2,
+        replicas=5,
+        episodes=2000,
+    )
+    run = cprl.load(cprl.run(experiment, tmp_path / "run", watch="off"))
+    episodes = cprl.evaluate_run(run, episodes=5).trained
+    assert all(
+        episode.return_.tolist() == [-2.0, -2.0] for replica in episodes.values() for episode in replica
+    )

@@ -1,20 +1,20 @@
 """Matrix games: agents choose at once and are paid by a table, once or for several turns.
 
-`MatrixGame` is a payoff table as a value, `prisoners_dilemma` and others are published ones, and `MatrixEnv`
-plays B worlds of one.
+`MatrixGame` is a payoff table as a value; `prisoners_dilemma` and others are published ones.
 Sources: Foerster et al. (2018), "Learning with Opponent-Learning Awareness", AAMAS; Leibo et al. (2017),
 "Multi-agent Reinforcement Learning in Sequential Social Dilemmas", AAMAS.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar, Final, TypedDict, Unpack
+from typing import Any, Final, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from cprl.envs.stage_games import StageEnv, StageGame
+from cprl.envs.stage_games import StageGame
 from cprl.values import MOST_NUMBER, refusal
 
 _MOST_PAYOFFS: Final = 2**16
@@ -22,9 +22,13 @@ _MOST_PAYOFFS: Final = 2**16
 
 @dataclass(frozen=True)
 class MatrixGame(StageGame):
-    """A game of N agents who choose among A actions each, at once, and are paid by a table; where it is
-    played for several turns, agents observe the last joint actions, each as A**N + 1 numbers. When it ends,
-    see `StageGame`.
+    """A game of N agents who choose among A actions each, at once, and are paid by a table. When it ends, see
+    `StageGame`.
+
+    Of each remembered joint action, the last one first, agents observe A**N + 1 numbers of which one is 1.
+    Each agent sees joint actions from its own side: its own action first, then those of the following
+    agents, cyclically. Of two agents with two actions, agent 0 sees the joint action (1, 0) as number 2 of
+    0..3, agent 1 as number 1. The number A**N stands for a turn before the first.
     """
 
     payoffs: Any
@@ -45,9 +49,32 @@ class MatrixGame(StageGame):
         """The number of actions A of each agent."""
         return len(self.payoffs)
 
-    def make(self, worlds: int, seed: int, device: Any, *, first_world: int = 0) -> "MatrixEnv":
-        """Its environment, so many worlds; see `MatrixEnv`."""
-        return MatrixEnv(self, worlds, seed=seed, device=device, first_world=first_world)
+    def tables(self, device: torch.device) -> "_Tables":
+        joint, agents = self.actions**self.agents, torch.arange(self.agents)
+        after = (agents - agents[:, None]) % self.agents
+        payoffs = torch.tensor(self.payoffs, dtype=torch.float32, device=device)
+        return _Tables(
+            torch.tensor(joint, device=device),
+            payoffs.reshape(joint, self.agents),
+            (self.actions ** (self.agents - 1 - after)).to(device),
+        )
+
+    def pay(self, tables: "_Tables", action: Tensor) -> tuple[Tensor, Tensor]:
+        seen = (action[:, None] * tables.places).sum(-1)
+        return tables.payoffs[seen[:, 0]], seen
+
+    def observe(self, tables: "_Tables", memory: Tensor) -> Tensor:
+        seen = torch.zeros(*memory.shape, len(tables.payoffs) + 1, device=memory.device)
+        return seen.scatter_(-1, memory.unsqueeze(-1), 1.0).flatten(2)
+
+
+class _Tables(NamedTuple):
+    blank: Tensor
+    """A**N, the number of a joint action before the first."""
+    payoffs: Tensor
+    """What agents are paid, [A**N, N], by the number of the joint action as agent 0 sees it."""
+    places: Tensor
+    """By which each agent's action (column) counts in the number that an agent (row) sees, [N, N]."""
 
 
 def _table(payoffs: Any) -> tuple[Any, ...]:
@@ -102,8 +129,9 @@ def prisoners_dilemma(
         temptation: of who defects alone.
         punishment: of both where both defect.
     """
-    _check_order(temptation=temptation, reward=reward, punishment=punishment, sucker=sucker)
-    return _symmetric(reward, sucker, temptation, punishment, clock)
+    return _symmetric(
+        ("temptation > reward > punishment > sucker",), clock, reward, sucker, temptation, punishment
+    )
 
 
 def stag_hunt(
@@ -119,9 +147,8 @@ def stag_hunt(
     Arguments are those of `prisoners_dilemma`, where to cooperate is to hunt the stag. Refuses others than
     reward > temptation > sucker and reward > punishment > sucker.
     """
-    _check_order(reward=reward, temptation=temptation, sucker=sucker)
-    _check_order(reward=reward, punishment=punishment, sucker=sucker)
-    return _symmetric(reward, sucker, temptation, punishment, clock)
+    orders = "reward > temptation > sucker", "reward > punishment > sucker"
+    return _symmetric(orders, clock, reward, sucker, temptation, punishment)
 
 
 def chicken(
@@ -137,8 +164,9 @@ def chicken(
     Arguments are those of `prisoners_dilemma`, where to cooperate is to swerve. Refuses others than
     temptation > reward > sucker > punishment.
     """
-    _check_order(temptation=temptation, reward=reward, sucker=sucker, punishment=punishment)
-    return _symmetric(reward, sucker, temptation, punishment, clock)
+    return _symmetric(
+        ("temptation > reward > sucker > punishment",), clock, reward, sucker, temptation, punishment
+    )
 
 
 def matching_pennies(*, stake: float = 1.0, **clock: Unpack[Clock]) -> MatrixGame:
@@ -153,47 +181,14 @@ def matching_pennies(*, stake: float = 1.0, **clock: Unpack[Clock]) -> MatrixGam
 
 
 def _symmetric(
-    reward: float, sucker: float, temptation: float, punishment: float, clock: Clock
+    orders: Sequence[str], clock: Clock, reward: float, sucker: float, temptation: float, punishment: float
 ) -> MatrixGame:
-    both_cooperate, both_defect = (reward, reward), (punishment, punishment)
-    one_defects = (sucker, temptation), (temptation, sucker)
-    return MatrixGame(((both_cooperate, one_defects[0]), (one_defects[1], both_defect)), **clock)
-
-
-def _check_order(**payoffs: float) -> None:
-    """Raise a ValueError unless each payoff is above the next."""
-    if not all(one > other for one, other in pairwise(payoffs.values())):
-        came = ", ".join(f"{name} {value:g}" for name, value in payoffs.items())
-        raise ValueError(f"the payoffs are {came}; allowed: {' > '.join(payoffs)}")
-
-
-class MatrixEnv(StageEnv):
-    """B worlds of a matrix game; entries as in `StageEnv`.
-
-    Of each remembered joint action, the last one first, agents observe A**N + 1 numbers of which one is 1.
-    Each agent sees joint actions from its own side: its own action first, then those of the following
-    agents, cyclically. Of two agents with two actions, agent 0 sees the joint action (1, 0) as number 2 of
-    0..3, agent 1 as number 1. The number A**N stands for a turn before the first.
-    """
-
-    memory_name: ClassVar[str] = "joint"
-    game: MatrixGame
-
-    def prepare(self) -> Tensor:
-        agents, actions = self.game.agents, self.game.actions
-        self._none = actions**agents
-        payoffs = torch.tensor(self.game.payoffs, dtype=torch.float32, device=self.device)
-        self._payoffs = payoffs.reshape(self._none, agents)
-        """What agents are paid, [A**N, N], by the number of the joint action as agent 0 sees it."""
-        after = (torch.arange(agents) - torch.arange(agents)[:, None]) % agents
-        self._places = (actions ** (agents - 1 - after)).to(self.device)
-        """By which each agent's action (column) counts in the number that an agent (row) sees, [N, N]."""
-        return torch.tensor(self._none, device=self.device)
-
-    def pay(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        seen = (action[:, None] * self._places).sum(-1)
-        return self._payoffs[seen[:, 0]], seen
-
-    def observe(self, memory: Tensor) -> Tensor:
-        seen = torch.zeros(*memory.shape, self._none + 1, device=self.device)
-        return seen.scatter_(-1, memory.unsqueeze(-1), 1.0).flatten(2)
+    """The game of these payoffs; raises a ValueError unless they are in these orders."""
+    payoffs = {"reward": reward, "sucker": sucker, "temptation": temptation, "punishment": punishment}
+    for order in orders:
+        names = order.split(" > ")
+        if not all(payoffs[one] > payoffs[other] for one, other in pairwise(names)):
+            came = ", ".join(f"{name} {payoffs[name]:g}" for name in names)
+            raise ValueError(f"the payoffs are {came}; allowed: {order}")
+    cooperates, defects = ((reward, reward), (sucker, temptation)), ((temptation, sucker), (punishment,) * 2)
+    return MatrixGame((cooperates, defects), **clock)

@@ -1,9 +1,8 @@
 """Stage games: all that happens is the agents' joint action, once or for several turns; B worlds at once."""
 
-from abc import abstractmethod
 from dataclasses import dataclass
 from math import log1p
-from typing import Annotated, Any, ClassVar, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import torch
@@ -42,16 +41,34 @@ class StageGame(Value, stored=False):
     continue_prob: PositiveShare = 1.0
     """The probability that a further turn follows."""
 
-    @property
-    def remembered(self) -> int:
-        """The number of turns that agents observe: `memory`, or what its default means."""
-        return int(self.turns > 1) if self.memory is None else self.memory
-
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.turns == 1 and self.continue_prob < 1:
             name = type(self).__name__
             raise ValueError(f"{name}.continue_prob is {self.continue_prob}; allowed for one turn: 1.0")
+
+    @property
+    def remembered(self) -> int:
+        """The number of turns that agents observe: `memory`, or what its default means."""
+        return int(self.turns > 1) if self.memory is None else self.memory
+
+    def make(self, worlds: int, seed: int, device: Any, *, first_world: int = 0) -> "StageEnv":
+        """Its environment, so many worlds."""
+        return StageEnv(self, worlds, seed=seed, device=device, first_world=first_world)
+
+    def tables(self, device: torch.device) -> Any:
+        """The tensors by which a game pays, on a device; `blank` of them is what agents remember of a turn
+        before the first."""
+        raise NotImplementedError
+
+    def pay(self, tables: Any, action: Tensor) -> tuple[Tensor, Tensor]:
+        """The rewards of a joint action, float32 [B, N], in a new tensor, and what each agent may remember of
+        it, [B, N, ...]."""
+        raise NotImplementedError
+
+    def observe(self, tables: Any, memory: Tensor) -> Tensor:
+        """What agents see of the turns that they remember, float32 [B, N, size], in a new tensor."""
+        raise NotImplementedError
 
 
 class StageEnv(LeanStepEnv):
@@ -70,8 +87,6 @@ class StageEnv(LeanStepEnv):
     """
 
     batch_locked = True
-    memory_name: ClassVar[str]
-    """The name of the buffer that holds the last turns, [B, N, remembered, ...], the last one first."""
 
     def __init__(
         self,
@@ -89,15 +104,13 @@ class StageEnv(LeanStepEnv):
         self.game, self._first_world = game, first_world
         self.group_map = {keys.AGENTS: [f"agent_{agent}" for agent in range(game.agents)]}
         self._agents_size = torch.Size([worlds, game.agents])
-        self._remembered: int = game.remembered
-        self._never = torch.zeros(worlds, 1, dtype=torch.bool, device=device)
         for name, dtype in _STATE.items():
             self.register_buffer(name, torch.zeros(worlds, 1, dtype=dtype, device=device))
         self.register_buffer("seed_bits", torch.zeros((), dtype=torch.int64))
         self._set_seed(seed)
-        self._blank = self.prepare()
-        shape = *self._agents_size, self._remembered, *self._blank.shape
-        self.register_buffer(self.memory_name, self._blank.expand(shape).clone())
+        self._tables = game.tables(device)
+        shape = *self._agents_size, game.remembered, *self._tables.blank.shape
+        self.register_buffer(_MEMORY, self._tables.blank.expand(shape).clone())
         self._make_specs()
 
     def __repr__(self) -> str:
@@ -121,34 +134,11 @@ class StageEnv(LeanStepEnv):
         flag = {name: flag_spec(*size, 1).to(self.device) for name in (keys.DONE, *_ENDS)}
         self.done_spec = Composite(flag, shape=size, device=self.device)
 
-    @abstractmethod
-    def prepare(self) -> Tensor:
-        """Put the tables that `pay` reads on the device; returns what agents remember of a turn before the
-        first."""
-
-    @abstractmethod
-    def pay(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        """The rewards of a joint action, float32 [B, N], in a new tensor, and what each agent may remember of
-        it, [B, N, ...]."""
-
-    @abstractmethod
-    def observe(self, memory: Tensor) -> Tensor:
-        """What agents see of the turns that they remember, float32 [B, N, size], in a new tensor."""
-
     def _observe(self) -> Tensor:
-        if not self._remembered:
+        if not self.game.remembered:
             return torch.ones(*self._agents_size, 1, device=self.device)
-        memory: Any = self._buffers[self.memory_name]
-        return self.observe(memory)
-
-    def _remember(self, turn: Tensor, over: Tensor | None) -> None:
-        """Keep a turn, [B, N, ...], as the last one, except in worlds that are over, bool [B, 1] (None: in
-        none)."""
-        before: Any = self._buffers[self.memory_name]
-        memory = torch.cat((turn.unsqueeze(2), before[:, :, :-1]), 2)
-        if over is not None:
-            memory = torch.where(over.reshape(-1, *(1,) * (memory.ndim - 1)), before, memory)
-        self._buffers[self.memory_name] = memory
+        seen: Tensor = self.game.observe(self._tables, self._buffers[_MEMORY])
+        return seen
 
     def lean_step(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """Does the same as `EnvBase.step_and_maybe_reset`, without its handling of keys; a test checks it."""
@@ -177,17 +167,15 @@ class StageEnv(LeanStepEnv):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         action = self._checked_action(tensordict)
-        state = self._buffers
-        over: Any = state["turn"] >= state["last_turn"]
-        is_any_over = bool(over.any())
-        paid, turn = self.pay(action)
-        if self._remembered:
-            self._remember(turn, over if is_any_over else None)
-        if is_any_over:
-            paid = torch.where(over, 0.0, paid)
-            state["turn"] = torch.where(over, state["turn"], state["turn"] + 1)
-        else:
-            state["turn"] = state["turn"] + 1
+        state: Any = self._buffers
+        over = state["turn"] >= state["last_turn"]
+        paid, turn = self.game.pay(self._tables, action)
+        if self.game.remembered:
+            before = state[_MEMORY]
+            memory = torch.cat((turn.unsqueeze(2), before[:, :, :-1]), 2)
+            state[_MEMORY] = torch.where(_like(over, memory), before, memory)
+        paid = torch.where(over, 0.0, paid)
+        state["turn"] = torch.where(over, state["turn"], state["turn"] + 1)
         return self._moment({"observation": self._observe(), "reward": paid.unsqueeze(-1)}, self._ends())
 
     def _ends(self) -> dict[str, Any]:
@@ -207,7 +195,7 @@ class StageEnv(LeanStepEnv):
     def _reset_worlds(self, which: Tensor | None) -> TensorDict:
         """Begins the next episode of these worlds, bool [B, 1] (None: of all)."""
         state: Any = self._buffers
-        marked = ~self._never if which is None else which
+        marked = torch.ones_like(state["is_final"]) if which is None else which
         state["turn"] = torch.where(marked, 0, state["turn"])
         state["episode"] = state["episode"] + marked
         if self.game.continue_prob < 1.0:
@@ -217,9 +205,8 @@ class StageEnv(LeanStepEnv):
         else:
             state["last_turn"] = state["last_turn"].masked_fill(marked, self.game.turns)
             state["is_final"] = state["is_final"].masked_fill(marked, self.game.turns == 1)
-        memory = state[self.memory_name]
-        marked = marked.reshape(-1, *(1,) * (memory.ndim - 1))
-        state[self.memory_name] = torch.where(marked, self._blank, memory)
+        memory = state[_MEMORY]
+        state[_MEMORY] = torch.where(_like(marked, memory), self._tables.blank, memory)
         return self._moment({"observation": self._observe()}, self._ends())
 
     def _lengths(self) -> tuple[Tensor, Tensor]:
@@ -247,6 +234,13 @@ class StageEnv(LeanStepEnv):
             self._buffers[name] = torch.zeros_like(self._buffers[name])
 
 
+def _like(flags: Tensor, memory: Tensor) -> Tensor:
+    """Flags of worlds, [B, 1], with the axes of a memory."""
+    return flags.reshape(-1, *(1,) * (memory.ndim - 1))
+
+
+_MEMORY: Final = "memory"
+"""The buffer of the last turns, [B, N, remembered, ...], the last one first."""
 _ENDS: Final = (keys.TERMINATED, keys.TRUNCATED)
 _STATE: Final = {
     "turn": torch.int64,

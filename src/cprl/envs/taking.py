@@ -1,16 +1,13 @@
-"""Games of people who share a resource: agents choose at once how much they take, once or for several turns.
-
-`TakingGame` is a `cprl.theory.SharingGame` that agents play, and `TakingEnv` plays B worlds of one.
-"""
+"""Games of people who share a resource: agents choose at once how much they take, once or several times."""
 
 from dataclasses import KW_ONLY, dataclass
-from typing import Annotated, Any, ClassVar, Final
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from cprl.envs.stage_games import StageEnv, StageGame
+from cprl.envs.stage_games import StageGame
 from cprl.theory.sharing import Above0, SharingGame
 from cprl.values import Range
 
@@ -23,11 +20,11 @@ most that it can take, and the share that all took of the most that all can take
 
 @dataclass(frozen=True)
 class TakingGame(StageGame):
-    """A game in which each of n agents chooses, all at once, how much it takes of what they share.
+    """A `cprl.theory.SharingGame` that agents play: all choose at once how much they take of what they share.
 
     Agents are paid `SharingGame.payoffs`. They choose one of `levels` evenly spaced amounts from 0 to
-    `most_each`. Where it is played for several turns, agents observe what they took in the last ones, each as
-    three numbers. When it ends, see `StageGame`.
+    `most_each`. Of each remembered turn, the last one first, agents observe the numbers of `OBSERVED`, all
+    0 for a turn before the first. When it ends, see `StageGame`.
 
     A recipe holds games whose worth is a `PowerWorth`. A worth of your own, e.g. a `CallableWorth`, can be
     played; in an experiment the game is then a `Custom` of a function that makes it.
@@ -80,36 +77,31 @@ class TakingGame(StageGame):
         """What an agent takes by its action 0, 1 and so on."""
         return tuple(np.linspace(0, self.most_each, self.levels).tolist())
 
-    def make(self, worlds: int, seed: int, device: Any, *, first_world: int = 0) -> "TakingEnv":
-        """Its environment, so many worlds; see `TakingEnv`."""
-        return TakingEnv(self, worlds, seed=seed, device=device, first_world=first_world)
+    def tables(self, device: torch.device) -> "_Tables":
+        totals = self.agents * (self.levels - 1) + 1
+        taken = np.linspace(0, self.agents * self.most_each, totals)
+        gains = np.vectorize(self.sharing.worth.at, otypes=[np.float64])(taken) - self.sharing.cost
+        return _Tables(
+            torch.zeros(len(OBSERVED), device=device),
+            torch.tensor(self.amounts, dtype=torch.float64, device=device),
+            torch.from_numpy(gains).to(device),
+        )
 
-
-class TakingEnv(StageEnv):
-    """B worlds of a `TakingGame`; entries as in `StageEnv`, rewards computed in double precision.
-
-    Of each remembered turn, the last one first, agents observe the numbers of `OBSERVED`; all 0 for a turn
-    before the first.
-    """
-
-    memory_name: ClassVar[str] = "seen"
-    game: TakingGame
-
-    def prepare(self) -> Tensor:
-        game, totals = self.game, self.game.agents * (self.game.levels - 1) + 1
-        taken = np.linspace(0, game.agents * game.most_each, totals)
-        gains = np.vectorize(game.sharing.worth.at, otypes=[np.float64])(taken) - game.sharing.cost
-        self._amounts = torch.tensor(game.amounts, dtype=torch.float64, device=self.device)
-        self._gains = torch.from_numpy(gains).to(self.device)
-        """What a unit is worth beyond its cost, by the sum of all levels."""
-        return torch.zeros(len(OBSERVED), device=self.device)
-
-    def pay(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        total, most = action.sum(-1, keepdim=True), self.game.levels - 1
-        paid = self._amounts[action] * self._gains[total] + self.game.sharing.payment
-        share, of_all = action / most, total / (most * self.game.agents)
+    def pay(self, tables: "_Tables", action: Tensor) -> tuple[Tensor, Tensor]:
+        total, most = action.sum(-1, keepdim=True), self.levels - 1
+        paid = tables.amounts[action] * tables.gains[total] + self.sharing.payment
+        share, of_all = action / most, total / (most * self.agents)
         turn = torch.stack((torch.ones_like(share), share, of_all.expand_as(share)), -1).float()
         return paid.float(), turn.clamp(0, 1)
 
-    def observe(self, memory: Tensor) -> Tensor:
+    def observe(self, tables: "_Tables", memory: Tensor) -> Tensor:
         return memory.flatten(2).clone()
+
+
+class _Tables(NamedTuple):
+    blank: Tensor
+    """Zeros, the numbers of `OBSERVED` of a turn before the first."""
+    amounts: Tensor
+    """What an agent takes by each action, float64: rewards are computed in double precision."""
+    gains: Tensor
+    """What a unit is worth beyond its cost, by the sum of all levels."""

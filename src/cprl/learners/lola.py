@@ -1,24 +1,15 @@
 """LOLALearner: teams whose members learn with the others' learning in view."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from typing import Any, Final
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.objectives import LossModule
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from cprl.learners.engine import (
-    BETA_1,
-    BETA_2,
-    WITH_MEAN,
-    WITH_SQUARE,
-    UpdateRule,
-    change_weights,
-    total,
-)
+from cprl.learners.engine import UpdateRule, shortened, torch_optimizer, total
 from cprl.learners.lanes import WEIGHTS, Acts, LaneLearner, LearningAgents, Method
 from cprl.learners.rollouts import refuse_full, refuse_other_parts, rollout_fields, write_turn
 from cprl.learners.settings import LOLASettings
@@ -30,144 +21,78 @@ from cprl.objectives import LOLADiCELoss, dice_objective
 _SMALL: Final = 1e-8
 
 
-class Steps:
-    """An optimiser of the parameters of S members, [R, ...] each; it clips the gradients of each member of
-    each replica."""
+class Members(nn.ModuleList):
+    """One network of each of S members, with the parameters of R replicas; lane = replica x S + member."""
 
-    def __init__(self, parameters: Sequence[Sequence[nn.Parameter]], rule: UpdateRule) -> None:
-        self._parameters, self._rule, self.count = parameters, rule, 0
-        name = rule.optimizer
-        self.means = [[torch.zeros_like(value) for value in of] for of in parameters if name in WITH_MEAN]
-        self.squares = [[torch.zeros_like(value) for value in of] for of in parameters if name in WITH_SQUARE]
-
-    def descend(self, loss: Tensor) -> None:
-        """One step along the gradient of a sum over members and replicas."""
-        self.count += 1
-        flat = [value for of in self._parameters for value in of]
-        slopes = list(torch.autograd.grad(loss, flat))
-        for member, of in enumerate(self._parameters):
-            gradients, slopes = slopes[: len(of)], slopes[len(of) :]
-            change_weights(
-                self._rule,
-                [value.data for value in of],
-                gradients,
-                self.means[member] if self.means else (),
-                self.squares[member] if self.squares else (),
-                step_size=gradients[0].new_tensor(self._rule.learning_rate / (1 - BETA_1**self.count)),
-                scale=gradients[0].new_tensor((1 - BETA_2**self.count) ** -0.5),
-            )
-
-    def moments(self, member: int) -> list[Tensor]:
-        """What it keeps of a member, [R, ...] each."""
-        return [value for of in (self.means, self.squares) if of for value in of[member]]
-
-    def state_dict(self) -> dict[str, Any]:
-        return {"count": self.count, "means": self.means, "squares": self.squares}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self.count = int(state["count"])
-        for name in ("means", "squares"):
-            copy_all(getattr(self, name), state[name])
-
-
-def copy_all(values: Sequence[Sequence[Tensor]], state: Sequence[Sequence[Tensor]]) -> None:
-    """Copies the tensors of each member into its own, in place."""
-    for of, others in zip(values, state, strict=True):
-        for value, other in zip(of, others, strict=True):
-            value.copy_(other)
-
-
-class MemberStacks:
-    """One network of each of S members, with the parameters of R replicas; lane = replica x S + member.
-
-    Args:
-        networks: of each member, the parameters with an axis of replicas in front.
-        forms: a network of one replica of each member, of which architecture alone matters.
-    """
-
-    def __init__(self, networks: Sequence[nn.Module], forms: Sequence[nn.Module]) -> None:
-        self.networks, self._forms = list(networks), list(forms)
-
-    def of_members(self, observation: Tensor) -> Tensor:
+    def forward(self, observation: Tensor) -> Tensor:
         """[R, .., S, *shape] to [R, .., S, outputs]."""
-        form: Any = self._forms[0]
-        seen = observation.unbind(-1 - form.observation_dims)
-        return torch.stack(
-            [network(of_member) for network, of_member in zip(self.networks, seen, strict=True)], -2
-        )
+        first: Any = self[0]
+        seen = observation.unbind(-1 - first.observation_dims)
+        return torch.stack([network(of_member) for network, of_member in zip(self, seen, strict=True)], -2)
 
     def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Tensor:
         """[R x S, k, *shape] to [R x S, k, outputs]; there is one part, 0."""
-        by_replica = observation.reshape(-1, len(self.networks), *observation.shape[1:]).transpose(1, 2)
-        return self.of_members(by_replica).transpose(1, 2).flatten(0, 1)
+        by_replica = observation.reshape(-1, len(self), *observation.shape[1:]).transpose(1, 2)
+        return self.forward(by_replica).transpose(1, 2).flatten(0, 1)
 
     def network_state(self, lane: int) -> dict[str, Tensor]:
-        replica, member = divmod(lane, len(self.networks))
-        return lane_state(self.networks[member], replica)
-
-    def parameters(self) -> list[list[nn.Parameter]]:
-        """The parameters of each member, [R, ...] each."""
-        return [list(network.parameters()) for network in self.networks]
-
-    def copy_from(self, other: "MemberStacks", members: Sequence[int]) -> None:
-        for member in members:
-            pairs = zip(self.parameters()[member], other.parameters()[member], strict=True)
-            for parameter, value in pairs:
-                parameter.data.copy_(value.data)
+        replica, member = divmod(lane, len(self))
+        return lane_state(self[member], replica)
 
 
-class LOLANetworks:
+class LOLANetworks(nn.Module):
     """The actors and critics of all teams, and their optimisers.
 
     Args:
         networks: `AgentNetworks` of "actor" and "critic" for each lane, replica by replica.
-        make_loss: makes the loss from an `nn.ModuleList` of the members' networks.
     """
 
-    def __init__(
-        self,
-        networks: Sequence[Any],
-        *,
-        members: int,
-        make_loss: Callable[[nn.Module], LossModule],
-        settings: LOLASettings,
-    ) -> None:
+    def __init__(self, networks: Sequence[Any], method: Method, *, members: int) -> None:
+        super().__init__()
+        settings: LOLASettings = method.settings
         stacks: list[Any] = [stack_lanes(networks[member::members]) for member in range(members)]
-        forms = networks[:members]
-        actors, critics = (
-            ([stack[name] for stack in stacks], [form[name] for form in forms])
-            for name in ("actor", "critic")
+        self.actors, self.critics = (
+            Members([stack[name] for stack in stacks]) for name in ("actor", "critic")
         )
-        self.acting, self.critics = MemberStacks(*actors), MemberStacks(*critics)
-        self.playing = MemberStacks(deepcopy(actors[0]), actors[1])
-        self.loss = make_loss(nn.ModuleList(stacks))
-        looks = isinstance(self.loss, LOLADiCELoss)
-        self.ahead = MemberStacks(deepcopy(actors[0]), actors[1]) if looks else None
-        self.policy_steps = Steps(self.acting.parameters(), UpdateRule.of(settings))
-        self.critic_steps = Steps(
-            self.critics.parameters(), UpdateRule(learning_rate=settings.critic_learning_rate)
-        )
+        self.playing = deepcopy(self.actors)
+        loss = method.make_loss(nn.ModuleList(stacks))
+        self.ahead = deepcopy(self.actors) if isinstance(loss, LOLADiCELoss) else None
+        object.__setattr__(self, "loss", loss)  # no submodule: its weights are those of the actors
+        self.rule = UpdateRule.of(settings)
+        of_critics = UpdateRule(learning_rate=settings.critic_learning_rate)
+        self.optimizers = [
+            torch_optimizer(self.rule, self.actors.parameters(), fused=None),
+            torch_optimizer(of_critics, self.critics.parameters(), fused=None),
+        ]
 
     def play(self, member: int | None) -> None:
         """From now on all act by their present weights; with a member, the others by those ahead."""
-        everyone = range(len(self.acting.networks))
-        self.playing.copy_from(self.acting, [other for other in everyone if member in (None, other)])
-        if member is not None and self.ahead is not None:
-            self.playing.copy_from(self.ahead, [other for other in everyone if other != member])
+        for number, network in enumerate(self.playing):
+            weights = self.actors if member in (None, number) or self.ahead is None else self.ahead
+            network.load_state_dict(weights[number].state_dict())
 
     def look_ahead(self, rollouts: TensorDict) -> None:
         """Puts the weights ahead to those after a naive step, from rollouts [R, B, T] of the present ones."""
         assert isinstance(self.loss, LOLADiCELoss)
         assert self.ahead is not None
+        pairs = zip(self.actors.parameters(), self.ahead.parameters(), strict=True)
+        then = {value.data_ptr(): ahead for value, ahead in pairs}
         for member, table in enumerate(self.loss.look_ahead(rollouts)):
-            of_loss = self.loss.actors_params.get(str(member)).items(True, True)
-            names = {value.data_ptr(): key for key, value in of_loss}
-            pairs = zip(self.acting.parameters()[member], self.ahead.parameters()[member], strict=True)
-            for parameter, then in pairs:
-                then.data.copy_(table.get(names[parameter.data_ptr()]))
+            present = self.loss.actors_params.get(str(member))
+            for key, value in table.items(True, True):
+                then[present.get(key).data_ptr()].data.copy_(value)
 
     def update_policies(self, rollouts: TensorDict) -> None:
-        self.policy_steps.descend(total(self.loss(rollouts), self.loss))
+        policies, _ = self.optimizers
+        policies.zero_grad()
+        total(self.loss(rollouts), self.loss).backward()
+        if self.rule.max_grad_norm is not None:
+            for network in self.actors:
+                weights = list(network.parameters())
+                gradients = [weight.grad for weight in weights if weight.grad is not None]
+                for weight, slope in zip(weights, shortened(gradients, self.rule.max_grad_norm), strict=True):
+                    weight.grad = slope
+        policies.step()
 
     def update_critics(self, observation: Tensor, target: Tensor) -> None:
         """One step of all critics along their mean squared errors.
@@ -176,44 +101,36 @@ class LOLANetworks:
             observation: [R, P, T, S, *shape].
             target: the values wanted, [R, P, T, S, 1].
         """
-        error = (self.critics.of_members(observation) - target).square()
-        self.critic_steps.descend(error.mean((1, 2)).sum())
+        _, critics = self.optimizers
+        critics.zero_grad()
+        (self.critics(observation) - target).square().mean((1, 2)).sum().backward()
+        critics.step()
 
     def finite(self) -> Tensor:
-        each = []
-        for member in range(len(self.acting.networks)):
-            weights = [value for stacks in self._stacks().values() for value in stacks.parameters()[member]]
-            moments = [
-                value for steps in (self.policy_steps, self.critic_steps) for value in steps.moments(member)
-            ]
-            each.append(finite_lanes([*weights, *moments]))
-        return torch.stack(each, -1)
-
-    def state_dict(self) -> dict[str, Any]:
-        return {
-            **{name: _data(stacks) for name, stacks in self._stacks().items()},
-            "policy_steps": self.policy_steps.state_dict(),
-            "critic_steps": self.critic_steps.state_dict(),
+        """Whether the weights and moments of each member are finite, bool [R, S]."""
+        moments = {
+            weight: [value for value in state.values() if value.ndim]
+            for optimizer in self.optimizers
+            for weight, state in optimizer.state.items()
         }
+        stacks = [self.actors, self.critics, self.playing, *([] if self.ahead is None else [self.ahead])]
+        of_members = [
+            [weight for stack in stacks for weight in stack[member].parameters()]
+            for member in range(len(self.actors))
+        ]
+        sound = [
+            finite_lanes([*weights, *(moment for weight in weights for moment in moments.get(weight, ()))])
+            for weights in of_members
+        ]
+        return torch.stack(sound, -1)
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        for name, stacks in self._stacks().items():
-            copy_all(_data(stacks), state[name])
-        self.policy_steps.load_state_dict(state["policy_steps"])
-        self.critic_steps.load_state_dict(state["critic_steps"])
+    def get_extra_state(self) -> list[dict[str, Any]]:
+        """The state of both optimisers; part of `state_dict`."""
+        return [optimizer.state_dict() for optimizer in self.optimizers]
 
-    def _stacks(self) -> dict[str, MemberStacks]:
-        stacks = {
-            "actors": self.acting,
-            "critics": self.critics,
-            "playing": self.playing,
-            "ahead": self.ahead,
-        }
-        return {name: stack for name, stack in stacks.items() if stack is not None}
-
-
-def _data(stacks: MemberStacks) -> list[list[Tensor]]:
-    return [[value.data for value in of] for of in stacks.parameters()]
+    def set_extra_state(self, state: list[dict[str, Any]]) -> None:
+        for optimizer, moments in zip(self.optimizers, state, strict=True):
+            optimizer.load_state_dict(moments)
 
 
 class LOLALearner(LaneLearner):
@@ -238,21 +155,20 @@ class LOLALearner(LaneLearner):
 
     def __init__(self, who: LearningAgents, method: Method, *, compile: bool = True) -> None:
         super().__init__(who, method)
-        settings: LOLASettings = method.settings
         networks = self._lanes.new_networks(WEIGHTS)
         refuse_other_parts(networks[0])
         members = len(self.agents)
-        self.engine = LOLANetworks(networks, members=members, make_loss=method.make_loss, settings=settings)
+        self.engine = LOLANetworks(networks, method, members=members)
         self._looks_ahead = isinstance(self.engine.loss, LOLADiCELoss)
         self.rollouts = 1 + members if self._looks_ahead else 2
         """The number P of rollouts that an update takes."""
         self.actor = self._lanes.actor(self.engine.playing, compile=compile)
-        self._rollouts = rollout_fields(self._lanes, (self.rollouts, settings.rollout_steps))
+        self._rollouts = rollout_fields(self._lanes, (self.rollouts, self.rollout_steps))
         self._size, self._phase = 0, 0
 
     @property
     def present(self) -> Acts:
-        return self.engine.acting
+        return self.engine.actors
 
     @property
     def rollout_steps(self) -> int:
@@ -314,8 +230,8 @@ class LOLALearner(LaneLearner):
             advantage, target = generalized_advantage_estimate(
                 self.settings.gamma,
                 self.settings.gae_lambda,
-                critics.of_members(columns["observation"]),
-                critics.of_members(columns["next_observation"]),
+                critics(columns["observation"]),
+                critics(columns["next_observation"]),
                 *(columns[name].unsqueeze(-1) for name in ("reward", "done", "terminated")),
                 time_dim=2,
             )

@@ -8,7 +8,8 @@ sequence may hold several episodes, and may begin in the middle of one.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Unpack
+from operator import attrgetter
+from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, Unpack
 
 import torch
 from torch import Tensor, nn
@@ -139,32 +140,22 @@ class StackedRecurrent(nn.Module):
     def __init__(self, networks: Sequence[RecurrentNetwork]) -> None:
         super().__init__()
         first = networks[0]
-        forms = {
-            (*network.cell.weight_ih.shape, *network.cell.weight_hh.shape, network.outputs)
-            for network in networks
-        }
+        forms = {tuple(value.shape for value in _layers(network)) for network in networks}
         if len(forms) != 1:
             raise ValueError(f"the networks of the lanes have {len(forms)} architectures; allowed: 1")
         self.lanes, self.outputs = len(networks), first.outputs
         self.observation_dims, self.state_shape = first.observation_dims, first.state_shape
         self.encoder = stack_lanes([network.encoder for network in networks])
         layers = zip(*map(_layers, networks), strict=True)
-        self.weights = nn.ParameterList(
-            [torch.stack([one.detach() for one in lanes]).contiguous() for lanes in layers]
-        )
+        self.weights = nn.ParameterList([torch.stack(lanes).detach().contiguous() for lanes in layers])
 
     def lane_state(self, lane: int) -> dict[str, Tensor]:
         """Copies of the weights of one lane, as the state dict of its `RecurrentNetwork`."""
-        layers = _Weights(*(weight[lane].detach() for weight in self.weights))
         state = {f"encoder.{name}": value for name, value in lane_state(self.encoder, lane).items()}
-        return state | {
-            "cell.weight_ih": layers.input.T.clone(),
-            "cell.weight_hh": layers.state.T.clone(),
-            "cell.bias_ih": layers.input_bias[0].clone(),
-            "cell.bias_hh": layers.state_bias[0].clone(),
-            "head.weight": layers.head.T.clone(),
-            "head.bias": layers.head_bias[0].clone(),
-        }
+        for name, weight in zip(_NAMES, self.weights, strict=True):
+            layer = weight[lane].detach().clone()
+            state[name] = layer[0] if "bias" in name else layer.T.contiguous()
+        return state
 
     def forward(
         self, observation: Tensor, state: Tensor, is_init: Tensor | None = None
@@ -179,17 +170,21 @@ class StackedRecurrent(nn.Module):
         return _outputs(_Weights(*self.weights), features, state, is_init, (self.lanes, -1, steps))
 
 
+_NAMES: Final = (
+    "cell.weight_ih",
+    "cell.bias_ih",
+    "cell.weight_hh",
+    "cell.bias_hh",
+    "head.weight",
+    "head.bias",
+)
+"""The parameters after the encoder, in the order of `_Weights`."""
+
+
 def _layers(network: RecurrentNetwork) -> _Weights:
     """The layers of one network after its encoder, without a lane axis."""
-    cell, head = network.cell, network.head
-    return _Weights(
-        cell.weight_ih.T,
-        cell.bias_ih[None],
-        cell.weight_hh.T,
-        cell.bias_hh[None],
-        head.weight.T,
-        head.bias[None],
-    )
+    weights = attrgetter(*_NAMES)(network)
+    return _Weights(*(weight.T if weight.ndim > 1 else weight[None] for weight in weights))
 
 
 def _outputs(
@@ -204,47 +199,31 @@ def _outputs(
     leading, numbers = features.shape[:-1], state.shape[-1]
     gates = torch.baddbmm(weights.input_bias, features.reshape(lanes, -1, features.shape[-1]), weights.input)
     gates, state = gates.view(lanes, -1, steps, gates.shape[-1]), state.reshape(*size, numbers)
-    if is_init is None:
-        after = _step(weights, gates[:, :, 0], state[:, :, 0]).unsqueeze(2)
-    else:
-        after = _through_time(weights, gates, state, is_init.reshape(*size, 1))
-    put_out = after[..., : weights.state.shape[-2]].reshape(lanes, -1, weights.state.shape[-2])
-    outputs = torch.baddbmm(weights.head_bias, put_out, weights.head)
-    return outputs.reshape(*leading, outputs.shape[-1]), after.reshape(*leading, numbers)
-
-
-def _through_time(weights: _Weights, gates: Tensor, state: Tensor, is_init: Tensor) -> Tensor:
-    """The states after each step of sequences, [L, n, T, K]."""
-    now, after = state[:, :, 0], []
     # Unbound once: the gradient of an index per step would be as large as the sequence.
-    each = zip(gates.unbind(2), state.unbind(2), is_init.unbind(2), strict=True)
-    for step, (of_input, given, begins) in enumerate(each):
-        now = _step(weights, of_input, torch.where(begins, given, now) if step else now)
+    begins = None if is_init is None else is_init.reshape(*size, 1).unbind(2)
+    now, after = state[:, :, 0], []
+    for step, (of_input, given) in enumerate(zip(gates.unbind(2), state.unbind(2), strict=True)):
+        if step and begins is not None:
+            now = torch.where(begins[step], given, now)
+        now = _step(weights, of_input, now)
         after.append(now)
-    return torch.stack(after, 2)
+    states = torch.stack(after, 2)
+    cells = weights.state.shape[-2]
+    put_out = states[..., :cells].reshape(lanes, -1, cells)
+    outputs = torch.baddbmm(weights.head_bias, put_out, weights.head)
+    return outputs.reshape(*leading, outputs.shape[-1]), states.reshape(*leading, numbers)
 
 
 def _step(weights: _Weights, of_input: Tensor, state: Tensor) -> Tensor:
-    """The states after a step, [L, n, K]."""
+    """The states after a step, [L, n, K], by the formulas of `torch.nn.GRU` and `torch.nn.LSTM`."""
     cells, gates = weights.state.shape[-2:]
-    return (_gru_step if gates == 3 * cells else _lstm_step)(weights, of_input, state)
-
-
-def _gru_step(weights: _Weights, of_input: Tensor, state: Tensor) -> Tensor:
-    """By the formulas of `torch.nn.GRU`; gates are reset, update and the new value."""
-    cells = state.shape[-1]
-    of_state = torch.baddbmm(weights.state_bias, state, weights.state)
-    both = (of_input[..., : 2 * cells] + of_state[..., : 2 * cells]).sigmoid()
-    reset, update = both.chunk(2, -1)
-    new = torch.addcmul(of_input[..., 2 * cells :], reset, of_state[..., 2 * cells :]).tanh()
-    return torch.lerp(new, state, update)
-
-
-def _lstm_step(weights: _Weights, of_input: Tensor, state: Tensor) -> Tensor:
-    """By the formulas of `torch.nn.LSTM`; gates are input, forget, the new value and output."""
-    hidden, memory = state.chunk(2, -1)
-    gates = of_input + torch.baddbmm(weights.state_bias, hidden, weights.state)
-    enters, stays, new, leaves = gates.chunk(4, -1)
+    before, memory = state[..., :cells], state[..., cells:]
+    of_state = torch.baddbmm(weights.state_bias, before, weights.state)
+    if gates == 3 * cells:
+        reset, update = (of_input[..., : 2 * cells] + of_state[..., : 2 * cells]).sigmoid().chunk(2, -1)
+        new = torch.addcmul(of_input[..., 2 * cells :], reset, of_state[..., 2 * cells :]).tanh()
+        return torch.lerp(new, before, update)
+    enters, stays, new, leaves = (of_input + of_state).chunk(4, -1)
     memory = torch.addcmul(stays.sigmoid() * memory, enters.sigmoid(), new.tanh())
     return torch.cat([leaves.sigmoid() * memory.tanh(), memory], -1)
 

@@ -17,7 +17,7 @@ begin of its piece.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -30,22 +30,16 @@ Parameters: TypeAlias = Sequence[Sequence[Tensor]]
 """For each of N agents the tensors that it learns, of any shapes."""
 Objective: TypeAlias = Callable[[list[list[Tensor]]], Tensor]
 """Maps the parameters of N agents to their losses [.., N], by operations that torch differentiates twice."""
-Factor: TypeAlias = Literal["detached", "both"]
-"""What is differentiated of the product of two gradients that LOLA adds to a loss: "detached", the step of
-the others alone, as in the paper; "both", also the factor by which their step matters."""
-
 _Flat: TypeAlias = tuple[Tensor, ...]
-_Slopes: TypeAlias = dict[tuple[int, int], Tensor]
-"""The gradient of the loss of an agent by a tensor, by the place of each."""
 
 
 def lola_gradients(
-    objectives: Sequence[Objective], parameters: Parameters, *, rate: float, factor: Factor = "detached"
+    objectives: Sequence[Objective], parameters: Parameters, *, rate: float
 ) -> tuple[list[list[Tensor]], Tensor]:
-    """The gradient along which each agent descends, and the losses.
+    """Return the gradient along which each agent descends, and the losses.
 
     For agent i it is dL_i/dtheta_i - rate * sum over j of (dL_i/dtheta_j) . (d2L_j/dtheta_j dtheta_i), with
-    the first factor of the product as a constant, or differentiated too, see `Factor`.
+    the first factor of the product as a constant, as in the paper.
 
     Args:
         objectives: one that is exact; or several independent estimates of it, each from a batch of its own.
@@ -59,113 +53,83 @@ def lola_gradients(
         over them.
     """
     flat, owners = _flat(parameters)
-    flat = tuple(value.detach() for value in flat)
-    agents = range(len(parameters))
-    followed = [(i, p) for i in agents for p, owner in enumerate(owners) if factor == "both" or owner == i]
+    values = tuple(value.detach() for value in flat)
     estimates: list[Any] = [
-        torch.func.vjp(_slopes(objective, owners, followed), *flat, has_aux=True) for objective in objectives
+        torch.func.vjp(_slopes(objective, owners), *values, has_aux=True) for objective in objectives
     ]
-    slopes: list[_Slopes] = [aux[0] for _, _, aux in estimates]
-    gradients = [_mean([slope[i, p] for slope in slopes]) for p, i in enumerate(owners)]
-    for one, (_, pull, _) in enumerate(estimates if rate else ()):
-        others = slopes[:one] + slopes[one + 1 :] or slopes
-        for i in agents:
-            for p, product in enumerate(pull(_weights(i, followed, owners, others))):
-                if owners[p] == i:
-                    gradients[p] = gradients[p] - rate / len(estimates) * product
-    losses = _mean([aux[1].detach() for _, _, aux in estimates])
-    return _by_agent(gradients, owners), losses
+    slopes: list[list[_Flat]] = [aux[0] for _, _, aux in estimates]
+    gradients = [
+        _mean([of_agents[agent][place] for of_agents in slopes]) for place, agent in enumerate(owners)
+    ]
+    for number, (_, pull, _) in enumerate(estimates if rate else ()):
+        others = slopes[:number] + slopes[number + 1 :] or slopes
+        for agent in range(len(parameters)):
+            steps_matter = tuple(
+                torch.zeros_like(value)
+                if owner == agent
+                else _mean([of_agents[agent][place] for of_agents in others]).detach()
+                for place, (value, owner) in enumerate(zip(values, owners, strict=True))
+            )
+            for place, product in enumerate(pull(steps_matter)):
+                if owners[place] == agent:
+                    gradients[place] = gradients[place] - rate / len(estimates) * product
+    return _by_agent(gradients, owners), _mean([aux[1].detach() for _, _, aux in estimates])
 
 
 def looked_ahead(
-    objective: Objective, parameters: Parameters, *, rate: float, steps: int = 1, still: int | None = None
+    objective: Objective, parameters: Parameters, *, rate: float, still: int | None = None
 ) -> list[list[Tensor]]:
-    """The parameters after naive steps of all agents: theta_j - rate * dL_j/dtheta_j, so often.
-
-    They are differentiable by `parameters`.
+    """Return the parameters after a naive step of all agents, theta_j - rate * dL_j/dtheta_j; differentiable.
 
     Args:
         rate: the step size, 0..1e12.
-        steps: how many steps, 1..1000.
         still: the index of an agent that does not move.
     """
     flat, owners = _flat(parameters)
-    followed = [(i, p) for p, i in enumerate(owners) if i != still]
-    for _ in range(steps):
-        slopes = dict(zip(followed, _slopes(objective, owners, followed)(*flat)[0], strict=True))
-        flat = tuple(
-            value - rate * slopes[i, p] if (i, p) in slopes else value
-            for p, (i, value) in enumerate(zip(owners, flat, strict=True))
-        )
-    return _by_agent(flat, owners)
+    slopes: _Flat = _slopes(objective, owners)(*flat)[0]
+    ahead = [
+        value if agent == still else value - rate * slope
+        for value, slope, agent in zip(flat, slopes, owners, strict=True)
+    ]
+    return _by_agent(ahead, owners)
 
 
 def look_ahead_losses(
-    inner: Objective,
-    outer: Sequence[Objective],
-    parameters: Parameters,
-    *,
-    rate: float,
-    steps: int = 1,
+    inner: Objective, outer: Sequence[Objective], parameters: Parameters, *, rate: float
 ) -> Tensor:
-    """The losses of each agent after the others' steps, [.., N]; of its gradients, only each agent's own
-    exists.
+    """Return the losses of each agent after the others' step, [.., N]; of its gradients, only each agent's
+    own exists.
 
-    Nothing is approximated: `backward` of the sum differentiates through the steps.
+    Nothing is approximated: `backward` of the sum differentiates through the step.
 
     Args:
         inner: what the others step by.
-        outer: what agent i has after their steps, for each agent; agent i reads the entry i of its losses.
-        steps: how many steps they take, 1..1000.
+        outer: what agent i has after their step, for each agent; agent i reads the entry i of its losses.
     """
     losses = []
-    for i, objective in enumerate(outer):
+    for agent, objective in enumerate(outer):
         attached = [
-            list(of) if j == i else [value.detach() for value in of] for j, of in enumerate(parameters)
+            list(values) if other == agent else [value.detach() for value in values]
+            for other, values in enumerate(parameters)
         ]
-        ahead = looked_ahead(inner, attached, rate=rate, steps=steps, still=i)
-        losses.append(objective(ahead)[..., i])
+        losses.append(objective(looked_ahead(inner, attached, rate=rate, still=agent))[..., agent])
     return torch.stack(losses, -1)
 
 
 def _slopes(
-    objective: Objective, owners: list[int], followed: list[tuple[int, int]]
-) -> Callable[..., tuple[_Flat, tuple[_Slopes, Tensor]]]:
-    """A function of all tensors: the gradients that are followed, and beside them all gradients and
-    losses."""
+    objective: Objective, owners: list[int]
+) -> Callable[..., tuple[_Flat, tuple[list[_Flat], Tensor]]]:
+    """A function of all tensors: the gradient of its own agent's loss by each; beside them those of each
+    agent's loss by each tensor, and the losses."""
 
-    def slopes(*flat: Tensor) -> tuple[_Flat, tuple[_Slopes, Tensor]]:
-        agents = owners[-1] + 1
-
-        def losses_of(*values: Tensor) -> Tensor:
-            return objective(_by_agent(values, owners))
-
+    def slopes(*flat: Tensor) -> tuple[_Flat, tuple[list[_Flat], Tensor]]:
         losses: Tensor
-        losses, pull = torch.func.vjp(losses_of, *flat)[:2]
-        units = torch.eye(agents, dtype=losses.dtype, device=losses.device)
-        every = {
-            (i, p): slope
-            for i in range(agents)
-            for p, slope in enumerate(pull(units[i].expand_as(losses).contiguous()))
-        }
-        return tuple(every[at] for at in followed), (every, losses)
+        losses, pull = torch.func.vjp(lambda *values: objective(_by_agent(values, owners)), *flat)[:2]
+        units = torch.eye(owners[-1] + 1, dtype=losses.dtype, device=losses.device)
+        of_agents = [pull(unit.expand_as(losses).contiguous()) for unit in units]
+        return tuple(of_agents[agent][place] for place, agent in enumerate(owners)), (of_agents, losses)
 
     return slopes
-
-
-def _weights(
-    i: int, followed: list[tuple[int, int]], owners: list[int], estimates: Sequence[_Slopes]
-) -> _Flat:
-    """What the gradients that are followed are multiplied by for agent i: where they are another agent's
-    step, by how much it matters to i; where they are how much that matters, by the step."""
-
-    def weight(j: int, p: int) -> Tensor:
-        first = estimates[0][j, p]
-        if i == owners[p] or i != j != owners[p]:
-            return torch.zeros_like(first)
-        return _mean([slopes[i if j == owners[p] else owners[p], p] for slopes in estimates]).detach()
-
-    return tuple(weight(j, p) for j, p in followed)
 
 
 def _mean(values: Sequence[Tensor]) -> Tensor:
@@ -174,7 +138,7 @@ def _mean(values: Sequence[Tensor]) -> Tensor:
 
 def _flat(parameters: Parameters) -> tuple[_Flat, list[int]]:
     """All tensors, and the agent of each."""
-    pairs = [(value, agent) for agent, of in enumerate(parameters) for value in of]
+    pairs = [(value, agent) for agent, values in enumerate(parameters) for value in values]
     return tuple(value for value, _ in pairs), [agent for _, agent in pairs]
 
 
@@ -190,40 +154,25 @@ def magic_box(log_prob: Tensor) -> Tensor:
     return (log_prob - log_prob.detach()).exp()
 
 
-def dice_objective(
-    log_prob: Tensor,
-    reward: Tensor,
-    *,
-    gamma: float,
-    done: Tensor | None = None,
-    baseline: Tensor | None = None,
-) -> Tensor:
-    """The mean discounted return of the pieces of each rollout, [.., N], differentiable any number of times.
+def dice_objective(log_prob: Tensor, reward: Tensor, *, gamma: float, done: Tensor | None = None) -> Tensor:
+    """Return the mean discounted return of the pieces of each rollout, [.., N], differentiable any number of
+    times.
 
     Args:
         gamma: the discount per step, 0..1.
         done: whether a piece ends with this step, bool [.., T, 1]; by default none does before the last.
-        baseline: what the returns from a step on are compared with, float [.., T, N], without a gradient. It
-            may depend on all that was there before the step's actions. It changes no expected derivative of
-            any order, and the variance of all: DiCE's own, which serves the first order, has the term
-            (1 - box of the step) here, which is (boxes up to the step before - boxes up to the step).
     """
     steps = _steps(log_prob, gamma, done)
-    paid = steps.so_far * reward
-    if baseline is not None:
-        paid = paid + (steps.before - steps.so_far) * baseline.detach()
-    return (steps.discount * paid).sum(-2) / steps.pieces
+    return (steps.discount * steps.so_far * reward).sum(-2) / steps.pieces
 
 
 def loaded_dice(log_prob: Tensor, advantage: Tensor, *, gamma: float, done: Tensor | None = None) -> Tensor:
-    """Zeros [.., N] with the derivatives, of any order, of the mean discounted return of pieces.
+    """Return zeros [.., N] with the derivatives, of any order, of the mean discounted return of pieces.
 
     Args:
         advantage: an estimate of each action's advantage, float [.., T, N], without a gradient. Returns to
             the end of the piece less a baseline are unbiased, and then this is `dice_objective`, less its
             value; what bootstraps, as generalised advantage estimates do, has less variance and a bias.
-        gamma: the discount per step, 0..1.
-        done: whether a piece ends with this step, bool [.., T, 1]; by default none does before the last.
     """
     steps = _steps(log_prob, gamma, done)
     gained = steps.discount * (steps.so_far - steps.before) * advantage.detach()
@@ -322,24 +271,23 @@ class _OfPolicies(LossModule):
 
     def _objective(self, rollouts: TensorDictBase) -> Objective:
         """The agents' losses over rollouts [.., B, T], as means over the B rollouts, [.., N]."""
-        action = rollouts.get(self.tensor_keys.action)
-        advantage = rollouts.get(self.tensor_keys.advantage).squeeze(-1)
-        done = rollouts.get(self.tensor_keys.done)
+        action, advantage, done = (rollouts.get(name) for name in self.in_keys[1:])
 
         def losses(parameters: list[list[Tensor]]) -> Tensor:
             taken = [
                 self._policy(agent, weights, rollouts).log_prob(action.select(rollouts.batch_dims, agent))
                 for agent, weights in enumerate(parameters)
             ]
-            gained = loaded_dice(torch.stack(taken, -1), advantage, gamma=self.gamma, done=done)
+            gained = loaded_dice(torch.stack(taken, -1), advantage.squeeze(-1), gamma=self.gamma, done=done)
             return -gained.mean(-2)
 
         return losses
 
     def _losses(self, objective: Tensor, rollouts: TensorDictBase) -> TensorDict:
         """The output of `forward`, whose entropies are those of the present policies."""
-        parameters = self._weights()
-        each = [self._policy(agent, weights, rollouts).entropy() for agent, weights in enumerate(parameters)]
+        each = [
+            self._policy(agent, weights, rollouts).entropy() for agent, weights in enumerate(self._weights())
+        ]
         lanes = rollouts.batch_dims - 2
         entropy = torch.stack([entropy.flatten(lanes).mean(-1) for entropy in each], -1)
         loss = -self.entropy_coeff * entropy.sum()
@@ -363,7 +311,6 @@ class LOLALoss(_OfPolicies):
             take, 0..1e12; 0 is naive learning.
         gamma: the discount per step, 0..1; the first step of each piece of a rollout counts in full.
         entropy_coeff: the weight of the policies' entropy in the loss, 0..1e6.
-        factor: what is differentiated, see `lola_gradients`.
 
     `forward` reads rollouts [.., B, T], B even: "observation" [.., B, T, N, *shape], "action" [.., B, T, N],
     "advantage" float [.., B, T, N, 1], "done" bool [.., B, T, 1]; `set_keys` renames them. Axes before B hold
@@ -375,36 +322,19 @@ class LOLALoss(_OfPolicies):
     of first order only; "loss_entropy"; and "entropy" [.., N], in nats, without a gradient.
     """
 
-    def __init__(
-        self,
-        actors: Sequence[ProbabilisticTensorDictSequential],
-        *,
-        look_ahead_rate: float = 1.0,
-        gamma: float = 0.99,
-        entropy_coeff: float = 0.0,
-        factor: Factor = "detached",
-    ) -> None:
-        super().__init__(actors, look_ahead_rate=look_ahead_rate, gamma=gamma, entropy_coeff=entropy_coeff)
-        self.factor = factor
-
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         if tensordict.batch_dims < 2 or tensordict.shape[-2] % 2:
             raise ValueError(
                 f"the rollouts are {list(tensordict.shape)}; allowed: [.., B, T] with an even B, whose "
                 "halves are independent"
             )
-        halves = tensordict.chunk(2, tensordict.batch_dims - 2)
+        objectives = [self._objective(half) for half in tensordict.chunk(2, tensordict.batch_dims - 2)]
         parameters = self._weights()
-        gradients, _ = lola_gradients(
-            [self._objective(half) for half in halves],
-            parameters,
-            rate=self.look_ahead_rate,
-            factor=self.factor,
-        )
+        gradients, _ = lola_gradients(objectives, parameters, rate=self.look_ahead_rate)
         carried = [
             ((value - value.detach()) * slope.detach()).sum()
-            for of, slopes in zip(parameters, gradients, strict=True)
-            for value, slope in zip(of, slopes, strict=True)
+            for values, slopes in zip(parameters, gradients, strict=True)
+            for value, slope in zip(values, slopes, strict=True)
         ]
         return self._losses(torch.stack(carried).sum(), tensordict)
 
@@ -430,7 +360,7 @@ class LOLADiCELoss(_OfPolicies):
         new tensors under the names of each actor's own."""
         ahead = looked_ahead(
             self._objective(rollouts),
-            [[value.detach() for value in of] for of in self._weights()],
+            [[value.detach() for value in values] for values in self._weights()],
             rate=self.look_ahead_rate,
         )
         return [
@@ -450,28 +380,3 @@ class LOLADiCELoss(_OfPolicies):
             rate=self.look_ahead_rate,
         )
         return self._losses(losses.sum(), now)
-
-
-def iterated_value(probabilities: Tensor, payoffs: Tensor | Sequence[Any], *, gamma: float) -> Tensor:
-    """The discounted return of each of N agents who repeat a matrix game for ever, [.., N].
-
-    It is p_0 (I - gamma P)^-1 r, where p_0 has the chances of the joint actions of the first turn, row a of P
-    those of the turn after the joint action a, and r the payoffs. Times (1 - gamma) it is a mean per turn.
-
-    Args:
-        probabilities: of the actions of each agent, float [.., N, A**N + 1, A], after each joint action of
-            the last turn, whose number is a_1 * A**(N-1) + .. + a_N; in the last row, at the first turn.
-            Every agent sees the joint action in the same order.
-        payoffs: of the joint actions, [A, .., A, N]; nested tuples or a tensor.
-        gamma: the discount per turn, 0 or more and below 1.
-
-    Source: Foerster et al., "Learning with Opponent-Learning Awareness" (2018), whose exact learners use it.
-    """
-    paid = torch.as_tensor(payoffs, dtype=probabilities.dtype, device=probabilities.device)
-    agents, joint = paid.ndim - 1, paid.shape[0] ** (paid.ndim - 1)
-    chances = probabilities[..., 0, :, :]
-    for agent in range(1, agents):
-        chances = (chances.unsqueeze(-1) * probabilities[..., agent, :, None, :]).flatten(-2)
-    after, first = chances[..., :joint, :], chances[..., joint, :]
-    visits: Tensor = torch.linalg.solve(torch.eye(joint).to(after) - gamma * after.mT, first)
-    return visits @ paid.reshape(joint, agents)
