@@ -1,4 +1,4 @@
-"""Matrix games and games of people who share: payments, what is seen, the clock, experiments that play them."""
+"""Matrix games and games of people who share: payments, what is seen, the clock, experiments of them."""
 
 import json
 from dataclasses import replace
