@@ -14,7 +14,8 @@ import cprl
 from cprl import presets
 from cprl.commands import main as cli
 from cprl.envs import CommonsGymnasiumEnv, parallel_env
-from cprl.envs.matrix import MatrixEnv, stag_hunt
+from cprl.envs.make_env import make_env
+from cprl.envs.matrix import stag_hunt
 
 PACKAGES = (
     *("algorithms", "commons", "envs", "evaluation", "institutions", "keys"),
@@ -72,7 +73,7 @@ def test_what_is_printed_says_in_a_line_what_one_asks_first():
     env = cprl.CommonsEnv(game, worlds=3)
     for printed in (env, TransformedEnv(env, StepCounter())):
         assert is_short(printed, "12 x 24", "4 agents", "worlds=3", "cpu"), printed
-    assert is_short(MatrixEnv(stag_hunt(), worlds=3), "2 agents", "worlds=3")
+    assert is_short(make_env(stag_hunt(), worlds=3), "2 agents", "worlds=3")
     for adapter in (parallel_env(game), CommonsGymnasiumEnv(alone)):
         assert is_short(adapter, "Game("), adapter
     assert is_short(game.map, "12 x 24", "89 sites", "4 agents")

@@ -23,7 +23,6 @@ from cprl.learners.preferences import (
     PreferenceWrapper,
     SocialValueOrientation,
     WantedRewards,
-    wanted_rewards,
 )
 from cprl.training.collectors import StepCollector
 
@@ -54,9 +53,13 @@ PREFERENCES = st.one_of(
 )
 
 
+def wanted_at_first(preference, rewards):
+    """What agents want in an episode's first turn."""
+    return WantedRewards(preference).add(rewards, np.zeros(len(rewards), np.bool_))
+
+
 def wanted(preference, *rewards):
-    """What each agent of one world wants in an episode's first turn."""
-    return wanted_rewards(preference, np.array([rewards], np.float32))[0][0].tolist()
+    return wanted_at_first(preference, np.array([rewards], np.float32))[0].tolist()
 
 
 def close(*numbers):
@@ -113,7 +116,7 @@ class TestWorkedNumbers:
 @settings(deadline=None)
 @given(rewards=REWARDS, alpha=between(0, 9), beta=between(0, 9))
 def test_being_unequal_never_pays(rewards, alpha, beta):
-    got = wanted_rewards(InequityAversion(alpha=alpha, beta=beta, smoothing=0), rewards)[0]
+    got = wanted_at_first(InequityAversion(alpha=alpha, beta=beta, smoothing=0), rewards)
     assert (got <= rewards).all()
     ahead = rewards > rewards.mean(1, keepdims=True)
     if beta > 1e-3:
@@ -124,7 +127,7 @@ def test_being_unequal_never_pays(rewards, alpha, beta):
 @given(preference=PREFERENCES, rewards=REWARDS, data=st.data())
 def test_agents_in_another_order_want_the_same_in_that_order(preference, rewards, data):
     order = data.draw(st.permutations(range(rewards.shape[1])))
-    got, shuffled = (wanted_rewards(preference, own)[0] for own in (rewards, rewards[:, order]))
+    got, shuffled = (wanted_at_first(preference, own) for own in (rewards, rewards[:, order]))
     np.testing.assert_allclose(shuffled, got[:, order], rtol=1e-5, atol=1e-6)
 
 
@@ -149,8 +152,8 @@ def test_without_a_weight_the_own_reward_is_wanted_and_an_exchange_keeps_the_sum
         SocialValueOrientation(angle=angle, weight=0),
         Exchange(0),
     ):
-        assert np.array_equal(wanted_rewards(idle, rewards)[0], rewards)
-    exchanged = wanted_rewards(Exchange(share), rewards)[0]
+        assert np.array_equal(wanted_at_first(idle, rewards), rewards)
+    exchanged = wanted_at_first(Exchange(share), rewards)
     np.testing.assert_allclose(exchanged.sum(1), rewards.sum(1), atol=1e-5)
 
 
@@ -208,7 +211,7 @@ class TestRefusals:
     @pytest.mark.parametrize("preference", [AVERSE, FAIR, Exchange(0.5)])
     def test_a_comparison_with_others_is_refused_where_there_are_none(self, preference):
         name = type(preference).__name__
-        with pytest.raises(ValueError, match=rf"preference is {name}, which compares .* a game of 1 agent"):
+        with pytest.raises(ValueError, match=rf"preferences is {name}, which compares .* a game of 1 agent"):
             wanted(preference, 3)
         alone = Game(map=maps.parse("A.>.A"), rules=Rules(may_fire=False))
         with pytest.raises(ValueError, match=f"preferences is {name}.*allowed there: 'individual', 'team'"):

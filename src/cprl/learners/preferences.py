@@ -2,7 +2,7 @@
 
 In each preference, N is the number of agents, r_i the reward that the environment gives agent i in a turn
 (apples, less fines, plus transfers), and r'_i the reward that agent i wants and learns from. First come the
-values of a recipe, then `wanted_rewards`, a pure function, and `WantedRewards`, which holds its memory; last
+values of a recipe, then `WantedRewards`, which computes what they want turn by turn; last
 `PreferenceTransform` and `PreferenceWrapper`, for TorchRL programs of one's own and for PettingZoo.
 """
 
@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 from tensordict import TensorDictBase
@@ -24,6 +25,9 @@ from torchrl.envs import Transform
 from cprl import keys
 from cprl.values import Range, Share, Value, Where, checked
 
+Array = Any
+"""A numpy array, or a tensor."""
+Doubles = NDArray[np.float64]
 Weight = Annotated[float, Range(0, 1e6)]
 Angle = Annotated[float, Where(lambda angle: -pi <= angle <= pi, "radians in -pi..pi, e.g. math.radians(45)")]
 
@@ -50,6 +54,15 @@ class InequityAversion(Value):
     beta: Weight
     smoothing: Share
 
+    def wanted(self, rewards: Doubles, smoothed: Doubles) -> Doubles:
+        """What agents want who get these rewards, [B, N], and have these smoothed ones."""
+        difference = (
+            smoothed[:, None, :] - smoothed[:, :, None]
+        )  # [B, one, other]: above 0 where one is behind
+        behind, ahead = difference.clip(min=0).sum(-1), (-difference).clip(min=0).sum(-1)
+        loss: Doubles = (self.alpha * behind + self.beta * ahead) / (rewards.shape[1] - 1)
+        return rewards - loss
+
 
 @dataclass(frozen=True, kw_only=True)
 class SocialValueOrientation(Value):
@@ -71,6 +84,13 @@ class SocialValueOrientation(Value):
     angle: Angle
     weight: Weight
 
+    def wanted(self, rewards: Doubles, _smoothed: Doubles) -> Doubles:
+        of_others = _mean_of_others(rewards)
+        plain = abs(np.arctan2(of_others, rewards) - self.angle)
+        shorter = np.where(plain > pi, 2 * pi - plain, plain)
+        off = np.where((rewards == 0) & (of_others == 0), np.zeros_like(rewards), shorter)
+        return rewards - self.weight * off
+
 
 @dataclass(frozen=True)
 class Exchange(Value):
@@ -87,6 +107,14 @@ class Exchange(Value):
     """
 
     share: Share
+
+    def wanted(self, rewards: Doubles, _smoothed: Doubles) -> Doubles:
+        return (1 - self.share) * rewards + self.share * _mean_of_others(rewards)
+
+
+def _mean_of_others(rewards: Doubles) -> Doubles:
+    of_others: Doubles = (rewards.sum(-1)[:, None] - rewards) / (rewards.shape[1] - 1)
+    return of_others
 
 
 Preference: TypeAlias = Literal["individual", "team"] | InequityAversion | SocialValueOrientation | Exchange
@@ -109,79 +137,6 @@ def named(preference: object) -> str:
     return f'"{preference}"' if isinstance(preference, str) else type(preference).__name__
 
 
-Array = Any
-"""A numpy array, or a tensor; what is computed from it is of the same kind, on the same device."""
-
-
-def wanted_rewards(
-    preference: Preference, rewards: Array, smoothed: Array | None = None
-) -> tuple[Array, Array | None]:
-    """The rewards that agents want who all have the same preference, in one turn; a pure function.
-
-    Args:
-        rewards: float [B, N], what the environment gives each of N agents in each of B worlds.
-        smoothed: float64 [B, N], what the turn before left to remember; None at an episode's first turn.
-
-    Returns:
-        The wanted rewards, [B, N]: "individual" those given, as they are; else float32, computed in float64.
-        And what is to be remembered, float64 [B, N], for `InequityAversion`; None for all others.
-    """
-    check_preference("preference", preference, rewards.shape[1])
-    with np.errstate(all="ignore"):  # rewards that are not finite are found and named elsewhere
-        return _wanted(preference, rewards, smoothed)
-
-
-def _wanted(preference: Preference, rewards: Array, smoothed: Array | None) -> tuple[Array, Array | None]:
-    if preference == "individual":
-        return rewards, None
-    if preference == "team":
-        return _of_kind(rewards).ones_like(rewards) * rewards.sum(-1)[:, None], None
-    given = _double(rewards)
-    if isinstance(preference, InequityAversion):
-        now = given if smoothed is None else preference.smoothing * smoothed + given
-        return _single(given - _dislike(preference, now)), now
-    of_others = (given.sum(-1)[:, None] - given) / (given.shape[1] - 1)
-    if isinstance(preference, SocialValueOrientation):
-        return _single(given - preference.weight * _off(preference.angle, given, of_others)), None
-    assert isinstance(preference, Exchange)
-    return _single((1 - preference.share) * given + preference.share * of_others), None
-
-
-def _dislike(preference: InequityAversion, smoothed: Array) -> Array:
-    """What each agent loses by inequity, [B, N]."""
-    difference = smoothed[:, None, :] - smoothed[:, :, None]  # [B, own, other]: above 0 where own is behind
-    behind, ahead = difference.clip(min=0).sum(-1), (-difference).clip(min=0).sum(-1)
-    loss: Array = (preference.alpha * behind + preference.beta * ahead) / (smoothed.shape[1] - 1)
-    return loss
-
-
-def _off(angle: float, given: Array, of_others: Array) -> Array:
-    """How far each agent's share is from the one it likes, radians [B, N]; 0 where nobody gets anything."""
-    kind = _of_kind(given)
-    plain = abs(kind.arctan2(of_others, given) - angle)
-    shorter = kind.where(plain > pi, 2 * pi - plain, plain)
-    return kind.where((given == 0) & (of_others == 0), kind.zeros_like(given), shorter)
-
-
-def _of_kind(array: Array) -> Any:
-    return torch if isinstance(array, Tensor) else np
-
-
-def _double(array: Array) -> Array:
-    return array.to(torch.float64, copy=True) if isinstance(array, Tensor) else array.astype(np.float64)
-
-
-def _single(array: Array) -> Array:
-    return array.float() if isinstance(array, Tensor) else array.astype(np.float32, copy=False)
-
-
-def _like(array: Array, other: Array) -> Array:
-    """The same values as the kind of array that another one is, on its device."""
-    if isinstance(other, Tensor):
-        return torch.as_tensor(array, device=other.device)
-    return array.numpy(force=True) if isinstance(array, Tensor) else array
-
-
 class WantedRewards:
     """The rewards that agents want, turn by turn, with what they remember of the running episodes.
 
@@ -191,18 +146,18 @@ class WantedRewards:
 
     def __init__(self, preferences: Preference | Sequence[Preference]) -> None:
         self.preferences = preferences
-        listed = tuple(preferences) if isinstance(preferences, list | tuple) else None
-        for place, preference in enumerate(listed or ()):
+        listed = tuple(preferences) if isinstance(preferences, list | tuple) else ()
+        for place, preference in enumerate(listed):
             checked(f"preferences[{place}]", preference, Preference)
         if not listed:
             checked("preferences", preferences, Preference)
         self._listed = listed
         kinds: Any = dict.fromkeys(listed) if listed else [preferences]
         self._columns = {
-            preference: [agent for agent, other in enumerate(listed or ()) if other == preference]
+            preference: [agent for agent, other in enumerate(listed) if other == preference]
             for preference in kinds
         }
-        self._smoothed: dict[Preference, Array] = {}
+        self._smoothed: dict[Preference, Doubles] = {}
         self._agents: int | None = None
         self.now: Array | None = None
         """[B, N], the wanted rewards of the latest turn; None before the first."""
@@ -219,44 +174,52 @@ class WantedRewards:
         self._agents = agents
 
     def add(self, rewards: Array, ended: Array) -> Array:
-        """The rewards wanted in the next turn of all worlds.
+        """Return the rewards wanted in the next turn of all worlds, a numpy array or a tensor as `rewards`.
 
         Args:
             rewards: float [B, N], what the environment gives.
             ended: bool [B], the worlds whose episode ends with this turn; they remember nothing of it.
 
         Returns:
-            The wanted rewards, [B, N], a numpy array or a tensor as `rewards`.
+            [B, N]: where all want their own those given, as they are; else float32, computed in float64.
         """
         if rewards.shape[1] != self._agents:
             self.check_agents(rewards.shape[1])
-        wanted = None
-        for preference, columns in self._columns.items():
-            before = self._before(preference, rewards)
-            with np.errstate(all="ignore"):
-                of_preference, after = _wanted(preference, rewards, before)
-            if after is not None:
-                after[ended] = 0
-                self._smoothed[preference] = after
-            if not self._listed:
-                wanted = of_preference
-            else:
-                wanted = _of_kind(of_preference).zeros_like(_single(rewards)) if wanted is None else wanted
-                wanted[:, columns] = _single(of_preference)[:, columns]
-        self.now = wanted
-        return wanted
+        if isinstance(rewards, Tensor):
+            wanted = self.add(rewards.numpy(force=True), ended.numpy(force=True))
+            self.now = torch.as_tensor(wanted, device=rewards.device)
+            return self.now
+        with np.errstate(all="ignore"):  # rewards that are not finite are found and named elsewhere
+            columns = {preference: self._wanted(preference, rewards, ended) for preference in self._columns}
+        if not self._listed:
+            (self.now,) = columns.values()
+            return self.now
+        self.now = np.empty(rewards.shape, np.float32)
+        for preference, of_preference in columns.items():
+            agents = self._columns[preference]
+            self.now[:, agents] = of_preference[:, agents]
+        return self.now
 
-    def _before(self, preference: Preference, rewards: Array) -> Array | None:
-        """What is remembered, as the same kind of array as rewards."""
-        smoothed = self._smoothed.get(preference)
-        if smoothed is None:
-            return None
-        if smoothed.shape != rewards.shape:
-            raise ValueError(
-                f"rewards is {list(rewards.shape)}; allowed: {list(smoothed.shape)}, as in the turn before, "
-                "or clear() before"
-            )
-        return _like(smoothed, rewards)
+    def _wanted(self, preference: Preference, rewards: Array, ended: Array) -> Array:
+        if preference == "individual":
+            return rewards
+        if preference == "team":
+            return np.ones_like(rewards) * rewards.sum(-1)[:, None]
+        assert not isinstance(preference, str)
+        given = smoothed = rewards.astype(np.float64)
+        if isinstance(preference, InequityAversion):
+            before = self._smoothed.get(preference)
+            if before is not None and before.shape != rewards.shape:
+                raise ValueError(
+                    f"rewards is {list(rewards.shape)}; allowed: {list(before.shape)}, as in the turn "
+                    "before, or clear() before"
+                )
+            smoothed = given.copy() if before is None else preference.smoothing * before + given
+        wanted = preference.wanted(given, smoothed).astype(np.float32)
+        if isinstance(preference, InequityAversion):
+            smoothed[ended] = 0
+            self._smoothed[preference] = smoothed
+        return wanted
 
     def clear(self, worlds: Array | None = None) -> None:
         """Forgets the episodes of the marked worlds, bool [B]; by default of all."""
@@ -264,20 +227,17 @@ class WantedRewards:
         if worlds is None:
             self._smoothed = {}
             return
-        for preference, smoothed in self._smoothed.items():
-            left = smoothed.clone() if isinstance(smoothed, Tensor) else smoothed.copy()
-            left[_like(worlds, smoothed)] = 0
-            self._smoothed[preference] = left
+        marked = worlds.numpy(force=True) if isinstance(worlds, Tensor) else worlds
+        self._smoothed = {
+            preference: np.where(marked[:, None], 0.0, smoothed)
+            for preference, smoothed in self._smoothed.items()
+        }
 
     def state_dict(self) -> dict[str, Tensor]:
         """What is remembered: "smoothed" float64 [K, B, N], for each of the K preferences that remember, in
         the order of their first agents; empty if nothing is."""
-        tables = [
-            torch.as_tensor(self._smoothed[preference])
-            for preference in self._columns
-            if preference in self._smoothed
-        ]
-        return {"smoothed": torch.stack(tables)} if tables else {}
+        tables = [self._smoothed[preference] for preference in self._columns if preference in self._smoothed]
+        return {"smoothed": torch.from_numpy(np.stack(tables))} if tables else {}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         remember = [preference for preference in self._columns if isinstance(preference, InequityAversion)]
@@ -288,7 +248,8 @@ class WantedRewards:
                 "agents], a table for each preference that remembers"
             )
         self.now = None
-        self._smoothed = {} if smoothed is None else dict(zip(remember, smoothed.clone(), strict=True))
+        tables = () if smoothed is None else smoothed.numpy(force=True).copy()
+        self._smoothed = dict(zip(remember, tables, strict=False))
 
 
 class PreferenceTransform(Transform):
