@@ -14,9 +14,11 @@ from typing import Any, Final
 
 import pyarrow.csv
 import tyro
+from scipy import stats
 
 from cprl.evaluation import draw_scenarios, run_scenarios
 from cprl.evaluation.scenarios import estimates
+from cprl.measuring.statistics import CONFIDENCE, holm
 from cprl.runs.files import write_atomically
 from cprl.system.process import prepare_process
 
@@ -53,26 +55,41 @@ def play(name: str, *, episodes: int) -> None:
 
 
 def table(name: str) -> str:
-    """The Markdown table of a population."""
+    """The Markdown table of a population; bold is what is not 0 by Holm's method for all of it."""
     with (OUT / f"{name}.csv").open() as file:
         rows = list(csv.DictReader(file))
     found = {(row["scenario"], row["focal"], row["metric"]): row for row in rows}
+    scenarios = list(dict.fromkeys(row["scenario"] for row in rows))
+    compared = [(scenario, *at) for scenario in scenarios for at in COLUMNS.values() if is_difference(*at)]
+    apart = dict(zip(compared, holm([p_value(found[at]) for at in compared]), strict=True))
     lines = ["| " + " | ".join(["scenario", *COLUMNS]) + " |", "|---|" + "---:|" * len(COLUMNS)]
-    for scenario in dict.fromkeys(row["scenario"] for row in rows):
-        cells = [shown(found[scenario, *at], signed=at[1].endswith("advantage")) for at in COLUMNS.values()]
+    for scenario in scenarios:
+        cells = [shown(found[scenario, *at], signed=is_difference(*at)) for at in COLUMNS.values()]
+        bold = [apart.get((scenario, *at), False) for at in COLUMNS.values()]
+        cells = [f"**{cell}**" if is_bold else cell for cell, is_bold in zip(cells, bold, strict=True)]
         lines.append("| " + " | ".join([f"`{scenario}`", *cells]) + " |")
     return "\n".join(lines)
 
 
+def is_difference(_: str, metric: str) -> bool:
+    return metric.endswith("advantage")
+
+
+def p_value(row: dict[str, Any]) -> float:
+    """That of the difference being 0, from its interval by Student's t."""
+    freedom = int(row["replicas"]) - 1
+    error = (float(row["high"]) - float(row["low"])) / 2 / stats.t.ppf((1 + CONFIDENCE) / 2, freedom)
+    return float(2 * stats.t.sf(abs(float(row["value"])) / error, freedom))
+
+
 def shown(row: dict[str, Any], *, signed: bool) -> str:
-    """An estimate with its interval; bold where the interval of a difference excludes 0."""
+    """An estimate with its interval."""
     if not row["value"]:
         return "undefined"
     value, low, high = (float(row[bound]) for bound in ("value", "low", "high"))
     digits = 2 if max(abs(value), abs(low), abs(high)) < 2 else 0
     sign = "+" if signed else ""
-    text = f"{value:{sign}.{digits}f} [{low:{sign}.{digits}f}, {high:{sign}.{digits}f}]"
-    return f"**{text}**" if signed and not low <= 0 <= high else text
+    return f"{value:{sign}.{digits}f} [{low:{sign}.{digits}f}, {high:{sign}.{digits}f}]"
 
 
 def main(*, tables: bool = False, episodes: int = EPISODES) -> None:

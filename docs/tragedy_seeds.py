@@ -6,12 +6,13 @@
 Intervals are those of the mean over replicas, 95 %, by Student's t.
 """
 
+import runpy
 import sys
 from pathlib import Path
 
 from cprl.measuring.statistics import Estimate, estimate
-from cprl.runs.curves import curves_of
-from cprl.terminal.course import LAST_EPISODES, PEAK_EPISODES, course_of
+from cprl.runs.curves import as_curves, curves_of, running_mean
+from cprl.runs.episodes import read_table
 from cprl.training.agents import load
 
 HEADING = (
@@ -24,21 +25,23 @@ def main(runs: list[Path]) -> None:
     """Prints a row for each run."""
     print(HEADING)
     print("|" + "---:|" * HEADING.count(" | ") + "---|")
+    course_of = runpy.run_path(str(Path(__file__).parents[1] / "recipes" / "tragedy.py"))["course_of"]
     for run in runs:
-        course, curves = course_of(run), curves_of(run)
-        peak = curves["collective_return"][:, course.peak_episode : course.peak_episode + PEAK_EPISODES]
-        last = curves["collective_return"][:, -LAST_EPISODES:].mean(1)
-        lengths = curves["survival_steps"][:, -LAST_EPISODES:].mean(1)
-        change = course.last_return / course.random_return - 1
+        curves = curves_of(run)
+        returns, lengths = curves["collective_return"], curves["survival_steps"][:, -30:].mean(1)
+        first = int(running_mean(returns.mean(0), 10).argmax())
+        last = estimate(returns[:, -30:].mean(1))
+        random = as_curves(read_table(run / "evaluation" / "random.parquet"))["collective_return"]
+        error = random.std(ddof=1) / random.size**0.5
         cells = [
             load(run).experiment.seed,
-            course.replicas,
-            _told(estimate(peak.mean(1))),
-            course.peak_episode,
-            _told(estimate(last)),
-            f"{change:+.0%} of {course.random_return:.0f} ± {course.random_error:.1f}",
+            len(returns),
+            _told(estimate(returns[:, first : first + 10].mean(1))),
+            first,
+            _told(last),
+            f"{last.value / random.mean() - 1:+.0%} of {random.mean():.0f} ± {error:.1f}",
             _told(estimate(lengths)),
-            "yes" if course.is_tragedy else "no",
+            "yes" if course_of(run).endswith("the tragedy of the commons.") else "no",
         ]
         print("| " + " | ".join(map(str, cells)) + " |")
 

@@ -344,7 +344,7 @@ def test_runs_play_with_each_other_as_they_decide(in_one_go, tmp_path):
         assert decided[0].tolist() == second[0].tolist()
         assert decided[1].tolist() == first[1].tolist()
     taxed = replace(OWN, game=replace(MEADOW, institutions=(VOTE,)), callbacks=(), episodes=1)
-    with pytest.raises(ValueError, match="different games: institutions Vote, Sanctioner and Vote"):
+    with pytest.raises(ValueError, match=r"different games: Game\.institutions"):
         cprl.crossplay([other, cprl.run(taxed, tmp_path / "taxed", watch="off")])
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cprl.measuring.dilemmas import dilemma
+from cprl.evaluation.schelling import dilemma
 
 
 def of(reward, sucker, temptation, punishment, *, spread=0.0, replicas=4):

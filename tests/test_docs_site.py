@@ -26,19 +26,16 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 
 
-def test_the_index_lists_every_page_once_and_says_for_whom_it_is():
-    listed = [path for found in navigation.sections().values() for path in found.values()]
+def test_the_index_lists_every_page_once_says_for_whom_it_is_and_begins_with_the_first_hour():
+    sections = list(navigation.sections().values())
+    listed = [path for section in sections for path in section.values()]
     assert sorted(path for path in listed if "/" not in path) == sorted(
         path.name for path in DOCS.glob("*.md") if path.name != "index.md"
     )
     assert len(listed) == len(set(listed))
+    assert listed[0] == "tutorial.md"
     rows = re.findall(r"^\| \[.*$", navigation.INDEX.read_text(), re.MULTILINE)
     assert all(all(cell.strip() for cell in row.strip("|").split("|")) for row in rows)
-
-
-def test_the_index_begins_with_the_first_hour():
-    first = next(iter(navigation.sections().values()))
-    assert next(iter(first.values())) == "tutorial.md"
 
 
 def test_every_package_is_on_a_page_of_the_reference_or_named_as_internal():
@@ -73,21 +70,17 @@ def test_links_lead_to_the_same_page_list_or_replay_from_every_depth(tmp_path):
                 assert (path.parent / target).exists(), (path, target)
 
 
-def test_a_link_to_nothing_is_refused_by_name(tmp_path, monkeypatch):
+def test_staged_pages_have_whole_lists_and_a_link_to_nothing_is_refused_by_name(tmp_path, monkeypatch):
     monkeypatch.setattr(pages, "ROOT", tmp_path)
     monkeypatch.setattr(pages, "DOCS", tmp_path)
-    (tmp_path / "a.md").write_text("see [it](b.md)\n")
-    with pytest.raises(ValueError, match=r"a\.md links to b\.md, which"):
-        pages.stage_pages(tmp_path / "staged")
-
-
-def test_a_list_right_after_a_paragraph_becomes_a_list_but_code_stays(tmp_path, monkeypatch):
-    monkeypatch.setattr(pages, "ROOT", tmp_path)
-    monkeypatch.setattr(pages, "DOCS", tmp_path)
-    (tmp_path / "a.md").write_text("Two:\n- one\n- [two](a.md)\n\n```text\nTwo:\n- [a](nowhere)\n```\n")
+    page = tmp_path / "a.md"
+    page.write_text("Two:\n- one\n- [two](a.md)\n\n```text\nTwo:\n- [a](nowhere)\n```\n")
     pages.stage_pages(tmp_path / "staged")
     staged = (tmp_path / "staged" / "a.md").read_text()
     assert staged == "Two:\n\n- one\n- [two](a.md)\n\n```text\nTwo:\n- [a](nowhere)\n```\n"
+    page.write_text("see [it](b.md)\n")
+    with pytest.raises(ValueError, match=r"a\.md links to b\.md, which"):
+        pages.stage_pages(tmp_path / "again")
 
 
 def test_the_page_of_replays_names_every_committed_one(tmp_path):
@@ -230,17 +223,16 @@ def test_the_page_of_replays_shows_a_board(built, tmp_path):
 
 
 @pytest.mark.docs
-def test_the_page_of_replays_from_the_disk_says_what_plays_them(built):
-    with browser((SITE / "replays.html").as_uri(), size=(900, 600)) as show:
-        wait_until(lambda: show.run("return !document.getElementById('replay-note').hidden"), 20, "no note")
-        assert "make docs-serve" in show.run("return document.getElementById('replay-note').textContent")
-
-
-@pytest.mark.docs
-def test_the_page_of_replays_says_that_a_replay_is_not_there(built):
-    with browser(f"{built}/replays.html?replay=institutions/nobody", size=(900, 600)) as show:
-        wait_until(
-            lambda: show.run("return !document.getElementById('replay-missing').hidden"), 60, "no note"
-        )
-        said = show.run("return document.getElementById('replay-missing').textContent")
-        assert "The replay institutions/nobody is not here" in said
+@pytest.mark.parametrize(
+    ("query", "element", "said"),
+    [
+        (None, "replay-note", "make docs-serve"),
+        ("institutions/nobody", "replay-missing", "The replay institutions/nobody is not here"),
+    ],
+    ids=["from the disk", "one that is not there"],
+)
+def test_the_page_of_replays_says_why_it_shows_none(built, query, element, said):
+    home = f"{built}/replays.html?replay={query}" if query else (SITE / "replays.html").as_uri()
+    with browser(home, size=(900, 600)) as show:
+        wait_until(lambda: show.run(f"return !document.getElementById('{element}').hidden"), 60, "no note")
+        assert said in show.run(f"return document.getElementById('{element}').textContent")

@@ -10,8 +10,7 @@ from stored_runs import MEADOW, SEED, command, ran
 import cprl
 from cprl import Game, Rules, maps
 from cprl.evaluation import analyse, draw_egta, pairwise_game, play_empirical_game
-from cprl.evaluation.egta import egta_tables
-from cprl.evaluation.empirical_game import _choices
+from cprl.evaluation.empirical_game import _choices, egta_tables
 from cprl.population import Scripted
 from cprl.theory import PayoffTable, compositions
 
@@ -58,7 +57,7 @@ def with_payoffs(made, names, matrices):
 def test_payoffs_are_means_over_who_plays_where(made):
     # A greedy agent bites all of its corridor, 2 or 3 apples, whoever plays in the other; others bite none.
     assert made.payoffs == pytest.approx(np.array([[[2.5, np.nan], [2.5, 0], [np.nan, 0]]] * 2), nan_ok=True)
-    assert made.table().pure_equilibria == [(2, 0)]
+    assert made.payoff_table().pure_equilibria == [(2, 0)]
     assert made.names == ["greedy", "sustainable"]
     assert not made.is_reduction
 
@@ -87,10 +86,10 @@ def test_of_more_agents_crossplay_makes_the_reduction(three):
     assert (whole.agents, pairs.agents, pairs.of_agents) == (3, 2, 3)
     assert pairs.is_reduction
     for place in range(2):
-        assert pairs.table([place]).pairs == pytest.approx(whole.table([place]).pairs)
+        assert pairs.payoff_table([place]).pairs == pytest.approx(whole.payoff_table([place]).pairs)
     # 3 (4 - 2) + 2 choices of who plays where, 2 replicas, 2 episodes, 3 agents.
-    assert len(whole.episodes_table) == 8 * 2 * 2 * 3
-    assert "greedy greedy random" in whole.episodes_table["runs"].to_pylist()
+    assert len(whole.table()) == 8 * 2 * 2 * 3
+    assert "greedy greedy random" in whole.table()["runs"].to_pylist()
 
 
 @pytest.mark.integration

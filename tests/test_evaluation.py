@@ -5,6 +5,7 @@ import os
 import shutil
 from dataclasses import replace
 from math import isnan
+from pathlib import Path
 
 import matplotlib
 import numpy as np
@@ -16,14 +17,10 @@ from stored_runs import C51, CORRIDORS, DQN, MEADOW, PPO, SAC, SEED, an_experime
 
 import cprl
 from cprl import CommonsEnv, Game, Observation, maps, presets
-from cprl.commands import main as cli
 from cprl.envs.make_env import spaces_of
 from cprl.evaluation import draw_gains, gains
-from cprl.evaluation.cross_play import diagonal_returns
 from cprl.evaluation.evaluate import differences
-from cprl.evaluation.film import film
-from cprl.evaluation.lanes import Source, Turns, policies_of
-from cprl.learners.lanes import EVALUATION, lane_seeds
+from cprl.evaluation.lanes import Fresh, Part, Turns, agents_of
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.metrics import with_unit
 from cprl.measuring.movement import trace
@@ -101,15 +98,12 @@ def test_greedy_agents_play_what_the_policy_of_the_loaded_run_plays(name, learne
     assert values(found.measures())["collective_return"] == pytest.approx(np.mean(means))
 
 
-@pytest.mark.parametrize(("worlds", "of_policy"), [(4, 1), (2, 4)])
-@pytest.mark.parametrize("name", ["alike", "mixed"])
-def test_a_policy_for_another_number_of_worlds_is_refused(name, worlds, of_policy, learned):
-    run = cprl.load(learned[name])
-    plays = "1 world" if of_policy == 1 else f"{of_policy} worlds"
-    message = f"the policy plays {plays} and the environment has {worlds}; allowed: as many"
-    with pytest.raises(ValueError, match=rf"{message}, e\.g\. run\.policy\(replica, worlds={worlds}\)"):
-        run.env(worlds=worlds).rollout(3, run.policy(0, worlds=of_policy))
-    assert run.env(worlds=worlds).rollout(3, run.policy(0, worlds=worlds)).batch_size[0] == worlds
+def test_a_policy_for_another_number_of_worlds_is_refused(learned):
+    loaded = cprl.load(learned["mixed"])
+    message = r"the policy plays 1 world and the environment has 4; allowed: as many, e\.g\. run\.policy\("
+    with pytest.raises(ValueError, match=message):
+        loaded.env(worlds=4).rollout(3, loaded.policy(0))
+    assert loaded.env(worlds=4).rollout(3, loaded.policy(0, worlds=4)).batch_size[0] == 4
 
 
 class Own(torch.nn.Module):
@@ -172,17 +166,6 @@ def test_agents_that_learned_a_policy_draw_from_it(learned):
         assert told(found.trained[replica]) == told(found.random[replica])
     greedy = cprl.evaluate_run(undecided, episodes=2, greedy=True)
     assert told(greedy.trained[0]) != told(greedy.random[0])
-
-
-def test_the_random_policy_is_that_of_the_populations(learned):
-    found = cprl.evaluate_run(learned["mixed"], episodes=2, seed=SEED, replicas=[1])
-    from cprl.policies.assignment import AgentPolicies
-    from cprl.policies.lanes import random_lanes
-
-    seeds = lane_seeds(SEED, replicas=[1], agents=[0, 1], purpose=EVALUATION)
-    actor = random_lanes(len(MEADOW.actions), seeds=seeds, agents=2, worlds=2)
-    env = CommonsEnv(MEADOW, 2, seed=SEED, first_world=2)
-    assert told(evaluate(env, AgentPolicies({(0, 1): actor}), explore=True)) == told(found.random[1])
 
 
 @pytest.mark.parametrize("name", ["alike", "mixed"])
@@ -292,30 +275,24 @@ def test_a_matrix_of_scripted_agents_gives_the_numbers_worked_by_hand(corridors)
         found.cell("greedy", "DQN")
 
 
-def test_each_cell_is_what_the_loaded_runs_policies_play_with_one_focal_agent(learned):
+def test_each_cell_is_what_the_loaded_runs_agents_play_with_one_focal_agent(learned):
     found = cprl.crossplay(learned.values(), episodes=3, seed=SEED, greedy=True)
     loaded = {name: cprl.load(run) for name, run in learned.items()}
     for focal, background in (("alike", "mixed"), ("mixed", "alike")):
-        cell = found.cell(focal, background)
-        by_replica = []
+        cell, means = found.cell(focal, background), []
         for replica in range(3):
-            mine, theirs, stock = [], [], []
+            numbers = []
             for agent in range(2):
-                sources = [Source(loaded[background])] * 2
-                sources[agent] = Source(loaded[focal])
-                env = CommonsEnv(MEADOW, 3, seed=SEED, first_world=3 * replica)
-                alone = evaluate(env, policies_of(sources, [replica], worlds=3, seed=SEED))
+                mixed = agents_of(loaded[background])
+                mixed[agent] = agents_of(loaded[focal])[agent]
+                fresh = Fresh(replicas=(replica,), episodes=3, seed=SEED, greedy=True)
+                alone = fresh.play(loaded[background], mixed)[replica]
                 assert told(alone) == told(cell.by_agent[agent][replica])
-                mine += [episode.return_[agent] for episode in alone]
-                theirs += [episode.return_[1 - agent] for episode in alone]
-                stock += [episode.stock_left for episode in alone]
-            by_replica.append((np.mean(mine), np.mean(theirs), np.mean(stock)))
-        measures = cell.measures()
-        for name, mean in zip(
-            ("focal/return", "background/return", "stock_left"), np.mean(by_replica, 0), strict=True
-        ):
-            assert measures[name].estimate.value == pytest.approx(mean)
-            assert measures[name].estimate.replicas == 3
+                numbers += [(one.return_[agent], one.return_[1 - agent], one.stock_left) for one in alone]
+            means.append(np.mean(numbers, 0))
+        names = ("focal/return", "background/return", "stock_left")
+        assert [values(cell.measures())[name] for name in names] == pytest.approx(np.mean(means, 0))
+        assert {cell.measures()[name].estimate.replicas for name in names} == {3}
     diagonal = found.cell("mixed", "mixed")
     at_home = cprl.evaluate_run(learned["mixed"], episodes=3, seed=SEED, greedy=True)
     assert diagonal.is_self_play
@@ -329,9 +306,9 @@ def test_on_the_diagonal_a_cross_seed_agent_is_of_the_next_replica(learned):
     found = cprl.crossplay(runs, diagonal="cross_seed", replicas=[0, 2], **how)
     loaded, cell = cprl.load(learned["alike"]), found.cell("alike", "alike")
     for background, focal in ((0, 2), (2, 0)):
-        sources = [Source(loaded), Source(loaded, {background: focal})]
-        env = CommonsEnv(MEADOW, 2, seed=SEED, first_world=2 * background)
-        alone = evaluate(env, policies_of(sources, [background], worlds=2, seed=SEED))
+        mixed = [agents_of(loaded)[0], agents_of(loaded, {background: focal})[1]]
+        fresh = Fresh(replicas=(background,), episodes=2, seed=SEED, greedy=True)
+        alone = fresh.play(loaded, mixed)[background]
         assert told(alone) == told(cell.by_agent[1][background])
     assert not cell.is_self_play
     usual = cprl.crossplay(runs, replicas=[0, 2], **how)
@@ -342,26 +319,26 @@ def test_on_the_diagonal_a_cross_seed_agent_is_of_the_next_replica(learned):
 
 
 @pytest.mark.integration
-def test_what_does_not_fit_is_refused_and_says_what_fits(learned, corridors, tmp_path):
-    alike, mixed = learned.values()
-    with pytest.raises(ValueError, match="episodes is 0"):
-        cprl.evaluate_run(alike, episodes=0)
-    with pytest.raises(ValueError, match=r"seed is 3, the training seed of .*alike"):
-        cprl.evaluate_run(alike, seed=3)
-    with pytest.raises(ValueError, match=r"alike has no replicas \[3, 9\]"):
-        cprl.evaluate_run(alike, replicas=[1, 9, 3])
-    with pytest.raises(ValueError, match="replica is 99"):
-        film(alike, replica=99)
-    with pytest.raises(ValueError, match="the number of runs is 1"):
-        cprl.crossplay([alike])
-    with pytest.raises(ValueError, match="alike is given twice"):
-        cprl.crossplay([alike, mixed, alike])
-    with pytest.raises(ValueError, match=r"alike and greedy .* different games: Map\.."):
-        cprl.crossplay([alike, mixed, corridors["greedy"]])
-    lonely = Game(map=maps.parse(">A"), rules=CORRIDORS.rules)
-    runs = [ran(tmp_path / n, lonely, [Scripted("greedy")], replicas=1) for n in ("a", "b")]
-    with pytest.raises(ValueError, match=r"the game has 1 agent; .* use `cprl evaluate`"):
-        cprl.crossplay(runs)
+@pytest.mark.parametrize(
+    ("function", "runs", "given", "answer"),
+    [
+        ("evaluate_run", "alike", {"episodes": 0}, "episodes is 0"),
+        ("evaluate_run", "alike", {"seed": 3}, r"seed is 3, the training seed of .*alike"),
+        ("evaluate_run", "alike", {"replicas": [1, 9, 3]}, r"alike has no replicas \[3, 9\]"),
+        ("crossplay", ["alike"], {}, "the number of runs is 1"),
+        ("crossplay", ["alike", "mixed", "alike"], {}, "alike is given twice"),
+        ("crossplay", ["alike", "mixed", "greedy"], {}, r"alike and greedy .* different games: Game\.map\."),
+        ("crossplay", ["lonely", "alone"], {}, r"the game has 1 agent; .* use `cprl evaluate`"),
+    ],
+)
+def test_what_does_not_fit_is_refused(function, runs, given, answer, learned, corridors, tmp_path):
+    there = {**learned, **corridors}
+    if "lonely" in runs:
+        lonely = Game(map=maps.parse(">A"), rules=CORRIDORS.rules)
+        there = {name: ran(tmp_path / name, lonely, [Scripted("greedy")], replicas=1) for name in runs}
+    chosen = [there[name] for name in runs] if isinstance(runs, list) else there[runs]
+    with pytest.raises(ValueError, match=answer):
+        getattr(cprl, function)(chosen, **given)
 
 
 def test_games_differ_in_what_a_message_tells():
@@ -372,42 +349,36 @@ def test_games_differ_in_what_a_message_tells():
         observation=Observation(agents_apart=True),
     )
     assert differences(MEADOW, other) == [
-        "Rules.freeze_steps 2 and 7",
-        "Observation.agents_apart False and True",
+        "Game.rules.freeze_steps 2 and 7",
+        "Game.observation.agents_apart False and True",
     ]
-    assert "Map.sites differ" in differences(MEADOW, CORRIDORS), "forty cells would help nobody"
+    assert "Game.map.sites differ" in differences(MEADOW, CORRIDORS), "forty cells would help nobody"
 
 
-def test_runs_of_the_same_name_are_told_apart_by_their_paths(corridors, tmp_path):
+def test_runs_have_given_names_those_of_their_directories_or_their_paths(corridors, tmp_path):
     copy = shutil.copytree(corridors["greedy"], tmp_path / "greedy")
     found = cprl.crossplay([corridors["greedy"], copy], episodes=1)
     assert list(found.runs) == [str(corridors["greedy"]), str(copy)]
-
-
-def test_runs_get_the_names_that_they_are_given(corridors):
     found = cprl.crossplay({"bites": corridors["greedy"], "waits": corridors["sustainable"]}, episodes=1)
-    assert list(found.runs) == ["bites", "waits"]
     assert found.cell("waits", "bites").measures()["background/return"].estimate.value == 2.5
 
 
 def with_returns(played, returns):
     """The same cross-play with other returns: of both agents, by cell, focal agent and replica."""
 
-    def changed(at, agent, replica, episodes):
-        own = np.array(returns[at][agent][replica], dtype=float)
-        return [replace(episode, return_=own) for episode in episodes]
+    def part_of(at, focal, by_agent):
+        played = played_of(at, focal, by_agent)
+        return Part({"focal": at[0], "background": at[1], "focal_agent": focal}, played, ((focal,),))
 
-    cells = {
-        at: replace(
-            cell,
-            by_agent={
-                agent: {r: changed(at, agent, r, episodes) for r, episodes in by_replica.items()}
-                for agent, by_replica in cell.by_agent.items()
-            },
-        )
-        for at, cell in played.cells.items()
-    }
-    return replace(played, cells=cells)
+    def played_of(at, focal, by_agent):
+        episodes = played.cell(*at).by_agent[focal]
+        return {
+            replica: [replace(one, return_=np.array(own, dtype=float)) for one in episodes[replica]]
+            for replica, own in enumerate(by_agent[focal])
+        }
+
+    parts = [part_of(at, focal, by_agent) for at, by_agent in returns.items() for focal in by_agent]
+    return replace(played, parts=parts)
 
 
 def exploited(corridors):
@@ -436,12 +407,11 @@ def test_gains_are_differences_from_the_diagonal_paired_by_replica(corridors):
     assert greedy.background.value == -2.75
     # Student's t for 1 degree of freedom at 97.5 % is 12.706; the standard error is 0.25.
     assert greedy.background.high == pytest.approx(-2.75 + 12.706 * 0.25, abs=1e-3)
-    assert not greedy.exploits, "that interval holds 0"
     # Sustainable among greedy agents: focal 1 - 2; background 2 - 2 = 0 and 3 - 2 = 1.
     sustainable = found["sustainable", "greedy"]
     assert (sustainable.focal.value, sustainable.background.value) == (-1, 0.5)
-    assert not sustainable.exploits
-    assert diagonal_returns(exploited(corridors)) == {"greedy": 2, "sustainable": 6}
+    at_home = [exploited(corridors).cell(name, name).mean_returns("focal").mean() for name in corridors]
+    assert at_home == [2, 6]
 
 
 @pytest.mark.integration
@@ -466,71 +436,67 @@ def test_the_command_evaluate_tells_every_metric_and_writes_the_episodes(
     out = tmp_path / "new" / "episodes.parquet"
     text = command(monkeypatch, capsys, "evaluate", learned["alike"], "--episodes", 2, "--out", out)
     found = cprl.evaluate_run(learned["alike"], episodes=2)
+    rows = rows_of(text)
     for name, random in found.measures("random").items():
-        line = f"│ {with_unit(name, rewards='apples')} "
-        (row,) = [row for row in text.splitlines() if row.startswith(line)]
-        cells = [cell.strip() for cell in row.split("│")[2:4]]
-        assert cells == [str(found.measures()[name]), str(random)]
+        cells = [with_unit(name, rewards="apples"), str(found.measures()[name]), str(random)]
+        assert cells in rows
     assert "run's agents, epsilon 0.05" in text
     table = pq.read_table(out)
     assert table.num_rows == 2 * 3 * 2 * 2, "policies, replicas, episodes, agents"
-    rows = table.to_pylist()
-    own = [
-        row["return"] for row in rows if (row["policy"], row["replica"], row["episode"]) == ("trained", 2, 1)
-    ]
-    assert own == found.trained[2][1].return_.tolist()
+    assert table.equals(found.table())
     with pytest.raises(SystemExit, match=r"cprl: .*episodes\.parquet exists and is not"):
         command(monkeypatch, capsys, "evaluate", learned["alike"], "--out", out)
     assert pq.read_table(out).equals(table)
 
 
-def test_the_command_crossplay_tells_a_matrix_for_each_number_and_writes_the_episodes(
-    corridors, tmp_path, monkeypatch, capsys
-):
-    out = tmp_path / "cross.parquet"
-    greedy, sustainable = corridors.values()
-    text = command(monkeypatch, capsys, "crossplay", greedy, sustainable, "--episodes", 1, "--out", out)
-    assert "2 replicas, 1 episode each with focal agent at each index, seed 30011, diagonal: self" in text
-    for name in ("focal/return (apples)", "group/return (apples)", "sustainability (steps)"):
-        assert name in (line.strip() for line in text.splitlines())
-    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines() if "│" in line]
-    assert ["greedy", "2.5 [2.5, 2.5]", "2.5 [2.5, 2.5]"] in rows
-    assert ["sustainable", "0 [0, 0]", "0 [0, 0]"] in rows
-    assert ["greedy", "sustainable", "1", "3 [3, 3]", "0 [0, 0]", "3 [3, 3]"] in rows
-    assert ["sustainable", "0.5 [0.5, 0.5]", "undefined in all 2"] in rows, "equality"
-    agents = pq.read_table(out, columns=["focal", "background", "focal_agent"]).to_pylist()
-    assert len(agents) == (1 + 2 + 2 + 1) * 2 * 2, "visits, replicas, agents"
-    assert {row["focal_agent"] for row in agents if row["focal"] == row["background"]} == {-1}
-    with pytest.raises(SystemExit, match=r"cprl: .*cross\.parquet exists and is not"):
-        command(monkeypatch, capsys, "crossplay", greedy, sustainable, "--out", out)
-    with pytest.raises(SystemExit, match="cprl: the number of runs is 1"):
-        command(monkeypatch, capsys, "crossplay", greedy)
+def rows_of(text):
+    """The cells of the rows of all tables."""
+    return [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines() if "│" in line]
 
 
 @pytest.mark.integration
-def test_the_command_crossplay_names_runs_and_draws_their_gains(corridors, tmp_path, monkeypatch, capsys):
+def test_the_command_crossplay_tells_a_matrix_for_each_number_and_draws_the_gains(
+    corridors, tmp_path, monkeypatch, capsys
+):
+    out, figure = tmp_path / "cross.parquet", tmp_path / "gains.png"
     greedy, sustainable = corridors.values()
-    figure = tmp_path / "gains.png"
-    words = ["crossplay", f"bites={greedy}", sustainable, "--episodes", 1, "--figure", figure]
+    words = ["crossplay", f"bites={greedy}", sustainable, "--episodes", 1, "--out", out, "--figure", figure]
     text = command(monkeypatch, capsys, *words)
-    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines() if "│" in line]
-    assert ["bites", "2.5 [2.5, 2.5]", "2.5 [2.5, 2.5]"] in rows
-    # In place of a sustainable agent, which gets nothing, a greedy one gets 2.5; the other gets as before.
-    assert ["bites", "", "2.5 [2.5, 2.5]"] in rows
-    assert ["sustainable", "-2.5 [-2.5, -2.5]", ""] in rows
+    assert "2 replicas, 1 episode each with focal agent at each index, seed 30011, diagonal: self" in text
+    for name in ("focal/return (apples)", "group/return (apples)", "sustainability (steps)"):
+        assert name in (line.strip() for line in text.splitlines())
+    for row in (
+        ["bites", "2.5 [2.5, 2.5]", "2.5 [2.5, 2.5]"],
+        ["sustainable", "0 [0, 0]", "0 [0, 0]"],
+        ["bites", "sustainable", "1", "3 [3, 3]", "0 [0, 0]", "3 [3, 3]"],
+        ["sustainable", "0.5 [0.5, 0.5]", "undefined in all 2"],  # equality
+        # In place of a sustainable agent, which gets nothing, a greedy one gets 2.5; the other as before. All
+        # replicas are alike, so that of four differences those have a star that are not 0.
+        ["bites", "", "2.5 [2.5, 2.5] *"],
+        ["sustainable", "-2.5 [-2.5, -2.5] *", ""],
+        ["bites", "", "0 [0, 0]"],
+    ):
+        assert row in rows_of(text)
+    assert text.count("* not 0 by Holm's method for all 4 differences") == 2
+    agents = pq.read_table(out, columns=["focal", "background", "focal_agent"]).to_pylist()
+    assert len(agents) == (1 + 2 + 2 + 1) * 2 * 2, "visits, replicas, agents"
+    assert {row["focal_agent"] for row in agents if row["focal"] == row["background"]} == {-1}
     assert text.splitlines()[-1] == f"Figure: {figure}"
     assert figure.exists()
-    with pytest.raises(SystemExit, match=r"gains\.png exists and is not overwritten"):
-        command(monkeypatch, capsys, *words)
-    with pytest.raises(SystemExit, match=r"--figure is '.*gains\.jpg'"):
-        command(monkeypatch, capsys, *words[:-1], tmp_path / "gains.jpg")
-    with pytest.raises(SystemExit, match="bites names 2 runs"):
-        command(monkeypatch, capsys, "crossplay", f"bites={greedy}", f"bites={sustainable}")
+    for wrong, said in (
+        (words, r"cross\.parquet exists and is not"),
+        (["crossplay", greedy, sustainable, "--figure", figure], r"gains\.png exists and is not overwritten"),
+        (["crossplay", greedy, sustainable, "--figure", tmp_path / "a.jpg"], r"--figure is '.*a\.jpg'"),
+        (["crossplay", f"bites={greedy}", f"bites={sustainable}"], "bites names 2 runs"),
+        (["crossplay", greedy], "the number of runs is 1"),
+    ):
+        with pytest.raises(SystemExit, match=f"cprl: .*{said}"):
+            command(monkeypatch, capsys, *wrong)
 
 
 def test_social_measures_are_those_of_the_docs(corridors):
     found = cprl.evaluate_run(corridors["greedy"], episodes=1)
-    text = (cli.Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
+    text = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
     documented = [line.split("`")[1] for line in text.splitlines() if line.startswith("| `social/")]
     assert {f"social/{name}" for name in social_measures(found.trained)} == set(documented)
     (single,) = [one for name, one in social_measures({0: found.trained[0]}).items() if name == "peace"]

@@ -2,6 +2,7 @@
 
 import subprocess
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -109,19 +110,25 @@ def test_a_film_of_a_board_that_lives_says_what_is_left(runs, tmp_path, drawn):
     assert drawn[-1][2:] == ("", f"{played.stock_left} of 4 apples left · {apples} apple{'s'[: apples != 1]}")
 
 
-def test_sites_without_an_apple_are_dim_squares(runs, tmp_path):
-    path, _ = film_video(runs / "greedy", tmp_path / "film.gif", style=Style(width=300))
-    dead = sites_in(frames_of(path)[0][3])
-    under_agents = [(0, 3), (2, 1)]
+def test_every_nth_turn_is_shown_and_always_the_last_and_sites_without_an_apple_are_dim(runs, tmp_path):
+    path, _ = film_video(runs / "greedy", tmp_path / "own.gif", style=Style(every=2, width=300))
+    pictures, _ = frames_of(path)
+    assert [apples_in(picture) for picture in pictures[:-1]] == [LEFT[0], LEFT[2], LEFT[3]]
+    under_agents, dead = [(0, 3), (2, 1)], sites_in(pictures[2])
     empty = [dead[place] for place, site in enumerate(CORRIDORS.map.sites) if site not in under_agents]
     assert (np.array(empty) == EMPTY_SITE_COLOUR).all()
     assert np.array(EMPTY_SITE_COLOUR).sum() > 1.5 * np.array(PALETTE[GROUND]).sum()
 
 
-def test_populations_play_side_by_side_on_one_clock(runs, tmp_path):
+def test_populations_play_side_by_side_on_one_clock_below_their_titles(runs, tmp_path, drawn):
+    titles = ["Été", "quotas, 50 %"]
     path, played = film_video(
-        runs / "greedy", tmp_path / "both.gif", beside=[runs / "random"], style=Style(width=480)
+        runs / "greedy",
+        tmp_path / "both.gif",
+        beside=[runs / "random"],
+        style=Style(width=480, titles=titles),
     )
+    assert [title for _, title, _, _ in drawn[-2:]] == titles
     assert [episode.steps for episode in played] == [3, 9]
     both, durations = frames_of(path)
     assert len(both) == 1 + 9 + 1
@@ -157,19 +164,6 @@ def test_titles_are_what_tells_runs_apart(runs, tmp_path):
     assert titles(runs / "greedy", runs / "random") == ["Greedy", "Random"]
     assert titles(*governed[:2]) == ["No rule", "Quota and monitoring"]
     assert titles(*governed) == ["one", "two", "three"], "two have the same rules, all the same name"
-
-
-def test_titles_of_your_own_stand_above_the_boards(runs, tmp_path, drawn):
-    own = ["Été", "quotas, 50 %"]
-    film_video(
-        runs / "greedy", tmp_path / "a.gif", beside=[runs / "greedy"], style=Style(titles=own, width=480)
-    )
-    assert [title for _, title, _, _ in drawn[-2:]] == own
-
-
-def test_every_nth_turn_is_shown_and_always_the_last(runs, tmp_path):
-    path, _ = film_video(runs / "greedy", tmp_path / "own.gif", style=Style(every=2, width=300))
-    assert [apples_in(picture) for picture in frames_of(path)[0][:-1]] == [LEFT[0], LEFT[2], LEFT[3]]
 
 
 def test_the_film_is_the_episode_that_the_recording_has(runs, tmp_path):
@@ -230,36 +224,26 @@ def test_an_mp4_without_imageio_ffmpeg_is_refused_in_a_sentence(runs, tmp_path, 
         cli.main()
 
 
-@pytest.mark.parametrize("name", ["own.gif", "own.mp4"])
-def test_a_film_that_is_interrupted_leaves_no_file(runs, tmp_path, monkeypatch, name):
+@pytest.mark.parametrize("name", ["own.gif", "own.mp4", "own.rrd"])
+def test_a_film_that_is_interrupted_leaves_no_file_and_can_be_made_again(runs, tmp_path, monkeypatch, name):
+    make = film if name.endswith(".rrd") else partial(film_video, style=Style(width=240))
     draw, drawn = EpisodePicture.draw, []
 
     def interrupted(*arguments, **named):
         drawn.append(arguments)
-        if len(drawn) == 6:
+        if len(drawn) == 6 or make is film:
             raise KeyboardInterrupt
         return draw(*arguments, **named)
 
-    monkeypatch.setattr(EpisodePicture, "draw", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        film_video(runs / "random", tmp_path / name, style=Style(width=240))
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_recording_that_is_interrupted_leaves_no_file_and_can_be_made_again(runs, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr("cprl.evaluation.film._Events.on_step", interrupt)
+        patch.setattr(EpisodePicture, "draw", interrupted)
+        patch.setattr("cprl.evaluation.film._Events.on_step", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            film(runs / "greedy", tmp_path / "own.rrd")
+            make(runs / "random", tmp_path / name)
     assert list(tmp_path.iterdir()) == []
-    path, _ = film(runs / "greedy", tmp_path / "own.rrd")
-    with pytest.raises(FileExistsError, match=r"own\.rrd exists and is not overwritten"):
-        film(runs / "greedy", path)
-    assert path.exists()
-
-
-def interrupt(*_):
-    raise KeyboardInterrupt
+    path, _ = make(runs / "random", tmp_path / name)
+    with pytest.raises(FileExistsError, match=rf"{name} exists and is not overwritten"):
+        make(runs / "random", path)
 
 
 @pytest.mark.parametrize(
@@ -305,18 +289,15 @@ def test_the_command_says_what_it_wrote(runs, tmp_path, monkeypatch, capsys):
     assert second.startswith(f"{runs / 'meadow'}: 12 steps")
 
 
-def test_boards_wider_than_the_picture_are_drawn_smaller():
+def test_boards_that_are_larger_than_the_picture_are_drawn_smaller():
     wide = maps.random(6, 300, agents=14, density=0.2, clustering=0.5, seed=1)
     picture = EpisodePicture(wide, steps=10, width=240)
     assert picture.size[0] == 240
     assert picture._board_size[0] <= 240
-
-
-@pytest.mark.parametrize("height", [30, 300, 9000])
-def test_boards_higher_than_the_picture_are_drawn_smaller(height):
-    picture = EpisodePicture(maps.parse("\n".join(["A>", *["A."] * (height - 1)])), steps=10, width=240)
-    assert picture._board_size[1] <= 480
-    assert picture.size[1] < 1000, "a GIF holds at most 65,535 rows"
+    for height in (30, 300, 9000):
+        picture = EpisodePicture(maps.parse("\n".join(["A>", *["A."] * (height - 1)])), steps=10, width=240)
+        assert picture._board_size[1] <= 480
+        assert picture.size[1] < 1000, "a GIF holds at most 65,535 rows"
 
 
 @pytest.mark.parametrize(("number", "top"), [(0, 10), (10, 10), (11, 20), (201, 500), (1001, 2000)])

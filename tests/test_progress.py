@@ -31,13 +31,6 @@ def lines(monkeypatch, *, before):
     return told.getvalue()
 
 
-def test_lines_count_episodes_from_where_a_stopped_training_was(monkeypatch):
-    shown = [int(number) for number in re.findall(r"episode (\d+)/9", lines(monkeypatch, before=0))]
-    assert (shown[0], shown[-1]) == (0, 5)
-    shown = [int(number) for number in re.findall(r"episode (\d+)/9", lines(monkeypatch, before=6))]
-    assert (shown[0], shown[-1]) == (3, 8)
-
-
 def test_the_bar_shows_square_brackets_of_the_title_as_they_are():
     told = io.StringIO()
     with ProgressBar(GAME, episodes=9, title="run [a]", console=Console(file=told, force_terminal=True)):
@@ -45,11 +38,17 @@ def test_the_bar_shows_square_brackets_of_the_title_as_they_are():
     assert "run [a]" in told.getvalue()
 
 
-def printed(bar_of, *, steps, compile_s=0.0):
+def test_lines_count_episodes_from_where_a_stopped_training_was(monkeypatch):
+    shown = [int(number) for number in re.findall(r"episode (\d+)/9", lines(monkeypatch, before=0))]
+    assert (shown[0], shown[-1]) == (0, 5)
+    shown = [int(number) for number in re.findall(r"episode (\d+)/9", lines(monkeypatch, before=6))]
+    assert (shown[0], shown[-1]) == (3, 8)
+
+
+def printed(*, steps, compile_s=0.0):
     """What a bar prints of so many steps of one world, a millisecond each, the first with a compilation."""
-    told = io.StringIO()
-    batch = TensorDict(batch_size=[1])
-    with bar_of(Console(file=told, width=200)) as bar:
+    told, batch = io.StringIO(), TensorDict(batch_size=[1])
+    with ProgressBar(GAME, episodes=1000, console=Console(file=told, width=200)) as bar:
         with CLOCK.running():
             time.sleep(compile_s)
         for _ in range(steps):
@@ -58,24 +57,18 @@ def printed(bar_of, *, steps, compile_s=0.0):
     return told.getvalue()
 
 
-def long_bar(console):
-    return ProgressBar(GAME, episodes=1000, console=console)
-
-
 def test_no_time_left_is_shown_before_twenty_steps_were_timed(monkeypatch):
     monkeypatch.setattr(progress, "_LINE_PERIOD_S", 0.0)
-    told = printed(long_bar, steps=40).splitlines()
-    lines = [line for line in told if ": episode " in line]  # what else is compiled meanwhile is told too
-    assert len(lines) == 40
-    assert all("left" not in line for line in lines[: progress.TIMED_STEPS - 1])
-    assert all(" left" in line for line in lines[progress.TIMED_STEPS - 1 :])
+    # What else is compiled meanwhile is told too.
+    lines = [line for line in printed(steps=40).splitlines() if ": episode " in line]
+    assert [" left" in line for line in lines] == [False] * 19 + [True] * 21
 
 
 @pytest.mark.integration
 def test_a_compilation_is_reported_while_it_lasts_and_slows_no_estimate(monkeypatch):
     monkeypatch.setattr(progress, "_LINE_PERIOD_S", 0.02)
     monkeypatch.setattr(progress, "COMPILING_PERIOD_S", 0.2)
-    told = printed(long_bar, steps=60, compile_s=1.0)
+    told = printed(steps=60, compile_s=1.0)
     assert re.search(r"training: compiling, \d s so far", told)
     rates = [int(rate.replace(",", "")) for rate in re.findall(r"([\d,]+) steps/s", told)]
     assert min(rates) > 30, "a second of compiling for the first step would make it one step per second"

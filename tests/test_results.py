@@ -201,17 +201,14 @@ def test_a_table_that_exists_is_not_written_over(tmp_path, close):
     table.close()
 
 
-def test_a_run_without_episodes_leaves_an_empty_table(tmp_path):
+def test_a_run_without_episodes_leaves_an_empty_table_and_a_directory_without_one_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="is this a run"):
+        read_episodes(tmp_path)
     table = EpisodeTable(tmp_path / "episodes.parquet")
     table.add()
     assert len(read_episodes(tmp_path)) == 0
     table.close()
     assert read_episodes(tmp_path)["equality"].to_pylist() == []
-
-
-def test_a_directory_without_a_table_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="is this a run"):
-        read_episodes(tmp_path)
 
 
 def test_the_metrics_of_a_table_are_those_of_its_first_episode(tmp_path):
@@ -266,17 +263,14 @@ def test_runs_without_a_place_get_one_each(tmp_path, monkeypatch):
     assert all(run.parent == Path("runs") and run.name.startswith("tragedy-20") for run in runs)
 
 
-def test_a_directory_that_holds_something_is_refused(tmp_path):
+def test_a_directory_that_holds_something_and_a_name_that_is_none_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="name"):
+        start_run(tmp_path / "run", "../tragedy", recipe)
+    assert list(tmp_path.iterdir()) == []
     (tmp_path / "thesis.txt").touch()
     with pytest.raises(FileExistsError, match="is not empty"):
         start_run(tmp_path, "tragedy", recipe)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
-
-
-def test_a_name_that_is_none_leaves_no_directory(tmp_path):
-    with pytest.raises(ValueError, match="the name of a directory, without slashes"):
-        start_run(tmp_path / "run", "../tragedy", recipe)
-    assert list(tmp_path.iterdir()) == []
 
 
 def a_checkout(folder, *names):

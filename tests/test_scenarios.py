@@ -12,9 +12,9 @@ from stored_runs import CORRIDORS, DQN, MEADOW, SEED, command, ran
 import cprl
 from cprl import Experiment, Observation, maps, presets
 from cprl.envs.matrix import stag_hunt
-from cprl.evaluation import Scenario, draw_scenarios, run_scenarios, scenarios_of
+from cprl.evaluation import Scenario, run_scenarios, scenarios_of
 from cprl.evaluation import scenarios as module
-from cprl.evaluation.lanes import Fresh, Source
+from cprl.evaluation.lanes import Fresh, agents_of, scripted
 from cprl.evaluation.scenarios import estimates, scenario_tables
 from cprl.population import Frozen, Learning, Scripted
 from cprl.runs.recipe import read_recipe
@@ -100,17 +100,16 @@ def test_a_stored_background_is_of_the_next_replica(runs):
     own = Scenario(name="its_like", game=MEADOW, focal="minority", background=background)
     score = run_scenarios(learned, scenarios=[own], episodes=2, seed=SEED).by_scenario["its_like"]
     run = cprl.load(learned)
-    mine, theirs = Source(run), Source(run, {0: 1, 1: 2, 2: 0})
-    for focal, sources in (((0,), [mine, theirs]), ((1,), [theirs, mine])):
-        expected = FRESH.play(run, FRESH.agents(sources))
-        assert returns(score.played["run"][focal]) == returns(expected)
-    one = run_scenarios(learned, scenarios=[own], episodes=2, seed=SEED, replicas=[2]).by_scenario["its_like"]
-    for focal, played in one.played["run"].items():
-        assert returns(played) == {2: returns(score.played["run"][focal])[2]}, "alone as among all"
+    mine, theirs = agents_of(run), agents_of(run, {0: 1, 1: 2, 2: 0})
+    for focal, agents in ((0, [mine[0], theirs[1]]), (1, [theirs[0], mine[1]])):
+        found = score.where(focal="run", focal_agents=str(focal)).played
+        assert returns(found) == returns(FRESH.play(run, agents))
+        one = run_scenarios(learned, scenarios=[own], episodes=2, seed=SEED, replicas=[2])
+        alone = one.where(focal="run", focal_agents=str(focal)).played
+        assert returns(alone) == {2: returns(found)[2]}, "alone as among all"
     # Random agents in its place meet the same background of the same replica.
-    by_chance = replace(run, experiment=experiment_of(run, [Scripted("random")] * 2))
-    expected = FRESH.play(run, FRESH.agents([Source(by_chance), theirs]))
-    assert returns(score.played["random"][0,]) == returns(expected)
+    expected = FRESH.play(run, [scripted("random"), theirs[1]])
+    assert returns(score.where(focal="random", focal_agents="0").played) == returns(expected)
 
 
 def keeping(run, *replicas):
@@ -136,10 +135,6 @@ def test_a_run_of_a_single_replica_is_not_its_own_background(runs, monkeypatch):
     assert run_scenarios(run, scenarios=[own], episodes=1, replicas=[0]).by_scenario, "another replica"
     asked = replace(own, background=tuple(replace(spec, replica=1) for spec in background))
     assert run_scenarios(keeping(run, 1), scenarios=[asked], episodes=1).by_scenario, "asked for"
-
-
-def experiment_of(run, agents):
-    return replace(run.experiment, agents=tuple(agents))
 
 
 def test_two_agents_have_minorities_alone_and_without_a_beam_no_background_that_fires():
@@ -203,30 +198,28 @@ def test_the_table_and_the_estimates_hold_every_number(runs):
 
 
 @pytest.mark.integration
-def test_the_picture_has_a_row_for_each_scenario(runs, tmp_path):
-    scores = run_scenarios(runs["greedy"], episodes=1)
-    with Image.open(draw_scenarios(scores, tmp_path / "new" / "scenarios.png")) as picture:
-        assert min(picture.size) > 500
-    with pytest.raises(ValueError, match=r"path is '.*other\.svg'"):
-        draw_scenarios(scores, tmp_path / "other.svg")
-
-
 def test_the_command_scenarios_tells_returns_and_social_metrics(runs, tmp_path, monkeypatch, capsys):
     out, figure = tmp_path / "scenarios.parquet", tmp_path / "scenarios.png"
-    words = ["scenarios", runs["greedy"], "--episodes", 1, "--out", out, "--figure", figure]
-    text = command(monkeypatch, capsys, *words, "--scenarios", "majority_among_sustainable")
-    assert "Scenarios of greedy: 2 replicas, 1 episode each in each placement, seed 30011" in text
+    words = ["scenarios", runs["sustainable"], "--episodes", 1, "--out", out, "--figure", figure]
+    text = command(monkeypatch, capsys, *words, "--scenarios", "majority_among_greedy")
+    assert "Scenarios of sustainable: 2 replicas, 1 episode each in each placement, seed 30011" in text
     rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines() if "│" in line]
     assert [row[:2] for row in rows] == [
-        ["majority_among_sustainable", "2 [2, 2]"],
-        ["majority_among_sustainable", "4 [4, 4]"],
+        ["majority_among_greedy", "0 [0, 0]"],
+        ["majority_among_greedy", "2 [2, 2]"],
     ]
+    # Replicas are alike, so that what is not 0 differs for certain.
+    assert rows[0][5] == "-2 [-2, -2] *"
+    assert "* not 0 by Holm's method for all 2 differences" in text
     assert pq.read_table(out).num_rows == 3 * 3 * 2 * 3, "who is focal, placements, replicas, agents"
-    assert figure.exists()
-    with pytest.raises(SystemExit, match=r"cprl: .*scenarios\.parquet exists and is not"):
-        command(monkeypatch, capsys, *words)
-    with pytest.raises(SystemExit, match=r"cprl: .*scenarios\.png exists and is not"):
-        command(monkeypatch, capsys, "scenarios", runs["greedy"], "--figure", figure)
+    with Image.open(figure) as picture:
+        assert picture.width == 1200
+    for wrong, said in (
+        (words, r"scenarios\.parquet exists and is not"),
+        (["scenarios", runs["greedy"], "--figure", figure], r"scenarios\.png exists and is not"),
+    ):
+        with pytest.raises(SystemExit, match=f"cprl: .*{said}"):
+            command(monkeypatch, capsys, *wrong)
 
 
 @pytest.mark.parametrize(
@@ -234,7 +227,7 @@ def test_the_command_scenarios_tells_returns_and_social_metrics(runs, tmp_path, 
     [
         ({"scenarios": ["among_wolves"]}, "a scenario is 'among_wolves'"),
         ({"scenarios": ["minority_among_greedy"] * 2}, "minority_among_greedy is given twice"),
-        ({"scenarios": scenarios_of(CORRIDORS)[:1]}, "have different games: Map.* differ"),
+        ({"scenarios": scenarios_of(CORRIDORS)[:1]}, "have different games: Game.map.* differ"),
         ({"episodes": 0}, "episodes is 0"),
         ({"replicas": [2]}, r"has no replicas \[2\]"),
         ({"seed": 3}, "seed is 3, the training seed of .*greedy"),

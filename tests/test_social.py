@@ -46,31 +46,19 @@ def test_each_metric_is_what_we_work_out_by_hand():
 def test_the_yield_share_sets_the_harvest_against_what_the_map_bears():
     # 4 apples of 0.5 per step * 4 steps + 6 at first = 8
     assert share(HARVEST, sustainable_yield=0.5, first_stock=6).item() == 0.5
-
-
-def test_the_yield_share_takes_a_yield_for_each_episode():
+    assert share(HARVEST, sustainable_yield=0.1, first_stock=0).item() == 4 / (0.1 * 4), "not of float32"
+    assert share(HARVEST, sustainable_yield=0, first_stock=0).isnan(), "a share of nothing"
     yields, stocks = torch.tensor([0.0, 0.5, 1.0]), torch.tensor([4, 6, 0])
     shares = share(HARVEST.expand(3, 4, 2), sustainable_yield=yields, first_stock=stocks)
-    assert shares.tolist() == [1.0, 0.5, 1.0]
+    assert shares.tolist() == [1.0, 0.5, 1.0], "a yield for each episode"
 
 
-def test_a_yield_is_not_rounded_to_float32():
-    assert share(HARVEST, sustainable_yield=0.1, first_stock=0).item() == 4 / (0.1 * 4)
-
-
-def test_a_yield_share_of_nothing_is_undefined():
-    assert share(HARVEST, sustainable_yield=0, first_stock=0).isnan()
-
-
-def test_without_a_harvest_equality_and_sustainability_are_undefined():
+def test_agents_without_a_harvest_leave_equality_and_sustainability_undefined_or_are_left_out():
     metrics = social.summary(torch.stack([HARVEST, EMPTY]), None)
     assert metrics["equality"].isnan().tolist() == [False, True]
     assert metrics["sustainability"].isnan().tolist() == [False, True]
-
-
-def test_an_agent_without_a_harvest_is_left_out_of_sustainability():
-    harvest = HARVEST * torch.tensor([1, 0])
-    assert social.summary(harvest, None)["sustainability"].item() == pytest.approx(7 / 3)
+    alone = social.summary(HARVEST * torch.tensor([1, 0]), None)
+    assert alone["sustainability"].item() == pytest.approx(7 / 3)
 
 
 def test_an_episode_without_steps_has_no_value_per_step():
@@ -81,16 +69,11 @@ def test_an_episode_without_steps_has_no_value_per_step():
     assert metrics["survival_steps"] == metrics["peacefulness"] == 0
 
 
-def test_padding_behind_the_end_is_never_read():
+def test_episodes_of_unlike_length_are_measured_in_one_batch_and_padding_is_never_read():
+    played = torch.arange(7) < torch.tensor([[4], [2]])
     harvest = torch.cat([HARVEST, torch.full((3, 2), torch.nan)])
     in_play = torch.cat([IN_PLAY, torch.ones(3, 2, dtype=torch.bool)])
-    played = torch.arange(7) < 4
-    assert values(social.summary(harvest, in_play, played=played)) == pytest.approx(BY_HAND)
-
-
-def test_episodes_of_unlike_length_are_measured_in_one_batch():
-    played = torch.arange(4) < torch.tensor([[4], [2]])
-    both = social.summary(HARVEST.expand(2, 4, 2), IN_PLAY.expand(2, 4, 2), played=played)
+    both = social.summary(harvest.expand(2, 7, 2), in_play.expand(2, 7, 2), played=played)
     short = social.summary(HARVEST[:2], IN_PLAY[:2])
     assert {name: value[0].item() for name, value in both.items()} == pytest.approx(BY_HAND)
     assert {name: value[1].item() for name, value in both.items()} == values(short)
@@ -138,16 +121,16 @@ def test_equality_is_one_when_all_have_the_same_and_one_nth_when_one_has_all():
     assert social.summary(one_has_all, None)["equality"].item() == pytest.approx(1 / 4)
 
 
-@pytest.mark.parametrize("harvest", [-HARVEST, HARVEST / 0])
-def test_a_harvest_that_is_none_is_refused(harvest):
-    with pytest.raises(ValueError, match="harvest"):
-        social.summary(harvest, IN_PLAY)
-
-
-def test_what_belongs_together_is_given_together():
-    with pytest.raises(ValueError, match="first_stock"):
-        social.summary(HARVEST, IN_PLAY, first_stock=3)
-    with pytest.raises(ValueError, match="harvest"):
-        social.summary(None, IN_PLAY, sustainable_yield=1, first_stock=3)
-    with pytest.raises(ValueError, match="played"):
-        social.summary(None, None)
+@pytest.mark.parametrize(
+    ("harvest", "in_play", "board", "field"),
+    [
+        (-HARVEST, IN_PLAY, {}, "harvest"),
+        (HARVEST / 0, IN_PLAY, {}, "harvest"),
+        (HARVEST, IN_PLAY, {"first_stock": 3}, "first_stock"),
+        (None, IN_PLAY, {"sustainable_yield": 1, "first_stock": 3}, "harvest"),
+        (None, None, {}, "played"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused(harvest, in_play, board, field):
+    with pytest.raises(ValueError, match=field):
+        social.summary(harvest, in_play, **board)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from cprl.measuring.statistics import curve_interval, difference, estimate, holm
+from cprl.measuring.statistics import curve_interval, difference, estimate, holm, starred
 
 
 def test_intervals_are_by_student():
@@ -29,17 +29,17 @@ def test_one_replica_has_no_interval_and_values_that_are_not_finite_are_refused(
             estimate(wrong)
 
 
-def test_a_curve_has_an_interval_at_each_episode():
+def test_a_curve_has_an_interval_at_each_episode_where_several_replicas_have_a_value():
     curves = np.array([[1.0, 5.0, np.nan, np.nan], [3.0, 5.0, 2.0, np.nan], [5.0, 5.0, 4.0, np.nan]])
     middle, low, high = curve_interval(curves)
-    assert middle[:3].tolist() == [3.0, 5.0, 3.0]
-    for episode, own in ((0, [1.0, 3.0, 5.0]), (1, [5.0, 5.0, 5.0]), (2, [2.0, 4.0])):
-        alone = estimate(own)
-        assert (low[episode], high[episode]) == pytest.approx((alone.low, alone.high))
+    for episode, values in enumerate(([1.0, 3.0, 5.0], [5.0, 5.0, 5.0], [2.0, 4.0])):
+        alone = estimate(values)
+        found = (middle[episode], low[episode], high[episode])
+        assert found == pytest.approx((alone.value, alone.low, alone.high))
     assert np.isnan([middle[3], low[3], high[3]]).all()
     middle, low, high = curve_interval(curves[:1])
     assert middle[:2].tolist() == [1.0, 5.0]
-    assert np.isnan([low, high]).all(), "a single replica has no interval"
+    assert np.isnan([low, high]).all()
 
 
 def test_p_values_are_those_of_t_tests_and_agree_with_intervals():
@@ -68,3 +68,12 @@ def test_p_values_are_those_of_t_tests_and_agree_with_intervals():
 )
 def test_of_several_differences_those_differ_that_holm_names(p_values, differs):
     assert holm(p_values).tolist() == differs
+
+
+def test_differences_that_are_compared_together_are_starred_together():
+    # Alone the second would differ too: its p-value is 0.046.
+    pairs = ([3.0, 3.1, 3.2], [1.0, 1.5, 2.2], [-1.0, 1.0, 0.5])
+    differences = [estimate(values) for values in pairs]
+    assert [round(found.p_value, 3) for found in differences] == [0.0, 0.046, 0.808]
+    assert [text[-1] for text in starred(differences)] == ["*", "]", "]"]
+    assert starred(differences, "+.1f") == ["+3.1 *", "+1.6", "+0.2"]

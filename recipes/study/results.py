@@ -24,7 +24,7 @@ from cprl.algorithms import DQN
 from cprl.commons.batch import Batch
 from cprl.commons.game import Game
 from cprl.evaluation.evaluate import SEED
-from cprl.evaluation.lanes import Fresh, MakePolicies, Source
+from cprl.evaluation.lanes import Agent, Fresh, agents_of, scripted
 from cprl.experiment import Experiment
 from cprl.measuring.movement import Trace, overlap, trace
 from cprl.measuring.phases import Phase
@@ -85,7 +85,7 @@ def measures(
         return Measures(training=training, trained={}, random={})
     loaded = load(run, allow=allow)
     fresh = Fresh(replicas=tuple(loaded.replicas), episodes=WORLDS, seed=seed, greedy=True)
-    trained = _at_play(loaded, fresh, fresh.agents([Source(loaded)] * loaded.game.agents))
+    trained = _at_play(loaded, fresh, agents_of(loaded))
     return Measures(
         training=training,
         trained={name: values for name, values in trained.items() if np.isfinite(values).all()},
@@ -100,15 +100,15 @@ def _by_chance(run: LoadedRun, fresh: Fresh) -> dict[str, Values]:
     """`of_play` of the random policy; the same for all runs of a game, so played once."""
     key = run.game, run.experiment.transforms, fresh
     if key not in _PLAYED_BY_CHANCE:
-        _PLAYED_BY_CHANCE[key] = _at_play(run, fresh, fresh.random_agents(run))
+        _PLAYED_BY_CHANCE[key] = _at_play(run, fresh, [scripted("random")] * run.game.agents)
     return _PLAYED_BY_CHANCE[key]
 
 
-def _at_play(run: LoadedRun, fresh: Fresh, policies: MakePolicies) -> dict[str, Values]:
+def _at_play(run: LoadedRun, fresh: Fresh, agents: Sequence[Agent]) -> dict[str, Values]:
     """`of_play` of a game in the same fresh worlds, whoever plays."""
     found: dict[str, list[Values]] = {}
     for group, env in fresh.worlds(run):
-        played = trace(env, policies(group))
+        played = trace(env, fresh.policies(run, agents, group))
         for name, values in of_play(played, len(group)).items():
             found.setdefault(name, []).append(values)
     return {name: np.concatenate(values) for name, values in found.items()}

@@ -243,13 +243,13 @@ def crossplay(
     """
     named = _begin_named(fresh, files, runs)
 
-    from cprl.evaluation.cross_play import agents_table, draw_gains, gains_tables, heading, matrices
     from cprl.evaluation.cross_play import crossplay as play_each_other
+    from cprl.evaluation.cross_play import crossplay_tables, draw_gains, heading
 
     played = play_each_other(named, diagonal=diagonal, **vars(fresh))
     files.keep(played.table)
     say(heading(played))
-    print_tables([*matrices(played), *gains_tables(played), agents_table(played)])
+    print_tables(crossplay_tables(played))
     files.tell(lambda path: draw_gains(played, path))
 
 
@@ -326,8 +326,14 @@ def egta(
     named = _begin_named(fresh, files, runs)
 
     from cprl.evaluation.cross_play import crossplay
-    from cprl.evaluation.egta import analyse, draw_egta, egta_heading, egta_tables
-    from cprl.evaluation.empirical_game import pairwise_game, play_empirical_game
+    from cprl.evaluation.empirical_game import (
+        analyse,
+        draw_egta,
+        egta_heading,
+        egta_tables,
+        pairwise_game,
+        play_empirical_game,
+    )
     from cprl.theory.solutions import check_extras
 
     check_extras()
@@ -336,7 +342,7 @@ def egta(
         if pairwise
         else play_empirical_game(named, **vars(fresh))
     )
-    files.keep(lambda: game.episodes_table)
+    files.keep(game.table)
     analysis = analyse(game, resamples=resamples)
     say(egta_heading(game))
     print_tables(egta_tables(analysis))
@@ -417,8 +423,7 @@ def exploit(
     _begin(run, seed=responses.seed)
 
     from cprl.commands.studies import StudyOptions, carry_out, executor_of
-    from cprl.evaluation.exploit import TABLE, measure, plan_responses
-    from cprl.evaluation.responses import exploitability_tables
+    from cprl.evaluation.exploit import TABLE, exploitability_tables, measure, plan_responses
     from cprl.studies.study import directory_of
 
     plan = plan_responses(run, **vars(responses))

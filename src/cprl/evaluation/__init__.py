@@ -1,29 +1,41 @@
 """Evaluation: the agents of stored runs in fresh worlds, with their own run or among others.
 
 Modules, in the order in which one reads them:
-    lanes           stored agents of all replicas side by side, or one world turn by turn
+    lanes           stored agents of all replicas side by side, or one world turn by turn; Results, what
+                    labelled populations did in the same worlds
     evaluate        evaluate_run: all replicas of a run, beside the random policy
     cross_play      crossplay: a focal agent of one run among background agents of another, and what it gains
     populations     play_population: scripted and stored agents in any mix
     schelling       what restrained and greedy agents get, by how many of the others are restrained
-    empirical_game  play_empirical_game: the game whose strategies are runs; pairwise_game: of a cross-play
-    egta            analyse: which runs last in it, by alpha-rank, equilibria and replicator dynamics
+    empirical_game  play_empirical_game: the game whose strategies are runs; pairwise_game: of a cross-play;
+                    analyse: which runs last in it, by alpha-rank, equilibria and replicator dynamics
     scenarios       run_scenarios: a run among named backgrounds that it never met
     territory       territory_of: where the agents of a run go and whom they tag
-    responses       play_responses: what trained best responses gain over the agents whose place they take
-    exploit         exploitability: trains such responses, a study, and plays them
+    exploit         exploitability: trains best responses, a study; play_responses: what they gain over the
+                    agents whose place they take
     film            an episode, every step recorded, or as a GIF or an MP4
     film_pictures   the pictures of a film, and its files
     play            a person among trained or scripted agents
 """
 
 from cprl.evaluation.cross_play import Cell, CrossPlay, Gain, crossplay, draw_gains, gains
-from cprl.evaluation.egta import Analysis, analyse, draw_egta
-from cprl.evaluation.empirical_game import EmpiricalGame, pairwise_game, play_empirical_game
+from cprl.evaluation.empirical_game import (
+    Analysis,
+    EmpiricalGame,
+    analyse,
+    draw_egta,
+    pairwise_game,
+    play_empirical_game,
+)
 from cprl.evaluation.evaluate import Evaluation, evaluate_run
-from cprl.evaluation.exploit import Plan, exploitability, plan_responses
+from cprl.evaluation.exploit import (
+    Exploitability,
+    Plan,
+    exploitability,
+    plan_responses,
+    play_responses,
+)
 from cprl.evaluation.populations import play_population
-from cprl.evaluation.responses import Exploitability, Response, play_responses
 from cprl.evaluation.scenarios import Scenario, Score, Scores, draw_scenarios, run_scenarios, scenarios_of
 from cprl.evaluation.schelling import SchellingDiagram, draw_schelling, schelling
 from cprl.evaluation.territory import Territory, draw_visits, territory_of
@@ -37,7 +49,6 @@ __all__ = [
     "Exploitability",
     "Gain",
     "Plan",
-    "Response",
     "Scenario",
     "SchellingDiagram",
     "Score",

@@ -1,133 +1,105 @@
-"""evaluate_run: compares the agents of a stored run with the random policy in fresh worlds."""
+"""evaluate_run: compares the agents of a stored run with the random policy in fresh worlds; and what all
+evaluations share: the check of runs, and tables for the terminal."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
-import pyarrow as pa
 import torch
 from rich.table import Table
 
-from cprl.commons.game import Game
 from cprl.custom import trust
 from cprl.envs.unwrap import agent_names
-from cprl.evaluation.lanes import Fresh, Played, Source
+from cprl.evaluation.lanes import Fresh, Part, Played, Results, agents_of, scripted
 from cprl.measuring.metrics import left_out, with_unit
 from cprl.measuring.series import OF_AGENTS
-from cprl.measuring.statistics import (
-    Measured,
-    agents_without_harvest,
-    institution_measures,
-    over_replicas,
-    social_measures,
-)
-from cprl.runs.episodes import labelled
+from cprl.measuring.statistics import Measured, agents_without_harvest, over_replicas
 from cprl.system.defaults import SEED as SEED
 from cprl.training.agents import LoadedRun, load
 from cprl.values import Positive, Seed, checked
 
-_LONGEST: Final = 40
-"""The largest number of characters of a value in a message."""
+_LONGEST: Final = 80
+"""The largest number of characters of two values in a message."""
 
 
 def check_same_game(runs: Mapping[str, LoadedRun]) -> None:
     """Checks that all runs, by name, have the game of the first."""
     first, *others = runs
     for other in others:
-        unlike = differences(runs[first].game, runs[other].game)
-        unlike += transform_differences(runs[first], runs[other])
-        if unlike:
-            raise ValueError(
-                f"{first} and {other} have different games: {'; '.join(unlike)}; allowed: runs of the same "
-                "game"
-            )
+        refuse_unlike(f"{first} and {other}", unlike(runs[first], runs[other]))
 
 
-def differences(game: Any, other: Any) -> list[str]:
-    """The fields in which games differ, of a commons those of map, rules and observation, with their values
-    if they are short, and the institutions."""
-    if not (isinstance(game, Game) and isinstance(other, Game)):
-        if game == other:
-            return []
-        alike = is_dataclass(game) and type(game) is type(other)
-        return (_field_differences(game, other) if alike else []) or [f"{game!r} and {other!r}"]
-    pairs = (game.map, other.map), (game.rules, other.rules), (game.observation, other.observation)
-    lines = [line for first, second in pairs for line in _field_differences(first, second)]
-    if game.institutions != other.institutions:
-        names = (
-            ", ".join(type(institution).__name__ for institution in of.institutions) or "none"
-            for of in (game, other)
-        )
-        lines.append(f"institutions {' and '.join(names)}, or their values")
-    return lines
+def refuse_unlike(names: str, lines: Sequence[str]) -> None:
+    if lines:
+        raise ValueError(f"{names} have different games: {'; '.join(lines)}; allowed: the same game")
 
 
-def _field_differences(first: Any, second: Any) -> list[str]:
-    lines = []
-    for entry in fields(first):
-        one, two = getattr(first, entry.name), getattr(second, entry.name)
-        if one != two:
-            values = f"{one!r} and {two!r}"
-            short = len(values) <= 2 * _LONGEST
-            lines.append(f"{type(first).__name__}.{entry.name} {values if short else 'differ'}")
-    return lines
+def unlike(run: LoadedRun, other: LoadedRun) -> list[str]:
+    """The differences between the games of two runs and between their transforms, with what these learned."""
+    lines = differences(run.game, other.game)
+    transforms = run.experiment.transforms, other.experiment.transforms
+    if transforms[0] != transforms[1]:
+        return [*lines, f"transforms {transforms[0]} and {transforms[1]}"]
+    learned = {
+        name: (torch.as_tensor(value), torch.as_tensor(other.transforms_state[name]))
+        for name, value in run.transforms_state.items()
+    }
+    names = [name for name, pair in learned.items() if not torch.equal(*pair)]
+    return [*lines, f"the learned state of the transforms differs: {', '.join(names)}"] if names else lines
 
 
-def transform_differences(run: LoadedRun, other: LoadedRun) -> list[str]:
-    """The differences between the transforms of two runs: their specification and their learned state."""
-    if run.experiment.transforms != other.experiment.transforms:
-        return [f"transforms {run.experiment.transforms} and {other.experiment.transforms}"]
-    state, other_state = run.transforms_state, other.transforms_state
-    unlike = [
-        name
-        for name in state
-        if not torch.equal(torch.as_tensor(state[name]), torch.as_tensor(other_state[name]))
-    ]
-    return [f"the learned state of the transforms differs: {', '.join(unlike)}"] if unlike else []
+def differences(game: Any, other: Any, path: str = "") -> list[str]:
+    """The fields in which games differ, as "Game.rules.freeze_steps 2 and 7", with their values if they are
+    short."""
+    if game == other:
+        return []
+    lines: list[str] = []
+    path = path or type(game).__name__
+    if is_dataclass(game) and type(game) is type(other):
+        for entry in fields(game):
+            pair = getattr(game, entry.name), getattr(other, entry.name)
+            lines += differences(*pair, path=f"{path}.{entry.name}")
+    values = f"{game!r} and {other!r}"
+    return lines or [f"{path} {values if len(values) <= _LONGEST else 'differ'}"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Evaluation:
-    """Fresh episodes of a run's agents, and of the random policy in the same worlds."""
+class Evaluation(Results):
+    """Fresh episodes of a run's agents and, in the same worlds, of uniformly random ones, by "policy":
+    "trained" or "random"."""
 
     run: LoadedRun
-    fresh: Fresh
-    trained: Played = field(repr=False)
-    """The episodes by replica."""
-    random: Played = field(repr=False)
-    """The episodes of uniformly random agents in the same worlds."""
+
+    @property
+    def trained(self) -> Played:
+        """The episodes of the run's agents by replica."""
+        return self.where(policy="trained").played
+
+    @property
+    def random(self) -> Played:
+        return self.where(policy="random").played
 
     def measures(self, policy: str = "trained") -> dict[str, Measured]:
         """The social metrics over replicas by name, those of institutions as `institutions/fines` and so on,
         then the agents' returns, and what they paid, got and broke, as `agent_0/return` and so on.
         """
-        checked("policy", policy, Literal["trained", "random"])
-        played = self.trained if policy == "trained" else self.random
-        names = agent_names(self.run.env())
+        results = self.where(policy=checked("policy", policy, Literal["trained", "random"]))
+        played = results.played
         first = next(iter(played.values()))[0]
-        fields = {"return_": "return"} | {
-            name: name for name in OF_AGENTS if getattr(first, name) is not None
-        }
+        names = {"return_": "return"}
+        names |= {name: name for name in OF_AGENTS if getattr(first, name) is not None}
         of_agents = {
-            f"{name}/{called}": over_replicas(
+            f"{agent_name}/{name}": over_replicas(
                 {
-                    replica: [float(getattr(episode, field)[agent]) for episode in episodes]
+                    replica: [float(getattr(episode, entry)[agent]) for episode in episodes]
                     for replica, episodes in played.items()
                 }
             )
-            for field, called in fields.items()
-            for agent, name in enumerate(names)
+            for entry, name in names.items()
+            for agent, agent_name in enumerate(agent_names(self.run.env()))
         }
-        return {**social_measures(played), **institution_measures(played), **of_agents}
-
-    def table(self) -> pa.Table:
-        """The episodes with the columns of `episodes.parquet`, after "policy": "trained" or "random"."""
-        return labelled(
-            ({"policy": name}, replica, episodes)
-            for name, played in (("trained", self.trained), ("random", self.random))
-            for replica, episodes in played.items()
-        )
+        return results.estimates() | of_agents
 
 
 def evaluate_run(
@@ -154,12 +126,12 @@ def evaluate_run(
     """
     loaded = opened(run, allow)
     fresh = fresh_episodes([loaded], episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
-    return Evaluation(
-        run=loaded,
-        fresh=fresh,
-        trained=fresh.play(loaded, fresh.agents([Source(loaded)] * loaded.game.agents)),
-        random=fresh.play(loaded, fresh.random_agents(loaded), explore=True),
-    )
+    random = [scripted("random")] * loaded.game.agents
+    parts = [
+        Part({"policy": "trained"}, fresh.play(loaded, agents_of(loaded))),
+        Part({"policy": "random"}, fresh.play(loaded, random, explore=True)),
+    ]
+    return Evaluation(run=loaded, fresh=fresh, parts=parts)
 
 
 def opened(run: str | Path | LoadedRun, allow: Sequence[str] = ()) -> LoadedRun:

@@ -24,7 +24,7 @@ from cprl.evaluation.film_pictures import (
     write_gif,
     write_mp4,
 )
-from cprl.evaluation.lanes import Turns
+from cprl.evaluation.lanes import Turns, board_now
 from cprl.measuring.episodes import Episode, tracker_of
 from cprl.policies.assignment import AgentPolicies
 from cprl.runs.files import refuse_to_write_over
@@ -107,7 +107,6 @@ def film(
 
 
 def _recorded(fresh: FreshEpisode, target: Path, title: str) -> Episode:
-    others = dict(zip(fresh.policies.indices, fresh.policies.actors, strict=True))
     with ViewerCallback(
         target.parent,
         fresh.env,
@@ -117,36 +116,29 @@ def _recorded(fresh: FreshEpisode, target: Path, title: str) -> Episode:
         file_name=target.name,
         is_replay=True,
     ) as viewer:
-        events = _Events(viewer)
+        log = _Events(viewer)
         train(
             fresh.env,
             {},
-            others=others,
+            others=dict(zip(fresh.policies.indices, fresh.policies.actors, strict=True)),
             decisions=fresh.policies.decisions,
             episodes=1,
-            callbacks=[viewer, *_decisions(viewer, fresh), *_offences(viewer, fresh), events],
+            callbacks=[viewer, *_views(viewer, fresh), log],
         )
-    assert events.episode is not None
-    return events.episode
+    assert log.episode is not None
+    return log.episode
 
 
-def _decisions(viewer: ViewerCallback, fresh: FreshEpisode) -> list[Decisions]:
-    """What agents choose by, of games whose boards are shown."""
-    scene, game = viewer.logger.scene, fresh.run.game
+def _views(viewer: ViewerCallback, fresh: FreshEpisode) -> Iterator[Decisions | Offences]:
+    """Of games whose boards are shown what agents choose by, and under institutions who breaks rules and what
+    is paid."""
+    scene, commons, logger = viewer.logger.scene, commons_of(fresh.env), viewer.logger
     if scene is None:
-        return []
-    decisions = Decisions(
-        viewer.logger, fresh.policies, actions=game.actions, names=scene.agents, window=scene.window
-    )
-    return [decisions]
-
-
-def _offences(viewer: ViewerCallback, fresh: FreshEpisode) -> list[Offences]:
-    """Who breaks rules and what is paid, of games with institutions whose boards are shown."""
-    scene, commons = viewer.logger.scene, commons_of(fresh.env)
-    if scene is None or commons is None or not has_institutions(scene):
-        return []
-    return [Offences(viewer.logger, commons, names=scene.agents)]
+        return
+    actions = fresh.run.game.actions
+    yield Decisions(logger, fresh.policies, actions=actions, names=scene.agents, window=scene.window)
+    if commons is not None and has_institutions(scene):
+        yield Offences(logger, commons, names=scene.agents)
 
 
 class _Events:
@@ -158,13 +150,13 @@ class _Events:
         self._step = 0
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Logs who was tagged by whom, and who broke a rule."""
         self._step += 1
         tagged_by = batch.get(("next", *keys.TAGGED_BY), None)
-        if tagged_by is not None:
-            for tagged, by in tagged_by[0].nonzero().tolist():
-                self._log(f"agent {tagged} is tagged out by agent {by}")
-        for event in events(batch):
+        tags = [] if tagged_by is None else tagged_by[0].nonzero().tolist()
+        for event in (
+            *(f"agent {tagged} is tagged out by agent {by}" for tagged, by in tags),
+            *events(batch),
+        ):
             self._log(event)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
@@ -183,8 +175,6 @@ GIF_FRAMES: Final = 300
 """The pictures of a GIF, at most, unless `every` is given."""
 _SAMPLES: Final = 24
 """The pictures from which a GIF's palette is taken."""
-
-
 Fps = Annotated[float, Where(lambda fps: 0 < fps <= MOST_FPS, f"a number above 0, at most {MOST_FPS:g}")]
 
 
@@ -348,34 +338,24 @@ def _panels(fresh: Sequence[FreshEpisode], titles: Sequence[str], width: int) ->
     episodes = [_play(population) for population in fresh]
     most = max(int(moments[-1].harvested.max()) for moments, _, _ in episodes)
     height = max(EpisodePicture(game.map, steps=1, width=width).size[1] for game in games)
-    panels = []
-    for title, game, (moments, violators, played) in zip(titles, games, episodes, strict=True):
-        picture = EpisodePicture(
-            game.map, steps=game.rules.episode_steps, width=width, most_harvested=most, height=height
-        )
-        panels.append(
-            _Panel(title=title, picture=picture, moments=moments, violators=violators, played=played)
-        )
-    return panels
+    sizes = {"width": width, "height": height, "most_harvested": most}
+    pictures = [EpisodePicture(game.map, steps=game.rules.episode_steps, **sizes) for game in games]
+    return [
+        _Panel(title=title, picture=picture, moments=moments, violators=violators, played=played)
+        for title, picture, (moments, violators, played) in zip(titles, pictures, episodes, strict=True)
+    ]
 
 
 def _play(fresh: FreshEpisode) -> tuple[list[Shown], list[set[int]], Episode]:
     """All boards of the episode, that at its start first, without what agents observe; the agents that broke
     a rule in the turn that led to each; and the episode."""
-    env, commons = fresh.env, _commons(fresh)
-
-    def now() -> Shown:
-        board = commons.worlds.show(commons.output)
-        return board._replace(observation=board.observation[:0])
-
-    tracker = tracker_of(env)
-    turns = Turns(env, fresh.policies)
-    moments, violators = [now()], [set[int]()]
-    while True:
+    tracker, turns, commons = tracker_of(fresh.env), Turns(fresh.env, fresh.policies), _commons(fresh)
+    ended: list[Episode] = []
+    moments, violators = [board_now(commons)], [set[int]()]
+    while not ended:
         batch = turns.play()
         ended = tracker.add(batch)
-        moments.append(now())
+        moments.append(board_now(commons))
         violated = batch.get(("next", *keys.VIOLATED), None)
         violators.append(set() if violated is None else set(violated[0].nonzero()[:, 0].tolist()))
-        if ended:
-            return moments, violators, ended[0]
+    return moments, violators, ended[0]

@@ -73,10 +73,12 @@ class EpisodePicture:
         shrink = min(1.0, room / wide, highest / high)
         self._board_size = max(1, int(wide * shrink)), max(1, int(high * shrink))
         self._half = (width - 3 * unit) // 2
-        self._legend = _Legend(len(board.starts), self._half, self._font)
+        self._item = int(self._font.getlength("00:0000  "))
+        self._in_a_row = max(1, self._half // self._item)
+        rows = ceil(len(board.starts) / self._in_a_row)
         self._line = line = unit + unit // 2
         self._title_height, self._plot_height = 3 * unit, _PLOT_HEIGHT * unit
-        below = unit // 2 + 5 * unit // 2 + line * (1 + self._legend.rows) + self._plot_height + 2 * line
+        below = unit // 2 + 5 * unit // 2 + line * (1 + rows) + self._plot_height + 2 * line
         height = max(height, self._title_height + self._board_size[1] + below)
         self.size: tuple[int, int] = width, height + height % 2
         """The width and height in pixels, both even."""
@@ -172,8 +174,12 @@ class EpisodePicture:
         for agent in range(harvests.shape[1]):
             path = self._points(left, harvests[:, agent], most)
             draw.line(path, agent_colour(agent), max(1, self._unit // 6))
-        below = self._axes_top - self._line * self._legend.rows
-        self._legend.draw(draw, (left, below), harvests[-1])
+        top = self._axes_top - self._line * ceil(harvests.shape[1] / self._in_a_row)
+        line = int(self._font.getbbox("0")[3] * 1.3) + 1
+        for agent, apples in enumerate(harvests[-1]):
+            row, place = divmod(agent, self._in_a_row)
+            at = left + place * self._item, top + row * line
+            draw.text(at, f"{agent}:{apples}", agent_colour(agent), self._font)
 
     def _axes(self, draw: ImageDraw.ImageDraw, left: int, number: str, words: str) -> None:
         """The frame of a plot over turns; above it a large number and what it counts."""
@@ -207,24 +213,6 @@ def _fitting(text: str, room: float, largest: int) -> ImageFont.FreeTypeFont:
     return _font(largest if wide <= room else max(1, int(largest * room / wide)))
 
 
-class _Legend:
-    """The number of each agent in its colour, with its harvest, in as many rows as it takes."""
-
-    def __init__(self, agents: int, wide: int, font: ImageFont.FreeTypeFont) -> None:
-        self._font, self._agents = font, agents
-        self._item = int(font.getlength("00:0000  "))
-        self._in_a_row = max(1, wide // self._item)
-        self.rows = ceil(agents / self._in_a_row)
-        self._line = int(font.getbbox("0")[3] * 1.3) + 1
-
-    def draw(self, draw: ImageDraw.ImageDraw, at: tuple[int, int], harvested: NDArray[np.int32]) -> None:
-        for agent in range(self._agents):
-            row, place = divmod(agent, self._in_a_row)
-            where = at[0] + place * self._item, at[1] + row * self._line
-            colour: Colour = agent_colour(agent)
-            draw.text(where, f"{agent}:{harvested[agent]}", colour, self._font)
-
-
 def nice(number: int) -> int:
     """The next larger of 10, 20, 50, 100, 200, 500 and so on."""
     power = 10
@@ -240,8 +228,6 @@ HOLD_S: Final = 2.0
 
 _COLOURS: Final = 127
 """Of a GIF, so that a pixel takes at most seven bits; one more marks pixels that do not change."""
-_SAMPLES: Final = 24
-"""Pictures from which the colours are taken."""
 
 
 def check_can_write_mp4(path: Path) -> None:
@@ -291,11 +277,11 @@ class _Palette:
         for picture in samples:
             colours, times = np.unique(_packed(picture), return_counts=True)
             counts.update(dict(zip(colours.tolist(), times.tolist(), strict=True)))
-        self._known = np.array([colour for colour, _ in counts.most_common(_COLOURS)], np.int64)
-        self._colours = np.stack([self._known >> 16, self._known >> 8 & 255, self._known & 255], -1)
+        known = np.array([colour for colour, _ in counts.most_common(_COLOURS)], np.int64)
+        self._colours = np.stack([known >> 16, known >> 8 & 255, known & 255], -1)
         self._index = np.full(2**24, -1, np.int16)
-        self._index[self._known] = np.arange(len(self._known))
-        self.unchanged = len(self._known)
+        self._index[known] = np.arange(len(known))
+        self.unchanged = len(known)
         """The index of pixels that do not change."""
         self.bytes = bytes(self._colours.astype(np.uint8).tobytes()) + bytes(3)
         """Red, green and blue of each index."""
@@ -303,18 +289,12 @@ class _Palette:
     def image(self, picture: Bytes) -> Image.Image:
         """A picture [height, width, 3] in colours of the palette."""
         packed = _packed(picture)
-        indices = self._index[packed]
-        if (indices < 0).any():
-            for colour in np.unique(packed[indices < 0]).tolist():
-                self._index[colour] = self._nearest(colour)
-            indices = self._index[packed]
-        image = Image.fromarray(indices.astype(np.uint8), "P")
+        for colour in np.unique(packed[self._index[packed] < 0]).tolist():
+            apart = self._colours - [colour >> 16, colour >> 8 & 255, colour & 255]
+            self._index[colour] = (apart**2).sum(-1).argmin()
+        image = Image.fromarray(self._index[packed].astype(np.uint8), "P")
         image.putpalette(self.bytes)
         return image
-
-    def _nearest(self, colour: int) -> int:
-        apart = self._colours.astype(np.int64) - [colour >> 16, colour >> 8 & 255, colour & 255]
-        return int((apart**2).sum(-1).argmin())
 
 
 def _packed(picture: Bytes) -> NDArray[Any]:

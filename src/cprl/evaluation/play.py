@@ -20,7 +20,7 @@ from cprl.commons.world import Shown, StepOutput
 from cprl.custom import trust
 from cprl.envs.make_env import make_env
 from cprl.envs.unwrap import commons_of
-from cprl.evaluation.lanes import Policy, Turns
+from cprl.evaluation.lanes import Policy, Turns, board_now
 from cprl.evaluation.populations import agent_named, board_named
 from cprl.measuring import social
 from cprl.measuring.metrics import title
@@ -76,7 +76,7 @@ class Session:
         self._decision, self._action = decision, 0
         self._turns = Turns(env, self._choose)
         self._played: list[TensorDictBase] = []
-        self.moments: list[Shown] = [self._now()]
+        self.moments: list[Shown] = [board_now(self._commons)]
         """The board as the episode began, then after each turn."""
 
     @property
@@ -106,7 +106,7 @@ class Session:
             raise refusal("action", action, ", ".join(self.game.actions))
         self._action = self.game.actions.index(action)
         self._played.append(self._turns.play())
-        self.moments.append(self._now())
+        self.moments.append(board_now(self._commons))
         return self._commons.output
 
     def metrics(self) -> dict[str, float]:
@@ -126,10 +126,6 @@ class Session:
                 values[0, self.agent] = value
                 chosen[key] = values
         return chosen
-
-    def _now(self) -> Shown:
-        board = self._commons.worlds.show(self._commons.output)
-        return board._replace(observation=board.observation[:0])
 
 
 def state(session: Session) -> str:
@@ -155,21 +151,6 @@ def happened(session: Session, turn: StepOutput) -> Iterator[str]:
         yield f"you tag {whom}" if by == me else f"agent {by} tags {whom}"
 
 
-def _ending(session: Session) -> str:
-    if not session.has_ended:
-        return f"stopped after turn {session.turn:,}"
-    return "no apple is left" if session.stock == 0 else "time is over"
-
-
-def _results(session: Session) -> str:
-    """Return the social metrics of the turns played, a line each: name, value, words and unit."""
-    numbers = {
-        name: "undefined" if isnan(value) else f"{value:.4g}" for name, value in session.metrics().items()
-    }
-    lines = [f"{name:17s} {number:>9s}  {title(name)}" for name, number in numbers.items()]
-    return "\n".join(lines) or "No turn was played, so there is nothing to measure."
-
-
 def play_in_terminal(session: Session, read_line: Callable[[], str] | None = None) -> None:
     """Play the episode: a line of keys is played key by key; `quit`, Ctrl-C or the end of input ends it.
 
@@ -185,8 +166,13 @@ def play_in_terminal(session: Session, read_line: Callable[[], str] | None = Non
         say(state(session))
         if session.has_ended or not _ask_and_play(session, read_line):
             break
-    say(f"The end: {_ending(session)}.")
-    say(_results(session))
+    ending = "no apple is left" if session.stock == 0 else "time is over"
+    say(f"The end: {ending if session.has_ended else f'stopped after turn {session.turn:,}'}.")
+    for name, value in session.metrics().items():
+        number = "undefined" if isnan(value) else f"{value:.4g}"
+        say(f"{name:17s} {number:>9s}  {title(name)}")
+    if not session.turn:
+        say("No turn was played, so there is nothing to measure.")
 
 
 def _ask_and_play(session: Session, read_line: Callable[[], str]) -> bool:
@@ -200,19 +186,14 @@ def _ask_and_play(session: Session, read_line: Callable[[], str]) -> bool:
             line = ""
         if not sys.stdin.isatty() or not line:
             say(line.rstrip("\n"))
-        if not line or line.strip() == QUIT:
+        typed = line.strip() or "."
+        if not line or typed == QUIT:
             return False
-        if _play_line(session, line.strip() or "."):
-            return True
-
-
-def _play_line(session: Session, line: str) -> bool:
-    """Play a line of keys, or none of it where one is unknown; whether it was played."""
-    for key in line:
-        if key not in KEYS or KEYS[key][0] not in session.game.actions:
-            say(f"key is {key!r}; allowed: {help_of(session.game)}, or {QUIT}; nothing was played")
-            return False
-    for key in line:
+        unknown = [key for key in typed if KEYS.get(key, ("",))[0] not in session.game.actions]
+        if not unknown:
+            break
+        say(f"key is {unknown[0]!r}; allowed: {help_of(session.game)}, or {QUIT}; nothing was played")
+    for key in typed:
         for event in happened(session, session.act(KEYS[key][0])):
             say(f"turn {session.turn:,}: {event}")
         if session.has_ended:

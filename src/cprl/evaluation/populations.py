@@ -11,10 +11,12 @@ from cprl import presets
 from cprl.commons import maps
 from cprl.commons.game import Game
 from cprl.commons.rules import Rules
+from cprl.commons.spaces import Spaces
 from cprl.custom import made, trust
-from cprl.envs.make_env import is_playable, make_env
+from cprl.envs.make_env import is_playable, make_env, spaces_of
 from cprl.evaluation.evaluate import SEED, check
-from cprl.evaluation.lanes import Fresh, Place, Played
+from cprl.evaluation.lanes import Place, Played
+from cprl.measuring.evaluate import evaluate
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
 from cprl.presets import Variant
@@ -59,9 +61,9 @@ def play_population(
     runs = {spec.run for spec in specs if isinstance(spec, Frozen)}
     check(episodes=episodes, seed=seed, runs=list(map(load, sorted(runs))))
     population = Population(place.env(replicas, seed=seed), specs, seed=seed)
-    policies = population.policy(episodes)
-    fresh = Fresh(replicas=tuple(range(replicas)), episodes=episodes, seed=seed, greedy=greedy)
-    return fresh.play(place, lambda _: policies)
+    env = place.env(replicas * episodes, seed=seed)
+    ended = evaluate(env, population.policy(episodes), explore=not greedy)
+    return {replica: ended[replica * episodes :][:episodes] for replica in range(replicas)}
 
 
 def place_of(where: Any) -> Place:
@@ -76,6 +78,10 @@ def place_of(where: Any) -> Place:
 @dataclass(frozen=True)
 class _FreshGame:
     game: Any
+
+    @property
+    def playing(self) -> Game | Spaces:
+        return self.game if isinstance(self.game, Game) else spaces_of(self.env())
 
     def env(self, worlds: int = 1, *, seed: int = 0, first_world: int = 0) -> EnvBase:
         return make_env(self.game, worlds=worlds, seed=seed, first_world=first_world)

@@ -14,16 +14,13 @@ those that it is held against; a number is a replica's mean over episodes and pl
 replicas, because only replicas are independent.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from math import isnan
 from pathlib import Path
-from statistics import fmean
 from typing import Annotated, Any, Final, Literal, TypeAlias, get_args
 
-import numpy as np
 import pyarrow as pa
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
@@ -36,24 +33,16 @@ from cprl.evaluation.evaluate import (
     fresh_episodes,
     how_they_play,
     opened,
+    refuse_unlike,
     table_of,
-    transform_differences,
+    unlike,
 )
-from cprl.evaluation.lanes import Fresh, Played, pooled
+from cprl.evaluation.lanes import Agent, Part, Results, Whose, agents_of, more, scripted
 from cprl.measuring.metrics import with_unit
-from cprl.measuring.statistics import (
-    Estimate,
-    Measured,
-    difference,
-    institution_measures,
-    over_replicas,
-    social_measures,
-)
-from cprl.policies.assignment import AgentPolicies
+from cprl.measuring.statistics import HOLM, Estimate, Measured, starred
 from cprl.population import Frozen, Scripted
-from cprl.runs.episodes import labelled
-from cprl.terminal.style import MARK, MEAN, SMALL_PT, head, picture_path, save
-from cprl.training.agents import LoadedRun, StoredAgent, check_scripted, load, stored_policies
+from cprl.terminal import style
+from cprl.training.agents import LoadedRun, StoredAgent, check_scripted, load
 from cprl.values import Value, Where, refusal
 
 Focal: TypeAlias = Literal["majority", "minority"]
@@ -187,81 +176,39 @@ FocalAgents: TypeAlias = Literal["run", "random", "greedy"]
 """Who takes the focal places: the run's agents, or agents that follow a scripted policy."""
 FOCAL_AGENTS: Final[tuple[FocalAgents, ...]] = get_args(FocalAgents)
 
-Whose: TypeAlias = Literal["focal", "background"]
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Score:
+class Score(Results):
     """The episodes of one scenario."""
-
-    scenario: Scenario
-    played: Mapping[FocalAgents, Mapping[tuple[int, ...], Played]] = field(repr=False)
-    """The episodes by who is focal, the indices of the focal agents, and the replica."""
 
     def measures(self, focal: FocalAgents = "run") -> dict[str, Measured]:
         """focal/return and background/return, the mean return of a focal and of a background agent, then the
         social metrics of all agents together, and those of institutions as `institutions/fines` and so on;
         intervals by Student's t.
         """
-        together = pooled(self.played[focal].values())
-        return {
-            "focal/return": over_replicas(self.returns("focal", focal)),
-            "background/return": over_replicas(self.returns("background", focal)),
-            **social_measures(together),
-            **institution_measures(together),
-        }
-
-    def returns(self, whose: Whose, focal: FocalAgents = "run") -> dict[int, list[float]]:
-        """The mean return per agent by replica, of each episode of each placement."""
-        values: dict[int, list[float]] = {}
-        for places, played in self.played[focal].items():
-            rest = np.setdiff1d(np.arange(self.scenario.game.agents), places)
-            agents = list(places) if whose == "focal" else rest.tolist()
-            for replica, episodes in played.items():
-                of_episodes = (float(episode.return_[agents].mean()) for episode in episodes)
-                values.setdefault(replica, []).extend(of_episodes)
-        return values
+        return self.where(focal=focal).estimates("focal", "background")
 
     def advantage(self, over: FocalAgents, *, whose: Whose = "focal") -> Estimate:
         """What the run's agents get more than others would in their places; or what the background gets
         more among them. Paired by replica, which plays the same worlds; the interval is by Student's t.
         """
-        reached, other = self.returns(whose), self.returns(whose, over)
-        means = [[fmean(values[replica]) for replica in reached] for values in (reached, other)]
-        return difference(*means, paired=True)
+        return more(self.where(focal="run"), self.where(focal=over), whose)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Scores:
-    """What a run reached in scenarios."""
+class Scores(Results):
+    """What a run reached, by "scenario", "focal", who takes the focal places, and "focal_agents", their
+    indices, e.g. "0 2 3"."""
 
     run: LoadedRun
-    by_scenario: Mapping[str, Score] = field(repr=False)
-    """The scores by the name of the scenario."""
-    fresh: Fresh
-    """Episodes of each replica in each placement."""
     left_out: str
     """Which named scenarios of the game were not at hand and why; "" if none was, or others were asked
     for."""
 
-    def table(self) -> pa.Table:
-        """All episodes with the columns of `episodes.parquet`, after "scenario", "focal" (who takes the focal
-        places: "run", "random" or "greedy") and "focal_agents" (their indices, e.g. "0 2 3")."""
-        return labelled(
-            (
-                {"scenario": name, "focal": focal, "focal_agents": " ".join(map(str, places))},
-                replica,
-                episodes,
-            )
-            for name, score in self.by_scenario.items()
-            for focal, by_places in score.played.items()
-            for places, played in by_places.items()
-            for replica, episodes in played.items()
-        )
-
-
-Member: TypeAlias = Callable[[int], StoredAgent]
-"""Who plays with an agent index, by the index of the replica."""
+    @property
+    def by_scenario(self) -> dict[str, Score]:
+        """The scores by the name of the scenario."""
+        names = dict.fromkeys(str(part.labels["scenario"]) for part in self.parts)
+        return {name: Score(parts=self.where(scenario=name).parts, fresh=self.fresh) for name in names}
 
 
 def run_scenarios(
@@ -284,46 +231,30 @@ def run_scenarios(
     """
     loaded = opened(run, allow)
     check_game(loaded.game)
-    everyone = tuple(range(loaded.game.agents))
-    check_scripted([(Scripted("greedy"), everyone)], loaded.spaces, loaded.game)
+    everyone = range(loaded.game.agents)
+    check_scripted([(Scripted("greedy"), tuple(everyone))], loaded.spaces, loaded.game)
     chosen = _chosen(loaded, scenarios)
     stored = _stored(loaded, chosen)
     fresh = fresh_episodes(
         [loaded], episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, trained=stored.values()
     )
     _refuse_meeting_itself(loaded, chosen, stored, fresh.replicas)
-
-    def played(members: Sequence[Member]) -> Played:
-        def policies(replicas: Sequence[int]) -> AgentPolicies:
-            agents = [[member(replica) for replica in replicas] for member in members]
-            return stored_policies(agents, loaded.game, replicas=replicas, worlds=episodes, seed=seed)
-
-        return fresh.play(loaded, policies)
-
-    scores = {}
+    focal_agents: dict[FocalAgents, Sequence[Agent]] = {
+        "run": agents_of(loaded),
+        "random": [scripted("random")] * len(everyone),
+        "greedy": [scripted("greedy")] * len(everyone),
+    }
+    parts = []
     for scenario in chosen:
         background = [_background(spec, stored) for spec in scenario.background]
-        scores[scenario.name] = Score(
-            scenario=scenario,
-            played={
-                focal: {
-                    places: played(
-                        [
-                            _focal(loaded, focal, agent) if agent in places else background[agent]
-                            for agent in everyone
-                        ]
-                    )
-                    for places in scenario.placements
-                }
-                for focal in FOCAL_AGENTS
-            },
-        )
-    return Scores(
-        run=loaded,
-        by_scenario=scores,
-        fresh=fresh,
-        left_out="" if scenarios else left_out_of(loaded.game),
-    )
+        for who, focal in focal_agents.items():
+            for places in scenario.placements:
+                agents = [focal[agent] if agent in places else background[agent] for agent in everyone]
+                indices = " ".join(map(str, places))
+                labels = {"scenario": scenario.name, "focal": who, "focal_agents": indices}
+                parts.append(Part(labels, fresh.play(loaded, agents), (places,)))
+    left_out = "" if scenarios else left_out_of(loaded.game)
+    return Scores(run=loaded, parts=parts, fresh=fresh, left_out=left_out)
 
 
 def _chosen(run: LoadedRun, scenarios: Sequence[str | Scenario]) -> list[Scenario]:
@@ -340,7 +271,7 @@ def _chosen(run: LoadedRun, scenarios: Sequence[str | Scenario]) -> list[Scenari
         scenario = named[given] if isinstance(given, str) else given
         if scenario.name in chosen:
             raise ValueError(f"{scenario.name} is given twice; allowed: scenarios with different names")
-        _check_game_of(f"the scenario {scenario.name}", differences(run.game, scenario.game), run)
+        refuse_unlike(f"{run.path} and the scenario {scenario.name}", differences(run.game, scenario.game))
         chosen[scenario.name] = scenario
     return list((chosen or named).values())
 
@@ -350,28 +281,14 @@ def _stored(run: LoadedRun, scenarios: Sequence[Scenario]) -> dict[str, LoadedRu
     paths = dict.fromkeys(spec.run for spec in specs if isinstance(spec, Frozen))
     runs = {path: load(path) for path in paths}
     for path, stored in runs.items():
-        unlike = differences(run.game, stored.game) + transform_differences(run, stored)
-        _check_game_of(f"the background {path}", unlike, run)
+        refuse_unlike(f"{run.path} and the background {path}", unlike(run, stored))
     return runs
 
 
-def _check_game_of(what: str, unlike: Sequence[str], run: LoadedRun) -> None:
-    if unlike:
-        raise ValueError(
-            f"{run.path} and {what} have different games: {'; '.join(unlike)}; allowed: the same game"
-        )
-
-
-def _focal(run: LoadedRun, focal: FocalAgents, agent: int) -> Member:
-    if focal == "run":
-        return lambda replica: run.agent(agent, replica=replica)
-    return lambda _: StoredAgent(scripted=focal)
-
-
-def _background(spec: Scripted | Frozen, stored: Mapping[str, LoadedRun]) -> Member:
+def _background(spec: Scripted | Frozen, stored: Mapping[str, LoadedRun]) -> Agent:
     """The agent in a background place; see `Scenario.background`."""
     if isinstance(spec, Scripted):
-        return lambda _: StoredAgent(scripted=spec.policy)
+        return scripted(spec.policy)
     run = stored[spec.run]
 
     def theirs(replica: int) -> StoredAgent:
@@ -414,20 +331,6 @@ def _refuse_meeting_itself(
 SOCIAL: Final = ("collective_return", "equality", "sustainability", "survival_steps", "peacefulness")
 """The social metrics of the table in the terminal; the others are in `estimates`."""
 
-_SCHEMA: Final = pa.schema(
-    [
-        ("scenario", pa.string()),
-        ("focal", pa.string()),
-        ("metric", pa.string()),
-        ("value", pa.float64()),
-        ("low", pa.float64()),
-        ("high", pa.float64()),
-        ("replicas", pa.int32()),
-        ("episodes", pa.int32()),
-        ("undefined", pa.int32()),
-    ]
-)
-
 
 def heading(scores: Scores) -> str:
     exploring = how_they_play([scores.run], scores.fresh)
@@ -441,16 +344,19 @@ def scenario_tables(scores: Scores) -> Iterator[Table]:
     """A table of returns, a row for each scenario, and one of social metrics of all agents together."""
     columns = ["scenario", "focal: the run's agents", "random in their place", "greedy in their place"]
     columns += ["run's - random's, paired", "run's - greedy's, paired", "background"]
+    by_scenario = scores.by_scenario
+    ahead = [score.advantage(who) for score in by_scenario.values() for who in ("random", "greedy")]
+    texts = iter(starred(ahead))
     rows = []
-    for name, score in scores.by_scenario.items():
+    for name, score in by_scenario.items():
         focal = [str(score.measures(who)["focal/return"]) for who in FOCAL_AGENTS]
-        ahead = [str(score.advantage(who)) for who in ("random", "greedy")]
-        rows.append((name, *focal, *ahead, str(score.measures()["background/return"])))
+        rows.append((name, *focal, next(texts), next(texts), str(score.measures()["background/return"])))
     table = table_of("return per agent (apples)", columns, rows)
-    table.caption = f"Left out: {scores.left_out}." if scores.left_out else None
+    left_out = f". Left out: {scores.left_out}" if scores.left_out else ""
+    table.caption = f"{HOLM} for all {len(ahead)} differences{left_out}"
     yield table
     title = "all agents together, with the run's agents in the focal places"
-    measured = {name: score.measures() for name, score in scores.by_scenario.items()}
+    measured = {name: score.measures() for name, score in by_scenario.items()}
     social = [(name, *(str(measures[metric]) for metric in SOCIAL)) for name, measures in measured.items()]
     yield table_of(title, ["scenario", *map(with_unit, SOCIAL)], social)
 
@@ -462,35 +368,33 @@ def estimates(scores: Scores) -> pa.Table:
     what the run's agents, or the background among them, get more; see `Score.advantage`.
     """
     rows: list[dict[str, Any]] = []
-    for name, score in scores.by_scenario.items():
+    for scenario, score in scores.by_scenario.items():
         for who in FOCAL_AGENTS:
-            for metric, measured in score.measures(who).items():
-                rows.append(
-                    {"scenario": name, "focal": who, "metric": metric}
-                    | _numbers(measured.estimate)
-                    | {"episodes": measured.episodes, "undefined": measured.undefined}
-                )
-            if who == "run":
-                continue
-            for whose in ("focal", "background"):
-                rows.append(
-                    {"scenario": name, "focal": who, "metric": f"{whose}/advantage"}
-                    | _numbers(score.advantage(who, whose=whose))
-                    | {"episodes": rows[-1]["episodes"], "undefined": 0}
-                )
-    return pa.Table.from_pylist(rows, schema=_SCHEMA)
+            measures = score.measures(who)
+            for whose in ("focal", "background") if who != "run" else ():
+                ahead, episodes = score.advantage(who, whose=whose), measures["focal/return"].episodes
+                measures[f"{whose}/advantage"] = Measured(estimate=ahead, undefined=0, episodes=episodes)
+            rows += [
+                {"scenario": scenario, "focal": who, "metric": metric}
+                | {name: _number(measured.estimate, name) for name in ("value", "low", "high")}
+                | {"replicas": getattr(measured.estimate, "replicas", 0)}
+                | {"episodes": measured.episodes, "undefined": measured.undefined}
+                for metric, measured in measures.items()
+            ]
+    kinds = dict.fromkeys(("scenario", "focal", "metric"), pa.string())
+    kinds |= dict.fromkeys(("value", "low", "high"), pa.float64())
+    kinds |= dict.fromkeys(("replicas", "episodes", "undefined"), pa.int32())
+    return pa.Table.from_pylist(rows, schema=pa.schema(kinds))
 
 
-def _numbers(estimated: Estimate | None) -> dict[str, Any]:
-    if estimated is None:
-        return {"value": None, "low": None, "high": None, "replicas": 0}
-    low, high = (None if isnan(bound) else bound for bound in (estimated.low, estimated.high))
-    return {"value": estimated.value, "low": low, "high": high, "replicas": estimated.replicas}
+def _number(estimated: Estimate | None, name: str) -> float | None:
+    number = float(getattr(estimated, name, "nan"))
+    return None if isnan(number) else number
 
 
 _LOOKS: Final[dict[tuple[FocalAgents, Whose], tuple[str, str, str]]] = {
-    ("run", "focal"): ("o", MEAN, "focal agents: the run's"),
-    ("greedy", "focal"): ("s", MARK, "greedy in their place"),
+    ("run", "focal"): ("o", style.MEAN, "focal agents: the run's"),
+    ("greedy", "focal"): ("s", style.MARK, "greedy in their place"),
     ("random", "focal"): ("D", "#8a8a8a", "random in their place"),
     ("run", "background"): ("|", "#000000", "background agents, beside the run's"),
 }
@@ -504,33 +408,26 @@ def draw_scenarios(scores: Scores, path: Path | str) -> Path:
     """Draws the mean return per agent, a row for each scenario: of the run's agents in the focal places, of
     greedy and of random ones there, and of the background; intervals by Student's t.
     """
-    path = picture_path(path)
-    figure = Figure((8.0, _ROW_IN * len(scores.by_scenario) + 2.0), layout="constrained")
+    path, by_scenario = style.picture_path(path), scores.by_scenario
+    figure = Figure((8.0, _ROW_IN * len(by_scenario) + 2.0), layout="constrained")
     axes = figure.subplots()
-    _draw_rows(axes, scores)
-    figure.legend(loc="outside lower center", ncols=2, fontsize=SMALL_PT, frameon=False)
+    for place, ((who, whose), (marker, colour, label)) in enumerate(_LOOKS.items()):
+        for row, score in enumerate(by_scenario.values()):
+            at = row + _BAND * (place - (len(_LOOKS) - 1) / 2)
+            estimate = score.measures(who)[f"{whose}/return"].estimate
+            assert estimate is not None  # a return is always defined
+            axes.plot([estimate.low, estimate.high], [at, at], color=colour, linewidth=2)
+            look: dict[str, Any] = {"color": colour, "markersize": 6, "linestyle": "none", "zorder": 3}
+            axes.plot(estimate.value, at, marker, label="" if row else label, **look)
+    for row in range(1, len(by_scenario)):
+        axes.axhline(row - 0.5, color="#dddddd", linewidth=0.8)
+    axes.set_yticks(range(len(by_scenario)), [name.replace("_", " ") for name in by_scenario])
+    axes.set_ylim(len(by_scenario) - 0.5, -0.5)
+    style.write_small(axes, x="return per agent, apples")
+    figure.legend(loc="outside lower center", ncols=2, fontsize=style.SMALL_PT, frameon=False)
     note = (
         f"{scores.fresh} in each placement, the same worlds for all; mean over replicas, 95 % interval by "
         "Student's t."
     )
-    head(figure, f"Scenarios of {scores.run.path.name}", note)
-    return save(figure, path)
-
-
-def _draw_rows(axes: Axes, scores: Scores) -> None:
-    names = list(scores.by_scenario)
-    for place, ((who, whose), (marker, colour, label)) in enumerate(_LOOKS.items()):
-        estimates = [scores.by_scenario[name].measures(who)[f"{whose}/return"].estimate for name in names]
-        rows = [row + _BAND * (place - (len(_LOOKS) - 1) / 2) for row in range(len(names))]
-        values = [estimate for estimate in estimates if estimate is not None]  # a return is always defined
-        axes.plot(
-            [value.value for value in values], rows, marker, color=colour, markersize=6, label=label, zorder=3
-        )
-        for row, estimate in zip(rows, values, strict=True):
-            axes.plot([estimate.low, estimate.high], [row, row], color=colour, linewidth=2)
-    for row in range(1, len(names)):
-        axes.axhline(row - 0.5, color="#dddddd", linewidth=0.8)
-    axes.set_yticks(range(len(names)), [name.replace("_", " ") for name in names])
-    axes.set_ylim(len(names) - 0.5, -0.5)
-    axes.set_xlabel("return per agent, apples", fontsize=SMALL_PT)
-    axes.tick_params(labelsize=SMALL_PT)
+    style.head(figure, f"Scenarios of {scores.run.path.name}", note)
+    return style.save(figure, path)

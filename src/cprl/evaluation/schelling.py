@@ -1,105 +1,166 @@
-"""schelling: what restrained and greedy agents get, by how many of the others are restrained.
+"""schelling: what restrained and greedy agents get, by how many of the others are restrained, and which
+social dilemma that makes.
 
 All mixes of N agents are played: k restrained and N - k greedy ones, for k = 0 to N. Where both kinds play, a
 mix is played N times, with the restrained agents at the indices s to s + k - 1, cyclically, for each s, so
 that each index is restrained as often as every other. A replica's payoff is the mean over those and its
 episodes.
 
-Source: T. C. Schelling, "Hockey Helmets, Concealed Weapons, and Daylight Saving" (1973); for policies of
-agents that learn, E. Hughes et al. (2018) and J. Perolat et al. (2017).
+R(k) is what an agent gets that restrains itself while k of the N - 1 others do, G(k) what it gets if it is
+greedy instead. There is a dilemma if all agents prefer restraint of all to greed of all, R(N-1) > G(0), and
+to being the only one who restrains itself, R(N-1) > R(0), and yet one of two things pulls an agent from it:
+
+    fear    G(0) > R(0): who meets greedy agents only had better be greedy
+    greed   G(N-1) > R(N-1): who meets restrained agents only had better be greedy
+
+With both it is a prisoner's dilemma, with greed alone chicken, with fear alone a stag hunt.
+
+Sources: T. C. Schelling, "Hockey Helmets, Concealed Weapons, and Daylight Saving" (1973); for policies of
+agents that learn, E. Hughes et al., "Inequity aversion improves cooperation in intertemporal social dilemmas"
+(2018), and J. Perolat et al. (2017); for the names of dilemmas, M. W. Macy and A. Flache, "Learning dynamics
+in social dilemmas" (2002).
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property
+from itertools import product
+from math import isnan
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from rich.table import Table
 
 from cprl.commons.game import Game
 from cprl.custom import trust
 from cprl.evaluation.evaluate import INTERVALS, SEED, table_of
-from cprl.evaluation.lanes import Fresh, Played, pooled
+from cprl.evaluation.lanes import Fresh, Part, Played, Results, Values, Whose
 from cprl.evaluation.populations import agent_named, place_of, play_population
-from cprl.measuring.dilemmas import Dilemma, dilemma
-from cprl.measuring.statistics import Measured, estimate, social_measures
+from cprl.measuring.statistics import Estimate, Measured, difference, estimate
 from cprl.policies.scripted import SCRIPTED_POLICIES
-from cprl.runs.episodes import labelled
 from cprl.terminal import style
+
+NONE: Final = "no dilemma"
+UNTOLD: Final = "cannot be told"
+_ALL: Final = 4
+"""The number of names: three dilemmas, and none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dilemma:
+    """The margins of a Schelling diagram, over replicas, in the unit of the payoffs."""
+
+    restraint: Estimate
+    """R(N-1) - G(0): what an agent gains if all restrain themselves instead of none."""
+    company: Estimate
+    """R(N-1) - R(0): what a restrained agent gains if all others are restrained, too."""
+    fear: Estimate
+    """G(0) - R(0)."""
+    greed: Estimate
+    """G(N-1) - R(N-1)."""
+
+    @property
+    def candidates(self) -> tuple[str, ...]:
+        """The dilemmas that the intervals allow, most likely first: one where they tell which it is."""
+        margins = [getattr(self, field.name) for field in fields(self)]
+        likely = _name(*(estimate.value > 0 for estimate in margins))
+        return tuple(dict.fromkeys((likely, *(_name(*signs) for signs in product(*map(_signs, margins))))))
+
+    @property
+    def name(self) -> str:
+        """The dilemma, or those that it may be."""
+        return " or ".join(self.candidates) if len(self.candidates) < _ALL else UNTOLD
+
+
+def dilemma(restrained: Values, greedy: Values) -> Dilemma:
+    """Which dilemma payoffs make.
+
+    Args:
+        restrained: R(k), float [R, N]: of each of R replicas, for k = 0 to N - 1 others that are restrained.
+        greedy: G(k), likewise. Replicas are paired.
+    """
+    if restrained.ndim != 2 or restrained.shape != greedy.shape or restrained.shape[1] < 2:
+        raise ValueError(
+            f"restrained is {list(restrained.shape)} and greedy {list(greedy.shape)}; allowed: [R, N] both, "
+            "at least 2 agents"
+        )
+    pairs = {
+        "restraint": (restrained[:, -1], greedy[:, 0]),
+        "company": (restrained[:, -1], restrained[:, 0]),
+        "fear": (greedy[:, 0], restrained[:, 0]),
+        "greed": (greedy[:, -1], restrained[:, -1]),
+    }
+    return Dilemma(**{name: difference(*pair, paired=True) for name, pair in pairs.items()})
+
+
+def _name(restraint: bool, company: bool, fear: bool, greed: bool) -> str:
+    if not (restraint and company and (fear or greed)):
+        return NONE
+    return "prisoner's dilemma" if fear and greed else "chicken" if greed else "stag hunt"
+
+
+def _signs(margin: Estimate) -> Iterator[bool]:
+    """Whether a margin is above 0, in all ways that its interval allows; without an interval both."""
+    if isnan(margin.low) or margin.high > 0:
+        yield True
+    if isnan(margin.low) or margin.low <= 0:
+        yield False
+
 
 _ALIKE_WITHOUT_A_BEAM: Final = {"greedy", "territorial"}
 
-Values = NDArray[np.float64]
 Who = tuple[int, ...]
 """The indices of the restrained agents, ascending."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SchellingDiagram:
-    """The episodes of all mixes of restrained and greedy agents; see the docstring of this module."""
+class SchellingDiagram(Results):
+    """The episodes of all mixes of restrained and greedy agents by "restrained", the indices of those who are
+    as a text, e.g. "0 1"; see the docstring of this module."""
 
     agents: int
     """N."""
     restrained: str
     greedy: str
     """Who plays restrained, and who greedy: a scripted policy or a run."""
-    played: Mapping[Who, Played] = field(repr=False)
-    """The episodes by the indices of the restrained agents and the replica."""
-    fresh: Fresh
 
     @cached_property
     def restrained_payoffs(self) -> Values:
         """R(k), float64 [R, N]: the mean return of a restrained agent, by the number k = 0 to N - 1 of
         others that are restrained."""
-        return np.stack([self._payoffs(count + 1, of_restrained=True) for count in range(self.agents)], 1)
+        return self._payoffs("focal", range(1, self.agents + 1))
 
     @cached_property
     def greedy_payoffs(self) -> Values:
         """G(k), float64 [R, N]: that of a greedy agent, likewise."""
-        return np.stack([self._payoffs(count, of_restrained=False) for count in range(self.agents)], 1)
+        return self._payoffs("background", range(self.agents))
 
     @cached_property
     def group_payoffs(self) -> Values:
         """float64 [R, N + 1]: the mean return of all agents together, by how many of them are restrained."""
-        counts = np.arange(self.agents + 1)
-        group = np.zeros((len(self.fresh.replicas), len(counts)))
-        group[:, 1:] += counts[1:] * self.restrained_payoffs
-        group[:, :-1] += counts[:0:-1] * self.greedy_payoffs
-        return group
+        return self._payoffs("group", range(self.agents + 1))
 
     def dilemma(self) -> Dilemma:
         return dilemma(self.restrained_payoffs, self.greedy_payoffs)
 
     def measures(self, count: int) -> dict[str, Measured]:
         """The social metrics of the mixes with so many restrained agents."""
-        return social_measures(pooled(self.played[who] for who in self._mixes(count)))
+        return self._mixes(count).estimates()
 
-    def table(self) -> pa.Table:
-        """All episodes with the columns of `episodes.parquet`, after "restrained", the indices of the
-        restrained agents as a text, e.g. "0 1"."""
-        return labelled(
-            ({"restrained": " ".join(map(str, who))}, replica, episodes)
-            for who, played in self.played.items()
-            for replica, episodes in played.items()
-        )
+    @property
+    def by_mix(self) -> dict[Who, Played]:
+        """The episodes by the indices of the restrained agents."""
+        return {focal: part.played for part in self.parts for focal in part.focal}
 
-    def _mixes(self, count: int) -> list[Who]:
-        return [who for who in self.played if len(who) == count]
+    def _mixes(self, count: int) -> Results:
+        parts = [part for part in self.parts if len(part.focal[0]) == count]
+        return Results(parts=parts, fresh=self.fresh)
 
-    def _payoffs(self, count: int, *, of_restrained: bool) -> Values:
-        """The mean return of a restrained or of a greedy agent, where so many are restrained, [R]."""
-        mixes, sums = self._mixes(count), np.zeros(len(self.fresh.replicas))
-        for who in mixes:
-            alike = [agent for agent in range(self.agents) if (agent in who) == of_restrained]
-            for replica, episodes in self.played[who].items():
-                sums[replica] += np.mean([episode.return_[alike] for episode in episodes])
-        return sums / len(mixes)
+    def _payoffs(self, whose: Whose, counts: Sequence[int]) -> Values:
+        return np.stack([self._mixes(count).mean_returns(whose) for count in counts], 1)
 
 
 def schelling(
@@ -131,22 +192,13 @@ def schelling(
         is_restrained: [agent_named(name_of, agent, replica=None, name=name) for agent in range(agents)]
         for is_restrained, name, name_of in ((True, "restrained", restrained), (False, "greedy", greedy))
     }
-    return SchellingDiagram(
-        agents=agents,
-        restrained=restrained,
-        greedy=greedy,
-        played={
-            who: play_population(
-                where,
-                [specs[agent in who][agent] for agent in range(agents)],
-                episodes=episodes,
-                replicas=replicas,
-                seed=seed,
-            )
-            for who in _mixes(agents)
-        },
-        fresh=Fresh(replicas=tuple(range(replicas)), episodes=episodes, seed=seed),
-    )
+    parts = []
+    for who in _mixes(agents):
+        mix = [specs[agent in who][agent] for agent in range(agents)]
+        played = play_population(where, mix, episodes=episodes, replicas=replicas, seed=seed)
+        parts.append(Part({"restrained": " ".join(map(str, who))}, played, (who,)))
+    fresh = Fresh(replicas=tuple(range(replicas)), episodes=episodes, seed=seed)
+    return SchellingDiagram(agents=agents, restrained=restrained, greedy=greedy, parts=parts, fresh=fresh)
 
 
 def _check_unlike(game: Any, restrained: str, greedy: str) -> None:
@@ -187,15 +239,13 @@ def draw_schelling(diagram: SchellingDiagram, path: Path | str) -> Path:
         (diagram.greedy_payoffs, diagram.greedy, "greedy", _GREEDY, "s"),
     ):
         _line(single, payoffs, label=f"{role}: {Path(who).name}", color=colour, marker=marker)
-    single.set_xlabel(f"restrained agents among the other {diagram.agents - 1}", fontsize=style.SMALL_PT)
-    single.set_ylabel("return of the agent", fontsize=style.SMALL_PT)
+    x = f"restrained agents among the other {diagram.agents - 1}"
+    style.write_small(single, x=x, y="return of the agent")
     single.legend(fontsize=style.SMALL_PT)
     _line(group, diagram.group_payoffs, color=style.MEAN, marker="o")
-    group.set_xlabel(f"restrained agents of {diagram.agents}", fontsize=style.SMALL_PT)
-    group.set_ylabel("return of all together", fontsize=style.SMALL_PT)
+    style.write_small(group, x=f"restrained agents of {diagram.agents}", y="return of all together")
     for axes in (single, group):
         axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
-        axes.tick_params(labelsize=style.SMALL_PT)
     note = f"{diagram.fresh} for each choice of restrained agents; bars: 95 % intervals by Student's t"
     style.head(figure, f"Schelling diagram: {diagram.dilemma().name}", note)
     return style.save(figure, path)
@@ -212,6 +262,7 @@ def _line(axes: Axes, values: Values, **style_of_line: Any) -> None:
 
 def schelling_tables(diagram: SchellingDiagram) -> Iterator[Table]:
     """The payoffs by the number of restrained others, and the margins between them that make a dilemma."""
+    payoffs = zip(diagram.restrained_payoffs.T, diagram.greedy_payoffs.T, strict=True)
     yield table_of(
         f"{diagram.fresh} for each choice of restrained agents, seed {diagram.fresh.seed}\n{INTERVALS}",
         [
@@ -219,12 +270,7 @@ def schelling_tables(diagram: SchellingDiagram) -> Iterator[Table]:
             f"return of {diagram.restrained} (restrained)",
             f"return of {diagram.greedy} (greedy)",
         ],
-        [
-            (str(count), str(estimate(restrained)), str(estimate(greedy)))
-            for count, (restrained, greedy) in enumerate(
-                zip(diagram.restrained_payoffs.T, diagram.greedy_payoffs.T, strict=True)
-            )
-        ],
+        [(str(count), *(str(estimate(values)) for values in pair)) for count, pair in enumerate(payoffs)],
         texts=0,
     )
     dilemma, last = diagram.dilemma(), diagram.agents - 1
@@ -234,8 +280,5 @@ def schelling_tables(diagram: SchellingDiagram) -> Iterator[Table]:
         "fear, G(0) - R(0)": dilemma.fear,
         f"greed, G({last}) - R({last})": dilemma.greed,
     }
-    yield table_of(
-        f"{dilemma.name}, by returns",
-        ["", "difference, paired by replica"],
-        [(name, str(margin)) for name, margin in margins.items()],
-    )
+    rows = [(name, str(margin)) for name, margin in margins.items()]
+    yield table_of(f"{dilemma.name}, by returns", ["", "difference, paired by replica"], rows)

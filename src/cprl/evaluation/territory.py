@@ -17,7 +17,7 @@ from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, agent_colour
 from cprl.commons.game import Game
 from cprl.commons.maps import Map
 from cprl.evaluation.evaluate import SEED, fresh_episodes, heading_beside_random, opened, table_of
-from cprl.evaluation.lanes import Fresh, MakePolicies, Source
+from cprl.evaluation.lanes import Agent, Fresh, agents_of, scripted
 from cprl.measuring import movement
 from cprl.measuring.movement import Trace, overlap, owners, trace, visits
 from cprl.measuring.statistics import Estimate, estimate
@@ -66,7 +66,8 @@ class Territory:
     random: Stays = field(repr=False)
 
     def of(self, policy: Policy) -> Stays:
-        return self.trained if checked("policy", policy, Policy) == "trained" else self.random
+        stays: Stays = getattr(self, checked("policy", policy, Policy))
+        return stays
 
 
 def territory_of(
@@ -86,34 +87,24 @@ def territory_of(
     if not isinstance(loaded.game, Game):
         raise ValueError(f"{loaded.path} plays a game without a board of cprl; allowed: a run of a cprl.Game")
     fresh = fresh_episodes([loaded], episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
-    agents = fresh.agents([Source(loaded)] * loaded.game.agents)
+    random = [scripted("random")] * loaded.game.agents
     return Territory(
         run=loaded,
         fresh=fresh,
-        trained=_stays(loaded, agents, fresh, explore=not greedy),
-        random=_stays(loaded, fresh.random_agents(loaded), fresh, explore=True),
+        trained=_stays(loaded, agents_of(loaded), fresh, explore=not greedy),
+        random=_stays(loaded, random, fresh, explore=True),
     )
 
 
-def _stays(run: LoadedRun, policies: MakePolicies, fresh: Fresh, *, explore: bool) -> Stays:
+def _stays(run: LoadedRun, agents: Sequence[Agent], fresh: Fresh, *, explore: bool) -> Stays:
     by_replica: list[dict[str, Any]] = []
     for group, env in fresh.worlds(run):
-        played = trace(env, policies(group), explore=explore)
+        played = trace(env, fresh.policies(run, agents, group), explore=explore)
         firsts = range(0, len(group) * fresh.episodes, fresh.episodes)
-        by_replica += [_of_replica(_worlds(played, first, first + fresh.episodes)) for first in firsts]
+        by_replica += [_of_replica(played.worlds(first, first + fresh.episodes)) for first in firsts]
     stacked = {name: np.stack([arrays[name] for arrays in by_replica]) for name in by_replica[0]}
     arrays = {name: stacked.pop(name) for name in ("visits", "taggings", "tagged_where")}
     return Stays(**arrays, by_replica=stacked)
-
-
-def _worlds(played: Trace, first: int, end: int) -> Trace:
-    """The trace of some of its worlds, from `first` on and without `end`."""
-    tags = played.tags[(played.tags[:, 1] >= first) & (played.tags[:, 1] < end)]
-    arrays = {name: getattr(played, name)[:, first:end] for name in _OF_WORLDS}
-    return Trace(**arrays, board=played.board, tags=tags - np.array([0, first, 0, 0]))
-
-
-_OF_WORLDS: Final = ("row", "col", "in_play", "fired", "played")
 
 
 def _of_replica(played: Trace) -> dict[str, Any]:
@@ -166,12 +157,12 @@ def draw_visits(
     board, shares = territory.run.game.map, stays.visits[place]
     figure, panels = _panels(len(shares) + 1, board)
     for agent, panel in enumerate(panels[:-1]):
-        _show(panel, board, _in_hue(shares[agent], agent, shares.max()))
+        tagged = f"agent {agent}, tagged {int(stays.taggings[place, agent].sum()):,} times"
+        hue = np.broadcast_to(_rgb(agent_colour(agent)), (board.height, board.width, 3))
+        _show(panel, board, hue, _light(shares[agent], shares.max()), tagged)
         row, col, _ = board.starts[agent]
         panel.plot(col, row, "o", markersize=5, fillstyle="none", color="white", markeredgewidth=0.8)
-        tagged = int(stays.taggings[place, agent].sum())
-        panel.set_title(f"agent {agent}, tagged {tagged:,} times", fontsize=style.SMALL_PT)
-    _owners(panels[-1], board, shares)
+    _show_owners(panels[-1], board, shares)
     index, sharing = (float(stays.by_replica[name][place]) for name in (EXCLUSION, VISITORS))
     who = "random agents" if policy == "random" else "its agents"
     title = (
@@ -193,47 +184,40 @@ def _panels(count: int, board: Map) -> tuple[Figure, list[Axes]]:
     return figure, panels
 
 
-def _in_hue(shares: Array, agent: int, longest: float) -> Array:
-    """The map of one agent, float64 [H, W, 3], 0..1."""
-    light = np.where(shares > 0, DARKEST + (1 - DARKEST) * np.sqrt(shares / max(longest, 1e-12)), 0.0)
-    return _blend(np.broadcast_to(_rgb(agent_colour(agent)), (*shares.shape, 3)), light)
-
-
-def _blend(hues: Array, light: Array) -> Array:
-    """Hues [H, W, 3] on the ground, by their brightness [H, W]."""
-    blended: Array = _rgb(PALETTE[GROUND]) * (1 - light[..., None]) + hues * light[..., None]
-    return blended
+def _light(shares: Array, longest: float) -> Array:
+    """The brightness of cells, 0..1, by the square root of the share of an agent's time."""
+    return np.where(shares > 0, DARKEST + (1 - DARKEST) * np.sqrt(shares / max(longest, 1e-12)), 0.0)
 
 
 def _rgb(colour: tuple[int, int, int]) -> Array:
     return np.array(colour) / 255
 
 
-def _show(panel: Axes, board: Map, image: Array) -> None:
-    """Shows a map of visits with the walls and sites of the board."""
-    image = image.copy()
+def _show(panel: Axes, board: Map, hues: Array, light: Array, title: str) -> None:
+    """Shows hues [H, W, 3] on the ground by their brightness [H, W], with the board's walls and sites."""
+    image = _rgb(PALETTE[GROUND]) * (1 - light[..., None]) + hues * light[..., None]
     for cell in board.walls:
         image[cell] = _rgb(PALETTE[WALL])
     panel.imshow(image, interpolation="nearest")
     rows, cols = np.array(board.sites).T
     panel.scatter(cols, rows, s=1.5, marker="s", color=_rgb(PALETTE[APPLE]), linewidths=0)
-    panel.set_xticks([])
-    panel.set_yticks([])
+    panel.set(xticks=[], yticks=[])
+    panel.set_title(title, fontsize=style.SMALL_PT)
 
 
-def _owners(panel: Axes, board: Map, shares: Array) -> None:
+def _show_owners(panel: Axes, board: Map, shares: Array) -> None:
     """Shows who owns each cell, with the owner's number in the middle of what it owns."""
     owner, longest, total = owners(shares), shares.max(0), shares.sum(0)
     alone = np.divide(longest, total, out=np.zeros_like(total), where=total > 0)
     light = DARKEST + (1 - DARKEST) * np.sqrt(longest / max(longest.max(), 1e-12)) * alone
     hues = np.stack([_rgb(agent_colour(agent)) for agent in range(len(shares))])
-    _show(panel, board, _blend(hues[owner], np.where(owner >= 0, light, 0.0)))
+    title = "who spends most time where"
+    _show(panel, board, hues[owner], np.where(owner >= 0, light, 0.0), title)
     for agent, share in enumerate(shares):
         owned = np.where(owner == agent, share, 0.0)
         if owned.any():
             row, col = divmod(int(owned.argmax()), board.width)
             panel.text(col, row, str(agent), color="white", fontsize=7, ha="center", va="center_baseline")
-    panel.set_title("who spends most time where", fontsize=style.SMALL_PT)
 
 
 def territory_table(territory: Territory) -> Table:

@@ -10,7 +10,6 @@ Modules, in the order in which one reads them:
     series, now   numbers while a training runs, and what a group is doing at the moment
     phases        change points of a whole training, and the phases between them
     movement      where agents go, which cells they share or keep, and who tags whom
-    dilemmas      which social dilemma payoffs make
 """
 
 from cprl.measuring import social

@@ -151,7 +151,7 @@ class EpisodeTracker:
         self.agents = checked("agents", agents, Positive)
         self.reported: tuple[str, ...] | None = None
         """The optional entries of this game; None before the first batch."""
-        self._yield = {"sustainable_yield": sustainable_yield, "first_stock": first_stock}
+        self._yield: dict[str, Any] = {"sustainable_yield": sustainable_yield, "first_stock": first_stock}
         self._institutions = tuple(institutions)
         self._episode = np.zeros(worlds, np.int64)
         self._reader = _TurnReader((), worlds=worlds, agents=agents, widths={})
@@ -281,9 +281,18 @@ class EpisodeTracker:
     def _measure(self, worlds: Array, turn: Turns) -> list[Episode]:
         """The episodes of the E worlds, int64 [E], that end with this turn."""
         ended = {name: array[worlds] for name, array in self._running.items()}
-        totals = {name: torch.from_numpy(ended[name]).to(torch.float64) for name in _TOTALS if name in ended}
-        metrics = social.of_totals(social.Totals(**totals), **self._yield)
-        of_institutions = self._measure_institutions(ended)
+        given: dict[str, Any] = {
+            name: torch.from_numpy(ended[name]).to(torch.float64) for name in _TOTALS if name in ended
+        }
+        if "tagged_by" in ended:
+            given["tags"] = torch.from_numpy(ended["tagged_by"].sum(1))
+        if "counts" in ended:
+            given["counts"] = dict(zip(COUNTS, torch.from_numpy(ended["counts"]).unbind(-1), strict=True))
+        totals = social.Totals(**given, **self._yield, groups=institutions.groups_of(self._institutions))
+        metrics, of_institutions = social.of_totals(totals), {}
+        if any(name in ended for name in INSTITUTIONAL):
+            summary, wanted = institutions.summary(totals), institutions.metrics_for(self._institutions)
+            of_institutions = {name: values for name, values in summary.items() if name in wanted}
         counted = institutions.counts_for(self._institutions) if "counts" in ended else ()
         episodes = []
         for index, world in enumerate(worlds):
@@ -311,23 +320,11 @@ class EpisodeTracker:
             )
         return episodes
 
-    def _measure_institutions(self, ended: Mapping[str, Array]) -> dict[str, Tensor]:
-        """The metrics of institutions of the E episodes that end, [E] by name; empty without institutions."""
-        if not any(name in ended for name in INSTITUTIONAL):
-            return {}
-        names = ("fines", "transfers", "violations", "harvest", "in_play_steps")
-        given: dict[str, Any] = {name: torch.from_numpy(ended[name]) for name in names if name in ended}
-        if "tagged_by" in ended:
-            given["tags"] = torch.from_numpy(ended["tagged_by"].sum(1))
-        if "counts" in ended:
-            columns = torch.from_numpy(ended["counts"]).unbind(-1)
-            given["counts"] = dict(zip(COUNTS, columns, strict=True))
-        metrics = institutions.summary(**given, groups=institutions.groups_of(self._institutions))
-        wanted = institutions.metrics_for(self._institutions)
-        return {name: metrics[name] for name in wanted if name in metrics}
 
-
-_TOTALS: Final = ("steps", "harvest", "harvest_steps", "harvest_time", "in_play_steps")
+_TOTALS: Final = (
+    *("steps", "harvest", "harvest_steps", "harvest_time", "in_play_steps"),
+    *("fines", "transfers", "violations"),
+)
 _AS_COUNTED: Final = (
     *("harvest", "in_play_steps", "shots", "tagged", "tagged_by"),
     *("fines", "transfers", "violations", "in_force"),

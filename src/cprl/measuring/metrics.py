@@ -15,23 +15,28 @@ from torchrl.envs import EnvBase
 from cprl import keys
 from cprl.measuring import institutions, social
 
-NAMES: Final = {**social.NAMES, "stock_left": ("stock left at the end", "apples")}
-"""The words and the unit of each number of an episode."""
-_WORDS: Final = {
-    **NAMES,
-    **{f"institutions/{name}": (metric.words, metric.unit) for name, metric in institutions.METRICS.items()},
+NAMES: Final[Mapping[str, tuple[str, str]]] = {
+    **{name: metric[:2] for name, metric in social.SOCIAL.items()},
+    "stock_left": ("stock left at the end", "apples"),
+    **{f"institutions/{name}": metric[:2] for name, metric in institutions.METRICS.items()},
 }
+"""The words and the unit of each number of an episode."""
+DIGITS: Final = {
+    **{name: metric.digits for name, metric in social.SOCIAL.items() if metric.digits is not None},
+    "stock_left": 1,
+}
+"""The digits behind the point of each metric in the summary of a run."""
 
 
 def title(name: str) -> str:
     """Words and unit of a metric, e.g. "survival, steps"; the name itself if it is none."""
-    return ", ".join(_WORDS[name]) if name in _WORDS else name
+    return ", ".join(NAMES[name]) if name in NAMES else name
 
 
 def unit(name: str) -> str:
     """The unit after a value, e.g. "steps"; "" where a range stands for one. A single agent's return is in
     apples."""
-    word = "apples" if name.startswith("return_") else _WORDS.get(name, ("", ""))[1]
+    word = "apples" if name.startswith("return_") else NAMES.get(name, ("", ""))[1]
     return "" if word == social.SHARE else word
 
 
@@ -42,7 +47,7 @@ def with_unit(name: str, *, rewards: str = "") -> str:
         name: of a metric, or of what an agent gets or pays: ".../return", ".../fines", ".../transfers".
         rewards: the unit of rewards; "" if the game does not say.
     """
-    word = rewards if name.endswith(("/return", "/fines", "/transfers")) else _WORDS.get(name, ("", ""))[1]
+    word = rewards if name.endswith(("/return", "/fines", "/transfers")) else NAMES.get(name, ("", ""))[1]
     return f"{name} ({word})" if word else name
 
 

@@ -15,6 +15,7 @@ compare with other agents, such as random ones, over as many steps from the same
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,13 @@ class Trace:
     tags: Array = field(default_factory=lambda: np.zeros((0, 4), np.int64))
     """Every tag, int64 [K, 4] in order: its step and world, the agent that was tagged, and who tagged it."""
 
+    def worlds(self, first: int, end: int) -> "Trace":
+        """The trace of some of its worlds, from `first` on and without `end`."""
+        tags = self.tags[(self.tags[:, 1] >= first) & (self.tags[:, 1] < end)]
+        names = ("row", "col", "in_play", "fired", "played")
+        arrays = {name: getattr(self, name)[:, first:end] for name in names}
+        return Trace(**arrays, board=self.board, tags=tags - np.array([0, first, 0, 0]))
+
 
 def trace(
     env: CommonsEnv, policy: Callable[[TensorDictBase], TensorDictBase], *, explore: bool = True
@@ -66,17 +74,10 @@ def trace(
             hits = np.argwhere(moment[keys.TAGGED_BY].numpy(force=True))
             tags.append(np.insert(hits, 0, len(steps), axis=1))
             steps.append((*places, *before, moment[keys.FIRED].numpy(force=True)))
-    row, col, in_play, played, fired = (np.stack(entries) for entries in zip(*steps, strict=True))
+    names = ("row", "col", "in_play", "played", "fired")
+    arrays = {name: np.stack(entries) for name, entries in zip(names, zip(*steps, strict=True), strict=True)}
     board = env.game.map.height, env.game.map.width
-    return Trace(
-        row=row,
-        col=col,
-        in_play=in_play,
-        fired=fired,
-        played=played,
-        board=board,
-        tags=np.concatenate(tags),
-    )
+    return Trace(**arrays, board=board, tags=np.concatenate(tags))
 
 
 def visits(trace: Trace) -> Array:
@@ -100,11 +101,9 @@ def overlap(trace: Trace) -> Array:
     for disjoint ones. NaN for a single agent.
     """
     shares = visits(trace)
-    agents = shares.shape[1]
     pairs = [
-        np.minimum(shares[:, a], shares[:, b]).sum((-2, -1))
-        for a in range(agents)
-        for b in range(a + 1, agents)
+        np.minimum(shares[:, one], shares[:, other]).sum((-2, -1))
+        for one, other in combinations(range(shares.shape[1]), 2)
     ]
     return np.mean(pairs, axis=0) if pairs else np.full(len(shares), np.nan)
 

@@ -9,9 +9,9 @@ Below, R_i is the sum of agent i's harvest over its episode, T the number of ste
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,20 +20,40 @@ SHARE: Final = "0 to 1"
 """In place of a unit."""
 
 
+_NONE: Any = None
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Totals:
-    """What an episode adds up to; None where the game does not report the entry."""
+    """What an episode adds up to, float64 [..., N] of each agent; None where the game does not report the
+    entry."""
 
-    steps: Tensor
+    steps: Tensor = _NONE
     """T, float64 [...]."""
-    harvest: Tensor | None = None
-    """R_i, the raw harvest and never a shaped reward, in apples, at least 0, float64 [..., N]."""
-    harvest_steps: Tensor | None = None
-    """The number of steps in which the agent harvested, float64 [..., N]."""
-    harvest_time: Tensor | None = None
-    """The sum of the steps in which the agent harvested, float64 [..., N]."""
-    in_play_steps: Tensor | None = None
-    """The number of steps at whose start the agent was in play, float64 [..., N]."""
+    harvest: Tensor = _NONE
+    """R_i, the raw harvest and never a shaped reward, in apples, at least 0."""
+    harvest_steps: Tensor = _NONE
+    """The number of steps in which the agent harvested."""
+    harvest_time: Tensor = _NONE
+    """The sum of the steps in which the agent harvested."""
+    in_play_steps: Tensor = _NONE
+    """The number of steps at whose start the agent was in play."""
+    fines: Tensor = _NONE
+    """What institutions took from the agent, in units of reward (an apple is 1)."""
+    transfers: Tensor = _NONE
+    """What they gave it."""
+    violations: Tensor = _NONE
+    """The number of steps in which it broke a rule."""
+    counts: Mapping[str, Tensor] = _NONE
+    """By the names of `cprl.institutions.COUNTS`; metrics of those that are lacking are left out."""
+    tags: Tensor = _NONE
+    """How often it tagged somebody."""
+    groups: Any = None
+    """The indices of the agents of each group of nested enterprises; each agent belongs to one."""
+    sustainable_yield: Any = None
+    """Apples per step that can be harvested forever; a number, or a tensor [...]."""
+    first_stock: Any = None
+    """Apples on the board at the start of the episode, likewise."""
 
 
 def totals_of(harvest: Tensor | None, in_play: Tensor | None, *, played: Tensor | None = None) -> Totals:
@@ -54,7 +74,7 @@ def totals_of(harvest: Tensor | None, in_play: Tensor | None, *, played: Tensor 
         if given is None:
             raise ValueError("harvest, in_play and played are None; allowed: at least one of them")
         played = torch.ones(given.shape[:-1], dtype=torch.bool, device=given.device)
-    totals = {"steps": played.sum(-1, dtype=torch.float64)}
+    totals: dict[str, Any] = {"steps": played.sum(-1, dtype=torch.float64)}
     if harvest is not None:
         harvest = torch.where(played.unsqueeze(-1), harvest, 0).to(torch.float64)
         if not ((harvest >= 0) & (harvest < torch.inf)).all():
@@ -81,39 +101,22 @@ def summary(
     Without harvest or in_play, the metrics that need it (`NEEDS`) are left out; without both, `played` says
     how many steps there were. For the arguments see `totals_of` and `yield_share`.
     """
-    totals = totals_of(harvest, in_play, played=played)
-    return of_totals(totals, sustainable_yield=sustainable_yield, first_stock=first_stock)
-
-
-def of_totals(
-    totals: Totals,
-    *,
-    sustainable_yield: float | Tensor | None = None,
-    first_stock: float | Tensor | None = None,
-) -> dict[str, Tensor]:
-    """Return the metrics of `summary` from the totals of episodes.
-
-    Raises:
-        ValueError: if only one of sustainable_yield and first_stock is given, or both without a harvest.
-    """
     if (sustainable_yield is None) != (first_stock is None):
         raise ValueError("sustainable_yield and first_stock belong together; allowed: both, or neither")
-    lacking = {name for name in ("harvest", "in_play") if getattr(totals, _TOTAL_OF[name]) is None}
-    metrics = {
-        name: metric.of(totals) for name, metric in _METRICS.items() if lacking.isdisjoint(metric.needs)
-    }
-    if sustainable_yield is not None and first_stock is not None:
-        if totals.harvest is None:
-            raise ValueError("sustainable_yield is given and harvest is None; allowed: both, or neither")
-        metrics["yield_share"] = yield_share(
-            totals, sustainable_yield=sustainable_yield, first_stock=first_stock
-        )
-    return metrics
+    if sustainable_yield is not None and harvest is None:
+        raise ValueError("sustainable_yield is given and harvest is None; allowed: both, or neither")
+    totals = totals_of(harvest, in_play, played=played)
+    return of_totals(replace(totals, sustainable_yield=sustainable_yield, first_stock=first_stock))
+
+
+def of_totals(totals: Totals) -> dict[str, Tensor]:
+    """Return the metrics of `summary` from the totals of episodes."""
+    return measured(SOCIAL, totals)
 
 
 def collective_return(totals: Totals) -> Tensor:
     """sum_i R_i, in apples, at least 0; what [W] calls "efficiency"."""
-    return _given(totals.harvest).sum(-1)
+    return totals.harvest.sum(-1)
 
 
 def efficiency(totals: Totals) -> Tensor:
@@ -121,7 +124,7 @@ def efficiency(totals: Totals) -> Tensor:
     return collective_return(totals) / totals.steps
 
 
-def yield_share(totals: Totals, *, sustainable_yield: float | Tensor, first_stock: float | Tensor) -> Tensor:
+def yield_share(totals: Totals) -> Tensor:
     """sum_i R_i / (sustainable_yield x T + first_stock), a ratio: the harvest relative to what the map
     can bear in the T steps that were played.
 
@@ -129,12 +132,8 @@ def yield_share(totals: Totals, *, sustainable_yield: float | Tensor, first_stoc
     once and end the episode.
     At least 0, and above 1 where the true yield exceeds the given lower bound. Undefined where nothing could
     be harvested.
-
-    Args:
-        sustainable_yield: Apples per step that can be harvested forever; a number, or a tensor [...].
-        first_stock: Apples on the board at the start of the episode; a number, or a tensor [...].
     """
-    bearable = sustainable_yield * totals.steps + first_stock
+    bearable = totals.sustainable_yield * totals.steps + totals.first_stock
     return torch.where(bearable > 0, collective_return(totals) / bearable, torch.nan)
 
 
@@ -143,7 +142,7 @@ def equality(totals: Totals) -> Tensor:
 
     From 1/N (one agent has everything) to 1 (all have the same). Undefined where no agent harvested.
     """
-    return equality_of(_given(totals.harvest))
+    return equality_of(totals.harvest)
 
 
 def equality_of(incomes: Tensor) -> Tensor:
@@ -158,7 +157,7 @@ def sustainability(totals: Totals) -> Tensor:
     High where apples are still available late. [P] does not define it for agents without a harvest; here they
     are ignored, and `cprl.measuring.statistics` counts them. Undefined where no agent harvested.
     """
-    return (_given(totals.harvest_time) / _given(totals.harvest_steps)).nanmean(-1)
+    return (totals.harvest_time / totals.harvest_steps).nanmean(-1)
 
 
 def survival_steps(totals: Totals) -> Tensor:
@@ -171,48 +170,72 @@ def peace(totals: Totals) -> Tensor:
 
     Undefined for an episode without steps.
     """
-    return _given(totals.in_play_steps).sum(-1) / totals.steps
+    return totals.in_play_steps.sum(-1) / totals.steps
 
 
 def peacefulness(totals: Totals) -> Tensor:
     """Agent-steps in play / N, in steps, 0..T, as in [W]; it also falls when episodes end early."""
-    in_play_steps = _given(totals.in_play_steps)
+    in_play_steps = totals.in_play_steps
     return in_play_steps.sum(-1) / in_play_steps.shape[-1]
 
 
 class Metric(NamedTuple):
-    """A metric, said once: what it is called and made of."""
+    """A metric, said once: what it is called and made of, and where it says something."""
 
     words: str
     unit: str
     needs: tuple[str, ...]
     """Which entries of a turn it is computed from; all need to know which steps were played."""
     of: Callable[[Totals], Tensor]
+    of_totals: tuple[str, ...] = ()
+    """Which other totals it is computed from."""
+    kinds: tuple[type, ...] = ()
+    """The institutions without which it says nothing; empty for one that concerns them all."""
+    counted: tuple[str, ...] = ()
+    """Which of `cprl.institutions.COUNTS` it is computed from."""
+    digits: int | None = None
+    """Behind the point, in the summary of a run; None where it is not in there."""
+
+    def is_known(self, totals: Totals) -> bool:
+        """Whether all that it is computed from is given."""
+        names = (*(_TOTAL_OF.get(entry, entry) for entry in self.needs), *self.of_totals)
+        counts = totals.counts or {}
+        return all(getattr(totals, name) is not None for name in names) and counts.keys() >= {*self.counted}
 
 
-_METRICS: Final[Mapping[str, Metric]] = {
-    "collective_return": Metric("collective return", "apples", ("harvest",), collective_return),
-    "efficiency": Metric("efficiency", "apples per step", ("harvest",), efficiency),
-    "equality": Metric("equality (1 - Gini)", SHARE, ("harvest",), equality),
-    "sustainability": Metric("sustainability", "steps", ("harvest",), sustainability),
-    "survival_steps": Metric("survival", "steps", (), survival_steps),
-    "peace": Metric("peace", "agents", ("in_play",), peace),
-    "peacefulness": Metric("peacefulness", "steps in play per agent", ("in_play",), peacefulness),
-}
-METRICS: Final = tuple(_METRICS)
+_TOTAL_OF: Final = {"in_play": "in_play_steps", "violated": "violations", "tagged_by": "tags"}
+"""The totals of entries that have another name."""
+
+
+def measured(metrics: Mapping[str, Metric], totals: Totals) -> dict[str, Tensor]:
+    """Return those metrics by name for which all that they are computed from is given."""
+    return {name: metric.of(totals) for name, metric in metrics.items() if metric.is_known(totals)}
+
+
+SOCIAL: Final[Mapping[str, Metric]] = MappingProxyType(
+    {
+        "collective_return": Metric("collective return", "apples", ("harvest",), collective_return),
+        "efficiency": Metric("efficiency", "apples per step", ("harvest",), efficiency),
+        "equality": Metric("equality (1 - Gini)", SHARE, ("harvest",), equality, digits=2),
+        "sustainability": Metric("sustainability", "steps", ("harvest",), sustainability, digits=1),
+        "survival_steps": Metric("survival", "steps", (), survival_steps, digits=1),
+        "peace": Metric("peace", "agents", ("in_play",), peace),
+        "peacefulness": Metric(
+            "peacefulness", "steps in play per agent", ("in_play",), peacefulness, digits=1
+        ),
+        "yield_share": Metric(
+            "yield share of the steps played",
+            "ratio",
+            ("harvest",),
+            yield_share,
+            of_totals=("sustainable_yield", "first_stock"),
+            digits=2,
+        ),
+    }
+)
+METRICS: Final = tuple(name for name in SOCIAL if name != "yield_share")
 """What `summary` holds of a game that reports harvest and in_play, in this order."""
 NEEDS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
-    {name: metric.needs for name, metric in _METRICS.items()} | {"yield_share": ("harvest",)}
+    {name: metric.needs for name, metric in SOCIAL.items()}
 )
 """Which entries of a turn each metric is computed from."""
-NAMES: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
-    {name: (metric.words, metric.unit) for name, metric in _METRICS.items()}
-    | {"yield_share": ("yield share of the steps played", "ratio")}
-)
-"""The words and the unit of each metric."""
-_TOTAL_OF: Final = {"harvest": "harvest", "in_play": "in_play_steps"}
-
-
-def _given(total: Tensor | None) -> Tensor:
-    assert total is not None
-    return total

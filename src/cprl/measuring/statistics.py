@@ -108,6 +108,24 @@ def holm(p_values: ArrayLike, *, level: float = 1 - CONFIDENCE) -> NDArray[np.bo
     return differs
 
 
+HOLM: Final = "* not 0 by Holm's method"
+"""What a star of `starred` means; "for ..." says which comparisons."""
+
+
+def starred(differences: Sequence[Estimate], form: str = "") -> list[str]:
+    """Return the texts of all differences that are compared in one place, with a star where `holm` says that
+    one is not 0.
+
+    Args:
+        form: of the value alone, e.g. "+.3g"; by default the value has its interval.
+    """
+    are_apart = holm([difference.p_value for difference in differences])
+    return [
+        (f"{difference.value:{form}}" if form else str(difference)) + " *" * bool(is_apart)
+        for difference, is_apart in zip(differences, are_apart, strict=True)
+    ]
+
+
 def curve_interval(curves: ArrayLike, *, confidence: float = CONFIDENCE) -> tuple[Values, Values, Values]:
     """Return the mean of several curves and its interval by Student's t at each episode.
 
@@ -228,35 +246,20 @@ def institution_metrics(episode: Episode) -> dict[str, float]:
 
 
 def institution_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measured]:
-    """Return `institution_metrics` over replicas, by name, as `institutions/fines` and so on.
-
-    Empty for a game without institutions.
-
-    Args:
-        played: episodes by replica.
-    """
+    """Return `institution_metrics` over replicas, by name, as `institutions/fines` and so on; empty of a game
+    without institutions."""
     measures = _measures(played, institution_metrics)
     return {f"institutions/{name}": measured for name, measured in measures.items()}
 
 
 def social_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measured]:
-    """Return `social_metrics` over replicas, by name.
-
-    Args:
-        played: episodes by replica.
-
-    Raises:
-        ValueError: if there are no replicas, or a replica has no episodes.
-    """
+    """Return `social_metrics` over replicas, by name, of episodes by replica."""
     return _measures(played, social_metrics)
 
 
 def _measures(
     played: Mapping[int, Sequence[Episode]], metrics_of: Callable[[Episode], dict[str, float]]
 ) -> dict[str, Measured]:
-    if not played or not all(played.values()):
-        counts = {replica: len(episodes) for replica, episodes in played.items()}
-        raise ValueError(f"episodes by replica are {counts}; allowed: at least one replica, each at least 1")
     by_replica = {
         replica: [metrics_of(episode) for episode in episodes] for replica, episodes in played.items()
     }

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cprl.institutions import COUNTS
 from cprl.measuring import phases, social
 from cprl.measuring.institutions import summary
+from cprl.measuring.social import Totals
 from cprl.runs.episodes import OF_INSTITUTIONS, read_episodes
 
 Values = NDArray[np.float64]
@@ -65,7 +66,7 @@ def _of_institutions(names: Sequence[str], values: Callable[[str], Values]) -> d
     given = tensors(("harvest", "in_play_steps", "fines", "transfers", "violations"))
     if "violations" in given:
         given["counts"] = tensors(COUNTS)
-    curves = {name: curve.numpy() for name, curve in summary(**given).items()}
+    curves = {name: curve.numpy() for name, curve in summary(Totals(**given)).items()}
     curves |= {name: values(name)[..., 0] for name in names if name.startswith("in_force_")}
     return {f"institutions/{name}": curve for name, curve in curves.items()}
 

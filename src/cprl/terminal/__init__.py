@@ -3,7 +3,6 @@
 Modules, in the order in which one reads them:
     progress  a bar while a training runs
     summary   what a run came to
-    course    the same in four sentences: peak, fall, survival, meaning
     figures   the training curve
     style     what all figures share: sizes, colours, legends
 """

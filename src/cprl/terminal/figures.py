@@ -1,7 +1,7 @@
 """Figures of a run, plotted from its table of episodes alone."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Final
@@ -86,18 +86,8 @@ def mark_exploration(panels: Sequence[Axes], episode: float | None) -> None:
     label = f"exploration ends, episode {episode:,.0f}"
     for panel in panels:
         panel.axvline(episode, color=MARK, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
-        panel.plot(
-            episode,
-            0,
-            marker="^",
-            markersize=9,
-            color=MARK,
-            linestyle="none",
-            transform=panel.get_xaxis_transform(),
-            clip_on=False,
-            zorder=5,
-            label=label,
-        )
+        on_the_axis: dict[str, Any] = {"transform": panel.get_xaxis_transform(), "clip_on": False}
+        panel.plot(episode, 0, "^", markersize=9, color=MARK, zorder=5, label=label, **on_the_axis)
 
 
 Values = NDArray[np.float64]
@@ -111,17 +101,14 @@ OF_INSTITUTIONS: Final = ("institutions/violations", "institutions/fines")
 
 @dataclass(frozen=True, kw_only=True)
 class _Panel:
-    """What is plotted in one panel."""
+    """What is plotted in one panel: [R, E], the mean of random play, and the episodes of evaluations with
+    their means over replicas and episodes."""
 
-    name: str
     title: str
     unit: str
     values: Values
-    """[R, E]."""
     random: float | None
-    """The mean of random play."""
-    evaluated: tuple[Values, Values] | None = None
-    """The episodes of evaluations, and their means over replicas and episodes."""
+    evaluated: tuple[Values, Values] | None
 
 
 def training_curve(
@@ -151,7 +138,7 @@ def training_curve(
     """
     title = title.encode("utf-8", "replace").decode()
     curves = curves_of(run)
-    panels = [replace(panel, evaluated=_evaluated(run, panel.name)) for panel in _panels(curves, random)]
+    panels = _panels(run, curves, random or [])
     episodes = panels[0].values.shape[1]
     window = min(smoothed, max(1, episodes // PARTS))
     ours = bands_of(phases_of(curves, centred=True) or [])
@@ -173,25 +160,38 @@ def training_curve(
     for axes in strip:
         draw_strip(axes, strips)
     drawn[-1].set_xlabel("episode")
-    is_over = exploration_steps is None or ends is not None
-    style.legend_below(figure, drawn, note=_note(window, is_over=is_over))
+    note = f"Running means are over {window} episodes, centred." if window > 1 else "Nothing is smoothed."
+    if exploration_steps is not None and ends is None:
+        note += " Exploration was not over at the last episode."
+    style.legend_below(figure, drawn, note=note)
     picture = run / "figures" / "training_curve.png"
     picture.parent.mkdir(exist_ok=True)
     return style.save(figure, picture)
 
 
-def _panels(curves: dict[str, Values], random: list[Episode] | None) -> list[_Panel]:
+def _panels(run: Path, curves: dict[str, Values], random: Sequence[Episode]) -> list[_Panel]:
     """Collective return and survival, or the return of all agents of a game without a harvest; violations and
     fines of a game with institutions."""
-    of_institutions = [_panel(name, curves[name], random) for name in OF_INSTITUTIONS if name in curves]
+    played: list[dict[str, float]] = [
+        {"return": float(one.return_.sum()), **one.metrics}
+        | {f"institutions/{name}": value for name, value in institution_metrics(one).items()}
+        for one in random
+    ]
     if "collective_return" in curves:
-        names = ("collective_return", "survival_steps")
-        return [*(_panel(name, curves[name], random) for name in names), *of_institutions]
-    returns = sum(curve for name, curve in curves.items() if name.startswith("return_"))
-    level = fmean(float(episode.return_.sum()) for episode in random) if random else None
-    values = np.asarray(returns)
-    whole = _Panel(name="return", title="return of all agents together", unit="", values=values, random=level)
-    return [whole, *of_institutions]
+        names = ["collective_return", "survival_steps"]
+    else:
+        returns = sum(curve for name, curve in curves.items() if name.startswith("return_"))
+        curves, names = {**curves, "return": np.asarray(returns)}, ["return"]
+    return [
+        _Panel(
+            title="return of all agents together" if name == "return" else metric_title(name),
+            unit=unit(name),
+            values=curves[name],
+            random=fmean(metrics[name] for metrics in played) if played else None,
+            evaluated=_evaluated(run, name),
+        )
+        for name in (*names, *(name for name in OF_INSTITUTIONS if name in curves))
+    ]
 
 
 def _evaluated(run: Path, name: str) -> tuple[Values, Values] | None:
@@ -206,18 +206,6 @@ def _evaluated(run: Path, name: str) -> tuple[Values, Values] | None:
         values = values * (table["agent"].to_numpy().max() + 1)
     at = np.unique(trained)
     return at - 1.0, np.array([np.nanmean(values[trained == episodes]) for episodes in at])
-
-
-def _panel(name: str, values: Values, random: list[Episode] | None) -> _Panel:
-    played = [{**one.metrics, **_of_institutions(one)} for one in random or ()]
-    if played and name not in played[0]:
-        raise ValueError(f"random has episodes without {name}; allowed: episodes of the run's game")
-    level = fmean(metrics[name] for metrics in played) if played else None
-    return _Panel(name=name, title=metric_title(name), unit=unit(name), values=values, random=level)
-
-
-def _of_institutions(episode: Episode) -> dict[str, float]:
-    return {f"institutions/{name}": value for name, value in institution_metrics(episode).items()}
 
 
 def _draw(axes: Axes, panel: _Panel, window: int, dashed: str) -> None:
@@ -252,20 +240,5 @@ def _mark_peak(axes: Axes, panel: _Panel, window: int) -> None:
         marks = {"highest and last": (top, "o")}
     for name, (place, marker) in marks.items():
         when = f", episode {at[place]:,.0f}" if place == top else ""
-        axes.plot(
-            at[place],
-            mean[place],
-            marker=marker,
-            markersize=8,
-            markerfacecolor="white",
-            markeredgecolor=style.MEAN,
-            markeredgewidth=2,
-            linestyle="none",
-            label=f"{name} {over}, {mean[place]:,.4g} {panel.unit}".rstrip() + when,
-            zorder=4,
-        )
-
-
-def _note(window: int, *, is_over: bool) -> str:
-    note = f"Running means are over {window} episodes, centred." if window > 1 else "Nothing is smoothed."
-    return note if is_over else f"{note} Exploration was not over at the last episode."
+        label = f"{name} {over}, {mean[place]:,.4g} {panel.unit}".rstrip() + when
+        axes.plot(at[place], mean[place], marker, **style.POINT, label=label, zorder=4)

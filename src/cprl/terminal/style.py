@@ -43,6 +43,13 @@ EVALUATED: Final[dict[str, Any]] = {
     "markersize": 4,
     "markerfacecolor": "white",
 }
+POINT: Final[dict[str, Any]] = {
+    "markersize": 8,
+    "markerfacecolor": "white",
+    "markeredgecolor": MEAN,
+    "markeredgewidth": 2,
+    "linestyle": "none",
+}
 PUBLISHED: Final = "#000000"
 MARK: Final = "#a50f15"
 _EDGE: Final = "#303030"
@@ -106,6 +113,14 @@ def head(figure: Figure, title: str, note: str) -> None:
 
 def wrapped(title: str, width_in: float) -> str:
     return fill(title, int(width_in / CHARACTER_IN))
+
+
+def write_small(axes: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
+    """Gives a panel its labels, in small text as its ticks."""
+    axes.set_xlabel(x, fontsize=SMALL_PT)
+    axes.set_ylabel(y, fontsize=SMALL_PT)
+    axes.set_title(title, fontsize=SMALL_PT)
+    axes.tick_params(labelsize=SMALL_PT)
 
 
 def picture_path(path: str | Path, name: str = "path") -> Path:

@@ -37,8 +37,13 @@ from cprl.studies.tables.table import (
     counted,
 )
 from cprl.studies.trials import State, trials_of
-from cprl.terminal.course import BELOW_RANDOM, LAST_EPISODES, PEAK_EPISODES, PEAK_OVER_RANDOM
 from cprl.values import Positive, checked
+
+PEAK_EPISODES, LAST_EPISODES = 10, 30
+"""Episodes of the mean whose highest value is the peak of a training, and at its end."""
+PEAK_OVER_RANDOM, BELOW_RANDOM = 1.5, 0.95
+"""How many times random play the peak of agents who learned something is at least, and a tragedy's end at
+most."""
 
 REASONS: Final[dict[State, str]] = {
     "missing": "was not begun",
