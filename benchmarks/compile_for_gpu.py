@@ -10,8 +10,9 @@ import re
 import subprocess
 import sys
 import tempfile
+from contextlib import suppress
 from dataclasses import replace
-from importlib.metadata import files
+from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,7 +28,8 @@ from cprl.commons.cuda import kernels
 from cprl.commons.game import output_forms
 from cprl.commons.world import Scratch, StepOutput, Worlds, empty_scratch, empty_worlds
 from cprl.institutions import Tax
-from cprl.institutions.memory import Law, Memory, empty_memory
+from cprl.institutions.arrays import changed
+from cprl.institutions.law import new_law
 
 
 def arguments(game: Game, worlds: int = 4) -> dict[str, tuple[Any, ...]]:
@@ -43,13 +45,14 @@ def arguments(game: Game, worlds: int = 4) -> dict[str, tuple[Any, ...]]:
     on_gpu = Worlds(*map(np.asfortranarray, state))
     loops = {"play_worlds": actions, "begin_worlds": marks, "refresh_worlds": marks, "show_worlds": boards}
     ruled = replace(game, institutions=(Tax(),))
-    memory = empty_memory(ruled.institution_tables, worlds=worlds)
     paid = output_of([np.zeros(*form) for form in output_forms(ruled, worlds).values()])
-    law = Law(ruled.institution_tables, Memory(*map(np.asfortranarray, memory)), actions, paid.payments)
+    law = changed(
+        new_law(ruled, worlds), lambda array, of_worlds: np.asfortranarray(array) if of_worlds else array
+    )._replace(decisions=actions, payments=paid.payments)
     return {
-        **{name: (on_gpu, tables, what, told, scratch) for name, what in loops.items()},
+        **{name: (on_gpu, tables, told, what, scratch) for name, what in loops.items()},
         **{
-            f"governed {name}": (on_gpu, ruled.tables, what, paid.turn, scratch, law)
+            f"governed {name}": (on_gpu, ruled.tables, paid.turn, law, what, scratch)
             for name, what in loops.items()
             if name != "show_worlds"
         },
@@ -59,8 +62,11 @@ def arguments(game: Game, worlds: int = 4) -> dict[str, tuple[Any, ...]]:
 
 def ptxas() -> Path | None:
     """NVIDIA's assembler, as the extra `cuda12` brings it."""
-    found = [path for path in files("nvidia-cuda-nvcc-cu12") or () if path.name == "ptxas"]
-    return Path(str(found[0].locate())) if found else None
+    with suppress(PackageNotFoundError):
+        for path in files("nvidia-cuda-nvcc-cu12") or ():
+            if path.name == "ptxas":
+                return Path(str(path.locate()))
+    return None
 
 
 def main(*, capability: tuple[int, int] = (9, 0)) -> None:

@@ -30,6 +30,7 @@ from cprl.institutions import (
     Mediation,
     Monitoring,
     Quota,
+    Rotation,
     Sanctioner,
     Tax,
     Vote,
@@ -46,6 +47,7 @@ EACH: Final[dict[str, tuple[Institution, ...]]] = {
     "Quota": (Quota(**HIDDEN),),
     "ClosedSeason": (ClosedSeason(**HIDDEN),),
     "ClosedPatches": (ClosedPatches(**HIDDEN),),
+    "Rotation": (Rotation(**HIDDEN),),
     "Tax": (Tax(**HIDDEN),),
     "Tax, per 50 turns, 3 brackets": (
         Tax(period_steps=50, brackets=((0, 0.1), (2, 0.3), (5, 0.5)), **HIDDEN),

@@ -75,7 +75,7 @@ def play(
             batch.play(choose(turn, turn_of(whole)), whole, decided)
             paid, now = whole.payments, batch.now
             one = turn_of(whole).harvest, paid.fines, paid.transfers, paid.counts, paid.in_force
-            more = now.in_play, batch.memory.level, now.stock, now.row, now.col
+            more = now.in_play, batch.law.sanctions.level, now.stock, now.row, now.col
             found.append([array[0].copy() for array in (*one, *more)])
         shown = batch.show(whole)._replace(in_play=np.ones(game.agents, np.bool_))
         if episode + 1 < episodes:

@@ -12,7 +12,8 @@ from cprl.commons.colours import CLASS_NAMES, FIRST_AGENT, class_colour
 from cprl.commons.maps import SIGN_OF_HEADING
 from cprl.commons.world import StepOutput, Worlds
 from cprl.institutions import COUNTS, Institution
-from cprl.institutions.memory import DERIVED, REMEMBERED, Memory, Payments
+from cprl.institutions.arrays import DERIVED, STATE, STEPS, lasting
+from cprl.institutions.ledger import Payments
 
 RGB_SIGN = {
     (10, 10, 10): ".",
@@ -155,11 +156,11 @@ def random_actions(steps: int, worlds: int, game: Game, *, seed: int = 0) -> np.
 
 
 class Moment(NamedTuple):
-    """Copies of all arrays after a turn; `memory` and `payments` are those of institutions, if any."""
+    """Copies of all arrays after a turn; `law`, of what lasts, and `payments` are those of institutions."""
 
     worlds: Worlds
     turn: StepOutput
-    memory: Memory | None = None
+    law: dict[str, np.ndarray] | None = None
     payments: Payments | None = None
 
 
@@ -170,10 +171,11 @@ def copied(record: Any) -> Any:
 
 def kept(batch: Batch, output: Any) -> Moment:
     """The moment after the last turn."""
-    records = [batch.now, turn_of(output)]
-    if batch.memory is not None:
-        records += [batch.memory, output.payments]
-    return Moment(*map(copied, records))
+    moment = Moment(copied(batch.now), copied(turn_of(output)))
+    if batch.law is None:
+        return moment
+    law = {name: array.copy() for name, array, _ in lasting(batch.law, STATE, STEPS, DERIVED)}
+    return moment._replace(law=law, payments=copied(output.payments))
 
 
 def play_on(batch: Batch, output: Any, actions: Any, decisions: Any = None) -> list[Moment]:
@@ -193,11 +195,11 @@ def played(game: Game, actions: Any, decisions: Any = None, **options) -> list[M
 
 
 def assert_same(record: Any, other: Any, *, rows: Any = slice(None), other_rows: Any = slice(None)) -> None:
-    """All that lasts in records of arrays, or in records of records, is equal in the given worlds."""
-    names = (*REMEMBERED, *DERIVED) if isinstance(record, Memory) else record._fields
-    for name in names:
-        one, two = getattr(record, name), getattr(other, name)
-        if isinstance(one, tuple):
-            assert_same(one, two, rows=rows, other_rows=other_rows)
+    """All arrays of records, and of the records in them, are equal in the given worlds."""
+    if not isinstance(record, dict):
+        record, other = record._asdict(), other._asdict()
+    for name, one in record.items():
+        if isinstance(one, tuple | dict):
+            assert_same(one, other[name], rows=rows, other_rows=other_rows)
         elif one is not None:
-            assert np.array_equal(one[rows], two[other_rows]), name
+            assert np.array_equal(one[rows], other[name][other_rows]), name

@@ -23,6 +23,7 @@ from cprl.institutions import (
     ClosedSeason,
     GraduatedSanctions,
     Quota,
+    Rotation,
     Sanctioner,
 )
 
@@ -41,15 +42,17 @@ def both(game: Game, worlds: int) -> tuple[Batch, Batch]:
 
 
 def assert_same(cpu: Batch, gpu: Batch, output, gpu_output, when: object) -> None:
-    """Worlds and step outputs are equal; with institutions also their memory and payments."""
+    """Worlds and step outputs are equal; with institutions also all their arrays and payments."""
     records = [(turn_of(output), turn_of(gpu_output)), (cpu.now, gpu.now)]
-    if cpu.memory is not None:
-        records += [(cpu.memory, gpu.memory), (output.payments, gpu_output.payments)]
+    if cpu.law is not None:
+        records.append((output.payments, gpu_output.payments))
+        records += [both for both in zip(cpu.law, gpu.law, strict=True) if hasattr(both[0], "_fields")]
     for ours, theirs in records:
         for name, array in ours._asdict().items():
-            other = gpu.driver.read(getattr(theirs, name))
-            if array.dtype != other.dtype or not np.array_equal(array, other):
-                raise AssertionError(f"{name} differs, {when}: {array} {other}")
+            if isinstance(array, np.ndarray):
+                other = gpu.driver.read(getattr(theirs, name))
+                if array.dtype != other.dtype or not np.array_equal(array, other):
+                    raise AssertionError(f"{name} differs, {when}: {array} {other}")
 
 
 def play(game: Game, *, worlds: int = 2, turns: int = 12) -> Batch:
@@ -153,7 +156,7 @@ def stopped() -> None:
     own = (
         Boundaries.drawn("001122-\n.......\n..3..22", owners=("01", "13", "2")),
         *(Quota(share=0.5), ClosedSeason(period_steps=4, closed_steps=1), ClosedPatches()),
-        Sanctioner(agents=(1, 2)),
+        *(Rotation(window_steps=4), Sanctioner(agents=(1, 2))),
         GraduatedSanctions(freeze_steps=((1,), (2,), (3,)), on="tags"),
     )
     rules = replace(

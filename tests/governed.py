@@ -17,6 +17,7 @@ from cprl.institutions import (
     Mediation,
     Monitoring,
     Quota,
+    Rotation,
     Sanctioner,
     Tax,
     Vote,
@@ -39,6 +40,7 @@ EVERYTHING = Game(
         Vote(on=Quota(window_steps=6, by_stock=True), choices=(0.5, 1, 2)),
         ClosedSeason(period_steps=9, closed_steps=2, fine=0.75),
         ClosedPatches(below=2, fine=0.1),
+        Rotation(window_steps=5, fine=0.2),
         Vote(on=Tax(period_steps=3), choices=(0.0, 0.3), override_prob=0.5, period_episodes=2),
         Tax(brackets=((0, 0.1), (2, 0.4)), redistribution="none", period_steps=5),
         Levies(groups=((1,), (2, 0))),
@@ -129,6 +131,7 @@ def governed_games(draw, *, harmless=False, ballots=True, **fixed):
         boundaries(game.map, fine, FINES | st.none()),
         quotas(fine),
         st.builds(ClosedSeason, period_steps=st.integers(5, 9), closed_steps=st.integers(0, 5), fine=fine),
+        st.builds(Rotation, window_steps=st.integers(1, 9), fine=fine),
         taxes(),
         levies(game.agents),
     ]

@@ -9,18 +9,13 @@ from boards import Play
 from cprl import Game, Rules, maps
 from cprl.commons.batch import Batch
 from cprl.commons.near import distance, neighbours
-from cprl.institutions import Boundaries
 
 
 def test_an_agent_harvests_the_apple_that_it_steps_on():
-    play = Play(">A.\n...").turn("forward")
+    play = Play(">A.A\n....").turn("forward")
     assert play.harvest == [1]
-    assert play.output.stock[0, 0] == 0
-
-
-def test_an_empty_site_gives_nothing():
-    play = Play(">A.A\n....").turn("forward").turn("stay")
-    assert play.harvest == [0]
+    assert play.output.stock[0, 0] == 1
+    assert play.turn("stay").harvest == [0], "the site is empty"
 
 
 def test_every_site_is_full_at_the_start_of_an_episode_also_the_one_on_which_an_agent_starts():
@@ -29,13 +24,6 @@ def test_every_site_is_full_at_the_start_of_an_episode_also_the_one_on_which_an_
     assert Play(board).turn("stay").harvest == [1, 0]
     assert Play(board).turn("forward", "stay").harvest == [0, 0], "it walked away"
     assert Play(board).turn("stay").again().output.stock[0, 0] == 2
-
-
-def test_an_agent_that_may_not_harvest_a_site_leaves_its_apple():
-    others = Boundaries.drawn(".1..\n....")
-    play = Play(">A.<\n..A.", institutions=[others]).turn("forward", "stay")
-    assert play.harvest == [0, 0]
-    assert play.output.stock[0, 0] == 2
 
 
 def test_as_run_the_agent_of_lower_index_on_a_cell_gets_the_apple():

@@ -2,7 +2,7 @@
 
 from boards import Play
 
-from cprl.institutions import GraduatedSanctions, Sanctioner
+from cprl.institutions import Sanctioner
 
 
 def test_a_beam_reaches_its_length_and_no_further():
@@ -82,26 +82,6 @@ def test_the_beam_action_of_an_agent_that_may_not_fire_does_nothing():
     play = Play("A...\n.>.^", institutions=[Sanctioner(agents=(1,))]).turn("beam", "stay")
     assert not play.output.fired.any()
     assert play.in_play == [True, True]
-
-
-def test_the_time_out_depends_on_the_shooter_and_on_the_offence():
-    # Agent 0 punishes by 1 turn, then by 3; agent 2 always by 2.
-    steps = ((1, 3), (9, 9), (2, 2))
-    sanctions = GraduatedSanctions(freeze_steps=steps, fines=(0,), recovery_steps=None, on="tags")
-
-    def missed(play, *names):
-        play.turn(*names)
-        turns = 0
-        while not play.in_play[1]:
-            play.turn("stay")
-            turns += 1
-        return turns
-
-    play = Play("A......\n>..^..<", institutions=[sanctions])
-    assert missed(play, "beam", "stay", "stay") == 1
-    assert missed(play, "beam", "stay", "stay") == 3
-    assert missed(play, "stay", "stay", "beam") == 2
-    assert missed(play, "beam", "stay", "beam") == 3, "the longer one counts"
 
 
 def test_the_length_of_a_beam_may_depend_on_the_heading():

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from cprl.commons.chance import philox4x32, threshold
+from cprl.commons.chance import philox4x32
+from cprl.institutions.base import threshold
 
 KNOWN_ANSWERS = [  # from the vectors published with Random123, philox4x32, 10 rounds
     ("00000000 00000000 00000000 00000000", "00000000 00000000", "6627e8d5 e169c58d bc57ac4c 9b00dbd8"),

@@ -21,7 +21,7 @@ from cprl.evaluation.film import film, film_video
 from cprl.evaluation.lanes import Turns
 from cprl.evaluation.play import Session, open_session
 from cprl.institutions import Sanctioner, Tax, Vote
-from cprl.institutions.deciding import choice_of
+from cprl.institutions.votes import choice_of
 from cprl.learners.decisions import Bandit, BanditDecider
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.assignment import AgentPolicies
@@ -119,10 +119,10 @@ def test_a_decision_is_one_number_for_the_choices_of_all_ballots(sizes, data):
     choices = np.array([data.draw(st.integers(0, size - 1)) for size in sizes])
     decision = decision_of(choices, sizes)
 
-    class Tables:
-        ballot_options = sizes
+    class Ballots:
+        options = sizes
 
-    assert [choice_of(Tables, ballot, int(decision)) for ballot in range(len(sizes))] == choices.tolist()
+    assert [choice_of(Ballots, ballot, int(decision)) for ballot in range(len(sizes))] == choices.tolist()
     assert choices_of(np.array([decision]), sizes).tolist() == [choices.tolist()]
 
 
@@ -374,7 +374,7 @@ def test_a_person_who_decides_is_heard():
         others = AgentPolicies(by_chance(), decisions=decider)
         session = Session(env, others, agent=2, decision=decision)
         session.act("stay")
-        rates.add((decision, float(env.worlds.memory.in_force[0, 0])))
+        rates.add((decision, float(env.worlds.law.ledger.in_force[0, 0])))
     assert rates == {(0, 0.0), (1, 1.0)}
 
 

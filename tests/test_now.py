@@ -39,57 +39,41 @@ def test_four_dqn_agents_explore_harvest_and_end_in_a_tragedy():
     assert now.mean == pytest.approx(np.mean(course[-11:]))
 
 
-def test_while_epsilon_falls_no_loss_is_a_tragedy():
-    course = np.repeat(TRAGEDY, 10)
-    assert labels(Now(agents=4, random_play=RANDOM), course, falling(110, 200)) == [("exploring", 110)]
+HELD = [1.0] * 20 + [0.6, 0.3, 0.1] + [0.1] * 10
+NOISE = RANDOM + np.random.default_rng(0).normal(0, 20, 500)
+COURSES = {
+    "while epsilon falls no loss is a tragedy": (
+        (np.repeat(TRAGEDY, 10), falling(110, 200)),
+        [("exploring", 110)],
+    ),
+    "an epsilon of one is exploration": (([5.0] * 33, HELD), [("exploring", 23), ("harvesting", 10)]),
+    "a small constant epsilon is none": (([5.0] * 12, [0.05] * 12), [("begins", 9), ("harvesting", 3)]),
+    "noise around random play is no tragedy": ((NOISE,), [("begins", 9), ("harvesting", 491)]),
+}
 
 
-def test_an_epsilon_of_one_is_exploration_before_it_begins_to_fall():
-    held = [1.0] * 20 + [0.6, 0.3, 0.1] + [0.1] * 10
-    told = labels(Now(agents=4), [5.0] * 33, held)
-    assert told == [("exploring", 23), ("harvesting", 10)]
+@pytest.mark.parametrize("case", COURSES)
+def test_a_course_has_its_labels_each_for_so_many_episodes(case):
+    course, expected = COURSES[case]
+    assert labels(Now(agents=4, random_play=RANDOM), *course) == expected
 
 
-def test_a_small_constant_epsilon_is_no_exploration():
-    assert labels(Now(agents=4), [5.0] * 12, [0.05] * 12) == [("begins", 9), ("harvesting", 3)]
-
-
-def test_learners_without_epsilon_are_judged_from_the_tenth_episode_on():
-    course = [*[300] * 20, *[600] * 20, *[250] * 30]
-    told = labels(Now(agents=4, random_play=RANDOM), course)
-    assert [label for label, _ in told] == ["begins", "harvesting", "tragedy"]
-    assert told[0] == ("begins", 9)
-
-
-def test_who_regains_a_quarter_of_the_loss_recovers_and_above_the_peak_it_is_over():
-    course = [*[600] * 20, *[300] * 20, *[450] * 20, *[700] * 40]
-    told = labels(Now(agents=4, random_play=RANDOM), course)
-    assert [label for label, _ in told] == ["begins", "harvesting", "tragedy", "recovery", "harvesting"]
-
-
-def test_a_recovery_that_is_lost_again_is_a_tragedy_again():
-    course = [*[600] * 20, *[300] * 20, *[500] * 20, *[300] * 20]
-    told = labels(Now(agents=4, random_play=RANDOM), course)
-    assert [label for label, _ in told][-2:] == ["recovery", "tragedy"]
-
-
-def test_a_single_agent_shares_nothing_and_declines():
-    course = [*[600] * 20, *[300] * 20]
-    assert labels(Now(agents=1, random_play=RANDOM), course)[-1][0] == "decline"
-
-
-def test_noise_around_random_play_is_no_tragedy():
-    course = RANDOM + np.random.default_rng(0).normal(0, 20, 500)
-    told = labels(Now(agents=4, random_play=RANDOM), course)
-    assert {label for label, _ in told} == {"begins", "harvesting"}
-
-
-def test_without_random_play_the_first_running_mean_stands_for_it():
-    course = [*[300] * 10, *[600] * 20, *[420] * 20]
-    assert labels(Now(agents=4), course)[-1][0] == "tragedy"
-    assert labels(Now(agents=4, random_play=-1000.0), course)[-1][0] == "harvesting", (
-        "a third of another lead"
-    )
+@pytest.mark.parametrize(
+    ("levels", "changes", "expected"),
+    [
+        ((300, 600, 250), {}, "begins harvesting tragedy"),
+        # A quarter of the loss regained is a recovery, which is over above the peak, or a tragedy again.
+        ((600, 300, 450, 700, 700), {}, "begins harvesting tragedy recovery harvesting"),
+        ((600, 300, 500, 300), {}, "begins harvesting tragedy recovery tragedy"),
+        ((600, 300), {"agents": 1}, "begins harvesting decline"),  # one alone shares nothing
+        # Without random play the first running mean stands for it; the same fall is a third of a larger lead.
+        ((300, 600, 420), {"random_play": None}, "begins harvesting tragedy"),
+        ((300, 600, 420), {"random_play": -1000.0}, "begins harvesting"),
+    ],
+)
+def test_learners_without_epsilon_are_judged_by_what_they_lose_and_regain(levels, changes, expected):
+    now = Now(**{"agents": 4, "random_play": RANDOM, **changes})
+    assert [label for label, _ in labels(now, np.repeat(levels, 20))] == expected.split()
 
 
 def test_a_published_length_run_is_told_as_exploration_tragedy_and_recovery():

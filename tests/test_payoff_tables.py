@@ -118,9 +118,7 @@ def test_equal_steps_of_what_herders_take_make_equilibria_that_are_none_of_the_g
 def test_alpha_rank_of_games_worked_by_hand_without_a_warning(open_spiel):
     assert alpha_rank(ROCK_PAPER_SCISSORS).shares == pytest.approx([1 / 3] * 3)
     assert alpha_rank(DILEMMA).shares == pytest.approx([0, 1], abs=1e-5)
-
-
-def test_where_several_compositions_are_almost_never_left_each_keeps_its_share(open_spiel):
+    # Where several compositions are almost never left each keeps its share.
     assert alpha_rank(STAG_HUNT).compositions == pytest.approx([0.5, 0, 0.5], abs=1e-4)
     assert alpha_rank(CHICKEN).compositions == pytest.approx([0, 1, 0], abs=1e-3)
 

@@ -54,15 +54,6 @@ def test_modules_of_recipes_have_names_of_their_own():
     assert sorted(names) == sorted(set(names))
 
 
-@pytest.mark.parametrize("name", STUDIES)
-def test_each_study_asks_a_question_and_says_what_the_paper_leads_to_expect(name, recipes):
-    study = recipes[name].STUDY
-    assert study.name == name
-    assert study.question.endswith("?")
-    assert study.expectation.startswith("After Perolat et al.: ")
-    assert study.replicas >= 2
-
-
 def test_equal_rooms_are_the_walls_of_the_study_of_walls(recipes):
     walls, unequal = (recipes[f"perolat_{name}"].STUDY for name in ("walls", "unequal"))
     sums = [{own.checksum for own in study.all_conditions} for study in (walls, unequal)]
@@ -130,15 +121,3 @@ def test_the_share_of_the_rich_is_that_of_every_fourth_agent(recipes, monkeypatc
     monkeypatch.setattr(claims, "evaluated", lambda run, policy: returns)
     # Agents 0 and 4 begin in the north-west room: 4 of 10 apples.
     assert claims.rich_share(Path("anywhere"), "trained").tolist() == [0.4]
-
-
-def test_a_file_of_claims_that_cannot_be_written_is_refused_before_anything_is_played(
-    recipes, monkeypatch, tmp_path
-):
-    claims = recipes["perolat_claims"]
-    monkeypatch.setattr(claims, "table", lambda runs, episodes: "cannot be told \u2212")
-    claims.main(out=tmp_path / "new" / "claims.md")
-    assert (tmp_path / "new" / "claims.md").read_text(encoding="utf-8") == "cannot be told \u2212\n"
-    monkeypatch.setattr(claims, "table", None)  # it would be called
-    with pytest.raises(IsADirectoryError, match="a directory; allowed: the name of a file"):
-        claims.main(out=tmp_path / "new")

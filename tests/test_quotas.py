@@ -1,4 +1,4 @@
-"""Quotas, closed seasons and closed patches: what is allowed when, and what the rest costs.
+"""Quotas, closed seasons and patches, rotation: what is allowed when, and what the rest costs.
 
 With `regrow_prob=(1.0,)` every site that begins a turn empty grows an apple in it: a site that is harvested
 at once bears an apple every second turn, a yield of 1/2.
@@ -9,7 +9,7 @@ from boards import Play
 
 from cprl import Observation, Rules, maps
 from cprl.commons.near import patches, sites_around
-from cprl.institutions import ClosedPatches, ClosedSeason, Quota
+from cprl.institutions import ClosedPatches, ClosedSeason, Quota, Rotation
 
 BOARD = """
 >AA..
@@ -130,6 +130,30 @@ def test_a_season_may_be_open_or_closed_for_ever(closed, harvest):
     play = Play(BOARD, institutions=[season])
     for _ in range(2):
         assert play.turn("forward").harvest == [harvest] * 2
+
+
+def test_agents_take_turns_in_harvesting():
+    # Windows of 2 turns: turns 1 and 2 are agent 0's, turns 3 and 4 agent 1's, turn 5 is agent 0's again.
+    play = Play(">AAAAA.\n.AAAAA<", institutions=[Rotation(window_steps=2)])
+    assert [play.turn("forward").harvest for _ in range(5)] == [[1, 0], [1, 0], [0, 1], [0, 1], [1, 0]]
+    assert play.board == "...AA>.\n.<..AA."
+    assert not any(play.violated)
+
+
+def test_a_bite_in_the_window_of_another_costs_its_fine():
+    play = Play(">AAA.\n.AAA<", institutions=[Rotation(window_steps=1, fine=1.5)])
+    assert play.turn("forward").fines == [0, 1.5]
+    # 1 - 1.5 = -0.5.
+    assert play.turn("forward").reward == [-0.5, 1]
+    assert (play.violated, play.counts("closed_bites")) == ([True, False], [1, 1])
+
+
+def test_agents_see_whether_they_may_harvest_in_the_coming_turn_and_what_is_left_of_the_window():
+    play = Play(BOARD, institutions=[Rotation(window_steps=2)])
+    # Before turns 1, 2, 3: a whole window of agent 0 is left, half of it, a whole one of agent 1.
+    seen = [play.shown(2), *(play.turn("stay").shown(2) for _ in range(2))]
+    assert seen == [[[255, 255], [0, 255]], [[255, 128], [0, 128]], [[0, 255], [255, 255]]]
+    assert play.again().shown(2) == [[255, 255], [0, 255]], "an episode begins with agent 0"
 
 
 PATCHES = ">AA....A.<"

@@ -1,5 +1,8 @@
 """Taxes and levies: what is taken when, and who gets it."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 from boards import Play
 
@@ -12,75 +15,65 @@ BOARD = """
 """Agent 0 harvests an apple a turn, agent 1 none."""
 
 
-def test_a_tax_is_paid_out_in_equal_parts():
-    play = Play(BOARD, institutions=[Tax(rate=0.25)]).turn("forward", "stay")
-    # 1 apple: 1/4 is taken, 1/8 goes to each of two agents.
-    assert (play.fines, play.transfers) == ([0.25, 0], [0.125, 0.125])
-    assert play.reward == [0.875, 0.125]
-    assert play.harvest == [1, 0]
+HALF = Tax(rate=0.5, redistribution="none")
+BRACKETS = Tax(brackets=((0, 0), (0.5, 0.2), (2, 1)), redistribution="none", period_steps=3)
+MANY = Tax(brackets=((0, 0.1), (1, 0.2), (2, 0.3)), redistribution="none")
+BITES, STAYS = ("forward", "stay"), ("stay", "stay")
+
+
+@pytest.mark.parametrize(
+    ("taxes", "turns", "fines", "transfers"),
+    [
+        # 1 apple: 1/4 is taken, and lost, or 1/8 goes to each of two agents; nothing where nothing is bitten.
+        ((Tax(rate=0.25),), (BITES,), [0.25, 0], [0.125, 0.125]),
+        ((Tax(rate=0.25, redistribution="none"),), (BITES,), [0.25, 0], [0, 0]),
+        ((Tax(rate=0.25),), (BITES, STAYS), [0, 0], [0, 0]),
+        # In periods of 2 turns nothing after the first, 2 x 0.5 after the second, one apple in the next.
+        ((replace(HALF, period_steps=2),), (BITES,), [0, 0], [0, 0]),
+        ((replace(HALF, period_steps=2),), (BITES, BITES), [1, 0], [0, 0]),
+        ((replace(HALF, period_steps=2),), (BITES, BITES, BITES, STAYS), [0.5, 0], [0, 0]),
+        # 3 apples: 0.5 x 0 + 1.5 x 0.2 + 1 x 1 = 1.3; 1 apple: 0.5 x 0.2.
+        ((BRACKETS,), (BITES, BITES, BITES), [1.3, 0], [0, 0]),
+        ((BRACKETS,), (BITES, STAYS, STAYS), [0.1, 0], [0, 0]),
+        # A tax with fewer brackets than another keeps its last rate: 3 x 0.5 of the period, 0.1 of this turn.
+        ((replace(HALF, period_steps=3), MANY), (BITES,), [0.1, 0], [0, 0]),
+        ((replace(HALF, period_steps=3), MANY), (BITES, BITES, BITES), [1.6, 0], [0, 0]),
+        # Several taxes have the same base, in either order.
+        ((Tax(rate=0.5), replace(HALF, rate=0.25)), (BITES,), [0.75, 0], [0.25, 0.25]),
+        ((replace(HALF, rate=0.25), Tax(rate=0.5)), (BITES,), [0.75, 0], [0.25, 0.25]),
+        # Taken: 0.25 + 0.25 + 0.5. Given to 0: 0.25 + 0.125 + 0.25, to 1: 0.125 + 0.25.
+        (
+            (Levies(groups=((0,), (1,)), local_rate=0.25, joint_rate=0.25), Tax(rate=0.5)),
+            (BITES,),
+            [1, 0],
+            [0.625, 0.375],
+        ),
+    ],
+)
+def test_a_turn_takes_and_gives(taxes, turns, fines, transfers):
+    play = Play(BOARD, institutions=taxes)
+    for turn in turns:
+        play.turn(*turn)
+    assert (play.fines, play.transfers) == (pytest.approx(fines), pytest.approx(transfers))
+    paid = np.array(play.harvest) - play.fines + play.transfers
+    assert play.reward == pytest.approx(paid.tolist(), abs=1e-6)
     assert not any(play.violated)
-    assert play.turn("stay").fines == play.transfers == [0, 0]
 
 
-def test_a_tax_without_redistribution_is_lost():
-    play = Play(BOARD, institutions=[Tax(rate=0.25, redistribution="none")]).turn("forward", "stay")
-    assert (play.fines, play.transfers, play.reward) == ([0.25, 0], [0, 0], [0.75, 0])
-
-
-def test_the_tax_of_a_period_is_collected_at_its_end():
-    play = Play(BOARD, institutions=[Tax(rate=0.5, redistribution="none", period_steps=2)])
-    assert play.turn("forward", "stay").fines == [0, 0]
-    # Two apples: 2 x 0.5.
-    assert play.turn("forward", "stay").fines == [1, 0]
-    assert play.reward == [0, 0]
-    play.turn("forward", "stay")
-    assert play.turn("stay").fines == [0.5, 0], "one apple in the second period"
-
-
-def test_what_is_left_of_a_period_is_collected_when_the_time_is_up():
+def test_what_is_left_of_a_period_is_collected_when_the_episode_ends():
     taxes = [Tax(rate=0.5, period_steps=50)]
-    play = Play(BOARD, institutions=taxes, episode_steps=2).turn("forward", "stay").turn("forward", "stay")
+    play = Play(BOARD, institutions=taxes, episode_steps=2).turn(*BITES).turn(*BITES)
     assert play.output.truncated.all()
     assert (play.fines, play.transfers, play.reward) == ([1, 0], [0.5, 0.5], [0.5, 0.5])
-
-
-def test_what_is_left_of_a_period_is_collected_when_no_apple_is_left():
-    play = Play(">A.<", institutions=[Tax(rate=0.5, period_steps=50)]).turn("forward", "stay")
+    play = Play(">A.<", institutions=taxes).turn(*BITES)
     assert play.output.terminated.all()
     assert (play.fines, play.transfers) == ([0.5, 0], [0.25, 0.25])
 
 
 def test_the_next_episode_owes_nothing_for_the_last_one():
-    play = Play(BOARD, institutions=[Tax(rate=0.5, period_steps=2)]).turn("forward", "stay")
+    play = Play(BOARD, institutions=[Tax(rate=0.5, period_steps=2)]).turn(*BITES)
     play.again()
     assert play.turn("stay").turn("stay").fines == [0, 0]
-
-
-def test_brackets_tax_the_apples_between_their_bounds():
-    tax = Tax(brackets=((0, 0), (0.5, 0.2), (2, 1)), redistribution="none", period_steps=3)
-    play = Play(BOARD, institutions=[tax]).turn("forward", "stay").turn("forward", "stay")
-    # 3 apples: 0.5 x 0 + 1.5 x 0.2 + 1 x 1 = 1.3.
-    assert play.turn("forward", "stay").fines == [pytest.approx(1.3), 0]
-    # 1 apple: 0.5 x 0.2.
-    play = Play(BOARD, institutions=[tax]).turn("forward", "stay").turn("stay").turn("stay")
-    assert play.fines == [pytest.approx(0.1), 0]
-
-
-def test_taxes_with_fewer_brackets_than_others_keep_their_last_rate():
-    many = Tax(brackets=((0, 0.1), (1, 0.2), (2, 0.3)), redistribution="none")
-    one = Tax(rate=0.5, redistribution="none", period_steps=3)
-    play = Play(BOARD, institutions=[one, many]).turn("forward", "stay")
-    assert play.fines == [pytest.approx(0.1), 0]
-    play.turn("forward", "stay").turn("forward", "stay")
-    # 3 x 0.5 of the period, and 0.1 of this turn.
-    assert play.fines == [pytest.approx(1.6), 0]
-
-
-def test_several_taxes_have_the_same_base():
-    taxes = [Tax(rate=0.5), Tax(rate=0.25, redistribution="none")]
-    for order in (taxes, taxes[::-1]):
-        play = Play(BOARD, institutions=order).turn("forward", "stay")
-        assert (play.fines, play.transfers) == ([0.75, 0], [0.25, 0.25])
 
 
 def test_an_agent_out_of_play_gets_its_part():
@@ -109,14 +102,6 @@ def test_groups_of_different_sizes_share_what_is_theirs():
     # Agent 1 pays itself; 0 pays 0.5, of which it gets half back.
     assert play.fines == [0.5, 0.5, 0]
     assert play.transfers == [0.25, 0.5, 0.25]
-
-
-def test_levies_and_a_tax_add_up():
-    levies = Levies(groups=((0,), (1,)), local_rate=0.25, joint_rate=0.25)
-    play = Play(BOARD, institutions=[levies, Tax(rate=0.5)]).turn("forward", "stay")
-    # Taken: 0.25 + 0.25 + 0.5. Given to 0: 0.25 + 0.125 + 0.25, to 1: 0.125 + 0.25.
-    assert (play.fines, play.transfers) == ([1, 0], [0.625, 0.375])
-    assert play.reward == [0.625, 0.375]
 
 
 def test_a_world_that_has_ended_pays_nothing_and_keeps_its_counts():

@@ -23,37 +23,30 @@ AS_RUN = presets.game("commons", variant="as_run").rules
 PUBLISHED = presets.game("commons").rules
 
 
-def test_an_isolated_cross_bears_a_tenth_of_an_apple_a_turn_as_run():
-    # All five sites are near each other. Two are harvested and have three apples near: 2 x 0.05; with one it
-    # is 1 x 0.05 (four near), with three 3 x 0.01 (two near).
-    assert sustainable_yield(CROSS, AS_RUN) == pytest.approx(0.1)
-    # As published a harvested site also stands full for the turn in which it is bitten: 0.05 / 1.05 each.
-    assert sustainable_yield(CROSS, PUBLISHED) == pytest.approx(2 * 0.05 / 1.05)
+FAR = maps.crosses(height=7, width=30, centres=((3, 3), (3, 12), (3, 21)), starts=((0, 0, 0),))
 
 
-def test_crosses_far_from_each_other_add_up():
-    board = maps.crosses(height=7, width=30, centres=((3, 3), (3, 12), (3, 21)), starts=((0, 0, 0),))
-    assert sustainable_yield(board, AS_RUN) == pytest.approx(0.3)
-
-
-def test_where_nothing_grows_there_is_no_yield():
-    assert sustainable_yield(CROSS, Rules(regrow_prob=(0.0,))) == 0
-    lonely = maps.parse("A...>...A")
-    assert sustainable_yield(lonely, PUBLISHED) == 0, "no apple is near another"
-
-
-def test_where_apples_come_from_nothing_all_sites_are_harvested():
-    # Three sites, each 1/2 without regrowth in the same turn, and 1 with it.
-    board = maps.parse("AAA>")
-    assert sustainable_yield(board, Rules(regrow_prob=(1.0,))) == pytest.approx(1.5)
-    assert sustainable_yield(board, Rules(regrow_prob=(1.0,), regrow_before_bites=True)) == pytest.approx(3)
-
-
-def test_a_probability_that_falls_with_the_apples_near_counts_at_its_lowest():
-    # A pair. One harvested, its neighbour full: always one near, 0.2 / 1.2. Both harvested: none or one near,
-    # so at least 0.2 each, 2 x 0.2 / 1.2.
-    board = maps.parse("AA>")
-    assert sustainable_yield(board, Rules(regrow_prob=(0.9, 0.2))) == pytest.approx(2 * 0.2 / 1.2)
+@pytest.mark.parametrize(
+    ("board", "rules", "expected"),
+    [
+        # All five sites of a cross are near each other. Two are harvested and have three apples near:
+        # 2 x 0.05; with one it is 1 x 0.05 (four near), with three 3 x 0.01 (two near).
+        (CROSS, AS_RUN, 0.1),
+        # As published a harvested site also stands full for the turn in which it is bitten: 0.05 / 1.05 each.
+        (CROSS, PUBLISHED, 2 * 0.05 / 1.05),
+        (FAR, AS_RUN, 0.3),
+        (CROSS, Rules(regrow_prob=(0.0,)), 0),
+        (maps.parse("A...>...A"), PUBLISHED, 0),  # no apple is near another
+        # Apples from nothing: three sites are harvested, each 1/2 without regrowth in the same turn.
+        (maps.parse("AAA>"), Rules(regrow_prob=(1.0,)), 1.5),
+        (maps.parse("AAA>"), Rules(regrow_prob=(1.0,), regrow_before_bites=True), 3),
+        # A pair whose probability falls. One harvested, its neighbour full: always one near, 0.2 / 1.2. Both
+        # harvested: none or one near, so at least 0.2 each, 2 x 0.2 / 1.2.
+        (maps.parse("AA>"), Rules(regrow_prob=(0.9, 0.2)), 2 * 0.2 / 1.2),
+    ],
+)
+def test_yields_that_are_worked_by_hand(board, rules, expected):
+    assert sustainable_yield(board, rules) == pytest.approx(expected)
 
 
 @st.composite

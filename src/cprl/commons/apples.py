@@ -1,5 +1,7 @@
 """Apples: harvest and random regrowth, on one world."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,8 +19,7 @@ from cprl.commons.chance import (
 from cprl.commons.moves import cell_of
 from cprl.commons.tables import Tables
 from cprl.commons.world import Scratch, Worlds
-from cprl.institutions.limits import note_bite, note_step, stops_bite
-from cprl.institutions.memory import Law
+from cprl.institutions.law import note_bite, note_step, stops_bite
 
 
 def fill(world: Worlds, tables: Tables) -> None:
@@ -116,7 +117,7 @@ def grow(world: Worlds, tables: Tables, scratch: Scratch, sprouts: int) -> None:
         add_apple(world, tables, scratch.sprouts[s])
 
 
-def bite(world: Worlds, tables: Tables, law: Law | None, harvest: NDArray[np.float32]) -> None:
+def bite(world: Worlds, tables: Tables, law: Any, harvest: NDArray[np.float32]) -> None:
     """Each agent in play harvests the apple on its cell, unless an institution stops it, which notes what the
     agent breaks; `harvest`: float32 [N], 0 or 1.
 
@@ -127,18 +128,18 @@ def bite(world: Worlds, tables: Tables, law: Law | None, harvest: NDArray[np.flo
         if world.in_play[i]:
             cell = cell_of(world.row[i], world.col[i], tables)
             if law is not None:
-                note_step(law.memory, law.rules, i, cell)
+                note_step(law, i, cell)
             k = tables.site_at[cell]
             if k >= 0 and world.stock[k] == 1 and may_bite(law, i, cell, k, world.step[0]):
                 remove_apple(world, tables, k)
                 harvest[i] = 1.0
                 world.harvested[i] += 1
                 if law is not None:
-                    note_bite(law.memory, law.rules, i, cell, k, world.step[0])
+                    note_bite(law, i, cell, k, world.step[0])
 
 
-def may_bite(law: Law | None, i: int, cell: int, k: int, step: int) -> bool:
+def may_bite(law: Any, i: int, cell: int, k: int, step: int) -> bool:
     """Whether no institution stops agent i from harvesting site k."""
     if law is None:
         return True
-    return not stops_bite(law.memory, law.rules, i, cell, k, step)
+    return not stops_bite(law, i, cell, k, step)

@@ -8,11 +8,11 @@ from numpy.typing import DTypeLike, NDArray
 
 from cprl.commons import state as states
 from cprl.commons.game import Game, check_worlds_fit, output_forms
-from cprl.commons.loops import Loop
+from cprl.commons.loops import Loop, Played
+from cprl.commons.tables import Tables
 from cprl.commons.threads import CpuThreads
 from cprl.commons.world import (
     Actions,
-    Arrays,
     Bools,
     Bytes,
     GovernedOutput,
@@ -21,7 +21,9 @@ from cprl.commons.world import (
     Worlds,
     empty_worlds,
 )
-from cprl.institutions.memory import REMEMBERED, Law, Payments, empty_memory
+from cprl.institutions.arrays import STATE, STEPS, lasting
+from cprl.institutions.law import new_law
+from cprl.institutions.ledger import Payments
 from cprl.values import Range, Seed, checked
 
 Output: TypeAlias = StepOutput | GovernedOutput
@@ -32,21 +34,14 @@ class Driver(Protocol):
     """Runs the rules on B worlds: `CpuThreads` or `cprl.commons.cuda.CudaThreads`."""
 
     threads: int
-    rules: Any
+    tables: Tables
 
-    def place(self, arrays: Arrays) -> Arrays: ...
+    def place(self, arrays: Any) -> Any: ...
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]: ...
     def read(self, array: NDArray[Any]) -> NDArray[Any]: ...
     def write(self, array: NDArray[Any], values: NDArray[Any]) -> None: ...
     def first_unknown(self, actions: Actions, known: int) -> int: ...
-    def run(
-        self,
-        loop: Loop,
-        worlds: Worlds,
-        argument: NDArray[Any],
-        output: StepOutput,
-        law: Law | None = None,
-    ) -> None: ...
+    def run(self, loop: Loop, game: Played, argument: NDArray[Any]) -> None: ...
 
 
 class Batch:
@@ -87,12 +82,10 @@ class Batch:
         host.number[:, 0] = np.arange(first_world, first_world + worlds, dtype=np.uint64)
         self.now: Worlds = self.driver.place(host)
         """The current state of the worlds, in the driver's arrays."""
-        self.memory: Any = None
-        """What institutions remember, likewise; None for a game without any."""
-        if game.institutions:
-            self._no_decisions: Actions = self.driver.empty((worlds, game.agents), np.int64)
-            self.driver.write(self._no_decisions, np.zeros((worlds, game.agents), np.int64))
-            self.memory = self.driver.place(empty_memory(game.institution_tables, worlds=worlds))
+        self.law: Any = self.driver.place(new_law(game, worlds)) if game.institutions else None
+        """The `Law` of the worlds, likewise, without decisions or payments; None without institutions."""
+        self._no_decisions: Actions = self.driver.empty((worlds, game.agents), np.int64)
+        self.driver.write(self._no_decisions, np.zeros((worlds, game.agents), np.int64))
         self._all_worlds: Bools = self.driver.empty((worlds,), np.bool_)
         self.driver.write(self._all_worlds, np.ones(worlds, np.bool_))
         self.set_seed(seed)
@@ -109,13 +102,12 @@ class Batch:
 
     def _run(self, loop: Loop, argument: NDArray[Any], output: Any, decisions: Actions | None = None) -> None:
         """Runs a loop of the game, with its institutions if it has any."""
-        if self.memory is None:
-            self.driver.run(loop, self.now, argument, output)
-            return
-        turn, payments = output
-        decided = self._no_decisions if decisions is None else decisions
-        law = Law(self.driver.rules, self.memory, decided, payments)
-        self.driver.run(loop, self.now, argument, turn, law)
+        if self.law is None:
+            game = Played(self.now, self.driver.tables, output, None, None, None)
+        else:
+            decided = self._no_decisions if decisions is None else decisions
+            game = Played(self.now, self.driver.tables, output.turn, self.law, decided, output.payments)
+        self.driver.run(loop, game, argument)
 
     def begin(self, output: Output, which: Bools | None = None) -> Output:
         """Begins the next episode of some worlds and writes their rows of `output`.
@@ -151,7 +143,8 @@ class Batch:
     def boards(self, output: Output) -> Bytes:
         """The current boards: uint8 [B, H, W], classes of `cprl.commons.colours`."""
         boards = self.driver.empty((self.size, self.game.map.height, self.game.map.width), np.uint8)
-        self.driver.run("show_worlds", self.now, boards, turn_of(output))
+        game = Played(self.now, self.driver.tables, turn_of(output), None, None, None)
+        self.driver.run("show_worlds", game, boards)
         return boards
 
     def show(self, output: Output, *, world: int = 0) -> Shown:
@@ -179,8 +172,8 @@ class Batch:
     def _state_arrays(self) -> dict[str, NDArray[Any]]:
         """The driver's arrays of a state by name."""
         arrays = {name: getattr(self.now, name) for name in states.names(self.game)}
-        if self.memory is not None:
-            arrays |= {name: getattr(self.memory, name) for name in REMEMBERED}
+        if self.law is not None:
+            arrays |= {name: array for name, array, _ in lasting(self.law, STATE, STEPS)}
         return arrays
 
     def load(self, state: Mapping[str, NDArray[Any]], output: Output) -> Output:

@@ -1,11 +1,13 @@
 """The beam: the cells it covers, the agents it hits, and how they are tagged, on one world."""
 
+from typing import Any
+
 from cprl.commons.colours import WALL
 from cprl.commons.moves import cell_of
 from cprl.commons.tables import Tables
 from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Worlds
-from cprl.institutions.memory import Law
-from cprl.institutions.paying import mediate, sanction_tag
+from cprl.institutions.mediation import mediate
+from cprl.institutions.sanctions import sanction_tag
 
 
 def beam_row(world: Worlds, tables: Tables, shooter: int) -> int:
@@ -66,7 +68,7 @@ def find_hits(world: Worlds, tables: Tables, hit_by: Bools) -> None:
             hit_by[i, j] = world.fired[j] and i != j and world.in_play[i] and is_hit(world, tables, i, j)
 
 
-def tag(world: Worlds, tables: Tables, law: Law | None, hit_by: Bools, tagged_by: Bools) -> None:
+def tag(world: Worlds, tables: Tables, law: Any, hit_by: Bools, tagged_by: Bools) -> None:
     """Counts hits, at most one per agent and turn, and tags agents with `hits_to_tag` hits; [N, N] each.
 
     Institutions may have other time-outs, and fines, and refund unjust tags.
@@ -75,11 +77,10 @@ def tag(world: Worlds, tables: Tables, law: Law | None, hit_by: Bools, tagged_by
         if count_hit(world, tables, hit_by, tagged_by, i):
             steps = tables.freeze_steps
             if law is not None:
-                steps = sanction_tag(law.memory, law.rules, tagged_by, i, world.step[0], steps)
+                steps = sanction_tag(law.sanctions, law.ledger, tagged_by, i, world.step[0], steps)
             take_out_of_play(world, tables, i, steps)
-    if law is not None and law.rules.mediation_turns > 0:
-        for i in range(world.row.shape[0]):
-            mediate(law.memory, law.rules, tagged_by, i, world.step[0])
+    if law is not None:
+        mediate(law.mediation, law.ledger, tagged_by, world.step[0])
 
 
 def count_hit(world: Worlds, tables: Tables, hit_by: Bools, tagged_by: Bools, i: int) -> bool:

@@ -45,8 +45,3 @@ def philox4x32(
         k0 = (k0 + KEY_STEP_0) & LOW_WORD
         k1 = (k1 + KEY_STEP_1) & LOW_WORD
     return c0, c1, c2, c3
-
-
-def threshold(probability: float) -> int:
-    """The threshold below which a uniform 32-bit word falls with this probability, to within 2**-33."""
-    return round(probability * 2**32)

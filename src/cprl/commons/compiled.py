@@ -158,7 +158,7 @@ def entry_for_cpu(loop: str, arguments: tuple[Any, ...]) -> Callable[..., None]:
     The types are the same in every game: the fields of `Worlds`, `Tables`, `StepOutput` and `Scratch` have
     fixed types.
     """
-    entries = _entries if arguments[4] is None else _governed_entries  # the law
+    entries = _entries if arguments[0].law is None else _governed_entries
     if loop not in entries:
         with CLOCK.running():
             entries[loop] = machine_code(rules_for_cpu()[loop], *arguments)

@@ -6,7 +6,6 @@ With NUMBA_ENABLE_CUDASIM=1 Numba simulates all of this without a GPU: slowly, a
 from collections.abc import Callable
 from functools import cache
 from math import isfinite
-from types import FunctionType
 from typing import Any, Final
 
 import numba.cuda
@@ -15,10 +14,10 @@ from numpy.typing import DTypeLike, NDArray
 
 from cprl.commons.compiled import compiled
 from cprl.commons.game import Game, check_worlds_fit
-from cprl.commons.loops import ENTRIES, LOOPS, Loop, one_scratch
+from cprl.commons.loops import ENTRIES, LOOPS, Loop, Played, one_scratch
 from cprl.commons.tables import Tables
-from cprl.commons.world import Actions, Arrays, Scratch, StepOutput, Worlds, empty_scratch
-from cprl.institutions.memory import InstitutionTables, Law
+from cprl.commons.world import Actions, Scratch, empty_scratch
+from cprl.institutions.arrays import changed
 
 cuda: Any = numba.cuda
 
@@ -43,22 +42,21 @@ class CudaThreads:
             )
         check_worlds_fit(game, worlds, free=_free_bytes())
         self.threads = worlds
-        self.tables = Tables(*(_constant(entry) for entry in game.tables))
-        self.rules: InstitutionTables | None = None
-        if game.institutions:
-            self.rules = InstitutionTables(*(_constant(entry) for entry in game.institution_tables))
+        self.tables: Tables = self.place(game.tables)
         scratch = empty_scratch(
             agents=game.agents,
             sites=len(game.map.sites),
             cells=game.tables.background.size,
             window=game.tables.window_cells.shape[1],
         )
-        self._scratch = Scratch(*(_worlds_innermost((worlds, *each.shape), each.dtype) for each in scratch))
+        self._scratch = Scratch(
+            *(cuda.to_device(np.zeros((worlds, *array.shape), array.dtype, order="F")) for array in scratch)
+        )
         self._unknown = cuda.to_device(np.full(1, NONE_UNKNOWN, np.int64))
 
-    def place(self, arrays: Arrays) -> Arrays:
-        """Copies the arrays of `Worlds` or `Memory` to the GPU."""
-        return type(arrays)(*(cuda.to_device(np.asfortranarray(array)) for array in arrays))
+    def place(self, arrays: Any) -> Any:
+        """Copy a tuple of arrays, `Worlds`, `Law` or `Tables`, to the GPU."""
+        return changed(arrays, _placed)
 
     def wrap(self, memory: Any) -> NDArray[Any]:
         """A Numba array on GPU memory of another owner, such as a torch tensor; shares the memory."""
@@ -85,47 +83,36 @@ class CudaThreads:
         at = int(self._unknown.copy_to_host()[0])
         return -1 if at == NONE_UNKNOWN else at
 
-    def run(
-        self,
-        loop: Loop,
-        worlds: Worlds,
-        argument: NDArray[Any],
-        output: StepOutput,
-        law: Law | None = None,
-    ) -> None:
+    def run(self, loop: Loop, game: Played, argument: NDArray[Any]) -> None:
         """Start a loop over all worlds on the default stream, as `CpuThreads.run`; returns before it has
         finished."""
         launch = _blocks(len(argument)), THREADS_PER_BLOCK
-        arguments = worlds, self.tables, argument, output, self._scratch
-        if law is None:
-            kernels()[loop][launch](*arguments)
+        if game.law is None:
+            kernels()[loop][launch](*game[:3], argument, self._scratch)
         else:
-            kernels()[f"governed {loop}"][launch](*arguments, law)
+            law = game.law._replace(decisions=game.decisions, payments=game.payments)
+            kernels()[f"governed {loop}"][launch](*game[:3], law, argument, self._scratch)
 
 
 @cache
 def kernels() -> dict[str, Any]:
     """The kernels by name: for each loop one without institutions and one with them, and `find_unknown`;
     compiled at their first launch."""
-    rules = compiled((*ENTRIES, one_scratch), _jit_for_gpu)
+    rules = compiled((*ENTRIES, one_scratch), cuda.jit(device=True))
     cut = rules[one_scratch.__name__]
     plain: dict[str, Any] = {loop: _kernel(rules[loop], cut) for loop in LOOPS}
     governed = {f"governed {loop}": _governed_kernel(rules[loop], cut) for loop in LOOPS}
     return {**plain, **governed, "find_unknown": _find_unknown(rules["first_unknown"])}
 
 
-def _jit_for_gpu(function: FunctionType) -> Callable[..., Any]:
-    return cuda.jit(device=True)(function)
-
-
 def _kernel(loop: Callable[..., None], cut: Callable[..., Scratch]) -> Callable[..., Any]:
     """Thread b runs the loop on world b alone, without institutions: a kernel takes no None, a loop does."""
 
     @cuda.jit
-    def kernel(worlds, tables, argument, output, scratch):  # type: ignore[no-untyped-def]
+    def kernel(worlds, tables, output, argument, scratch):  # type: ignore[no-untyped-def]
         b = cuda.grid(1)
         if b < argument.shape[0]:
-            loop(worlds, tables, argument, output, None, cut(scratch, b), b, b + 1)
+            loop(Played(worlds, tables, output, None, None, None), argument, cut(scratch, b), b, b + 1)
 
     launched: Callable[..., Any] = kernel
     return launched
@@ -135,10 +122,11 @@ def _governed_kernel(loop: Callable[..., None], cut: Callable[..., Scratch]) -> 
     """Thread b runs the loop on world b alone, with institutions."""
 
     @cuda.jit
-    def kernel(worlds, tables, argument, output, scratch, law):  # type: ignore[no-untyped-def]
+    def kernel(worlds, tables, output, law, argument, scratch):  # type: ignore[no-untyped-def]
         b = cuda.grid(1)
         if b < argument.shape[0]:
-            loop(worlds, tables, argument, output, law, cut(scratch, b), b, b + 1)
+            game = Played(worlds, tables, output, law, law.decisions, law.payments)
+            loop(game, argument, cut(scratch, b), b, b + 1)
 
     launched: Callable[..., Any] = kernel
     return launched
@@ -159,13 +147,8 @@ def _find_unknown(first_unknown: Callable[..., int]) -> Callable[..., Any]:
     return launched
 
 
-def _constant(entry: Any) -> Any:
-    """Copies an array of the tables to the GPU; returns a number unchanged."""
-    return cuda.to_device(entry) if isinstance(entry, np.ndarray) else entry
-
-
-def _worlds_innermost(shape: tuple[int, ...], dtype: DTypeLike) -> Any:
-    return cuda.to_device(np.zeros(shape, dtype, order="F"))
+def _placed(array: NDArray[Any], is_of_worlds: bool) -> Any:
+    return cuda.to_device(np.asfortranarray(array) if is_of_worlds else array)
 
 
 def _free_bytes() -> int | None:

@@ -11,23 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.colours import FIRST_AGENT, MAX_AGENTS_APART, class_colour
-from cprl.commons.institution_tables import (
-    build_institution_tables,
-    check_institutions,
-    entries_shown,
-    shows_places,
-)
 from cprl.commons.maps import Map
+from cprl.commons.near import patches, sites_around
 from cprl.commons.observation import Observation, channel_names
 from cprl.commons.reach import why_out_of_reach
 from cprl.commons.rules import Rules
 from cprl.commons.spaces import Spaces
 from cprl.commons.tables import Tables, build_tables, check_sizes
-from cprl.commons.world import Bytes, StepOutput, empty_worlds
-from cprl.institutions import COUNTS, Institution
-from cprl.institutions.arrays import Form, forms_of
-from cprl.institutions.choice import Ballot, ballots, decision_options
-from cprl.institutions.memory import SHOWN, InstitutionTables, Payments, empty_memory
+from cprl.commons.world import Bytes, Ints, StepOutput, empty_worlds
+from cprl.commons.yields import sustainable_yield
+from cprl.institutions import COUNTS, Institution, law
+from cprl.institutions.arrays import Form, changed, forms_of
+from cprl.institutions.base import Ballot
+from cprl.institutions.ledger import Payments
+from cprl.institutions.votes import ballots_of, decision_options
 from cprl.system.memory import check_memory
 from cprl.values import Value
 
@@ -63,7 +60,7 @@ class Game(Value):
                 f"Observation.agents_apart is True and the map has {agents} agents; allowed: at most "
                 f"{MAX_AGENTS_APART}"
             )
-        check_institutions(self.institutions, self.map, self.rules, self.observation)
+        law.check_institutions(self)
         warning = why_out_of_reach(self.map, self.institutions, shuffle_starts=self.rules.shuffle_starts)
         if warning is not None:
             warnings.warn(warning, UserWarning, stacklevel=3)
@@ -103,15 +100,14 @@ class Game(Value):
     def _institution_channels(self) -> tuple[str, ...]:
         rows, columns = self._seen
         entries = len(self.entries_shown)
-        places = ("forbidden",) if shows_places(self.institutions) else ()
+        places = ("forbidden",) if law.shows_places(self) else ()
         return *places, *("institutions",) * -(-entries // (rows * columns))
 
     @property
     def entries_shown(self) -> tuple[str, ...]:
         """What the entries of the channels "institutions" show, each with the number of its kind: "quota left
-        0"; see `cprl.institutions.showing`."""
-        entries = entries_shown(self.institutions, self.agents)
-        return tuple(f"{SHOWN[kind]} {argument}" for kind, argument in entries)
+        0"; see `shown` in the modules of institutions."""
+        return tuple(f"{entry} {number}" for entry, number in law.entries_shown(self))
 
     @property
     def _seen(self) -> tuple[int, int]:
@@ -144,12 +140,12 @@ class Game(Value):
     @property
     def ballots(self) -> tuple[Ballot, ...]:
         """What agents decide on at an episode's first turn."""
-        return ballots(self.institutions, self.agents)
+        return ballots_of(self)
 
     @property
     def decisions(self) -> int:
         """The number of options of ("agents", "decision"); 0 where there is nothing to decide."""
-        return decision_options(self.institutions, self.agents)
+        return decision_options(self)
 
     @property
     def spaces(self) -> Spaces:
@@ -180,11 +176,19 @@ class Game(Value):
         return build_tables(self.map, self.rules, self.observation, highest=self.observation_highest)
 
     @cached_property
-    def institution_tables(self) -> InstitutionTables:
-        """The lookup tables of the game's institutions; computed once and cached."""
-        return build_institution_tables(
-            self.institutions, self.map, self.rules, self.tables, first_plane=len(self.cell_channels)
-        )
+    def law_parameters(self) -> dict[str, dict[str, Any]]:
+        """The parameters of the game's institutions; computed once and cached."""
+        return law.parameters(self)
+
+    @property
+    def sustainable_yield(self) -> float:
+        """Apples a turn that the map can bear, see `cprl.commons.yields`."""
+        return sustainable_yield(self.map, self.rules)
+
+    @property
+    def patches(self) -> Ints:
+        """The patch of each site, int32 [K]: sites that are connected by being near each other."""
+        return patches(sites_around(self.map, self.rules))
 
     def __getstate__(self) -> dict[str, object]:
         return {field.name: getattr(self, field.name) for field in fields(self)}
@@ -208,11 +212,11 @@ OUTPUTS_HELD: Final = 3
 
 def bytes_of_worlds(game: Game, worlds: int) -> int:
     """The bytes that B worlds take at least: their state, and `OUTPUTS_HELD` step outputs."""
-    state: list[NDArray[Any]] = [*empty_worlds(worlds=1, agents=game.agents, sites=len(game.map.sites))]
+    arrays: list[NDArray[Any]] = [*empty_worlds(worlds=1, agents=game.agents, sites=len(game.map.sites))]
     if game.institutions:
-        state += empty_memory(game.institution_tables, worlds=1)
+        changed(law.new_law(game, 1), lambda array, is_of_worlds: arrays.append(array) if is_of_worlds else 0)
     outputs = sum(prod(shape) * np.dtype(dtype).itemsize for shape, dtype in output_forms(game, 1).values())
-    return worlds * (sum(array.nbytes for array in state) + OUTPUTS_HELD * outputs)
+    return worlds * (sum(array.nbytes for array in arrays) + OUTPUTS_HELD * outputs)
 
 
 def check_worlds_fit(game: Game, worlds: int, *, free: int | None = None) -> None:

@@ -1,12 +1,11 @@
 """Whether any agent can walk to an apple site that it may harvest: a drawn wall may part them by mistake."""
 
-from collections.abc import Iterable, Sequence
-from collections.abc import Set as AbstractSet
+from collections.abc import Sequence
 
-from cprl.commons.maps import Cell, Map
-from cprl.commons.world import COL_STEP, ROW_STEP
-from cprl.institutions import Boundaries, Institution
-from cprl.institutions.boundaries import OPEN
+import numpy as np
+
+from cprl.commons.maps import Map
+from cprl.institutions import Institution
 
 _STARTS_NAMED = 3
 """The starts that a message names at most."""
@@ -21,55 +20,30 @@ def why_out_of_reach(
     Agents walk over all cells but walls, also through each other's, since others may move away. `Boundaries`
     without a fine stop bites, not steps.
     """
-    stops = [
-        boundaries
-        for boundaries in institutions
-        if isinstance(boundaries, Boundaries) and boundaries.bite_fine is None
-    ]
-    if not board.walls and not stops:
-        return None
-    starts, walls = [(row, col) for row, col, _ in board.starts], set(board.walls)
-    if not stops:
-        is_reached = _reaches(board, walls, starts, set(board.sites))
-    else:
-        is_reached = any(
-            _reaches(board, walls, starts if shuffle_starts else [starts[agent]], _own(board, stops, agent))
+    allowed = np.array(
+        [
+            [all(rule.may_harvest(agent, *site) for rule in institutions) for site in board.sites]
             for agent in range(board.agents)
-        )
-    if is_reached:
+        ]
+    )
+    if not board.walls and allowed.all():
+        return None
+    from scipy.ndimage import label
+
+    is_open = np.ones((board.height, board.width), np.bool_)
+    for wall in board.walls:
+        is_open[wall] = False
+    part = label(is_open)[0]  # the number of the part of the board around each cell that walls enclose
+    starts = [(row, col) for row, col, _ in board.starts]
+    of_sites = np.array([part[site] for site in board.sites])
+    of_starts = np.array([part[start] for start in starts])
+    walks = (of_starts[:, None] == of_sites).any(0) if shuffle_starts else of_starts[:, None] == of_sites
+    if (allowed & walks).any():
         return None
     named = "; ".join(f"row {row}, column {col}" for row, col in starts[:_STARTS_NAMED])
     more = "; ..." if len(starts) > _STARTS_NAMED else ""
-    what = "walls and Boundaries keep" if stops else "walls keep"
+    what = "walls keep" if allowed.all() else "walls and Boundaries keep"
     return (
         f"no agent can harvest any of the {len(board.sites)} sites of Game.map: {what} them out of reach of "
         f"all starts ({named}{more})"
     )
-
-
-def _own(board: Map, stops: Sequence[Boundaries], agent: int) -> set[Cell]:
-    """The sites that an agent can harvest once it stands there."""
-    return {
-        (row, col)
-        for row, col in board.sites
-        if all(boundaries.regions[row][col] in OPEN + boundaries.signs_of(agent) for boundaries in stops)
-    }
-
-
-def _reaches(board: Map, walls: AbstractSet[Cell], starts: Iterable[Cell], wanted: AbstractSet[Cell]) -> bool:
-    """Whether a walk from any of the starts ends on a wanted cell."""
-    waiting = list(starts)
-    seen = set(waiting)
-    while waiting and wanted:
-        following = []
-        for row, col in waiting:
-            if (row, col) in wanted:
-                return True
-            for row_step, col_step in zip(ROW_STEP, COL_STEP, strict=True):
-                cell = row + row_step, col + col_step
-                inside = 0 <= cell[0] < board.height and 0 <= cell[1] < board.width
-                if inside and cell not in seen and cell not in walls:
-                    seen.add(cell)
-                    following.append(cell)
-        waiting = following
-    return False

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from cprl.commons.game import Game
 from cprl.commons.world import COL_STEP, PLAYING, ROW_STEP, TRUNCATED, Worlds, empty_worlds
-from cprl.institutions.memory import REMEMBERED, empty_memory
+from cprl.institutions.arrays import STATE, STEPS, lasting
+from cprl.institutions.law import new_law
 from cprl.values import shown
 
 State = dict[str, NDArray[Any]]
@@ -35,9 +36,9 @@ def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
     """Returns a state as arrays, after checking that the game can be in it."""
     empty = empty_worlds(worlds=worlds, agents=game.agents, sites=len(game.map.sites))
     expected = {name: getattr(empty, name) for name in names(game)}
-    if game.institutions:
-        memory = empty_memory(game.institution_tables, worlds=worlds)
-        expected |= {name: getattr(memory, name) for name in REMEMBERED}
+    law = new_law(game, worlds) if game.institutions else None
+    if law is not None:
+        expected |= {name: array for name, array, _ in lasting(law, STATE, STEPS)}
     if set(state) != set(expected):
         missing = sorted(set(expected) - set(state))
         unknown = sorted(map(str, set(state) - set(expected)))
@@ -55,8 +56,8 @@ def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
             )
     _check_ranges(arrays, game)
     _check_places(arrays, game)
-    if game.institutions:
-        _check_memory(arrays, game)
+    if law is not None:
+        _check_law(arrays, game, law)
     return arrays
 
 
@@ -92,16 +93,16 @@ def _check_ranges(arrays: State, game: Game) -> None:
     _refuse(arrays, "in_play", arrays["in_play"] & out, "False while out_steps is above 0")
 
 
-def _check_memory(arrays: State, game: Game) -> None:
+def _check_law(arrays: State, game: Game, law: Any) -> None:
     """Checks what institutions remember."""
-    steps = game.rules.episode_steps
-    most = dict.fromkeys(("taken", "offence_step", "violation_step"), steps)
-    for name in ("taken", "level", "offence_step", "violation_step", "counts"):
-        high = most.get(name, _MAX_INT32)
-        _refuse(arrays, name, (arrays[name] < 0) | (arrays[name] > high), f"0 to {high}")
-    for name in ("allowed", "income"):
-        wrong = ~(np.isfinite(arrays[name]) & (arrays[name] >= 0))
-        _refuse(arrays, name, wrong, "a number of at least 0")
+    for name, empty, lasts in lasting(law, STATE, STEPS):
+        values = arrays[name]
+        if empty.dtype == np.float64:
+            wrong, allowed = ~(np.isfinite(values) & (values >= 0)), "a number of at least 0"
+        else:
+            high = game.rules.episode_steps if lasts == STEPS else _MAX_INT32
+            wrong, allowed = (values < 0) | (values > high), f"0 to {high}"
+        _refuse(arrays, name, wrong, allowed)
     for number, ballot in enumerate(game.ballots):
         wrong = np.zeros(arrays["in_force"].shape, np.bool_)
         wrong[:, number] = ~np.isin(arrays["in_force"][:, number], ballot.choices)

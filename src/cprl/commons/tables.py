@@ -5,13 +5,14 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.commons.chance import REST_BITS, threshold
+from cprl.commons.chance import REST_BITS
 from cprl.commons.colours import FIRST_AGENT, GROUND, WALL, class_colour
 from cprl.commons.maps import Map
 from cprl.commons.near import neighbours
 from cprl.commons.observation import Observation, classes_shown
 from cprl.commons.rules import Rules
 from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Indices, Ints
+from cprl.institutions.base import threshold
 
 CLASS_SHIFT: Final = 24
 """A paint is a colour in 24 bits, and its class from this bit on."""

@@ -10,10 +10,9 @@ from numpy.typing import DTypeLike, NDArray
 
 from cprl.commons.compiled import entry_for_cpu, rules_for_cpu
 from cprl.commons.game import Game
-from cprl.commons.loops import Loop
+from cprl.commons.loops import Loop, Played
 from cprl.commons.tables import Tables
-from cprl.commons.world import Actions, Arrays, StepOutput, Worlds, empty_scratch
-from cprl.institutions.memory import Law
+from cprl.commons.world import Actions, empty_scratch
 from cprl.values import Range, checked
 
 MOST_THREADS: Final = 1024
@@ -37,7 +36,7 @@ class CpuThreads:
         limit = threads or os.cpu_count() or 1
         self.threads = min(limit, worlds if threads else -(-worlds // WORLDS_PER_THREAD))
         self.tables: Tables = game.tables
-        self.rules = game.institution_tables if game.institutions else None
+        self._entries: dict[str, Any] = {}
         self._scratch = [
             empty_scratch(
                 agents=game.agents,
@@ -48,8 +47,8 @@ class CpuThreads:
             for _ in range(self.threads)
         ]
 
-    def place(self, arrays: Arrays) -> Arrays:
-        """Returns the arrays of `Worlds` or `Memory` unchanged: this driver uses numpy arrays."""
+    def place(self, arrays: Any) -> Any:
+        """Return a tuple of arrays, `Worlds` or `Law`, unchanged: this driver uses numpy arrays."""
         return arrays
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
@@ -68,29 +67,22 @@ class CpuThreads:
         """The index, in row-major order, of the first action outside 0 .. known - 1; -1 if there is none."""
         return int(rules_for_cpu()["first_unknown"](actions.reshape(-1), known))
 
-    def run(
-        self,
-        loop: Loop,
-        worlds: Worlds,
-        argument: NDArray[Any],
-        output: StepOutput,
-        law: Law | None = None,
-    ) -> None:
+    def run(self, loop: Loop, game: Played, argument: NDArray[Any]) -> None:
         """Run a loop over all worlds; the calling thread takes the last share.
 
         Nothing is checked: all arrays are contiguous and have the form that the game gives them.
         """
         size = len(argument)
-        arguments = worlds, self.tables, argument, output, law
-        whole = *arguments, self._scratch[0], 0, size
-        entry = entry_for_cpu(loop, whole)
+        entry = self._entries.get(loop)
+        if entry is None:
+            entry = self._entries[loop] = entry_for_cpu(loop, (game, argument, self._scratch[0], 0, size))
         if self.threads == 1:
-            entry(*whole)
+            entry(game, argument, self._scratch[0], 0, size)
             return
         bounds = [size * t // self.threads for t in range(self.threads + 1)]
         *others, last_share = zip(self._scratch, bounds, bounds[1:], strict=False)
         pool = _pool(os.getpid(), self.threads - 1)
-        shares = [pool.submit(entry, *arguments, *share) for share in others]
-        entry(*arguments, *last_share)
+        shares = [pool.submit(entry, game, argument, *share) for share in others]
+        entry(game, argument, *last_share)
         for share in shares:
             share.result()

@@ -1,5 +1,7 @@
 """The order of a turn and of an episode, and what institutions do in them, on one world."""
 
+from typing import Any
+
 import numpy as np
 
 from cprl.commons.apples import bite, draw, fill, find_sprouts, grow, recount
@@ -17,22 +19,15 @@ from cprl.commons.moves import (
 from cprl.commons.tables import Tables
 from cprl.commons.views import draw_institutions, draw_windows
 from cprl.commons.world import PLAYING, TERMINATED, TRUNCATED, Actions, Scratch, StepOutput, Worlds
-from cprl.institutions.deciding import appoint, hold_ballot, is_due
-from cprl.institutions.limits import add_to_patch, close_patches, count_patches, open_windows
-from cprl.institutions.memory import SANCTIONS, InstitutionTables, Law, Memory
-from cprl.institutions.paying import (
-    charge,
-    collect_taxes,
-    note_violation,
-    offend,
-    pay_monitor,
-    recover,
-    time_out,
-)
+from cprl.institutions.law import begin, note_growth, open_turn, refresh, settle
+from cprl.institutions.ledger import charge, count_violation, forget_episode, forget_turn
+from cprl.institutions.sanctioner import appoint
+from cprl.institutions.sanctions import sanction_violation
+from cprl.institutions.votes import hold_ballot, is_due
 
 
 def play_turn(
-    world: Worlds, tables: Tables, actions: Actions, output: StepOutput, law: Law | None, scratch: Scratch
+    world: Worlds, tables: Tables, actions: Actions, output: StepOutput, law: Any, scratch: Scratch
 ) -> None:
     """Plays one turn; `actions`: int64 [N]. A world that has ended does not change and pays nothing.
 
@@ -42,7 +37,7 @@ def play_turn(
         clear_events(output)
         write_state(world, tables, output, scratch)
         if law is not None:
-            clear_turn(law.memory)
+            forget_turn(law.ledger)
             write_payments(world, tables, law, output)
         return
     began_empty = world.stock_left[0] == 0
@@ -53,7 +48,7 @@ def play_turn(
     count_down(world)
     act(world, tables, actions, scratch)
     if law is not None:
-        hold_fire(world, law.memory)
+        hold_fire(world, law)
     if tables.pairwise_clashes:
         settle_pairwise(world, scratch)
     else:
@@ -71,11 +66,9 @@ def play_turn(
     tag(world, tables, law, output.hit_by, output.tagged_by)
     if law is not None:
         pursue_violations(world, tables, law)
-        recover(law.memory, law.rules, world.step[0])
     check_end(world, tables, began_empty)
     if law is not None:
-        pay_monitor(law.memory, law.rules)
-        collect_taxes(law.memory, law.rules, world.step[0], world.ended[0] != PLAYING)
+        settle(law, world.step[0], world.ended[0] != PLAYING)
     for i in range(world.row.shape[0]):
         output.fired[i] = world.fired[i]
         world.on_board[i] = world.in_play[i]
@@ -97,9 +90,7 @@ def shuffle_starts(world: Worlds) -> None:
         world.heading[i], world.heading[j] = world.heading[j], world.heading[i]
 
 
-def begin_episode(
-    world: Worlds, tables: Tables, output: StepOutput, law: Law | None, scratch: Scratch
-) -> None:
+def begin_episode(world: Worlds, tables: Tables, output: StepOutput, law: Any, scratch: Scratch) -> None:
     """Starts the next episode: all sites hold an apple, all agents are at their starts; institutions forget
     the last one, but for what votes put in force."""
     world.episode[0] += 1
@@ -116,9 +107,7 @@ def begin_episode(
         write_payments(world, tables, law, output)
 
 
-def refresh_output(
-    world: Worlds, tables: Tables, output: StepOutput, law: Law | None, scratch: Scratch
-) -> None:
+def refresh_output(world: Worlds, tables: Tables, output: StepOutput, law: Any, scratch: Scratch) -> None:
     """Writes the output for a state that was set from outside, with no harvest, shots, hits, growth or
     payments."""
     recount(world, tables)
@@ -172,42 +161,47 @@ def write_state(world: Worlds, tables: Tables, output: StepOutput, scratch: Scra
     draw_windows(world, tables, scratch, output.observation)
 
 
-def begin_turn(world: Worlds, law: Law) -> None:
-    """Clears the notes of the last turn; in the first one of an episode agents decide, and quotas begin."""
-    clear_turn(law.memory)
+def begin_turn(world: Worlds, law: Any) -> None:
+    """Clears the notes of the last turn; in the first one of an episode agents decide, and windows open."""
+    forget_turn(law.ledger)
     if world.step[0] == 1:
-        decide(world, law)
-        open_windows(law.memory, law.rules, 1, stock_share(world))
+        for ballot in range(law.votes.options.shape[0]):
+            if is_due(law.votes, ballot, world.episode[0]):
+                words = draw(world, BALLOT + ballot)
+                hold_ballot(law.votes, law.ledger, ballot, law.decisions, words)
+        appoint(law.sanctioner, law.ledger)
+        open_turn(law, 1, stock_share(world))
 
 
-def hold_fire(world: Worlds, memory: Memory) -> None:
+def hold_fire(world: Worlds, law: Any) -> None:
     """Takes back the shots of agents that may not fire."""
     for i in range(world.row.shape[0]):
-        world.fired[i] = world.fired[i] and memory.may_fire[i]
+        world.fired[i] = world.fired[i] and law.sanctioner.may_fire[i]
 
 
-def end_turn(world: Worlds, law: Law, scratch: Scratch, sprouts: int) -> None:
-    """Writes what quotas allow and which patches are closed in the coming turn; `sprouts`: apples grown."""
-    open_windows(law.memory, law.rules, world.step[0] + 1, stock_share(world))
+def end_turn(world: Worlds, law: Any, scratch: Scratch, sprouts: int) -> None:
+    """Begins what begins with the coming turn; `sprouts`: apples grown."""
     for s in range(sprouts):
-        add_to_patch(law.memory, law.rules, scratch.sprouts[s], 1)
-    close_patches(law.memory, law.rules)
+        note_growth(law, scratch.sprouts[s])
+    open_turn(law, world.step[0] + 1, stock_share(world))
 
 
-def begin_institutions(world: Worlds, law: Law) -> None:
-    """Begins an episode: all is forgotten but what votes put in force."""
-    forget(law.memory)
-    begin_ballots(world, law.memory, law.rules)
-    open_windows(law.memory, law.rules, 1, stock_share(world))
+def begin_institutions(world: Worlds, law: Any) -> None:
+    """Begins an episode: all is forgotten but what votes put in force. Before the first vote of a world, that
+    is the first choice of each ballot."""
+    forget_episode(law.ledger)
+    begin(law)
+    if world.episode[0] == 0:
+        for ballot in range(law.votes.options.shape[0]):
+            law.ledger.in_force[ballot] = law.votes.choices[ballot, 0]
     refresh_institutions(world, law)
+    open_turn(law, 1, stock_share(world))
 
 
-def refresh_institutions(world: Worlds, law: Law) -> None:
+def refresh_institutions(world: Worlds, law: Any) -> None:
     """Writes what follows from the rest of the memory and from the stock, without events."""
-    appoint(law.memory, law.rules)
-    count_patches(law.memory, law.rules, world.stock)
-    close_patches(law.memory, law.rules)
-    clear_turn(law.memory)
+    refresh(law, world.stock)
+    forget_turn(law.ledger)
 
 
 def stock_share(world: Worlds) -> float:
@@ -215,72 +209,30 @@ def stock_share(world: Worlds) -> float:
     return world.stock_left[0] / world.stock.shape[0]
 
 
-def forget(memory: Memory) -> None:
-    """Clears all that institutions remember of an episode."""
-    for i in range(memory.level.shape[0]):
-        memory.level[i] = 0
-        memory.offence_step[i] = 0
-        memory.violation_step[i] = 0
-        memory.detected[i] = False
-        for count in range(memory.counts.shape[1]):
-            memory.counts[i, count] = 0
-        for tax in range(memory.income.shape[0]):
-            memory.income[tax, i] = 0.0
-
-
-def begin_ballots(world: Worlds, memory: Memory, rules: InstitutionTables) -> None:
-    """Before the first vote of a world, the first choice of each ballot is in force."""
-    if world.episode[0] == 0:
-        for ballot in range(rules.ballot_options.shape[0]):
-            memory.in_force[ballot] = rules.ballot_choice[ballot, 0]
-
-
-def clear_turn(memory: Memory) -> None:
-    """Clears what institutions note within a turn."""
-    for i in range(memory.broke.shape[0]):
-        memory.sanctioned[i] = memory.counts[i, SANCTIONS] > 0
-        memory.broke[i] = False
-        memory.unjust[i] = False
-        memory.due[i] = 0.0
-        memory.fines[i] = 0.0
-        memory.transfers[i] = 0.0
-
-
-def decide(world: Worlds, law: Law) -> None:
-    """Holds the ballots that are due in this episode."""
-    for ballot in range(law.rules.ballot_options.shape[0]):
-        if is_due(law.rules, ballot, world.episode[0]):
-            hold_ballot(law.memory, law.rules, ballot, law.decisions, draw(world, BALLOT + ballot))
-    appoint(law.memory, law.rules)
-
-
-def pursue_violations(world: Worlds, tables: Tables, law: Law) -> None:
+def pursue_violations(world: Worlds, tables: Tables, law: Any) -> None:
     """Detects violations of this turn, or not, and lets those who are found out pay and miss turns."""
-    memory, rules = law.memory, law.rules
     for i in range(world.row.shape[0]):
-        memory.detected[i] = False
-        if note_violation(memory, i, world.step[0]):
+        law.ledger.detected[i] = False
+        if count_violation(law.ledger, i, world.step[0]):
             word = np.int64(draw(world, DETECTION + i)[0])
-            if word < rules.detected_below:
-                charge(memory, i)
-                if rules.sanctions_violations:
-                    steps = time_out(memory, rules, i, i)
-                    if steps > 0:
-                        take_out(world, tables, i, steps)
-                    offend(memory, rules, i, world.step[0])
+            if word < law.monitoring.detected_below:
+                charge(law.ledger, i)
+                steps = sanction_violation(law.sanctions, law.ledger, i, world.step[0])
+                if steps > 0:
+                    take_out(world, tables, i, steps)
 
 
-def write_payments(world: Worlds, tables: Tables, law: Law, output: StepOutput) -> None:
+def write_payments(world: Worlds, tables: Tables, law: Any, output: StepOutput) -> None:
     """Writes what institutions took, gave and counted in this turn, the reward, and what agents are shown."""
-    memory, rules, payments = law.memory, law.rules, law.payments
-    draw_institutions(world, memory, tables, rules, output.observation)
+    ledger, payments = law.ledger, law.payments
+    draw_institutions(world, tables, law, output.observation)
     for i in range(world.row.shape[0]):
-        payments.fines[i] = memory.fines[i]
-        payments.transfers[i] = memory.transfers[i]
-        payments.reward[i] = output.harvest[i] - memory.fines[i] + memory.transfers[i]
-        payments.violated[i] = memory.broke[i]
-        for count in range(memory.counts.shape[1]):
-            payments.counts[i, count] = memory.counts[i, count]
+        payments.fines[i] = ledger.fines[i]
+        payments.transfers[i] = ledger.transfers[i]
+        payments.reward[i] = output.harvest[i] - ledger.fines[i] + ledger.transfers[i]
+        payments.violated[i] = ledger.broke[i]
+        for count in range(ledger.counts.shape[1]):
+            payments.counts[i, count] = ledger.counts[i, count]
     for ballot in range(payments.in_force.shape[0]):
-        payments.in_force[ballot] = memory.in_force[ballot]
-        payments.ballots_due[ballot] = world.step[0] == 0 and is_due(rules, ballot, world.episode[0])
+        payments.in_force[ballot] = ledger.in_force[ballot]
+        payments.ballots_due[ballot] = world.step[0] == 0 and is_due(law.votes, ballot, world.episode[0])

@@ -3,18 +3,15 @@
 The rules are written for one world: they receive these tuples without the axis B.
 """
 
-from typing import Annotated, Any, NamedTuple, TypeAlias, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.chance import SITES_PER_DRAW
-from cprl.institutions.arrays import forms_of, zeros
-from cprl.institutions.memory import Memory, Payments
+from cprl.institutions.arrays import Bools, Bytes, Ints, filled, forms_of
+from cprl.institutions.ledger import Payments
 
-Ints: TypeAlias = NDArray[np.int32]
-Bytes: TypeAlias = NDArray[np.uint8]
-Bools: TypeAlias = NDArray[np.bool_]
 Indices: TypeAlias = NDArray[np.uint32]
 """Unsigned: Numba then skips its check for negative indices."""
 Actions: TypeAlias = NDArray[np.int64]
@@ -117,9 +114,6 @@ class GovernedOutput(NamedTuple):
     payments: Payments
 
 
-Arrays = TypeVar("Arrays", "Worlds", Memory)
-
-
 class Scratch(NamedTuple):
     """Working memory for one turn, one per thread: the rules allocate nothing."""
 
@@ -162,7 +156,7 @@ class Shown(NamedTuple):
 
 def empty_worlds(*, worlds: int, agents: int, sites: int) -> Worlds:
     """Memory for B worlds, all zero except `episode`, which is -1; `Batch.begin` starts the first episode."""
-    empty = zeros(Worlds, B=worlds, N=agents, K=sites)
+    empty = filled(Worlds, {}, B=worlds, N=agents, K=sites)
     empty.episode[:] = -1
     return empty
 

@@ -14,7 +14,7 @@ from cprl.commons.game import Game
 from cprl.commons.picture import world_image
 from cprl.commons.world import Bytes, GovernedOutput
 from cprl.envs.drivers import drawn_seed
-from cprl.institutions.memory import Payments
+from cprl.institutions.ledger import Payments
 from cprl.values import Range, checked, refusal, shown
 
 RENDER_MODES: Final = ("rgb_array",)

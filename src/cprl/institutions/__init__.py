@@ -1,30 +1,60 @@
-"""Institutions: rules that people make, as frozen values, and their scalar rules.
+"""Institutions: rules that people make, a module a kind, and their scalar rules.
 
-Values: `Game(..., institutions=(Quota(share=0.8), Tax(rate=0.2)))`.
-    base        what all share
-    boundaries  Boundaries: regions with owners
-    quotas      Quota, ClosedSeason, ClosedPatches: limits that fit the resource
-    taxes       Tax, and Levies of nested groups
-    monitoring  Monitoring: whether violations are detected, and what that costs
-    sanctions   GraduatedSanctions, and Mediation of tags
-    choice      Vote and Sanctioner: what agents decide themselves
-Rules, on one world's arrays, compiled by `cprl.commons` for every target:
+Values: `Game(..., institutions=(Quota(share=0.8), Tax(rate=0.2)))`. A module has the value, `Arrays`, which
+are its parameters and what it remembers of B worlds, `parameters`, which fills them, and the hooks of a turn
+at which it acts, see `cprl.institutions.law`. In reading order:
+
     arrays      tuples of arrays, allocated and cut into worlds
-    memory      the arrays: memory, payments, parameters
-    deciding    votes and elections
-    limits      which bites and steps are stopped or forbidden
-    paying      fines, refunds and taxes
-    showing     what agents are shown
+    ledger      what all share: who broke what, what is owed, taken and given
+    base        Institution, the base of all values
+    boundaries  Boundaries: regions with owners
+    seasons     ClosedSeason
+    quotas      Quota
+    patches     ClosedPatches
+    rotation    Rotation: agents take turns in harvesting
+    taxes       Tax, and Levies of nested groups
+    votes       Vote, and how ballots are held
+    monitoring  Monitoring: whether violations are detected, and what that costs
+    sanctions   GraduatedSanctions
+    mediation   Mediation of tags
+    sanctioner  Sanctioner: who may fire
+    law         all of them together, compiled by `cprl.commons` for every target
 """
 
+from typing import Final
+
+from cprl.institutions import (
+    boundaries,
+    mediation,
+    monitoring,
+    patches,
+    quotas,
+    rotation,
+    sanctioner,
+    sanctions,
+    seasons,
+    taxes,
+    votes,
+)
 from cprl.institutions.base import Institution
 from cprl.institutions.boundaries import Boundaries
-from cprl.institutions.choice import Sanctioner, Vote
-from cprl.institutions.memory import COUNTS
+from cprl.institutions.ledger import COUNTS
+from cprl.institutions.mediation import Mediation
 from cprl.institutions.monitoring import Monitoring
-from cprl.institutions.quotas import ClosedPatches, ClosedSeason, Quota
-from cprl.institutions.sanctions import GraduatedSanctions, Mediation
+from cprl.institutions.patches import ClosedPatches
+from cprl.institutions.quotas import Quota
+from cprl.institutions.rotation import Rotation
+from cprl.institutions.sanctioner import Sanctioner
+from cprl.institutions.sanctions import GraduatedSanctions
+from cprl.institutions.seasons import ClosedSeason
 from cprl.institutions.taxes import Levies, Tax
+from cprl.institutions.votes import Vote
+
+MODULES: Final = (
+    *(boundaries, seasons, quotas, patches, rotation),
+    *(monitoring, taxes, votes, sanctions, mediation, sanctioner),
+)
+"""The module of each kind, in the order in which their rules are called within a turn."""
 
 __all__ = [
     "COUNTS",
@@ -37,6 +67,7 @@ __all__ = [
     "Mediation",
     "Monitoring",
     "Quota",
+    "Rotation",
     "Sanctioner",
     "Tax",
     "Vote",

@@ -2,9 +2,13 @@
 
 from dataclasses import dataclass
 from string import ascii_lowercase, digits
-from typing import Annotated, Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final, NamedTuple
 
-from cprl.institutions.base import Amount, Institution
+import numpy as np
+
+from cprl.institutions.arrays import Bools, Numbers
+from cprl.institutions.base import Amount, Institution, columns, with_ballots
+from cprl.institutions.ledger import FOREIGN_BITES, OWN_BITES, TRESPASSES, Ledger, violate
 from cprl.values import Where, shown
 
 OPEN: Final = "."
@@ -13,6 +17,7 @@ NOBODY: Final = "-"
 """The sign of a cell that nobody may use: a reserve."""
 SIGNS: Final = digits + ascii_lowercase
 """The signs of the regions of agents 0, 1, ..., where `owners` is None."""
+COUNT: Final = FOREIGN_BITES
 
 Regions = Annotated[
     tuple[str, ...],
@@ -55,6 +60,8 @@ class Boundaries(Institution):
     is a violation, and costs so many apples if it is detected."""
 
     principle: ClassVar[str] = "1 clearly defined boundaries"
+    shows_places: ClassVar[bool] = True
+    counts: ClassVar[tuple[str, ...]] = ("own_bites", "foreign_bites", "trespasses")
 
     @classmethod
     def drawn(cls, drawing: str, **fields: Any) -> "Boundaries":
@@ -76,11 +83,19 @@ class Boundaries(Institution):
             return self.owners[agent]
         return SIGNS[agent] if agent < len(SIGNS) else ""
 
-    def check_board(self, *, agents: int, height: int, width: int) -> None:
-        size = len(self.regions), len(self.regions[0])
-        if size != (height, width):
+    @property
+    def can_be_broken(self) -> bool:
+        return self.bite_fine is not None or self.step_fine is not None
+
+    def may_harvest(self, agent: int, row: int, col: int) -> bool:
+        return self.bite_fine is not None or self.regions[row][col] in OPEN + self.signs_of(agent)
+
+    def check(self, game: Any) -> None:
+        agents, size = game.agents, (len(self.regions), len(self.regions[0]))
+        if size != (game.map.height, game.map.width):
             raise ValueError(
-                f"Boundaries.regions is {size[0]} x {size[1]}; allowed: {height} x {width}, as the map"
+                f"Boundaries.regions is {size[0]} x {size[1]}; allowed: {game.map.height} x "
+                f"{game.map.width}, as the map"
             )
         if self.owners is not None and len(self.owners) != agents:
             raise ValueError(
@@ -94,3 +109,60 @@ class Boundaries(Institution):
                         f"Boundaries.regions has {shown(sign)} in row {row}, column {col}, which no agent "
                         "may use; allowed: '.', '-' and the signs of owners"
                     )
+
+
+class Arrays(NamedTuple):
+    """All boundaries of a game, one per index of axis R."""
+
+    may_use: Annotated[Bools, "R N cells"]
+    """Whether the agent may use the cell; cells as in `cprl.commons.tables.Tables`."""
+    is_stopped: Annotated[Bools, "R"]
+    """Whether bites that break the rule do not happen."""
+    fine: Annotated[Numbers, "R"]
+    step_is_violation: Annotated[Bools, "R"]
+    step_fine: Annotated[Numbers, "R"]
+    observed: Annotated[Bools, "R"]
+
+
+def parameters(game: Any) -> dict[str, Any]:
+    boundaries = [boundary for boundary, _ in with_ballots(game, Boundaries)]
+    board, tables = game.map, game.tables
+    rows = tables.background.size // tables.stride
+    may_use = np.ones((len(boundaries), game.agents, rows, tables.stride), np.bool_)
+    inside = slice(tables.rim, tables.rim + board.height), slice(tables.rim, tables.rim + board.width)
+    for number, boundary in enumerate(boundaries):
+        signs = np.array([list(row) for row in boundary.regions])
+        for agent in range(game.agents):
+            may_use[(number, agent, *inside)] = np.isin(signs, [OPEN, *boundary.signs_of(agent)])
+    return {
+        "may_use": may_use.reshape(len(boundaries), game.agents, tables.background.size),
+        "is_stopped": [boundary.bite_fine is None for boundary in boundaries],
+        "fine": [boundary.bite_fine or 0.0 for boundary in boundaries],
+        "step_is_violation": [boundary.step_fine is not None for boundary in boundaries],
+        **columns(Boundaries, Arrays, game),
+    }
+
+
+def breaks(boundaries: Arrays, ledger: Ledger, r: int, i: int, cell: int, site: int, turn: int) -> bool:
+    return not boundaries.may_use[r, i, cell]
+
+
+def note_bite(boundaries: Arrays, ledger: Ledger, i: int, cell: int, site: int, turn: int) -> None:
+    for r in range(boundaries.fine.shape[0]):
+        ledger.counts[i, OWN_BITES] += boundaries.may_use[r, i, cell]
+
+
+def note_step(boundaries: Arrays, ledger: Ledger, i: int, cell: int) -> None:
+    for r in range(boundaries.step_fine.shape[0]):
+        if not boundaries.may_use[r, i, cell]:
+            if boundaries.step_is_violation[r]:
+                violate(ledger, i, TRESPASSES, boundaries.step_fine[r])
+            else:
+                ledger.counts[i, TRESPASSES] += 1
+
+
+def forbids(boundaries: Arrays, ledger: Ledger, i: int, cell: int, site: int) -> bool:
+    for r in range(boundaries.observed.shape[0]):
+        if boundaries.observed[r] and not boundaries.may_use[r, i, cell]:
+            return True
+    return False

@@ -1,14 +1,22 @@
-"""Limits on the harvest that fit the resource: quotas, closed seasons and closed patches."""
+"""Quota: a limit on each agent's harvest in a window of time."""
 
+import math
+import warnings
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar, Final, NamedTuple
 
-from cprl.institutions.base import Amount, Institution
-from cprl.values import Natural, Positive, Range
+from cprl.institutions.arrays import STATE, STEPS, Bools, Ints, Numbers
+from cprl.institutions.base import Limit, columns, with_ballots
+from cprl.institutions.ledger import EXCESS_BITES, Ledger
+from cprl.values import Positive, Range
+
+COUNT: Final = EXCESS_BITES
+ROUNDING: Final = 1e-9
+"""Apples by which a quota may be exceeded: the rounding of its computation."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Quota(Institution):
+class Quota(Limit):
     """A limit on each agent's harvest in a window of time, as a share of what the map can bear (Ostrom's
     principle 2, rules that fit local conditions).
 
@@ -27,57 +35,82 @@ class Quota(Institution):
     """Whether the quota of a window is multiplied by the share of all sites that hold an apple when it
     begins."""
 
-    fine: Amount | None = None
-    """None: nobody can harvest more. A number: it can be done, is a violation, and each bite
-    above the quota costs so many apples if it is detected."""
-
     principle: ClassVar[str] = "2 rules that fit local conditions"
+    counts: ClassVar[tuple[str, ...]] = ("excess_bites",)
+    entries: ClassVar[tuple[str, ...]] = ("quota left", "quota time")
+    voted_on: ClassVar[str] = "the quota's share"
 
 
-@dataclass(frozen=True, kw_only=True)
-class ClosedSeason(Institution):
-    """Times in which nobody may harvest (Ostrom's principle 2).
+class Arrays(NamedTuple):
+    """All quotas of a game, one per index of axis Q."""
 
-    Each period of `period_steps` turns, from the first turn of an episode, ends with `closed_steps` turns in
-    which bites are forbidden. Agents observe whether the season is closed, and how long it stays so.
-    """
-
-    period_steps: Positive = 100
-    """The length of a period in turns."""
-
-    closed_steps: Natural = 25
-    """The last turns of each period, in which the season is closed: 0 to `period_steps`."""
-
-    fine: Amount | None = None
-    """None: nobody can harvest in a closed season. A number: it can be done, is a violation, and
-    each bite costs so many apples if it is detected."""
-
-    principle: ClassVar[str] = "2 rules that fit local conditions"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.closed_steps > self.period_steps:
-            raise ValueError(
-                f"ClosedSeason.closed_steps is {self.closed_steps}; allowed: up to period_steps, "
-                f"{self.period_steps}"
-            )
+    unit: Annotated[Numbers, "Q"]
+    """Apples per agent and window at a share of 1."""
+    full: Annotated[Numbers, "Q"]
+    """The most apples that an agent may harvest in a window, for what agents are shown."""
+    share: Annotated[Numbers, "Q"]
+    ballot: Annotated[Ints, "Q"]
+    """The ballot that decides the share; -1 for none."""
+    window_steps: Annotated[Ints, "Q"]
+    by_stock: Annotated[Bools, "Q"]
+    is_stopped: Annotated[Bools, "Q"]
+    """Whether bites that break the rule do not happen."""
+    fine: Annotated[Numbers, "Q"]
+    allowed: Annotated[Numbers, "B Q", STATE]
+    """The apples that an agent may harvest in the current window."""
+    taken: Annotated[Ints, "B Q N", STEPS]
+    """Apples harvested in the current window."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ClosedPatches(Institution):
-    """A patch is closed while it holds too few apples (Ostrom's principle 2).
+def parameters(game: Any) -> dict[str, Any]:
+    quotas = with_ballots(game, Quota)
+    of_agent = game.sustainable_yield / game.agents if quotas else 0.0
+    most = [quota.share if ballot < 0 else game.ballots[ballot].choices[-1] for quota, ballot in quotas]
+    for (quota, _), share in zip(quotas, most, strict=True):
+        _warn_of_less_than_an_apple(quota, of_agent * share)
+    unit = [of_agent * quota.window_steps for quota, _ in quotas]
+    full = [share * apples for share, apples in zip(most, unit, strict=True)]
+    return {"unit": unit, "full": full, **columns(Quota, Arrays, game)}
 
-    A patch is a set of sites that are connected by being near each other (`Rules.regrow_radius_cells`). It is
-    closed in every turn that begins with fewer than `below` apples on it. Agents observe, for each cell of
-    their window, whether a bite there would break a rule.
-    """
 
-    below: Natural = 2
-    """The number of apples below which a patch is closed."""
+def _warn_of_less_than_an_apple(quota: Quota, apples_a_turn: float) -> None:
+    """Warns of a quota that stops every bite although its share is not 0."""
+    apples = apples_a_turn * quota.window_steps
+    if quota.fine is None and 0 < apples < 1 - ROUNDING:
+        warnings.warn(
+            f"Quota.window_steps is {quota.window_steps}: in such a window an agent may take {apples:.3g} "
+            "apples at most, so nobody ever harvests; an apple is allowed in windows of "
+            f"{math.ceil((1 - ROUNDING) / apples_a_turn)} turns or more",
+            UserWarning,
+            stacklevel=2,
+        )
 
-    fine: Amount | None = None
-    """None: nobody can harvest in a closed patch. A number: it can be done, is a violation, and
-    each bite costs so many apples if it is detected."""
 
-    principle: ClassVar[str] = "2 rules that fit local conditions"
-    at_most: ClassVar[int | None] = 1
+def open_turn(quotas: Arrays, ledger: Ledger, turn: int, stock_share: float) -> None:
+    for q in range(quotas.window_steps.shape[0]):
+        if (turn - 1) % quotas.window_steps[q] == 0:
+            share = quotas.share[q]
+            if quotas.ballot[q] >= 0:
+                share = ledger.in_force[quotas.ballot[q]]
+            if quotas.by_stock[q]:
+                share *= stock_share
+            quotas.allowed[q] = share * quotas.unit[q]
+            for i in range(quotas.taken.shape[1]):
+                quotas.taken[q, i] = 0
+
+
+def breaks(quotas: Arrays, ledger: Ledger, q: int, i: int, cell: int, site: int, turn: int) -> bool:
+    return quotas.taken[q, i] + 1 > quotas.allowed[q] + ROUNDING
+
+
+def note_bite(quotas: Arrays, ledger: Ledger, i: int, cell: int, site: int, turn: int) -> None:
+    for q in range(quotas.window_steps.shape[0]):
+        quotas.taken[q, i] += 1
+
+
+def shown(quotas: Arrays, ledger: Ledger, what: int, q: int, i: int, turn: int) -> float:
+    """The apples left to agent i, relative to the most that they can be; the part of the window left."""
+    if what == 1:
+        return (quotas.window_steps[q] - turn % quotas.window_steps[q]) / quotas.window_steps[q]
+    left = quotas.allowed[q] - quotas.taken[q, i]
+    return left / quotas.full[q] if left > 0 and quotas.full[q] > 0 else 0.0

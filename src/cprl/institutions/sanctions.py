@@ -1,9 +1,13 @@
-"""What follows an offence: graduated sanctions, and mediation of tags."""
+"""GraduatedSanctions: time-outs and fines that grow with an agent's offences."""
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
-from cprl.institutions.base import Amount, Institution
+import numpy as np
+
+from cprl.institutions.arrays import STATE, STEPS, Bools, Ints, Numbers
+from cprl.institutions.base import A_RULE_TO_BREAK, Amount, Institution, with_ballots
+from cprl.institutions.ledger import SANCTIONS, Ledger
 from cprl.values import Natural, Positive, Where
 
 Offence = Literal["tags", "violations", "both"]
@@ -45,7 +49,9 @@ class GraduatedSanctions(Institution):
     if they are detected; "both"."""
 
     principle: ClassVar[str] = "5 graduated sanctions"
+    entries: ClassVar[tuple[str, ...]] = ("sanction level",)
     at_most: ClassVar[int | None] = 1
+    counts: ClassVar[tuple[str, ...]] = ("sanctions", "returns_to_violation")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -60,31 +66,109 @@ class GraduatedSanctions(Institution):
         """Whether `freeze_steps` has a row for each agent that tags."""
         return isinstance(self.freeze_steps[0], tuple)
 
-    def check_board(self, *, agents: int, height: int, width: int) -> None:
-        if self.is_table and len(self.freeze_steps) != agents:
+    @property
+    def needs_tags(self) -> bool:
+        return self.on == "tags"
+
+    def check(self, game: Any) -> None:
+        if self.is_table and len(self.freeze_steps) != game.agents:
             raise ValueError(
-                f"GraduatedSanctions.freeze_steps has {len(self.freeze_steps)} rows; allowed: {agents}, one "
-                "per agent"
+                f"GraduatedSanctions.freeze_steps has {len(self.freeze_steps)} rows; allowed: {game.agents}, "
+                "one per agent"
+            )
+        is_idle = self.on == "violations" or (self.on == "both" and not game.rules.may_fire)
+        if is_idle and not any(other.can_be_broken for other in game.institutions):
+            raise ValueError(
+                f'GraduatedSanctions with on="{self.on}" has no offence to sanction; allowed: '
+                f"{A_RULE_TO_BREAK}"
             )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Mediation(Institution):
-    """A tag of an agent that broke no rule is unjust, and refunded by the shooter (Ostrom's principle 6,
-    conflict resolution).
+class Arrays(NamedTuple):
+    """The sanctions of a game, one per index of axis L, of levels, and the level of each agent."""
 
-    A tag is unjust if the tagged agent has violated no rule in this turn and the `turns` - 1 before it. It is
-    a violation by each agent that tagged; together they pay `refund` to the tagged one, detected or not.
-    Agents observe which agents have violated a rule in the last `turns`, their own mark first, then those of
-    the following indices, cyclically; to know them apart they need `Observation.agents_apart`.
-    """
+    steps: Annotated[Ints, "N L"]
+    """The time-out by shooter and level; [N, 0] without `GraduatedSanctions`."""
+    fine: Annotated[Numbers, "fines"]
+    """By level."""
+    recovery: int
+    """Turns; 0 for never."""
+    of_tags: bool
+    of_violations: bool
+    level: Annotated[Ints, "B N", STATE]
+    """The level of the next sanction."""
+    offence_step: Annotated[Ints, "B N", STEPS]
+    """The step of the last offence, or at which the level last fell."""
 
-    turns: Positive = 10
-    """The number of turns, this one included, in which a violation justifies a tag."""
 
-    refund: Amount = 1.0
-    """The apples that the tagged agent is paid."""
+def parameters(game: Any) -> dict[str, Any]:
+    for sanctions, _ in with_ballots(game, GraduatedSanctions):
+        levels = np.atleast_2d(sanctions.freeze_steps)
+        return {
+            "steps": np.broadcast_to(levels, (game.agents, levels.shape[1])),
+            "fine": sanctions.fines,
+            "recovery": sanctions.recovery_steps or 0,
+            "of_tags": sanctions.on in ("tags", "both"),
+            "of_violations": sanctions.on in ("violations", "both"),
+        }
+    steps = np.zeros((game.agents, 0))
+    return {"steps": steps, "fine": (), "recovery": 0, "of_tags": False, "of_violations": False}
 
-    principle: ClassVar[str] = "6 conflict resolution"
-    at_most: ClassVar[int | None] = 1
-    needs: ClassVar[tuple[str, ...]] = ("agents_apart",)
+
+def begin(sanctions: Arrays, ledger: Ledger) -> None:
+    for i in range(sanctions.level.shape[0]):
+        sanctions.level[i] = 0
+        sanctions.offence_step[i] = 0
+
+
+def time_out(sanctions: Arrays, shooter: int, i: int) -> int:
+    """The turns that agent i misses for an offence at its level; `shooter`: who sanctions."""
+    return sanctions.steps[shooter, min(sanctions.level[i], sanctions.steps.shape[1] - 1)]
+
+
+def offend(sanctions: Arrays, ledger: Ledger, i: int, turn: int) -> None:
+    """Counts an offence of agent i, which pays the fine of its level and rises by one."""
+    ledger.fines[i] += sanctions.fine[min(sanctions.level[i], sanctions.fine.shape[0] - 1)]
+    sanctions.level[i] += 1
+    sanctions.offence_step[i] = turn
+    ledger.counts[i, SANCTIONS] += 1
+
+
+def sanction_tag(
+    sanctions: Arrays, ledger: Ledger, tagged_by: Bools, i: int, turn: int, freeze_steps: int
+) -> int:
+    """Lets agent i pay for being tagged, where that is an offence; returns the turns that it misses,
+    `freeze_steps` where it is none."""
+    if not sanctions.of_tags:
+        return freeze_steps
+    steps = 0
+    for j in range(tagged_by.shape[0]):
+        if tagged_by[i, j]:
+            steps = max(steps, time_out(sanctions, j, i))
+    offend(sanctions, ledger, i, turn)
+    return steps
+
+
+def sanction_violation(sanctions: Arrays, ledger: Ledger, i: int, turn: int) -> int:
+    """Lets agent i pay for a detected violation, where that is an offence; returns the turns that it
+    misses."""
+    if not sanctions.of_violations:
+        return 0
+    steps = time_out(sanctions, i, i)
+    offend(sanctions, ledger, i, turn)
+    return steps
+
+
+def settle(sanctions: Arrays, ledger: Ledger, turn: int, is_over: bool) -> None:
+    """Lowers the level of agents that have had no offence in the last turns, this one included."""
+    if sanctions.recovery > 0:
+        for i in range(sanctions.level.shape[0]):
+            if sanctions.level[i] > 0 and turn - sanctions.offence_step[i] >= sanctions.recovery:
+                sanctions.level[i] -= 1
+                sanctions.offence_step[i] = turn
+
+
+def shown(sanctions: Arrays, ledger: Ledger, what: int, argument: int, i: int, turn: int) -> float:
+    """The agent's level, relative to the last one."""
+    last = max(1, sanctions.fine.shape[0] - 1, sanctions.steps.shape[1] - 1)
+    return min(sanctions.level[i], last) / last

@@ -1,9 +1,13 @@
 """Taxes on the harvest, and levies of nested groups."""
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
-from cprl.institutions.base import Amount, Institution, check_agent_indices
+import numpy as np
+
+from cprl.institutions.arrays import STATE, Ints, Numbers
+from cprl.institutions.base import Amount, Institution, check_agent_indices, with_ballots
+from cprl.institutions.ledger import Ledger
 from cprl.values import Natural, Positive, Share, Where
 
 Redistribution = Literal["equal", "none"]
@@ -43,6 +47,7 @@ class Tax(Institution):
     up to the next bracket are taxed at this rate. Empty for `rate` alone."""
 
     principle: ClassVar[str] = "2 rules that fit local conditions"
+    voted_on: ClassVar[str] = "the tax rate"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,12 +78,13 @@ class Levies(Institution):
                 "at most 1 together"
             )
 
-    def check_board(self, *, agents: int, height: int, width: int) -> None:
+    def check(self, game: Any) -> None:
         members = sorted(agent for group in self.groups for agent in group)
-        check_agent_indices("Levies.groups", members, agents)
-        if members != list(range(agents)):
+        check_agent_indices("Levies.groups", members, game.agents)
+        if members != list(range(game.agents)):
             raise ValueError(
-                f"Levies.groups has the agents {members}; allowed: each of 0 to {agents - 1} exactly once"
+                f"Levies.groups has the agents {members}; allowed: each of 0 to {game.agents - 1} exactly "
+                "once"
             )
 
     @property
@@ -86,3 +92,96 @@ class Levies(Institution):
         """The index of each agent's group: [N]."""
         by_agent = {agent: number for number, group in enumerate(self.groups) for agent in group}
         return tuple(by_agent[agent] for agent in sorted(by_agent))
+
+
+class Arrays(NamedTuple):
+    """All taxes and levies of a game, one per index of axis T; levies are two taxes."""
+
+    from_: Annotated[Numbers, "T brackets"]
+    """Where each bracket begins; infinite for those that a tax lacks."""
+    rate: Annotated[Numbers, "T brackets"]
+    ballot: Annotated[Ints, "T"]
+    """The ballot that decides the rate; -1 for none."""
+    steps: Annotated[Ints, "T"]
+    """Turns per period."""
+    group: Annotated[Ints, "T N"]
+    """The group within which it is paid out; -1 where it is lost."""
+    income: Annotated[Numbers, "B T N", STATE]
+    """Apples harvested in the current period."""
+    owed: Annotated[Numbers, "B N"]
+    """The tax that each agent owes."""
+
+
+def parameters(game: Any) -> dict[str, Any]:
+    rows: list[tuple[int, int, tuple[int, ...], tuple[tuple[float, float], ...]]] = []
+    for tax, ballot in with_ballots(game, Tax):
+        group = (0 if tax.redistribution == "equal" else -1,) * game.agents
+        rows.append((ballot, tax.period_steps, group, tax.brackets or ((0.0, tax.rate),)))
+    for levies, _ in with_ballots(game, Levies):
+        rows.append((-1, 1, levies.group_of, ((0.0, levies.local_rate),)))
+        rows.append((-1, 1, (0,) * game.agents, ((0.0, levies.joint_rate),)))
+    most = max((len(brackets) for *_, brackets in rows), default=1)
+    from_, rate = np.full((len(rows), most), np.inf), np.zeros((len(rows), most))
+    for tax_number, (*_, brackets) in enumerate(rows):
+        from_[tax_number, : len(brackets)], rate[tax_number, : len(brackets)] = np.transpose(brackets)
+    ballots, steps, groups, _ = zip(*rows, strict=True) if rows else ((), (), (), ())
+    group_of = np.reshape(groups, (-1, game.agents))
+    return {"from_": from_, "rate": rate, "ballot": ballots, "steps": steps, "group": group_of}
+
+
+def begin(taxes: Arrays, ledger: Ledger) -> None:
+    for tax in range(taxes.income.shape[0]):
+        for i in range(taxes.income.shape[1]):
+            taxes.income[tax, i] = 0.0
+
+
+def note_bite(taxes: Arrays, ledger: Ledger, i: int, cell: int, site: int, turn: int) -> None:
+    for tax in range(taxes.steps.shape[0]):
+        taxes.income[tax, i] += 1.0
+
+
+def settle(taxes: Arrays, ledger: Ledger, turn: int, is_over: bool) -> None:
+    """Collects and pays out the taxes whose period ends with this turn, or with the episode."""
+    agents = ledger.fines.shape[0]
+    for tax in range(taxes.steps.shape[0]):
+        if (is_over or turn % taxes.steps[tax] == 0) and has_income(taxes, tax):
+            for i in range(agents):
+                taxes.owed[i] = tax_of(taxes, ledger, tax, i)
+                ledger.fines[i] += taxes.owed[i]
+                taxes.income[tax, i] = 0.0
+            for i in range(agents):
+                if taxes.group[tax, i] >= 0:
+                    pay_out(taxes, ledger, tax, i)
+
+
+def has_income(taxes: Arrays, tax: int) -> bool:
+    """Whether any agent harvested in the period of a tax."""
+    for i in range(taxes.income.shape[1]):
+        if taxes.income[tax, i] > 0:
+            return True
+    return False
+
+
+def tax_of(taxes: Arrays, ledger: Ledger, tax: int, i: int) -> float:
+    """The apples that agent i owes on its harvest of the period."""
+    income, owed = taxes.income[tax, i], 0.0
+    if taxes.ballot[tax] >= 0:
+        return ledger.in_force[taxes.ballot[tax]] * income
+    for bracket in range(taxes.rate.shape[1]):
+        from_ = taxes.from_[tax, bracket]
+        if income > from_:
+            upper = income
+            if bracket + 1 < taxes.from_.shape[1]:
+                upper = min(income, taxes.from_[tax, bracket + 1])
+            owed += taxes.rate[tax, bracket] * (upper - from_)
+    return owed
+
+
+def pay_out(taxes: Arrays, ledger: Ledger, tax: int, i: int) -> None:
+    """Gives agent i its equal part of what its group owed."""
+    pool, members = 0.0, 0
+    for j in range(ledger.fines.shape[0]):
+        if taxes.group[tax, j] == taxes.group[tax, i]:
+            pool += taxes.owed[j]
+            members += 1
+    ledger.transfers[i] += pool / members

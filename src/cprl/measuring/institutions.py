@@ -15,19 +15,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from cprl.institutions import (
-    COUNTS,
-    Boundaries,
-    ClosedPatches,
-    ClosedSeason,
-    GraduatedSanctions,
-    Institution,
-    Levies,
-    Mediation,
-    Monitoring,
-    Quota,
-    Vote,
-)
+from cprl.institutions import COUNTS, Institution, Levies
 from cprl.measuring import social
 from cprl.measuring.social import SHARE, Metric, Totals, measured
 
@@ -93,23 +81,23 @@ def _sum(words: str, unit: str, entry: str, total: str) -> Metric:
     return Metric(words, unit, (entry,), lambda sums: _total(getattr(sums, total)))
 
 
-def _count(words: str, unit: str, name: str, *kinds: type[Institution]) -> Metric:
+def _count(words: str, unit: str, name: str) -> Metric:
     """The sum of one of `COUNTS`."""
     metric = Metric(words, unit, ("counts",), lambda sums: _total(sums.counts[name]))
-    return metric._replace(kinds=kinds, counted=(name,))
+    return metric._replace(counted=(name,))
 
 
-def _per_violation(words: str, name: str, kind: type[Institution], *, unit: str = SHARE) -> Metric:
+def _per_violation(words: str, name: str, *, unit: str = SHARE) -> Metric:
     """The sum of one of `COUNTS` for each violation; undefined without one."""
     of = Metric(words, unit, ("counts",), lambda sums: _ratio(sums.counts[name], sums.counts["violations"]))
-    return of._replace(kinds=(kind,), counted=(name, "violations"))
+    return of._replace(counted=(name, "violations"))
 
 
 def _of_groups(words: str, of: Callable[[Tensor, Groups], Tensor], *, is_net: bool = False) -> Metric:
     """Principle 8, nested enterprises: of the harvest or of net incomes."""
     needs = _INCOMES if is_net else ("harvest",)
     metric = Metric(words, SHARE, needs, lambda sums: of(_net(sums) if is_net else sums.harvest, sums.groups))
-    return metric._replace(of_totals=("groups",), kinds=(Levies,))
+    return metric._replace(of_totals=("groups",))
 
 
 METRICS: Final[Mapping[str, Metric]] = MappingProxyType(
@@ -123,11 +111,9 @@ METRICS: Final[Mapping[str, Metric]] = MappingProxyType(
             ("violated", "in_play"),
             lambda sums: _ratio(sums.violations, sums.in_play_steps),
         ),
-        "trespasses": _count("trespasses", "turns", "trespasses", Boundaries),
-        "excess_bites": _count("taken above a quota", "bites", "excess_bites", Quota),
-        "closed_bites": _count(
-            "taken in closed seasons and patches", "bites", "closed_bites", ClosedSeason, ClosedPatches
-        ),
+        "trespasses": _count("trespasses", "turns", "trespasses"),
+        "excess_bites": _count("taken above a quota", "bites", "excess_bites"),
+        "closed_bites": _count("taken while closed", "bites", "closed_bites"),
         # Principle 1, boundaries: bites where the agent may bite, places that are open to all included.
         "own_share_of_bites": Metric(
             "bites where one may bite",
@@ -136,26 +122,20 @@ METRICS: Final[Mapping[str, Metric]] = MappingProxyType(
             lambda sums: _ratio(
                 sums.counts["own_bites"], sums.counts["own_bites"] + sums.counts["foreign_bites"]
             ),
-            kinds=(Boundaries,),
             counted=("own_bites", "foreign_bites"),
         ),
         # Principle 4, monitoring: near p of `Monitoring`.
-        "detection_rate": _per_violation("violations detected", "detections", Monitoring),
+        "detection_rate": _per_violation("violations detected", "detections"),
         # Principle 5, graduated sanctions: violations by agents who were sanctioned before in the episode.
-        "recidivism": _per_violation(
-            "violations after a sanction", "returns_to_violation", GraduatedSanctions
-        ),
+        "recidivism": _per_violation("violations after a sanction", "returns_to_violation"),
         # Above 1 where tags are sanctioned too.
-        "sanctions_per_violation": _per_violation(
-            "sanctions per violation", "sanctions", GraduatedSanctions, unit="ratio"
-        ),
+        "sanctions_per_violation": _per_violation("sanctions per violation", "sanctions", unit="ratio"),
         # Principle 6, conflict resolution; undefined without a tag.
         "unjust_share_of_tags": Metric(
             "unjust tags",
             SHARE,
             ("counts", "tagged_by"),
             lambda sums: _ratio(sums.counts["unjust_tags"], sums.tags),
-            kinds=(Mediation,),
             counted=("unjust_tags",),
         ),
         "net_equality": Metric("equality of net incomes", SHARE, _INCOMES, lambda sums: equality(_net(sums))),
@@ -179,12 +159,12 @@ def metrics_for(institutions: Sequence[Institution]) -> tuple[str, ...]:
     are somebody's own, all but those of groups."""
     if not institutions:
         return tuple(name for name, metric in METRICS.items() if "groups" not in metric.of_totals)
-    voted_on = [institution.on for institution in institutions if isinstance(institution, Vote)]
+    counted = {"violations", *(count for institution in institutions for count in institution.rule.counts)}
     return tuple(
         name
         for name, metric in METRICS.items()
-        if not metric.kinds
-        or any(isinstance(institution, metric.kinds) for institution in (*institutions, *voted_on))
+        if counted.issuperset(metric.counted)
+        and ("groups" not in metric.of_totals or groups_of(institutions) is not None)
     )
 
 

@@ -189,10 +189,9 @@ class Metric(NamedTuple):
     of: Callable[[Totals], Tensor]
     of_totals: tuple[str, ...] = ()
     """Which other totals it is computed from."""
-    kinds: tuple[type, ...] = ()
-    """The institutions without which it says nothing; empty for one that concerns them all."""
     counted: tuple[str, ...] = ()
-    """Which of `cprl.institutions.COUNTS` it is computed from."""
+    """Which of `cprl.institutions.COUNTS` it is computed from; says nothing unless an institution counts
+    them."""
     digits: int | None = None
     """Behind the point, in the summary of a run; None where it is not in there."""
 

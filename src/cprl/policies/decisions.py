@@ -1,7 +1,7 @@
 """Decider: what all agents decide at an episode's begin, ("agents", "decision"), as part of a policy.
 
-A decision is one number for all ballots of a game, see `cprl.institutions.choice.ballots`. Here each ballot's
-choice is made by itself: V ballots with 5 choices each are V tables of 5 values, not one of 5**V.
+A decision is one number for all ballots of a game, see `cprl.institutions.votes.ballots_of`. Here each
+ballot's choice is made by itself: V ballots with 5 choices each are V tables of 5 values, not one of 5**V.
 """
 
 from collections.abc import Mapping, Sequence

@@ -89,50 +89,27 @@ class CallableWorth(Value, stored=False):
     """v(A), from a total to what a unit is worth."""
     most: Above0
     """The total from which on a unit is worth nothing."""
-    derivative: Callable[[float], float] | None = None
-    """v'(A); by default from differences of the function."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         totals = np.linspace(0.0, self.most, _TRIED + 1)
-        values = self._tried("function", totals)
+        try:
+            values = np.array([float(self.function(float(total))) for total in totals])
+        except Exception as error:
+            raise ValueError(f"CallableWorth.function fails: {type(error).__name__}: {error}") from error
         chords = np.diff(values) / totals[1]
         margin = _ROUNDING * np.abs(chords).max()
-        allowed = "positive below `most`, falling there to 0, ever more steeply or in a straight line"
-        if (
-            not values[:-1].min() > 0
-            or not chords.max() < margin
-            or not np.diff(chords).max() <= margin
-            or abs(values[-1]) > _NOTHING * values.max()
-        ):
+        falls_ever_more = chords.max() < margin and np.diff(chords).max() <= margin
+        if not (falls_ever_more and values[:-1].min() > 0 and abs(values[-1]) <= _NOTHING * values.max()):
+            allowed = "positive below `most`, falling there to 0, ever more steeply or in a straight line"
             raise ValueError(f"CallableWorth.function is {values[:2]} .. {values[-2:]}; allowed: {allowed}")
-        if self.derivative is None:
-            return
-        # That of a function which falls ever more steeply lies between the slopes of the chords beside it.
-        slopes, before = self._tried("derivative", totals[:-1]), np.array([0.0, *chords[:-1]])
-        if not ((chords - margin <= slopes) & (slopes <= before + margin)).all():
-            raise ValueError("CallableWorth.derivative is none of the function; allowed: v', or None")
-
-    def _tried(self, field: str, totals: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What a function of the user's own gives for totals."""
-        function = getattr(self, field)
-        try:
-            values = np.array([float(function(float(total))) for total in totals])
-        except Exception as error:
-            failed = f"{type(error).__name__}: {error}"
-            raise ValueError(f"CallableWorth.{field} fails ({failed}); allowed: a number") from error
-        if not np.isfinite(values).all():
-            raise ValueError(f"CallableWorth.{field} gives NaN or infinity; allowed: a finite number")
-        return values
 
     def at(self, total: float) -> float:
         """v(A)."""
         return float(self.function(total)) if total < self.most else 0.0
 
     def slope(self, total: float) -> float:
-        """v'(A), below `most`."""
-        if self.derivative is not None:
-            return float(self.derivative(total))
+        """v'(A), below `most`, from differences of the function."""
         step = _STEP * self.most
         low, high = max(total - step, 0.0), min(total + step, self.most)
         return (float(self.function(high)) - float(self.function(low))) / (high - low)

@@ -1,0 +1,256 @@
+"""Law: the institutions of a game together, and the hooks of a turn at which they act, on one world.
+
+A hook is a function in the module of an institution with one of these names. It gets the module's `Arrays`,
+the `Ledger`, and:
+
+    breaks       n, i, cell, site, turn: whether a bite of agent i breaks limit n of the module. It does not
+                 happen, by `is_stopped`, or is a violation, counted as `COUNT`, that costs `fine`
+    note_bite    i, cell, site, turn: agent i has harvested
+    note_step    i, cell: agent i, in play, ends its move on a cell
+    note_growth  site: an apple has grown
+    settle       turn, is_over: what is collected, paid and forgiven at the end of a turn
+    begin        an episode begins, and all that is remembered of the last one is cleared
+    refresh      stock: writes what is derived from the rest of a state, uint8 [K]
+    open_turn    turn, stock_share: what begins with the coming turn, counted from 1
+    shown        what, argument, i, turn: an entry that agent i sees after a turn, 0..1
+    forbids      i, cell, site: whether agent i sees that a bite there breaks a rule about places
+
+Rules are called one by one in the order of `MODULES`, so sums of fines do not depend on the order of
+institutions in a game. What a tag costs and who is detected is asked of `sanctions`, `mediation` and
+`monitoring` by the turn itself. Kinds that a game lacks have arrays of length 0, so that no combination
+compiles anything.
+"""
+
+from types import FunctionType
+from typing import Annotated, Any, Final, NamedTuple, cast
+
+from cprl.institutions import MODULES
+from cprl.institutions.arrays import Ints, Longs, fields_of, filled, slicer
+from cprl.institutions.base import Institution, numbered
+from cprl.institutions.ledger import COUNTS, Ledger, Payments, violate
+from cprl.institutions.votes import MOST_DECISIONS, decision_options
+
+MOST_INSTITUTIONS: Final = 64
+"""The largest number of institutions of a game."""
+
+KINDS: Final[tuple[type[Institution], ...]] = tuple(
+    kind
+    for module in MODULES
+    for kind in vars(module).values()
+    if isinstance(kind, type) and issubclass(kind, Institution) and kind.__module__ == module.__name__
+)
+"""All kinds of institutions that a game can have."""
+
+
+class Entries(NamedTuple):
+    """What agents are shown of institutions, one entry per index of axis E."""
+
+    module: Annotated[Ints, "E"]
+    """The index in `MODULES`."""
+    what: Annotated[Ints, "E"]
+    """The index in the `entries` of its kind."""
+    argument: Annotated[Ints, "E"]
+    """Which one of its kind."""
+    places: bool
+    """Whether agents see where bites are forbidden."""
+    first_plane: int
+    """The channel of observations that is the first one of institutions."""
+
+
+_NAMES: Final = tuple(module.__name__.rpartition(".")[2] for module in MODULES)
+
+Law: Final[Any] = cast(Any, NamedTuple)(
+    "Law",
+    [
+        ("decisions", Annotated[Longs, "B N"]),
+        ("payments", Payments),
+        ("ledger", Ledger),
+        ("entries", Entries),
+        *((name, module.Arrays) for name, module in zip(_NAMES, MODULES, strict=True)),
+    ],
+)
+"""All that institutions need in a turn, beside the world: int64 `decisions`, [N] of one world, read in the
+first turn of an episode, and the `Arrays` of each module by its name."""
+
+
+_FUNCTIONS: Final = {
+    f"{name}_{hook}": function
+    for name, module in zip(_NAMES, MODULES, strict=True)
+    for hook, function in vars(module).items()
+    if isinstance(function, FunctionType) and function.__module__ == module.__name__
+}
+_COUNTS: Final = {
+    f"{name}_COUNT": module.COUNT
+    for name, module in zip(_NAMES, MODULES, strict=True)
+    if hasattr(module, "COUNT")
+}
+
+_SLICERS: Final = {
+    f"one_{name}": slicer(kind)
+    for name, kind in Law.__annotations__.items()
+    if name != "decisions" and any(field.is_of_worlds for field in fields_of(kind))
+}
+
+
+def _calls(hook: str, arguments: str) -> list[str]:
+    """The calls of a hook in every module that has it."""
+    names = [name for name in _NAMES if f"{name}_{hook}" in _FUNCTIONS]
+    return [f"{name}_{hook}(law.{name}, law.ledger, {arguments})" for name in names]
+
+
+def _written(head: str, lines: list[str]) -> Any:
+    """Return a function of these lines, in which hooks are called one by one: rules cannot loop over them."""
+    names: dict[str, Any] = {"__name__": __name__, "violate": violate, "Law": Law}
+    names |= {**_COUNTS, **_FUNCTIONS, **_SLICERS}
+    exec(f"def {head}:\n    " + "\n    ".join(lines), names)
+    return names[head.partition("(")[0]]
+
+
+def _each(hook: str, arguments: str = "") -> Any:
+    return _written(f"{hook}(law, {arguments})", _calls(hook, arguments))
+
+
+def _limits(then: str) -> list[str]:
+    """Lines that do something for each limit that a bite breaks."""
+    lines = []
+    for call in _calls("breaks", "n, i, cell, site, turn"):
+        name = call.partition("_breaks")[0]
+        lines.append(f"for n in range(law.{name}.fine.shape[0]):")
+        lines.append(f"    if {then.format(name=name, call=call)}")
+    return lines
+
+
+one_law = _written(
+    "one_law(law, decisions, payments, b)",
+    [
+        "if law is None: return None",
+        "return Law(decisions[b], one_payments(payments, b), "
+        + ", ".join(
+            f"one_{name}(law.{name}, b)" if f"one_{name}" in _SLICERS else f"law.{name}"
+            for name in Law._fields[2:]
+        )
+        + ")",
+    ],
+)
+"""What institutions need in world b, without the axis B; shares memory. None without a law."""
+stops_bite = _written(
+    "stops_bite(law, i, cell, site, turn)",
+    [*_limits("law.{name}.is_stopped[n] and {call}: return True"), "return False"],
+)
+note_bite = _written(
+    "note_bite(law, i, cell, site, turn)",
+    [
+        *_limits("{call}: violate(law.ledger, i, {name}_COUNT, law.{name}.fine[n])"),
+        *_calls("note_bite", "i, cell, site, turn"),
+    ],
+)
+note_step = _each("note_step", "i, cell")
+note_growth = _each("note_growth", "site")
+settle = _each("settle", "turn, is_over")
+begin = _each("begin")
+refresh = _each("refresh", "stock")
+open_turn = _each("open_turn", "turn, stock_share")
+forbids = _written(
+    "forbids(law, i, cell, site)", ["return " + " or ".join(_calls("forbids", "i, cell, site"))]
+)
+shown = _written(
+    "shown(law, entry, i, turn)",
+    [
+        "module, what, argument = law.entries.module[entry], law.entries.what[entry], "
+        "law.entries.argument[entry]",
+        *(
+            f"if module == {_NAMES.index(call.partition('_shown')[0])}: return {call}"
+            for call in _calls("shown", "what, argument, i, turn")
+        ),
+        "return 0.0",
+    ],
+)
+
+
+def entries_shown(game: Any) -> list[tuple[str, int]]:
+    """What the institutions of a game show agents, in their order, each with the number of which one."""
+    entries: list[tuple[str, int]] = []
+    seen = dict.fromkeys(KINDS, 0)
+    for institution, ballot in numbered(game):
+        for part in dict.fromkeys((institution, institution.rule)):
+            if part.observed:
+                entries += part.shows(number=seen[type(part)], ballot=ballot, agents=game.agents)
+            seen[type(part)] += 1
+    return entries
+
+
+def parameters(game: Any) -> dict[str, dict[str, Any]]:
+    """The parameters of a game's institutions, by the fields of `Law`."""
+    places = {
+        entry: (_NAMES.index(kind.__module__.rpartition(".")[2]), what)
+        for kind in KINDS
+        for what, entry in enumerate(kind.entries)
+    }
+    entries = {
+        "module": [places[entry][0] for entry, _ in entries_shown(game)],
+        "what": [places[entry][1] for entry, _ in entries_shown(game)],
+        "argument": [number for _, number in entries_shown(game)],
+        "places": shows_places(game),
+        "first_plane": len(game.cell_channels),
+    }
+    of_modules = {name: module.parameters(game) for name, module in zip(_NAMES, MODULES, strict=True)}
+    return {"entries": entries, **of_modules}
+
+
+def new_law(game: Any, worlds: int) -> Any:
+    """The law of B worlds of a game, in which nothing has happened and the first choice of each ballot is in
+    force; without `decisions` and `payments`, which come with each turn."""
+    given = game.law_parameters
+    sizes = {"B": worlds, "N": game.agents, "C": len(COUNTS), "V": len(game.ballots)}
+    kinds = Law.__annotations__
+    parts = {name: filled(kinds[name], values, **sizes) for name, values in given.items()}
+    ledger = filled(Ledger, {}, **sizes)
+    ledger.in_force[:] = parts["votes"].choices[:, 0]
+    return Law(decisions=None, payments=None, ledger=ledger, **parts)
+
+
+def check_institutions(game: Any) -> None:
+    """Checks that the institutions of a game fit each other, its map, rules and observation."""
+    institutions = game.institutions
+    if len(institutions) > MOST_INSTITUTIONS:
+        raise ValueError(
+            f"Game.institutions has {len(institutions)} entries; allowed: at most {MOST_INSTITUTIONS}"
+        )
+    for institution in institutions:
+        kind = type(institution)
+        if kind not in KINDS:
+            raise ValueError(
+                f"Game.institutions has a {kind.__name__}; allowed: "
+                f"{', '.join(known.__name__ for known in KINDS)}; an institution of your own is a "
+                "TorchRL transform, see docs/institutions.md"
+            )
+        of_kind = sum(type(other) is kind for other in institutions)
+        if kind.at_most is not None and of_kind > kind.at_most:
+            raise ValueError(
+                f"Game.institutions has {of_kind} of {kind.__name__}; allowed: at most {kind.at_most}"
+            )
+        lacking = [
+            name for name in kind.needs if institution.observed and not getattr(game.observation, name)
+        ]
+        if lacking:
+            raise ValueError(
+                f"{kind.__name__}.observed is True and Observation.{lacking[0]} is False; allowed: "
+                f"Observation({lacking[0]}=True), or {kind.__name__}(observed=False)"
+            )
+        if institution.needs_tags and not game.rules.may_fire:
+            raise ValueError(
+                f"Game.institutions has a {kind.__name__} and Rules.may_fire is False; allowed: a game in "
+                "which agents may fire"
+            )
+        institution.check(game)
+    options = decision_options(game)
+    if options > MOST_DECISIONS:
+        raise ValueError(
+            f"Game.institutions lets agents choose from {options:,} options; allowed: at most "
+            f"{MOST_DECISIONS:,}"
+        )
+
+
+def shows_places(game: Any) -> bool:
+    """Whether agents of a game see where bites are forbidden."""
+    return any(institution.shows_places and institution.observed for institution in game.institutions)

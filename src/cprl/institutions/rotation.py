@@ -1,0 +1,53 @@
+"""Rotation: agents take turns in harvesting."""
+
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Final, NamedTuple
+
+from cprl.institutions.arrays import Bools, Ints, Numbers
+from cprl.institutions.base import Limit, columns
+from cprl.institutions.ledger import CLOSED_BITES, Ledger
+from cprl.values import Positive
+
+COUNT: Final = CLOSED_BITES
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rotation(Limit):
+    """A right of access that goes round: in each window of turns one agent may harvest (Ostrom's principle
+    2, rules that fit local conditions).
+
+    Windows follow one another from the first turn of an episode: the first one belongs to agent 0, the next
+    to agent 1, and so on, and after the last agent's to agent 0 again. Agents observe whether they may
+    harvest in the coming turn, and the part of the window that is left.
+    """
+
+    window_steps: Positive = 25
+    """The length of a window in turns."""
+
+    principle: ClassVar[str] = "2 rules that fit local conditions"
+    counts: ClassVar[tuple[str, ...]] = ("closed_bites",)
+    entries: ClassVar[tuple[str, ...]] = ("may harvest", "window time")
+
+
+class Arrays(NamedTuple):
+    """All rotations of a game, one per index of axis R."""
+
+    window_steps: Annotated[Ints, "R"]
+    is_stopped: Annotated[Bools, "R"]
+    """Whether bites that break the rule do not happen."""
+    fine: Annotated[Numbers, "R"]
+
+
+def parameters(game: Any) -> dict[str, Any]:
+    return columns(Rotation, Arrays, game)
+
+
+def breaks(rotations: Arrays, ledger: Ledger, r: int, i: int, cell: int, site: int, turn: int) -> bool:
+    return (turn - 1) // rotations.window_steps[r] % ledger.fines.shape[0] != i
+
+
+def shown(rotations: Arrays, ledger: Ledger, what: int, r: int, i: int, turn: int) -> float:
+    """1 if agent i may harvest in the coming turn; the part of the window that is left."""
+    if what == 0:
+        return 0.0 if breaks(rotations, ledger, r, i, 0, 0, turn + 1) else 1.0
+    return (rotations.window_steps[r] - turn % rotations.window_steps[r]) / rotations.window_steps[r]
