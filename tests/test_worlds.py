@@ -264,10 +264,11 @@ def test_the_rules_play_the_same_game_without_compilation(variant):
         agents=2, sites=45, cells=game.tables.background.size, window=game.tables.window_cells.shape[1]
     )
     output = batch.new_output()
-    plain["begin_worlds"](batch.now, game.tables, np.ones(2, np.bool_), output, None, scratch, 0, 2)
+    arrays = loops.Played(batch.now, game.tables, output, None, None, None)
+    plain["begin_worlds"](arrays, np.ones(2, np.bool_), scratch, 0, 2)
     for turn, expected in zip([None, *actions], played(game, actions, seed=1), strict=True):
         if turn is not None:
-            plain["play_worlds"](batch.now, game.tables, turn, output, None, scratch, 0, 2)
+            plain["play_worlds"](arrays, turn, scratch, 0, 2)
         assert_same(kept(batch, output), expected)
 
 

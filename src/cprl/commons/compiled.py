@@ -17,7 +17,7 @@ from typing import Any, Final
 import numba
 from filelock import FileLock
 
-from cprl.commons.loops import ENTRIES
+from cprl.commons import loops
 from cprl.system.compile_clock import CLOCK
 from cprl.system.libraries import relying_on
 from cprl.system.process import cache_folder
@@ -125,7 +125,7 @@ def compiled(functions: Iterable[Any], jit: Callable[[FunctionType], Callable[..
 def _jit_for_cpu(function: FunctionType, *, on_disk: bool) -> Callable[..., Any]:
     """Compiles a function for CPU threads."""
     options = dict(CPU_OPTIONS)
-    if function.__name__ not in (entry.__name__ for entry in ENTRIES):
+    if function.__name__ not in (entry.__name__ for entry in loops.ENTRIES):
         options |= {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     elif on_disk:
         return kept_on_disk(function, **options)
@@ -143,25 +143,24 @@ def rules_for_cpu() -> Compiled:
     folder = cache_folder() / _fingerprint()
     on_disk = _can_write(folder)
     with kept_in(folder):
-        return compiled(ENTRIES, partial(_jit_for_cpu, on_disk=on_disk))
+        return compiled(loops.ENTRIES, partial(_jit_for_cpu, on_disk=on_disk))
 
 
-_entries: dict[str, Callable[..., None]] = {}
-_governed_entries: dict[str, Callable[..., None]] = {}
+ENTRIES: Final[tuple[Compiled, Compiled]] = ({}, {})
+"""The machine code of loops, without institutions and with them, as far as it was asked for."""
 
 
-def entry_for_cpu(loop: str, arguments: tuple[Any, ...]) -> Callable[..., None]:
-    """The machine code of a loop, with institutions or without, for direct calls with arguments like these.
+def compiled_entry(loop: str, arguments: tuple[Any, ...]) -> Callable[..., None]:
+    """Put the machine code of a loop into `ENTRIES`, for direct calls with arguments like these.
 
     Numba's dispatcher inspects the types of about sixty arrays on every call, which takes seven of the eight
     microseconds that one world needs. A direct call inspects nothing, so the caller must check the arguments.
     The types are the same in every game: the fields of `Worlds`, `Tables`, `StepOutput` and `Scratch` have
     fixed types.
     """
-    entries = _entries if arguments[0].law is None else _governed_entries
-    if loop not in entries:
-        with CLOCK.running():
-            entries[loop] = machine_code(rules_for_cpu()[loop], *arguments)
+    entries = ENTRIES[arguments[0].law is not None]
+    with CLOCK.running():
+        entries[loop] = machine_code(rules_for_cpu()[loop], *arguments)
     return entries[loop]
 
 

@@ -2,13 +2,13 @@
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, partial
 from typing import Annotated, Any, Final
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from cprl.commons.compiled import entry_for_cpu, rules_for_cpu
+from cprl.commons.compiled import ENTRIES, compiled_entry, rules_for_cpu
 from cprl.commons.game import Game
 from cprl.commons.loops import Loop, Played
 from cprl.commons.tables import Tables
@@ -36,7 +36,6 @@ class CpuThreads:
         limit = threads or os.cpu_count() or 1
         self.threads = min(limit, worlds if threads else -(-worlds // WORLDS_PER_THREAD))
         self.tables: Tables = game.tables
-        self._entries: dict[str, Any] = {}
         self._scratch = [
             empty_scratch(
                 agents=game.agents,
@@ -73,16 +72,17 @@ class CpuThreads:
         Nothing is checked: all arrays are contiguous and have the form that the game gives them.
         """
         size = len(argument)
-        entry = self._entries.get(loop)
+        entry = ENTRIES[game.law is not None].get(loop)
         if entry is None:
-            entry = self._entries[loop] = entry_for_cpu(loop, (game, argument, self._scratch[0], 0, size))
+            entry = compiled_entry(loop, (game, argument, self._scratch[0], 0, size))
         if self.threads == 1:
             entry(game, argument, self._scratch[0], 0, size)
             return
         bounds = [size * t // self.threads for t in range(self.threads + 1)]
+        run = partial(entry, game, argument)
         *others, last_share = zip(self._scratch, bounds, bounds[1:], strict=False)
         pool = _pool(os.getpid(), self.threads - 1)
-        shares = [pool.submit(entry, game, argument, *share) for share in others]
-        entry(game, argument, *last_share)
+        shares = [pool.submit(run, scratch, first, last) for scratch, first, last in others]
+        run(*last_share)
         for share in shares:
             share.result()

@@ -9,7 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.chance import SITES_PER_DRAW
-from cprl.institutions.arrays import Bools, Bytes, Ints, filled, forms_of
+from cprl.institutions.arrays import Bools as Bools
+from cprl.institutions.arrays import Bytes as Bytes
+from cprl.institutions.arrays import Ints as Ints
+from cprl.institutions.arrays import filled, forms_of
 from cprl.institutions.ledger import Payments
 
 Indices: TypeAlias = NDArray[np.uint32]

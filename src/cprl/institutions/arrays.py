@@ -118,8 +118,9 @@ def changed(arrays: Tuple, change: Callable[[Any, bool], Any]) -> Tuple:
 def lasting(arrays: Any, *kinds: str) -> Iterator[tuple[str, Any, str]]:
     """The name of each array of a tuple, and of the tuples in it, that lasts, the array, and what its
     annotation says of that; `kinds`: of these only."""
+    kind: Any = type(arrays)
     for name, entry in zip(arrays._fields, arrays, strict=True):
-        field = _fields(type(arrays))[name]
+        field = _fields(kind)[name]
         if isinstance(entry, tuple):
             yield from lasting(entry, *kinds)
         elif isinstance(field, Field) and field.lasts in kinds:
