@@ -5,7 +5,7 @@ import os
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import pyarrow as pa
 
@@ -63,11 +63,15 @@ def export_results(run: Path, folder: Path, *, weights: bool = True) -> Path:
     if moved != recipe:
         contents[RECIPE_FILE] = (json.dumps(moved, indent=2) + "\n").encode()
     for name, content in contents.items():
-        write_listed(folder, name, lambda file, content=content: file.write(content))
+        write_listed(folder, name, partial(_write_bytes, content))
     _write(read_episodes(run), folder, FILE_NAME)
     for path in sorted((run / "evaluation").glob("*.parquet")):
         _write(read_table(path), folder, f"evaluation/{path.name}")
     return folder
+
+
+def _write_bytes(content: bytes, file: BinaryIO) -> None:
+    file.write(content)
 
 
 def _refuse_another(folder: Path, run: Path, recipe: Mapping[str, Any]) -> None:

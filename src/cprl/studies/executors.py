@@ -167,8 +167,9 @@ class Processes(Value, _SideBySide, stored=False):
 
     def exit_code(self, task: Task, stops: Sequence[int]) -> int:
         def is_over() -> bool:
-            time.sleep(_LOOK_S)
-            return process.poll() is not None
+            is_running = process.poll() is None
+            time.sleep(_LOOK_S * is_running)
+            return not is_running
 
         with _started(task.arguments, str(task.status.log), task.variables) as process:
             _attend(is_over, stops, lambda kill: process.kill() if kill else _ask_to_stop(process))

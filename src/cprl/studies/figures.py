@@ -531,11 +531,18 @@ def _word(level: Any) -> str:
 
 
 def _panels(
-    width_in: float, height_in: float, rows: int, columns: int, number: int, **shared: bool
+    width_in: float,
+    height_in: float,
+    rows: int,
+    columns: int,
+    number: int,
+    *,
+    sharex: bool = False,
+    sharey: bool = False,
 ) -> tuple[Figure, list[Axes]]:
     """An empty figure with so many panels in rows and columns."""
     figure = Figure((width_in, height_in), layout="constrained")
-    panels = list(figure.subplots(rows, columns, squeeze=False, **shared).reshape(-1))
+    panels = list(figure.subplots(rows, columns, sharex=sharex, sharey=sharey, squeeze=False).reshape(-1))
     for axes in panels:
         axes.tick_params(labelsize=SMALL_PT)
     for axes in panels[number:]:
