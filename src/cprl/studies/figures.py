@@ -240,7 +240,7 @@ def by_condition(table: StudyTable, path: Path | str, *, kind: Kind = "levels", 
     first, names = comparisons[0], names_of(table)
     rows_in = 0.34 if all("\n" not in names[name] for name in conditions) else 0.46
     height, columns = rows_in * len(conditions) + 1.8, len(comparisons)
-    figure, panels = _panels(12.0, height, 1, columns, columns, sharey=True)
+    figure, panels = _panels(12.0, height, 1, columns, columns, shared="y")
     for axes, comparison in zip(panels, comparisons, strict=True):
         chance = _chance(table, comparison.metric) if is_levels else {}
         for place, name in enumerate(conditions):
@@ -314,7 +314,7 @@ def courses(table: StudyTable, path: Path | str, *, metrics: Sequence[str] = ())
         colours = colours_of(conditions, levels)
         lines = {name: (colours[name], names[name]) for name in conditions}
         views = [(metric, conditions, lines) for metric in chosen]
-        figure, panels = _panels(9.0, 2.9 * len(views) + 1.4, len(views), 1, len(views), sharex=True)
+        figure, panels = _panels(9.0, 2.9 * len(views) + 1.4, len(views), 1, len(views), shared="x")
     else:
         reference = design.reference
         beside = {reference: ("#777777", f"reference: {names[reference]}")} if reference in conditions else {}
@@ -322,7 +322,7 @@ def courses(table: StudyTable, path: Path | str, *, metrics: Sequence[str] = ())
         others = [name for name in conditions if name != reference]
         views = [(chosen[0], [name], {**beside, name: own}) for name in others]
         rows = -(-len(views) // _PANELS)
-        figure, panels = _panels(12.0, 2.5 * rows + 1.6, rows, _PANELS, len(views), sharex=True, sharey=True)
+        figure, panels = _panels(12.0, 2.5 * rows + 1.6, rows, _PANELS, len(views), shared="xy")
         figure.supylabel(metric_title(chosen[0]), fontsize=SMALL_PT + 1)
     windows: set[int] = set()
     for axes, (metric, of_panel, lines) in zip(panels, views, strict=True):
@@ -434,7 +434,7 @@ def heat_map(
     grid, elsewhere = _grid_of(table.design, factors)
     rows, columns = _levels_of(grid)
     width = max(2 * _CELL_IN[0] * len(columns) + 3.4, 8.0)
-    figure, panels = _panels(width, _CELL_IN[1] * len(rows) + 2.3, 1, 2, 2, sharey=True)
+    figure, panels = _panels(width, _CELL_IN[1] * len(rows) + 2.3, 1, 2, 2, shared="y")
     levels, differences = _numbers(comparison, grid)
     means = [value for value, _ in levels.values()]
     reach = max((abs(value) for value, _ in differences.values()), default=1.0) or 1.0
@@ -531,18 +531,13 @@ def _word(level: Any) -> str:
 
 
 def _panels(
-    width_in: float,
-    height_in: float,
-    rows: int,
-    columns: int,
-    number: int,
-    *,
-    sharex: bool = False,
-    sharey: bool = False,
+    width_in: float, height_in: float, rows: int, columns: int, number: int, *, shared: str = ""
 ) -> tuple[Figure, list[Axes]]:
-    """An empty figure with so many panels in rows and columns."""
+    """An empty figure with so many panels in rows and columns, which share the axes "x", "y" or "xy"."""
     figure = Figure((width_in, height_in), layout="constrained")
-    panels = list(figure.subplots(rows, columns, sharex=sharex, sharey=sharey, squeeze=False).reshape(-1))
+    panels = list(
+        figure.subplots(rows, columns, sharex="x" in shared, sharey="y" in shared, squeeze=False).reshape(-1)
+    )
     for axes in panels:
         axes.tick_params(labelsize=SMALL_PT)
     for axes in panels[number:]:

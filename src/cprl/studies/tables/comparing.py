@@ -7,7 +7,7 @@ that are marked differ by Holm's method: with 95 % none of the marked ones is by
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import isnan
 from typing import Final, Literal, NamedTuple
 
@@ -106,11 +106,7 @@ def compare(table: StudyTable, metric: str, *, part: str = TRAINING, last: int =
     checked("last", last, Positive)
     if part == TRAINING and last < table.window:
         raise refusal("last", last, f"at least {table.window}, the episodes of a window of the table")
-    key = metric, part, last
-    if key not in table.comparisons:
-        table.comparisons[key] = _compared(table, *key)
-    comparison: Comparison = table.comparisons[key]
-    return comparison
+    return _compared(table, metric, part, last)
 
 
 def metrics_of(table: StudyTable, metrics: Sequence[str] = ()) -> tuple[str, ...]:
@@ -122,6 +118,7 @@ def metrics_of(table: StudyTable, metrics: Sequence[str] = ()) -> tuple[str, ...
     return tuple(metrics) or tuple(metric for metric in METRICS if metric in table.metrics)
 
 
+@lru_cache(maxsize=128)  # figures and texts of a table share what it says
 def _compared(table: StudyTable, metric: str, part: str, last: int) -> Comparison:
     reference, is_paired = table.design.reference, table.design.is_paired
     means = {name: _means(table, name, metric, part, last) for name in table.design.conditions}

@@ -160,11 +160,6 @@ class StudyTable:
         counts = Counter(pairs["condition"].to_pylist())
         return {condition: counts[condition] for condition in self.design.conditions}
 
-    @cached_property
-    def comparisons(self) -> dict[Any, Any]:
-        """What `compare` in comparing.py has computed of it, so that figures and texts share it."""
-        return {}
-
     def __str__(self) -> str:
         """What it holds, what it lacks and what is mixed, in sentences."""
         return "\n".join([self.summary, *self.design.notes, *self.mixed, *map(str, self.lacking)])
