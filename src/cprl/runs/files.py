@@ -195,17 +195,11 @@ def verify(path: Path) -> None:
     its run; a file without a checksum is not checked."""
     refuse_special(path)
     named = _NAMED_CHECKSUM.search(path.name)
-    expected = named[1] if named else _listed_checksum(path)
+    runs = [run for run in (path.parent, path.parent.parent) if (run / MANIFEST_FILE).exists()]
+    listed = _listed(runs[0]).get(path.relative_to(runs[0]).as_posix()) if runs and not named else None
+    expected = named[1] if named else listed
     if expected is not None and (actual := checksum(path)) != expected:
         raise ValueError(f"{path} is damaged or was changed: its checksum is {actual}, not {expected}")
-
-
-def _listed_checksum(path: Path) -> str | None:
-    """What the manifest of its run says of a file in the run's directory, or in a folder of it."""
-    for run in (path.parent, path.parent.parent):
-        if (run / MANIFEST_FILE).exists():
-            return _listed(run).get(path.relative_to(run).as_posix())
-    return None
 
 
 def refuse_missing(run: Path) -> None:
@@ -318,7 +312,13 @@ class RunLock:
                 closing.callback(os.close, file)
                 self._lock(file)
                 if self._is_in_place(file):  # else once more: its holder ended in the meantime
-                    self._refuse_another_study(file)
+                    holder = _holder(file)
+                    if self._study is not None and holder.get("study") != self._study:
+                        raise RunLockedError(
+                            f"{self.directory} is run as another study by {_named(holder)}; wait until it "
+                            "ends, or take another directory; if it ended with its machine, delete "
+                            f"{self.path}"
+                        )
                     closing.pop_all()
                     self._file = file
         return self
@@ -334,22 +334,18 @@ class RunLock:
                 ) from None
             self.is_alone = False
         else:
-            self.is_alone = self._is_of_this_host(_holder(file))
+            holder, here = _holder(file), socket.gethostname()
+            # A process on another host may hold it, as far as the file says.
+            self.is_alone = holder.get("host") in (None, here) or self._take_over
             if self.is_alone:
                 self._sign(file)
+            elif self._study is None:
+                raise RunLockedError(
+                    f"{self.directory} is locked by {_named(holder)}, on another host than this, {here}; if "
+                    "that process has ended: --take-over (in Python take_over=True)"
+                )
         if self._study is not None:
             fcntl.flock(file, fcntl.LOCK_SH)  # whoever else had it exclusively had it for this moment
-
-    def _is_of_this_host(self, holder: Mapping[str, Any]) -> bool:
-        """Whether no process on another host may hold the lock, as far as its file says."""
-        if holder.get("host") in (None, socket.gethostname()) or self._take_over:
-            return True
-        if self._study is not None:
-            return False
-        raise RunLockedError(
-            f"{self.directory} is locked by {_named(holder)}, on another host than this, "
-            f"{socket.gethostname()}; if that process has ended: --take-over (in Python take_over=True)"
-        )
 
     def _sign(self, file: int) -> None:
         started = datetime.now().astimezone().isoformat(timespec="seconds")
@@ -369,14 +365,6 @@ class RunLock:
             return os.path.samestat(os.fstat(file), os.stat(self.path))
         except FileNotFoundError:
             return False
-
-    def _refuse_another_study(self, file: int) -> None:
-        holder = _holder(file)
-        if self._study is not None and holder.get("study") != self._study:
-            raise RunLockedError(
-                f"{self.directory} is run as another study by {_named(holder)}; wait until it ends, or take "
-                f"another directory; if it ended with its machine, delete {self.path}"
-            )
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
         if self._file is None:
