@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar
 
 import tyro
 
-from cprl.commands.recipe import Words, ended_by_sigterm, in_a_sentence, parse_with, trusting
+from cprl.commands.recipe import ALLOW, Words, ended_by_sigterm, in_a_sentence, parse_with, trusting
 from cprl.runs.recipe import read_recipe, without_directories, without_options
 from cprl.system.defaults import LAST
 from cprl.system.output import console, printed, say
@@ -250,7 +250,7 @@ def _print_help(options: RecipeOptions, program: str) -> None:
     ) -> None:
         """Never called."""
 
-    about = f"{_ABOUT[program]} {_NOTE} The flags of a recipe are listed by {program} RECIPE --help."
+    about = f"{_ABOUT[program]} {_NOTE} The flags of a recipe are listed by {program} RECIPE --help. {ALLOW}"
     tyro.cli(read, args=["--help"], prog=program, description=about, config=_CONFIG)
 
 
@@ -296,6 +296,7 @@ def _about(study: "Study") -> str:
         study.question,
         f"Expected: {study.expectation}" if study.expectation else "",
         f"{len(conditions)} conditions: {names}{more}; {study.replicas} replicas of each.",
+        ALLOW,
     ]
     return "\n\n".join(filter(None, parts))
 
