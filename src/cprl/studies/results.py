@@ -3,14 +3,13 @@
 The summary and the figures are made of the table: `write_summary` makes a summary again where runs are gone.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from cprl.runs.files import refuse_links, write_atomically
 from cprl.studies.figures import DRAWN, figures_of
 from cprl.studies.study import STATUS, Study
-from cprl.studies.tables.comparing import LAST, cell, cells, compare, markdown, metrics_of
+from cprl.studies.tables.comparing import LAST, Cells, cell, cells, compare, markdown, metrics_of
 from cprl.studies.tables.sources import study_table
 from cprl.studies.tables.table import EVALUATION, RANDOM, TRAINING, WINDOW, StudyTable
 
@@ -91,19 +90,13 @@ def _compared(table: StudyTable, part: str, last: int) -> list[str]:
 
 
 def _phases(table: StudyTable) -> list[str]:
-    rows = []
+    rows = ["| condition | replicas | end in |", "|---|---:|---|"]
     for condition in table.design.conditions:
         counts = table.endings.get(condition, {})
         phases = ", ".join(f"{phase} {number}" for phase, number in counts.items())
-        rows.append([condition, str(sum(counts.values())), phases or "-"])
+        rows.append(f"| {cell(condition)} | {sum(counts.values())} | {phases or '-'} |")
     heading = f"In which phase a replica ends: {'; '.join(table.ending_rules)}."
-    return [
-        "## Phases",
-        "",
-        heading,
-        "",
-        *_lines_of("| condition | replicas | end in |", "|---|---:|---|", rows),
-    ]
+    return ["## Phases", "", heading, "", *rows, ""]
 
 
 def _made(table: StudyTable) -> list[str]:
@@ -114,24 +107,19 @@ def _made(table: StudyTable) -> list[str]:
 
 
 def _lengths(table: StudyTable) -> list[str]:
-    rows = []
-    for condition in table.design.conditions:
-        if condition in table.lengths:
-            lengths = table.lengths[condition]
-            rows.append([condition, *(_range(*lengths[name]) for name in ("episodes", "steps"))])
-    if not rows:
-        return []
+    ranges = {
+        condition: [table.lengths[condition][name] for name in ("episodes", "steps")]
+        for condition in table.design.conditions
+        if condition in table.lengths
+    }
     what = (
         "How long each replica trained. The replicas of a run take each step together until every one has "
         "played its episodes; those whose episodes are short play and learn on, in episodes that are in no "
         "table."
     )
-    return [what, "", *_lines_of("| condition | episodes | environment steps |", "|---|---:|---:|", rows)]
-
-
-def _range(least: int, most: int) -> str:
-    return f"{least:,}" if least == most else f"{least:,} to {most:,}"
-
-
-def _lines_of(head: str, rule: str, rows: Sequence[Sequence[str]]) -> list[str]:
-    return [head, rule, *(f"| {' | '.join([cell(name), *texts])} |" for name, *texts in rows), ""]
+    rows = [
+        [condition, *(f"{least:,}" if least == most else f"{least:,} to {most:,}" for least, most in pairs)]
+        for condition, pairs in ranges.items()
+    ]
+    lines = markdown(Cells(what, ["condition", "episodes", "environment steps"], rows))
+    return [what, "", *lines] if rows else []

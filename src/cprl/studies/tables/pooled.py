@@ -9,7 +9,7 @@ from typing import Any, Final
 from cprl.experiment import Experiment
 from cprl.runs.recipe import read_recipe, runs_in
 from cprl.studies.factors import ALL, normalised, values_at
-from cprl.studies.study import UNNAMED, Condition, named, short_names
+from cprl.studies.study import UNNAMED, Condition, named, short_names, unlike
 from cprl.studies.tables.sources import REASONS, Source, plain_level, table_of
 from cprl.studies.tables.table import WINDOW, Design, Lacking, StudyTable, some
 from cprl.studies.trials import state_of
@@ -92,9 +92,7 @@ def _groups(
     groups: dict[str, Any] = {}
     for values, members in sorted(by_values.values(), key=lambda group: list(map(_rank, group[0]))):
         levels = {path: plain_level(value) for path, value in zip(fields, values, strict=True)}
-        name = named({short[path]: level for path, level in levels.items()})
-        alike = sum(other == name or other.startswith(f"{name} (") for other in groups)
-        name = f"{name} ({alike + 1})" if alike else name
+        name = unlike(named({short[path]: level for path, level in levels.items()}), groups)
         conditions[name], groups[name] = levels, members
     return conditions, groups
 
