@@ -21,13 +21,9 @@ def recipe(monkeypatch):
 
 
 @pytest.mark.parametrize("board", BOARDS)
-def test_settings_are_those_that_the_tuning_chose(recipe, board):
+def test_settings_are_those_that_the_tuning_chose_on_other_seeds(recipe, board):
     table = StudyTable.read(ROOT / "docs" / "results" / "learners" / f"tuning_{board}" / "table.parquet")
     assert recipe("ways").winners(table) == recipe(f"comparison_{board}").CHOSEN
-
-
-@pytest.mark.parametrize("board", BOARDS)
-def test_every_way_is_tuned_on_other_seeds_than_it_is_compared_on(recipe, board):
     compared, tuned = recipe(f"comparison_{board}").STUDY, recipe("ways").tuning(board)
     assert abs(compared.experiment.seed - tuned.experiment.seed) >= compared.replicas + tuned.replicas
     assert len(tuned.conditions) == 4 * len(recipe("ways").WAYS)

@@ -130,43 +130,33 @@ def shot(tags, cells, **more):
     return type(played)(**{**vars(played), "tags": np.array(tags, np.int64).reshape(-1, 4)})
 
 
-def test_agents_apart_exclude_each_other_and_agents_alike_do_not():
-    assert exclusion(APART) == 1
-    assert visitors(APART) == 1
-    assert exclusion(ALIKE) == 0
-    assert visitors(ALIKE) == pytest.approx(2)
-    # In half of their time the cell says who it is, in the other half it is either: H = 1/2 log 2.
-    assert exclusion(HALF) == pytest.approx(0.5)
-    assert visitors(HALF) == pytest.approx(2**0.5)
+NOBODY = [[0, 0, 0, 0]]
 
 
-def test_exclusion_is_the_divergence_of_distributions_of_unequal_shares():
-    # p = (3/4, 1/4) and q = (1/4, 3/4), their mean (1/2, 1/2):
-    # 3/4 log(3/2) + 1/4 log(1/2) = log 2 - H(1/4) = (1 - 0.8113) log 2.
-    unequal = [[[0.75, 0.25]], [[0.25, 0.75]]]
-    assert exclusion(unequal) == pytest.approx(1 - 0.811278, abs=1e-6)
-
-
-def test_three_agents_of_whom_two_share_all_cells():
-    # H(agent | cell) = 2/3 log 2, of log 3.
-    three = [[[1.0, 0]], [[1.0, 0]], [[0, 1.0]]]
-    assert exclusion(three) == pytest.approx(1 - 2 / 3 * np.log(2) / np.log(3))
-    assert visitors(three) == pytest.approx(2 ** (2 / 3))
-
-
-def test_an_agent_that_was_never_in_play_does_not_count():
-    absent = [*APART, [[0, 0, 0, 0]]]
-    assert exclusion(absent) == 1
-    assert exclusion([*HALF, [[0, 0, 0, 0]]]) == pytest.approx(0.5)
-    assert np.isnan(exclusion(APART[:1]))
-    assert visitors(APART[:1]) == 1
-    assert np.isnan(visitors(np.zeros((2, 1, 4))))
-
-
-def test_measures_of_several_worlds_are_those_of_each():
-    both = np.array([APART, HALF])
-    np.testing.assert_allclose(exclusion(both), [1, 0.5])
-    assert exclusion(both).shape == (2,)
+@pytest.mark.parametrize(
+    ("shares", "excluded", "sharing"),
+    [
+        (APART, 1, 1),
+        (ALIKE, 0, 2),
+        # In half of their time the cell says who it is, in the other half it is either: H = 1/2 log 2.
+        (HALF, 0.5, 2**0.5),
+        # p = (3/4, 1/4) and q = (1/4, 3/4), their mean (1/2, 1/2), of which the divergence is
+        # 3/4 log(3/2) + 1/4 log(1/2) = log 2 - H(1/4) = (1 - 0.811278) log 2.
+        ([[[0.75, 0.25]], [[0.25, 0.75]]], 1 - 0.811278, 2**0.811278),
+        # Of three agents two share all cells: H(agent | cell) = 2/3 log 2, of log 3.
+        ([[[1.0, 0]], [[1.0, 0]], [[0, 1.0]]], 1 - 2 / 3 * np.log(2) / np.log(3), 2 ** (2 / 3)),
+        # An agent that was never in play does not count.
+        ([*APART, NOBODY], 1, 1),
+        ([*HALF, NOBODY], 0.5, 2**0.5),
+        (APART[:1], np.nan, 1),
+        ([NOBODY, NOBODY], np.nan, np.nan),
+        # Each of two worlds.
+        ([APART, HALF], [1, 0.5], [1, 2**0.5]),
+    ],
+)
+def test_agents_exclude_each_other_as_far_as_a_cell_says_who_they_are(shares, excluded, sharing):
+    np.testing.assert_allclose(exclusion(shares), excluded, atol=1e-6)
+    np.testing.assert_allclose(visitors(shares), sharing, atol=1e-6)
 
 
 def test_the_owner_of_a_cell_spends_the_largest_share_there():

@@ -12,7 +12,6 @@ from rich.console import Console
 from test_results import an_episode
 
 from cprl.measuring.metrics import NAMES, title, with_unit
-from cprl.measuring.statistics import over_replicas
 from cprl.terminal.summary import summarise
 
 
@@ -91,11 +90,6 @@ def test_rewards_that_are_no_apples_have_a_row_of_their_own(tmp_path):
     assert rows["return of all agents together, rewards"] == ["0.0"]
 
 
-def test_an_estimate_of_one_replica_is_printed_without_an_interval():
-    assert str(over_replicas({0: [2.0, 4.0]})) == "3"
-    assert str(over_replicas({0: [2.0, float("nan")]})) == "2, undefined in 1 of 2"
-
-
 def test_units_are_those_of_the_docs():
     lines = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text().splitlines()
     table = [line.split("|")[1:3] for line in lines if line.startswith("| `social/")]
@@ -116,7 +110,4 @@ def test_units_are_those_of_the_docs():
 )
 def test_a_name_in_code_has_its_unit_in_brackets(name, rewards, told):
     assert with_unit(name, rewards=rewards) == told
-
-
-def test_a_metric_of_ones_own_is_called_by_its_name():
     assert title("of_ones_own") == "of_ones_own"

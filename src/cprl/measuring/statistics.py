@@ -42,48 +42,36 @@ class Estimate:
         return f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]" if has_interval else f"{self.value:.4g}"
 
 
-def estimate(values: ArrayLike, *, confidence: float = CONFIDENCE) -> Estimate:
-    """Return the mean over replicas with its interval by Student's t.
-
-    Args:
-        values: float [R].
-        confidence: The confidence of the interval, between 0 and 1, exclusive.
+def estimate(values: ArrayLike) -> Estimate:
+    """Return the mean over replicas, of float [R], with its 95 % interval by Student's t.
 
     Raises:
         ValueError: If there are no replicas, or a value is not finite.
     """
     sample = _sample(values)
-    low, high, p_value = _by_t([sample], [1.0], confidence)
-    value = float(sample.mean()) + 0.0  # so that none is -0.0
-    return Estimate(value=value, low=low, high=high, replicas=len(sample), p_value=p_value)
+    return _estimate(float(sample.mean()) + 0.0, sample)  # so that none is -0.0
 
 
-def difference(
-    values: ArrayLike, reference: ArrayLike, *, paired: bool, confidence: float = CONFIDENCE
-) -> Estimate:
-    """Return the difference between two means over replicas, with its interval.
+def difference(values: ArrayLike, reference: ArrayLike, *, paired: bool) -> Estimate:
+    """Return the difference between two means over replicas, with its 95 % interval.
 
     Args:
         values: float [R].
         reference: float [R] if paired, else of any number of replicas.
         paired: Whether replica r of both had the same chance: then the interval is that of the mean of
             differences, else Welch's.
-        confidence: The confidence of the interval, between 0 and 1, exclusive.
 
     Raises:
         ValueError: If there are no replicas, a value is not finite, or pairs have unequal numbers of them.
     """
-    samples = [_sample(values), _sample(reference)]
-    if paired:
-        if len(samples[0]) != len(samples[1]):
-            raise ValueError(
-                f"values has {len(samples[0])} replicas and reference {len(samples[1])}; allowed in pairs: "
-                "as many"
-            )
-        return estimate(samples[0] - samples[1], confidence=confidence)
-    low, high, p_value = _by_t(samples, [1.0, -1.0], confidence)
-    value = float(samples[0].mean() - samples[1].mean())
-    return Estimate(value=value, low=low, high=high, replicas=sum(map(len, samples)), p_value=p_value)
+    first, second = _sample(values), _sample(reference)
+    if not paired:
+        return _estimate(float(first.mean() - second.mean()), first, second)
+    if len(first) != len(second):
+        raise ValueError(
+            f"values has {len(first)} replicas and reference {len(second)}; allowed in pairs: as many"
+        )
+    return estimate(first - second)
 
 
 def holm(p_values: ArrayLike, *, level: float = 1 - CONFIDENCE) -> NDArray[np.bool_]:
@@ -126,12 +114,11 @@ def starred(differences: Sequence[Estimate], form: str = "") -> list[str]:
     ]
 
 
-def curve_interval(curves: ArrayLike, *, confidence: float = CONFIDENCE) -> tuple[Values, Values, Values]:
-    """Return the mean of several curves and its interval by Student's t at each episode.
+def curve_interval(curves: ArrayLike) -> tuple[Values, Values, Values]:
+    """Return the mean of several curves and its 95 % interval by Student's t at each episode.
 
     Args:
         curves: float [R, E], a curve of E episodes per replica; NaN where undefined.
-        confidence: The confidence of the interval, between 0 and 1, exclusive.
 
     Returns:
         Mean, low and high, float64 [E]; NaN where no replica has a value, for low and high also where only
@@ -146,38 +133,27 @@ def curve_interval(curves: ArrayLike, *, confidence: float = CONFIDENCE) -> tupl
         middle = np.where(defined, curves, 0.0).sum(0) / replicas
         squares = np.where(defined, curves - middle, 0.0) ** 2
         error = np.sqrt(squares.sum(0) / (replicas - 1) / replicas)
-    reach = stats.t.ppf((1 + confidence) / 2, replicas - 1) * error
+    reach = stats.t.ppf((1 + CONFIDENCE) / 2, replicas - 1) * error
     return middle, middle - reach, middle + reach
 
 
-def _by_t(
-    samples: Sequence[Values], weights: Sequence[float], confidence: float
-) -> tuple[float, float, float]:
-    """The interval of a weighted sum of means by Student's t, with the degrees of freedom of Welch.
-
-    Args:
-        samples: [R] each, independent.
-        weights: of the mean of each sample.
-        confidence: of the interval.
-
-    Returns:
-        Low, high and the p-value of the sum being 0; NaN where a sample has one value.
-    """
+def _estimate(value: float, *samples: Values) -> Estimate:
+    """A mean or a difference of means with its interval by t, of the degrees of freedom of Welch."""
     from scipy import stats
 
-    if any(len(sample) < 2 for sample in samples):
-        return float("nan"), float("nan"), float("nan")
-    weighted = list(zip(weights, samples, strict=True))
-    middle = sum(weight * float(sample.mean()) for weight, sample in weighted)
-    parts = [weight**2 * float(sample.var(ddof=1)) / len(sample) for weight, sample in weighted]
-    if sum(parts) == 0:
-        return middle, middle, float(middle == 0)
-    freedom = sum(parts) ** 2 / sum(
-        part**2 / (len(sample) - 1) for part, sample in zip(parts, samples, strict=True)
-    )
-    error = sum(parts) ** 0.5
-    reach = float(stats.t.ppf((1 + confidence) / 2, freedom)) * error
-    return middle - reach, middle + reach, 2 * float(stats.t.sf(abs(middle) / error, freedom))
+    low = high = p_value = float("nan")
+    if all(len(sample) > 1 for sample in samples):
+        parts = [float(sample.var(ddof=1)) / len(sample) for sample in samples]
+        low, high, p_value = value, value, float(value == 0)
+        if error := sum(parts) ** 0.5:
+            freedoms = [len(sample) - 1 for sample in samples]
+            of_parts = zip(parts, freedoms, strict=True)
+            freedom = sum(parts) ** 2 / sum(part**2 / of_part for part, of_part in of_parts)
+            reach = float(stats.t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
+            low, high = value - reach, value + reach
+            p_value = 2 * float(stats.t.sf(abs(value) / error, freedom))
+    replicas = sum(map(len, samples))
+    return Estimate(value=value, low=low, high=high, replicas=replicas, p_value=p_value)
 
 
 def _sample(values: ArrayLike) -> Values:
