@@ -54,6 +54,14 @@ def corridors(tmp_path_factory):
     }
 
 
+@pytest.fixture(scope="session")
+def alike(tmp_path_factory):
+    """A run on `stored_runs.MEADOW` of two DQN agents that learned a little, three replicas."""
+    from stored_runs import DQN, MEADOW, ran
+
+    return ran(tmp_path_factory.mktemp("learned") / "alike", MEADOW, [DQN] * 2)
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A run of experiment 4 in miniature: 2 replicas of 12 episodes of 40 steps."""

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from PIL import Image
-from stored_runs import C51, CORRIDORS, DQN, MEADOW, PPO, SAC, SEED, an_experiment, command, ran, told, values
+from stored_runs import C51, CORRIDORS, MEADOW, PPO, SAC, SEED, an_experiment, command, ran, told, values
 
 import cprl
 from cprl import CommonsEnv, Game, Observation, maps, presets
@@ -37,10 +37,9 @@ from cprl.training.agents import Population, StoredAgent, stored_policies
 
 
 @pytest.fixture(scope="module")
-def learned(tmp_path_factory):
-    """Runs on the meadow: two DQN agents, and one that draws its actions beside a frozen one of them."""
-    folder = tmp_path_factory.mktemp("learned")
-    alike = ran(folder / "alike", MEADOW, [DQN] * 2)
+def learned(alike, tmp_path_factory):
+    """Beside two DQN agents one that draws its actions, among whom one of those is frozen."""
+    folder = tmp_path_factory.mktemp("mixed")
     mixed = ran(folder / "mixed", MEADOW, [PPO, Frozen(os.path.relpath(alike), 1, replica=2)])
     return {"alike": alike, "mixed": mixed}
 

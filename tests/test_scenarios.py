@@ -35,16 +35,14 @@ THREE_CORRIDORS = replace(
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory):
+def runs(alike, tmp_path_factory):
     """Runs of scripted agents in three corridors, two replicas, and two DQN agents on the meadow, three."""
     folder = tmp_path_factory.mktemp("scenarios")
-    return {
-        **{
-            policy: ran(folder / policy, THREE_CORRIDORS, [Scripted(policy)] * 3, replicas=2)
-            for policy in ("greedy", "sustainable")
-        },
-        "learned": ran(folder / "learned", MEADOW, [DQN] * 2),
-    }
+    policies = ("greedy", "sustainable")
+    scripted_runs = [
+        ran(folder / name, THREE_CORRIDORS, [Scripted(name)] * 3, replicas=2) for name in policies
+    ]
+    return {**dict(zip(policies, scripted_runs, strict=True)), "learned": alike}
 
 
 FRESH = Fresh(replicas=(0, 1, 2), episodes=2, seed=SEED)
@@ -129,7 +127,7 @@ def test_a_run_of_a_single_replica_is_not_its_own_background(runs, monkeypatch):
     monkeypatch.setattr(module, "load", lambda path: keeping(run, 1))
     background = tuple(Frozen(str(run.path), agent, replica=None) for agent in range(2))
     own = Scenario(name="itself", game=MEADOW, focal="minority", background=background)
-    answer = "the scenario itself has the background .*learned, which keeps the single replica 1, so that"
+    answer = "the scenario itself has the background .*alike, which keeps the single replica 1, so that"
     with pytest.raises(ValueError, match=answer):
         run_scenarios(keeping(run, 1), scenarios=[own], episodes=1)
     assert run_scenarios(run, scenarios=[own], episodes=1, replicas=[0]).by_scenario, "another replica"
@@ -241,7 +239,7 @@ def test_what_cannot_be_played_is_refused(given, answer, runs):
 def test_a_background_of_another_game_is_refused(runs):
     other = tuple(Frozen(str(runs["learned"]), agent) for agent in (0, 1, 1))
     own = Scenario(name="own", game=THREE_CORRIDORS, focal="minority", background=other)
-    with pytest.raises(ValueError, match=r"greedy and the background .*learned have"):
+    with pytest.raises(ValueError, match=r"greedy and the background .*alike have"):
         run_scenarios(runs["greedy"], scenarios=[own])
 
 

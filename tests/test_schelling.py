@@ -7,19 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from stored_runs import CORRIDORS, DQN, MEADOW, SEED, command, ran
+from stored_runs import CORRIDORS, DQN, MEADOW, SEED, command
 
 import cprl
 from cprl import Game, Rules, maps, presets
 from cprl.envs.matrix import stag_hunt
 from cprl.evaluation import play_population, schelling
 from cprl.population import Frozen, Scripted
-
-
-@pytest.fixture(scope="module")
-def alike(tmp_path_factory):
-    """Two DQN agents that learned a little, three replicas."""
-    return ran(tmp_path_factory.mktemp("populations") / "alike", MEADOW, [DQN] * 2)
 
 
 def returns(played):
@@ -134,18 +128,13 @@ def test_a_mix_is_the_population_of_its_agents(patch):
 
 
 @pytest.mark.integration
-def test_agents_of_runs_play_restrained_or_greedy(tmp_path):
-    run = ran(tmp_path / "alike", MEADOW, [DQN] * 2)
-    found = schelling(cprl.load(run), restrained="sustainable", greedy=str(run), episodes=2, replicas=3)
-    trained = cprl.evaluate_run(run, episodes=2).trained
-    for replica, episodes in found.by_mix[()].items():
-        assert [one.return_.tolist() for one in episodes] == [
-            one.return_.tolist() for one in trained[replica]
-        ]
+def test_agents_of_runs_play_restrained_or_greedy(alike):
+    found = schelling(cprl.load(alike), restrained="sustainable", greedy=str(alike), episodes=2, replicas=3)
+    assert returns(found.by_mix[()]) == returns(cprl.evaluate_run(alike, episodes=2).trained)
     with pytest.raises(ValueError, match="keeps no network of replica_3/agent_0"):
-        schelling(MEADOW, greedy=str(run), episodes=1, replicas=4)
+        schelling(MEADOW, greedy=str(alike), episodes=1, replicas=4)
     with pytest.raises(ValueError, match=r"restrained and greedy are .* and .*, the same"):
-        schelling(MEADOW, restrained=str(run), greedy=f"{run}/", episodes=1)
+        schelling(MEADOW, restrained=str(alike), greedy=f"{alike}/", episodes=1)
 
 
 @pytest.mark.parametrize(

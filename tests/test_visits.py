@@ -3,21 +3,13 @@
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from stored_runs import MEADOW, SEED, command, ran
-from test_population import ALGORITHMS
+from stored_runs import SEED, command, ran
 
 import cprl
 from cprl.envs.matrix import stag_hunt
 from cprl.evaluation import territory_of
 from cprl.evaluation.territory import DEFENCE, EXCLUSION, OVERLAP, TAGS, VISITORS, draw_visits
-from cprl.population import Learning, Scripted
-
-
-@pytest.fixture(scope="module")
-def meadow(tmp_path_factory):
-    """Two agents that learned a little, on a board without walls and with a beam."""
-    dqn = Learning(ALGORITHMS["DQN"])
-    return ran(tmp_path_factory.mktemp("runs") / "alike", MEADOW, [dqn] * 2)
+from cprl.population import Scripted
 
 
 def test_agents_in_corridors_of_their_own_exclude_each_other(corridors):
@@ -33,8 +25,8 @@ def test_agents_in_corridors_of_their_own_exclude_each_other(corridors):
     np.testing.assert_allclose(found.trained.visits[1, 1, 2], [0, 0, 1 / 3, 1 / 3, 1 / 3])
 
 
-def test_the_episodes_are_those_of_an_evaluation(meadow):
-    found, played = (ask(meadow, episodes=5, seed=SEED) for ask in (territory_of, cprl.evaluate_run))
+def test_the_episodes_are_those_of_an_evaluation(alike):
+    found, played = (ask(alike, episodes=5, seed=SEED) for ask in (territory_of, cprl.evaluate_run))
     for policy in ("trained", "random"):
         stays = found.of(policy)
         for place, replica in enumerate(found.fresh.replicas):
@@ -48,9 +40,9 @@ def test_the_episodes_are_those_of_an_evaluation(meadow):
     assert found.random.taggings.sum() > 0
 
 
-def test_a_replica_alone_stays_where_it_stays_among_all(meadow):
-    both = territory_of(meadow, episodes=3)
-    alone = territory_of(meadow, episodes=3, replicas=[2])
+def test_a_replica_alone_stays_where_it_stays_among_all(alike):
+    both = territory_of(alike, episodes=3)
+    alone = territory_of(alike, episodes=3, replicas=[2])
     np.testing.assert_array_equal(alone.trained.visits[0], both.trained.visits[2])
     np.testing.assert_array_equal(alone.random.tagged_where[0], both.random.tagged_where[2])
     for name, values in both.random.by_replica.items():
@@ -88,10 +80,10 @@ def test_a_game_without_a_board_is_refused(tmp_path):
         territory_of(run)
 
 
-def test_the_command_visits_tells_and_draws(meadow, tmp_path, monkeypatch, capsys):
+def test_the_command_visits_tells_and_draws(alike, tmp_path, monkeypatch, capsys):
     out = tmp_path / "visits.png"
-    text = command(monkeypatch, capsys, "visits", meadow, "--episodes", 2, "--figure", out, "--random")
-    found = territory_of(meadow, episodes=2)
+    text = command(monkeypatch, capsys, "visits", alike, "--episodes", 2, "--figure", out, "--random")
+    found = territory_of(alike, episodes=2)
     for name, own in found.random.measures().items():
         (row,) = [row for row in text.splitlines() if row.startswith(f"│ {name} ")]
         assert row.split("│")[3].strip() == str(own)
@@ -99,4 +91,4 @@ def test_the_command_visits_tells_and_draws(meadow, tmp_path, monkeypatch, capsy
     assert imread(out).shape[1] == 1500
     for words in (("--figure", out), ("--random",), ("--figure", tmp_path / "visits.gif")):
         with pytest.raises(SystemExit, match=r"cprl: .*(exists|allowed: with --figure|ends in \.png)"):
-            command(monkeypatch, capsys, "visits", meadow, *words)
+            command(monkeypatch, capsys, "visits", alike, *words)

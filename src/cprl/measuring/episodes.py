@@ -1,7 +1,7 @@
 """Episode, the record of one that has ended, and EpisodeTracker, which makes them of batches of turns."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
 import numpy as np
@@ -120,6 +120,13 @@ _RUNNING: Final[Mapping[str, tuple[str, str, type]]] = {
 }
 """What a tracker adds up of each running episode, by name: the entry that it needs, its axes after that of
 worlds (N agents, C counts, V decisions), and its dtype."""
+
+
+_ADDED: Final = ("in_play_steps", "shots", "hit_by", "tagged_by", "fines", "transfers", "violations")
+"""Those to which the entry is added turn by turn."""
+_COPIED: Final = {entry.name for entry in fields(Episode)} & ({*_RUNNING} - {"depletion_step", "counts"})
+"""Those that an episode has unchanged."""
+_TOTALS: Final = {entry.name for entry in fields(social.Totals)} & ({"steps", *_RUNNING} - {"counts"})
 
 
 class EpisodeTracker:
@@ -255,24 +262,16 @@ class EpisodeTracker:
             running["harvest"] += turn["harvest"]
             running["harvest_steps"] += bites
             running["harvest_time"] += bites * steps[:, None]
-        if "in_play" in turn:
-            running["in_play_steps"] += turn["in_play"]
-        if "fired" in turn:
-            running["shots"] += turn["fired"]
-        if "hit_by" in turn and np.count_nonzero(turn["hit_by"]):
-            running["hit_by"] += turn["hit_by"]
+        for name in _ADDED:
+            entry, _, _ = _RUNNING[name]
+            if entry in turn and np.count_nonzero(turn[entry]):
+                running[name] += turn[entry]
         if "tagged_by" in turn and np.count_nonzero(turn["tagged_by"]):
             running["tagged"] += turn["tagged_by"].any(-1)
-            running["tagged_by"] += turn["tagged_by"]
         if "stock" in turn and np.count_nonzero(turn["stock"]) < turn["stock"].size:
             depletion_step = running["depletion_step"]
             just_now = (turn["stock"][:, 0] == 0) & (depletion_step == 0)
             depletion_step[just_now] = steps[just_now]
-        for name in ("fines", "transfers"):
-            if name in turn:
-                running[name] += turn[name]
-        if "violated" in turn and np.count_nonzero(turn["violated"]):
-            running["violations"] += turn["violated"]
         if "counts" in turn:  # they are cumulative: the last turn's are those of the episode
             running["counts"][:] = turn["counts"]
         if "in_force" in turn and np.count_nonzero(first := steps == 1):
@@ -296,16 +295,16 @@ class EpisodeTracker:
         counted = institutions.counts_for(self._institutions) if "counts" in ended else ()
         episodes = []
         for index, world in enumerate(worlds):
-            fields: dict[str, Any] = {name: ended[name][index] for name in _AS_COUNTED if name in ended}
+            more: dict[str, Any] = {name: ended[name][index] for name in _COPIED if name in ended}
             if "hit_by" in ended:
-                fields["hits"] = ended["hit_by"][index].sum(0)
+                more["hits"] = ended["hit_by"][index].sum(0)
             if "decision" in turn:
-                fields["decision"] = turn["decision"][world].copy()
+                more["decision"] = turn["decision"][world].copy()
             if "stock" in turn:
-                fields["stock_left"] = int(turn["stock"][world, 0])
-                fields["depletion_step"] = int(ended["depletion_step"][index]) or -1
+                more["stock_left"] = int(turn["stock"][world, 0])
+                more["depletion_step"] = int(ended["depletion_step"][index]) or -1
             if "counts" in ended:
-                fields["counts"] = {name: ended["counts"][index][:, COUNTS.index(name)] for name in counted}
+                more["counts"] = {name: ended["counts"][index][:, COUNTS.index(name)] for name in counted}
             episodes.append(
                 Episode(
                     world=int(world),
@@ -315,21 +314,10 @@ class EpisodeTracker:
                     return_=ended["return"][index],
                     metrics={name: float(values[index]) for name, values in metrics.items()},
                     institutions={name: float(values[index]) for name, values in of_institutions.items()},
-                    **fields,
+                    **more,
                 )
             )
         return episodes
-
-
-_TOTALS: Final = (
-    *("steps", "harvest", "harvest_steps", "harvest_time", "in_play_steps"),
-    *("fines", "transfers", "violations"),
-)
-_AS_COUNTED: Final = (
-    *("harvest", "in_play_steps", "shots", "tagged", "tagged_by"),
-    *("fines", "transfers", "violations", "in_force"),
-)
-"""Fields of an episode that are copied from the tracker's state unchanged."""
 
 
 def tracker_of(env: EnvBase) -> EpisodeTracker:
