@@ -5,7 +5,9 @@ from test_population import ALGORITHMS
 import cprl
 from cprl import Experiment, Game, Rules, maps
 from cprl.commands import main as cli
-from cprl.population import Learning
+from cprl.population import Learning, Scripted
+from cprl.runs.recipe import start_run
+from cprl.runs.weights import save_weights
 
 CORRIDORS = Game(
     map=maps.parse(
@@ -53,6 +55,15 @@ def an_experiment(name, game, members, *, replicas=3):
 
 def ran(folder, game, members, **how):
     return cprl.run(an_experiment(folder.name, game, members, **how), folder, watch="off")
+
+
+def stored(folder, game=CORRIDORS, policy="greedy", *, name="", replicas=1):
+    """A run of scripted agents, of which no episode was played."""
+    name = name or folder.name
+    agents = (Scripted(policy),) * game.agents
+    experiment = Experiment(name=name, game=game, agents=agents, replicas=replicas, episodes=1)
+    save_weights(start_run(folder, name, experiment.to_recipe), {})
+    return folder
 
 
 def values(measures):

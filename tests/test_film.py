@@ -10,9 +10,9 @@ import pytest
 import torch
 from imageio_ffmpeg import get_ffmpeg_exe
 from PIL import Image
-from stored_runs import CORRIDORS
+from stored_runs import CORRIDORS, stored
 
-from cprl import Experiment, Game, Rules, load, maps
+from cprl import Game, Rules, load, maps
 from cprl.commands import main as cli
 from cprl.commons.colours import APPLE, GROUND, PALETTE, agent_colour
 from cprl.commons.picture import EMPTY_SITE_COLOUR
@@ -21,9 +21,6 @@ from cprl.evaluation.film import Style, film, film_video, fresh_episode
 from cprl.evaluation.film import _titles as titles_of
 from cprl.evaluation.film_pictures import EpisodePicture, nice
 from cprl.institutions import Monitoring, Quota
-from cprl.population import Scripted
-from cprl.runs.recipe import start_run
-from cprl.runs.weights import save_weights
 
 LEFT = [5, 3, 2, 0]
 """Apples on the board at the start and after each turn."""
@@ -36,21 +33,13 @@ MEADOW = Game(
 """A higher board, more agents and a longer clock than the corridors."""
 
 
-def stored(folder, name, game=CORRIDORS, policy="greedy"):
-    """A run of scripted agents."""
-    agents = (Scripted(policy),) * len(game.map.starts)
-    experiment = Experiment(name=name, game=game, agents=agents, episodes=1)
-    save_weights(start_run(folder, name, experiment.to_recipe), {})
-    return folder
-
-
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """Runs on the corridors by the policy of both agents, and one on another board."""
     folder = tmp_path_factory.mktemp("runs")
     for policy in ("greedy", "random"):
-        stored(folder / policy, policy, policy=policy)
-    stored(folder / "meadow", "meadow", MEADOW, "random")
+        stored(folder / policy, policy=policy)
+    stored(folder / "meadow", MEADOW, "random")
     return folder
 
 
@@ -153,7 +142,7 @@ def test_boards_agents_and_clocks_may_differ_side_by_side(runs, tmp_path):
 def test_titles_are_what_tells_runs_apart(runs, tmp_path):
     limits = Quota(fine=1.0), Monitoring(prob=0.5)
     governed = [
-        stored(tmp_path / name, "two_rules", replace(CORRIDORS, institutions=institutions))
+        stored(tmp_path / name, replace(CORRIDORS, institutions=institutions), name="two_rules")
         for name, institutions in (("one", ()), ("two", limits), ("three", limits))
     ]
 
@@ -184,9 +173,7 @@ def test_with_the_seed_of_an_evaluation_its_worlds_are_filmed(tmp_path):
         CORRIDORS,
         rules=replace(CORRIDORS.rules, regrow_prob=(0.0, 0.3), shuffle_starts=True, episode_steps=30),
     )
-    own = Experiment(name="own", game=growing, agents=(Scripted("greedy"),) * 2, replicas=2, episodes=1)
-    run = start_run(tmp_path / "own", "own", own.to_recipe)
-    save_weights(run, {})
+    run = stored(tmp_path / "own", growing, replicas=2)
     worlds = load(run).env(2 * 3, seed=77)
     stay = torch.full((6, 2), 6)
 

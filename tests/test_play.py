@@ -6,15 +6,13 @@ from pathlib import Path
 
 import pytest
 from matrix_game import MatrixGame
+from stored_runs import stored
 
-from cprl import Experiment, Game, Rules, maps, presets
+from cprl import Game, Rules, maps, presets
 from cprl.commands import main as cli
 from cprl.evaluation.play import Session, board_text, help_of, open_session, play_in_terminal
 from cprl.measuring.episodes import EpisodeTracker
 from cprl.measuring.statistics import social_metrics
-from cprl.population import Scripted
-from cprl.runs.recipe import start_run
-from cprl.runs.weights import save_weights
 
 DRAWING = """
 .A>.A.
@@ -28,11 +26,7 @@ MEADOW = Game(map=maps.parse(DRAWING), rules=RULES)
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A run on the meadow, in which everybody always leaves the apples that hang alone."""
-    folder = tmp_path_factory.mktemp("runs") / "meadow"
-    agents = (Scripted("sustainable"), Scripted("sustainable"))
-    own = Experiment(name="meadow", game=MEADOW, agents=agents, episodes=1)
-    save_weights(start_run(folder, "meadow", own.to_recipe), {})
-    return folder
+    return stored(tmp_path_factory.mktemp("runs") / "meadow", MEADOW, "sustainable")
 
 
 def text_of(session):
