@@ -134,7 +134,7 @@ def test_each_world_counts_its_own_episodes_and_starts_anew():
     assert harvests == [(0, 0, 1, [1, 0]), (0, 1, 1, [1, 0]), (1, 0, 2, [0, 2]), (1, 1, 1, [0, 1])]
     assert tracker.add(turn(worlds=2, done=[[True]] * 2, had_ended=[[True]] * 2)) == [], "no second time"
     episodes = tracker.add(turn(worlds=2, done=[[True]] * 2))
-    assert [(episode.episode, episode.steps) for episode in episodes] == [(2, 2), (2, 1)]
+    assert [(episode.episode, episode.steps) for episode in episodes] == [(2, 1), (2, 1)]
 
 
 def test_what_a_collector_yields_is_measured_as_the_whole_episodes_would_be():
