@@ -49,7 +49,7 @@ from cprl.terminal.summary import summarise
 from cprl.training.collectors import StepCollector
 from cprl.training.training import Callback
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.watching import check_watch
+from cprl.viewer.page import check_watch
 
 SHORT = {"epsilon_decay_steps": 30_000, "batch_size": 64, "learning_rate": 3e-4, "target_every_episodes": 1}
 """What differs from the published schedule, besides the number of episodes: it has to learn from 1/50 of the

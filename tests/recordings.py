@@ -16,7 +16,7 @@ from cprl.learners.settings import DQNSettings
 from cprl.policies.lanes import RandomActor
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.scenery import Scene
+from cprl.viewer.layout import Scene
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -51,6 +51,14 @@ def static(path, entity, component):
         if component in batch.schema.names:
             return batch.column(component).to_pylist()[0]
     return None
+
+
+def names(view):
+    """The names of all views and tabs of a layout."""
+    found = [str(own) for own in [getattr(view, "name", None)] if own]
+    for inner in getattr(view, "contents", None) or ():
+        found += names(inner) if not isinstance(inner, str) else []
+    return found
 
 
 def frames(count, *, first_step=1):

@@ -30,7 +30,7 @@ from cprl import CommonsEnv, Game, Rules, keys, maps
 from cprl.commons import compiled
 from cprl.learners.engine import FunctionalLoss, total, weights_of
 from cprl.system import compat
-from cprl.system.compat import LaneCategorical, losses, recordings
+from cprl.system.compat import LaneCategorical, losses
 from cprl.system.libraries import fitting_versions, relying_on, require
 
 SOURCE = Path(compat.__file__).parents[1]
@@ -87,14 +87,11 @@ TORCH, RERUN = r"torch \S+ has no torch\.", r"rerun-sdk \S+ has no rerun_binding
             lambda: compat.remember_vector_instructions.__wrapped__(),
             TORCH + r"_inductor\.cpu_vec_isa",
         ),
-        *(
-            ("rerun_bindings", part, lambda part=part: recordings._binding.__wrapped__(part), RERUN + part)
-            for part in (
-                "flush_and_cleanup_orphaned_recordings",
-                "send_arrow_chunk",
-                "ChunkInternal",
-                "send_chunks",
-            )
+        (
+            "rerun_bindings",
+            "flush_and_cleanup_orphaned_recordings",
+            compat.end_recordings,
+            RERUN + "flush_and_cleanup_orphaned_recordings",
         ),
         ("numba.core.config", "CACHE_DIR", kept_here, r"numba\.config\.CACHE_DIR"),
     ],
@@ -647,46 +644,3 @@ def test_vector_instructions_are_looked_for_once_for_all_processes(tmp_path, mon
         compat.remember_vector_instructions.__wrapped__()
         assert cpu_vec_isa.valid_vec_isa_list() == []
         assert len(searches) == 3
-
-
-def test_a_row_is_sent_as_rerun_itself_sends_columns(tmp_path):
-    import rerun as rr
-    from rerun.chunk import RrdReader
-
-    from cprl.viewer.logger import components, timelines, times
-
-    columns = rr.Points2D.columns(positions=np.ones((2, 2)), labels=["one", "two"])
-    at = times([3, 4], [0, 1], [5, 6])
-
-    def sent(name, send):
-        recording = rr.RecordingStream("cprl", recording_id="sent")
-        recording.save(tmp_path / name)
-        send(recording)
-        recording.disconnect()
-        chunks = [chunk.to_record_batch() for chunk in RrdReader(tmp_path / name).stream()]
-        return [
-            {column: batch.column(column).to_pylist() for column in batch.schema.names if ":" in column}
-            | {line: batch.column(line).to_pylist() for line in ("step", "episode", "frame")}
-            for batch in chunks
-            if "step" in batch.schema.names
-        ]
-
-    with relies_on("rerun_bindings.send_arrow_chunk", used_by="compat.send_chunk"):
-        own = sent("own", lambda to: compat.send_chunk(to, "a/b", timelines(at), components(columns)))
-        assert own
-        assert own == sent("its", lambda to: to.send_columns("a/b", at, columns))
-
-
-def test_what_ends_a_recording_waits_for_its_viewer_and_is_in_a_private_part():
-    """`RecordingStream.__del__` flushes; `keep_native` keeps `inner` alive in its place."""
-    import rerun as rr
-
-    with relies_on("RecordingStream.inner", used_by="compat.keep_native"):
-        recording = rr.RecordingStream("cprl", recording_id="kept")
-        native = recording.inner
-        before = sys.getrefcount(native)
-        compat.keep_native(recording)
-        assert sys.getrefcount(native) == before + 1
-    with relies_on("RecordingStream.__del__", used_by="deadline.exit_in_time"):
-        assert callable(vars(rr.RecordingStream)["__del__"])
-    recording.disconnect()

@@ -11,7 +11,7 @@ from cprl.policies.lanes import LaneActor, random_lanes
 from cprl.policies.scripted import scripted_lanes
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.panels import APART, BAR, HIGH, decision_panels
+from cprl.viewer.layout import APART, BAR, HIGH, decision_panels
 from cprl.viewer.replay import Decisions
 
 GAME = Game(

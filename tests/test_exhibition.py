@@ -23,9 +23,8 @@ from cprl.training.outcome import exhibited, fresh_env
 from cprl.viewer import exhibition
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.exhibition import BATCH_S, BATCH_STEPS, Exhibition, caption_of
-from cprl.viewer.frames import scene_of
-from cprl.viewer.scenery import curves_of
-from cprl.viewer.streams import Live, Stream
+from cprl.viewer.layout import curves_of, scene_of
+from cprl.viewer.live import Stream
 
 REPLAY = DQNSettings(buffer_size=300, batch_size=4, hidden_cells=(8,), epsilon_hold_steps=10)
 ROLLOUT = RolloutSettings(rollout_steps=20, minibatch_size=10, hidden_cells=(8,))
@@ -70,6 +69,9 @@ def population_of(experiment):
 class Kept:
     """An exhibition whose viewers are files, on a clock that the test moves."""
 
+    class Viewers(Stream):
+        is_behind = False
+
     def __init__(self, folder, experiment=ALONE):
         self.now, self.waits = 0.0, []
         self.paths = (folder / "live.rrd", folder / "exhibition.rrd")
@@ -77,7 +79,7 @@ class Kept:
         for path in self.paths:
             recording = rr.RecordingStream("cprl", recording_id="one")
             recording.save(path)
-            self.streams.append(Stream("live view", recording, period_s=1))
+            self.streams.append(Kept.Viewers("live view", recording, period_s=1))
         self.env, self.population = population_of(experiment)
         self.policy, self.world = exhibited(experiment, self.env, self.population)
         commons = self.env if not experiment.transforms else self.env.base_env
@@ -89,7 +91,8 @@ class Kept:
             self.world,
             trained=self.env,
             scene=scene,
-            live=Live(*self.streams),
+            kept=self.streams[0],
+            newest=self.streams[1],
             clock=lambda: self.now,
             wait=lambda seconds: self.waits.append(seconds),
         )
@@ -111,7 +114,7 @@ def steps(kept, count):
     """So many steps of the training, each when the exhibition is due."""
     for _ in range(count):
         kept.now += exhibition.BATCH_S
-        kept.exhibition.on_step(episode=0)
+        kept.exhibition.on_step(0, 0, None)
 
 
 FIRST, *OTHERS = EXPERIMENTS
@@ -179,7 +182,7 @@ def test_it_plays_ten_to_twelve_steps_a_second_however_often_the_training_asks(t
     kept = Kept(tmp_path)
     for thousandth in range(round(3000 * BATCH_S)):
         kept.now = thousandth / 1000
-        kept.exhibition.on_step(episode=7)
+        kept.exhibition.on_step(0, 7, None)
     boards, timelines = kept.rows("SegmentationImage:buffer")
     assert abs(len(boards) - 3 * BATCH_STEPS) <= 2
     assert timelines == set(), "rows without a time: viewers keep the newest alone, on every timeline"
@@ -202,7 +205,7 @@ def test_a_slow_exhibition_takes_one_percent_of_the_time(seconds, tmp_path, monk
     monkeypatch.setattr(Exhibition, "_step", slowly)
     while kept.now < 200:
         kept.now += 0.01
-        kept.exhibition.on_step(episode=0)
+        kept.exhibition.on_step(0, 0, None)
     later = len(played) - BATCH_STEPS  # the first ones compile, which is not counted
     assert 0.007 * kept.now <= later * seconds <= 0.011 * kept.now
 
@@ -268,7 +271,7 @@ def test_the_caption_names_the_episode_and_the_exploration():
 
 def test_an_exhibition_that_fails_warns_once_and_ends(tmp_path, monkeypatch):
     kept = Kept(tmp_path)
-    kept.exhibition.on_step(episode=0)
+    kept.exhibition.on_step(0, 0, None)
     monkeypatch.setattr(kept.world, "step_and_maybe_reset", lambda moment: 1 / 0)
     with pytest.warns(RuntimeWarning, match="the exhibition failed, the run") as caught:
         steps(kept, 8)
@@ -277,7 +280,7 @@ def test_an_exhibition_that_fails_warns_once_and_ends(tmp_path, monkeypatch):
 
 def test_viewers_that_do_not_keep_up_miss_frames_and_nothing_waits(tmp_path, monkeypatch):
     kept = Kept(tmp_path)
-    monkeypatch.setattr(Stream, "is_behind", True)
+    monkeypatch.setattr(Kept.Viewers, "is_behind", True)
     steps(kept, 5)
     assert len(kept.rows("SegmentationImage:buffer")[0]) == 1, "the first, which the constructor sent"
 
@@ -309,14 +312,14 @@ def test_a_game_without_a_board_has_no_exhibition_and_one_event_says_so(tmp_path
         texts += batch.column("TextLog:text").to_pylist()
     assert ["no exhibition: the game has no board"] in texts
     with pytest.raises(ValueError, match=r"a MatrixGame of batch size \[1\]"):
-        Exhibition(Some(), env, trained=env, scene=None, live=Live())
+        Exhibition(Some(), env, trained=env, scene=None, kept=None, newest=None)
 
 
 def test_parts_that_never_change_are_sent_once_to_the_server_that_keeps_them_and_formats_with_frames(
     tmp_path,
 ):
     kept = Kept(tmp_path)
-    kept.exhibition.on_step(episode=0)
+    kept.exhibition.on_step(0, 0, None)
     for stream in kept.streams:
         stream.close()
     live, frames = (

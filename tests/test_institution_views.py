@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rerun.blueprint as rrb
 from matplotlib.image import imread
 from paying_game import Charges
-from recordings import column, static
+from recordings import column, names, static
 from rerun.chunk import RrdReader
 from rich.console import Console
 from test_film import frames_of
@@ -29,12 +28,11 @@ from cprl.runs.episodes import read_episodes
 from cprl.terminal.figures import training_curve
 from cprl.terminal.summary import institutions_table, summarise
 from cprl.training import train
-from cprl.viewer.blueprint import layout
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.institutions import has_institutions, lines, tabs
+from cprl.viewer.layout import Curves, curves_of, layout, styles
+from cprl.viewer.pictures import borders, regions_of
 from cprl.viewer.replay import Offences
-from cprl.viewer.scenery import Curves, curves_of
-from cprl.viewer.views import borders, in_words, regions_of
+from cprl.viewer.story import in_words
 
 GAME = Game(
     map=maps.parse(".A>.A.A\n.A#A.AA\nv.<.AA>"),
@@ -137,26 +135,22 @@ def test_events_are_in_words():
 
 def test_only_games_with_institutions_have_their_tabs(run):
     _, viewer, _ = run
-    curves, titles = viewer.logger.curves, []
-
-    def plot(name, *entities, share=False):
-        titles.append(name)
-        return rrb.TimeSeriesView(name=name, contents=[f"+ /{entity}" for entity in entities])
-
-    assert tabs(curves, lambda name, *entities, share=False: None) == []
-    assert [tab.name for tab in tabs(curves, plot)] == ["Institutions", "Rules kept"]
-    assert titles == [
+    curves = viewer.logger.curves
+    tabs = {
+        "Institutions",
         "Violations of each, turns",
         "Fines of each, apples",
         "Transfers to each, apples",
+        "Rules kept",
         "Shares of violations, bites, tags",
         "Equality of net incomes",
         "In force: decision 0",
-    ]
+    }
+    assert tabs <= set(names(layout(curves).root_container))
     without = Curves(agents=("a", "b"))
-    assert not has_institutions(without)
-    assert (tabs(without, plot), lines(without)) == ([], {})
-    assert layout(curves) is not None
+    assert not without.has_institutions
+    assert not tabs & set(names(layout(without).root_container))
+    assert not [entity for entity in styles(without) if "institutions" in entity]
 
 
 def test_a_recording_without_institutions_has_nothing_of_them(tmp_path):

@@ -20,7 +20,7 @@ from cprl.commons.colours import (
     picture_colour,
 )
 from cprl.commons.picture import BODY, INK, MARKED, agent_sprite, number_pixels, world_image
-from cprl.viewer.stage import marks, numbers, numbers_and_headings
+from cprl.viewer.board import marks, numbers, numbers_and_headings
 
 SEEN = {
     "deuteranopia": (

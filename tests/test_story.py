@@ -1,22 +1,33 @@
-"""What people read first in a recording: the header, the label, the phases, the recipe, the layout."""
+"""What people read first in a recording, and its pictures: header, label, phases, recipe and layout; the
+boards of all replicas, where agents go, the stock over the turn, and the Lorenz curve.
+"""
+
+import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rerun as rr
-from recordings import GAME, SCENE, column, static, strict_rerun
+import torch
+from recordings import GAME, SCENE, column, names, static, strict_rerun
 from rerun.chunk import RrdReader
-from test_watch import fake
+from test_watch import connected, fake
 
-from cprl import CommonsEnv, presets
+from cprl import CommonsEnv, Game, Rules, maps, presets
+from cprl.commons.colours import APPLE, FIRST_AGENT, GROUND, PALETTE, WALL, agent_colour
+from cprl.measuring import social
 from cprl.measuring.metrics import reported_by
 from cprl.measuring.phases import LONGEST, PHASES_BEGIN
-from cprl.viewer import callback
-from cprl.viewer.blueprint import layout
+from cprl.policies.lanes import random_agents
+from cprl.runs.episodes import EpisodeTable
+from cprl.training import train
+from cprl.viewer.board import boards
 from cprl.viewer.callback import ViewerCallback
+from cprl.viewer.layout import Curves, Panels, curves_of, layout
+from cprl.viewer.live import LiveStream, Stream
 from cprl.viewer.logger import RerunLogger, as_table, send_waiting
-from cprl.viewer.scenery import Curves, curves_of
-from cprl.viewer.story import Header, played, published_phases
-from cprl.viewer.streams import LiveStream, Stream
+from cprl.viewer.pictures import Turns, Visits, Wall, gini, lorenz_curve
+from cprl.viewer.story import CLOCK, CompilingNotice, Header, played, published_phases
 
 __all__ = ["strict_rerun"]
 
@@ -27,54 +38,58 @@ def headers(path):
     return [(episode, text[0].splitlines()[0]) for episode, text in zip(episodes, texts, strict=True)]
 
 
+def texts(path):
+    """The episode of each event."""
+    at, events = column(path, "log", "TextLog:text", "episode")
+    return dict(zip([text[0] for text in events], at, strict=True))
+
+
+def recorded(run, numbers, *, replicas=1, episodes=9, learning=lambda number: {}, finished=None):
+    """The recording of a run whose agents harvest thirty apples in each episode of these numbers."""
+    with ViewerCallback(run, CommonsEnv(GAME, replicas), title="run", episodes=episodes) as viewer:
+        if finished:
+            viewer.random_play(finished["random"])
+        for number in numbers:
+            for world in range(replicas):
+                returned = 100.0 * world if replicas > 1 else 30.0
+                viewer.on_episode(fake(number, world, returned=returned, tagged=0), learning(number))
+        if finished:
+            viewer.finished(finished)
+            RrdReader(run / "run.rrd").store()  # closed, with its footer
+    return run / "run.rrd"
+
+
 def test_the_header_goes_from_the_beginning_to_the_end(tmp_path):
-    random = [fake(0, 0, returned=float(apples), tagged=0) for apples in (280, 284)]
-    trained = [fake(5, 0, returned=100.0, tagged=0) for _ in range(4)]
-    with ViewerCallback(tmp_path, CommonsEnv(GAME, 2), title="run", episodes=6) as viewer:
-        viewer.log_status("compiling")
-        assert viewer.baseline is None
-        viewer.random_play(random)
-        assert viewer.baseline == 282.0
-        for number in range(6):
-            for world in (0, 1):
-                viewer.on_episode(
-                    fake(number, world, returned=100.0 * world, tagged=0), {"agent_0/epsilon": 0.9}
-                )
-        viewer.finished({"trained": trained, "random": random})
-        RrdReader(tmp_path / "run.rrd").store()  # closed, with its footer
-    told = headers(tmp_path / "run.rrd")
-    assert [line for _, line in told[:2]] == ["# Episode 1 of 6 · begins", "# Episode 1 of 6 · compiling"]
-    assert told[2] == (
-        0,
-        "# Episode 1 of 6 · exploring · 50 apples (random play 282) · 0 of 2 boards died early",
+    path = recorded(
+        tmp_path,
+        range(6),
+        replicas=2,
+        episodes=6,
+        learning=lambda number: {"agent_0/epsilon": 0.9},
+        finished={
+            "random": [fake(0, 0, returned=float(apples), tagged=0) for apples in (280, 284)],
+            "trained": [fake(5, 0, returned=100.0, tagged=0) for _ in range(4)],
+        },
     )
-    assert told[-2][1].endswith("· 2 of 2 boards died early")
-    assert told[-1] == (
-        5,
-        "# Finished, 6 episodes · trained 100 apples, random play 282 · 4 of 4 boards died early",
-    )
-    _, events = column(tmp_path / "run.rrd", "log", "TextLog:text")
-    (words, *_) = [text[0] for text in events if text[0].startswith("random play")]
+    said = headers(path)
+    assert said[0][1] == "# Episode 1 of 6 · begins"
+    line = "# Episode 1 of 6 · exploring · 50 apples (random play 282) · 0 of 2 boards died early"
+    assert said[1] == (0, line)
+    assert said[-2][1].endswith("· 2 of 2 boards died early")
+    line = "# Finished, 6 episodes · trained 100 apples, random play 282 · 4 of 4 boards died early"
+    assert said[-1] == (5, line)
+    words = next(text for text in texts(path) if text.startswith("random play"))
     assert words.startswith("random play 282.0 ± 2 apples in 2 fresh episodes (mean and its standard error)")
-    assert column(tmp_path / "run.rrd", "phase/found", "StateChange:state") == ([], []), "too few episodes"
+    assert column(path, "phase/found", "StateChange:state") == ([], []), "too few episodes"
 
 
-def test_a_training_without_an_evaluation_ends_with_a_header_of_its_own(tmp_path):
-    with ViewerCallback(tmp_path, CommonsEnv(GAME, 1), title="run", episodes=2) as viewer:
-        for number in range(2):
-            viewer.on_episode(fake(number, 0, returned=30.0, tagged=0), {})
-    assert headers(tmp_path / "run.rrd")[-1] == (1, "# Finished, 2 episodes · 30 apples at the end")
-
-
-def test_a_run_that_was_stopped_says_so_and_where_it_goes_on_when_it_is_resumed(tmp_path):
-    env = CommonsEnv(GAME, 1)
-    with ViewerCallback(tmp_path, env, title="run", episodes=9) as viewer:
-        viewer.on_episode(fake(0, 0, returned=30.0, tagged=0), {})
-        state = viewer.state_dict()
-    assert headers(tmp_path / "run.rrd")[-1] == (0, "# Stopped after 1 of 9 episodes · 30 apples")
-    with ViewerCallback(tmp_path, env, title="run", episodes=9) as resumed:
-        resumed.load_state_dict(state)
-    assert headers(tmp_path / "run-2.rrd")[-2] == (1, "# Episode 1 of 9 · begins · 30 apples")
+def test_a_training_without_an_evaluation_or_that_was_stopped_ends_with_a_header_of_its_own(tmp_path):
+    for episodes, line in (
+        (2, "# Finished, 2 episodes · 30 apples at the end"),
+        (9, "# Stopped after 2 of 9 episodes · 30 apples"),
+    ):
+        run = tmp_path / str(episodes)
+        assert headers(recorded(run, range(2), episodes=episodes))[-1] == (1, line)
 
 
 @pytest.mark.parametrize("kind", [LiveStream, Stream])
@@ -92,33 +107,74 @@ def test_viewers_get_the_newest_header_at_all_times_and_files_each_at_its_own(ki
 
 
 def test_where_exploration_ends_the_strip_changes_and_an_event_says_so(tmp_path):
-    with ViewerCallback(tmp_path, CommonsEnv(GAME, 1), title="run", episodes=30) as viewer:
-        for number in range(30):
-            viewer.on_episode(
-                fake(number, 0, returned=30.0, tagged=0), {"agent_0/epsilon": max(0.1, 1 - number / 20)}
-            )
-    at, events = column(tmp_path / "run.rrd", "log", "TextLog:text", "episode")
-    told = dict(zip([text[0] for text in events], at, strict=True))
-    assert told["episode 19: exploration ends: no epsilon falls any more; now harvesting"] == 19
-    states = column(tmp_path / "run.rrd", "now", "StateChange:state", "episode")
+    path = recorded(
+        tmp_path,
+        range(30),
+        episodes=30,
+        learning=lambda number: {"agent_0/epsilon": max(0.1, 1 - number / 20)},
+    )
+    said = texts(path)
+    assert said["episode 19: exploration ends: no epsilon falls any more; now harvesting"] == 19
+    states = column(path, "now", "StateChange:state", "episode")
     assert states == ([0, 19], [["exploring"], ["harvesting"]])
 
 
-def test_the_live_label_goes_on_after_a_resume(tmp_path):
-    def play(viewer, numbers):
-        for number in numbers:
-            viewer.on_episode(fake(number, 0, returned=600.0 if number < 30 else 200.0, tagged=1), {})
+def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_get_all_of_it(tmp_path):
+    """Running means, label and new bests go on from the episodes in the table, which are not logged again."""
 
-    env = CommonsEnv(GAME, 1)
-    with ViewerCallback(tmp_path, env, title="run", episodes=60, file_name="whole.rrd") as whole:
-        play(whole, range(40))
-        state = whole.state_dict()
-        play(whole, range(40, 60))
-    with ViewerCallback(tmp_path, env, title="run", episodes=60, file_name="now.rrd") as resumed:
-        resumed.load_state_dict(state)
-        play(resumed, range(40, 60))
-    assert headers(tmp_path / "now.rrd")[-20:] == headers(tmp_path / "whole.rrd")[-20:]
-    assert "tragedy" in headers(tmp_path / "now.rrd")[-2][1]
+    def play(numbers, *callbacks, worlds=(0, 1)):
+        for number in numbers:
+            for world in worlds:
+                returned = (600.0 if number < 30 else 200.0) + number * world
+                for callback in callbacks:
+                    episode = fake(number, world, returned=returned, tagged=1)
+                    callback.on_episode(episode, {"agent_0/epsilon": max(0.1, 1 - number / 60)})
+
+    (tmp_path / "recipe.json").write_text("{}")
+    env, common = CommonsEnv(GAME, 2), {"title": "run", "episodes": 70}
+    with ViewerCallback(tmp_path, env, file_name="whole.rrd", **common) as whole:
+        play(range(70), whole)
+    with ViewerCallback(tmp_path, env, **common) as first:
+        with EpisodeTable(tmp_path / "episodes.parquet") as table:
+            play(range(49), first, table)
+            play([49], first, table, worlds=[0])
+        state = first.state_dict()
+    assert headers(tmp_path / "run.rrd")[-1][1].startswith("# Stopped after 49 of 70 episodes")
+    with ViewerCallback(tmp_path, env, live="serve", **common) as second:
+        second.load_state_dict(state)
+        second.on_start(SimpleNamespace(steps=1000))
+        play([49], second, worlds=[1])
+        play(range(50, 70), second)
+        second.flush()
+        seen_by_viewers(second.logger, tmp_path / "seen", "social/collective_return", list(range(70)))
+    files = [tmp_path / name for name in ("run.rrd", "run-2.rrd")]
+    assert len({RrdReader(file).recordings()[0].recording_id for file in files}) == 1
+    complete, resumed = tmp_path / "whole.rrd", files[1]
+    assert headers(resumed)[1][1].startswith("# Episode 49 of 70 · exploring · ")
+    assert headers(resumed)[-21:] == headers(complete)[-21:]
+    for name in ("social/collective_return", "agent_0/return"):
+        episodes, values = column(resumed, name, "Scalars:scalars", "episode")
+        assert episodes == list(range(49, 70))
+        assert values == column(complete, name, "Scalars:scalars", "episode")[1][49:]
+    states = dict(zip(*column(complete, "now", "StateChange:state", "episode"), strict=True))
+    later = {episode: state for episode, state in states.items() if episode > 48}
+    goes_on = dict(zip(*column(resumed, "now", "StateChange:state", "episode"), strict=True))
+    assert goes_on == {48: ["exploring"], **later}
+    assert later, "the label changes once more"
+
+
+def seen_by_viewers(logger, folder, entity, episodes):
+    """Waits until viewers of a served recording have these episodes of an entity, each once."""
+    folder.mkdir()
+    client = connected(logger.addresses["native"].split()[-1], folder)
+    try:
+        ends = time.monotonic() + 60
+        while sorted(column(folder / "got.rrd", entity, "Scalars:scalars", "episode")[0]) != episodes:
+            assert time.monotonic() < ends
+            time.sleep(0.5)
+    finally:
+        client.terminate()
+        client.wait()
 
 
 def test_phases_of_the_published_game_stand_beside_those_found():
@@ -126,8 +182,7 @@ def test_phases_of_the_published_game_stand_beside_those_found():
     assert published_phases(commons) == dict(
         zip((0, *PHASES_BEGIN), ("exploration", "tragedy", "combat", "cultivation"), strict=True)
     )
-    assert published_phases(presets.game("single_basic")) == {}
-    assert published_phases(None) == {}
+    assert published_phases(presets.game("single_basic")) == published_phases(None) == {}
 
 
 def test_a_recording_of_a_training_too_long_for_the_search_has_no_phases():
@@ -140,98 +195,239 @@ def test_a_recording_of_a_training_too_long_for_the_search_has_no_phases():
 
 
 def test_while_code_is_compiled_the_live_header_says_for_how_long(monkeypatch):
-    monkeypatch.setattr(callback, "_PERIOD_S", 0.02)
-    told = []
+    monkeypatch.setattr(CompilingNotice, "PERIOD_S", 0.02)
+    said = []
 
-    def tell(status):
-        told.append(status)
+    def say(status):
+        said.append(status)
         if status == "begins":
-            notice.stop()
+            notice.close()
 
-    notice = callback.CompilingNotice(tell)
-    with callback.CLOCK.running():
-        while len(told) < 2:
+    notice = CompilingNotice(say)
+    with CLOCK.running():
+        while len(said) < 2:
             pass
-    while told[-1] != "begins":
+    while said[-1] != "begins":
         pass
-    assert told[0] == "compiling, 0 s so far"
+    assert said[0] == "compiling, 0 s so far"
 
 
 def test_the_recipe_is_a_table_of_places():
     same = {"kind": "DQN", "settings": {"gamma": 0.995}}
     recipe = {"name": "a|b", "agents": [same, same, {"kind": "Frozen"}], "loggers": [], "map": "A.\n.B"}
-    assert as_table(recipe).splitlines() == [
-        "| place | value |",
-        "| --- | --- |",
-        "| name | a\\|b |",
-        "| agents.0.kind | DQN |",
-        "| agents.0.settings.gamma | 0.995 |",
-        "| agents.1 | as agents.0 |",
-        "| agents.2.kind | Frozen |",
-        "| loggers | [] |",
-        "",
-        "`map`",
-        "",
-        "```",
-        "A.",
-        ".B",
-        "```",
-    ]
+    assert as_table(recipe) == (
+        "| place | value |\n"
+        "| --- | --- |\n"
+        "| name | a\\|b |\n"
+        "| agents.0.kind | DQN |\n"
+        "| agents.0.settings.gamma | 0.995 |\n"
+        "| agents.1 | as agents.0 |\n"
+        "| agents.2.kind | Frozen |\n"
+        "| loggers | [] |\n\n"
+        "`map`\n\n```\nA.\n.B\n```"
+    )
 
 
-def names(view):
-    """The names of all views and tabs of a layout."""
-    found = [str(own) for own in [getattr(view, "name", None)] if own]
-    for inner in getattr(view, "contents", None) or ():
-        found += names(inner) if not isinstance(inner, str) else []
-    return found
-
-
-def test_the_live_layout_has_the_present_policy_and_the_files_has_the_recorded_board():
-    live, file = (names(layout(SCENE, live=live).root_container) for live in (True, False))
-    assert "Present policy" in live
-    assert "Recorded episodes" in live
-    assert "Present policy" not in file
+def test_a_layout_has_the_views_of_what_a_game_reports_and_the_live_one_the_present_policy():
+    live, file, bare = (
+        set(names(view.root_container))
+        for view in (
+            layout(SCENE, live=True),
+            layout(SCENE),
+            layout(Curves(agents=("a",), metrics=(), has_tags=False)),
+        )
+    )
+    assert {"Present policy", "Recorded episodes", "Outcome"} <= live
     assert "Board" in file
-
-
-def test_a_game_without_a_board_or_metrics_has_no_empty_views():
-    bare = names(layout(Curves(agents=("a",), metrics=(), has_tags=False)).root_container)
-    assert "Outcome" not in bare
-    assert "Board" not in bare
-    assert "Who tagged whom" not in bare
-    assert {"Agents", "Learning", "Events", "Recipe"} <= set(bare)
+    assert "Present policy" not in file
+    assert {"Agents", "Learning", "Events", "Recipe"} <= bare
+    assert not {"Outcome", "Board", "Who tagged whom"} & bare
 
 
 def test_the_file_closes_while_the_live_view_goes_on(tmp_path):
-    with RerunLogger("run", tmp_path, scene=SCENE, live="serve") as logger:
+    with RerunLogger("run", tmp_path, curves=SCENE, live="serve") as logger:
         logger.log_document("header", "# one")
         logger.close_file()
         RrdReader(tmp_path / "run.rrd").store()
-        assert logger.is_served
+        assert logger.is_live
         logger.log_document("header", "# two")
         logger.flush()
-    assert not logger.is_served
+    assert not logger.is_live
     assert column(tmp_path / "run.rrd", "header", "TextDocument:text")[1] == [["# one"]]
     assert static(tmp_path / "run.rrd", "header", "TextDocument:media_type") == ["text/markdown"]
 
 
 def test_the_numbers_of_an_evaluation_are_means_with_their_error():
     episodes = [fake(5, 0, returned=apples, tagged=0) for apples in (10.0, 14.0)]
-    own = played(episodes)
-    assert (own.mean, own.error, own.died, own.episodes) == (12.0, 2.0, 2, 2)
+    assert played(episodes) == (12.0, 2.0, 2, 2)
     assert np.isnan(played(episodes[:1]).error)
 
 
 def test_the_header_says_where_a_run_is_and_how_to_read_its_plots():
     header = Header(episodes=4800, replicas=8, unit="apples")
-    line = header.line(episode=640, label="tragedy", mean=436.4, random_play=282.1, died=2.0)
-    assert all(word in line for word in ("640", "4,800", "tragedy", "436", "282", "2 of 8"))
-    notes = header.notes(window=96, of_mean=64)
-    assert all(word in notes for word in ("64 episodes", "96 episodes", "8 replicas"))
+    line = header.line(episode=640, label="tragedy", mean=436.4, random_play=282.1, died=2.0, over=64)
+    words = ("640", "4,800", "tragedy", "436", "282", "2 of 8", "64 episodes", "96 episodes", "8 replicas")
+    assert all(word in line for word in words)
     alone = Header(episodes=200, replicas=1, unit="return")
-    assert "replicas" not in alone.notes(window=10)
     for died in (None, float("nan"), 0.0):
-        line = alone.line(episode=1, label="harvesting", mean=4.25, random_play=None, died=died)
+        line = alone.line(episode=1, label="harvesting", mean=4.25, random_play=None, died=died, over=1)
         assert "return 4.25" in line
+        assert "replicas" not in line
         assert "died" not in line
+
+
+SMALL = Game(
+    map=maps.parse(".A>.A\n.A#A.\n..<.A"),
+    rules=Rules(regrow_prob=(0.0, 0.02), window_rows=3, window_columns=5, episode_steps=70),
+)
+
+
+class Remembers:
+    """The episodes, and the first replica's stock after each step."""
+
+    def __init__(self, env):
+        self.env, self.episodes, self.stocks = env, [], []
+
+    def on_step(self, batch):
+        self.stocks.append(int(self.env.worlds.now.stock_left[0, 0]))
+
+    def on_episode(self, episode, learning):
+        self.episodes.append(episode)
+
+
+def trained(folder, *, game=SMALL, replicas=2, episodes=6):
+    """The recording of a training of random agents, its callback, and what happened."""
+    env = CommonsEnv(game, replicas, seed=1)
+    seen = Remembers(env)
+    with ViewerCallback(folder, env, title="run", episodes=episodes) as viewer:
+        others = random_agents(game.spaces, tuple(range(game.agents)), replicas=replicas, seed=1)
+        train(env, {}, others=others, episodes=episodes, callbacks=[seen, viewer])
+    return folder / "run.rrd", viewer, seen
+
+
+def view_of(viewer, kind):
+    return next(view for view in viewer._views if isinstance(view, kind))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return trained(tmp_path_factory.mktemp("run"))
+
+
+def test_the_gini_coefficient_of_a_lorenz_curve_is_one_minus_equality():
+    for harvest in ([4.0, 1.0, 0.0], [2.0, 2.0], [0.0, 0.0, 0.0, 9.0], [5.0]):
+        equality = float(social.equality_of(torch.tensor(harvest)))
+        assert gini(lorenz_curve(np.array(harvest))) == pytest.approx(1 - equality)
+    assert np.isnan(lorenz_curve(np.zeros(3))).all()
+
+
+def test_the_lorenz_curve_is_the_mean_over_the_episodes_of_all_replicas(run):
+    path, _, seen = run
+    _, lines = column(path, "lorenz/lines", "LineStrips2D:strips", "episode")
+    _, titles = column(path, "lorenz/title", "Points2D:labels", "episode")
+    first = [own for own in seen.episodes if own.episode == 0 and own.harvest.sum()]
+    mean = np.mean([1 - own.metrics["equality"] for own in first])
+    assert titles[0][0].startswith(f"Gini {mean:.2f}: episode 1, {len(first)} with a harvest")
+    assert len(lines[0]) == 3, "equal shares, the first curve, this one"
+
+
+def test_the_wall_shows_each_replica_with_the_frame_of_the_same_step(run):
+    path, _, _ = run
+    wall = column(path, "wall/boards", "SegmentationImage:buffer", "frame")
+    images = dict(zip(*column(path, "world/board", "SegmentationImage:buffer", "frame"), strict=True))
+    assert 3 < len(wall[0]) < len(images) / 5
+    (top, left), second = Panels(2, (5, 7)).corners
+    for frame, pixels in zip(*wall, strict=True):
+        image = np.array(pixels[0], np.uint8).reshape(Panels(2, (5, 7)).shape)
+        first = image[top : top + 5, left : left + 7]
+        assert np.array_equal(first, np.array(images[frame][0], np.uint8).reshape(5, 7))
+    assert len(column(path, "wall/labels", "Points2D:labels")[1][0]) == 2
+    assert second[1] > left
+
+
+def test_the_line_of_a_replica_is_its_stock_turn_by_turn(run):
+    path, viewer, seen = run
+    first = [own for own in seen.episodes if own.world == 0]
+    steps = sum(own.steps for own in first[:-1])
+    stocks = seen.stocks[steps : steps + first[-1].steps - 1]
+    expected = [(0, len(SMALL.map.sites)), *enumerate(stocks, 1), (first[-1].steps, first[-1].stock_left)]
+    assert view_of(viewer, Turns).lines[0] == expected
+    _, colours = column(path, "turn/lines", "LineStrips2D:colors")
+    died = [own.terminated for own in seen.episodes if own.episode == 5]
+    assert len(set(colours[-1])) == len(set(died))
+
+
+def test_maps_show_where_agents_were_in_their_hues(run):
+    path, viewer, _ = run
+    visits = view_of(viewer, Visits)
+    visits.counts[:] = 0
+    assert (visits.maps()[:, 1, 1:-1] == PALETTE[GROUND]).all()
+    assert (visits.maps()[:, 2, 3] == PALETTE[WALL]).all()
+    visits.counts[[0, 1], [0, 2], [0, 4]] = [9, 1]
+    drawn = visits.maps()
+    assert drawn[0, 1, 1].tolist() == list(agent_colour(0)), "the longest stay is brightest"
+    assert drawn[1, 3, 5].sum() < sum(agent_colour(1))
+    assert drawn[1, 3, 5].argmax() == np.argmax(agent_colour(1))
+    _, labels = column(path, "visits/labels", "Points2D:labels", "episode")
+    assert labels[0] == ["0: episode 1", "1: episode 1"]
+
+
+@pytest.mark.parametrize(("drawing", "replicas"), [(">A", 1), ("A" * 12 + "\n" + ">" * 12, 8)])
+def test_any_number_of_agents_and_replicas_is_shown(drawing, replicas, tmp_path):
+    game = Game(map=maps.parse(drawing), rules=Rules(episode_steps=12, window_rows=2, window_columns=3))
+    path, _, _ = trained(tmp_path, game=game, replicas=replicas, episodes=2)
+    assert (static(path, "wall/boards", "SegmentationImage:format") is not None) == (replicas > 1)
+    assert bool(column(path, "lorenz/lines", "LineStrips2D:strips")[0]) == (game.agents > 1)
+    assert len(column(path, "visits/labels", "Points2D:labels")[1][0]) == game.agents
+    assert len(column(path, "turn/lines", "LineStrips2D:strips")[1][-1]) == replicas
+
+
+def test_the_wall_marks_a_board_that_has_died(run):
+    path, _, seen = run
+    frames, colours = column(path, "wall/died", "Boxes2D:colors", "step")
+    assert 0 < sum(own.terminated for own in seen.episodes) < len(seen.episodes), "some die, some live"
+    ended, died = 0, False
+    for own in (own for own in seen.episodes if own.world == 0):
+        rows = [row for step, row in zip(frames, colours, strict=True) if ended < step <= ended + own.steps]
+        assert all((row[0] >> 8 == 0xD55E00) == died for row in rows)
+        ended, died = ended + own.steps, own.terminated
+
+
+class Listener:
+    """Takes what is logged, as a logger with viewers does."""
+
+    is_live, frames = True, 12
+
+    def __init__(self):
+        self.rows, self.live_only = [], []
+
+    def log_static(self, name, *what):
+        """Nothing."""
+
+    def do(self, what, *, live_only=False):
+        self.live_only.append(live_only)
+        what(self)
+
+    def send_columns(self, entity, at, columns):
+        self.rows.append((entity, {line.timeline_name(): line.as_arrow_array().to_pylist() for line in at}))
+
+
+def test_viewers_get_the_wall_every_two_seconds_and_the_file_does_not(run, monkeypatch):
+    _, viewer, _ = run
+    clock, listener = iter(np.arange(10.0, 20.0, 0.8)), Listener()
+    monkeypatch.setattr("cprl.viewer.pictures.time.perf_counter", lambda: next(clock))
+    wall = Wall(viewer.env, listener, viewer.logger.scene, recorded_steps=100)
+    for step in range(1, 10):
+        wall.on_step(step, 3, None)
+    boards_at = [at for name, at in listener.rows if name == "wall/boards"]
+    assert boards_at == [{"step": [step], "episode": [3], "frame": [12]} for step in (1, 4, 7)]
+    assert listener.live_only == [True] * 3
+
+
+def test_boards_of_many_worlds_are_drawn_as_frames_of_one(run):
+    _, viewer, _ = run
+    now = viewer.env.worlds.now
+    state = {name: getattr(now, name) for name in ("stock", "in_play", "row", "col")}
+    drawn = boards(viewer.logger.scene, {"step": now.step, **state})
+    assert drawn.shape == (2, 5, 7)
+    assert set(np.unique(drawn)) <= {GROUND, WALL, APPLE, FIRST_AGENT, FIRST_AGENT + 1}

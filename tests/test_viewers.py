@@ -20,8 +20,8 @@ from viewers import browser, native_viewer, wait_until
 from cprl.commons.colours import APPLE, PALETTE, agent_colour
 from cprl.training.outcome import exhibited
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.page import Page
-from cprl.viewer.scenery import SOCIAL
+from cprl.viewer.layout import SOCIAL
+from cprl.viewer.page import WebViewer
 
 pytestmark = pytest.mark.viewer
 
@@ -213,7 +213,7 @@ def test_the_web_viewer_in_chromium_shows_a_live_training(training, tmp_path):
 
 def test_the_web_viewer_shows_a_recording_that_is_served_from_its_file(tmp_path):
     run = Path(__file__).parents[1] / "docs" / "results" / "commons" / "replay-0-0.rrd"
-    page = Page([run])
+    page = WebViewer([run])
     with browser(page.address()) as take_picture:
         look_until(
             lambda picture: len(spots(picture, (0.0, 0.0, 0.6, 0.8), PALETTE[APPLE], within=4)) > 3000,

@@ -1,16 +1,23 @@
 """The recordings of docs/results, and the page that plays them in Rerun's web viewer, that of rerun-sdk."""
 
 import shutil
+import time
 from functools import cache
 from html import escape
 from pathlib import Path
 from typing import Final
+from urllib.error import URLError
 from urllib.parse import quote
+from urllib.request import ProxyHandler, build_opener
+
+from cprl.viewer.page import LOCALHOST, WebViewer
 
 RESULTS: Final = Path(__file__).parents[1] / "results"
 PAGE: Final = "replays.md"
 FOLDER: Final = "recordings"
 VIEWER: Final = "viewer"
+VIEWER_FILES: Final = ("index.html", "re_viewer.js", "re_viewer_bg.wasm", "sw.js", "favicon.ico")
+START_S: Final = 30.0
 
 _TEMPLATE: Final = Path(__file__).parent / "replays.md"
 """The page, with {links} where they go."""
@@ -42,9 +49,25 @@ def stage_replays(folder: Path) -> None:
 
 
 def copy_viewer(folder: Path) -> None:
-    """Writes the web viewer of the installed rerun-sdk, 43 MB, beside the pages."""
-    from cprl.viewer.page import web_viewer
-
+    """Writes the web viewer of the installed rerun-sdk, 43 MB, beside the pages; Rerun's command has it built
+    in, and only hands it out as a server."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, content in web_viewer().items():
-        (folder / name).write_bytes(content)
+    server = WebViewer()
+    try:
+        for name in VIEWER_FILES:
+            (folder / name).write_bytes(_fetched(f"http://{LOCALHOST}:{server.port}/{name}"))
+    finally:
+        server.close()
+
+
+def _fetched(address: str) -> bytes:
+    """What a server answers that may just have been started."""
+    opener, ends = build_opener(ProxyHandler({})), time.monotonic() + START_S
+    while True:
+        try:
+            with opener.open(address, timeout=START_S) as answer:
+                return answer.read()
+        except URLError:
+            if time.monotonic() > ends:
+                raise
+            time.sleep(0.1)

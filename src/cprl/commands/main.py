@@ -5,7 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from contextvars import ContextVar
 from dataclasses import replace
 from importlib import import_module
@@ -216,12 +216,15 @@ def watch(run: Path, /, *, serve: bool = False) -> None:
 
 
 def _serve(files: Sequence[Path], *, why: str) -> None:
-    from cprl.viewer.page import Page, headers_of, viewer
+    from cprl.viewer.live import newest_header
+    from cprl.viewer.page import WebViewer, viewer
 
-    with TemporaryDirectory() as folder, suppress(KeyboardInterrupt):
-        page = Page([*headers_of(files, Path(folder)), *files])
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(TemporaryDirectory()))
+        stack.enter_context(suppress(KeyboardInterrupt))
+        page = stack.enter_context(closing(WebViewer([*newest_header(files, folder), *files])))
         say(f"Watch (browser): {page.address()}")
-        say(f"Watch (native): {printed([viewer(), *page.recordings])}")
+        say(f"Watch (native): {printed([viewer(), '--connect', page.data])}")
         say(f"{why}served on 127.0.0.1 until Ctrl-C")
         while True:
             time.sleep(1)

@@ -36,7 +36,6 @@ from cprl.training import train
 from cprl.training.agents import LoadedRun, load
 from cprl.values import Natural, Positive, Range, Seed, Value, Where, checked, refusal
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.institutions import has_institutions
 from cprl.viewer.replay import Decisions, Offences, events
 
 
@@ -137,7 +136,7 @@ def _views(viewer: ViewerCallback, fresh: FreshEpisode) -> Iterator[Decisions | 
         return
     actions = fresh.run.game.actions
     yield Decisions(logger, fresh.policies, actions=actions, names=scene.agents, window=scene.window)
-    if commons is not None and has_institutions(scene):
+    if commons is not None and scene.has_institutions:
         yield Offences(logger, commons, names=scene.agents)
 
 
@@ -165,7 +164,7 @@ class _Events:
 
     def _log(self, event: str) -> None:
         self.viewer.logger.at(step=self._step, episode=0)
-        self.viewer.log_event(f"step {self._step:,}: {event}")
+        self.viewer.logger.log_text(f"step {self._step:,}: {event}")
 
 
 DEFAULT_FPS: Final = 15.0

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -92,11 +92,7 @@ class LoadedRun:
     """Runs whose agents are frozen in this one, read once."""
 
     def __repr__(self) -> str:
-        experiment = self.experiment
-        return (
-            f"LoadedRun({str(self.path)!r}, {experiment.name!r}, {experiment.episodes} episodes, "
-            f"{experiment.replicas} replicas, {self.game.agents} agents)"
-        )
+        return f"LoadedRun({str(self.path)!r}, {self.experiment!r})"
 
     @cached_property
     def game(self) -> Any:
@@ -105,7 +101,6 @@ class LoadedRun:
 
     @property
     def specs(self) -> list[AgentSpec]:
-        """The specification of each agent."""
         return specs_by_agent(self.experiment.agents, self.game.agents)
 
     @cached_property
@@ -221,21 +216,18 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
 
 def _networks(run: LoadedRun, weights: Mapping[str, Any]) -> dict[str, nn.Module]:
     networks = {}
-    no_network = f"{run.path / RECIPE_FILE}: a network cannot be made"
-    reason = no_weights = f"{run.weights_from} holds no weights of this run"
+    refusal = no_weights = f"{run.weights_from} holds no weights of this run"
     try:
-        for name, state in weights.items():
-            lane = name if "/" in name else f"replica_0/{name}"
+        for lane, state in weights.items():
             spec = run.specs[int(lane.rpartition("_")[2])]
             if not isinstance(spec, Learning | Team):
                 raise ValueError(f"{lane} is the network of an agent that does not learn")
-            reason = no_network
-            network = acting_part(made(spec.algorithm).make_network(run.spaces))
-            reason = no_weights
-            network.load_state_dict(state)
-            networks[lane] = network
+            refusal = f"{run.path / RECIPE_FILE}: a network cannot be made"
+            networks[lane] = acting_part(made(spec.algorithm).make_network(run.spaces))
+            refusal = no_weights
+            networks[lane].load_state_dict(state)
     except Exception as error:
-        raise ValueError(f"{reason}: {error}") from error
+        raise ValueError(f"{refusal}: {error}") from error
     if not networks and any(isinstance(spec, Learning | Team) for spec in run.specs):
         raise ValueError(f"{no_weights}: it is empty")
     if networks and not any(all_finite(network.state_dict().values()) for network in networks.values()):
@@ -245,11 +237,10 @@ def _networks(run: LoadedRun, weights: Mapping[str, Any]) -> dict[str, nn.Module
 
 def _trained(spec: Learning | Team, network: nn.Module, decisions: Tensor | None) -> StoredAgent:
     algorithm = made(spec.algorithm)
-    stochastic = bool(algorithm.stochastic)
     return StoredAgent(
         network=network,
-        stochastic=stochastic,
-        epsilon=0.0 if stochastic else float(getattr(algorithm.settings, "epsilon_evaluation", 0.0)),
+        stochastic=algorithm.stochastic,
+        epsilon=0.0 if algorithm.stochastic else getattr(algorithm.settings, "epsilon_evaluation", 0.0),
         algorithm=repr(spec.algorithm),
         decisions=decisions,
     )
@@ -269,55 +260,58 @@ def stored_policies(
         agents: by agent and replica.
         seed: what random numbers follow from, with the replica and the agent.
     """
-    alike: dict[Any, list[int]] = {}
-    for agent, of_replicas in enumerate(agents):
-        alike.setdefault(of_replicas[0].kind, []).append(agent)
-    actors: dict[AgentIndices, nn.Module] = {}
-    for together in alike.values():
-        seeds = lane_seeds(seed, replicas=replicas, agents=together, purpose=EVALUATION)
-        lanes = [agents[agent][place] for place in range(len(replicas)) for agent in together]
-        actors[tuple(together)] = _actor(
-            lanes, playing, seeds=seeds, agents=len(together), worlds=worlds, stacks=True
-        )
+    by_index = dict(enumerate(agents))
+    kinds = {agent: of_replicas[0].kind for agent, of_replicas in by_index.items()}
+    seeds = partial(lane_seeds, seed, replicas=replicas, purpose=EVALUATION)
     decisions = None
     if isinstance(playing, Game):
         values = [[stored.decisions for stored in of_replicas] for of_replicas in agents]
         decisions = stored_decisions(values, playing, replicas=replicas, worlds=worlds, seed=seed)
+    actors = _actors(by_index, playing, kinds=kinds, seeds=seeds, worlds=worlds, stacks=True)
     return AgentPolicies(actors, decisions=decisions)
 
 
-def _actor(
-    lanes: Sequence[StoredAgent],
+def _actors(
+    agents: Mapping[int, Sequence[StoredAgent]],
     playing: Game | Spaces,
     *,
-    seeds: Sequence[Sequence[int]],
-    agents: int,
+    kinds: Mapping[int, Any],
+    seeds: Callable[..., Sequence[Sequence[int]]],
     worlds: int,
     stacks: bool = False,
-) -> nn.Module:
-    """One actor for stored agents of one kind, a lane each.
+) -> dict[AgentIndices, nn.Module]:
+    """Actors for stored agents, those of a kind as lanes of one: lane = replica x agents + agent.
 
     Args:
-        seeds: of each lane, lane = replica x agents + agent.
-        agents: how many agents of a replica it controls.
+        agents: of each replica, by index.
+        seeds: those of the lanes of some `agents`.
         stacks: whether lanes of one and the same network are stacked too, so that its values are, to the last
             bit, those that it has among others.
     """
-    first = lanes[0]
-    of_lanes: dict[str, Any] = {"seeds": seeds, "agents": agents, "worlds": worlds}
-    if first.scripted is not None:
-        return scripted_lanes(first.scripted, playing, **of_lanes)
-    networks: list[Any] = [lane.network for lane in lanes]
+    alike: dict[Any, list[int]] = {}
+    for agent in sorted(agents):
+        alike.setdefault(kinds[agent], []).append(agent)
     spaces = playing.spaces if isinstance(playing, Game) else playing
-    actor = LaneActor(
-        _side_by_side(networks, stacks=stacks),
-        spaces.actions,
-        stochastic=first.stochastic,
-        state_cells=state_cells_of(networks[0]),
-        **of_lanes,
-    )
-    actor.epsilon = first.epsilon
-    return actor
+    actors: dict[AgentIndices, nn.Module] = {}
+    for together in alike.values():
+        of_replicas = zip(*(agents[agent] for agent in together), strict=True)
+        lanes = [lane for of_replica in of_replicas for lane in of_replica]
+        first = lanes[0]
+        common: dict[str, Any] = {"seeds": seeds(agents=together), "agents": len(together), "worlds": worlds}
+        if first.scripted is not None:
+            actors[tuple(together)] = scripted_lanes(first.scripted, playing, **common)
+            continue
+        networks: list[Any] = [lane.network for lane in lanes]
+        actor = LaneActor(
+            _side_by_side(networks, stacks=stacks),
+            spaces.actions,
+            stochastic=first.stochastic,
+            state_cells=state_cells_of(networks[0]),
+            **common,
+        )
+        actor.epsilon = first.epsilon
+        actors[tuple(together)] = actor
+    return actors
 
 
 def _side_by_side(networks: Sequence[nn.Module], *, stacks: bool) -> Callable[..., Any]:
@@ -372,8 +366,7 @@ class Population:
         self.learners: dict[tuple[int, ...], Learner] = {}
         for spec, agents in self._groups:
             if isinstance(spec, Learning | Team):
-                start = self._start_weights(spec, agents) if starts else {}
-                self.learners[agents] = self._learner(spec, agents, engine, start)
+                self.learners[agents] = self._learner(spec, agents, engine, starts)
         self.others: dict[AgentIndices, nn.Module] = self._others(EXPLORATION, worlds=1)
         self.decisions: BanditDecider | None = self._decisions()
         """What the agents decide, and learn to, where the game asks them."""
@@ -463,19 +456,16 @@ class Population:
         """The actors of the agents that do not learn, with random numbers for a purpose; for so many
         replicas, all by default. Scripted agents of one policy act as lanes of one actor, and agents of one
         kind from one stored run."""
-        alike: dict[Any, list[int]] = {}
-        for spec, indices in self._groups:
-            if not isinstance(spec, Learning | Team):
-                key = getattr(spec, "run", None), self._stored[indices[0]][0].kind
-                alike.setdefault(key, []).extend(indices)
         numbers = self._numbers[:replicas]
-        actors: dict[AgentIndices, nn.Module] = {}
-        for together in alike.values():
-            agents = tuple(sorted(together))
-            lanes = [self._stored[agent][place] for place in range(len(numbers)) for agent in agents]
-            seeds = lane_seeds(self.seed, replicas=numbers, agents=agents, purpose=purpose)
-            actors[agents] = _actor(lanes, self.playing, seeds=seeds, agents=len(agents), worlds=worlds)
-        return actors
+        agents = {agent: of_replicas[: len(numbers)] for agent, of_replicas in self._stored.items()}
+        kinds = {
+            agent: (getattr(spec, "run", None), self._stored[agent][0].kind)
+            for spec, indices in self._groups
+            for agent in indices
+            if agent in agents
+        }
+        seeds = partial(lane_seeds, self.seed, replicas=numbers, purpose=purpose)
+        return _actors(agents, self.playing, kinds=kinds, seeds=seeds, worlds=worlds)
 
     def _decisions(self) -> BanditDecider | None:
         sizes = () if self._game is None else ballot_sizes(self._game)
@@ -501,9 +491,7 @@ class Population:
             first_replica=self._numbers.start,
         )
 
-    def _learner(
-        self, spec: Learning | Team, agents: tuple[int, ...], engine: Any, start: Mapping[str, Any]
-    ) -> Learner:
+    def _learner(self, spec: Learning | Team, agents: tuple[int, ...], engine: Any, starts: bool) -> Learner:
         who = LearningAgents(
             self.spaces,
             agents=agents,
@@ -511,18 +499,16 @@ class Population:
             seed=self.seed,
             first_replica=self._numbers.start,
             reward_kind=spec.reward,
-            start_from=start,
+            start_from=self._start_weights(spec, agents) if starts else {},
             share_parameters=isinstance(spec, Team) and spec.share_parameters,
             device=self._device,
         )
         learner = _algorithm_of(spec).make_learner(who, engine)
         wants = getattr(learner, "wants", None)
         if not isinstance(spec.reward, str) and getattr(wants, "preferences", None) != spec.reward:
-            algorithm = spec.algorithm
-            name = algorithm.target if isinstance(algorithm, Custom) else type(algorithm).__name__
             raise ValueError(
-                f"reward is {named(spec.reward)}, which the learner of {name} does not have as its `wants`; "
-                "allowed for it: 'individual', 'team'"
+                f"reward is {named(spec.reward)}, which the learner of {_name(spec)} does not have as its "
+                "`wants`; allowed for it: 'individual', 'team'"
             )
         return learner
 
@@ -645,10 +631,13 @@ def _algorithm_of(spec: Learning | Team) -> Algorithm:
     kind = TeamAlgorithm if isinstance(spec, Team) and not is_sharing else Algorithm
     algorithm = made(spec.algorithm)
     if not isinstance(algorithm, kind):
-        target = f" of {spec.algorithm.target}" if isinstance(spec.algorithm, Custom) else ""
         raise ValueError(
-            f"the algorithm{target} is a {type(algorithm).__name__}; allowed: a subclass of "
+            f"the algorithm of {_name(spec)} is a {type(algorithm).__name__}; allowed: a subclass of "
             f"cprl.algorithms.{kind.__name__}"
         )
     refuse_sharing(algorithm, is_sharing)
     return algorithm
+
+
+def _name(spec: Learning | Team) -> str:
+    return spec.algorithm.target if isinstance(spec.algorithm, Custom) else type(spec.algorithm).__name__

@@ -49,8 +49,8 @@ from cprl.training.outcome import (
     write_evaluation,
 )
 from cprl.training.training import Training, check_callbacks, train
-from cprl.viewer.watching import check_linger, check_watch
-from cprl.viewer.watching import linger as stay_served
+from cprl.viewer.page import check_watch
+from cprl.viewer.page import linger as stay_served
 
 if TYPE_CHECKING:
     from cprl.viewer.callback import ViewerCallback
@@ -83,7 +83,7 @@ def run(
         keep_checkpoint: whether a finished run keeps the state of its training, buffers included, so that it
             can be extended.
         watch: "file" for a recording for the Rerun viewer; "serve" or "spawn" to watch
-            live as well, see `cprl.viewer.streams.open_live`; "off" for none.
+            live as well, see `cprl.viewer.live.Live`; "off" for none.
         linger: whether the recording stays served after the run, until Ctrl-C (SIGINT) or SIGTERM; only with
             `watch` "serve" or "spawn".
         allow: the user's own code, "module:Class", that the process trusts from now on; stored runs of
@@ -107,29 +107,29 @@ def run(
     """
     times = RunTimes()
     free_earlier()
-    out = None if out is None else Path(out)
-    check_watch(watch)
-    check_linger(linger, watch)
+    check_watch(watch, linger=linger)
     for logger in experiment.loggers:
         check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
     trust(*allow)
     prepare_process(experiment.seed)
-    is_begun = resume and out is not None and bool(checkpoints_in(out / FOLDER))
-    weights = _weights_of_partners(experiment, out) if resume and out is not None else {}
+    out = None if out is None else Path(out)
+    is_new, is_begun = out is None or not out.exists(), False
+    weights: dict[str, str] = {}
+    if resume and out is not None:
+        is_begun, weights = bool(checkpoints_in(out / FOLDER)), _weights_of_partners(experiment, out)
     env, population = make_agents(experiment, starts=not is_begun, weights=weights)
     observers: list[Any] = [*(made(callback) for callback in experiment.callbacks), *callbacks]
     check_callbacks(observers)
     episodes = refuse_another_run(out, experiment.to_recipe, Experiment) if resume else experiment.episodes
-    is_new = out is None or not out.exists()
     if not resume or out is None:
         directory = start_run(out, experiment.name, lambda directory: _recipe(experiment, directory))
-    elif episodes == experiment.episodes and (out / REPORT).exists():
-        _tidy_up(out, keep_checkpoint=keep_checkpoint, take_over=take_over)
-        return out
-    else:
+    elif episodes < experiment.episodes or not (out / REPORT).exists():
         directory = out
         if episodes < experiment.episodes:
             refuse_to_extend(out, episodes, observers)
+    else:
+        _tidy_up(out, keep_checkpoint=keep_checkpoint, take_over=take_over)
+        return out
     checkpointer = Checkpointer(directory, keep_ending=keep_checkpoint, take_over=take_over)
     closing = ExitStack()  # of the viewer, which outlives the rest
     try:
@@ -137,29 +137,14 @@ def run(
             if resume:
                 _begin_again(directory, experiment, is_begun=is_begun, episodes=episodes)
             viewer = closing.enter_context(_make_viewer(watch, directory, experiment, env, population))
-            before: list[Episode] | None = None
-            with ExitStack() as stack:
-                table, bar, *loggers = _recorders(stack, directory, experiment, env)
-                if viewer is not None:
-                    before = random_play(experiment, population)
-                    viewer.random_play(before)
-                    observers.append(viewer)
-                evaluations = Evaluations(directory, experiment, env, population)
-                training = train(
-                    env,
-                    population.learners,
-                    others=population.others,
-                    decisions=population.decisions,
-                    episodes=experiment.episodes,
-                    callbacks=[evaluations, table, bar, *observers, *loggers],
-                    checkpointer=checkpointer,
-                    update_every=experiment.update_every,
-                    on_nan=experiment.on_nan,
-                )
-                _save(directory, env, population)
+            random = None if viewer is None else random_play(experiment, population)
+            if viewer is not None and random is not None:
+                viewer.random_play(random)
+                observers.append(viewer)
+            training = _train(directory, experiment, env, population, observers, checkpointer)
             if viewer is not None:
                 viewer.flush()
-            played = evaluate_population(experiment, env, population, random=before)
+            played = evaluate_population(experiment, env, population, random=random)
             write_evaluation(directory, played, of_replica=experiment.evaluation_episodes)
             if viewer is not None:
                 viewer.finished(played)
@@ -184,6 +169,41 @@ def run(
         if linger and viewer is not None:
             stay_served(viewer.logger, viewer.play_on)
     return directory
+
+
+def _train(
+    directory: Path,
+    experiment: Experiment,
+    env: EnvBase,
+    population: Population,
+    observers: Sequence[Any],
+    checkpointer: Checkpointer,
+) -> Training:
+    """Trains with the callbacks that write the table of episodes, show the progress and write to loggers, and
+    saves what was learned."""
+    replicas, names = experiment.replicas, agent_names(env)
+    with ExitStack() as stack:
+        table = stack.enter_context(EpisodeTable(directory / "episodes.parquet", resumable=True))
+        bar = stack.enter_context(ProgressBar(env, episodes=experiment.episodes, replicas=replicas))
+        loggers = [make_logger(made(logger), directory) for logger in experiment.loggers]
+        callbacks = [LoggerCallback(logger, replicas=replicas, agents=names) for logger in loggers]
+        evaluations = Evaluations(directory, experiment, env, population)
+        training = train(
+            env,
+            population.learners,
+            others=population.others,
+            decisions=population.decisions,
+            episodes=experiment.episodes,
+            callbacks=[evaluations, table, bar, *observers, *map(stack.enter_context, callbacks)],
+            checkpointer=checkpointer,
+            update_every=experiment.update_every,
+            on_nan=experiment.on_nan,
+        )
+        save_weights(directory, population.networks())
+        save_transforms(directory, transforms_state(env))
+        if population.decisions is not None:
+            save_decisions(directory, population.decisions.learned())
+    return training
 
 
 def _recipe(experiment: Experiment, directory: Path) -> dict[str, Any]:
@@ -234,26 +254,6 @@ def _make_viewer(
         live=None if watch == "file" else watch,
         exhibited=None if watch == "file" else exhibited(experiment, env, population),
     )
-
-
-def _recorders(stack: ExitStack, directory: Path, experiment: Experiment, env: EnvBase) -> list[Any]:
-    """The callbacks that write the table of episodes, show the progress and write to loggers."""
-    episodes, replicas, names = experiment.episodes, experiment.replicas, agent_names(env)
-    table = stack.enter_context(EpisodeTable(directory / "episodes.parquet", resumable=True))
-    bar = stack.enter_context(ProgressBar(env, episodes=episodes, replicas=replicas))
-    loggers = (
-        LoggerCallback(make_logger(made(logger), directory), replicas=replicas, agents=names)
-        for logger in experiment.loggers
-    )
-    return [table, bar, *map(stack.enter_context, loggers)]
-
-
-def _save(directory: Path, env: EnvBase, population: Population) -> None:
-    """Saves what was learned."""
-    save_weights(directory, population.networks())
-    save_transforms(directory, transforms_state(env))
-    if population.decisions is not None:
-        save_decisions(directory, population.decisions.learned())
 
 
 def _draw(directory: Path, experiment: Experiment, random: list[Episode]) -> Path:

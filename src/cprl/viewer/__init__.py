@@ -1,21 +1,16 @@
 """The Rerun recording of a training.
 
 Modules, in the order in which one reads them:
-    callback   ViewerCallback: logs a training while it runs; its lines, and who tagged whom
+    callback   ViewerCallback: logs a training while it runs, by a list of views
     story      header, live label, events, and the phases when it ends
-    views      the boards of all replicas, where agents go, stock over the turn, Lorenz curve, institutions
-    frames     which episodes are recorded frame by frame, and the frames of one world
+    pictures   View; lines, tags, all boards at once, where agents go, stock over the turn, Lorenz curve
+    board      which episodes are recorded frame by frame, and how a board looks
     replay     what policies say of their actions, who breaks a rule, and what is paid
     exhibition a world that the present policy plays, for viewers alone
+    layout     what a recording shows, with names and colours, and where the viewer shows it
     logger     RerunLogger: TorchRL's logger interface on a recording
-    streams    to a file and served live, each of which may fail without harm
-    page       the web viewer's page on 127.0.0.1, and recordings for it
-    watching   a finished run stays served until Ctrl-C
-    scenery    what a recording shows, with names and colours
-    institutions  lines and tabs of games with institutions
-    panels     places in the viewer: several boards in one image, and plots that are not over time
-    stage      frames as Rerun's columns, agents as lines
-    blueprint  the layout of the viewer
+    live       the streams of a recording, to a file and served live, each of which may fail without harm
+    page       Rerun's viewers, native and in a browser; a finished run stays served until Ctrl-C
 """
 
 from importlib import import_module

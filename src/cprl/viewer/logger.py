@@ -4,7 +4,8 @@ import itertools
 import json
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -17,31 +18,31 @@ from torchrl.record.loggers import Logger
 
 from cprl.runs.files import read_json
 from cprl.runs.recipe import RECIPE_FILE
-from cprl.system.compat import send_chunk
+from cprl.system.compat import end_recordings
 from cprl.system.output import console, legible
 from cprl.values import shown
-from cprl.viewer.blueprint import layout
-from cprl.viewer.scenery import Curves, Scene
-from cprl.viewer.stage import columns, fixed
-from cprl.viewer.streams import (
-    FLUSH_TIMEOUT_S,
-    REPLAY,
-    RUN,
-    Live,
-    LiveStream,
-    Stream,
-    open_file,
-    open_live,
-    release,
-)
+from cprl.viewer.board import Frames, columns, fixed
+from cprl.viewer.layout import Curves, Scene, layout
+from cprl.viewer.live import FLUSH_TIMEOUT_S, REPLAY, RUN, Live, Stream, open_file, send_text
 
 FILE_NAME: Final = "run.rrd"
+TIMELINES: Final = ("step", "episode", "frame")
+"""The timelines of every row: environment steps of the run, episodes, and frames recorded so far."""
+
+_LIVE_PERIOD_S: Final = 4.0
+"""Sending a dozen numbers takes some ten milliseconds, in which a training waits for Python's lock."""
+_FILE_PERIOD_S: Final = 60.0
+"""Each batch of numbers adds about forty kilobytes to the file, however few they are."""
+_LONGEST: Final = 90
+"""Characters of a value in the table; the recipe of the run has them all."""
+
+Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
 
 
-def free_name(run: Path) -> str:
-    """run.rrd, or run-2.rrd and so on if the run has a recording already."""
+def recordings_of(run: Path) -> list[Path]:
+    """The recordings of a run so far, in their order: run.rrd, run-2.rrd and so on."""
     names = (FILE_NAME if number == 1 else f"run-{number}.rrd" for number in itertools.count(1))
-    return next(name for name in names if not (run / name).exists())
+    return list(itertools.takewhile(Path.exists, (run / name for name in names)))
 
 
 def recording_id(run: Path, file_name: str) -> str | None:
@@ -51,10 +52,6 @@ def recording_id(run: Path, file_name: str) -> str | None:
     recipe = read_json(run / RECIPE_FILE)
     same = {name: value for name, value in recipe.items() if name not in ("experiment", "extended")}
     return str(uuid.uuid5(uuid.NAMESPACE_URL, file_name + json.dumps(same, sort_keys=True)))
-
-
-_LONGEST: Final = 90
-"""Characters of a value in the table; the recipe of the run has them all."""
 
 
 def as_table(recipe: Mapping[Any, Any]) -> str:
@@ -87,38 +84,12 @@ def _places(value: Any, place: str) -> Iterator[tuple[str, Any]]:
 
 
 def _short(value: Any) -> str:
-    text = value if isinstance(value, str) else repr(value) if isinstance(value, float) else _plain(value)
+    text = value if isinstance(value, str) else shown(value)
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
-
-
-def _plain(value: Any) -> str:
-    try:
-        return str(value)
-    except Exception:  # of whatever kind a user's object raises
-        return shown(value)
 
 
 def _cell(text: str) -> str:
     return text.replace("|", "\\|").replace("\n", " ")
-
-
-def numbers_in(data: Any) -> NDArray[Any]:
-    return np.asarray(data.detach().cpu() if isinstance(data, Tensor) else data).reshape(-1)
-
-
-def images_of(video: Tensor) -> NDArray[np.uint8]:
-    clip = torch.as_tensor(video).cpu()
-    clip = clip[0] if clip.ndim == 5 else clip
-    if clip.ndim != 4:
-        raise ValueError(f"the video is {list(video.shape)}; allowed: [T, C, H, W] or [1, T, C, H, W]")
-    images: NDArray[np.uint8] = clip.permute(0, 2, 3, 1).to(torch.uint8).numpy()
-    return images
-
-
-TIMELINES: Final = ("step", "episode", "frame")
-"""The timelines of every row: environment steps of the run, episodes, and frames recorded so far."""
-
-Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
 
 
 def times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
@@ -127,24 +98,6 @@ def times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
         rr.TimeColumn(name, sequence=np.asarray(numbers, np.int64))
         for name, numbers in zip(TIMELINES, (steps, episodes, frames), strict=True)
     ]
-
-
-def components(columns: Iterable[Any]) -> dict[Any, Any]:
-    """Columns of an archetype as `cprl.system.compat.send_chunk` takes them."""
-    return {column.component_descriptor(): column.as_arrow_array() for column in columns}
-
-
-def timelines(at: Iterable[Any]) -> dict[str, Any]:
-    """`times` as `cprl.system.compat.send_chunk` takes them."""
-    return {column.timeline_name(): column.as_arrow_array() for column in at}
-
-
-def log_now(recording: Any, name: str, what: Any, now: tuple[int, int, int]) -> None:
-    """Logs one row that has no columns, such as a tensor, at a (step, episode, frame)."""
-    for timeline, number in zip(TIMELINES, now, strict=True):
-        recording.set_time(timeline, sequence=number)
-    recording.log(name, what)
-    recording.reset_time()
 
 
 def send_waiting(stream: Stream) -> None:
@@ -156,39 +109,23 @@ def send_waiting(stream: Stream) -> None:
     waiting = stream.take()
 
     def send(recording: Any) -> None:
-        known: dict[Any, dict[str, Any]] = {}  # most names have the same times
+        known: dict[Any, list[Any]] = {}  # most names have the same times
         for name, rows in waiting.items():
             *at, values = zip(*rows, strict=True)
-            if isinstance(stream, LiveStream) and isinstance(values[-1], str):
+            if stream.is_live and isinstance(values[-1], str):
                 send_text(recording, name, values[-1])
                 continue
             if tuple(at) not in known:
-                known[tuple(at)] = timelines(times(*at))
-            send_chunk(recording, name, known[tuple(at)], components(_columns(values)))
+                known[tuple(at)] = times(*at)
+            if isinstance(values[0], str):
+                what: Any = rr.TextDocument.columns(text=list(values))
+            else:
+                lines = [len(line) for line in values]
+                what = rr.Scalars.columns(scalars=np.concatenate(values)).partition(lines)
+            recording.send_columns(name, known[tuple(at)], what)
         recording.flush(timeout_sec=FLUSH_TIMEOUT_S)
 
     stream.do(send)
-
-
-def send_text(recording: Any, name: str, text: str) -> None:
-    """Sends a Markdown text without a time, which takes the place of the one before at all times.
-
-    A server sends it before the history, so who connects late never reads an old one as the present.
-    """
-    send_chunk(recording, name, {}, components(rr.TextDocument.columns(text=[text])))
-
-
-def _columns(values: Sequence[Any]) -> Any:
-    """Markdown texts, or equally many numbers in each row."""
-    if isinstance(values[0], str):
-        return rr.TextDocument.columns(text=list(values))
-    return rr.Scalars.columns(scalars=np.concatenate(values)).partition([len(value) for value in values])
-
-
-_LIVE_PERIOD_S: Final = 4.0
-"""Sending a dozen numbers takes some ten milliseconds, in which a training waits for Python's lock."""
-_FILE_PERIOD_S: Final = 60.0
-"""Each batch of numbers adds about forty kilobytes to the file, however few they are."""
 
 
 class RerunLogger(Logger):
@@ -200,9 +137,9 @@ class RerunLogger(Logger):
     one fails, the logger warns once, drops it and continues with the other.
 
     Args:
-        curves: the numbers that are plotted, if there is no scene, which has them too.
-        live: "serve" or "spawn", see `cprl.viewer.streams.open_live`; None for the file alone. The recording
-            and the page of the web viewer are served on 127.0.0.1 only.
+        curves: the numbers that are plotted; a `Scene` if there is a board.
+        live: "serve" or "spawn", see `cprl.viewer.live.Live`; None for the file alone. The recording and the
+            page of the web viewer are served on 127.0.0.1 only.
         exhibits: whether viewers are sent an exhibition too, see `cprl.viewer.exhibition`.
         recording_id: the viewer shows files with the same id as one recording; by default a new id.
 
@@ -215,23 +152,21 @@ class RerunLogger(Logger):
         exp_name: str,
         log_dir: str | Path,
         *,
-        scene: Scene | None = None,
         curves: Curves | None = None,
         live: str | None = None,
         exhibits: bool = False,
         file_name: str = FILE_NAME,
         recording_id: str | None = None,
     ) -> None:
-        self.scene = scene
-        self.curves = scene or curves or Curves(agents=())
+        self.curves = curves or Curves(agents=())
         self.recording_id = recording_id or f"{exp_name}-{time.time_ns()}"
         self.path = Path(log_dir) / file_name
         if self.path.exists():
             raise FileExistsError(
                 f"{self.path} exists and is not overwritten; use another directory or file_name"
             )
-        self.live = Live()
-        """What viewers are sent; nothing where the recording is written to a file alone."""
+        self.live: Live | None = None
+        """What viewers are sent; None where the recording is written to a file alone."""
         self._live, self._exhibits = live, exhibits
         self._streams: list[Stream] = []
         self.frames = 0
@@ -241,23 +176,28 @@ class RerunLogger(Logger):
         super().__init__(exp_name, str(log_dir))
 
     def _create_experiment(self) -> list[Any]:
-        recording_id = self.recording_id
         Path(self.log_dir).mkdir(parents=True, exist_ok=True)
-        application = REPLAY if isinstance(self.curves, Scene) and self.curves.is_replay else RUN
-        streams = [open_file(recording_id, self.path, layout(self.curves), _FILE_PERIOD_S, application)]
+        application = REPLAY if self.scene is not None and self.scene.is_replay else RUN
+        file = open_file(
+            self.recording_id,
+            self.path,
+            layout(self.curves),
+            period_s=_FILE_PERIOD_S,
+            application=application,
+        )
+        self._streams = [] if file is None else [file]
         if self._live:
-            self.live = open_live(
+            self.live = Live(
                 self._live,
-                recording_id,
+                self.recording_id,
                 layout(self.curves, live=True),
-                _LIVE_PERIOD_S,
-                application,
+                period_s=_LIVE_PERIOD_S,
+                application=application,
                 exhibits=self._exhibits,
             )
-            streams.append(self.live.stream)
+            self._streams.append(self.live.stream)
             for where, address in self.addresses.items():
                 console().print(f"Watch live ({where}): {address}", soft_wrap=True, highlight=False)
-        self._streams = [stream for stream in streams if stream is not None]
         self.do(lambda recording: recording.send_recording_name(self.exp_name))
         for entity, parts in fixed(self.curves).items():
             self.log_static(entity, *parts)
@@ -265,34 +205,57 @@ class RerunLogger(Logger):
         return [stream.recording for stream in self._streams]
 
     @property
+    def scene(self) -> Scene | None:
+        """The board that is shown, if there is one."""
+        return self.curves if isinstance(self.curves, Scene) else None
+
+    @property
     def addresses(self) -> dict[str, str]:
-        return self.live.addresses
+        """How to watch live: "browser" and "native"."""
+        return {} if self.live is None else self.live.addresses
+
+    @property
+    def is_live(self) -> bool:
+        """Whether viewers can connect: the live stream is open and served."""
+        return self.live is not None and self.live.stream.is_open
 
     def do(self, what: Callable[[Any], object], *, live_only: bool = False) -> None:
         """Calls a function with each recording, or with that to viewers alone, in the thread that sends."""
         for stream in self._streams:
-            if isinstance(stream, LiveStream) or not live_only:
+            if stream.is_live or not live_only:
                 stream.do(what)
+
+    @contextmanager
+    def silent(self) -> Iterator[None]:
+        """Log nothing within the block."""
+        streams, self._streams = self._streams, []
+        try:
+            yield
+        finally:
+            self._streams = streams
 
     def log_static(self, entity: str, *what: Any) -> None:
         """Logs archetypes that hold at all times."""
         self.do(lambda recording: recording.log(entity, *what, static=True))
 
-    def _send(self, entity: str, at: list[Any], what: Any, *, live_only: bool = False) -> None:
-        self.do(lambda recording: recording.send_columns(entity, at, what), live_only=live_only)
+    def log_row(self, name: str, what: Any, *, step: int | None = None) -> None:
+        """Logs an archetype at the time set by `at`, or at another step."""
+        at = self._now[0] if step is None else step, self._now[1], self.frames
 
-    @property
-    def is_live(self) -> bool:
-        return any(isinstance(stream, LiveStream) for stream in self._streams)
+        def log(recording: Any) -> None:
+            for timeline, number in zip(TIMELINES, at, strict=True):
+                recording.set_time(timeline, sequence=number)
+            recording.log(name, what)
+            recording.reset_time()
 
-    def log_row(self, name: str, what: Any) -> None:
-        """Logs an archetype at the time set by `at`."""
-        now = (*self._now, self.frames)
-        self.do(lambda recording: log_now(recording, name, what, now))
+        self.do(log)
 
-    def log_columns(self, name: str, at: tuple[Numbers, Numbers, Numbers], what: Any) -> None:
+    def log_columns(
+        self, name: str, at: tuple[Numbers, Numbers, Numbers], what: Any, *, live_only: bool = False
+    ) -> None:
         """Logs rows at steps, episodes and frames of their own."""
-        self._send(name, times(*at), what)
+        columns = times(*at)
+        self.do(lambda recording: recording.send_columns(name, columns, what), live_only=live_only)
 
     def at(self, *, step: int, episode: int) -> None:
         """Sets the time of subsequent logs that have no step of their own."""
@@ -300,14 +263,10 @@ class RerunLogger(Logger):
 
     def log_scalar(self, name: str, value: Any, step: int | None = None, **kwargs: Any) -> None:
         """Logs a number, or a list, array or tensor of numbers as name/0, name/1 and so on."""
-        if isinstance(value, Tensor | np.ndarray | list | tuple):
-            numbers = numbers_in(value)
-            if numbers.size != 1:
-                for index, number in enumerate(numbers):
-                    self.log_scalar(f"{name}/{index}", float(number), step)
-                return
-            value = numbers[0]
-        self._wait(name, self._now[0] if step is None else int(step), [float(value)])
+        numbers = _numbers_in(value)
+        for index, number in enumerate(numbers.tolist()):
+            entity = name if numbers.size == 1 else f"{name}/{index}"
+            self._wait(entity, self._now[0] if step is None else int(step), [float(number)])
 
     def log_lines(self, name: str, values: Sequence[float]) -> None:
         """Logs the numbers of several lines of one plot, equally many each time; NaN leaves a gap."""
@@ -329,31 +288,22 @@ class RerunLogger(Logger):
 
     def log_states(self, name: str, states: Mapping[int, str], *, live_only: bool = False) -> None:
         """Logs states by the episode from which they hold; their step is the one set by `at`."""
-        episodes = list(states)
-        at = times([self._now[0]] * len(episodes), episodes, [self.frames] * len(episodes))
-        self._send(name, at, rr.StateChange.columns(state=list(states.values())), live_only=live_only)
+        at = [self._now[0]] * len(states), list(states), [self.frames] * len(states)
+        what = rr.StateChange.columns(state=list(states.values()))
+        self.log_columns(name, at, what, live_only=live_only)
 
-    def log_matrix(self, name: str, matrix: NDArray[Any], dims: Sequence[str]) -> None:
-        """Logs a matrix of numbers, float32 [rows, columns], with the names of its two axes."""
-        values = np.array(matrix, np.float32)  # a copy, because a viewer gets it later
-        self.log_row(name, rr.Tensor(values, dim_names=list(dims)))
-
-    def log_frames(self, frames: Mapping[str, NDArray[Any]]) -> None:
-        """Logs frames of `FrameRecorder.take`; see `stage.columns`."""
+    def log_frames(self, frames: Frames) -> None:
+        """Logs frames of `FrameRecorder.take`; see `cprl.viewer.board.columns`."""
         if self.scene is None:
-            raise ValueError("the logger has no scene; pass scene to log frames")
-        count = len(frames["step"])
-        if not count:
-            return
-        numbers = np.arange(self.frames, self.frames + count)
-        self.frames += count
+            raise ValueError("the logger has no scene; pass a Scene as curves to log frames")
+        numbers = np.arange(self.frames, self.frames + len(frames["step"]))
+        self.frames += len(numbers)
         for entity, (rows, what) in columns(self.scene, frames).items():
-            at = times(frames["step"][rows], frames["episode"][rows], numbers[rows])
-            self._send(entity, at, what)
+            self.log_columns(entity, (frames["step"][rows], frames["episode"][rows], numbers[rows]), what)
 
     def log_text(self, text: str, level: str = "INFO") -> None:
-        at = times([self._now[0]], [self._now[1]], [self.frames])
-        self._send("log", at, rr.TextLog.columns(text=[text], level=[level]))
+        at = [self._now[0]], [self._now[1]], [self.frames]
+        self.log_columns("log", at, rr.TextLog.columns(text=[text], level=[level]))
 
     def log_hparams(self, cfg: Any) -> None:
         """Logs a mapping, as a table, or a Markdown text, as the recipe of the run."""
@@ -366,28 +316,29 @@ class RerunLogger(Logger):
         Starts after the last image of an earlier clip with the same name, because TorchRL's recorders pass
         the number of the clip as its step.
         """
-        images = images_of(video)
+        clip = torch.as_tensor(video).cpu()
+        clip = clip[0] if clip.ndim == 5 else clip
+        if clip.ndim != 4:
+            raise ValueError(f"the video is {list(video.shape)}; allowed: [T, C, H, W] or [1, T, C, H, W]")
+        count, channels, height, width = clip.shape
         first = max(self._now[0] if step is None else int(step), self._clips_end.get(name, 0))
-        self._clips_end[name] = first + len(images)
-        count = len(images)
-        at = times(range(first, first + count), [self._now[1]] * count, [self.frames] * count)
+        self._clips_end[name] = first + count
         form = rr.components.ImageFormat(
-            width=images.shape[2],
-            height=images.shape[1],
-            color_model="L" if images.shape[3] == 1 else "RGB",
+            width=width,
+            height=height,
+            color_model="L" if channels == 1 else "RGB",
             channel_datatype=rr.ChannelDatatype.U8,
         )
-        buffer = images.reshape(count, -1).copy()
-        self._send(name, at, rr.Image.columns(buffer=buffer, format=[form] * count))
+        buffer = clip.permute(0, 2, 3, 1).to(torch.uint8).numpy().reshape(count, -1).copy()
+        at = range(first, first + count), [self._now[1]] * count, [self.frames] * count
+        self.log_columns(name, at, rr.Image.columns(buffer=buffer, format=[form] * count))
 
     def log_histogram(
         self, name: str, data: Any, *, bins: int = 30, step: int | None = None, **kwargs: Any
     ) -> None:
         """Logs a histogram of values in equal bins, as bars."""
-        now = self._now[0] if step is None else int(step), self._now[1], self.frames
-        counts, edges = np.histogram(numbers_in(data), bins=bins)
-        bars = rr.BarChart(counts, abscissa=(edges[:-1] + edges[1:]) / 2)
-        self.do(lambda recording: log_now(recording, name, bars, now))
+        counts, edges = np.histogram(_numbers_in(data), bins=bins)
+        self.log_row(name, rr.BarChart(counts, abscissa=(edges[:-1] + edges[1:]) / 2), step=step)
 
     def flush(self) -> None:
         """Sends all buffered numbers to the file and to the viewer."""
@@ -400,28 +351,22 @@ class RerunLogger(Logger):
             ended = layout(self.curves, live=True, ended=True)
             self.do(lambda recording: recording.send_blueprint(ended), live_only=True)
 
-    @property
-    def is_served(self) -> bool:
-        """Whether viewers can still connect: the live stream is open and served."""
-        return any(
-            isinstance(stream, LiveStream) and stream.recording is not None for stream in self._streams
-        )
-
     def close_file(self) -> None:
         """Flushes and closes the file, which gets its footer; the live stream goes on."""
         self.flush()
         for stream in self._streams:
-            if not isinstance(stream, LiveStream):
+            if not stream.is_live:
                 stream.close()
 
     def shutdown(self) -> None:
         """Flushes and closes the recording; the file gets its footer. A second call does nothing."""
-        self.flush()
-        for stream in self._streams:
-            stream.close()
-        self.live.close()
+        self.close_file()
+        if self.live is not None:
+            self.live.close()
         self.experiment.clear()
-        release()
+        if not any(stream.has_failed for stream in self._streams):  # the end of one would wait for its viewer
+            self._streams.clear()
+            end_recordings()
 
     close = shutdown
 
@@ -433,3 +378,7 @@ class RerunLogger(Logger):
 
     def __repr__(self) -> str:
         return f"RerunLogger(exp_name={self.exp_name!r}, path={str(self.path)!r}, addresses={self.addresses})"
+
+
+def _numbers_in(data: Any) -> NDArray[Any]:
+    return np.asarray(data.detach().cpu() if isinstance(data, Tensor) else data).reshape(-1)

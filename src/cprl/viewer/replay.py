@@ -15,11 +15,9 @@ from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode
 from cprl.policies.assignment import AgentPolicies, agent_indices
 from cprl.policies.lanes import LaneActor
-from cprl.viewer.institutions import GIVEN, PAID
+from cprl.viewer.board import RIM_CELLS
+from cprl.viewer.layout import APART, BACKGROUND, BAR, GIVEN, HIGH, PAID, decision_panels
 from cprl.viewer.logger import RerunLogger
-from cprl.viewer.panels import APART, BAR, HIGH, decision_panels
-from cprl.viewer.scenery import BACKGROUND
-from cprl.viewer.stage import RIM_CELLS
 
 ENTITY: Final = "decisions"
 SIGNS: Final = {  # the viewer ends at a sign that its font lacks

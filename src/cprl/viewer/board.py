@@ -1,14 +1,17 @@
-"""Frames of one world as Rerun archetypes: the board with its agents, and their windows."""
+"""The board of one world, frame by frame: which are recorded, and how they look in Rerun."""
 
+import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
-from typing import Any, Final
+from math import ceil
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
+from tensordict import TensorDictBase
 
+from cprl import keys
 from cprl.commons.colours import (
     APPLE,
     BEAM,
@@ -19,11 +22,128 @@ from cprl.commons.colours import (
     agent_mark,
     class_colour,
 )
-from cprl.commons.decoding import UNSEEN
+from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.commons.picture import DIGIT_HIGH, INK_COLOUR, MARK_COLOUR, POINTS, number_paths
 from cprl.commons.world import Bools, Bytes
-from cprl.viewer.panels import mosaic, mosaic_size, window_corners
-from cprl.viewer.scenery import Curves, Scene, classes, lines, state_colours
+from cprl.envs.commons_env import CommonsEnv
+from cprl.viewer.layout import Curves, Scene, classes, styles, window_corners
+
+if TYPE_CHECKING:
+    from cprl.viewer.logger import RerunLogger
+
+Floats = NDArray[np.float32]
+Frames = Mapping[str, NDArray[Any]]
+"""Columns of `FrameRecorder.take`, [T, ...] each, with windows as classes of `classes_seen`."""
+
+FRAMES_BYTES: Final = 45_000_000
+"""The target size of a file's regular frames, about; the frames after new bests come on top."""
+_PERIOD_S: Final = 1.0
+_FEWEST_FRAMES, _MOST_FRAMES = 50, 5000
+"""Frames are sent when an episode ends, when there are many, or after a second if there are some: each chunk
+has overhead."""
+
+
+class FrameRecorder:
+    """Copies the state of the first world after each step, and returns the frames when they are due.
+
+    Windows show the observations of the `CommonsEnv` itself, without transforms.
+    """
+
+    def __init__(self, env: CommonsEnv, scene: Scene, *, has_windows: bool = True) -> None:
+        self._env, self._has_tags, self._has_windows = env, scene.has_tags, has_windows
+        self._frames: list[dict[str, NDArray[Any]]] = []
+        self._tagged_by = np.full(env.game.agents, -1, np.int32)
+        """Who tagged each agent last; -1 if unknown."""
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def add(self, batch: TensorDictBase, *, step: int = 0, episode: int = 0) -> None:
+        """Copy a frame; `batch` is the latest step, and `step` counts those of the whole run."""
+        if self._has_tags:  # of several shooters the first
+            tagged_by = batch["next"][keys.TAGGED_BY][0].cpu().numpy()
+            tagged = tagged_by.any(1)
+            self._tagged_by[tagged] = tagged_by.argmax(1)[tagged]
+        self.add_board(step=step, episode=episode)
+
+    def add_board(self, *, step: int = 0, episode: int = 0) -> None:
+        """Copy a frame of the board as it is, e.g. when an episode begins."""
+        board = self._env.worlds.show(self._env.output)
+        frame = {"step": step, "episode": episode, "beams": board.board == BEAM, "tagged_by": self._tagged_by}
+        for name in ("stock", "row", "col", "heading", "in_play", "harvested"):
+            frame[name] = getattr(board, name)
+        if self._has_windows:
+            frame["windows"] = board.observation
+        self._frames.append({name: np.array(value) for name, value in frame.items()})
+
+    def take(self) -> Frames | None:
+        """Return all frames as columns, [T, ...] each, for `RerunLogger.log_frames`, or None."""
+        taken, self._frames = self._frames, []
+        if not taken:
+            return None
+        frames = {name: np.stack([frame[name] for frame in taken]) for name in taken[0]}
+        if self._has_windows:
+            frames["windows"] = classes_seen(self._env.game, frames["windows"])
+        return frames
+
+
+class Filming:
+    """Logs the frames of the first world in every k-th episode, including the first and the last, and in the
+    episode after each new best.
+    """
+
+    def __init__(
+        self, env: CommonsEnv | None, logger: "RerunLogger", scene: Scene | None, *, episodes: int
+    ) -> None:
+        self._logger, self._last, self._sent = logger, episodes - 1, time.perf_counter()
+        self._recorder: FrameRecorder | None = None
+        self.every = 0
+        """Episodes from one with frames to the next; 0 for no frames."""
+        if env is not None and scene is not None:
+            self._recorder = FrameRecorder(env, scene)
+            steps = episodes * env.game.rules.episode_steps
+            self.every = max(1, ceil(steps * _frame_bytes(scene) / FRAMES_BYTES))
+        self.shows_next = False
+        """Whether the running episode is recorded in any case."""
+        self.is_on = False
+        """Whether frames are recorded now; `choose` decides it."""
+
+    def is_shown(self, episode: int) -> bool:
+        """Whether the frames of an episode that runs now are recorded."""
+        is_chosen = self.every > 0 and (episode % self.every == 0 or self.shows_next or episode == self._last)
+        return is_chosen and episode <= self._last
+
+    def choose(self, episode: int) -> None:
+        self.is_on = self.is_shown(episode)
+
+    def add(self, batch: TensorDictBase, *, step: int, episode: int) -> int | None:
+        """Copies a frame if this episode's are recorded; returns its number, None if there is none."""
+        if self._recorder is None or not self.is_on:
+            return None
+        # Where an episode ends, the board is already that of the next one.
+        if keys.entry(keys.entry(batch, "next"), keys.DONE)[0, 0]:
+            self.send()
+            return None
+        self._recorder.add(batch, step=step, episode=episode)
+        count = len(self._recorder)
+        frame = self._logger.frames + count - 1
+        waited = time.perf_counter() - self._sent
+        if count >= _MOST_FRAMES or (waited > _PERIOD_S and count >= _FEWEST_FRAMES):
+            self.send()
+        return frame
+
+    def send(self) -> None:
+        self._sent = time.perf_counter()
+        frames = None if self._recorder is None else self._recorder.take()
+        if frames is not None:
+            self._logger.log_frames(frames)
+
+
+def _frame_bytes(scene: Scene) -> float:
+    """The largest size of one frame in a file, about; with a trained population on `commons` it is 500."""
+    rows, columns = mosaic_size(len(scene.agents), scene.window)
+    return 80 + 45 * len(scene.agents) + 0.35 * (rows * columns + scene.height * scene.width)
+
 
 RADIUS_CELLS: Final = 0.045
 """Half the width of a line, in cells."""
@@ -38,11 +158,8 @@ depth and half its width; the largest distance between points of a digit."""
 _TURNS: Final = np.array([[(1, 0), (0, 1)], [(0, 1), (-1, 0)], [(-1, 0), (0, -1)], [(0, -1), (1, 0)]])
 """What a heading makes of right and down, as seen by somebody headed up."""
 
-Floats = NDArray[np.float32]
 
-
-@dataclass(frozen=True)
-class Strokes:
+class Strokes(NamedTuple):
     """Lines of some agents, for each heading."""
 
     owner: NDArray[np.intp]
@@ -161,52 +278,47 @@ BEAM_OPACITY: Final = 0.7
 IMAGES: Final = ("board", "beams")
 """The parts of a board that are images of classes; all others are lines and boxes."""
 
-Frames = Mapping[str, NDArray[Any]]
-"""Columns of `FrameRecorder.take`, [T, ...] each, with windows as classes of `classes_seen`."""
-
 
 def image_form(size: tuple[int, int]) -> Any:
     """The format of an image of classes with so many rows and columns."""
     return rr.components.ImageFormat(width=size[1], height=size[0], channel_datatype=rr.ChannelDatatype.U8)
 
 
+def board_form(scene: Scene) -> Any:
+    return image_form((scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS))
+
+
 def fixed(curves: Curves) -> dict[str, list[Any]]:
     """The static parts of a recording, by entity: names and colours of what it shows, and of a `Scene` also
     sizes of images and the agents' frames."""
-    styles = lines(curves) | state_colours(curves)
-    header = rr.TextDocument.from_fields(media_type=rr.MediaType.MARKDOWN)
     parts = {
         "/": [classes(curves)],
-        **{entity: [style] for entity, style in styles.items()},
-        "header": [header],
+        **{entity: [style] for entity, style in styles(curves).items()},
+        "header": [rr.TextDocument.from_fields(media_type=rr.MediaType.MARKDOWN)],
     }
-    return parts | (_fixed_on_board(curves) if isinstance(curves, Scene) else {})
-
-
-def _fixed_on_board(scene: Scene) -> dict[str, list[Any]]:
-    form, image = image_form, rr.SegmentationImage.from_fields
-    board = image(format=form((scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS)))
-    agents, (rows, columns) = len(scene.agents), scene.window
-    colours = [agent_colour(agent) for agent in range(agents)]
-    corners = np.array(window_corners(agents, scene.window), np.float32)[:, ::-1]
-    styles = board_styles().items()
-    return {
-        **{f"world/{name}": [*parts, board] if name in IMAGES else parts for name, parts in styles},
-        "windows": [
-            classes(scene, class_colour),
-            image(format=form(mosaic_size(agents, scene.window)), opacity=1.0),
-        ],
-        "windows/frames": [
-            rr.Boxes2D(
-                mins=corners - 0.2,
-                sizes=np.full((agents, 2), (columns + 0.4, rows + 0.4)),
-                colors=colours,
-                radii=2 * OUT_STROKE_CELLS,
-                labels=list(scene.agents),
-                show_labels=False,
-            )
-        ],
-    }
+    if not isinstance(curves, Scene):
+        return parts
+    for name, styles_of_part in board_styles().items():
+        parts[f"world/{name}"] = styles_of_part
+        if name in IMAGES:
+            parts[f"world/{name}"].append(rr.SegmentationImage.from_fields(format=board_form(curves)))
+    agents, (rows, columns) = len(curves.agents), curves.window
+    corners = np.array(window_corners(agents, curves.window), np.float32)[:, ::-1]
+    parts["windows"] = [
+        classes(curves, class_colour),
+        rr.SegmentationImage.from_fields(format=image_form(mosaic_size(agents, curves.window)), opacity=1.0),
+    ]
+    parts["windows/frames"] = [
+        rr.Boxes2D(
+            mins=corners - 0.2,
+            sizes=np.full((agents, 2), (columns + 0.4, rows + 0.4)),
+            colors=[agent_colour(agent) for agent in range(agents)],
+            radii=2 * OUT_STROKE_CELLS,
+            labels=list(curves.agents),
+            show_labels=False,
+        )
+    ]
+    return parts
 
 
 def board_styles() -> dict[str, list[Any]]:
@@ -332,3 +444,24 @@ def _changes(rows: NDArray[Any]) -> NDArray[np.intp]:
     """The indices of the first row, and of all rows that differ from the previous one."""
     flat = rows.reshape(len(rows), -1)
     return np.flatnonzero(np.concatenate([[True], (flat[1:] != flat[:-1]).any(1)]))
+
+
+def mosaic_size(agents: int, window: tuple[int, int]) -> tuple[int, int]:
+    corners = window_corners(agents, window)
+    return max(row for row, _ in corners) + window[0], max(col for _, col in corners) + window[1]
+
+
+def mosaic(windows: Bytes) -> Bytes:
+    """The windows of all agents in a mosaic at `window_corners`, with UNSEEN between them.
+
+    Args:
+        windows: uint8 [T, N, X, Y], classes of `classes_seen`.
+
+    Returns:
+        uint8 [T, rows, columns], with the size of `mosaic_size`.
+    """
+    frames, agents, rows, columns = windows.shape
+    joined = np.full((frames, *mosaic_size(agents, (rows, columns))), UNSEEN, np.uint8)
+    for agent, (top, left) in enumerate(window_corners(agents, (rows, columns))):
+        joined[:, top : top + rows, left : left + columns] = windows[:, agent]
+    return joined

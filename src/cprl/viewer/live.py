@@ -1,0 +1,282 @@
+"""The streams of one recording, to a file and to viewers: each may fail without harm to the run."""
+
+import os
+import shutil
+import subprocess
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from queue import Full, Queue
+from threading import Thread
+from typing import Any, Final, TypeAlias
+
+import rerun as rr
+from rerun.chunk import RrdReader
+
+from cprl.system.output import legible, printed
+from cprl.values import checked
+from cprl.viewer.page import LOCALHOST, Served, WebViewer, free_port, has_display, viewer
+
+STALL_S: Final = 2.0
+"""Seconds that a training waits for a place in the queue of a viewer that has stopped taking data."""
+CLOSE_S: Final = 5.0
+"""Seconds within which a viewer must take the last data when a run ends."""
+QUEUED_CALLS: Final = 256
+"""Calls that wait for a viewer; the frames of about thirty episodes."""
+FLUSH_TIMEOUT_S: Final = 5.0
+
+RUN, REPLAY = "cprl", "cprl replay"
+"""The application ids of runs and of replays: a viewer keeps one layout for each. Recordings of a run that is
+resumed must have that of its first one."""
+SERVER_MEMORY: Final = "512MB"
+"""The memory limit of the served recording; beyond it viewers lose the oldest rows, the file does not."""
+EXHIBITION_MEMORY: Final = "1MB"
+"""The same of the exhibition, of which viewers need the newest frame alone."""
+NEEDED_BYTES: Final = 2_000_000
+"""The free disk space needed to start a recording; its layout and static parts take a tenth."""
+
+Row: TypeAlias = tuple[int, int, int, list[float] | str]
+"""Step, episode, frame, and a number for each line or a Markdown text."""
+
+
+class Stream:
+    """One recording stream. If it fails, it warns once, and the run continues without it."""
+
+    is_live = False
+    """Whether it is sent to viewers."""
+
+    def __init__(self, name: str, recording: Any, *, period_s: float) -> None:
+        self.name, self.recording, self.period_s = name, recording, period_s
+        self.is_open, self.has_failed = True, False
+        self.waiting: dict[str, list[Row]] = {}
+        """Numbers and texts that have not been sent, by entity."""
+        self._sent = time.perf_counter()
+
+    @property
+    def is_due(self) -> bool:
+        return time.perf_counter() - self._sent > self.period_s
+
+    def take(self) -> dict[str, list[Row]]:
+        """The buffered numbers; the buffer is empty afterwards."""
+        taken, self.waiting = self.waiting, {}
+        self._sent = time.perf_counter()
+        return taken
+
+    def do(self, what: Callable[[Any], object]) -> None:
+        """Calls a function with the recording, unless the stream has failed or is closed."""
+        if self.is_open:
+            self._try(partial(self._call, what))
+
+    def close(self) -> None:
+        """Disconnects; the file gets its footer. A second call does nothing."""
+        if self.is_open:
+            self._try(self._disconnect)
+            self.is_open = False
+
+    def _try(self, what: Callable[[], object]) -> None:
+        try:
+            what()
+        except Exception as error:
+            self.is_open, self.has_failed = False, True  # the recording stays: its end waits for viewers
+            warnings.warn(
+                f"the Rerun {self.name} failed, the run continues without it: {error}",
+                RuntimeWarning,
+                stacklevel=5,
+            )
+
+    def _call(self, what: Callable[[Any], object]) -> None:
+        what(self.recording)
+
+    def _disconnect(self) -> None:
+        self.recording.disconnect()
+
+
+class LiveStream(Stream):
+    """A stream to viewers. Its calls are made in a thread of its own, because a viewer that stands still, or
+    accepts a connection and never reads, makes them wait for half a minute.
+    """
+
+    is_live = True
+
+    def __init__(self, name: str, recording: Any, *, period_s: float) -> None:
+        super().__init__(name, recording, period_s=period_s)
+        self._queue: Queue[Callable[[Any], object] | None] = Queue(QUEUED_CALLS)
+        self._error: Exception | None = None
+        self._thread = Thread(target=self._work, daemon=True, name="cprl viewer")
+        self._thread.start()
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether calls wait that viewers have not taken, so that what can be left out should be."""
+        return self._queue.qsize() > 1
+
+    def _call(self, what: Callable[[Any], object] | None) -> None:
+        if self._error is not None:
+            raise self._error
+        try:
+            self._queue.put(what, timeout=STALL_S)
+        except Full:
+            raise TimeoutError(f"it has taken no data for {STALL_S:g} s and the queue is full") from None
+
+    def _disconnect(self) -> None:
+        ends = time.monotonic() + CLOSE_S
+        self._call(lambda recording: recording.disconnect())
+        self._call(None)
+        self._thread.join(max(0.0, ends - time.monotonic()))
+        if self._error is not None:
+            raise self._error
+        if self._thread.is_alive():
+            raise TimeoutError(f"it has not taken the last data within {CLOSE_S:g} s")
+
+    def _work(self) -> None:
+        while (what := self._queue.get()) is not None:
+            try:
+                what(self.recording)
+            except Exception as error:
+                self._error = error
+                return
+
+
+class Live:
+    """What viewers of a run are sent, served on free ports of 127.0.0.1; they can connect at any time and get
+    the history.
+
+    Args:
+        how: "serve", or "spawn" to start Rerun's native viewer as well.
+        exhibits: whether there is an exhibition, which has a server of its own, since a server that has used
+            its memory drops the oldest rows of all.
+    """
+
+    def __init__(
+        self,
+        how: str,
+        recording_id: str,
+        blueprint: Any,
+        *,
+        period_s: float,
+        application: str = RUN,
+        exhibits: bool = False,
+    ) -> None:
+        checked("live", how, Served)
+
+        def serve(name: str, memory: str, *, send_properties: bool) -> LiveStream:
+            recording = _recording(application, recording_id, send_properties=send_properties)
+            port = free_port()
+            sink = rr.GrpcServerSink(LOCALHOST, port, server_memory_limit=memory)
+            # The layout is in both: a viewer may hear of the recording from either first.
+            recording.set_sinks(sink, default_blueprint=blueprint)
+            sources.append(f"rerun+http://{LOCALHOST}:{port}/proxy")
+            return LiveStream(name, recording, period_s=period_s)
+
+        sources: list[str] = []
+        self.stream = serve("live view", SERVER_MEMORY, send_properties=True)
+        self.exhibition: LiveStream | None = None
+        if exhibits:
+            self.exhibition = serve("exhibition", EXHIBITION_MEMORY, send_properties=False)
+        if how == "spawn":
+            _spawn(sources)
+        self._page = WebViewer()
+        self.addresses = {
+            "browser": self._page.address(*sources),
+            "native": printed([viewer(), "--connect", *sources]),
+        }
+        """How to watch."""
+
+    def close(self) -> None:
+        self.stream.close()
+        if self.exhibition is not None:
+            self.exhibition.close()
+        self._page.close()
+
+
+def open_file(
+    recording_id: str, path: Path, blueprint: Any, *, period_s: float, application: str = RUN
+) -> Stream | None:
+    """A stream to a new file; None, with a warning, if the disk is almost full.
+
+    Otherwise Rerun may wait forever for the layout to be written.
+    """
+    free = shutil.disk_usage(path.parent).free
+    if free < NEEDED_BYTES:
+        _warn_of(f"file {path}", f"{free:,} bytes are free there, {NEEDED_BYTES:,} are needed")
+        return None
+    recording = _recording(application, recording_id)
+    try:
+        recording.save(path, default_blueprint=blueprint)
+    except UnicodeEncodeError:  # Rerun takes no folder whose name is not in UTF-8
+        folder = os.open(path.parent, os.O_RDONLY)
+        recording.save(f"/proc/self/fd/{folder}/{path.name}", default_blueprint=blueprint)
+        os.close(folder)
+    return Stream("file", recording, period_s=period_s)
+
+
+def send_text(recording: Any, name: str, text: str) -> None:
+    """Sends a Markdown text without a time, which takes the place of the one before at all times.
+
+    A server sends it before the history, so who connects late never reads an old one as the present.
+    """
+    recording.send_columns(name, [], rr.TextDocument.columns(text=[text]))
+
+
+def newest_header(recordings: Sequence[Path], folder: Path) -> list[Path]:
+    """Write the newest header of recordings as static data, to be served with them: while a viewer loads
+    their history it would show old headers as the present.
+
+    Returns:
+        The file; none where no recording that can be read has a header.
+    """
+    headers = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the recording of a run that was killed has no footer
+        for path in recordings:
+            with suppress(RuntimeError):
+                reader = RrdReader(path)
+                store = reader.recordings()[0]
+                batches = [chunk.to_record_batch() for chunk in reader.stream().filter(content="/header")]
+                headers += [
+                    (batch["step"][-1].as_py(), batch["TextDocument:text"][-1].as_py()[0], store)
+                    for batch in batches
+                    if "step" in batch.schema.names
+                ]
+    if not headers:
+        return []
+    _, text, store = max(reversed(headers), key=lambda header: header[0])
+    recording = _recording(store.application_id, store.recording_id, send_properties=False)
+    recording.save(folder / "header.rrd")
+    send_text(recording, "header", text)
+    recording.disconnect()
+    return [folder / "header.rrd"]
+
+
+def _spawn(sources: list[str]) -> None:
+    """Starts Rerun's native viewer in its own process; warns if it cannot open."""
+    if not has_display():
+        _warn_of("viewer cannot open", "there is no display; open one of the addresses from elsewhere")
+        return
+    try:
+        subprocess.Popen(
+            [viewer(), "--connect", *sources],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+    except OSError as error:
+        _warn_of("viewer cannot be started", error)
+
+
+def _warn_of(what: str, why: object) -> None:
+    warnings.warn(f"the Rerun {what}: {why}; the run continues without it", RuntimeWarning, stacklevel=3)
+
+
+def _recording(application: str, recording_id: str, *, send_properties: bool = True) -> Any:
+    recording = rr.RecordingStream(
+        application,
+        recording_id=legible(recording_id),
+        send_properties=send_properties,
+        batcher_config=rr.ChunkBatcherConfig(flush_num_rows=1),  # columns would overtake rows that wait
+    )
+    recording.set_log_time_enabled(False)
+    return recording
