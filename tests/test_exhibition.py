@@ -3,12 +3,14 @@
 import threading
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rerun as rr
 import torch
 from matrix_game import MatrixGame
+from recordings import column
 from rerun.chunk import RrdReader
 from torchrl.envs import Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -66,55 +68,58 @@ def population_of(experiment):
     return env, Population(env, experiment.agents, engine=experiment.engine)
 
 
+class Viewers(Stream):
+    """A stream to a file in the place of one to viewers."""
+
+    is_behind = False
+
+    def __init__(self, path):
+        super().__init__("live view", rr.RecordingStream("cprl", recording_id="one"), period_s=1)
+        self.path = path
+        self.recording.save(path)
+
+    def chunks(self, entity):
+        self.close()
+        return list(RrdReader(self.path).stream().filter(content=f"/exhibition/{entity}"))
+
+
 class Kept:
     """An exhibition whose viewers are files, on a clock that the test moves."""
 
-    class Viewers(Stream):
-        is_behind = False
-
-    def __init__(self, folder, experiment=ALONE):
+    def __init__(self, folder):
         self.now, self.waits = 0.0, []
-        self.paths = (folder / "live.rrd", folder / "exhibition.rrd")
-        self.streams = []
-        for path in self.paths:
-            recording = rr.RecordingStream("cprl", recording_id="one")
-            recording.save(path)
-            self.streams.append(Kept.Viewers("live view", recording, period_s=1))
-        self.env, self.population = population_of(experiment)
-        self.policy, self.world = exhibited(experiment, self.env, self.population)
-        commons = self.env if not experiment.transforms else self.env.base_env
-        scene = scene_of(
-            commons, curves_of(commons, experiment.game.agent_names, [], episodes=3), is_replay=False
-        )
+        self.fixed, self.newest = Viewers(folder / "live.rrd"), Viewers(folder / "exhibition.rrd")
+        env, population = population_of(ALONE)
+        policy, self.world = exhibited(ALONE, env, population)
+        curves = curves_of(env.base_env, ALONE.game.agent_names, [], episodes=3)
         self.exhibition = Exhibition(
-            self.policy,
+            policy,
             self.world,
-            trained=self.env,
-            scene=scene,
-            kept=self.streams[0],
-            newest=self.streams[1],
+            trained=env,
+            scene=scene_of(env.base_env, curves),
+            kept=self.fixed,
+            newest=self.newest,
             clock=lambda: self.now,
             wait=lambda seconds: self.waits.append(seconds),
         )
 
+    def step(self, count=1, episode=0):
+        """So many steps of the training, each when the exhibition is due."""
+        for _ in range(count):
+            self.now += exhibition.BATCH_S
+            self.exhibition.on_step(0, episode, None)
+
     def rows(self, component, entity="board"):
-        """The values that viewers were sent, and whether any had a time."""
-        for stream in self.streams:
-            stream.close()
-        values, timelines = [], set()
-        for chunk in RrdReader(self.paths[1]).stream().filter(content=f"/exhibition/{entity}"):
-            batch = chunk.to_record_batch()
-            timelines |= set(batch.schema.names) & {"step", "episode", "frame", "log_time"}
-            if component in batch.schema.names:
-                values += batch.column(component).to_pylist()
-        return values, timelines
+        """The values that viewers were sent."""
+        batches = [chunk.to_record_batch() for chunk in self.newest.chunks(entity)]
+        assert not {name for batch in batches for name in batch.schema.names} & {"step", "episode", "frame"}
+        columns = (batch.column(component) for batch in batches if component in batch.schema.names)
+        return [value for column in columns for value in column.to_pylist()]
 
 
-def steps(kept, count):
-    """So many steps of the training, each when the exhibition is due."""
-    for _ in range(count):
-        kept.now += exhibition.BATCH_S
-        kept.exhibition.on_step(0, 0, None)
+@pytest.fixture
+def kept(tmp_path):
+    return Kept(tmp_path)
 
 
 FIRST, *OTHERS = EXPERIMENTS
@@ -177,25 +182,22 @@ def test_the_present_policy_computes_its_own_replica_alone_and_acts_as_in_evalua
                 assert torch.equal(alone.choose(seen[:1]), of_all.choose(seen)[:1])
 
 
-def test_it_plays_ten_to_twelve_steps_a_second_however_often_the_training_asks(tmp_path):
+def test_it_plays_ten_to_twelve_steps_a_second_however_often_the_training_asks(kept):
     assert 10 <= BATCH_STEPS / BATCH_S <= 12
-    kept = Kept(tmp_path)
     for thousandth in range(round(3000 * BATCH_S)):
         kept.now = thousandth / 1000
         kept.exhibition.on_step(0, 7, None)
-    boards, timelines = kept.rows("SegmentationImage:buffer")
+    boards = kept.rows("SegmentationImage:buffer")
     assert abs(len(boards) - 3 * BATCH_STEPS) <= 2
-    assert timelines == set(), "rows without a time: viewers keep the newest alone, on every timeline"
     assert len({repr(board) for board in boards}) > len(boards) / 2, "the board moves"
     assert kept.waits == [BATCH_S / BATCH_STEPS] * 3 * (BATCH_STEPS - 1), "they are sent one by one"
-    captions, _ = kept.rows("Points2D:labels", "caption")
-    assert captions[-1] == ["present policy, episode 7, epsilon 1.00"]
+    assert kept.rows("Points2D:labels", "caption")[-1] == ["present policy, episode 7, epsilon 1.00"]
 
 
 @pytest.mark.integration
 @pytest.mark.parametrize("seconds", [0.003, 0.05])
-def test_a_slow_exhibition_takes_one_percent_of_the_time(seconds, tmp_path, monkeypatch):
-    kept, played, step = Kept(tmp_path), [], Exhibition._step
+def test_a_slow_exhibition_takes_one_percent_of_the_time(seconds, kept, monkeypatch):
+    played, step = [], Exhibition._step
 
     def slowly(self):
         step(self)
@@ -248,46 +250,37 @@ def test_its_world_is_played_by_no_training_and_no_evaluation():
     assert len(set(courses)) == len(courses)
 
 
-class Some:
-    """A policy, as far as the caption goes."""
-
-    is_trained = False
-
-    def __init__(self, *epsilons):
-        self.epsilons = epsilons
-
-    def explore_as_now(self):
-        pass
-
-
-def test_the_caption_names_the_episode_and_the_exploration():
-    assert caption_of(Some(0.314), 1234) == "present policy, episode 1,234, epsilon 0.31"
-    assert caption_of(Some(), 0) == "present policy, episode 0"
-    assert caption_of(Some(0.1, 0.5, 1.0), 3) == "present policy, episode 3, epsilon 0.10 to 1.00"
-    trained = Some(0.05)
-    trained.is_trained = True
-    assert caption_of(trained, 4800) == "trained policy, episode 4,800, epsilon 0.05"
+@pytest.mark.parametrize(
+    ("epsilons", "is_trained", "episode", "caption"),
+    [
+        ((0.314,), False, 1234, "present policy, episode 1,234, epsilon 0.31"),
+        ((), False, 0, "present policy, episode 0"),
+        ((0.1, 0.5, 1.0), False, 3, "present policy, episode 3, epsilon 0.10 to 1.00"),
+        ((0.05,), True, 4800, "trained policy, episode 4,800, epsilon 0.05"),
+    ],
+)
+def test_the_caption_names_the_episode_and_the_exploration(epsilons, is_trained, episode, caption):
+    policy = SimpleNamespace(epsilons=epsilons, is_trained=is_trained, explore_as_now=lambda: None)
+    assert caption_of(policy, episode) == caption
 
 
-def test_an_exhibition_that_fails_warns_once_and_ends(tmp_path, monkeypatch):
-    kept = Kept(tmp_path)
-    kept.exhibition.on_step(0, 0, None)
+def test_an_exhibition_that_fails_warns_once_and_ends(kept, monkeypatch):
+    kept.step()
     monkeypatch.setattr(kept.world, "step_and_maybe_reset", lambda moment: 1 / 0)
     with pytest.warns(RuntimeWarning, match="the exhibition failed, the run") as caught:
-        steps(kept, 8)
+        kept.step(8)
     assert len(caught) == 1
 
 
-def test_viewers_that_do_not_keep_up_miss_frames_and_nothing_waits(tmp_path, monkeypatch):
-    kept = Kept(tmp_path)
-    monkeypatch.setattr(Kept.Viewers, "is_behind", True)
-    steps(kept, 5)
-    assert len(kept.rows("SegmentationImage:buffer")[0]) == 1, "the first, which the constructor sent"
+def test_viewers_that_do_not_keep_up_miss_frames_and_nothing_waits(kept, monkeypatch):
+    monkeypatch.setattr(Viewers, "is_behind", True)
+    kept.step(5)
+    assert len(kept.rows("SegmentationImage:buffer")) == 1, "the first, which the constructor sent"
 
 
-def test_after_the_training_the_trained_policy_plays_on_until_it_is_stopped(tmp_path, monkeypatch):
+def test_after_the_training_the_trained_policy_plays_on_until_it_is_stopped(kept, monkeypatch):
     monkeypatch.setattr(exhibition, "BATCH_S", 0.01)
-    kept, stop = Kept(tmp_path), threading.Event()
+    stop = threading.Event()
     thread = threading.Thread(target=kept.exhibition.play_on, args=(stop,), kwargs={"episode": 4})
     thread.start()
     while kept.exhibition.steps < 25:
@@ -295,9 +288,8 @@ def test_after_the_training_the_trained_policy_plays_on_until_it_is_stopped(tmp_
     stop.set()
     thread.join(10)
     assert not thread.is_alive()
-    assert len(kept.rows("SegmentationImage:buffer")[0]) >= 24
-    captions, _ = kept.rows("Points2D:labels", "caption")
-    assert captions[-1] == ["trained policy, episode 4, epsilon 0.05"]
+    assert len(kept.rows("SegmentationImage:buffer")) >= 24
+    assert kept.rows("Points2D:labels", "caption")[-1] == ["trained policy, episode 4, epsilon 0.05"]
 
 
 def test_a_game_without_a_board_has_no_exhibition_and_one_event_says_so(tmp_path):
@@ -306,33 +298,18 @@ def test_a_game_without_a_board_has_no_exhibition_and_one_event_says_so(tmp_path
     with ViewerCallback(tmp_path, env, title="run", episodes=1, live="serve") as viewer:
         assert viewer.exhibition is None
         viewer.play_on(threading.Event())
-    texts = []
-    for chunk in RrdReader(tmp_path / "run.rrd").stream().filter(content="/log"):
-        batch = chunk.to_record_batch()
-        texts += batch.column("TextLog:text").to_pylist()
+    texts = column(tmp_path / "run.rrd", "log", "TextLog:text")[1]
     assert ["no exhibition: the game has no board"] in texts
-    with pytest.raises(ValueError, match=r"a MatrixGame of batch size \[1\]"):
-        Exhibition(Some(), env, trained=env, scene=None, kept=None, newest=None)
 
 
-def test_parts_that_never_change_are_sent_once_to_the_server_that_keeps_them_and_formats_with_frames(
-    tmp_path,
-):
-    kept = Kept(tmp_path)
-    kept.exhibition.on_step(0, 0, None)
-    for stream in kept.streams:
-        stream.close()
-    live, frames = (
-        [
-            set(chunk.to_record_batch().schema.names)
-            for chunk in RrdReader(path).stream()
-            if chunk.entity_path == "/exhibition/board"
-        ]
-        for path in kept.paths
+def test_parts_that_never_change_are_sent_once_to_the_server_that_keeps_them_and_formats_with_frames(kept):
+    kept.step()
+    fixed, frames = (
+        [set(chunk.to_record_batch().schema.names) for chunk in stream.chunks("board")]
+        for stream in (kept.fixed, kept.newest)
     )
-    assert "SegmentationImage:opacity" in set().union(*live)
     image = {"SegmentationImage:buffer", "SegmentationImage:format"}
     assert all(image <= frame for frame in frames), "a frame without its format draws nothing"
-    assert not any(image & part for part in live), "a format that comes after a frame hides it"
+    assert "SegmentationImage:opacity" in set().union(*fixed)
+    assert not any(image & part for part in fixed), "a format that comes after a frame hides it"
     assert len(frames) == 1 + BATCH_STEPS
-    assert "windows" not in {name.partition(":")[0] for frame in frames for name in frame}

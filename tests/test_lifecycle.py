@@ -124,15 +124,13 @@ def test_a_run_that_a_signal_stops_is_saved_and_raises_what_the_signal_means(
 def test_a_command_that_a_signal_stops_says_once_what_resumes_and_exits_as_shells_count(
     number, tmp_path, monkeypatch, capsys
 ):
-    begun = start_run(tmp_path / "begun", "field", FIELD.to_recipe)
+    begun, signalled = start_run(tmp_path / "begun", "field", FIELD.to_recipe), cprl.run
 
     def with_signals(*arguments, **options):
         return signalled(*arguments, **{**options, "callbacks": [Signals(number, 30)]})
 
-    signalled = cprl.run
     monkeypatch.setattr("cprl.training.running.run", with_signals)
-    words = ["cprl", "run", str(begun), "--out", str(tmp_path / "run"), "--watch", "off"]
-    monkeypatch.setattr("sys.argv", words)
+    monkeypatch.setattr("sys.argv", f"cprl run {begun} --out {tmp_path / 'run'} --watch off".split())
     with pytest.raises(SystemExit) as ended:
         cli.main()
     assert ended.value.code == 128 + number

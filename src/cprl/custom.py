@@ -7,12 +7,12 @@ process trusts each name: `--allow module:Class` on the command line, `allow=` o
 import importlib
 import json
 import re
+import reprlib
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
-from reprlib import repr as short
 from typing import Any, Final
 
 _NAMES: Final = re.compile(r"[\w-]+(\.[\w-]+)*:\w+(\.\w+)*", re.ASCII)
@@ -44,9 +44,9 @@ class Custom:
             or len(self.target) > _LONGEST_NAME
             or not _NAMES.fullmatch(self.target)
         ):
-            raise ValueError(f'Custom.target is {_short(self.target)}; allowed: "module:Class"')
+            raise ValueError(f'Custom.target is {shown(self.target)}; allowed: "module:Class"')
         if not isinstance(self.arguments, Mapping):
-            came = _short(self.arguments)
+            came = shown(self.arguments)
             raise ValueError(f"Custom.arguments is {came}; allowed: a table of keyword arguments")
         try:
             _refuse_other_keys(self.arguments)
@@ -160,11 +160,26 @@ def source_of(module: str) -> str | None:
     return text
 
 
-def _short(value: object) -> str:
+class _Repr(reprlib.Repr):
+    """Short, and without what objects say of themselves: by their class."""
+
+    def repr_instance(self, x: Any, level: int) -> str:
+        if isinstance(x, type):
+            return f"the class {x.__name__}"
+        plain_kinds = type(None), bool, float, complex, bytes, range
+        return super().repr_instance(x, level) if type(x) in plain_kinds else f"a {type(x).__name__}"
+
+
+_REPR: Final = _Repr()
+_REPR.maxlevel, _REPR.maxtuple, _REPR.maxlist, _REPR.maxstring, _REPR.maxother = 4, 20, 20, 120, 120
+
+
+def shown(value: object) -> str:
+    """Return a value as a message shows it, on one line and not at full length; an object by its class."""
     try:
-        return short(value)
+        return " ".join(_REPR.repr(value).split())
     except Exception:  # a user's object may raise anything, and an integer may have too many digits
-        return f"a {type(value).__name__}"
+        return f"a {type(value).__name__} that cannot be shown"
 
 
 def made(value: Any, *positional: Any) -> Any:

@@ -11,8 +11,8 @@ A table is what JSON can hold of a value, `{"kind": "DQN", ...its fields}`; a tu
 table is strict: what is not known is refused by the place where it stands.
 """
 
-import reprlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import MISSING, fields, is_dataclass
 from difflib import get_close_matches
 from math import isfinite
@@ -31,6 +31,7 @@ from typing import (
 )
 
 from cprl.custom import Custom, refuse_targets
+from cprl.custom import shown as shown
 
 T = TypeVar("T")
 
@@ -323,32 +324,18 @@ def refusal(name: str, value: object, allowed: str) -> ValueError:
     return ValueError(f"{name} is {shown(value)}; allowed: {allowed}")
 
 
-class _Repr(reprlib.Repr):
-    """Short, and without what objects say of themselves: by their class."""
-
-    def repr_instance(self, x: Any, level: int) -> str:
-        if isinstance(x, type):
-            return f"the class {x.__name__}"
-        plain_kinds = type(None), bool, float, complex, bytes, range
-        return super().repr_instance(x, level) if type(x) in plain_kinds else f"a {type(x).__name__}"
-
-
-_REPR: Final = _Repr()
-_REPR.maxlevel, _REPR.maxtuple, _REPR.maxlist, _REPR.maxstring, _REPR.maxother = 4, 20, 20, 120, 120
-
-
-def shown(value: object) -> str:
-    """Return a value as a message shows it, on one line and not at full length; an object by its class."""
-    try:
-        return " ".join(_REPR.repr(value).split())
-    except Exception:  # a user's object may raise anything, and an integer may have too many digits
-        return f"a {type(value).__name__} that cannot be shown"
-
-
 def meant(name: object, known: Iterable[str]) -> str:
     """Return " (did you mean ...?)" where a name is close to one that is known, else an empty text."""
     close = get_close_matches(str(name), list(known), n=1)
     return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+@contextmanager
+def _not_too_deep(where: str) -> Iterator[None]:
+    try:
+        yield
+    except RecursionError:
+        raise ValueError(f"{where} is nested too deeply") from None
 
 
 def to_config(value: object, where: str = "value") -> Any:
@@ -361,10 +348,8 @@ def to_config(value: object, where: str = "value") -> Any:
     Raises:
         ValueError: for anything else, with what to write instead.
     """
-    try:
+    with _not_too_deep(where):
         return _config(value, where)
-    except RecursionError:
-        raise ValueError(f"{where} is nested too deeply") from None
 
 
 def _config(value: object, where: str) -> Any:
@@ -408,20 +393,16 @@ def from_config(table: object, where: str = "value") -> Any:
         ValueError: for what is not known, with its place; for code of the user's own that is not allowed, see
             `cprl.custom.allowing`.
     """
-    try:
+    with _not_too_deep(where):
         refuse_targets(table)
         return _value(table, where)
-    except RecursionError:
-        raise ValueError(f"{where} is nested too deeply") from None
 
 
 def build(kind: type[T], table: object, where: str) -> T:
     """Return a dataclass out of the table of its fields, as `from_config`; missing ones take defaults."""
-    try:
+    with _not_too_deep(where):
         refuse_targets(table)
         return _built(kind, table, where)
-    except RecursionError:
-        raise ValueError(f"{where} is nested too deeply") from None
 
 
 def _value(table: object, where: str) -> Any:
@@ -491,7 +472,8 @@ def differences(before: object, now: object, where: str, kind: Any = None) -> li
     elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
         pairs = enumerate(zip(before, now, strict=True))
         return [line for place, (a, b) in pairs for line in differences(a, b, f"{where}[{place}]")]
-    return [] if before == now else [f"{where} was {_entry_text(before)}, is {_entry_text(now)}"]
+    was, is_now = ("not there" if entry is _ABSENT else shown(entry) for entry in (before, now))
+    return [] if before == now else [f"{where} was {was}, is {is_now}"]
 
 
 def _is_default_of_later(
@@ -505,10 +487,6 @@ def _is_default_of_later(
         return False
     defaults = defaults_of(kind)
     return name in defaults and without_defaults(now[name]) == defaults[name]
-
-
-def _entry_text(entry: object) -> str:
-    return "not there" if entry is _ABSENT else shown(entry)
 
 
 def defaults_of(kind: Any) -> dict[str, Any]:

@@ -101,8 +101,10 @@ class Filming:
         """Episodes from one with frames to the next; 0 for no frames."""
         if env is not None and scene is not None:
             self._recorder = FrameRecorder(env, scene)
-            steps = episodes * env.game.rules.episode_steps
-            self.every = max(1, ceil(steps * _frame_bytes(scene) / FRAMES_BYTES))
+            rows, columns = mosaic_size(len(scene.agents), scene.window)
+            # The largest size of a frame, about; with a trained population on `commons` it is 500 bytes.
+            size = 80 + 45 * len(scene.agents) + 0.35 * (rows * columns + scene.height * scene.width)
+            self.every = max(1, ceil(episodes * env.game.rules.episode_steps * size / FRAMES_BYTES))
         self.shows_next = False
         """Whether the running episode is recorded in any case."""
         self.is_on = False
@@ -137,12 +139,6 @@ class Filming:
         frames = None if self._recorder is None else self._recorder.take()
         if frames is not None:
             self._logger.log_frames(frames)
-
-
-def _frame_bytes(scene: Scene) -> float:
-    """The largest size of one frame in a file, about; with a trained population on `commons` it is 500."""
-    rows, columns = mosaic_size(len(scene.agents), scene.window)
-    return 80 + 45 * len(scene.agents) + 0.35 * (rows * columns + scene.height * scene.width)
 
 
 RADIUS_CELLS: Final = 0.045
@@ -208,14 +204,6 @@ def numbers(agents: int) -> Strokes:
 @cache
 def marks(agents: int) -> Strokes:
     return _strokes([(agent, line) for agent in range(agents) for line in _mark(agent_mark(agent))])
-
-
-@cache
-def squares(agents: int) -> Strokes:
-    """A hollow square in the cell of each agent."""
-    far = OUT_HALF_CELLS
-    square = _turned((-far, -far), (far, -far), (far, far), (-far, far), (-far, -far))
-    return _strokes([(agent, square) for agent in range(agents)])
 
 
 def _strokes(lines: list[tuple[int, Floats]]) -> Strokes:
@@ -361,7 +349,7 @@ def board_columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.in
     }
     if len(marks(agents).owner):
         contents["marks"] = everywhere, _lines(marks(agents), frames)
-    covered = beam_pictures(frames["beams"])
+    covered = _with_rim(np.where(frames["beams"], BEAM, UNSEEN).astype(np.uint8), UNSEEN)
     changed = _changes(covered)
     contents["beams"] = changed, _pictures(covered[changed])
     return contents | _out(frames)
@@ -387,11 +375,6 @@ def boards(scene: Scene, frames: Frames) -> Bytes:
         at = np.flatnonzero(frames["in_play"][:, agent])
         drawn[at, frames["row"][at, agent], frames["col"][at, agent]] = FIRST_AGENT + agent
     return _with_rim(drawn, WALL)
-
-
-def beam_pictures(beams: Bools) -> Bytes:
-    """The cells that beams cover, UNSEEN elsewhere: bool [T, H, W] to uint8 [T, H + 2, W + 2]."""
-    return _with_rim(np.where(beams, BEAM, UNSEEN).astype(np.uint8), UNSEEN)
 
 
 def _with_rim(pictures: Bytes, kind: int) -> Bytes:

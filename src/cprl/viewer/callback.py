@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from math import gcd
+from operator import methodcaller
 from pathlib import Path
 from threading import Event
 from types import TracebackType
@@ -169,7 +170,7 @@ class ViewerCallback:
             for episode in _stored_episodes(self._run):
                 self.on_episode(episode, {})
         for recording in self._earlier:
-            self.logger.do(lambda live, path=recording: live.log_file_from_path(path), live_only=True)
+            self.logger.do(methodcaller("log_file_from_path", recording), live_only=True)
         self.logger.at(step=step, episode=self._episode)
         if self.story is not None:
             self.story.resume(self._now)

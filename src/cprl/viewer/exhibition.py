@@ -72,11 +72,7 @@ class Exhibition(View):
         wait: Callable[[float], bool] | None = None,
     ) -> None:
         commons = commons_of(env)
-        if commons is None or tuple(env.batch_size) != (1,):
-            raise ValueError(
-                f"the exhibition has a {type(env).__name__} of batch size {list(env.batch_size)}; allowed: "
-                "one world of a CommonsEnv, with transforms or without"
-            )
+        assert commons is not None
         self._policy, self._env, self._trained, self._scene = policy, env, trained, scene
         self._stream, self._clock, self._closing = newest, clock, Event()
         self._wait = wait or self._slept
