@@ -44,13 +44,7 @@ def make_agents(
             is resumed reads its own.
         weights: those that `Frozen` agents play with, see `Population`.
     """
-    env = make_env(
-        experiment.game,
-        worlds=experiment.replicas,
-        seed=experiment.seed,
-        device=experiment.device,
-        transforms=experiment.transforms,
-    )
+    env = _worlds(experiment, experiment.replicas, device=experiment.device)
     population = Population(
         env,
         experiment.agents,
@@ -68,11 +62,24 @@ def make_agents(
 
 def fresh_env(experiment: Experiment) -> EnvBase:
     """The worlds of the evaluation, `evaluation_episodes` for each replica, which no training plays."""
+    worlds = experiment.replicas * experiment.evaluation_episodes
+    return _worlds(experiment, worlds, fresh=True, device=experiment.device)
+
+
+def _worlds(
+    experiment: Experiment,
+    count: int,
+    *,
+    first: int = 0,
+    fresh: bool = False,
+    device: str = "cpu",
+) -> EnvBase:
     return make_env(
         experiment.game,
-        worlds=experiment.replicas * experiment.evaluation_episodes,
-        seed=experiment.seed + 1,
-        device=experiment.device,
+        worlds=count,
+        seed=experiment.seed + fresh,
+        first_world=first,
+        device=device,
         transforms=experiment.transforms,
     )
 
@@ -85,13 +92,7 @@ def exhibited(
     if commons_of(trained) is None:
         return None
     with torch.random.fork_rng(devices=[]):
-        env = make_env(
-            experiment.game,
-            seed=experiment.seed,
-            first_world=EXHIBITED_WORLD,
-            device=experiment.device,
-            transforms=experiment.transforms,
-        )
+        env = _worlds(experiment, 1, first=EXHIBITED_WORLD, device=experiment.device)
         return population.present_policy(), env
 
 
@@ -158,13 +159,7 @@ class Evaluations:
         experiment, worlds = self._experiment, self._experiment.evaluation_episodes
         seed, played = experiment.seed + 1, dict[int, list[Episode]]()
         for group in groups:
-            env = make_env(
-                experiment.game,
-                worlds=len(group) * worlds,
-                seed=seed,
-                first_world=group[0] * worlds,
-                transforms=experiment.transforms,
-            )
+            env = _worlds(experiment, len(group) * worlds, first=group[0] * worlds, fresh=True)
             load_transforms_state(env, transforms_state(self._env))
             agents, playing = self._population.as_stored(group), self._population.playing
             policies = stored_policies(agents, playing, replicas=group, worlds=worlds, seed=seed)
