@@ -13,7 +13,7 @@ from matrix_game import MatrixGame, tit_for_tat
 from recordings import column
 from rerun.chunk import RrdReader
 from rich.console import Console
-from test_torchrl_logs import Corridor
+from test_rerun_logger import Corridor
 from torchrl.data import Bounded
 from torchrl.envs import (
     Compose,

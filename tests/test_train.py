@@ -50,23 +50,19 @@ def learner(agent=0, *, seed=0):
     return make_learner(algorithm, GAME.spaces, agents=(agent,), replicas=1, seed=seed, engine="torchrl")
 
 
-def test_observers_see_every_turn_and_every_episode_and_the_learner_learns_once_a_turn():
-    witness, agent = Witness(), learner()
-    train(CommonsEnv(GAME), {(0,): agent}, others=OTHER, episodes=5, callbacks=[witness])
-    assert len(witness.turns) == agent.steps == sum(episode.steps for episode in witness.episodes)
+def test_observers_see_every_turn_and_every_episode_and_each_learner_stores_its_own_turns():
+    witness, learners = Witness(), {(0,): learner(0), (1,): learner(1)}
+    train(CommonsEnv(GAME), learners, episodes=5, callbacks=[witness])
+    first, second = (one.buffer.each[0][:]["observation"] for one in learners.values())
+    assert not torch.equal(first, second)
+    turns = {len(first), len(second), learners[0,].steps, sum(episode.steps for episode in witness.episodes)}
+    assert turns == {len(witness.turns)}
     assert [episode.episode for episode in witness.episodes] == [0, 1, 2, 3, 4]
-    assert set(witness.learning[-1]) == {"agent_0/loss", "agent_0/epsilon", "agent_0/q"}
+    names = {f"agent_{agent}/{name}" for agent in (0, 1) for name in ("loss", "epsilon", "q")}
+    assert set(witness.learning[-1]) == names
     assert np.isfinite(witness.learning[-1]["agent_0/loss"])
     harvest = sum(float(turn["next", "agents", "harvest"].sum()) for turn in witness.turns)
     assert harvest == sum(episode.harvest.sum() for episode in witness.episodes)
-
-
-def test_two_learners_sit_side_by_side_and_each_stores_its_own_turns():
-    learners = {(0,): learner(0), (1,): learner(1)}
-    train(CommonsEnv(GAME), learners, episodes=2)
-    first, second = (one.buffer.each[0][:]["observation"] for one in learners.values())
-    assert len(first) == len(second) == learners[0,].steps
-    assert not torch.equal(first, second)
 
 
 @pytest.mark.parametrize(
@@ -104,13 +100,10 @@ def test_torchrls_own_collector_trains_the_same():
         witness = Witness()
         agents = dqn_learner(GAME.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=3, compile=False)
         train(CommonsEnv(GAME, 2, seed=3), {(0, 1): agents}, episodes=4, callbacks=[witness], **arguments)
-        losses = [learning["agent_1/loss"] for learning in witness.learning]
         weights = agents.networks()["replica_1/agent_0"].state_dict().values()
-        return (
-            [episode.return_.tolist() for episode in witness.episodes],
-            losses,
-            [w.tolist() for w in weights],
-        )
+        losses = [learning["agent_1/loss"] for learning in witness.learning]
+        returns = [episode.return_.tolist() for episode in witness.episodes]
+        return returns, losses, [weight.tolist() for weight in weights]
 
     assert repr(course(make_collector=stock_collector)) == repr(course())
     returns, losses, _ = course(make_collector=partial(stock_collector, steps=4), update_every=4)

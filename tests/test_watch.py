@@ -12,9 +12,12 @@ import sys
 import threading
 import time
 import warnings
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from subprocess import PIPE
+from types import SimpleNamespace
 from urllib.parse import urlsplit
+from urllib.request import urlopen
 
 import numpy as np
 import psutil
@@ -23,20 +26,23 @@ import rerun as rr
 import rerun_cli
 import torch
 from dqn_parts import dqn_learner
-from recordings import GAME, column, static
+from recordings import GAME, SCENE, column, frames, static
 from rerun.chunk import RrdReader
 from test_outcome import EXPERIMENT
 
 import cprl
 from cprl import CommonsEnv
+from cprl.commands import main as cli
 from cprl.commands.recipe import parse
 from cprl.learners.settings import DQNSettings
 from cprl.measuring import Episode, social
 from cprl.training import train
 from cprl.viewer import live as streams
+from cprl.viewer import page
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.live import LiveStream
-from cprl.viewer.page import check_watch, free_port, to_watch
+from cprl.viewer.logger import RerunLogger
+from cprl.viewer.page import LOCALHOST, WebViewer, check_watch, free_port, to_watch
 
 SETTINGS = DQNSettings(buffer_size=200, learning_rate=1e-3, hidden_cells=(8,), epsilon_hold_steps=5)
 VIEWER = Path(rerun_cli.__path__[0]) / "rerun"
@@ -442,3 +448,80 @@ def test_linger_is_a_flag_of_every_recipe():
     for words in (["--watch", "serve", "--linger"], []):
         _, options = parse(lambda: EXPERIMENT, ["recipe.py", *words])
         assert options.linger == bool(words)
+
+
+def listens(port, address=LOCALHOST):
+    with suppress(ConnectionRefusedError):
+        socket.create_connection((address, port), timeout=5).close()
+        return True
+    return False
+
+
+def wait(is_so):
+    ends = time.monotonic() + 60
+    while not is_so():
+        assert time.monotonic() < ends
+        time.sleep(0.05)
+
+
+def test_the_page_is_on_this_machine_alone_until_it_is_closed():
+    served = WebViewer()
+    try:
+        wait(lambda: listens(served.port))
+        assert b"re_viewer_bg.wasm" in urlopen(served.address("rerun+http://127.0.0.1:9/proxy")).read()
+        own = [one.address for all_ in psutil.net_if_addrs().values() for one in all_ if one.family == 2]
+        for address in set(own) - {LOCALHOST}:
+            assert not listens(served.port, address)
+    finally:
+        served.close()
+    wait(lambda: not listens(served.port))
+    served.close()
+
+
+def test_a_process_that_is_killed_leaves_no_page():
+    script = "from cprl.viewer.page import WebViewer; print(WebViewer().port, flush=True); input()"
+    process = subprocess.Popen([sys.executable, "-c", script], stdin=PIPE, stdout=PIPE, text=True)
+    port = int(process.stdout.readline())
+    wait(lambda: listens(port))
+    process.kill()
+    process.communicate()
+    wait(lambda: not listens(port))
+
+
+@pytest.mark.parametrize("serve", [True, False])
+def test_without_a_display_or_on_request_a_run_is_served_until_it_is_interrupted(
+    serve, tmp_path, monkeypatch, capsys
+):
+    with RerunLogger("run", tmp_path, curves=SCENE) as logger:
+        logger.log_frames(frames(3)[0])
+        for episode, text in enumerate(("# Episode 1", "# Finished")):
+            logger.at(step=episode, episode=episode)
+            logger.log_document("header", text)
+    (tmp_path / "film.rrd").write_bytes(b"half a recording")
+    monkeypatch.setattr(page, "has_display", lambda: serve)
+    got, said = tmp_path / "got", []
+
+    def interrupted(seconds):
+        said.append(capsys.readouterr().out)
+        got.mkdir()
+        address = re.search(r"--connect (\S+)", said[0])[1]
+        wait(lambda: listens(urlsplit(address).port))
+        client = connected(address, got)
+        try:
+            wait(lambda: column(got / "got.rrd", "world/board", "SegmentationImage:buffer")[0])
+        finally:
+            client.terminate()
+            client.wait()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "time", SimpleNamespace(sleep=interrupted))
+    cli.watch(tmp_path, serve=serve)
+    assert said[0].endswith("served on 127.0.0.1 until Ctrl-C\n")
+    assert ("There is no display" in said[0]) != serve
+    assert static(got / "got.rrd", "header", "TextDocument:text") == ["# Finished"], "before the history"
+    assert column(got / "got.rrd", "world/board", "SegmentationImage:buffer")[0] == [1, 2, 3]
+
+
+def test_a_run_without_a_recording_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="holds no recording"):
+        cli.watch(tmp_path, serve=True)
