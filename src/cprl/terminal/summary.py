@@ -54,9 +54,8 @@ def summarise(
     console.print(f"Saved in {run}: {', '.join(files)}", soft_wrap=True)
     if figure:
         console.print(f"Training curve: {figure}", soft_wrap=True)
-    if "run.rrd" in files:
-        watch = printed(to_watch(run / "run.rrd"))
-        console.print(f"Watch again: {watch}", soft_wrap=True)
+    if recordings := sorted(run.glob("run*.rrd")):  # a run that was resumed has several
+        console.print(f"Watch again: {printed(to_watch(*recordings))}", soft_wrap=True)
 
 
 def _new_table(title: str, caption: str, names: Sequence[str]) -> Table:

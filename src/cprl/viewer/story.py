@@ -275,10 +275,7 @@ class Story(View):
     def _in_words(self, numbers: Played) -> str:
         error = f" ± {numbers.error:.2g}" if isfinite(numbers.error) else ""
         died = "" if numbers.died is None else f", {numbers.died:,} boards died early"
-        return (
-            f"{numbers.mean:.1f}{error} {self.header.unit} in {numbers.episodes:,} fresh episodes (mean and "
-            f"its standard error){died}"
-        )
+        return f"{numbers.mean:.1f}{error} {self.header.unit} in {numbers.episodes:,} fresh episodes{died}"
 
 
 def published_phases(game: Game | None) -> dict[int, str]:
