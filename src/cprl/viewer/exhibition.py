@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Callable
 from functools import partial
 from threading import Event
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -188,16 +188,38 @@ def _send_frames(
     recording: Any, *, scene: Scene, frames: Frames, caption: str, wait: Callable[[float], bool]
 ) -> None:
     """Sends frames one by one, over the time of a batch, until `wait` says to leave out the rest."""
-    form, count = board_form(scene), len(frames["step"])
     recording.send_columns("exhibition/caption", [], rr.Points2D.columns(labels=[caption]))
-    for place in range(count):
-        frame = {name: column[place : place + 1] for name, column in frames.items()}
-        for entity, (_, columns) in board_columns(scene, frame).items():
-            if entity in IMAGES:
-                columns = [*columns, *rr.SegmentationImage.columns(format=[form])]
+    rows = _rows(scene, frames)
+    for sent, row in enumerate(rows, 1):
+        for entity, columns in row:
             recording.send_columns(f"exhibition/{entity}", [], columns)
-        if place + 1 < count and wait(BATCH_S / count):
+        if sent < len(rows) and wait(BATCH_S / len(rows)):
             return
+
+
+class _Values(NamedTuple):
+    """Values of one component of one frame."""
+
+    array: Any
+
+    def as_arrow_array(self) -> Any:
+        return self.array
+
+
+def _rows(scene: Scene, frames: Frames) -> list[list[tuple[str, list[Any]]]]:
+    """What each frame changes: entities and their columns of one row, cut out of those of all frames, which
+    takes a quarter of the time of columns for each."""
+    rows: list[list[tuple[str, list[Any]]]] = [[] for _ in frames["step"]]
+    for entity, (numbers, columns) in board_columns(scene, frames).items():
+        if entity in IMAGES:
+            forms = rr.SegmentationImage.columns(format=[board_form(scene)] * len(numbers))
+            columns = [*columns, *forms]
+        arrays = [(column.component_descriptor(), column.as_arrow_array()) for column in columns]
+        for place, number in enumerate(numbers.tolist()):
+            values = [(kind, array.slice(place, 1).flatten()) for kind, array in arrays]
+            row = [rr.ComponentColumn(kind, _Values(part), lengths=[len(part)]) for kind, part in values]
+            rows[number].append((entity, row))
+    return rows
 
 
 def _before_the_first_step(game: Game) -> Frames:
