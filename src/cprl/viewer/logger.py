@@ -5,7 +5,7 @@ import json
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -366,7 +366,8 @@ class RerunLogger(Logger):
         self.experiment.clear()
         if not any(stream.has_failed for stream in self._streams):  # the end of one would wait for its viewer
             self._streams.clear()
-            end_recordings()
+            with suppress(RuntimeError):  # of an earlier recording that failed, which was reported then
+                end_recordings()
 
     close = shutdown
 
