@@ -28,9 +28,9 @@ SHAPE, ACTIONS, BATCH, TRANSITIONS = (3, 7, 15), 8, 8, 4096
 
 WAYS: dict[str, Callable[..., Engine]] = {
     "list of TorchRL losses": ListEngine,
-    "vmapped, compiled": partial(FunctionalEngine, lane_axis=False),
-    "lane axis, not compiled": partial(FunctionalEngine, lane_axis=True, compile=False),
-    "lane axis, compiled": partial(FunctionalEngine, lane_axis=True),
+    "vmapped, compiled": partial(FunctionalEngine, batching="vmapped"),
+    "lane axis, not compiled": partial(FunctionalEngine, batching="lane_axis", compile=False),
+    "lane axis, compiled": partial(FunctionalEngine, batching="lane_axis"),
 }
 MEASURED_BEFORE = {  # on such a machine, before this library was begun
     "list of TorchRL losses": (1388, 5292, 21_811, 89_852),

@@ -1,4 +1,4 @@
-"""One update of many agents for each of TorchRL's losses: the way that is found, and microseconds.
+"""One update of many agents for each of TorchRL's losses: the way that it names, and microseconds.
 
 One thread, batch 8, window 7 x 15 x 3, two hidden layers of 32 and 8 actions. There are four learners in each
 replica of `commons`; those of VDN, QMIX, MAPPO, IPPO and MADDPG are a team of four. Each loss runs in a
@@ -20,15 +20,15 @@ from rich.table import Table
 from tensordict import TensorDict
 
 from cprl import presets
-from cprl.algorithms.base import Algorithm, TeamAlgorithm
+from cprl.algorithms.base import Algorithm
 from cprl.algorithms.off_policy import CQL, DQN, IQL, PR2, SAC, DistributionalDQN
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
 from cprl.algorithms.teams import IPPO, MADDPG, MAPPO, QMIX, VDN
-from cprl.learners.engine import UpdateRule
-from cprl.learners.lanes import WEIGHTS, Lanes, LearningAgents, Teams
+from cprl.learners.engine import UpdateRule, make_engine
+from cprl.learners.lanes import WEIGHTS, Lanes, LearningAgents
 from cprl.learners.ring import TransitionForm
 from cprl.learners.settings import DQNSettings, RolloutSettings
-from cprl.learners.trial import TRIAL_LANES, fitting_engine, make_engine, trial_batch, trial_rollout
+from cprl.learners.trial import trial_batch, trial_rollout
 
 REPLAY, ROLLOUTS = DQNSettings(), RolloutSettings()
 ALGORITHMS = {
@@ -52,12 +52,11 @@ ALGORITHMS = {
 BATCH = 8
 
 
-def lanes_of(algorithm: Algorithm, learners: int) -> Lanes | Teams:
+def lanes_of(algorithm: Algorithm, learners: int) -> Lanes:
     """So many learners, four in each replica of `commons`, as lanes or teams."""
     game = presets.game("commons")
     who = LearningAgents(game.spaces, agents=range(game.agents), replicas=learners // game.agents)
-    kind = Teams if isinstance(algorithm, TeamAlgorithm) else Lanes
-    return kind(who, algorithm.method(game.spaces))
+    return Lanes(who, algorithm.method(game.spaces))
 
 
 def update_us(name: str, learners: int, repeats: int) -> tuple[str, bool, float]:
@@ -79,14 +78,12 @@ def update_us(name: str, learners: int, repeats: int) -> tuple[str, bool, float]
         batch = trial_batch(count, form, len(presets.game("commons").actions))
         return trial_rollout(batch) if isinstance(algorithm.settings, RolloutSettings) else batch
 
-    networks = lanes_of(algorithm, max(learners, TRIAL_LANES * 4)).new_networks(WEIGHTS)
-    trial = batch_of(TRIAL_LANES)
-    engine = fitting_engine(networks[:TRIAL_LANES], algorithm.make_loss, trial)
+    assert algorithm.batching is not None
     update = make_engine(
-        engine,
-        networks[: len(lanes)],
+        lanes.new_networks(WEIGHTS),
         algorithm.make_loss,
         UpdateRule(learning_rate=1e-5, adam_eps=1e-5),
+        batching=algorithm.batching,
         compile=True,
     )
     batch, best = batch_of(len(lanes)), float("inf")
@@ -101,7 +98,7 @@ def update_us(name: str, learners: int, repeats: int) -> tuple[str, bool, float]
             turns += 1
         best = min(best, (time.perf_counter() - started) / turns)
     failed = any("torch.compile failed" in str(one.message) for one in told)
-    return engine, engine != "list" and not failed, best * 1e6
+    return algorithm.batching, algorithm.batching != "list" and not failed, best * 1e6
 
 
 def main(*, learners: tuple[int, ...] = (4, 32), repeats: int = 5, only: tuple[str, ...] = ()) -> None:

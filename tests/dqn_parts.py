@@ -16,13 +16,13 @@ def make_learner(algorithm, spaces, *, engine="compiled", **who):
 
 def learner_of_parts(kind, algorithm, spaces, *, parts=(), options=(), **who):
     """A learner of a kind, with parts of a `Method` in place of the algorithm's, and options of its kind."""
-    method = replace(algorithm.method(spaces), **dict(parts))
+    method = replace(algorithm.method(spaces), **{"batching": None, **dict(parts)})
     return kind(LearningAgents(spaces, **who), method, **dict(options))
 
 
 def dqn_learner(spaces, *, settings, kind=ReplayLearner, make_loss=None, engine=None, compile=None, **who):
-    parts = {} if make_loss is None else {"make_loss": make_loss}
-    options = {name: word for name, word in (("engine", engine), ("compile", compile)) if word is not None}
+    parts = {"batching": engine} if make_loss is None else {"make_loss": make_loss, "batching": engine}
+    options = {} if compile is None else {"compile": compile}
     return learner_of_parts(kind, DQN(settings=settings), spaces, parts=parts, options=options, **who)
 
 

@@ -27,7 +27,6 @@ import cprl
 from cprl import CommonsEnv, Experiment
 from cprl.algorithms import DQN, Tabular, TabularSettings
 from cprl.evaluation import crossplay, evaluate_run
-from cprl.learners import replay, rollouts, trial
 from cprl.learners.preferences import InequityAversion
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in
@@ -106,19 +105,18 @@ WAYS = {
 @pytest.mark.integration
 @pytest.mark.parametrize(("name", "way"), [(name, way) for name, ways in WAYS.items() for way in ways])
 def test_every_engine_learns_what_a_list_of_torchrls_losses_does(name, way, monkeypatch):
-    found, fitting = [], trial.fitting_engine
+    kind = type(GROUPS[name][0].algorithm)
+    assert kind.batching == way or name not in TEAMS, "this is the way that it names"
 
-    def learned(engine):
-        for learners in (replay, rollouts):
-            monkeypatch.setattr(learners, "fitting_engine", engine)
+    def learned(batching):
+        monkeypatch.setattr(kind, "batching", batching)
         agents = population(GROUPS[name])
         trained(agents, episodes=3)
         return weights(agents)
 
-    ours = learned(lambda *given: found.append(fitting(*given)) or way)
-    for key, value in learned(lambda *_: "list").items():
+    ours = learned(way)
+    for key, value in learned("list").items():
         torch.testing.assert_close(ours[key], value, rtol=1e-3 if name in TEAMS else 1e-4, atol=1e-5, msg=key)
-    assert found == [way] or name not in TEAMS, "this is the way that is found"
 
 
 BESIDE = Learning(ALGORITHMS["DQN"])

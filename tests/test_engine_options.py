@@ -242,7 +242,11 @@ def test_a_target_bootstraps_by_the_discount_of_its_steps():
     batch = buffer.sample()
     made = networks([0, 1])
     update = FunctionalEngine(
-        made, partial(dqn_loss, gamma=gamma), UpdateRule(learning_rate=0.1), lane_axis=True, compile=False
+        made,
+        partial(dqn_loss, gamma=gamma),
+        UpdateRule(learning_rate=0.1),
+        batching="lane_axis",
+        compile=False,
     )
     losses = update.update_from(batch)
     for lane, network in enumerate(networks([0, 1])):

@@ -20,12 +20,12 @@ FORM = TransitionForm(observation_shape=SHAPE)
 ACTIONS = 6
 ENGINES = {
     "list": ListEngine,
-    "vmapped": partial(FunctionalEngine, lane_axis=False, compile=False),
-    "lane_axis": partial(FunctionalEngine, lane_axis=True, compile=False),
+    "vmapped": partial(FunctionalEngine, batching="vmapped", compile=False),
+    "lane_axis": partial(FunctionalEngine, batching="lane_axis", compile=False),
 }
 COMPILED = {
-    "vmapped, compiled": partial(FunctionalEngine, lane_axis=False, compile=True),
-    "lane_axis, compiled": partial(FunctionalEngine, lane_axis=True, compile=True),
+    "vmapped, compiled": partial(FunctionalEngine, batching="vmapped", compile=True),
+    "lane_axis, compiled": partial(FunctionalEngine, batching="lane_axis", compile=True),
 }
 PRECISION = {torch.float32: 1e-5, torch.float64: 1e-10}
 
@@ -212,7 +212,7 @@ def test_a_users_own_network_is_vmapped():
         return made
 
     make_loss, rule = partial(dqn_loss, gamma=0.9), UpdateRule(learning_rate=1e-3)
-    fast = FunctionalEngine(both(), make_loss, rule, lane_axis=False, compile=False)
+    fast = FunctionalEngine(both(), make_loss, rule, batching="vmapped", compile=False)
     plain = ListEngine(both(), make_loss, rule)
     for update in (fast, plain):
         buffer = filled([0, 1, 2])

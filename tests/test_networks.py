@@ -30,7 +30,7 @@ from cprl.algorithms import (
 )
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
-from cprl.learners import replay, rollouts
+from cprl.learners import lanes
 from cprl.learners.engine import FunctionalEngine, ListEngine, own_targets
 from cprl.learners.replay import ReplayLearner
 from cprl.networks import MLP, Conv, ConvNetwork, MLPNetwork
@@ -173,8 +173,8 @@ def test_lanes_learn_with_any_network_what_each_would_alone(kind, network, monke
     ends = []
     for engine in (FunctionalEngine, ListEngine):
         if engine is ListEngine:
-            for learners in (replay, rollouts):
-                monkeypatch.setattr(learners, "fitting_engine", lambda *_: "list")
+            monkeypatch.setattr(lanes, "fitting_engine", lambda *_: "list")
+            monkeypatch.setattr(kind, "batching", "list")
         _, learner = learner_of(kind, network)
         assert isinstance(learner.engine, engine)
         played(learner, 30)

@@ -1,7 +1,6 @@
 """engine="torchrl": stock parts learn what the fast engine learns, are stopped and continue, and refuse."""
 
 from collections import deque
-from dataclasses import replace
 from functools import partial
 from io import BytesIO
 
@@ -10,7 +9,6 @@ import torch
 from dqn_parts import dqn_learner, learner_of_parts, make_learner
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler, RoundRobinWriter, Sampler, SamplerWithoutReplacement
-from torchrl.envs.transforms import MultiStepTransform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import (
     A2CLoss,
@@ -47,7 +45,6 @@ from cprl.algorithms import (
     TabularSettings,
 )
 from cprl.custom import Custom
-from cprl.learners.engine import total
 from cprl.learners.reference import TorchRLReplayLearner, TorchRLRolloutLearner
 from cprl.learners.replay import ReplayLearner
 from cprl.objectives import LogCoshDQNLoss, PR2Loss
@@ -255,7 +252,6 @@ RESUMED = {
     "everything of replay": DQN(
         settings=changed(
             REPLAY,
-            n_steps=3,
             tau=0.05,
             updates_per_step=2,
             optimizer="rmsprop",
@@ -358,55 +354,6 @@ def test_soft_targets_move_by_tau_after_every_update_and_not_at_the_end_of_episo
     assert torch.equal(weights("target_value_network_params"), moved)
 
 
-def test_n_steps_sum_the_rewards_of_an_episode_and_keep_its_last_flags():
-    # Each stored transition holds r_t + gamma r_t+1 + gamma^2 r_t+2, cut where the episode ends, the
-    # observation after the last step that it sums, and the flags of that step.
-    settings = changed(REPLAY, n_steps=3, gamma=0.5, buffer_size=100)
-    learner = resumable(DQN(settings=settings))
-    assert isinstance(learner.buffer.each[0].transform[0], MultiStepTransform)
-    played = turns(learner.actor)
-    came = [next(played).clone() for _ in range(60)]
-    for turn in came:
-        learner.store(turn)
-    for replica, agent in ((0, 1), (1, 0)):
-        buffer = learner.buffer.each[2 * replica + agent]
-        kept = buffer.storage[:]
-        assert len(kept) == 60 - 3
-        for step in range(len(kept)):
-            reward, last = 0.0, step
-            for ahead in range(3):
-                last = step + ahead
-                reward += 0.5**ahead * came[last]["next", "agents", "reward"][replica, agent].item()
-                if came[last]["next", "done"][replica].item():
-                    break
-            assert kept["next", "reward"][step].item() == pytest.approx(reward)
-            assert kept["steps_to_next_obs"][step].item() == last - step + 1
-            seen = came[last]["next", "agents", "observation"][replica, agent]
-            assert torch.equal(kept["next", "observation"][step], seen)
-            assert torch.equal(kept["observation"][step], came[step][keys.OBSERVATION][replica, agent])
-            for flag in ("done", "terminated"):
-                assert torch.equal(kept["next", flag][step], came[last]["next", flag][replica])
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize("name", [name for name in OFF_POLICY if name != "IQL"])
-def test_what_follows_n_steps_is_discounted_by_as_many(name):
-    algorithm = replace(
-        OFF_POLICY[name], settings=changed(OFF_POLICY[name].settings, n_steps=3, gamma=0.5, batch_size=16)
-    )
-    learner = resumable(algorithm)
-    played = turns(learner.actor)
-    for _ in range(30):
-        take(learner, next(played))
-    batch, loss = learner.buffer.each[0].sample(), learner.engine.losses[0]
-
-    def with_steps(steps):
-        changed = batch.clone().set("steps_to_next_obs", torch.full_like(batch["steps_to_next_obs"], steps))
-        return total(loss(changed), loss).item()
-
-    assert with_steps(1) != with_steps(3)
-
-
 def replay_learner_of(make_loss, **changes):
     settings = changed(REPLAY, **changes)
     return dqn_learner(SPACES, settings=settings, kind=TorchRLReplayLearner, make_loss=make_loss, **HOW)
@@ -485,6 +432,8 @@ def test_other_losses_networks_and_sizes_are_refused():
     parts = {"make_network": partial(DQN(settings=REPLAY).make_network, SPACES)}
     with pytest.raises(ValueError, match="an agent has the networks"):
         learner_of_parts(TorchRLRolloutLearner, PPO(settings=ROLLOUT), SPACES, parts=parts, **HOW)
+    with pytest.raises(ValueError, match=r"n_steps is 3; allowed with engine=\"torchrl\".*: 1"):
+        resumable(DQN(settings=changed(REPLAY, n_steps=3)))
     with pytest.raises(
         MemoryError, match=r"4 agents x 1,000,000,000,000 transitions take .* smaller buffer_size"
     ):

@@ -16,6 +16,7 @@ from torchrl.objectives import LossModule, ValueEstimators
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.learners.base import Learner
+from cprl.learners.engine import Batching
 from cprl.learners.lanes import LearningAgents, Method
 from cprl.learners.preferences import Preference, named
 from cprl.learners.reference import TorchRLReplayLearner, TorchRLRolloutLearner
@@ -64,6 +65,10 @@ class Algorithm(Value, stored=False):
     """Whether its networks can be recurrent: its loss must pass on the states of sequences, see
     `cprl.algorithms.base.module_of`."""
 
+    batching: ClassVar[Batching | None] = None
+    """How lanes are updated, see `cprl.learners.engine.Batching`. Each class says it for its own loss, with
+    networks of cprl; where it does not, a trial finds the fastest way that works."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
         name, functions = type(self).__name__, self.loss_functions
@@ -110,6 +115,7 @@ class Algorithm(Value, stored=False):
             settings=self.settings,
             make_network=lambda: self.make_network(spaces),
             make_loss=self.make_loss,
+            batching=None if isinstance(self.network, Custom) else vars(type(self)).get("batching"),
             stochastic=self.stochastic,
         )
 

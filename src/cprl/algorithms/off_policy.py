@@ -30,6 +30,7 @@ from cprl.algorithms.base import (
 )
 from cprl.commons.spaces import Spaces
 from cprl.learners.base import Learner
+from cprl.learners.engine import Batching
 from cprl.learners.lanes import LearningAgents
 from cprl.learners.settings import (
     TabularSettings,
@@ -66,6 +67,7 @@ class DQN(OffPolicy):
     ln cosh d, that of some versions of the study's program (`cprl.objectives.LogCoshDQNLoss`)."""
     loss_functions: ClassVar[tuple[str, ...]] = DISTANCES
     can_be_recurrent: ClassVar[bool] = True
+    batching: ClassVar[Batching | None] = "lane_axis"
 
     def make_loss(self, network: nn.Module) -> LossModule:
         is_ours = self.loss_function == LOG_COSH
@@ -88,6 +90,7 @@ class DistributionalDQN(OffPolicy):
     highest_return: Return = 100.0
     """The range of the atoms: discounted returns in apples. With a discount of 0.995 one apple per step
     amounts to 200."""
+    batching: ClassVar[Batching | None] = "lane_axis_flat"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -132,6 +135,7 @@ class CQL(OffPolicy):
     """The weight of the conservative term. TorchRL's weight is 1, for fixed data sets; with it, agents that
     explore imitate their first random actions (`tests/test_optimum.py`)."""
     loss_function: str = "l2"
+    batching: ClassVar[Batching | None] = "lane_axis"
 
     def make_loss(self, network: nn.Module) -> LossModule:
         loss = _WeightedCQLLoss(
@@ -172,6 +176,7 @@ class SAC(OffPolicy):
     """The initial temperature, in units of reward (apples)."""
     loss_function: str = "l2"
     stochastic: ClassVar[bool] = True
+    batching: ClassVar[Batching | None] = "vmapped"
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         actions = spaces.actions
@@ -206,6 +211,7 @@ class IQL(OffPolicy):
     """The inverse temperature of the advantage weights, in 1/reward (1/apples)."""
     loss_function: str = "l2"
     stochastic: ClassVar[bool] = True
+    batching: ClassVar[Batching | None] = "vmapped"
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         actions = spaces.actions
@@ -252,6 +258,7 @@ class PR2(OffPolicy):
     stochastic: ClassVar[bool] = True
     sees_peers_actions: ClassVar[bool] = True
     loss_functions: ClassVar[tuple[str, ...]] = DISTANCES
+    batching: ClassVar[Batching | None] = "lane_axis"
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         """New networks of one agent.

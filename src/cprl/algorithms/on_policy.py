@@ -8,6 +8,7 @@ from torch import nn
 from torchrl.objectives import A2CLoss, ClipPPOLoss, LossModule, ReinforceLoss
 
 from cprl.algorithms.base import OnPolicy, Weight, module_of, policy
+from cprl.learners.engine import Batching
 from cprl.networks.agent import AgentNetworks
 from cprl.values import Range
 
@@ -46,6 +47,7 @@ class PPO(Clipped):
     """
 
     loss_kind: ClassVar[Callable[..., LossModule]] = ClipPPOLoss
+    batching: ClassVar[Batching | None] = "lane_axis"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +60,7 @@ class A2C(OnPolicy):
     entropy_coeff: Weight = 0.01
     critic_coeff: Weight = 0.5
     can_be_recurrent: ClassVar[bool] = True
+    batching: ClassVar[Batching | None] = "lane_axis"
 
     def make_loss(self, network: nn.Module) -> LossModule:
         return _loss(
@@ -78,6 +81,7 @@ class Reinforce(OnPolicy):
     """
 
     can_be_recurrent: ClassVar[bool] = True
+    batching: ClassVar[Batching | None] = "lane_axis"
 
     def make_loss(self, network: nn.Module) -> LossModule:
         loss = _loss(network, ReinforceLoss, loss_critic_type="l2")

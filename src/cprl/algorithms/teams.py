@@ -26,6 +26,7 @@ from cprl.algorithms.on_policy import Clipped
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
 from cprl.learners.base import Learner
+from cprl.learners.engine import Batching
 from cprl.learners.lanes import LearningAgents, Method
 from cprl.learners.lola import LOLALearner
 from cprl.learners.settings import LOLASettings
@@ -47,6 +48,8 @@ class VDN(TeamAlgorithm, OffPolicy):
     Source: Sunehag et al., "Value-Decomposition Networks For Cooperative Multi-Agent Learning" (2017).
     """
 
+    batching: ClassVar[Batching | None] = "vmapped"
+
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
         mixer = VDNMixer(len(members), device="cpu")
         return AgentNetworks({"actor": _team(members, spaces), "mixer": mixer})
@@ -67,6 +70,7 @@ class QMIX(TeamAlgorithm, OffPolicy):
     mixing_cells: Cells = 32
     """Units of the mixing layer."""
     fewest_members: ClassVar[int] = 2
+    batching: ClassVar[Batching | None] = "vmapped"
 
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
         mixer = Mixing(
@@ -90,6 +94,7 @@ class MAPPO(TeamAlgorithm, Clipped):
     """
 
     loss_kind: ClassVar[Callable[..., LossModule]] = MAPPOLoss
+    batching: ClassVar[Batching | None] = "lane_axis"
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         return self.new_network(spaces, spaces.actions)
@@ -111,6 +116,7 @@ class IPPO(TeamAlgorithm, Clipped):
 
     loss_kind: ClassVar[Callable[..., LossModule]] = IPPOLoss
     shares_reward: ClassVar[bool] = False
+    batching: ClassVar[Batching | None] = "lane_axis"
 
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
         of_each: Sequence[Any] = members
@@ -163,6 +169,7 @@ class MADDPG(TeamAlgorithm, OffPolicy):
     stochastic: ClassVar[bool] = True
     noise_numbers: ClassVar[int] = NUMBERS
     loss_functions: ClassVar[tuple[str, ...]] = DISTANCES
+    batching: ClassVar[Batching | None] = "lane_axis"
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         return self.new_network(spaces, spaces.actions)

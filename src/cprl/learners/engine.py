@@ -1,9 +1,7 @@
 """Engines: one update step for many independent learners, each with a TorchRL loss module.
 
-`FunctionalEngine` updates all lanes together in one compiled step: it stacks networks along a lane axis if it
-can, else it applies `torch.vmap` to the loss. `ListEngine` runs a plain list of loss modules. It is the
-reference, and the fallback for losses that work with neither. `SharedEngine` is for agents that share a
-network. `cprl.learners.trial` chooses.
+`FunctionalEngine` updates all lanes together in one compiled step. `ListEngine` is TorchRL's stock parts, one
+lane after the other: what the step is tested against, and the fallback for losses that work in no other way.
 """
 
 from abc import ABC, abstractmethod
@@ -11,23 +9,35 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
-from functools import partial
 from math import prod
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.nn import TensorDictParams
 from torch import Tensor, nn
-from torchrl.objectives import LossModule
+from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
+from torchrl.objectives.utils import TargetNetUpdater
 
-from cprl.learners.ring import FIELDS, Horizon, Ring, sampled
+from cprl.learners.ring import FIELDS, Horizon, Ring, gather
 from cprl.learners.settings import Optimizer
 from cprl.networks.agent import parts_of
 from cprl.networks.finite import all_finite, finite_lanes
 from cprl.networks.stacked import lane_state, stack_lanes
 from cprl.system.compat import forget_cached_weights, promise_targets, refuse_updaters, updated_weights
 from cprl.system.compiling import Compiled
+
+Batching: TypeAlias = Literal["lane_axis", "lane_axis_flat", "vmapped", "list"]
+"""How lanes are updated, the fastest way first.
+
+"lane_axis": the networks' parameters have a lane axis, under one ordinary loss; needs networks that stack,
+    see `cprl.networks.stacked.stack_lanes`.
+"lane_axis_flat": the same, for losses that need a flat batch of transitions, [L x b].
+"vmapped": `torch.vmap` of the loss over stacked parameters; works with any network.
+"list": a loss module for each lane, one after the other; works with any loss.
+"""
+WAYS: Final[tuple[Batching, ...]] = ("lane_axis", "lane_axis_flat", "vmapped")
+"""Those that update all lanes together."""
 
 MakeLoss = Callable[[nn.Module], LossModule]
 """Makes one agent's loss from its network."""
@@ -163,54 +173,6 @@ def weights_of(loss: LossModule) -> Weights:
     return {name: value.detach().clone() for name, value in _named(loss).items()}
 
 
-class Stacked(NamedTuple):
-    """A loss of many lanes and its weights by name, with the lane axis first."""
-
-    loss: LossModule
-    params: Weights
-    """The trained weights."""
-    targets: Weights
-    """Tensors that gradients do not change: target weights and buffers."""
-    names: Mapping[str, str]
-    """The names in the loss of those parameters of the network that are among its weights."""
-
-
-def stacked(networks: Sequence[nn.Module], make_loss: MakeLoss, *, lane_axis: bool) -> Stacked:
-    """One loss for the networks of all lanes; the weights are copied."""
-    made = [stack_lanes(networks)] if lane_axis else list(networks)
-    losses = [make_loss(network) for network in made]
-    if lane_axis and (shared := _single_weights(losses[0])):
-        raise ValueError(f"all agents would share the weights {', '.join(shared)} of the loss")
-    if lane_axis and any(group.batch_size for group in groups_of(losses[0]).values()):
-        raise ValueError("the loss stacks networks along an axis before the lane axis")
-    for loss in losses:
-        own_targets(loss)
-    named = _named(losses[0])
-    where = {value.data_ptr(): name for name, value in named.items()}
-    names = {
-        name: where[weight.data_ptr()]
-        for name, weight in made[0].named_parameters()
-        if weight.data_ptr() in where
-    }
-    learns = [name for name, value in named.items() if value.requires_grad]
-    each = [weights_of(loss) for loss in losses]
-    weights = each[0] if lane_axis else {name: torch.stack([one[name] for one in each]) for name in each[0]}
-    return Stacked(
-        losses[0],
-        {name: weights[name] for name in learns},
-        {name: value for name, value in weights.items() if name not in learns},
-        names,
-    )
-
-
-def vmapped(network: nn.Module, weights: Weights, *inputs: Tensor) -> Any:
-
-    def output(of_lane: Weights, *seen: Tensor) -> Any:
-        return torch.func.functional_call(network, of_lane, seen)
-
-    return torch.vmap(output)(weights, *inputs)
-
-
 BETA_1, BETA_2 = 0.9, 0.999
 """Adam's decay rates (Kingma and Ba 2015, torch's defaults)."""
 ADAMW_DECAY: Final = 0.01
@@ -224,17 +186,15 @@ WITH_SQUARE: Final = ("adam", "adamw", *RMSPROP_ALPHAS)
 """Optimisers with a running mean of squared gradients."""
 
 
-def torch_optimizer(
-    rule: UpdateRule, parameters: Iterable[Tensor], *, fused: bool | None = True
-) -> torch.optim.Optimizer:
-    """The optimiser of one lane; `fused` where torch has such a form of it, None for torch's default."""
+def torch_optimizer(rule: UpdateRule, parameters: Iterable[Tensor]) -> torch.optim.Optimizer:
+    """The optimiser of one lane; fused where torch has such a form of it."""
     name, rate, eps = rule.optimizer, rule.learning_rate, rule.adam_eps
     if name in RMSPROP_ALPHAS:
         return torch.optim.RMSprop(parameters, lr=rate, eps=eps, alpha=RMSPROP_ALPHAS[name])
     if name == "sgd":
-        return torch.optim.SGD(parameters, lr=rate, fused=fused)
+        return torch.optim.SGD(parameters, lr=rate, fused=True)
     kind = torch.optim.Adam if name == "adam" else torch.optim.AdamW
-    return kind(parameters, lr=rate, eps=eps, fused=fused)
+    return kind(parameters, lr=rate, eps=eps, fused=True)
 
 
 def change_weights(
@@ -286,21 +246,30 @@ def shortened(gradients: Sequence[Tensor], longest: float) -> list[Tensor]:
 
 
 class Engine(ABC):
-    """Updates L lanes at once."""
+    """Updates the networks of L lanes at once.
+
+    Args:
+        sharing: how many consecutive lanes S share a network, which learns from the transitions of all of
+            them in one batch, S x b of them. There are L / S networks.
+    """
+
+    def __init__(self, sharing: int = 1) -> None:
+        self.sharing = sharing
 
     def update(self, ring: Ring) -> Tensor:
-        """Samples from a ring, updates every lane once and returns their losses, float [L]."""
+        """Samples from a ring, updates every network once and returns their losses, float [L / S]."""
         return self.update_from(ring.sample())
 
-    @abstractmethod
     def update_from(self, batch: TensorDict) -> Tensor:
-        """Updates every lane once from a batch, [L, b], and returns their losses, float [L]."""
+        """Updates every network once from a batch, [L, b] or sequences; returns their losses, [L / S]."""
+        if self.sharing > 1:
+            lanes, *sizes = batch.batch_size
+            if "is_init" in batch:  # each sequence stays one
+                *sequences, steps = sizes
+                sizes = [prod(sequences), steps]
+            batch = batch.reshape(lanes // self.sharing, self.sharing * sizes[0], *sizes[1:])
+        return self._update(batch)
 
-    @abstractmethod
-    def copy_to_targets(self, which: Tensor) -> None:
-        """Copies the weights of the marked lanes, bool [L], to their targets."""
-
-    @abstractmethod
     def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
         """The outputs of the networks with their current weights: [L, k, ...] to [L, k, ...]; of recurrent
         ones also their states.
@@ -310,18 +279,35 @@ class Engine(ABC):
             recurrent: what recurrent networks read besides, likewise: see `cprl.networks.recurrent`.
             part: which of an agent's networks, see `cprl.networks.agent.parts_of`; the first one acts.
         """
+        if self.sharing == 1:
+            return self._outputs(part, observation, *recurrent)
+        by_network = [entry.unflatten(0, (-1, self.sharing)) for entry in (observation, *recurrent)]
+        if recurrent:  # the time of sequences stays an axis of its own
+            return tuple(given.flatten(0, 1) for given in self._outputs(part, *by_network))
+        given: Tensor = self._outputs(part, by_network[0].flatten(1, 2))
+        return given.reshape(*observation.shape[:2], *given.shape[2:])
 
     @abstractmethod
-    def network_state(self, lane: int) -> Weights:
-        """Copies of the current weights of one lane, as the state dict of its acting network."""
+    def _update(self, batch: TensorDict) -> Tensor: ...
 
     @abstractmethod
-    def weights(self, lane: int) -> Weights:
-        """Copies of all weights of one lane, including targets, by their names in the loss."""
+    def _outputs(self, part: int, *seen: Tensor) -> Any: ...
+
+    @abstractmethod
+    def copy_to_targets(self, which: Tensor) -> None:
+        """Copies the weights of the marked networks, bool [L / S], to their targets."""
+
+    @abstractmethod
+    def network_state(self, network: int) -> Weights:
+        """Copies of the current weights of an acting network, as its state dict."""
+
+    @abstractmethod
+    def weights(self, network: int) -> Weights:
+        """Copies of all weights of a network, including targets, by their names in the loss."""
 
     @abstractmethod
     def finite(self) -> Tensor:
-        """Whether the weights, targets and optimiser state of each lane are finite, bool [L] on the CPU."""
+        """Whether weights, targets and optimiser state of networks are finite, bool [L / S] on the CPU."""
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
@@ -333,10 +319,10 @@ class Engine(ABC):
 
 
 class ListEngine(Engine):
-    """A TorchRL loss module and a `torch.optim` optimiser for each lane; lanes are updated one by one.
+    """TorchRL's stock parts for each network: its loss module, an optimiser of `torch.optim`, and a
+    `HardUpdate` or `SoftUpdate` of its targets. Networks are trained in place, one after the other.
 
     Args:
-        networks: the lanes' networks; they are trained in place.
         target_networks: networks with the initial target weights; by default targets start as copies.
     """
 
@@ -347,53 +333,56 @@ class ListEngine(Engine):
         rule: UpdateRule,
         *,
         target_networks: Sequence[nn.Module] | None = None,
+        sharing: int = 1,
     ) -> None:
+        super().__init__(sharing)
         self._rule = rule
         self.parts = [list(parts_of(network).values()) for network in networks]
         self.losses = [make_loss(network) for network in networks]
         for loss in self.losses:
             own_targets(loss)
-        self._start_targets(target_networks or (), make_loss)
-        self.optimizers = [torch_optimizer(rule, loss.parameters()) for loss in self.losses]
-
-    def _start_targets(self, networks: Sequence[nn.Module], make_loss: MakeLoss) -> None:
-        for loss, network in zip(self.losses, networks, strict=False):
+        self.updaters = [_target_updater(loss, rule.tau) for loss in self.losses]  # makes targets copies
+        for loss, network in zip(self.losses, target_networks or (), strict=False):
             for name, values in targets_of(make_loss(network)).items():
                 getattr(loss, f"target_{name}").data.copy_(values.data)
+        self.optimizers = [torch_optimizer(rule, loss.parameters()) for loss in self.losses]
 
-    def update_from(self, batch: TensorDict) -> Tensor:
-        return torch.stack([self.learn(lane, batch[lane]) for lane in range(len(self.losses))])
+    def _update(self, batch: TensorDict) -> Tensor:
+        return torch.stack([self.learn(network, batch[network]) for network in range(len(self.losses))])
 
-    def learn(self, lane: int, batch: TensorDictBase) -> Tensor:
-        """One step of an optimiser on a batch of one lane, [b]; returns the loss, 0-d."""
-        loss = total(self.losses[lane](batch), self.losses[lane]).mean() * self._rule.loss_share
-        self.optimizers[lane].zero_grad()
+    def learn(self, network: int, batch: TensorDictBase) -> Tensor:
+        """One step of an optimiser on a batch of one network, [b]; returns the loss, 0-d."""
+        module, updater = self.losses[network], self.updaters[network]
+        loss = total(module(batch), module).mean() * self._rule.loss_share
+        self.optimizers[network].zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         if self._rule.max_grad_norm is not None:
-            torch.nn.utils.clip_grad_norm_(self.losses[lane].parameters(), self._rule.max_grad_norm)
-        self.optimizers[lane].step()
-        if self._rule.tau is not None:
-            for weight, target in _with_targets(self.losses[lane]):
-                target.data.lerp_(weight.data, self._rule.tau)
+            torch.nn.utils.clip_grad_norm_(module.parameters(), self._rule.max_grad_norm)
+        self.optimizers[network].step()
+        if isinstance(updater, SoftUpdate):
+            updater.step()
         return loss.detach()
 
-    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
-        return stacked_outputs([parts[part] for parts in self.parts], observation, *recurrent)
+    def _outputs(self, part: int, *seen: Tensor) -> Any:
+        given = [parts[part](*inputs) for parts, *inputs in zip(self.parts, *seen, strict=True)]
+        if isinstance(given[0], tuple):
+            return tuple(torch.stack(each) for each in zip(*given, strict=True))
+        return torch.stack(given)
 
     def copy_to_targets(self, which: Tensor) -> None:
-        for lane in which.nonzero().flatten().tolist():
-            for weight, target in _with_targets(self.losses[lane]):
-                target.data.copy_(weight.data)
+        for network in which.nonzero().flatten().tolist():
+            updater = self.updaters[network]
+            if updater is not None:
+                updater.step()
 
-    def network_state(self, lane: int) -> Weights:
-        return {name: value.detach().clone() for name, value in self.parts[lane][0].state_dict().items()}
+    def network_state(self, network: int) -> Weights:
+        return {name: value.detach().clone() for name, value in self.parts[network][0].state_dict().items()}
 
-    def weights(self, lane: int) -> Weights:
-        return weights_of(self.losses[lane])
+    def weights(self, network: int) -> Weights:
+        return weights_of(self.losses[network])
 
     def finite(self) -> Tensor:
-        pairs = zip(self.losses, self.optimizers, strict=True)
-        return torch.tensor([is_finite(loss, optimizer) for loss, optimizer in pairs])
+        return torch.tensor(list(map(_is_finite, self.losses, self.optimizers)))
 
     def state_dict(self) -> dict[str, Any]:
         return {
@@ -408,36 +397,54 @@ class ListEngine(Engine):
             optimizer.load_state_dict(moments)
 
 
-def stacked_outputs(networks: Sequence[nn.Module], *inputs: Tensor) -> Any:
-    """The outputs of several networks: [l, k, ...] to [l, k, ...]; of recurrent ones also their states."""
-    given = [network(*seen) for network, *seen in zip(networks, *inputs, strict=True)]
-    if isinstance(given[0], tuple):
-        return tuple(torch.stack(each) for each in zip(*given, strict=True))
-    return torch.stack(given)
+def _target_updater(loss: LossModule, tau: float | None) -> TargetNetUpdater | None:
+    if not targets_of(loss):
+        return None
+    # HardUpdate copies at every (interval + 1)-th step.
+    return HardUpdate(loss, value_network_update_interval=0) if tau is None else SoftUpdate(loss, tau=tau)
 
 
-def is_finite(loss: LossModule, optimizer: torch.optim.Optimizer) -> bool:
+def _is_finite(loss: LossModule, optimizer: torch.optim.Optimizer) -> bool:
     moments = [value for state in optimizer.state.values() for value in state.values()]
-    weights: list[Any] = list(loss.state_dict().values())
-    return all_finite(value for value in (*weights, *moments) if isinstance(value, Tensor))
+    values: list[Any] = [*loss.state_dict().values(), *moments]
+    return all_finite(value for value in values if isinstance(value, Tensor))
 
 
-def _with_targets(loss: LossModule) -> list[tuple[TensorDictParams, TensorDictParams]]:
-    """The groups of weights of a loss that have targets, each paired with its targets."""
-    return [(values, getattr(loss, f"target_{name}")) for name, values in targets_of(loss).items()]
+class _FromRing(NamedTuple):
+    """A batch that the step itself gathers from the fields of a ring."""
+
+    rows: int
+    horizon: Horizon | None
+
+    def batch(self, columns: Sequence[Tensor]) -> TensorDict:
+        index, *noise = columns[len(FIELDS) :]
+        fields = dict(zip(FIELDS, columns, strict=False))
+        return gather(fields, index, self.rows, self.horizon, noise[0] if noise else None)
+
+
+class _Given(NamedTuple):
+    """A batch that exists before the step: the names of its entries, and its batch size."""
+
+    names: tuple[Any, ...]
+    size: tuple[int, ...]
+
+    def batch(self, columns: Sequence[Tensor]) -> TensorDict:
+        batch = TensorDict({}, batch_size=self.size)
+        for name, column in zip(self.names, columns, strict=True):
+            batch.set(name, column)
+        return batch
 
 
 class FunctionalEngine(Engine):
-    """Updates all lanes in one step: gathering a batch, TorchRL's loss, its gradient and the optimiser.
+    """Updates all networks in one step: gathering a batch, TorchRL's loss, its gradient and the optimiser.
 
     With a lane axis the loss returns one number per transition. These are averaged over the batch and summed
-    over lanes, so that each lane's gradient depends on its own loss alone.
+    over networks, so that each one's gradient depends on its own loss alone.
 
     Args:
-        networks: the lanes' networks, of one architecture; their weights are copied.
+        networks: of one architecture; their weights are copied.
         target_networks: networks with the initial target weights; by default targets start as copies.
-        lane_axis: whether the networks are stacked along a lane axis; else the loss is vmapped.
-        flat: with a lane axis, whether the loss gets the transitions of all lanes flat, [L x b].
+        batching: see `Batching`; not "list".
         compile: whether torch compiles the step. If compilation fails, the engine warns once and runs the
             step uncompiled.
     """
@@ -449,117 +456,107 @@ class FunctionalEngine(Engine):
         rule: UpdateRule,
         *,
         target_networks: Sequence[nn.Module] | None = None,
-        lane_axis: bool,
-        flat: bool = False,
+        batching: Batching,
+        sharing: int = 1,
         compile: bool = True,
     ) -> None:
-        loss, self.params, self.targets, names = stacked(networks, make_loss, lane_axis=lane_axis)
+        super().__init__(sharing)
+        self.batching: Final = batching
+        self._vmapped = batching == "vmapped"
+        network, loss, weights = self._stacked(networks, make_loss)
+        named = _named(loss)
+        self.params = {name: weights[name] for name, value in named.items() if value.requires_grad}
+        self.targets = {name: value for name, value in weights.items() if name not in self.params}
         if target_networks is not None:
-            others = stacked(target_networks, make_loss, lane_axis=lane_axis).params
+            _, _, others = self._stacked(target_networks, make_loss)
             self.targets |= {name: others[_source(name)] for name in self.targets if _source(name) in others}
         self._mean, self._square = (
             {
                 name: torch.zeros_like(value)
                 for name, value in self.params.items()
-                if rule.optimizer in have_it
+                if rule.optimizer in optimizers
             }
-            for have_it in (WITH_MEAN, WITH_SQUARE)
+            for optimizers in (WITH_MEAN, WITH_SQUARE)
         )
-        self.loss = FunctionalLoss(loss)
-        network = stack_lanes(networks) if lane_axis else deepcopy(networks[0])
+        places = {value.data_ptr(): name for name, value in named.items()}
+        self._in_loss = {
+            name: self.params[places[value.data_ptr()]]
+            for name, value in network.named_parameters()
+            if places.get(value.data_ptr()) in self.params
+        }
+        """Those of the trained weights that the network has, by their names in it."""
         self._parts = list(parts_of(network).items())
-        self._shared = {name: self.params[key] for name, key in names.items() if key in self.params}
-        if lane_axis:  # acts with the same tensors that updates change
+        if not self._vmapped:  # acts with the same tensors that updates change
             for name, parameter in network.named_parameters():
-                if name in self._shared:
-                    parameter.requires_grad_(False).data = self._shared[name]
+                if name in self._in_loss:
+                    parameter.requires_grad_(False).data = self._in_loss[name]
+        self.loss = FunctionalLoss(loss)
         self._names, self._target_names = tuple(self.params), tuple(self.targets)
         groups = self.params, self.targets, self._mean, self._square
         self._tensors = [list(group.values()) for group in groups]
         self.steps = 0
-        kind = next(iter(self.params.values()))
+        kind = self._tensors[0][0]
         self._scalars = kind.new_zeros(()), kind.new_zeros(())
-        self._rule, self._vmapped, self._flat = rule, not lane_axis, flat
-        self._is_warm = not compile
-        self._compiled = Compiled(FunctionalEngine._step, what="updates run", changes=(7,), enabled=compile)
-        self._compiled_on = Compiled(
-            FunctionalEngine._step_on, what="updates run", changes=(6,), enabled=compile
-        )
+        self._rule, self._is_warm = rule, not compile
+        self._compiled = Compiled(FunctionalEngine._step, what="updates run", changes=(5,), enabled=compile)
+
+    def _stacked(
+        self, networks: Sequence[nn.Module], make_loss: MakeLoss
+    ) -> tuple[nn.Module, LossModule, Weights]:
+        """One network and its loss, and copies of all their weights by name, with the lane axis first."""
+        network = deepcopy(networks[0]) if self._vmapped else stack_lanes(networks)
+        loss = make_loss(network)
+        own_targets(loss)
+        if self._vmapped:
+            each = [weights_of(make_loss(one)) for one in networks]
+            return network, loss, {name: torch.stack([one[name] for one in each]) for name in each[0]}
+        if shared := _single_weights(loss):
+            raise ValueError(f"all agents would share the weights {', '.join(shared)} of the loss")
+        if any(group.batch_size for group in groups_of(loss).values()):
+            raise ValueError("the loss stacks networks along an axis before the lane axis")
+        return network, loss, weights_of(loss)
 
     def update(self, ring: Ring) -> Tensor:
-        if ring.sequence_steps > 1:
-            return self.update_from(ring.sample())
-        index = ring.draw()
-        self.steps += 1
-        noise = None if ring.noise is None else ring.noise.next()
-        if not self._is_warm:
-            self._warm_up(sampled(ring.fields, index, ring.rows, ring.horizon, noise))
-        fields, form = [*ring.fields.values()], _form(ring, index, noise)
-        arguments = fields, ring.rows, ring.horizon, index, *self._adam_scalars(), self._tensors, noise
-        losses: Tensor = self._compiled(form, self, *arguments)
-        return losses
+        if ring.sequence_steps > 1 or self.sharing > 1:
+            return super().update(ring)
+        columns = [*ring.fields.values(), ring.draw()]
+        if ring.noise is not None:
+            columns.append(ring.noise.next())
+        return self._run(_FromRing(ring.rows, ring.horizon), columns)
 
-    def update_from(self, batch: TensorDict) -> Tensor:
-        self.steps += 1
-        if not self._is_warm:
-            self._warm_up(batch.clone())
+    def _update(self, batch: TensorDict) -> Tensor:
         entries = sorted(batch.items(True, True), key=lambda entry: str(entry[0]))
-        names, columns = tuple(name for name, _ in entries), [column for _, column in entries]
-        form = names, batch.batch_size, *((column.shape, column.dtype) for column in columns)
-        arguments = names, tuple(batch.batch_size), columns, *self._adam_scalars()
-        losses: Tensor = self._compiled_on(form, self, *arguments, self._tensors)
-        return losses
+        given = _Given(tuple(name for name, _ in entries), tuple(batch.batch_size))
+        return self._run(given, [column for _, column in entries])
 
-    def _warm_up(self, batch: TensorDict) -> None:
-        """Calls TensorDict once before compilation: it fills a cache at first use, which compiled code would
-        refill at each call."""
-        self._gradients(self._tensors[0], self._tensors[1], batch)
-        self._is_warm = True
-
-    def _adam_scalars(self) -> tuple[Tensor, Tensor]:
-        """Adam's two bias corrections, computed once here instead of once per weight in the graph."""
-        size, scale = self._scalars
-        size.fill_(self._rule.learning_rate / (1 - BETA_1**self.steps))
+    def _run(self, source: _FromRing | _Given, columns: list[Tensor]) -> Tensor:
+        self.steps += 1
+        if not self._is_warm:
+            # TensorDict fills a cache at first use, which compiled code would refill at each call.
+            self._gradients(self._tensors[0], self._tensors[1], source.batch(columns))
+            self._is_warm = True
+        # Adam's two bias corrections, computed once here instead of once per weight in the graph.
+        step_size, scale = self._scalars
+        step_size.fill_(self._rule.learning_rate / (1 - BETA_1**self.steps))
         scale.fill_((1 - BETA_2**self.steps) ** -0.5)
-        return size, scale
+        # All that code is compiled for; the engine's own tensors never change their shapes.
+        form = source, *((column.shape, column.dtype) for column in columns)
+        losses: Tensor = self._compiled(form, self, source, columns, step_size, scale, self._tensors)
+        return losses
 
     def _step(
         self,
-        fields: list[Tensor],
-        rows: int,
-        horizon: Horizon | None,
-        index: Tensor,
-        step_size: Tensor,
-        scale: Tensor,
-        tensors: list[list[Tensor]],
-        noise: Tensor | None,
-    ) -> Tensor:
-        """One step. Tensors are passed in lists: the guards of compiled code find a dict's entry by counting
-        through its keys, which takes longer than all computation of one lane."""
-        batch = sampled(dict(zip(FIELDS, fields, strict=True)), index, rows, horizon, noise)
-        return self._change(batch, step_size, scale, tensors)
-
-    def _step_on(
-        self,
-        names: tuple[Any, ...],
-        size: tuple[int, ...],
+        source: _FromRing | _Given,
         columns: list[Tensor],
         step_size: Tensor,
         scale: Tensor,
         tensors: list[list[Tensor]],
     ) -> Tensor:
-        """One step on a batch; its entries are in the order of their names."""
-        batch = TensorDict({}, batch_size=size)
-        for name, column in zip(names, columns, strict=True):
-            batch.set(name, column)
-        return self._change(batch, step_size, scale, tensors)
-
-    def _change(
-        self, batch: TensorDict, step_size: Tensor, scale: Tensor, tensors: list[list[Tensor]]
-    ) -> Tensor:
-        """Computes gradients, changes the weights in place and returns each lane's loss."""
+        """Changes the weights in place and returns the loss of each network. Tensors are passed in lists: the
+        guards of compiled code find a dict's entry by counting through its keys, which takes longer than all
+        computation of one lane."""
         params, targets, means, squares = tensors
-        gradients, losses = self._gradients(params, targets, batch)
+        gradients, losses = self._gradients(params, targets, source.batch(columns))
         change_weights(self._rule, params, gradients, means, squares, step_size=step_size, scale=scale)
         if self._rule.tau is not None:
             for name, target in zip(self._target_names, targets, strict=True):
@@ -570,58 +567,61 @@ class FunctionalEngine(Engine):
     def _gradients(
         self, params: list[Tensor], targets: list[Tensor], batch: TensorDict
     ) -> tuple[list[Tensor], Tensor]:
-        """The gradients of the trained weights, and each lane's loss."""
-        gradient = torch.func.grad(self._lane_losses, has_aux=True)
+        """The gradients of the trained weights, and each network's loss."""
+        gradient = torch.func.grad(self._losses, has_aux=True)
         if self._vmapped:
             gradient = torch.vmap(gradient)
         gradients, losses = gradient(params, targets, batch)
         return gradients, losses
 
-    def _lane_losses(
+    def _losses(
         self, params: list[Tensor], targets: list[Tensor], batch: TensorDict
     ) -> tuple[Tensor, Tensor]:
-        """The sum of the losses of all lanes, to differentiate, and each lane's loss; under vmap there is one
-        lane."""
+        """The sum of the losses of all networks, to differentiate, and each one's loss; under vmap there is
+        one."""
         by_name = (
             dict(zip(self._names, params, strict=True)),
             dict(zip(self._target_names, targets, strict=True)),
         )
-        each = self.loss(*by_name, batch.reshape(-1) if self._flat else batch)
-        if self._flat:
+        flat = self.batching == "lane_axis_flat"
+        each = self.loss(*by_name, batch.reshape(-1) if flat else batch)
+        if flat:
             each = each.reshape(batch.batch_size)
         losses = (each.mean() if self._vmapped else each.flatten(1).mean(-1)) * self._rule.loss_share
         return losses.sum(), losses
 
-    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
+    def _outputs(self, part: int, *seen: Tensor) -> Any:
         name, network = self._parts[part]
         if not self._vmapped:
-            return network(observation, *recurrent)
-        return vmapped(network, self._of_part(name), observation, *recurrent)
+            return network(*seen)
+
+        def outputs(weights: Weights, *inputs: Tensor) -> Any:
+            return torch.func.functional_call(network, weights, inputs)
+
+        return torch.vmap(outputs)(self._of_part(name), *seen)
 
     def _of_part(self, name: str) -> Weights:
         """The weights of one of an agent's networks, by their names in that network."""
         prefix = f"{name}." if name else ""
-        return {
-            key.removeprefix(prefix): value for key, value in self._shared.items() if key.startswith(prefix)
-        }
+        weights = self._in_loss.items()
+        return {key.removeprefix(prefix): value for key, value in weights if key.startswith(prefix)}
 
     def copy_to_targets(self, which: Tensor) -> None:
         for name, target in self.targets.items():
             if _source(name) in self.params:
                 target[which] = self.params[_source(name)][which]
 
-    def network_state(self, lane: int) -> Weights:
-        name, network = self._parts[0]
+    def network_state(self, network: int) -> Weights:
+        name, module = self._parts[0]
         if not self._vmapped:
-            return lane_state(network, lane)
-        buffers = {key: value.clone() for key, value in network.named_buffers()}
-        return {**{key: value[lane].clone() for key, value in self._of_part(name).items()}, **buffers}
+            return lane_state(module, network)
+        buffers = {key: value.clone() for key, value in module.named_buffers()}
+        return {**{key: value[network].clone() for key, value in self._of_part(name).items()}, **buffers}
 
-    def weights(self, lane: int) -> Weights:
-        everything = {**self.params, **self.targets}
+    def weights(self, network: int) -> Weights:
         return {
-            name: (value[lane] if self._vmapped or _source(name) in self.params else value).clone()
-            for name, value in everything.items()
+            name: (value[network] if self._vmapped or _source(name) in self.params else value).clone()
+            for name, value in {**self.params, **self.targets}.items()
         }
 
     def finite(self) -> Tensor:
@@ -629,24 +629,19 @@ class FunctionalEngine(Engine):
         return finite_lanes([value for value in every if value.ndim and len(value) == lanes])
 
     def state_dict(self) -> dict[str, Any]:
-        return {
-            "own": self.params,
-            "targets": self.targets,
-            "mean": self._mean,
-            "square": self._square,
-            "steps": self.steps,
-        }
+        groups = {"own": self.params, "targets": self.targets, "mean": self._mean, "square": self._square}
+        return {**groups, "steps": self.steps}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        # Copies into the existing tensors, which the compiled step refers to.
-        groups = {"own": self.params, "targets": self.targets, "mean": self._mean, "square": self._square}
+        groups = self.state_dict()
+        del groups["steps"]
         for group, tensors in groups.items():
             if set(state[group]) != set(tensors):
                 raise ValueError(
                     f"the state has the weights {sorted(state[group])}; allowed: {sorted(tensors)}"
                 )
             for name, tensor in tensors.items():
-                tensor.copy_(state[group][name])
+                tensor.copy_(state[group][name])  # in place: the compiled step refers to these
         self.steps = int(state["steps"])
 
 
@@ -654,64 +649,20 @@ def _source(name: str) -> str:
     return name.removeprefix("target_")
 
 
-def _form(ring: Ring, index: Tensor, noise: Tensor | None) -> tuple[object, ...]:
-    """The shapes and dtypes for which a step is compiled; the engine's own tensors never change theirs."""
-    sizes = ring.rows, ring.horizon, index.shape, None if noise is None else noise.shape
-    return (*sizes, *((field.shape, field.dtype) for field in ring.fields.values()))
-
-
-class SharedEngine(Engine):
-    """Presents an engine of R networks, each shared by S agents, as an engine of L = R x S lanes.
-
-    A network learns from the transitions of all its agents in one batch, S x b of them. The loss of a lane is
-    that of its network.
-    """
-
-    def __init__(self, engine: Engine, agents: int) -> None:
-        self.engine, self._agents = engine, agents
-
-    def update_from(self, batch: TensorDict) -> Tensor:
-        lanes, *sizes = batch.batch_size
-        if "is_init" in batch:  # each sequence stays one
-            *sequences, steps = sizes
-            sizes = [prod(sequences), steps]
-        together = batch.reshape(lanes // self._agents, self._agents * sizes[0], *sizes[1:])
-        return self.engine.update_from(together).repeat_interleave(self._agents)
-
-    def copy_to_targets(self, which: Tensor) -> None:
-        # Agents that share a network are marked together.
-        self.engine.copy_to_targets(which.view(-1, self._agents)[:, 0])
-
-    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
-        return self._by_network(partial(self.engine.outputs, part=part), observation, *recurrent)
-
-    def network_state(self, lane: int) -> Weights:
-        return self.engine.network_state(lane // self._agents)
-
-    def weights(self, lane: int) -> Weights:
-        return self.engine.weights(lane // self._agents)
-
-    def finite(self) -> Tensor:
-        return self.engine.finite().repeat_interleave(self._agents)
-
-    def state_dict(self) -> dict[str, Any]:
-        return self.engine.state_dict()
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self.engine.load_state_dict(state)
-
-    def _by_network(self, outputs: Callable[..., Any], observation: Tensor, *recurrent: Tensor) -> Any:
-        """[L, k, ...] to [L, k, ...], through a function of [R, S x k, ...], or of recurrent networks of
-        [R, S, k, ...]."""
-        if recurrent:
-            inputs = [seen.reshape(-1, self._agents, *seen.shape[1:]) for seen in (observation, *recurrent)]
-            return tuple(output.flatten(0, 1) for output in outputs(*inputs))
-        lanes, size = observation.shape[:2]
-        by_network = observation.reshape(lanes // self._agents, self._agents * size, *observation.shape[2:])
-        given: Tensor = outputs(by_network)
-        return given.reshape(lanes, size, *given.shape[2:])
-
-
-def is_list(engine: object) -> bool:
-    """Whether an engine updates one loss after the other, uncompiled."""
-    return isinstance(engine.engine if isinstance(engine, SharedEngine) else engine, ListEngine)
+def make_engine(
+    networks: Sequence[nn.Module],
+    make_loss: MakeLoss,
+    rule: UpdateRule,
+    *,
+    batching: Batching,
+    target_networks: Sequence[nn.Module] | None = None,
+    sharing: int = 1,
+    compile: bool,
+) -> Engine:
+    """The engine of all lanes over their networks; `compile` is ignored for "list"."""
+    options = networks, make_loss, rule
+    if batching == "list":
+        return ListEngine(*options, target_networks=target_networks, sharing=sharing)
+    return FunctionalEngine(
+        *options, target_networks=target_networks, batching=batching, sharing=sharing, compile=compile
+    )

@@ -1,20 +1,21 @@
 """Lanes: the agents that a learner trains in every replica, with their seeds, networks and actors."""
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import KW_ONLY, dataclass, field
-from functools import partial
-from typing import Annotated, Any, Final, Protocol, TypeAlias
+from typing import Annotated, Any, ClassVar, Final, Protocol, TypeAlias
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from cprl import keys
 from cprl.commons.spaces import Spaces
-from cprl.learners.engine import Engine, MakeLoss, SharedEngine, is_list
+from cprl.learners.engine import WAYS, Batching, Engine, ListEngine, MakeLoss, UpdateRule, make_engine
 from cprl.learners.preferences import Preference, WantedRewards, check_preference
 from cprl.learners.transitions import LaneTurn, array_of, joint_actions, lane_turn, seen_next
+from cprl.learners.trial import TRIAL_LANES, fitting_engine
 from cprl.networks.agent import acting_part
 from cprl.networks.recurrent import state_cells_of
 from cprl.networks.specification import refuse_unseen
@@ -132,6 +133,8 @@ class Method:
     lane."""
     make_loss: MakeLoss
     """Makes a lane's loss from its networks."""
+    batching: Batching | None = None
+    """How lanes are updated; None for the fastest way that works, see `cprl.learners.trial`."""
     make_team: MakeTeam | None = None
     """Makes the networks of a team from those of its members; a lane is then the team of a replica."""
     own_rewards: bool = False
@@ -148,24 +151,37 @@ class Method:
 
 
 class Lanes:
-    """R x S agents: S agents of each of R replicas. A lane is one of them, in order of replicas."""
+    """What learns apart: each of R x S agents, or the team of S agents of each replica; in order of replicas.
 
-    member_shape: tuple[int, ...] = ()
-    """The axes of the members of a lane: none, since it is one agent."""
+    Members of a team have the seeds of initial weights and exploration that they would have as independent
+    agents. Parts that `make_team` adds are initialised from torch's generator, which is seeded for each team.
+    """
 
     def __init__(self, who: LearningAgents, method: Method) -> None:
         refuse_unseen(who.spaces)
         self.who, self.method = who, method
         self.spaces, self.agents, self.replicas = who.spaces, who.agents, who.replicas
-        self.make_network = method.make_network
-        self.sharing = len(self.agents) if who.share_parameters else 1
-        """The number of agents that share a network."""
+        size, self.is_team = len(who.agents), method.make_team is not None
+        if self.is_team and method.sees_peers:
+            raise ValueError(
+                "sees_peers is True; allowed for a team, whose actions are stored together: False"
+            )
+        self.member_shape = (size,) if self.is_team else ()
+        """The axes of the members of a lane: (S,) of a team, () of one agent."""
+        self._sharing = size if who.share_parameters else 1
         self.state_cells = 0
         """The numbers H of the state of an acting network; known once there are networks, 0 for those without
         a state."""
+        self._acting: Any = None
+        """The acting network of a team, of which architecture alone matters; likewise."""
 
     def __len__(self) -> int:
-        return self.replicas * len(self.agents)
+        return self.replicas * (1 if self.is_team else len(self.agents))
+
+    @property
+    def sharing(self) -> int:
+        """How many lanes share a network; those of teams share within theirs."""
+        return 1 if self.is_team else self._sharing
 
     @property
     def observation_shape(self) -> tuple[int, ...]:
@@ -175,64 +191,69 @@ class Lanes:
     @property
     def action_shape(self) -> tuple[int, ...]:
         """The shape of a lane's stored action: (), or (N,) if it sees those of peers; (S,) of a team."""
-        return (*self.member_shape, self.spaces.agents) if self.method.sees_peers else self.member_shape
+        return (self.spaces.agents,) if self.method.sees_peers else self.member_shape
 
     @property
     def reward_shape(self) -> tuple[int, ...]:
-        """The shape of a lane's reward in a replay buffer: (S,) if members of a team have their own."""
-        return ()
+        """The shape of a lane's reward: (S,) if members of a team have their own."""
+        return self.member_shape if self.method.own_rewards else ()
 
     def turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
-        """One transition of every lane, as a replay buffer stores it; see `lane_turn`."""
-        turn = lane_turn(self.agents, batch, rewards)
+        """One transition of every lane; see `lane_turn`.
+
+        Args:
+            rewards: of all agents, [R, N]; those of a team without `own_rewards` all the same.
+        """
+        turn = lane_turn(self.agents, batch, rewards, are_team=self.is_team)
+        if self.is_team and not self.method.own_rewards:
+            turn = turn._replace(reward=turn.reward[:, 0])
         if self.method.sees_peers:
             turn = turn._replace(action=joint_actions(self.agents, batch))
         if self.state_cells:
-            states = self.recurrent_state(batch), self.recurrent_state(batch, keys.RECURRENT_STATE)
-            before, after = map(array_of, states)
-            turn = turn._replace(recurrent_state=before, next_recurrent_state=after)
+            before, after = self.recurrent_state(batch), self.recurrent_state(batch, keys.RECURRENT_STATE)
+            turn = turn._replace(recurrent_state=array_of(before), next_recurrent_state=array_of(after))
         return turn
-
-    def rollout_turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
-        """One transition of every lane, as a rollout stores it; see `lane_turn`."""
-        return lane_turn(self.agents, batch, rewards)
 
     def seen_next(self, batch: TensorDictBase) -> Tensor:
         """The observations of lanes after a turn, uint8 [L, 1, *observation_shape]."""
-        return seen_next(batch)[:, list(self.agents)].flatten(0, 1).unsqueeze(1)
+        seen = seen_next(batch)[:, list(self.agents)]
+        return seen.reshape(len(self), 1, *self.observation_shape)
 
     def recurrent_state(
         self, batch: TensorDictBase, entry: tuple[str, str] = keys.RECURRENT_STATE_BEFORE
     ) -> Tensor:
         """The states that lanes had before a turn, or by another entry after it, float32 [L, H], of teams
         [L, S, H]."""
-        states: Tensor = batch.get(entry)
-        return states[:, list(self.agents), : self.state_cells].flatten(0, 1)
+        states: Tensor = batch.get(entry)[:, list(self.agents), : self.state_cells]
+        return states.reshape(len(self), *self.member_shape, self.state_cells)
 
-    def by_agent(self, losses: Tensor) -> Tensor:
-        """Values of lanes, [L], as values of the agents of each replica, [R, S]."""
-        return losses.view(self.replicas, len(self.agents))
+    def by_agent(self, values: Tensor) -> Tensor:
+        """Values of networks as values of the agents of each replica, [R, S]; members of a team, and agents
+        that share a network, have the same."""
+        everyone = self.replicas * len(self.agents)
+        return values.repeat_interleave(everyone // len(values)).view(self.replicas, len(self.agents))
 
     def of_replicas(self, marked: Tensor) -> Tensor:
-        """Flags of replicas, [R], as flags of lanes, [L]."""
-        return marked.repeat_interleave(len(self) // self.replicas)
+        """Flags of replicas, [R], as flags of networks."""
+        return marked.repeat_interleave(len(self) // self.sharing // self.replicas)
 
     def seeds(self, purpose: int) -> list[tuple[int, int, int, int]]:
         """The seed of each lane; that of a team is its first member's."""
-        return self.who.seeds(purpose)
+        return self.who.seeds(purpose)[:: len(self.agents) if self.is_team else 1]
 
     def new_networks(self, purpose: int) -> list[nn.Module]:
         """New networks for each lane, or for each replica whose agents share one; the acting ones with the
         weights to start from, if there are any.
         """
-        first, *others = self.who.seeds(purpose)[:: self.sharing]
-        networks = [init_network(self.make_network, first)]
+        make_network, names = self.method.make_network, self.who.names
+        first, *others = self.who.seeds(purpose)[:: self._sharing]
+        networks = [init_network(make_network, first)]
         _check_networks(networks[0], 1 + len(others), self.who.device)
         self.state_cells = state_cells_of(acting_part(networks[0]))
-        networks += [init_network(self.make_network, seed) for seed in others]
+        networks += [init_network(make_network, seed) for seed in others]
         for place, network in enumerate(networks):
-            names = self.who.names[place * self.sharing : (place + 1) * self.sharing]
-            start, *same = (self.who.start_from.get(name, {}) for name in names)
+            sharing = names[place * self._sharing : (place + 1) * self._sharing]
+            start, *same = (self.who.start_from.get(name, {}) for name in sharing)
             if any(not _equal(start, weights) for weights in same):
                 raise ValueError(
                     f"the agents {list(self.agents)} would start from different weights; allowed for agents "
@@ -240,29 +261,31 @@ class Lanes:
                 )
             if start:
                 acting_part(network).load_state_dict(start)
+        if self.method.make_team is not None:
+            networks = self._teams(self.method.make_team, networks, purpose)
+            self._acting = deepcopy(acting_part(networks[0]))
         return [network.to(self.who.device) for network in networks]
 
-    def by_lane(self, engine: Engine) -> Engine:
-        """An engine of the lanes, from that of their networks."""
-        return SharedEngine(engine, self.sharing) if self.sharing > 1 else engine
-
-    def by_member(self, engine: Acts) -> Acts:
-        """The networks of all agents, from those of the lanes."""
-        return engine
+    def _teams(self, make_team: MakeTeam, networks: list[nn.Module], purpose: int) -> list[nn.Module]:
+        teams, size = [], len(self.agents) // self._sharing
+        for replica, seed in enumerate(self.seeds(purpose)):
+            different = networks[replica * size : (replica + 1) * size]
+            members = [network for network in different for _ in range(self._sharing)]
+            teams.append(init_network(lambda members=members: make_team(members), (*seed, _SHARED)))  # type: ignore[misc]
+        return teams
 
     def actor(self, engine: Acts, *, compile: bool) -> LaneActor:
         """The actor of training: the current weights, and random numbers of its own for each agent."""
-        compile = compile and not is_list(engine)
-        return self._actor(self.by_member(engine), EXPLORATION, compile=compile)
+        return self._actor(engine, EXPLORATION, compile=compile and not isinstance(engine, ListEngine))
 
     def evaluation_actor(self, engine: Acts, worlds: int, *, epsilon: float) -> LaneActor:
-        actor = self._actor(self.by_member(engine), EVALUATION, worlds=worlds)
+        actor = self._actor(engine, EVALUATION, worlds=worlds)
         actor.epsilon = epsilon
         return actor
 
-    def _actor(self, members: Acts, purpose: int, *, worlds: int = 1, compile: bool = False) -> LaneActor:
+    def _actor(self, engine: Acts, purpose: int, *, worlds: int = 1, compile: bool = False) -> LaneActor:
         return LaneActor(
-            members.outputs,
+            _of_members(engine, len(self.agents)) if self.is_team else engine.outputs,
             self.spaces.actions,
             seeds=self.who.seeds(purpose),
             agents=len(self.agents),
@@ -274,103 +297,34 @@ class Lanes:
 
     def states(self, engine: Acts) -> dict[str, dict[str, Tensor]]:
         """The state dict of each agent's acting network, by "replica_0/agent_0" and so on."""
-        members = self.by_member(engine)
-        return {name: members.network_state(lane) for lane, name in enumerate(self.who.names)}
+        return {name: self._state(engine, place) for place, name in enumerate(self.who.names)}
+
+    def _state(self, engine: Acts, place: int) -> dict[str, Tensor]:
+        if not self.is_team:
+            return engine.network_state(place // self.sharing)
+        replica, member = divmod(place, len(self.agents))
+        state: dict[str, Tensor] = self._acting.member_state(engine.network_state(replica), member)
+        return state
 
     def networks(self, engine: Acts) -> dict[str, nn.Module]:
         made = {}
         for name, weights in self.states(engine).items():
-            made[name] = acting_part(self.make_network())
+            made[name] = acting_part(self.method.make_network())
             made[name].load_state_dict(weights)
         return made
 
 
-class Teams(Lanes):
-    """Lanes that hold all members of a team instead of one agent: lane r is the team of replica r.
+def _of_members(engine: Acts, size: int) -> Callable[..., Any]:
+    """The networks of the S members of teams: [R x S, k, ...] to [R x S, k, A], through those of teams, of
+    [R, k, S, ...]; of recurrent ones also states, likewise."""
 
-    Each member has the seeds of initial weights and exploration that it would have as an independent agent.
-    Parts that `make_team` adds are initialised from torch's generator, which is seeded for each team.
-    """
+    def outputs(*seen: Tensor) -> Any:
+        given = engine.outputs(*(entry.unflatten(0, (-1, size)).transpose(1, 2) for entry in seen))
+        if isinstance(given, tuple):
+            return tuple(output.transpose(1, 2).flatten(0, 1) for output in given)
+        return given.transpose(1, 2).flatten(0, 1)
 
-    def __init__(self, who: LearningAgents, method: Method) -> None:
-        super().__init__(who, method)
-        assert method.make_team is not None
-        if method.sees_peers:
-            raise ValueError(
-                "sees_peers is True; allowed for a team: False; its members' actions are stored together"
-            )
-        self._make_team = make_team = method.make_team
-        self.member_shape = (len(self.agents),)
-        form = init_network(
-            lambda: make_team(self._shared([self.make_network() for _ in range(self._networks)])),
-            self.seeds(0)[0],
-        )
-        self._acting: Any = acting_part(form)
-
-    def __len__(self) -> int:
-        return self.replicas
-
-    @property
-    def _networks(self) -> int:
-        """The number of networks of a team's members."""
-        return len(self.agents) // self.sharing
-
-    def _shared(self, networks: Sequence[nn.Module]) -> list[nn.Module]:
-        """The network of each member, from the different ones."""
-        return [network for network in networks for _ in range(self.sharing)]
-
-    @property
-    def reward_shape(self) -> tuple[int, ...]:
-        return self.member_shape if self.method.own_rewards else ()
-
-    def seeds(self, purpose: int) -> list[tuple[int, int, int, int]]:
-        return self.who.seeds(purpose)[:: len(self.agents)]
-
-    def new_networks(self, purpose: int) -> list[nn.Module]:
-        members, size = super().new_networks(purpose), self._networks
-        made = []
-        for replica, seed in enumerate(self.seeds(purpose)):
-            of_team = self._shared(members[replica * size : (replica + 1) * size])
-            made.append(init_network(partial(self._make_team, of_team), (*seed, _SHARED)).to(self.who.device))
-        return made
-
-    def turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
-        """One transition of every team, as a replay buffer stores it: observations [R, S, C, X, Y], actions
-        [R, S] and team rewards [R], or with `own_rewards` those of each member, [R, S].
-
-        Args:
-            rewards: of all agents, [R, N]; those of a team without `own_rewards` all the same.
-        """
-        turn = self.rollout_turn(batch, rewards)
-        return turn if self.method.own_rewards else turn._replace(reward=turn.reward[:, 0])
-
-    def rollout_turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
-        """One transition of every team, as a rollout stores it: as `turn`, with rewards [R, S]."""
-        turn, size = super().rollout_turn(batch, rewards), (len(self), len(self.agents))
-        of_members = {
-            name: getattr(turn, name).reshape(*size, *getattr(turn, name).shape[1:])
-            for name in ("observation", "action", "next_observation", "reward")
-        }
-        flags = {name: getattr(turn, name).reshape(size)[:, 0] for name in ("done", "terminated")}
-        return turn._replace(**of_members, **flags)
-
-    def seen_next(self, batch: TensorDictBase) -> Tensor:
-        return seen_next(batch)[:, list(self.agents)].unsqueeze(1)
-
-    def recurrent_state(
-        self, batch: TensorDictBase, entry: tuple[str, str] = keys.RECURRENT_STATE_BEFORE
-    ) -> Tensor:
-        return super().recurrent_state(batch, entry).view(len(self), *self.member_shape, -1)
-
-    def by_agent(self, losses: Tensor) -> Tensor:
-        """Values of teams, [R], repeated for each of their members, [R, S]."""
-        return losses[:, None].expand(-1, len(self.agents))
-
-    def by_lane(self, engine: Engine) -> Engine:
-        return engine
-
-    def by_member(self, engine: Acts) -> Acts:
-        return _Members(engine, self._acting, len(self.agents))
+    return outputs
 
 
 class BaseLearner:
@@ -393,10 +347,12 @@ class LaneLearner(BaseLearner):
 
     engine: Any
     actor: LaneActor
+    ways: ClassVar[Sequence[Batching]] = WAYS
+    """How it may update lanes, beside "list"."""
 
     def __init__(self, who: LearningAgents, method: Method) -> None:
         super().__init__(who, method.settings)
-        self._lanes = Teams(who, method) if method.make_team else Lanes(who, method)
+        self._lanes = Lanes(who, method)
 
     @property
     def lanes(self) -> int:
@@ -407,6 +363,33 @@ class LaneLearner(BaseLearner):
     def present(self) -> Acts:
         acts: Acts = self.engine
         return acts
+
+    def _make_engine(
+        self,
+        networks: Sequence[nn.Module],
+        targets: Sequence[nn.Module] | None = None,
+        *,
+        rule: UpdateRule,
+        compile: bool,
+    ) -> Engine:
+        """The engine of all lanes, whose targets start as copies or as networks of their own."""
+        method, batching = self._lanes.method, self._lanes.method.batching
+        if batching is None or batching not in self.ways:
+            few = networks[:TRIAL_LANES]
+            batching = fitting_engine(few, method.make_loss, self._trial(len(few)), self.ways)
+        return make_engine(
+            networks,
+            method.make_loss,
+            rule,
+            batching=batching,
+            target_networks=targets,
+            sharing=self._lanes.sharing,
+            compile=compile,
+        )
+
+    def _trial(self, lanes: int) -> TensorDict:
+        """A synthetic batch of so many lanes, as the loss reads it."""
+        raise NotImplementedError
 
     def evaluation_actor(self, worlds: int) -> LaneActor:
         return self._lanes.evaluation_actor(self.present, worlds, epsilon=0.0)
@@ -435,34 +418,6 @@ class LaneLearner(BaseLearner):
         self.actor.rng.load_state_dict(state["exploration"])
         self.steps = int(state["steps"])
         self.wants.load_state_dict(state["wants"])
-
-
-class _Members:
-    """Presents an engine of teams as one of their members, with lane = replica x S + member.
-
-    Args:
-        form: the acting network of a team, of which architecture alone matters.
-    """
-
-    def __init__(self, engine: Acts, form: Any, members: int) -> None:
-        self._engine, self._form, self._members = engine, form, members
-
-    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
-        """[R x S, k, C, X, Y] to [R x S, k, A], through networks of [R, k, S, ...]; of recurrent ones also
-        states, likewise."""
-        inputs = (
-            seen.view(-1, self._members, *seen.shape[1:]).transpose(1, 2)
-            for seen in (observation, *recurrent)
-        )
-        given = self._engine.outputs(*inputs, part=part)
-        if isinstance(given, tuple):
-            return tuple(output.transpose(1, 2).flatten(0, 1) for output in given)
-        return given.transpose(1, 2).flatten(0, 1)
-
-    def network_state(self, lane: int) -> dict[str, Tensor]:
-        replica, member = divmod(lane, self._members)
-        state: dict[str, Tensor] = self._form.member_state(self._engine.network_state(replica), member)
-        return state
 
 
 def _equal(weights: Mapping[str, Tensor], others: Mapping[str, Tensor]) -> bool:

@@ -181,7 +181,7 @@ class LOLALearner(LaneLearner):
 
     def store(self, batch: TensorDictBase) -> None:
         refuse_full(self._size, self.rollout_steps)
-        turn = self._lanes.rollout_turn(batch, wanted_in(self.wants, batch))
+        turn = self._lanes.turn(batch, wanted_in(self.wants, batch))
         write_turn(self._rollouts, (self._phase, self._size), turn)
         self._size += 1
         self.steps += 1

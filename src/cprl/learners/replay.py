@@ -1,15 +1,15 @@
 """ReplayLearner: independent agents that learn from replay, all of them in one update."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from copy import deepcopy
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from cprl import keys
-from cprl.learners.engine import COMPILED_STEPS, Engine, UpdateRule
+from cprl.learners.engine import COMPILED_STEPS, UpdateRule
 from cprl.learners.lanes import (
     NOISE,
     SAMPLING,
@@ -18,19 +18,11 @@ from cprl.learners.lanes import (
     LaneLearner,
     LearningAgents,
     Method,
-    Teams,
 )
 from cprl.learners.ring import Horizon, Ring, TransitionForm
 from cprl.learners.settings import DQNSettings
 from cprl.learners.transitions import wanted_in
-from cprl.learners.trial import (
-    TRIAL_LANES,
-    EngineName,
-    fitting_engine,
-    make_engine,
-    refuse_for_replay,
-    trial_batch,
-)
+from cprl.learners.trial import refuse_for_replay, trial_batch
 from cprl.policies.lanes import LaneActor
 
 
@@ -43,8 +35,7 @@ class ReplayLearner(LaneLearner):
     update of more than `COMPILED_STEPS` is not compiled.
 
     Args:
-        engine: how lanes are updated; None picks the fastest that works, see `cprl.learners.trial`.
-        compile: whether torch compiles acting and the update; the engine "list" is never compiled.
+        compile: whether torch compiles acting and the update.
     """
 
     settings: DQNSettings
@@ -52,14 +43,7 @@ class ReplayLearner(LaneLearner):
     takes_transforms = False
     """Whether batches pass through `DQNSettings.replay_transforms`."""
 
-    def __init__(
-        self,
-        who: LearningAgents,
-        method: Method,
-        *,
-        engine: EngineName | None = None,
-        compile: bool = True,
-    ) -> None:
+    def __init__(self, who: LearningAgents, method: Method, *, compile: bool = True) -> None:
         super().__init__(who, method)
         settings: DQNSettings = method.settings
         if settings.replay_transforms and not self.takes_transforms:
@@ -80,10 +64,13 @@ class ReplayLearner(LaneLearner):
             state_cells=lanes.state_cells,
             sequence_steps=settings.sequence_steps,
         )
-        trial = self._trial(min(len(networks), TRIAL_LANES))
-        refuse_for_replay(method.make_loss(deepcopy(networks[0])), settings, trial[0])
+        loss = method.make_loss(deepcopy(networks[0]))
+        refuse_for_replay(loss, settings, lambda: self._trial(1)[0])
         targets = lanes.new_networks(TARGET_WEIGHTS) if settings.own_target_weights else None
-        self.engine = self._make_engine(networks, targets, trial, name=engine, compile=compile)
+        share = 1 / self.spaces.actions if settings.mean_over_all_outputs else 1.0
+        rule = UpdateRule.of(settings, loss_share=share)
+        is_short = settings.sequence_steps <= COMPILED_STEPS
+        self.engine = self._make_engine(networks, targets, rule=rule, compile=compile and is_short)
         self.buffer = self._make_buffer()
         self.actor = lanes.actor(self.engine, compile=compile)
         self.actor.epsilon = settings.epsilon(0)
@@ -99,37 +86,11 @@ class ReplayLearner(LaneLearner):
             raise ValueError(
                 f"settings.sequence_steps is {steps}; allowed with {kind} recurrent network: {allowed}"
             )
-        if is_recurrent and isinstance(self._lanes, Teams):
+        if is_recurrent and self._lanes.is_team:
             raise ValueError("the networks are recurrent; allowed for teams that learn from replay: others")
 
     def _trial(self, lanes: int) -> TensorDict:
-        """Synthetic transitions of so many lanes."""
         return trial_batch(lanes, self._form, self.spaces.actions, device=self.who.device)
-
-    def _make_engine(
-        self,
-        networks: Sequence[nn.Module],
-        targets: Sequence[nn.Module] | None,
-        trial: TensorDict,
-        *,
-        name: EngineName | None,
-        compile: bool,
-    ) -> Engine:
-        """The engine of all lanes, whose targets start as copies or with those of networks of their own."""
-        make_loss = self._lanes.method.make_loss
-        engine = make_engine(
-            name or fitting_engine(networks[:TRIAL_LANES], make_loss, trial),
-            networks,
-            make_loss,
-            self._rule(),
-            target_networks=targets,
-            compile=compile and self.settings.sequence_steps <= COMPILED_STEPS,
-        )
-        return self._lanes.by_lane(engine)
-
-    def _rule(self) -> UpdateRule:
-        share = 1 / self.spaces.actions if self.settings.mean_over_all_outputs else 1.0
-        return UpdateRule.of(self.settings, loss_share=share)
 
     def _make_buffer(self) -> Any:
         """What transitions are stored in and sampled from: `write`, `cut`, and what the engine asks for."""

@@ -23,7 +23,6 @@ from cprl.system.memory import check_memory, free_bytes
 
 FIELDS: Final = ("observation", "action", "reward", "done", "terminated", "row")
 """What a ring holds, in the order in which it holds it."""
-
 STATE: Final = "recurrent_state"
 """What a ring for sequences holds besides."""
 
@@ -62,14 +61,22 @@ class TransitionForm:
     def dtype(self) -> torch.dtype:
         return torch_dtype(self.observation_dtype)
 
+    @property
+    def steps_ahead(self) -> int:
+        """The turns after its first one that a sample reads."""
+        return (self.horizon.steps if self.horizon else self.sequence_steps) - 1
+
     def stored_bytes(self, lanes: int, transitions: int) -> int:
         row = prod(self.observation_shape) * self.dtype.itemsize + 4 * self.state_cells
         beside = 8 * prod(self.action_shape) + 4 * prod(self.reward_shape) + 8 + 1 + 1
         return lanes * (_rows(transitions) * row + transitions * beside)
 
 
-def gather(fields: Fields, index: Tensor, rows: int, horizon: Horizon | None = None) -> TensorDict:
-    """Transitions at places [L, b] of a `Ring`, as TorchRL's losses read them; changes nothing.
+def gather(
+    fields: Fields, index: Tensor, rows: int, horizon: Horizon | None = None, noise: Tensor | None = None
+) -> TensorDict:
+    """Transitions at places [L, b] of a `Ring`, as TorchRL's losses read them; changes nothing. Uniform
+    numbers [L, b, ...] become the entry "noise".
 
     With a horizon of n steps "reward" is the discounted sum of the rewards from there on: of n, or of those
     until the episode ends. What is "next" is that of the last of these steps, and "steps_to_next_obs", int64
@@ -91,7 +98,7 @@ def gather(fields: Fields, index: Tensor, rows: int, horizon: Horizon | None = N
         return fields[name][place, lane].unsqueeze(-1)
 
     last, last_row, reward = index, row, field("reward", index)
-    more = {}
+    more = {} if noise is None else {"noise": noise}
     if horizon is not None:
         last, reward, steps = _returns(fields, index, lane, horizon)
         last_row = fields["row"][last, lane]
@@ -130,16 +137,6 @@ def sequences(fields: Fields, index: Tensor, rows: int, steps: int) -> TensorDic
     ends = (turns["next", "done"] | turns["next", "terminated"]).squeeze(-1)
     is_init = torch.cat([torch.ones_like(ends[..., :1]), ends[..., :-1]], -1)
     return turns.set("is_init", is_init).set(("next", "is_init"), is_init.clone())
-
-
-def sampled(
-    fields: Fields, index: Tensor, rows: int, horizon: Horizon | None, noise: Tensor | None
-) -> TensorDict:
-    """`gather`, with uniform numbers [L, b, ...] as the entry "noise" for losses that sample, or without."""
-    batch = gather(fields, index, rows, horizon)
-    if noise is not None:
-        batch.set("noise", noise)
-    return batch
 
 
 def _returns(fields: Fields, index: Tensor, lane: Tensor, horizon: Horizon) -> tuple[Tensor, Tensor, Tensor]:
@@ -232,32 +229,22 @@ class Ring:
     ) -> None:
         self.horizon, self.sequence_steps, self.capacity = form.horizon, form.sequence_steps, transitions
         self.lanes, self.rows, self.device = len(seeds), _rows(transitions), torch.device(device)
-        lanes, shape, dtype = self.lanes, form.observation_shape, form.dtype
-        windows = lanes * batch_size * form.sequence_steps * 2
-        _check_memory(
-            form.stored_bytes(lanes, transitions), windows * prod(shape) * (dtype.itemsize + 4), self
-        )
-
-        def allocate(*shape: int, kind: torch.dtype) -> Tensor:
-            if self.device.type != "cpu":
-                return torch.zeros(shape, dtype=kind, device=self.device)
-            # numpy leaves it to the system to clear pages when they are first written; torch writes them all
-            # at once, for a gigabyte in a second or more.
-            return torch.from_numpy(np.zeros(shape, array_of(torch.empty(0, dtype=kind)).dtype))
-
-        self.fields: Fields = {
-            "observation": allocate(lanes * self.rows, *shape, kind=dtype),
-            "action": allocate(transitions, lanes, *form.action_shape, kind=torch.int64),
-            "reward": allocate(transitions, lanes, *form.reward_shape, kind=torch.float32),
-            "done": allocate(transitions, lanes, kind=torch.bool),
-            "terminated": allocate(transitions, lanes, kind=torch.bool),
-            "row": allocate(transitions, lanes, kind=torch.int64),
+        self._ahead, lanes, shape, dtype = form.steps_ahead, self.lanes, form.observation_shape, form.dtype
+        sample = lanes * batch_size * form.sequence_steps * 2 * prod(shape) * (dtype.itemsize + 4)
+        _check_memory(form.stored_bytes(lanes, transitions), sample, self)
+        forms = {
+            "observation": ((lanes * self.rows, *shape), dtype),
+            "action": ((transitions, lanes, *form.action_shape), torch.int64),
+            "reward": ((transitions, lanes, *form.reward_shape), torch.float32),
+            "done": ((transitions, lanes), torch.bool),
+            "terminated": ((transitions, lanes), torch.bool),
+            "row": ((transitions, lanes), torch.int64),
+            **({STATE: ((lanes * self.rows, form.state_cells), torch.float32)} if form.state_cells else {}),
         }
+        self.fields: Fields = {name: _zeros(*of_field, self.device) for name, of_field in forms.items()}
         """Observations [L x rows, ...], actions and rewards [T, L, ...], the rest [T, L]; `row` counts the
         observations that a lane has written. A state [L x rows, K] stands in the row of the observation that
         the lane saw next."""
-        if form.state_cells:
-            self.fields[STATE] = allocate(lanes * self.rows, form.state_cells, kind=torch.float32)
         self._of_rows = [name for name in self.fields if name in ("observation", STATE)]
         # Steps are written with numpy on the CPU: for so few numbers torch takes five times as long.
         self._arrays = {name: array_of(field) for name, field in self.fields.items()}
@@ -267,12 +254,9 @@ class Ring:
         self._next_row, self._oldest = array_of(zeros), array_of(zeros.clone())
         self._begins, self._any_begins = array_of(zeros == 0), True
         self._written = 0
-        self.rng = LaneRng(seeds, batch_size)
-        self.noise = (
-            Noise(noise_seeds or seeds, batch_size, form.noise_shape, self.device)
-            if form.noise_shape
-            else None
-        )
+        self.rng, self.noise = LaneRng(seeds, batch_size), None
+        if form.noise_shape:
+            self.noise = Noise(noise_seeds or seeds, batch_size, form.noise_shape, self.device)
 
     def __len__(self) -> int:
         """Transitions stored in the fullest lane."""
@@ -299,11 +283,29 @@ class Ring:
         arrays["terminated"][place] = turn.terminated
         arrays["row"][place] = row
         self._begins = turn.done | turn.terminated
-        self._any_begins = _any(self._begins)
+        begins = self._begins
+        self._any_begins = bool(np.count_nonzero(begins) if isinstance(begins, np.ndarray) else begins.any())
         self._next_row = row + 1 + self._begins if self._any_begins else row + 1
         self._written += 1
         if self._written % LOOKS_EVERY == 0:
             self._forget()
+
+    def fill(self, actions: int, chance: torch.Generator) -> None:
+        """Fills every place with synthetic transitions; one in eight ends an episode."""
+        turn = torch.arange(self.capacity)[:, None]
+        for name, field in self.fields.items():
+            if name == "row":
+                field.copy_(turn)
+            elif name == "action":
+                field.copy_(torch.randint(actions, field.shape, generator=chance))
+            elif field.dtype == torch.bool and name != "observation":
+                field.copy_(turn % 8 == 7)
+            elif field.dtype == torch.uint8:
+                field.copy_(torch.randint(256, field.shape, generator=chance))
+            else:
+                numbers = torch.rand(field.shape, generator=chance)
+                field.copy_(numbers.round() if name == "observation" else numbers)
+        self._written = self.capacity
 
     def cut(self) -> None:
         """Ends the running episodes, as a time limit would: what is written next does not follow them."""
@@ -327,8 +329,7 @@ class Ring:
     def draw(self) -> Tensor:
         """The places of a sample, int64 [L, b]."""
         oldest, written = self.oldest()
-        # The newest transitions have no full return or sequence yet.
-        written -= (self.sequence_steps if self.horizon is None else self.horizon.steps) - 1
+        written -= self._ahead  # the newest transitions have no full return or sequence yet
         shares = array_of(self.rng.next().to(self.device)) * (written - oldest)[:, None]
         # numpy on the CPU: for so few numbers torch takes three times as long.
         numbers = shares.astype(np.int64) if isinstance(shares, np.ndarray) else shares.long()
@@ -388,31 +389,27 @@ class Ring:
         return {name: field.view(self.lanes, self.rows, *field.shape[1:]) for name, field in fields.items()}
 
 
-def _check_memory(needed: int, sampled: int, ring: Ring) -> None:
+def _zeros(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    if device.type != "cpu":
+        return torch.zeros(shape, dtype=dtype, device=device)
+    # numpy leaves it to the system to clear pages when they are first written; torch writes them all at once,
+    # for a gigabyte in a second or more.
+    return torch.from_numpy(np.zeros(shape, array_of(torch.empty(0, dtype=dtype)).dtype))
+
+
+def _check_memory(needed: int, sample: int, ring: Ring) -> None:
     """Raises a TooLargeError if there is too little memory for a ring and its samples; logs what it takes."""
-    check_memory(
-        f"the replay buffers of {ring.lanes} learners x {ring.capacity:,} transitions",
-        needed + sampled,
-        "a smaller buffer_size or batch_size, or fewer replicas",
-        device=ring.device,
-    )
+    what = f"{ring.lanes} learners x {ring.capacity:,} transitions"
+    cure = "a smaller buffer_size or batch_size, or fewer replicas"
+    check_memory(f"the replay buffers of {what}", needed + sample, cure, device=ring.device)
     if needed >= 2**20:
-        logging.getLogger("cprl").info(
-            "Replay buffers of %d learners x %s transitions: %.2f GiB of %.1f GiB free",
-            ring.lanes,
-            f"{ring.capacity:,}",
-            needed / 2**30,
-            free_bytes(ring.device) / 2**30,
-        )
+        sizes = needed / 2**30, free_bytes(ring.device) / 2**30
+        logging.getLogger("cprl").info("Replay buffers of %s: %.2f GiB of %.1f GiB free", what, *sizes)
 
 
 def _at_least(numbers: Any, lowest: int) -> Any:
     """`clip` from below; numpy's `clip` checks the limits of the dtype, which takes five times as long."""
     return np.maximum(numbers, lowest) if isinstance(numbers, np.ndarray) else numbers.clip(min=lowest)
-
-
-def _any(flags: Any) -> bool:
-    return bool(np.count_nonzero(flags) if isinstance(flags, np.ndarray) else flags.any())
 
 
 def _part(whole: Tensor, part: Tensor) -> Tensor:

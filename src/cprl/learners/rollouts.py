@@ -1,7 +1,8 @@
 """RolloutLearner: independent on-policy agents, all of them in one update."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from copy import deepcopy
+from dataclasses import replace
 from math import prod
 from typing import Any, Final, NamedTuple
 
@@ -15,16 +16,7 @@ from cprl.learners.lanes import SAMPLING, WEIGHTS, LaneLearner, Lanes, LearningA
 from cprl.learners.ring import TransitionForm, steps_ahead, torch_dtype
 from cprl.learners.settings import RolloutSettings
 from cprl.learners.transitions import LaneTurn, refuse_other_dtype, wanted_in
-from cprl.learners.trial import (
-    TRIAL_LANES,
-    EngineName,
-    fitting_engine,
-    make_engine,
-    reads,
-    refuse_other_advantages,
-    trial_batch,
-    trial_rollout,
-)
+from cprl.learners.trial import reads, refuse_other_advantages, trial_batch, trial_rollout
 from cprl.networks.agent import AgentNetworks, parts_of
 from cprl.networks.recurrent import state_shape_of
 from cprl.policies.rng import LaneRng
@@ -163,44 +155,27 @@ class RolloutLearner(LaneLearner):
 
     settings: RolloutSettings
 
-    def __init__(
-        self,
-        who: LearningAgents,
-        method: Method,
-        *,
-        engine: EngineName | None = None,
-        compile: bool = True,
-    ) -> None:
-        super().__init__(who, method)
+    def __init__(self, who: LearningAgents, method: Method, *, compile: bool = True) -> None:
+        # Advantages, and so rewards, are those of each member of a team.
+        super().__init__(who, replace(method, own_rewards=True))
         settings: RolloutSettings = method.settings
         networks = self._lanes.new_networks(WEIGHTS)
         refuse_other_parts(networks[0])
-        shapes, sequence = states_in(networks[0]), settings.minibatch_size
-        self._states = States(shapes, self._lanes, sequence=sequence) if shapes else None
-        self.engine = self._make_engine(networks, name=engine, compile=compile)
+        self._state_shapes, sequence = states_in(networks[0]), settings.minibatch_size
+        loss = method.make_loss(deepcopy(networks[0]))
+        refuse_other_advantages(loss, settings)
+        self._reads_logits = reads(loss, "logits")
+        is_short = not self._state_shapes or sequence <= COMPILED_STEPS
+        rule = UpdateRule.of(settings)
+        self.engine = self._make_engine(networks, rule=rule, compile=compile and is_short)
+        self._states = (
+            States(self._state_shapes, self._lanes, sequence=sequence) if self._state_shapes else None
+        )
         self.actor = self._lanes.actor(self.engine, compile=compile)
         steps = settings.rollout_steps
         self.rng = LaneRng(self._lanes.seeds(SAMPLING), steps, ahead=steps_ahead(steps))
         self._rollout = rollout_fields(self._lanes, (steps,))
         self._size = 0
-
-    def _make_engine(
-        self, networks: Sequence[nn.Module], *, name: EngineName | None, compile: bool
-    ) -> Engine:
-        settings, shapes, make_loss = self.settings, states_in(networks[0]), self._lanes.method.make_loss
-        loss = make_loss(deepcopy(networks[0]))
-        refuse_other_advantages(loss, settings)
-        self._reads_logits = reads(loss, "logits")
-        trial = trial_rollout(
-            self._trial(min(len(networks), TRIAL_LANES)),
-            actions=self.spaces.actions if self._reads_logits else None,
-            states=shapes,
-        )
-        name = name or fitting_engine(networks[:TRIAL_LANES], make_loss, trial)
-        is_short = not shapes or settings.minibatch_size <= COMPILED_STEPS
-        rule = UpdateRule.of(settings)
-        engine = make_engine(name, networks, make_loss, rule, compile=compile and is_short)
-        return self._lanes.by_lane(engine)
 
     def _trial(self, lanes: int) -> TensorDict:
         form = TransitionForm(
@@ -208,7 +183,11 @@ class RolloutLearner(LaneLearner):
             observation_dtype=self.spaces.observation_dtype,
             action_shape=self._lanes.action_shape,
         )
-        return trial_batch(lanes, form, self.spaces.actions, device=self.who.device)
+        actions = self.spaces.actions
+        transitions = trial_batch(lanes, form, actions, device=self.who.device)
+        return trial_rollout(
+            transitions, actions=actions if self._reads_logits else None, states=self._state_shapes
+        )
 
     @property
     def rollout_steps(self) -> int:
@@ -224,7 +203,7 @@ class RolloutLearner(LaneLearner):
         refuse_full(self._size, self.rollout_steps)
         if self._states is not None and not self._size:
             self._states.begin(batch)
-        turn = self._lanes.rollout_turn(batch, wanted_in(self.wants, batch))
+        turn = self._lanes.turn(batch, wanted_in(self.wants, batch))
         write_turn(self._rollout, (self._size,), turn)
         self._size += 1
         self.steps += 1
@@ -367,7 +346,7 @@ def rollout_fields(lanes: Lanes, size: tuple[int, ...]) -> dict[str, Tensor]:
         "observation": (shape, dtype),
         "action": (lanes.action_shape, torch.int64),
         "next_observation": (shape, dtype),
-        "reward": (lanes.member_shape, torch.float32),
+        "reward": (lanes.reward_shape, torch.float32),
         "done": ((), torch.bool),
         "terminated": ((), torch.bool),
     }

@@ -12,7 +12,8 @@ from cprl.learners.preferences import WantedRewards
 
 
 class LaneTurn(NamedTuple):
-    """One transition of each of L lanes, as tensors or numpy arrays."""
+    """One transition of each of L lanes, as tensors or numpy arrays. Where lanes are teams of S agents, their
+    fields have the axis of members next: [L, S, ...]."""
 
     observation: Any
     """uint8 [L, C, X, Y]."""
@@ -21,23 +22,26 @@ class LaneTurn(NamedTuple):
     next_observation: Any
     """uint8 [L, C, X, Y]."""
     reward: Any
-    """float32 [L]; [L, S] where a lane is a team whose S members have rewards of their own."""
+    """float32 [L]; of teams [L, S] or, if their members share it, [L]."""
     done: Any
     """bool [L]."""
     terminated: Any
     """bool [L]."""
     recurrent_state: Any = None
-    """float32 [L, K], before the turn, of lanes with a recurrent network that learn from replay."""
+    """float32 [L, K], before the turn, of lanes with a recurrent network."""
     next_recurrent_state: Any = None
     """After it, likewise."""
 
 
-def lane_turn(agents: Sequence[int], batch: TensorDictBase, rewards: Any = None) -> LaneTurn:
+def lane_turn(
+    agents: Sequence[int], batch: TensorDictBase, rewards: Any = None, *, are_team: bool = False
+) -> LaneTurn:
     """One transition of each of some agents of every replica.
 
     Args:
         batch: entries of `cprl.keys` at the root and under "next", with batch size [R].
         rewards: the rewards that all agents want, [R, N], see `wanted_in`; by default those of the batch.
+        are_team: whether the agents of a replica are one lane.
 
     Returns:
         The transitions of `transitions_of`, with lane = replica x S + position in `agents`. On the CPU they
@@ -47,27 +51,26 @@ def lane_turn(agents: Sequence[int], batch: TensorDictBase, rewards: Any = None)
     before, after = entry(batch, keys.AGENTS), entry(batch, "next")
     agents_after = entry(after, keys.AGENTS)
     observation = array_of(entry(before, "observation"))
-    everyone = list(agents) == list(range(observation.shape[1]))
-    lanes, windows, at = len(observation) * len(agents), observation.shape[2:], list(agents)
+    replicas, everyone, *window = observation.shape
+    at = list(agents)
+    everyone_learns = at == list(range(everyone))
+    lanes = (replicas, len(at)) if are_team else (replicas * len(at),)
 
-    def of(tensor: Tensor, *shape: int) -> Any:
-        return picked(array_of(tensor), *shape)
+    def of(array: Any, *shape: int) -> Any:
+        return (array if everyone_learns else array[:, at]).reshape(*lanes, *shape)
 
-    def picked(array: Any, *shape: int) -> Any:
-        return (array if everyone else array[:, at]).reshape(lanes, *shape)
-
-    def of_world(flag: Tensor) -> Any:
-        array = array_of(flag)
-        repeat = array.repeat if isinstance(array, np.ndarray) else array.repeat_interleave
-        return repeat(len(at))
+    def of_world(flags: Any) -> Any:
+        if are_team:
+            return flags.reshape(replicas)
+        return flags.repeat(len(at)) if isinstance(flags, np.ndarray) else flags.repeat_interleave(len(at))
 
     return LaneTurn(
-        of(entry(before, "observation"), *windows),
-        of(entry(before, "action")),
-        of(entry(agents_after, "observation"), *windows),
-        of(entry(agents_after, "reward")) if rewards is None else picked(rewards),
-        of_world(entry(after, keys.DONE)),
-        of_world(entry(after, keys.TERMINATED)),
+        of(observation, *window),
+        of(array_of(entry(before, "action"))),
+        of(array_of(entry(agents_after, "observation")), *window),
+        of(array_of(entry(agents_after, "reward")) if rewards is None else rewards),
+        of_world(array_of(entry(after, keys.DONE))),
+        of_world(array_of(entry(after, keys.TERMINATED))),
     )
 
 
