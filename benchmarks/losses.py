@@ -26,7 +26,6 @@ from cprl.algorithms.on_policy import A2C, PPO, Reinforce
 from cprl.algorithms.teams import IPPO, MADDPG, MAPPO, QMIX, VDN
 from cprl.learners.engine import UpdateRule, make_engine
 from cprl.learners.lanes import WEIGHTS, Lanes, LearningAgents
-from cprl.learners.ring import TransitionForm
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.learners.trial import trial_batch, trial_rollout
 
@@ -66,13 +65,7 @@ def update_us(name: str, learners: int, repeats: int) -> tuple[str, bool, float]
     torch.manual_seed(0)
     algorithm = ALGORITHMS[name]
     lanes = lanes_of(algorithm, learners)
-    numbers = lanes.method.noise_numbers
-    form = TransitionForm(
-        observation_shape=lanes.observation_shape,
-        action_shape=lanes.action_shape,
-        reward_shape=lanes.reward_shape,
-        noise_shape=(*lanes.member_shape, numbers) if numbers else (),
-    )
+    form = lanes.form()
 
     def batch_of(count: int) -> TensorDict:
         batch = trial_batch(count, form, len(presets.game("commons").actions))

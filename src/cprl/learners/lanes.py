@@ -14,6 +14,7 @@ from cprl import keys
 from cprl.commons.spaces import Spaces
 from cprl.learners.engine import WAYS, Batching, Engine, ListEngine, MakeLoss, UpdateRule, make_engine
 from cprl.learners.preferences import Preference, WantedRewards, check_preference
+from cprl.learners.ring import Horizon, TransitionForm
 from cprl.learners.transitions import LaneTurn, array_of, joint_actions, lane_turn, seen_next
 from cprl.learners.trial import TRIAL_LANES, fitting_engine
 from cprl.networks.agent import acting_part
@@ -183,20 +184,19 @@ class Lanes:
         """How many lanes share a network; those of teams share within theirs."""
         return 1 if self.is_team else self._sharing
 
-    @property
-    def observation_shape(self) -> tuple[int, ...]:
-        """The shape of a lane's observation: (C, X, Y), (S, C, X, Y) of a team."""
-        return *self.member_shape, *self.spaces.observation_shape
-
-    @property
-    def action_shape(self) -> tuple[int, ...]:
-        """The shape of a lane's stored action: (), or (N,) if it sees those of peers; (S,) of a team."""
-        return (self.spaces.agents,) if self.method.sees_peers else self.member_shape
-
-    @property
-    def reward_shape(self) -> tuple[int, ...]:
-        """The shape of a lane's reward: (S,) if members of a team have their own."""
-        return self.member_shape if self.method.own_rewards else ()
+    def form(self, horizon: Horizon | None = None, sequence_steps: int = 1) -> TransitionForm:
+        """What is stored of a turn and sampled, see `TransitionForm`."""
+        noise = self.method.noise_numbers
+        return TransitionForm(
+            observation_shape=(*self.member_shape, *self.spaces.observation_shape),
+            observation_dtype=self.spaces.observation_dtype,
+            action_shape=(self.spaces.agents,) if self.method.sees_peers else self.member_shape,
+            reward_shape=self.member_shape if self.method.own_rewards else (),
+            noise_shape=(*self.member_shape, noise) if noise else (),
+            horizon=horizon,
+            state_cells=self.state_cells,
+            sequence_steps=sequence_steps,
+        )
 
     def turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
         """One transition of every lane; see `lane_turn`.
@@ -217,7 +217,7 @@ class Lanes:
     def seen_next(self, batch: TensorDictBase) -> Tensor:
         """The observations of lanes after a turn, uint8 [L, 1, *observation_shape]."""
         seen = seen_next(batch)[:, list(self.agents)]
-        return seen.reshape(len(self), 1, *self.observation_shape)
+        return seen.reshape(len(self), 1, *self.member_shape, *self.spaces.observation_shape)
 
     def recurrent_state(
         self, batch: TensorDictBase, entry: tuple[str, str] = keys.RECURRENT_STATE_BEFORE

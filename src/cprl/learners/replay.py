@@ -19,7 +19,7 @@ from cprl.learners.lanes import (
     LearningAgents,
     Method,
 )
-from cprl.learners.ring import Horizon, Ring, TransitionForm
+from cprl.learners.ring import Horizon, Ring
 from cprl.learners.settings import DQNSettings
 from cprl.learners.transitions import wanted_in
 from cprl.learners.trial import refuse_for_replay, trial_batch
@@ -54,16 +54,8 @@ class ReplayLearner(LaneLearner):
         lanes = self._lanes
         networks = lanes.new_networks(WEIGHTS)
         self._refuse_other_sequences()
-        self._form = TransitionForm(
-            observation_shape=lanes.observation_shape,
-            observation_dtype=who.spaces.observation_dtype,
-            action_shape=lanes.action_shape,
-            reward_shape=lanes.reward_shape,
-            noise_shape=(*lanes.member_shape, method.noise_numbers) if method.noise_numbers else (),
-            horizon=Horizon(settings.n_steps, settings.gamma) if settings.n_steps > 1 else None,
-            state_cells=lanes.state_cells,
-            sequence_steps=settings.sequence_steps,
-        )
+        horizon = Horizon(settings.n_steps, settings.gamma) if settings.n_steps > 1 else None
+        self._form = lanes.form(horizon, settings.sequence_steps)
         loss = method.make_loss(deepcopy(networks[0]))
         refuse_for_replay(loss, settings, lambda: self._trial(1)[0])
         targets = lanes.new_networks(TARGET_WEIGHTS) if settings.own_target_weights else None

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
 from math import prod
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -13,7 +13,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from cprl.learners.engine import COMPILED_STEPS, Engine, UpdateRule
 from cprl.learners.lanes import SAMPLING, WEIGHTS, LaneLearner, Lanes, LearningAgents, Method
-from cprl.learners.ring import TransitionForm, steps_ahead, torch_dtype
+from cprl.learners.ring import steps_ahead
 from cprl.learners.settings import RolloutSettings
 from cprl.learners.transitions import LaneTurn, refuse_other_dtype, wanted_in
 from cprl.learners.trial import reads, refuse_other_advantages, trial_batch, trial_rollout
@@ -45,16 +45,6 @@ def states_in(network: nn.Module) -> dict[str, tuple[int, ...]]:
     return {name: shape for name, shape in zip(NAMES, shapes, strict=True) if shape is not None}
 
 
-class Evaluated(NamedTuple):
-    """What the networks give for the turns of a rollout, [L, T, ...]."""
-
-    logits: Tensor
-    value: Tensor
-    next_value: Tensor
-    entries: dict[str, Tensor]
-    """Entries for losses: the states before each turn, and "is_init"."""
-
-
 class States:
     """The states of recurrent actors and critics of L lanes, from one rollout to the next.
 
@@ -81,8 +71,11 @@ class States:
         """Notes by which states agents act in the first turn of a rollout."""
         self._first[NAMES[ACTOR]].copy_(self._lanes.recurrent_state(batch))
 
-    def evaluate(self, engine: Engine, columns: Mapping[str, Tensor]) -> Evaluated:
-        """Evaluates a full rollout, and keeps the critic's states for the next one."""
+    def evaluate(
+        self, engine: Engine, columns: Mapping[str, Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]:
+        """The logits, values and next values of a full rollout, [L, T, ...], and what losses read besides:
+        the states before each turn, and "is_init". Keeps the critic's states for the next rollout."""
         began, states = self._began(columns["done"]), {}
         logits, states[NAMES[ACTOR]], _ = self._in_order(engine, columns, began, ACTOR)
         value, states[NAMES[CRITIC]], after = self._in_order(engine, columns, began, CRITIC)
@@ -91,7 +84,7 @@ class States:
         self._ended.copy_(columns["done"][:, -1])
         is_init = began.clone()
         is_init[:, :: self._sequence] = True
-        return Evaluated(logits, value, next_value, {**states, "is_init": is_init})
+        return logits, value, next_value, {**states, "is_init": is_init}
 
     def value_next(
         self, engine: Engine, columns: Mapping[str, Tensor], size: int, seen_next: Tensor
@@ -129,11 +122,6 @@ class States:
         )
         return outputs, before, after
 
-    def minibatches(self, numbers: Tensor) -> Tensor:
-        """The turns of an epoch's minibatches, int64 [minibatches, L, T'], from random numbers [L, T]."""
-        order = numbers[:, :: self._sequence].argsort(-1).T
-        return order.unsqueeze(-1) * self._sequence + torch.arange(self._sequence)
-
     def state_dict(self) -> dict[str, Tensor]:
         return {**self._first, "ended": self._ended}
 
@@ -161,16 +149,14 @@ class RolloutLearner(LaneLearner):
         settings: RolloutSettings = method.settings
         networks = self._lanes.new_networks(WEIGHTS)
         refuse_other_parts(networks[0])
-        self._state_shapes, sequence = states_in(networks[0]), settings.minibatch_size
+        self._state_shapes = shapes = states_in(networks[0])
         loss = method.make_loss(deepcopy(networks[0]))
         refuse_other_advantages(loss, settings)
         self._reads_logits = reads(loss, "logits")
-        is_short = not self._state_shapes or sequence <= COMPILED_STEPS
+        is_short = not shapes or settings.minibatch_size <= COMPILED_STEPS
         rule = UpdateRule.of(settings)
         self.engine = self._make_engine(networks, rule=rule, compile=compile and is_short)
-        self._states = (
-            States(self._state_shapes, self._lanes, sequence=sequence) if self._state_shapes else None
-        )
+        self._states = States(shapes, self._lanes, sequence=settings.minibatch_size) if shapes else None
         self.actor = self._lanes.actor(self.engine, compile=compile)
         steps = settings.rollout_steps
         self.rng = LaneRng(self._lanes.seeds(SAMPLING), steps, ahead=steps_ahead(steps))
@@ -178,13 +164,8 @@ class RolloutLearner(LaneLearner):
         self._size = 0
 
     def _trial(self, lanes: int) -> TensorDict:
-        form = TransitionForm(
-            observation_shape=self._lanes.observation_shape,
-            observation_dtype=self.spaces.observation_dtype,
-            action_shape=self._lanes.action_shape,
-        )
         actions = self.spaces.actions
-        transitions = trial_batch(lanes, form, actions, device=self.who.device)
+        transitions = trial_batch(lanes, self._lanes.form(), actions, device=self.who.device)
         return trial_rollout(
             transitions, actions=actions if self._reads_logits else None, states=self._state_shapes
         )
@@ -222,18 +203,25 @@ class RolloutLearner(LaneLearner):
         return self._lanes.by_agent(torch.stack(losses).mean(0))
 
     def _minibatches(self, numbers: Tensor) -> Tensor:
-        """The steps of an epoch's minibatches, int64 [minibatches, L, size], from random numbers [L, T]."""
+        """The steps of an epoch's minibatches, int64 [minibatches, L, size], from random numbers [L, T];
+        those of recurrent networks are consecutive."""
         size = self.settings.minibatch_size
-        if self._states is not None:
-            return self._states.minibatches(numbers)
-        return numbers.argsort(-1).view(len(numbers), -1, size).transpose(0, 1)
+        if self._states is None:
+            return numbers.argsort(-1).view(len(numbers), -1, size).transpose(0, 1)
+        return numbers[:, ::size].argsort(-1).T.unsqueeze(-1) * size + torch.arange(size)
 
     def _batch(self) -> TensorDict:
         """The rollout with advantages, [L, T], under the keys of TorchRL's losses; advantages are normalised
         within each lane if the settings say so."""
         columns = self._columns()
         with torch.no_grad():
-            logits, value, next_value, entries = self._evaluated(columns)
+            entries: dict[str, Tensor] = {}
+            if self._states is not None:
+                logits, value, next_value, entries = self._states.evaluate(self.engine, columns)
+            else:
+                logits = self.engine.outputs(columns["observation"], part=ACTOR)
+                value = self.engine.outputs(columns["observation"], part=CRITIC)
+                next_value = self.engine.outputs(columns["next_observation"], part=CRITIC)
             chances = logits.log_softmax(-1)
             advantage, target = advantages(columns, value, next_value, settings=self.settings)
         chosen = chances.gather(-1, columns["action"].unsqueeze(-1)).squeeze(-1)
@@ -250,14 +238,6 @@ class RolloutLearner(LaneLearner):
             },
             [self.lanes, self.rollout_steps],
         )
-
-    def _evaluated(self, columns: Mapping[str, Tensor]) -> Evaluated:
-        if self._states is not None:
-            return self._states.evaluate(self.engine, columns)
-        logits = self.engine.outputs(columns["observation"], part=ACTOR)
-        value = self.engine.outputs(columns["observation"], part=CRITIC)
-        next_value = self.engine.outputs(columns["next_observation"], part=CRITIC)
-        return Evaluated(logits, value, next_value, {})
 
     def _columns(self) -> dict[str, Tensor]:
         return {name: field.transpose(0, 1) for name, field in self._rollout.items()}
@@ -331,28 +311,24 @@ def rollout_fields(lanes: Lanes, size: tuple[int, ...]) -> dict[str, Tensor]:
     Args:
         size: the number of steps; with several rollouts, their number first.
     """
-    shape, dtype, device = (
-        lanes.observation_shape,
-        torch_dtype(lanes.spaces.observation_dtype),
-        lanes.who.device,
-    )
+    form, device = lanes.form(), lanes.who.device
     check_memory(
         f"the rollouts of {len(lanes)} learners x {prod(size):,} steps",
-        prod(size) * len(lanes) * (2 * prod(shape) * (dtype.itemsize + 4) + 64),
+        prod(size) * len(lanes) * (2 * prod(form.observation_shape) * (form.dtype.itemsize + 4) + 64),
         "fewer rollout_steps or fewer replicas",
         device=device,
     )
-    forms: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
-        "observation": (shape, dtype),
-        "action": (lanes.action_shape, torch.int64),
-        "next_observation": (shape, dtype),
-        "reward": (lanes.reward_shape, torch.float32),
+    fields: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
+        "observation": (form.observation_shape, form.dtype),
+        "action": (form.action_shape, torch.int64),
+        "next_observation": (form.observation_shape, form.dtype),
+        "reward": (form.reward_shape, torch.float32),
         "done": ((), torch.bool),
         "terminated": ((), torch.bool),
     }
     return {
-        name: torch.zeros((*size, len(lanes), *of_one), dtype=kind, device=device)
-        for name, (of_one, kind) in forms.items()
+        name: torch.zeros((*size, len(lanes), *shape), dtype=dtype, device=device)
+        for name, (shape, dtype) in fields.items()
     }
 
 
