@@ -20,7 +20,7 @@ docs: $(DOCS_INSTALLED)
 docs-serve: docs
 	$(BIN)/python -m http.server --bind 127.0.0.1 --directory build/site $(or $(PORT),8765)
 
-# ARGS="tests/test_lanes.py" runs a part of the tests.
+# ARGS="tests/test_ring.py" runs a part of the tests.
 PYTEST := python -m pytest -n auto --dist worksteal
 NOT_HERE := not slow and not gpu and not viewer and not network and not docs
 

@@ -24,8 +24,9 @@ from cprl.algorithms.base import Algorithm
 from cprl.algorithms.off_policy import CQL, DQN, IQL, PR2, SAC, DistributionalDQN
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
 from cprl.algorithms.teams import IPPO, MADDPG, MAPPO, QMIX, VDN
+from cprl.learners.base import WEIGHTS, LearningAgents
 from cprl.learners.engine import UpdateRule, make_engine
-from cprl.learners.lanes import WEIGHTS, Lanes, LearningAgents
+from cprl.learners.lanes import Lanes
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.learners.trial import trial_batch, trial_rollout
 

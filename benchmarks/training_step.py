@@ -26,7 +26,7 @@ from rich.table import Table
 
 from cprl import CommonsEnv, presets
 from cprl.algorithms.off_policy import DQN
-from cprl.learners.lanes import LearningAgents
+from cprl.learners.base import LearningAgents
 from cprl.learners.replay import ReplayLearner
 from cprl.measuring.episodes import EpisodeTracker
 from cprl.policies.assignment import AgentPolicies

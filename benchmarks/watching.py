@@ -31,7 +31,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from cprl import CommonsEnv, presets
 from cprl.algorithms.off_policy import DQN
-from cprl.learners.lanes import LearningAgents
+from cprl.learners.base import LearningAgents
 from cprl.measuring import Episode
 from cprl.policies.lanes import random_agents
 from cprl.policies.present import PresentPolicy

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from cprl.algorithms import DQN, DQNSettings
-from cprl.learners.lanes import LearningAgents
+from cprl.learners.base import LearningAgents
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.transitions import LaneTurn
 

@@ -18,9 +18,9 @@ from test_population import (
     trained,
     weights,
 )
+from test_recurrent import DQNS
 from test_recurrent import ON_POLICY as RECURRENT
 from test_recurrent import specs as recurrent_specs
-from test_recurrent_replay import DQNS
 from test_teams import TEAMS
 
 import cprl

@@ -88,23 +88,6 @@ def test_the_clock_running_out_is_no_end_for_the_target_but_depletion_is(ending,
     assert loss(batch)["loss"].item() == pytest.approx(by_hand.item(), rel=1e-5)
 
 
-def target_weights(agent):
-    weights = agent.engine.losses[0].target_value_network_params
-    return torch.cat([weight.data.flatten() for weight in weights.values(True, True)])
-
-
-def own_weights(agent):
-    weights = agent.engine.losses[0].value_network_params
-    return torch.cat([weight.data.flatten() for weight in weights.values(True, True)])
-
-
-def test_the_target_network_starts_as_a_copy_and_as_run_with_weights_of_its_own():
-    copy = learner()
-    assert torch.equal(target_weights(copy), own_weights(copy))
-    own = learner(own_target_weights=True)
-    assert not torch.equal(target_weights(own), own_weights(own))
-
-
 def test_the_actor_follows_the_learner_and_epsilon_its_steps():
     agent = learner(epsilon_hold_steps=10, epsilon_decay_steps=100)
     assert agent.actor.epsilon == 1.0

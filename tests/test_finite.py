@@ -12,26 +12,8 @@ from matrix_game import MatrixGame
 from torchrl.envs import Transform, TransformedEnv
 
 import cprl.training.training
-from cprl import CommonsEnv, Custom, Experiment, Game, Rules, load, maps, run
-from cprl.algorithms import (
-    DQN,
-    IPPO,
-    LOLA,
-    MADDPG,
-    MAPPO,
-    PPO,
-    PR2,
-    QMIX,
-    SAC,
-    VDN,
-    DistributionalDQN,
-    DQNSettings,
-    LOLASettings,
-    Reinforce,
-    RolloutSettings,
-    Tabular,
-    TabularSettings,
-)
+from cprl import CommonsEnv, Custom, Experiment, Game, Rules, algorithms, load, maps, run
+from cprl.algorithms import DQN, PPO, PR2, DQNSettings, LOLASettings, RolloutSettings
 from cprl.commands.recipe import parse
 from cprl.envs.make_env import spaces_of
 from cprl.learners.base import LaneLosses
@@ -60,25 +42,25 @@ REPLAY = DQNSettings(
 )
 ROLLOUT = RolloutSettings(rollout_steps=6, minibatch_size=3, epochs=2, hidden_cells=(8,), learning_rate=1e-3)
 LOOK = LOLASettings(rollout_steps=6, hidden_cells=(8,))
+STOCK, TEAM = {"engine": "torchrl"}, {"reward_kind": "team"}
 LEARNERS = {
     "DQN": (DQN(settings=REPLAY), {}),
     "DQN with soft updates": (DQN(settings=replace(REPLAY, tau=0.1)), {}),
-    "C51": (DistributionalDQN(settings=REPLAY, atoms=5), {}),
-    "SAC": (SAC(settings=REPLAY), {}),
+    "C51": (algorithms.DistributionalDQN(settings=REPLAY, atoms=5), {}),
+    "SAC": (algorithms.SAC(settings=REPLAY), {}),
     "PR2": (PR2(settings=REPLAY), {}),
-    "PR2 of TorchRL": (PR2(settings=REPLAY), {"engine": "torchrl"}),
+    "PR2 of TorchRL": (PR2(settings=REPLAY), STOCK),
     "PPO": (PPO(settings=ROLLOUT), {}),
-    "DQN of TorchRL": (DQN(settings=REPLAY), {"engine": "torchrl"}),
-    "PPO of TorchRL": (PPO(settings=ROLLOUT), {"engine": "torchrl"}),
-    "Reinforce of TorchRL": (Reinforce(settings=ROLLOUT), {"engine": "torchrl"}),
-    "Tabular": (Tabular(settings=TabularSettings()), {}),
-    "VDN": (VDN(settings=REPLAY), {"reward_kind": "team"}),
-    "QMIX": (QMIX(settings=REPLAY), {"reward_kind": "team"}),
-    "IPPO": (IPPO(settings=ROLLOUT), {}),
-    "MADDPG": (MADDPG(settings=REPLAY), {}),
-    "MAPPO": (MAPPO(settings=ROLLOUT), {"reward_kind": "team"}),
-    "LOLA": (LOLA(settings=LOOK), {}),
-    "LOLA by DiCE": (LOLA(settings=LOOK, estimator="dice"), {}),
+    "DQN of TorchRL": (DQN(settings=REPLAY), STOCK),
+    "PPO of TorchRL": (PPO(settings=ROLLOUT), STOCK),
+    "Reinforce of TorchRL": (algorithms.Reinforce(settings=ROLLOUT), STOCK),
+    "Tabular": (algorithms.Tabular(settings=algorithms.TabularSettings()), {}),
+    **{name: (getattr(algorithms, name)(settings=REPLAY), TEAM) for name in ("VDN", "QMIX")},
+    "IPPO": (algorithms.IPPO(settings=ROLLOUT), {}),
+    "MADDPG": (algorithms.MADDPG(settings=REPLAY), {}),
+    "MAPPO": (algorithms.MAPPO(settings=ROLLOUT), TEAM),
+    "LOLA": (algorithms.LOLA(settings=LOOK), {}),
+    "LOLA by DiCE": (algorithms.LOLA(settings=LOOK, estimator="dice"), {}),
 }
 REPLICAS, BROKEN = 3, (1, 0)
 """The replica and the agent that break."""

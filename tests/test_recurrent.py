@@ -1,7 +1,9 @@
-"""Agents with recurrent networks: what they remember, when they forget it, and how they learn from it."""
+"""Agents with recurrent networks: what they remember, when they forget it, and how they learn from it, from
+rollouts and from the sequences of a replay buffer."""
 
 import os
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -18,27 +20,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import GRUModule, LSTMModule, set_recurrent_mode
 
 import cprl
-from cprl import CommonsEnv, Custom, Experiment
-from cprl.algorithms import (
-    A2C,
-    CQL,
-    DQN,
-    IPPO,
-    IQL,
-    LOLA,
-    MADDPG,
-    MAPPO,
-    PPO,
-    PR2,
-    QMIX,
-    SAC,
-    VDN,
-    DistributionalDQN,
-    DQNSettings,
-    LOLASettings,
-    Reinforce,
-    RolloutSettings,
-)
+from cprl import CommonsEnv, Custom, Experiment, algorithms
+from cprl.algorithms import DQN, PPO, DQNSettings, LOLASettings, RolloutSettings
 from cprl.envs import make_env, spaces_of
 from cprl.envs.matrix import stag_hunt
 from cprl.evaluation.film import film
@@ -61,10 +44,25 @@ ON_POLICY = {
     "PPO": PPO(settings=ROLLOUTS, network=SMALL),
     "PPO, LSTM": PPO(settings=ROLLOUTS, network=LONG),
     "PPO, convolutions": PPO(settings=ROLLOUTS, network=CONV),
-    "A2C": A2C(settings=replace(ROLLOUTS, epochs=1), network=SMALL),
-    "REINFORCE": Reinforce(settings=replace(ROLLOUTS, epochs=1), network=SMALL),
-    "IPPO": IPPO(settings=ROLLOUTS, network=SMALL),
-    "MAPPO": MAPPO(settings=ROLLOUTS, network=SMALL),
+    "A2C": algorithms.A2C(settings=replace(ROLLOUTS, epochs=1), network=SMALL),
+    "REINFORCE": algorithms.Reinforce(settings=replace(ROLLOUTS, epochs=1), network=SMALL),
+    "IPPO": algorithms.IPPO(settings=ROLLOUTS, network=SMALL),
+    "MAPPO": algorithms.MAPPO(settings=ROLLOUTS, network=SMALL),
+}
+SEQUENCES = DQNSettings(
+    buffer_size=60,
+    batch_size=4,
+    learning_starts=8,
+    sequence_steps=6,
+    learning_rate=1e-3,
+    epsilon_hold_steps=0,
+    epsilon_decay_steps=60,
+    target_every_episodes=2,
+)
+DQNS = {
+    "GRU": DQN(settings=SEQUENCES, network=SMALL),
+    "LSTM, double, log-cosh": DQN(settings=SEQUENCES, network=LONG, double=True, loss_function="log_cosh"),
+    "convolutions": DQN(settings=replace(SEQUENCES, tau=0.1), network=CONV),
 }
 FOUR = (0, 1, 2, 3)
 
@@ -76,6 +74,10 @@ def specs(name, *, shares=False):
         reward = "team" if name == "MAPPO" else "individual"
         return [Team(algorithm, FOUR, reward=reward, share_parameters=shares)]
     return [Learning(algorithm)] * 4
+
+
+def learner_of(algorithm, *, replicas=2, engine="eager"):
+    return make_learner(algorithm, GAME.spaces, agents=FOUR, replicas=replicas, engine=engine)
 
 
 def sequences(batch, steps, cells, *, seed=0):
@@ -193,22 +195,19 @@ def test_a_state_goes_from_turn_to_turn_and_is_zero_where_an_episode_begins(kind
     )
     policy = AgentPolicies({learner.agents: learner.actor})
     played = batches(env, policy, 30)
-    first = True
-    for before, now in zip([None, *played], played, strict=False):
-        states = now["agents", "recurrent_state_before"]
-        began = torch.ones(2, dtype=torch.bool) if first else before["next", "done"][:, 0]
-        first = False
+    assert (played[0]["agents", "recurrent_state_before"] == 0).all()
+    for before, now in pairwise(played):
+        states, began = now["agents", "recurrent_state_before"], before["next", "done"][:, 0]
         assert (states[began] == 0).all()
-        if before is not None:
-            kept = before["agents", "recurrent_state"][~began]
-            assert torch.equal(states[~began], kept)
-            assert (kept != 0).any() or not len(kept)
+        kept = before["agents", "recurrent_state"][~began]
+        assert torch.equal(states[~began], kept)
+        assert (kept != 0).any() or not len(kept)
     assert any(now["next", "done"].any() for now in played[:-1])
 
 
 def test_rollouts_and_collectors_of_torchrl_carry_and_reset_states_too():
     env = CommonsEnv(GAME, 2, seed=3)
-    learner = make_learner(ON_POLICY["PPO"], env.game.spaces, agents=FOUR, replicas=2, engine="eager")
+    learner = learner_of(ON_POLICY["PPO"])
     policy = AgentPolicies({FOUR: learner.actor})
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         played = env.rollout(30, policy, break_when_any_done=False)
@@ -226,7 +225,7 @@ def test_rollouts_and_collectors_of_torchrl_carry_and_reset_states_too():
 def test_a_rollout_is_evaluated_as_it_was_played_across_rollouts_and_episodes():
     """The logits of `_batch` are those by which agents acted; so are those of any minibatch's own states."""
     env = CommonsEnv(GAME, 2, seed=3)
-    learner = make_learner(ON_POLICY["PPO"], env.game.spaces, agents=FOUR, replicas=2, engine="eager")
+    learner = learner_of(ON_POLICY["PPO"])
     policy = AgentPolicies({FOUR: learner.actor})
     turns = iter(StepCollector(env, policy))
     for _ in range(3):  # episodes last 12 turns, rollouts 20
@@ -274,10 +273,120 @@ def test_the_critic_goes_on_from_rollout_to_rollout_and_values_the_state_after_e
         learner.store(played[-1])
         torch.testing.assert_close(learner.values(played[-1]), wanted(played)[0])
         if learner._size == 10:
-            evaluated = learner._evaluated(learner._columns())
-            torch.testing.assert_close(evaluated.next_value[0, -1:], wanted(played)[0])
+            _, _, next_value, _ = learner._states.evaluate(learner.engine, learner._columns())
+            torch.testing.assert_close(next_value[0, -1:], wanted(played)[0])
             learner._size = 0
             torch.testing.assert_close(learner.values(played[-1]), wanted(played)[0])
+
+
+def play(learner, steps):
+    """Plays and stores so many turns; returns each, as it was played."""
+    turns = iter(
+        StepCollector(CommonsEnv(GAME, learner.replicas, seed=3), AgentPolicies({FOUR: learner.actor}))
+    )
+    played = []
+    for _ in range(steps):
+        played.append(next(turns).clone())
+        learner.store(played[-1])
+    return played
+
+
+def of_lane(played, name, lane, after=False):
+    """An entry of a lane in each turn."""
+    turns = [turn["next"] if after else turn for turn in played]
+    found = [turn["agents", name] if ("agents", name) in turn.keys(True) else turn[name] for turn in turns]
+    return torch.stack([own.flatten(0, 1)[lane] if own.ndim > 2 else own[lane // 4] for own in found])
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("steps", [17, 200])
+def test_a_sequence_is_what_was_played_from_some_turn_on(steps):
+    """Also where the ring has come round three times; episodes last up to 12 turns, sequences 6."""
+    learner = learner_of(DQNS["GRU"])
+    played = play(learner, steps)
+    batch, starts = learner.buffer.sample(), []
+    assert batch.batch_size == torch.Size([8, 4, 6])
+    for lane in range(8):
+        actions = torch.stack([turn["agents", "action"].flatten()[lane] for turn in played])
+        seen = of_lane(played, "observation", lane)
+        before = of_lane(played, "recurrent_state_before", lane)
+        after = of_lane(played, "recurrent_state", lane)
+        done = of_lane(played, "done", lane, after=True)[:, 0]
+        for own in batch[lane]:
+            fits = [
+                place
+                for place in range(max(0, steps - 60), steps - 5)
+                if torch.equal(own["recurrent_state"], before[place : place + 6])
+                and torch.equal(own["action"], actions[place : place + 6])
+                and torch.equal(own["observation"], seen[place : place + 6])
+            ]
+            assert fits
+            now = slice(fits[0], fits[0] + 6)
+            starts.append(fits[0])
+            assert torch.equal(own["next", "done"][:, 0], done[now])
+            assert torch.equal(own["next", "recurrent_state"], after[now])
+            seen_next = of_lane(played, "observation", lane, after=True)
+            assert torch.equal(own["next", "observation"], seen_next[now])
+            began = torch.cat([torch.tensor([True]), done[now][:-1]])
+            assert torch.equal(own["is_init"], began)
+            assert torch.equal(own["next", "is_init"], began)
+    assert len(set(starts)) > 8 if steps > 20 else set(starts) <= set(range(12))
+
+
+def test_every_turn_is_sampled_once_enough_follow_it():
+    learner = learner_of(DQNS["GRU"], replicas=1)
+    play(learner, 100)
+    oldest, written = learner.buffer.oldest()
+    drawn = torch.cat([learner.buffer.draw() for _ in range(200)], 1)
+    places = {int(place) % 60 for place in range(int(oldest[0]), written - 5)}
+    assert set(drawn.flatten().tolist()) == places
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("double", [False, True])
+def test_the_loss_is_that_of_a_network_that_goes_through_the_turns_by_itself(double):
+    """One step of the network after the other, with the state of the one before, for the network and its
+    targets, whose sequences are of the observations after each turn."""
+    learner = learner_of(replace(DQNS["GRU"], double=double))
+    targets = learner.networks()  # copied to the targets at the end of an episode, which nobody tells here
+    play(learner, 40)
+    for _ in range(3):
+        learner.update()
+    networks, batch = learner.networks(), learner.buffer.sample()
+
+    def values(network, turns):
+        found, state = [], None
+        for turn in turns:
+            state = turn["recurrent_state"] if turn["is_init"] else state
+            output, state = network(turn["observation"], state)
+            found.append(output)
+        return torch.stack(found)
+
+    wanted = []
+    for own, target, sequences in zip(networks.values(), targets.values(), batch, strict=True):
+        errors = []
+        for sequence in sequences:
+            chosen = values(own, sequence).gather(-1, sequence["action"][:, None])[:, 0]
+            after = values(target, sequence["next"])
+            best = (values(own, sequence["next"]) if double else after).argmax(-1, keepdim=True)
+            goes_on = ~sequence["next", "terminated"][:, 0]
+            bootstrap = 0.995 * after.gather(-1, best)[:, 0] * goes_on
+            errors.append(chosen - sequence["next", "reward"][:, 0] - bootstrap)
+        wanted.append(torch.cat(errors).square().mean())
+    found = learner.engine.update_from(batch)
+    torch.testing.assert_close(found, torch.stack(wanted).detach())
+
+
+def test_the_value_of_dqn_after_a_turn_knows_the_turns_before():
+    learner = learner_of(DQNS["GRU"], replicas=1)
+    played = play(learner, 30)
+    network = learner.networks()["replica_0/agent_2"]
+    state, place = torch.zeros(5), max(t for t, turn in enumerate(played[:-1]) if turn["next", "done"].any())
+    for turn in played[place + 1 :]:
+        _, state = network(turn["agents", "observation"][0, 2], state)
+    expected, _ = network(played[-1]["next", "agents", "observation"][0, 2], state)
+    assert len(played[place + 1 :]) > 1
+    torch.testing.assert_close(learner.values(played[-1])[0, 2], expected.max())
 
 
 @pytest.mark.parametrize("name", ["PPO", "MAPPO"])
@@ -362,28 +471,35 @@ def test_states_of_other_policies_are_refused(ran):
 
 
 REPLAY = DQNSettings(buffer_size=60, batch_size=4)
+OF_TURNS = ("DistributionalDQN", "CQL", "SAC", "IQL", "PR2", "VDN", "QMIX", "MADDPG", "LOLA")
 
 
 @pytest.mark.parametrize("network", [SMALL, LONG])
-@pytest.mark.parametrize("kind", [DistributionalDQN, CQL, SAC, IQL, PR2, VDN, QMIX, MADDPG, LOLA])
-def test_algorithms_that_learn_from_single_transitions_are_refused_by_name(kind, network):
-    settings = LOLASettings() if kind is LOLA else REPLAY
-    with pytest.raises(
-        ValueError,
-        match=rf"{kind.__name__}.network is (GRU|LSTM).*does not learn from sequences.*DQN, .* MAPPO learn",
-    ):
-        kind(settings=settings, network=network)
+@pytest.mark.parametrize("name", OF_TURNS)
+def test_algorithms_that_learn_from_single_transitions_are_refused_by_name(name, network):
+    settings = LOLASettings() if name == "LOLA" else REPLAY
+    with pytest.raises(ValueError, match=rf"{name}.network is (GRU|LSTM).*does not learn from sequences"):
+        getattr(algorithms, name)(settings=settings, network=network)
 
 
-def test_other_wrong_values_are_refused_by_name():
-    with pytest.raises(ValueError, match=r"GRU.encoder is a MLP"):
-        GRU(encoder=MLP(hidden_cells=()))
-    with pytest.raises(ValueError, match=r"GRU.encoder is a GRU"):
-        GRU(encoder=SMALL)
-    with pytest.raises(ValueError, match="relu_on_outputs is True"):
-        SMALL.make(VECTORS, 3, relu_on_outputs=True)
-    with pytest.raises(ValueError, match="recurrent"):
-        make_learner(ON_POLICY["PPO"], GAME.spaces, agents=FOUR, replicas=1, engine="torchrl")
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: GRU(encoder=MLP(hidden_cells=())), "GRU.encoder is a MLP"),
+        (lambda: GRU(encoder=SMALL), "GRU.encoder is a GRU"),
+        (lambda: SMALL.make(VECTORS, 3, relu_on_outputs=True), "relu_on_outputs is True"),
+        (lambda: learner_of(ON_POLICY["PPO"], engine="torchrl"), "recurrent"),
+        (lambda: learner_of(DQNS["GRU"], engine="torchrl"), "sequence_steps is 6"),
+        (lambda: learner_of(DQN(settings=DQNSettings(), network=SMALL)), "sequence_steps is 1"),
+        (lambda: learner_of(DQN(settings=SEQUENCES)), "sequence_steps is 6"),
+        (lambda: replace(SEQUENCES, n_steps=2), "sequence_steps is 6"),
+        (lambda: DQNSettings(sequence_steps=17), "sequence_steps is 17"),
+        (lambda: replace(SEQUENCES, replay_transforms=(Custom("a:B"),)), "sequence_steps is 6"),
+    ],
+)
+def test_other_wrong_values_are_refused_by_name(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        wrong()
 
 
 STACKED = Custom(
@@ -455,8 +571,8 @@ def test_memory_is_what_a_game_of_recall_needs(algorithm, settings, episodes):
         train(env, {(0,): learner}, episodes=episodes, callbacks=[returns])
         return [float(np.mean(own[-100:])) for own in returns.of.values()]
 
-    sequences = {"sequence_steps": 6} if algorithm is DQN else {}
+    turns = {"sequence_steps": 6} if algorithm is DQN else {}
     for kind in (GRU, LSTM):
-        remembering = reached(kind(encoder=MLP(hidden_cells=(8,)), recurrent_cells=8), **sequences)
+        remembering = reached(kind(encoder=MLP(hidden_cells=(8,)), recurrent_cells=8), **turns)
         assert sorted(remembering)[1] > 0.9, (kind, remembering)
     assert max(reached(MLP(hidden_cells=(16,)))) < 0.7

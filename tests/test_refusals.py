@@ -15,8 +15,8 @@ from torchrl.objectives import ClipPPOLoss, DQNLoss, HardUpdate, KLPENPPOLoss, S
 from cprl import CommonsEnv, Observation
 from cprl.algorithms import A2C, DQN, PPO, QMIX
 from cprl.algorithms.base import policy
+from cprl.learners.base import LearningAgents
 from cprl.learners.engine import ListEngine
-from cprl.learners.lanes import LearningAgents
 from cprl.learners.reference import TorchRLRolloutLearner
 from cprl.learners.ring import Ring, TransitionForm
 from cprl.learners.rollouts import RolloutLearner

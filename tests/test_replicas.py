@@ -1,7 +1,5 @@
 """Training many replicas at once: each plays and learns as it would alone."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -60,17 +58,6 @@ def learner(engine="lane_axis", *, game=GAME, agents=(0, 1), settings=SETTINGS, 
     return dqn_learner(game.spaces, agents=agents, settings=settings, engine=engine, compile=False, **how)
 
 
-def test_as_run_targets_start_from_weights_of_their_own_and_the_loss_is_shared_over_outputs():
-    as_run = replace(SETTINGS, own_target_weights=True, mean_over_all_outputs=True)
-    plain, odd = (learner(replicas=2, settings=settings) for settings in (SETTINGS, as_run))
-    assert odd.engine._rule.loss_share == plain.engine._rule.loss_share / 8
-    for agents, same in ((plain, True), (odd, False)):
-        weights = agents.engine.weights(0)
-        own = [value for name, value in weights.items() if not name.startswith("target_")]
-        target = [value for name, value in weights.items() if name.startswith("target_")]
-        assert torch.equal(own[0], target[0]) is same
-
-
 @pytest.mark.integration
 def test_every_replica_is_told_of_so_many_episodes_and_of_its_losses(tmp_path):
     with EpisodeTable(tmp_path / "episodes.parquet") as table:
@@ -87,16 +74,6 @@ def test_every_replica_is_told_of_so_many_episodes_and_of_its_losses(tmp_path):
     assert set(witness.learning[0]) == {
         f"agent_{i}/{name}" for i in (0, 1) for name in ("loss", "epsilon", "q")
     }
-
-
-def test_targets_follow_each_replicas_own_episodes():
-    agents = learner(replicas=2)
-    agents.store(CommonsEnv(GAME, 2).rollout(1)[:, 0])
-    copied = []
-    agents.engine.copy_to_targets = lambda which: copied.append(which.tolist())
-    for ended in ([True, False], [True, False], [True, True], [False, True]):
-        agents.end_episode(torch.tensor(ended))
-    assert copied == [[True, True, False, False], [False, False, True, True]]
 
 
 @pytest.mark.integration

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 from test_population import ALGORITHMS, GAME, REPLAY, ROLLOUTS, population, ran, trained
+from test_recurrent import DQNS
 from test_recurrent import ON_POLICY as RECURRENT
-from test_recurrent_replay import DQNS
 from test_teams import TEAMS, first_turn
 
 from cprl import CommonsEnv, Custom, Experiment

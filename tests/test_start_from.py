@@ -15,8 +15,6 @@ from cprl import CommonsEnv, Experiment
 from cprl.algorithms import DQN, IPPO, MADDPG, MAPPO, PPO, QMIX, SAC, VDN, Tabular, TabularSettings
 from cprl.commands import main as cli
 from cprl.commands.recipe import parse
-from cprl.learners.settings import DQNSettings
-from cprl.measuring.evaluate import evaluate
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.checkpoints import checkpoints_in
 from cprl.runs.weights import load_weights, save_weights
@@ -80,24 +78,25 @@ def test_agents_start_with_the_weights_of_a_stored_one(stored, engine, agent):
         assert same(begun.networks()[f"replica_{replica}/agent_0"], kept[name])
 
 
-@pytest.mark.parametrize("algorithm", [VDN(settings=REPLAY), QMIX(settings=REPLAY)])
-def test_members_of_a_team_start_with_the_weights_of_the_members_of_a_stored_one(stored, algorithm):
-    kept = load_weights(Path(f"{stored}/teams/checkpoints/final.pt"))
-    spec = Team(algorithm, agents=(1, 3), start_from=Frozen(f"{stored}/teams", 2))
-    begun = population([spec, Scripted(), Scripted()]).networks()
-    for replica in (0, 1):
-        for agent, theirs in ((1, 0), (3, 2)):
-            assert same(begun[f"replica_{replica}/agent_{agent}"], kept[f"replica_0/agent_{theirs}"])
-
-
 @pytest.mark.parametrize(
-    "algorithm", [MAPPO(settings=ROLLOUT), IPPO(settings=ROLLOUT), MADDPG(settings=REPLAY)]
+    ("algorithm", "stored_agents"),
+    [
+        *((kind(settings=REPLAY), {1: 0, 3: 2}) for kind in (VDN, QMIX)),
+        *((kind(settings=ROLLOUT), {0: 1, 1: 3}) for kind in (MAPPO, IPPO)),
+        (MADDPG(settings=REPLAY), {0: 1, 1: 3}),
+    ],
 )
-def test_teams_of_actors_start_likewise(stored, algorithm):
+def test_members_of_a_team_start_with_the_weights_of_the_members_of_a_stored_one(
+    stored, algorithm, stored_agents
+):
     kept = load_weights(Path(f"{stored}/teams/checkpoints/final.pt"))
-    spec = Team(algorithm, agents=(0, 1), start_from=Frozen(f"{stored}/teams", 1, replica=None))
-    begun = population([spec, Scripted(), Scripted()]).networks()
-    assert same(begun["replica_1/agent_1"], kept["replica_1/agent_3"])
+    first = stored_agents[min(stored_agents)]
+    start = Frozen(f"{stored}/teams", first, replica=None)
+    begun = population([Team(algorithm, tuple(stored_agents), start_from=start), Scripted(), Scripted()])
+    for replica in (0, 1):
+        for agent, theirs in stored_agents.items():
+            network = begun.networks()[f"replica_{replica}/agent_{agent}"]
+            assert same(network, kept[f"replica_{replica}/agent_{theirs}"])
 
 
 @pytest.mark.parametrize("engine", ["eager", "torchrl"])
@@ -119,18 +118,6 @@ def test_targets_start_with_the_same_weights_and_the_optimiser_and_exploration_a
         assert any(own.shape == target.shape and torch.equal(own, target) for own in trained)
     assert learner.steps == 0
     assert learner.actor.epsilon == settings.epsilon(0) == 1.0
-
-
-def test_without_updates_it_plays_what_was_stored(stored):
-    never = DQNSettings(**{**vars(REPLAY), "learning_starts": 60, "learning_rate": 1e-12})
-    agents = [replace(ALONE[0], algorithm=DQN(settings=never), start_from=Frozen(f"{stored}/alone", 0))]
-    begun = population([*agents, *[Scripted("sustainable")] * 3])
-    frozen = population([Frozen(f"{stored}/alone", 0), *[Scripted("sustainable")] * 3])
-    played = [
-        [episode.return_.tolist() for episode in evaluate(CommonsEnv(FOUR, 2, seed=1), own.policy(1))]
-        for own in (begun, frozen)
-    ]
-    assert played[0] == played[1]
 
 
 @pytest.mark.integration
@@ -173,40 +160,31 @@ class Stops:
             os.kill(os.getpid(), signal.SIGTERM)
 
 
-def refused(spec, match):
-    others = 4 - (len(spec.agents) if isinstance(spec, Team) else 1)
-    with pytest.raises(ValueError, match=match):
-        population([spec, *[Scripted()] * others])
-
-
 @pytest.mark.integration
 def test_what_cannot_be_started_from_is_refused_by_name(stored, tmp_path):
-    dqn, ppo, run = ALONE[0], ALONE[1], f"{stored}/alone"
-    refused(replace(dqn, start_from=Frozen(run, 4)), r"agent is 4; .*alone has the agents 0 to 3")
-    refused(replace(dqn, start_from=Frozen(run, 0, replica=2)), r"keeps no network of replica_2/agent_0")
-    refused(replace(dqn, start_from=Frozen(f"{stored}/frozen", 1)), r"agent_1 of .*frozen is scripted")
-    refused(replace(dqn, start_from=Frozen(f"{stored}/nowhere", 0)), "nowhere")
-    refused(
-        replace(dqn, start_from=Frozen(run, 1)),
-        r"agent_1 of .*alone outputs the logits of a policy; DQN learns action values",
-    )
-    refused(
-        replace(ppo, start_from=Frozen(run, 0)), r"outputs action values; PPO learns the logits of a policy"
-    )
+    dqn, ppo, run, teams = DQN(settings=REPLAY), ALONE[1].algorithm, f"{stored}/alone", f"{stored}/teams"
     wider = DQN(settings=replace(REPLAY, hidden_cells=(9,)))
-    refused(
-        Learning(wider, start_from=Frozen(run, 0)), r"agent_0 of .* has another network than DQN here: .*siz"
-    )
     relu = DQN(settings=replace(REPLAY, relu_on_outputs=True))
-    refused(Learning(relu, start_from=Frozen(run, 0)), "with the same weights the outputs differ")
-    vdn = VDN(settings=REPLAY)
-    refused(
-        Team(vdn, (0, 1), start_from=Frozen(run, 0)), "agent 0 of .*alone is in no team; allowed for a te"
-    )
-    refused(
-        Team(vdn, (0, 1, 2), start_from=Frozen(f"{stored}/teams", 0)),
-        "is in a team of 2; allowed for a team of 3 to start from: a member of a team of 3",
-    )
+    for algorithm, start, message in (
+        (dqn, Frozen(run, 4), r"agent is 4; .*alone has the agents 0 to 3"),
+        (dqn, Frozen(run, 0, replica=2), "keeps no network of replica_2/agent_0"),
+        (dqn, Frozen(f"{stored}/frozen", 1), "agent_1 of .*frozen is scripted"),
+        (dqn, Frozen(f"{stored}/nowhere", 0), "nowhere"),
+        (dqn, Frozen(run, 1), "agent_1 of .*alone outputs the logits of a policy; DQN learns action values"),
+        (ppo, Frozen(run, 0), "outputs action values; PPO learns the logits of a policy"),
+        (wider, Frozen(run, 0), "agent_0 of .* has another network than DQN here: .*siz"),
+        (relu, Frozen(run, 0), "with the same weights the outputs differ"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            population([Learning(algorithm, start_from=start), *[Scripted()] * 3])
+    for agents, start, message in (
+        ((0, 1), Frozen(run, 0), "agent 0 of .*alone is in no team; allowed for a te"),
+        ((0, 1, 2), Frozen(teams, 0), "is in a team of 2; .*: a member of a team of 3"),
+    ):
+        team = Team(VDN(settings=REPLAY), agents, start_from=start)
+        with pytest.raises(ValueError, match=message):
+            population([team, *[Scripted()] * (4 - len(agents))])
+    dqn = ALONE[0]
     spec = replace(dqn, start_from=Frozen(run, 0))
     taller = replace(FOUR, rules=replace(FOUR.rules, window_rows=4))
     with pytest.raises(ValueError, match=r"have observations .*; this game has"):

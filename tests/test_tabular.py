@@ -12,7 +12,7 @@ from dqn_parts import q_table
 from cprl import CommonsEnv, Game, Observation, Rules, maps
 from cprl.envs import make_env, spaces_of
 from cprl.envs.matrix import prisoners_dilemma
-from cprl.learners.lanes import LearningAgents
+from cprl.learners.base import LearningAgents
 from cprl.learners.settings import TabularSettings
 from cprl.learners.tabular import TabularLearner
 from cprl.measuring.evaluate import evaluate

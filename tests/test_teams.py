@@ -9,12 +9,10 @@ import torch
 from tensordict import TensorDict
 from test_population import GAME, REPLAY, ROLLOUTS, population, weights
 
-from cprl import CommonsEnv, Game, Rules, maps, presets
+from cprl import CommonsEnv, Game, Rules, maps
 from cprl.algorithms.off_policy import DQN
 from cprl.algorithms.teams import IPPO, MADDPG, MAPPO, QMIX, VDN
-from cprl.learners.engine import FunctionalEngine
 from cprl.learners.ring import TransitionForm
-from cprl.learners.settings import DQNSettings
 from cprl.learners.trial import trial_batch
 from cprl.measuring.evaluate import evaluate
 from cprl.networks.team import Mixing
@@ -36,13 +34,6 @@ def team_of(name, **how):
     agents = population([Team(TEAMS[name], FOUR)], **how)
     (learner,) = agents.learners.values()
     return agents, learner
-
-
-def test_qmix_over_many_observations_is_not_slowed_by_what_the_trial_rounds():
-    game = presets.game("commons")  # 1260 inputs to its mixing
-    team = Team(QMIX(settings=DQNSettings(buffer_size=50)), FOUR)
-    (learner,) = Population(CommonsEnv(game, 2), [team], engine="eager").learners.values()
-    assert isinstance(learner.engine, FunctionalEngine)
 
 
 def test_a_member_acts_by_its_own_network_and_what_it_sees_itself():

@@ -1,49 +1,21 @@
 """engine="torchrl": stock parts learn what the fast engine learns, are stopped and continue, and refuse."""
 
 from collections import deque
+from dataclasses import replace
 from functools import partial
 from io import BytesIO
 
 import pytest
 import torch
 from dqn_parts import dqn_learner, learner_of_parts, make_learner
+from torchrl import objectives
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler, RoundRobinWriter, Sampler, SamplerWithoutReplacement
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.objectives import (
-    A2CLoss,
-    ClipPPOLoss,
-    DiscreteCQLLoss,
-    DiscreteIQLLoss,
-    DiscreteSACLoss,
-    DistributionalDQNLoss,
-    DQNLoss,
-    HardUpdate,
-    ReinforceLoss,
-    SoftUpdate,
-)
 from torchrl.objectives.value import GAE
 
-from cprl import CommonsEnv, Game, Rules, keys, maps
-from cprl.algorithms import (
-    A2C,
-    CQL,
-    DQN,
-    IPPO,
-    IQL,
-    MAPPO,
-    PPO,
-    PR2,
-    QMIX,
-    SAC,
-    VDN,
-    DistributionalDQN,
-    DQNSettings,
-    Reinforce,
-    RolloutSettings,
-    Tabular,
-    TabularSettings,
-)
+from cprl import CommonsEnv, Game, Rules, algorithms, keys, maps
+from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
 from cprl.custom import Custom
 from cprl.learners.reference import TorchRLReplayLearner, TorchRLRolloutLearner
 from cprl.learners.replay import ReplayLearner
@@ -58,13 +30,14 @@ SPACES = GAME.spaces
 REPLAY = DQNSettings(
     buffer_size=90, learning_rate=1e-3, hidden_cells=(16,), epsilon_hold_steps=20, epsilon_decay_steps=100
 )
-AS_RUN = {
-    "own_target_weights": True,
-    "relu_on_outputs": True,
-    "mean_over_all_outputs": True,
-    "glorot_uniform": True,
-    "adam_eps": 1e-7,
-}
+AS_RUN = replace(
+    REPLAY,
+    own_target_weights=True,
+    relu_on_outputs=True,
+    mean_over_all_outputs=True,
+    glorot_uniform=True,
+    adam_eps=1e-7,
+)
 ROLLOUT = RolloutSettings(
     rollout_steps=40, minibatch_size=10, epochs=4, learning_rate=1e-3, hidden_cells=(16,)
 )
@@ -72,43 +45,31 @@ ONE_EPOCH = RolloutSettings(rollout_steps=10, minibatch_size=10, epochs=1, hidde
 HOW = {"agents": (0, 1), "replicas": 2, "seed": 7}
 
 OFF_POLICY = {
-    "published DQN": DQN(settings=REPLAY),
-    "DQN as run": DQN(settings=REPLAY.__class__(**{**vars(REPLAY), **AS_RUN})),
-    "double DQN": DQN(settings=REPLAY, double=True),
-    "Huber": DQN(settings=REPLAY, loss_function="smooth_l1"),
-    "log-cosh": DQN(settings=REPLAY, loss_function="log_cosh"),
-    "C51": DistributionalDQN(settings=REPLAY, atoms=11, highest_return=20.0),
-    "CQL": CQL(settings=REPLAY),
-    "SAC": SAC(settings=REPLAY),
-    "IQL": IQL(settings=REPLAY),
-    "PR2": PR2(settings=REPLAY),
+    "published DQN": (DQN(settings=REPLAY), objectives.DQNLoss),
+    "DQN as run": (DQN(settings=AS_RUN), objectives.DQNLoss),
+    "double DQN": (DQN(settings=REPLAY, double=True), objectives.DQNLoss),
+    "Huber": (DQN(settings=REPLAY, loss_function="smooth_l1"), objectives.DQNLoss),
+    "log-cosh": (DQN(settings=REPLAY, loss_function="log_cosh"), LogCoshDQNLoss),
+    "C51": (
+        algorithms.DistributionalDQN(settings=REPLAY, atoms=11, highest_return=20.0),
+        objectives.DistributionalDQNLoss,
+    ),
+    "CQL": (algorithms.CQL(settings=REPLAY), objectives.DiscreteCQLLoss),
+    "SAC": (algorithms.SAC(settings=REPLAY), objectives.DiscreteSACLoss),
+    "IQL": (algorithms.IQL(settings=REPLAY), objectives.DiscreteIQLLoss),
+    "PR2": (algorithms.PR2(settings=REPLAY), PR2Loss),
 }
 ON_POLICY = {
-    "PPO": PPO(settings=ROLLOUT),
-    "A2C": A2C(settings=ONE_EPOCH),
-    "REINFORCE": Reinforce(settings=ONE_EPOCH),
+    "PPO": (PPO(settings=ROLLOUT), objectives.ClipPPOLoss),
+    "A2C": (algorithms.A2C(settings=ONE_EPOCH), objectives.A2CLoss),
+    "REINFORCE": (algorithms.Reinforce(settings=ONE_EPOCH), objectives.ReinforceLoss),
 }
-ALGORITHMS = {**OFF_POLICY, **ON_POLICY}
-LOSSES = {
-    **dict.fromkeys(("published DQN", "DQN as run", "double DQN", "Huber"), DQNLoss),
-    "log-cosh": LogCoshDQNLoss,
-    "C51": DistributionalDQNLoss,
-    "CQL": DiscreteCQLLoss,
-    "SAC": DiscreteSACLoss,
-    "IQL": DiscreteIQLLoss,
-    "PR2": PR2Loss,
-    "PPO": ClipPPOLoss,
-    "A2C": A2CLoss,
-    "REINFORCE": ReinforceLoss,
-}
+LOSSES = {name: loss for name, (_, loss) in {**OFF_POLICY, **ON_POLICY}.items()}
+ALGORITHMS = {name: algorithm for name, (algorithm, _) in {**OFF_POLICY, **ON_POLICY}.items()}
 
 DEMANDED = ("published DQN", "DQN as run", "double DQN", "PPO", "A2C")
 UPDATES = {name: 200 if name in DEMANDED else 60 for name in LOSSES}
 """Updates after which weights are compared; fewer where an update takes long."""
-
-
-def changed(settings, **changes):
-    return settings.__class__(**{**vars(settings), **changes})
 
 
 def turns(actor, *, seed=3):
@@ -240,7 +201,7 @@ def test_every_part_is_torchrls_or_torchs_own(name):
     if on_policy:
         assert all(type(estimator) is GAE for estimator in learner.estimators)
     else:
-        assert all(type(updater) is HardUpdate for updater in learner.engine.updaters)
+        assert all(type(updater) is objectives.HardUpdate for updater in learner.engine.updaters)
 
 
 def resumable(algorithm, **how):
@@ -250,7 +211,7 @@ def resumable(algorithm, **how):
 RESUMED = {
     **ALGORITHMS,
     "everything of replay": DQN(
-        settings=changed(
+        settings=replace(
             REPLAY,
             tau=0.05,
             updates_per_step=2,
@@ -307,121 +268,29 @@ def test_a_stopped_learner_continues_bit_for_bit(name, steps):
         assert torch.equal(own, other) if isinstance(own, torch.Tensor) else own == other, where
 
 
-def test_hard_targets_are_copied_after_every_third_episode_of_each_replica():
-    learner = resumable(DQN(settings=changed(REPLAY, own_target_weights=True)))
-    played = turns(learner.actor)
-    for _ in range(30):
-        learner.store(next(played))
-        learner.update()
-
-    def copied():
-        return [
-            all(
-                torch.equal(own, target)
-                for own, target in zip(
-                    loss.value_network_params.values(True, True),
-                    loss.target_value_network_params.values(True, True),
-                    strict=True,
-                )
-            )
-            for loss in learner.engine.losses
-        ]
-
-    for episode in range(1, 4):
-        learner.end_episode(torch.tensor([True, False]))
-        assert copied() == [episode == 3] * 2 + [False] * 2
-    learner.end_episode(torch.tensor([False, True]))
-    assert copied() == [True, True, False, False]
-
-
-def test_soft_targets_move_by_tau_after_every_update_and_not_at_the_end_of_episodes():
-    learner = resumable(DQN(settings=changed(REPLAY, tau=0.25, target_every_episodes=1)))
-    played = turns(learner.actor)
-    for _ in range(16):
-        learner.store(next(played))
-    loss = learner.engine.losses[0]
-
-    def weights(group):
-        return torch.cat([own.data.flatten() for own in getattr(loss, group).values(True, True)])
-
-    assert type(learner.engine.updaters[0]) is SoftUpdate
-    before = weights("target_value_network_params")
-    learner.update()
-    wanted = before + 0.25 * (weights("value_network_params") - before)
-    torch.testing.assert_close(weights("target_value_network_params"), wanted)
-    moved = weights("target_value_network_params")
-    learner.end_episode(torch.tensor([True, True]))
-    assert torch.equal(weights("target_value_network_params"), moved)
-
-
-def replay_learner_of(make_loss, **changes):
-    settings = changed(REPLAY, **changes)
-    return dqn_learner(SPACES, settings=settings, kind=TorchRLReplayLearner, make_loss=make_loss, **HOW)
-
-
 def test_a_loss_of_each_transition_learns_as_their_mean():
-    def of(reduction):
-        learner = replay_learner_of(partial(made, reduction=reduction))
-        played = turns(learner.actor)
-        losses = [take(learner, next(played)) for _ in range(20)]
-        return losses[-1], learner.engine.network_state(0)
-
     def made(network, *, reduction):
         loss = DQN(settings=REPLAY).make_loss(network)
         loss.reduction = reduction
         return loss
 
-    (of_each, weights), (of_mean, expected) = of("none"), of("mean")
-    assert of_each.tolist() == of_mean.tolist()
-    assert all(weights[name].equal(expected[name]) for name in expected)
-
-
-@pytest.mark.integration
-def test_updates_per_step_and_the_optimiser_are_those_of_the_settings():
-    kinds = {
-        "adam": torch.optim.Adam,
-        "adamw": torch.optim.AdamW,
-        "rmsprop": torch.optim.RMSprop,
-        "keras_rmsprop": torch.optim.RMSprop,
-        "sgd": torch.optim.SGD,
-    }
-    for name, kind in kinds.items():
-        learner = resumable(DQN(settings=changed(REPLAY, optimizer=name, updates_per_step=3)))
-        optimizer = learner.engine.optimizers[0]
-        assert type(optimizer) is kind
-        assert optimizer.param_groups[0]["lr"] == REPLAY.learning_rate
-        assert optimizer.param_groups[0].get("eps", REPLAY.adam_eps) == REPLAY.adam_eps
-        steps = []
-        optimizer.register_step_post_hook(lambda *_, steps=steps: steps.append(1))
+    ends = []
+    for reduction in ("none", "mean"):
+        make_loss = partial(made, reduction=reduction)
+        learner = dqn_learner(SPACES, settings=REPLAY, kind=TorchRLReplayLearner, make_loss=make_loss, **HOW)
         played = turns(learner.actor)
-        for _ in range(18):
-            take(learner, next(played))
-        assert len(steps) == 3 * 3, "from the 16th turn on"
+        losses = [take(learner, next(played)) for _ in range(20)]
+        ends.append({**learner.engine.network_state(0), "loss": losses[-1]})
+    assert all(torch.equal(value, ends[1][name]) for name, value in ends[0].items())
 
 
-def test_between_updates_nothing_is_learned_by_either_engine():
-    settings = changed(REPLAY, steps_per_update=4)
-    stock = resumable(DQN(settings=settings))
-    fast = make_learner(
-        DQN(settings=settings), stock.spaces, agents=stock.agents, replicas=stock.replicas, engine="eager"
-    )
-    for learner in (stock, fast):
-        played, losses = turns(learner.actor), []
-        for _ in range(30):
-            learner.store(next(played))
-            losses.append(learner.update())
-        assert [turn for turn, own in enumerate(losses, 1) if own is not None] == [19, 23, 27]
-
-
-REFUSED = [VDN(settings=REPLAY), QMIX(settings=REPLAY), MAPPO(settings=ROLLOUT), IPPO(settings=ROLLOUT)]
-REFUSED.append(Tabular(settings=TabularSettings()))
-
-
-@pytest.mark.parametrize("team", REFUSED, ids=lambda team: type(team).__name__)
-def test_teams_and_tables_are_refused_by_name(team):
-    match = f'{type(team).__name__} does not support engine="torchrl", .*"compiled" or "eager"'
+@pytest.mark.parametrize("name", ["VDN", "QMIX", "MAPPO", "IPPO", "Tabular"])
+def test_teams_and_tables_are_refused_by_name(name):
+    kind = getattr(algorithms, name)
+    settings = {"MAPPO": ROLLOUT, "IPPO": ROLLOUT, "Tabular": algorithms.TabularSettings()}.get(name, REPLAY)
+    match = f'{name} does not support engine="torchrl", .*"compiled" or "eager"'
     with pytest.raises(ValueError, match=match):
-        make_learner(team, SPACES, engine="torchrl", reward_kind="team", **HOW)
+        make_learner(kind(settings=settings), SPACES, engine="torchrl", reward_kind="team", **HOW)
 
 
 def test_other_losses_networks_and_sizes_are_refused():
@@ -433,31 +302,30 @@ def test_other_losses_networks_and_sizes_are_refused():
     with pytest.raises(ValueError, match="an agent has the networks"):
         learner_of_parts(TorchRLRolloutLearner, PPO(settings=ROLLOUT), SPACES, parts=parts, **HOW)
     with pytest.raises(ValueError, match=r"n_steps is 3; allowed with engine=\"torchrl\".*: 1"):
-        resumable(DQN(settings=changed(REPLAY, n_steps=3)))
+        resumable(DQN(settings=replace(REPLAY, n_steps=3)))
     with pytest.raises(
         MemoryError, match=r"4 agents x 1,000,000,000,000 transitions take .* smaller buffer_size"
     ):
-        resumable(DQN(settings=changed(REPLAY, buffer_size=10**12)))
+        resumable(DQN(settings=replace(REPLAY, buffer_size=10**12)))
 
 
 @pytest.mark.parametrize("kind", [TorchRLReplayLearner, ReplayLearner])
 def test_targets_are_refused_for_a_loss_that_has_none(kind):
     def without_targets(network):
-        loss = DQNLoss(
-            DQN(settings=REPLAY).make_loss(network).value_network,
-            delay_value=False,
-            loss_function="l2",
-            action_space="categorical",
-        )
+        actor = DQN(settings=REPLAY).make_loss(network).value_network
+        loss = objectives.DQNLoss(actor, delay_value=False, loss_function="l2", action_space="categorical")
         loss.make_value_estimator(gamma=0.9)
         return loss
 
-    def make(**changes):
-        settings = changed(REPLAY, **changes)
-        return dqn_learner(SPACES, settings=settings, kind=kind, make_loss=without_targets, **HOW)
-
-    assert getattr(make().engine, "updaters", [None] * 4) == [None] * 4
-    with pytest.raises(ValueError, match=r"tau is 0\.1"):
-        make(tau=0.1)
-    with pytest.raises(ValueError, match="own_target_weights is True"):
-        make(own_target_weights=True)
+    for changes, message in (
+        ({}, None),
+        ({"tau": 0.1}, r"tau is 0\.1"),
+        ({"own_target_weights": True}, "own_target_weights is True"),
+    ):
+        settings = replace(REPLAY, **changes)
+        make = partial(dqn_learner, SPACES, settings=settings, kind=kind, make_loss=without_targets, **HOW)
+        if message is None:
+            assert getattr(make().engine, "updaters", [None] * 4) == [None] * 4
+            continue
+        with pytest.raises(ValueError, match=message):
+            make()

@@ -11,25 +11,14 @@ from matrix_game import MatrixGame
 from one_road_parts import Dilemma
 
 import cprl
-from cprl import CommonsEnv, Custom, Experiment, Game, Rules, maps
-from cprl.algorithms import (
-    DQN,
-    IPPO,
-    LOLA,
-    PPO,
-    QMIX,
-    DQNSettings,
-    LOLASettings,
-    RolloutSettings,
-    Tabular,
-    TabularSettings,
-)
+from cprl import CommonsEnv, Custom, Experiment, Game, Rules, algorithms, maps
+from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
 from cprl.commands.recipe import parse
 from cprl.envs import spaces_of
 from cprl.institutions import Tax
 from cprl.learners.preferences import Exchange, InequityAversion, SocialValueOrientation, WantedRewards
 from cprl.measuring.episodes import EpisodeTracker
-from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.population import Learning, Scripted, Team
 from cprl.runs.episodes import read_episodes
 from cprl.training import Training, train
 from cprl.training.agents import Population
@@ -46,14 +35,15 @@ REPLAY = DQNSettings(
     buffer_size=60, batch_size=4, hidden_cells=(8,), learning_rate=1e-3, epsilon_decay_steps=40
 )
 ROLLOUTS = RolloutSettings(rollout_steps=20, minibatch_size=10, epochs=2, hidden_cells=(8,))
+LOOK = algorithms.LOLASettings(rollout_steps=20, hidden_cells=(8,))
 LEARNERS = {
     "replay": (DQN(settings=REPLAY), "eager"),
     "replay of torchrl": (DQN(settings=REPLAY), "torchrl"),
     "rollouts": (PPO(settings=ROLLOUTS), "eager"),
     "rollouts of torchrl": (PPO(settings=ROLLOUTS), "torchrl"),
-    "tables": (Tabular(settings=TabularSettings()), "eager"),
-    "team": (IPPO(settings=ROLLOUTS), "eager"),
-    "look ahead": (LOLA(settings=LOLASettings(rollout_steps=20, hidden_cells=(8,))), "eager"),
+    "tables": (algorithms.Tabular(settings=algorithms.TabularSettings()), "eager"),
+    "team": (algorithms.IPPO(settings=ROLLOUTS), "eager"),
+    "look ahead": (algorithms.LOLA(settings=LOOK), "eager"),
 }
 BOARD = Game(
     map=maps.parse(".A>.A.A\nA.A.v.A\n..<.A.A"),
@@ -240,26 +230,10 @@ def test_a_run_keeps_preferences_in_its_recipe_and_its_table(tmp_path):
             assert row["wanted_return"] is None
     longer = cprl.run(EXPERIMENT, tmp_path / "other", watch="off")
     assert read_episodes(longer).equals(read_episodes(run)), "null equals null, NaN does not"
+    milder = Learning(DQN(settings=REPLAY), reward=replace(AVERSE, alpha=4))
+    changed = replace(EXPERIMENT, agents=[milder, *EXPERIMENT.agents[1:]])
     with pytest.raises(ValueError, match=r"agents\[0\]\.reward\.alpha was 5.0, is 4.0"):
-        cprl.run(
-            replace(EXPERIMENT, agents=[Learning(DQN(settings=REPLAY), reward=replace(AVERSE, alpha=4)),
-                                        *EXPERIMENT.agents[1:]]),
-            run,
-            resume=True,
-            watch="off",
-        )  # fmt: skip
-
-
-@pytest.mark.integration
-def test_agents_that_start_from_stored_weights_want_what_they_are_told(tmp_path):
-    cprl.run(EXPERIMENT, tmp_path / "first", watch="off")
-    start = Frozen(str(tmp_path / "first"), agent=0, replica=None)
-    agents = population(
-        [Learning(DQN(settings=REPLAY), reward=Exchange(0.5), start_from=start)] * 3, CommonsEnv(BOARD, 2)
-    )
-    (learner,) = agents.learners.values()
-    assert learner.wants.preferences == Exchange(0.5)
-    train(CommonsEnv(BOARD, 2, seed=1), agents.learners, episodes=1)
+        cprl.run(changed, run, resume=True, watch="off")
 
 
 def test_preferences_are_flags_by_their_place():
@@ -282,7 +256,7 @@ class Deaf(DQN):
 @pytest.mark.parametrize(
     ("specs", "message"),
     [
-        ([Team(QMIX(settings=REPLAY), (0, 1), reward=AVERSE)], "reward is InequityAversion"),
+        ([Team(algorithms.QMIX(settings=REPLAY), (0, 1), reward=AVERSE)], "reward is InequityAversion"),
         (
             [Learning(Deaf(settings=REPLAY), reward=AVERSE)] * 2,
             "reward is InequityAversion, which the learner of Deaf does not have as its `wants`",

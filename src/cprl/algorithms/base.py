@@ -15,9 +15,9 @@ from torchrl.objectives import LossModule, ValueEstimators
 
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
-from cprl.learners.base import Learner
+from cprl.learners.base import Learner, LearningAgents
 from cprl.learners.engine import Batching
-from cprl.learners.lanes import LearningAgents, Method
+from cprl.learners.lanes import Method
 from cprl.learners.preferences import Preference, named
 from cprl.learners.reference import TorchRLReplayLearner, TorchRLRolloutLearner
 from cprl.learners.replay import ReplayLearner

@@ -29,9 +29,8 @@ from cprl.algorithms.base import (
     refuse_relu,
 )
 from cprl.commons.spaces import Spaces
-from cprl.learners.base import Learner
+from cprl.learners.base import Learner, LearningAgents
 from cprl.learners.engine import Batching
-from cprl.learners.lanes import LearningAgents
 from cprl.learners.settings import (
     TabularSettings,
 )

@@ -25,9 +25,9 @@ from cprl.algorithms.base import (
 from cprl.algorithms.on_policy import Clipped
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom
-from cprl.learners.base import Learner
+from cprl.learners.base import Learner, LearningAgents
 from cprl.learners.engine import Batching
-from cprl.learners.lanes import LearningAgents, Method
+from cprl.learners.lanes import Method
 from cprl.learners.lola import LOLALearner
 from cprl.learners.settings import LOLASettings
 from cprl.networks.agent import AgentNetworks

@@ -1,8 +1,10 @@
-"""The interface between the training loop and a learner."""
+"""Who learns, and the interface between the training loop and a learner."""
 
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from math import nan
-from typing import Any, Protocol
+from typing import Annotated, Any, Final, TypeAlias
 
 import numpy as np
 import torch
@@ -10,55 +12,148 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from cprl.learners.preferences import WantedRewards
+from cprl.commons.spaces import Spaces
+from cprl.learners.preferences import Preference, WantedRewards, check_preference
 from cprl.policies.assignment import AgentIndices, agent_indices
 from cprl.policies.decisions import Decider
-from cprl.values import Positive, checked
+from cprl.system.memory import check_memory
+from cprl.values import Natural, Positive, Range, Value, checked
+
+WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION, EXHIBITION, NOISE = range(7)
+"""The purposes of a lane's random numbers; each has its own seed."""
+
+StartFrom: TypeAlias = Mapping[str, Mapping[str, Tensor]]
+"""The state dict of the acting network with which each lane starts, by the lane's name."""
+
+_LEAST_BYTES: Final = 4096
+"""Of a lane, whatever it learns by: its name, seeds and random number generators."""
 
 
-class Learner(Protocol):
+def lane_seeds(
+    seed: int, *, replicas: Sequence[int], agents: Sequence[int], purpose: int
+) -> list[tuple[int, int, int, int]]:
+    """The seed of each lane, replica by replica: (seed of the run, replica, agent, purpose)."""
+    return [(seed, replica, agent, purpose) for replica in replicas for agent in agents]
+
+
+def lane_name(replica: int, agent: int) -> str:
+    return f"replica_{replica}/agent_{agent}"
+
+
+def lane_names(*, replicas: Sequence[int], agents: Sequence[int]) -> list[str]:
+    """The name of each lane, replica by replica: "replica_0/agent_0" and so on."""
+    return [lane_name(replica, agent) for replica in replicas for agent in agents]
+
+
+@dataclass(frozen=True)
+class LearningAgents(Value, stored=False):
+    """Who learns: S agents of each of R replicas, what they want, and what they start from.
+
+    Made and checked once, then handed whole to the learner.
+    """
+
+    spaces: Spaces
+    """The shape and dtype of observations, and the number of actions A."""
+    _: KW_ONLY
+    agents: tuple[Natural, ...]
+    """The indices of the agents, each once."""
+    replicas: Annotated[int, Range(1, 2**20)]
+    """The number of replicas R."""
+    seed: int = 0
+    """The seed of the run."""
+    first_replica: int = 0
+    """The index of the first replica, so that replica r can be trained alone."""
+    reward_kind: Preference = "individual"
+    """What they want, see `cprl.learners.preferences`."""
+    start_from: StartFrom = field(default_factory=dict)
+    """The weights with which acting networks, and their targets, start, by the lane's name; the others, such
+    as critics, are new."""
+    share_parameters: bool = False
+    """Whether the agents of a replica share one network, which learns from all of them."""
+    device: str | torch.device = "cpu"
+    """The torch device of networks, stored turns and updates."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        agents, everyone = self.agents, self.spaces.agents
+        check_preference("reward_kind", self.reward_kind, everyone)
+        if not agents or len(set(agents)) < len(agents) or not set(agents) <= set(range(everyone)):
+            raise ValueError(
+                f"agents is {agents}; allowed: one or more of the agents 0 to {everyone - 1}, each once"
+            )
+        lanes = len(agents) * self.replicas
+        check_memory(
+            f"{self.replicas} replicas of {len(agents)} agents", lanes * _LEAST_BYTES, "fewer replicas"
+        )
+
+    @property
+    def names(self) -> list[str]:
+        """The name of each agent's networks, see `lane_names`."""
+        return lane_names(replicas=self._numbers, agents=self.agents)
+
+    def seeds(self, purpose: int) -> list[tuple[int, int, int, int]]:
+        """The seed of each agent of each replica, see `lane_seeds`."""
+        return lane_seeds(self.seed, replicas=self._numbers, agents=self.agents, purpose=purpose)
+
+    @property
+    def _numbers(self) -> range:
+        return range(self.first_replica, self.first_replica + self.replicas)
+
+
+class Learner(ABC):
     """Learns for S agents of each of R replicas; `ReplayLearner` is one."""
 
     actor: Any
     """Chooses the actions of these agents; callbacks get its `epsilon`."""
-    agents: tuple[int, ...]
-    """The indices of the agents."""
-    replicas: int
-    """The number of replicas R."""
-    settings: Any
-    """The hyperparameters.
 
-    A learner may also have `wants`, a `cprl.learners.preferences.WantedRewards`: what its agents want. And
-    `begin()`, which a training calls before its first turn: whatever the learner has stored of an earlier
-    training, the next turn begins new episodes.
-    """
+    def __init__(self, who: LearningAgents, settings: Any) -> None:
+        self.who, self.settings = who, settings
+        self.wants = WantedRewards(who.reward_kind)
+        """What its agents want."""
+        self.spaces, self.agents, self.replicas = who.spaces, who.agents, who.replicas
+        self.steps = 0
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(agents={self.agents}, replicas={self.replicas})"
+
+    def begin(self) -> None:  # noqa: B027 - most have nothing to do
+        """Called before the first turn of a training: whatever is stored of an earlier one, the next turn
+        begins new episodes."""
+
+    @abstractmethod
     def store(self, batch: TensorDictBase) -> None:
         """Stores one step of every replica; the batch size is [R]."""
 
+    @abstractmethod
     def update(self) -> Tensor | None:
         """Updates every agent once; returns the losses [R, S], or None if too little is stored."""
 
-    def end_episode(self, ended: Tensor) -> None:
+    def end_episode(self, ended: Tensor) -> None:  # noqa: B027 - likewise
         """Called after an episode has ended in the marked replicas, bool [R]."""
 
+    @abstractmethod
     def values(self, batch: TensorDictBase) -> Tensor:
         """Each agent's estimate of the value of the state after the turn, [R, S]; for display only."""
 
+    @abstractmethod
     def finite(self) -> Tensor:
         """Whether everything that the learner keeps of each agent is finite, above all weights and targets,
         bool [R, S]; called at the end of episodes and before the state is saved."""
 
+    @abstractmethod
     def evaluation_actor(self, worlds: int) -> Any:
         """An actor with the current weights and the exploration of evaluation, for `worlds` worlds of each
         replica."""
 
+    @abstractmethod
     def networks(self) -> dict[str, nn.Module]:
         """A copy of each agent's current acting network, by "replica_0/agent_0" and so on."""
 
+    @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """The full state: training continues from it exactly."""
+        """The full state, the tensors themselves, not copies: training continues from it exactly."""
 
+    @abstractmethod
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continues from a state that `state_dict` returned."""
 
@@ -95,19 +190,16 @@ class WantedReturns:
     """The sums of the rewards that agents want, over the running episode of each replica.
 
     Args:
-        agents: the number of agents N; those that do not learn, or whose learner does not say what they want,
-            have NaN.
+        agents: the number of agents N; those that do not learn have NaN.
     """
 
     def __init__(self, replicas: int, agents: int, learners: Mapping[tuple[int, ...], Learner]) -> None:
         self._wants: list[tuple[Any, WantedRewards]] = []
         self._first = np.full(agents, nan)
         for indices, learner in learners.items():
-            wants = getattr(learner, "wants", None)
-            if isinstance(wants, WantedRewards):
-                wants.clear()
-                self._wants.append((slice(None) if len(indices) == agents else list(indices), wants))
-                self._first[list(indices)] = 0
+            learner.wants.clear()
+            self._wants.append((slice(None) if len(indices) == agents else list(indices), learner.wants))
+            self._first[list(indices)] = 0
         self.returns = np.tile(self._first, (replicas, 1))
 
     def add(self) -> None:

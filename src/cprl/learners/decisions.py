@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from cprl.commons.game import Game
-from cprl.learners.lanes import EVALUATION, EXHIBITION, EXPLORATION, lane_names, lane_seeds
+from cprl.learners.base import EVALUATION, EXHIBITION, EXPLORATION, lane_names, lane_seeds
 from cprl.policies.decisions import UNTRIED, Decider, Doubles, Longs, ballot_sizes, choices_of
 from cprl.values import Positive, Range, Share, Value
 

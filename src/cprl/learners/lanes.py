@@ -2,8 +2,8 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import KW_ONLY, dataclass, field
-from typing import Annotated, Any, ClassVar, Final, Protocol, TypeAlias
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final, Protocol
 
 import numpy as np
 import torch
@@ -11,9 +11,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from cprl import keys
-from cprl.commons.spaces import Spaces
+from cprl.learners.base import EVALUATION, EXPLORATION, Learner, LearningAgents
 from cprl.learners.engine import WAYS, Batching, Engine, ListEngine, MakeLoss, UpdateRule, make_engine
-from cprl.learners.preferences import Preference, WantedRewards, check_preference
 from cprl.learners.ring import Horizon, TransitionForm
 from cprl.learners.transitions import LaneTurn, array_of, joint_actions, lane_turn, seen_next
 from cprl.learners.trial import TRIAL_LANES, fitting_engine
@@ -22,13 +21,6 @@ from cprl.networks.recurrent import state_cells_of
 from cprl.networks.specification import refuse_unseen
 from cprl.policies.lanes import LaneActor
 from cprl.system.memory import check_memory
-from cprl.values import Natural, Range, Value
-
-WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION, EXHIBITION, NOISE = range(7)
-"""The purposes of a lane's random numbers; each has its own seed."""
-
-StartFrom: TypeAlias = Mapping[str, Mapping[str, Tensor]]
-"""The state dict of the acting network with which each lane starts, by the lane's name."""
 
 MakeTeam = Callable[[Sequence[nn.Module]], nn.Module]
 """Makes the networks of a team from those of its members: `AgentNetworks`, a `cprl.networks.team.Team` first.
@@ -39,24 +31,6 @@ _SHARED: Final = 1
 _COPIES: Final = 6
 """Of a lane's weights while it trains: as made, stacked, target, gradient and two of the optimiser."""
 _LARGEST_SEED: Final = 2**63 - 1
-_LEAST_BYTES: Final = 4096
-"""Of a lane, whatever it learns by: its name, seeds and random number generators."""
-
-
-def lane_seeds(
-    seed: int, *, replicas: Sequence[int], agents: Sequence[int], purpose: int
-) -> list[tuple[int, int, int, int]]:
-    """The seed of each lane, replica by replica: (seed of the run, replica, agent, purpose)."""
-    return [(seed, replica, agent, purpose) for replica in replicas for agent in agents]
-
-
-def lane_name(replica: int, agent: int) -> str:
-    return f"replica_{replica}/agent_{agent}"
-
-
-def lane_names(*, replicas: Sequence[int], agents: Sequence[int]) -> list[str]:
-    """The name of each lane, replica by replica: "replica_0/agent_0" and so on."""
-    return [lane_name(replica, agent) for replica in replicas for agent in agents]
 
 
 class Acts(Protocol):
@@ -67,61 +41,6 @@ class Acts(Protocol):
 
     def network_state(self, lane: int) -> dict[str, Tensor]:
         """Copies of the current weights of one lane, as the state dict of its acting network."""
-
-
-@dataclass(frozen=True)
-class LearningAgents(Value, stored=False):
-    """Who learns: S agents of each of R replicas, what they want, and what they start from.
-
-    Made and checked once, then handed whole to the learner.
-    """
-
-    spaces: Spaces
-    """The shape and dtype of observations, and the number of actions A."""
-    _: KW_ONLY
-    agents: tuple[Natural, ...]
-    """The indices of the agents, each once."""
-    replicas: Annotated[int, Range(1, 2**20)]
-    """The number of replicas R."""
-    seed: int = 0
-    """The seed of the run."""
-    first_replica: int = 0
-    """The index of the first replica, so that replica r can be trained alone."""
-    reward_kind: Preference = "individual"
-    """What they want, see `cprl.learners.preferences`."""
-    start_from: StartFrom = field(default_factory=dict)
-    """The weights with which acting networks, and their targets, start, by the lane's name; the others, such
-    as critics, are new."""
-    share_parameters: bool = False
-    """Whether the agents of a replica share one network, which learns from all of them."""
-    device: str | torch.device = "cpu"
-    """The torch device of networks, stored turns and updates."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        agents, everyone = self.agents, self.spaces.agents
-        check_preference("reward_kind", self.reward_kind, everyone)
-        if not agents or len(set(agents)) < len(agents) or not set(agents) <= set(range(everyone)):
-            raise ValueError(
-                f"agents is {agents}; allowed: one or more of the agents 0 to {everyone - 1}, each once"
-            )
-        lanes = len(agents) * self.replicas
-        check_memory(
-            f"{self.replicas} replicas of {len(agents)} agents", lanes * _LEAST_BYTES, "fewer replicas"
-        )
-
-    @property
-    def names(self) -> list[str]:
-        """The name of each agent's networks, see `lane_names`."""
-        return lane_names(replicas=self._numbers, agents=self.agents)
-
-    def seeds(self, purpose: int) -> list[tuple[int, int, int, int]]:
-        """The seed of each agent of each replica, see `lane_seeds`."""
-        return lane_seeds(self.seed, replicas=self._numbers, agents=self.agents, purpose=purpose)
-
-    @property
-    def _numbers(self) -> range:
-        return range(self.first_replica, self.first_replica + self.replicas)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -327,22 +246,7 @@ def _of_members(engine: Acts, size: int) -> Callable[..., Any]:
     return outputs
 
 
-class BaseLearner:
-    """What learners of S agents of each of R replicas have in common."""
-
-    def __init__(self, who: LearningAgents, settings: Any) -> None:
-        self.who, self.settings, self.wants = who, settings, WantedRewards(who.reward_kind)
-        self.spaces, self.agents, self.replicas = who.spaces, who.agents, who.replicas
-        self.steps = 0
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}(agents={self.agents}, replicas={self.replicas})"
-
-    def end_episode(self, ended: Tensor) -> None:
-        """Does nothing where an episode has ended in the marked replicas, bool [R]."""
-
-
-class LaneLearner(BaseLearner):
+class LaneLearner(Learner):
     """What learners have in common whose lanes are updated together by an engine."""
 
     engine: Any

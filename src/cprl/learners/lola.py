@@ -10,7 +10,8 @@ from torch import Tensor, nn
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from cprl.learners.engine import UpdateRule, shortened, torch_optimizer, total
-from cprl.learners.lanes import WEIGHTS, Acts, LaneLearner, LearningAgents, Method
+from cprl.learners.base import WEIGHTS, LearningAgents
+from cprl.learners.lanes import Acts, LaneLearner, Method
 from cprl.learners.rollouts import refuse_full, refuse_other_parts, rollout_fields, write_turn
 from cprl.learners.settings import LOLASettings
 from cprl.learners.transitions import wanted_in

@@ -18,8 +18,9 @@ from torchrl.data.replay_buffers import RandomSampler, Sampler, SamplerWithoutRe
 from torchrl.objectives.value import GAE
 
 from cprl.custom import made
+from cprl.learners.base import NOISE, SAMPLING, LearningAgents
 from cprl.learners.engine import ListEngine
-from cprl.learners.lanes import NOISE, SAMPLING, Lanes, LearningAgents, Method, seed_of
+from cprl.learners.lanes import Lanes, Method, seed_of
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.ring import Noise, TransitionForm
 from cprl.learners.rollouts import ACTOR, CRITIC, RolloutLearner
@@ -142,16 +143,17 @@ class TorchRLReplayLearner(ReplayLearner):
         return batch
 
     def _make_buffer(self) -> StockBuffers:
-        lanes, settings = self._lanes, self.settings
+        lanes, settings, form = self._lanes, self.settings, self._form
         # Stock storage holds the observations before and after each transition, and its pages are committed
         # as they fill, so a machine with too little memory would fail hours later.
         check_memory(
             f"the replay buffers of {len(lanes)} agents x {settings.buffer_size:,} transitions",
-            2 * self._form.stored_bytes(len(lanes), settings.buffer_size),
+            2 * form.stored_bytes(len(lanes), settings.buffer_size)
+            + form.sampled_bytes(len(lanes), settings.batch_size),
             'a smaller buffer_size or batch_size, fewer replicas, or engine="compiled", which needs half',
             device=lanes.who.device,
         )
-        return StockBuffers(lanes, settings, self._form, self._make_sampler)
+        return StockBuffers(lanes, settings, form, self._make_sampler)
 
 
 class TorchRLRolloutLearner(RolloutLearner):

@@ -9,16 +9,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cprl import keys
+from cprl.learners.base import NOISE, SAMPLING, TARGET_WEIGHTS, WEIGHTS, LearningAgents
 from cprl.learners.engine import COMPILED_STEPS, UpdateRule
-from cprl.learners.lanes import (
-    NOISE,
-    SAMPLING,
-    TARGET_WEIGHTS,
-    WEIGHTS,
-    LaneLearner,
-    LearningAgents,
-    Method,
-)
+from cprl.learners.lanes import LaneLearner, Method
 from cprl.learners.ring import Horizon, Ring
 from cprl.learners.settings import DQNSettings
 from cprl.learners.transitions import wanted_in

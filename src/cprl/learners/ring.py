@@ -71,6 +71,11 @@ class TransitionForm:
         beside = 8 * prod(self.action_shape) + 4 * prod(self.reward_shape) + 8 + 1 + 1
         return lanes * (_rows(transitions) * row + transitions * beside)
 
+    def sampled_bytes(self, lanes: int, batch_size: int) -> int:
+        """Of the observations of a sample, as stored and as numbers of networks."""
+        observation = prod(self.observation_shape) * (self.dtype.itemsize + 4)
+        return lanes * batch_size * self.sequence_steps * 2 * observation
+
 
 def gather(
     fields: Fields, index: Tensor, rows: int, horizon: Horizon | None = None, noise: Tensor | None = None
@@ -229,11 +234,10 @@ class Ring:
     ) -> None:
         self.horizon, self.sequence_steps, self.capacity = form.horizon, form.sequence_steps, transitions
         self.lanes, self.rows, self.device = len(seeds), _rows(transitions), torch.device(device)
-        self._ahead, lanes, shape, dtype = form.steps_ahead, self.lanes, form.observation_shape, form.dtype
-        sample = lanes * batch_size * form.sequence_steps * 2 * prod(shape) * (dtype.itemsize + 4)
-        _check_memory(form.stored_bytes(lanes, transitions), sample, self)
+        self._ahead, lanes = form.steps_ahead, self.lanes
+        _check_memory(form.stored_bytes(lanes, transitions), form.sampled_bytes(lanes, batch_size), self)
         forms = {
-            "observation": ((lanes * self.rows, *shape), dtype),
+            "observation": ((lanes * self.rows, *form.observation_shape), form.dtype),
             "action": ((transitions, lanes, *form.action_shape), torch.int64),
             "reward": ((transitions, lanes, *form.reward_shape), torch.float32),
             "done": ((transitions, lanes), torch.bool),

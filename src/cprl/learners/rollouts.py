@@ -11,8 +11,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
+from cprl.learners.base import SAMPLING, WEIGHTS, LearningAgents
 from cprl.learners.engine import COMPILED_STEPS, Engine, UpdateRule
-from cprl.learners.lanes import SAMPLING, WEIGHTS, LaneLearner, Lanes, LearningAgents, Method
+from cprl.learners.lanes import LaneLearner, Lanes, Method
 from cprl.learners.ring import steps_ahead
 from cprl.learners.settings import RolloutSettings
 from cprl.learners.transitions import LaneTurn, refuse_other_dtype, wanted_in

@@ -23,13 +23,13 @@ from torch import Tensor, nn
 
 from cprl import keys
 from cprl.commons.spaces import Spaces
-from cprl.learners.lanes import EVALUATION, EXPLORATION, BaseLearner, LearningAgents
+from cprl.learners.base import EVALUATION, EXPLORATION, Learner, LearningAgents
 from cprl.learners.settings import TabularSettings
 from cprl.learners.transitions import lane_turn, wanted_in
 from cprl.policies.tabular import NEVER_MET, QTables, TableNetwork, TabularActor, observed_entries, states_of
 
 
-class TabularLearner(BaseLearner):
+class TabularLearner(Learner):
     """R x S independent tabular agents: S agents of each of R replicas, each with its own table.
 
     A `cprl.learners.base.Learner`; its tables are in the CPU's memory.

@@ -19,9 +19,16 @@ from cprl.envs.make_env import make_env, spaces_of
 from cprl.envs.state import load_transforms_state
 from cprl.envs.unwrap import commons_of
 from cprl.experiment import Experiment
-from cprl.learners.base import Learner
+from cprl.learners.base import (
+    EVALUATION,
+    EXHIBITION,
+    EXPLORATION,
+    Learner,
+    LearningAgents,
+    lane_name,
+    lane_seeds,
+)
 from cprl.learners.decisions import Bandit, BanditDecider, stored_decisions
-from cprl.learners.lanes import EVALUATION, EXHIBITION, EXPLORATION, LearningAgents, lane_name, lane_seeds
 from cprl.learners.preferences import named
 from cprl.networks.agent import acting_part
 from cprl.networks.finite import all_finite

@@ -95,8 +95,7 @@ class Training:
         self._losses = {agents: LaneLosses(replicas, agents) for agents in self.learners}
         self._wanted = WantedReturns(replicas, spaces.agents, self.learners)
         for learner in self.learners.values():
-            if hasattr(learner, "begin"):
-                learner.begin()
+            learner.begin()
         self.finite = FiniteCheck(self.learners, spaces, on_nan=on_nan)
         self._on_step = self._hooks("on_step")
         self._played = [0] * replicas

@@ -1,5 +1,5 @@
-"""Every field of every class of values refuses what it cannot be, by its name; sizes too, before they are
-allocated."""
+"""Values of recipes: every field of every class refuses what it cannot be, by its name, sizes before they are
+allocated; values become tables and come back the same, and what is not known is refused by its place."""
 
 import json
 from collections import UserDict
@@ -13,21 +13,27 @@ import torch
 from dqn_parts import make_learner
 from valid_values import EVERY
 
-from cprl import Custom, Experiment, Rules, presets
+from cprl import Custom, Experiment, Game, Observation, Rules, institutions, maps, presets
 from cprl.algorithms import (
     DQN,
+    LOLA,
     PPO,
     QMIX,
     DistributionalDQN,
     DQNSettings,
+    LOLASettings,
     RolloutSettings,
     Tabular,
     TabularSettings,
 )
 from cprl.commands.recipe import parse, recipe_main
+from cprl.custom import allowing, custom_targets
+from cprl.envs.matrix import MatrixGame
 from cprl.envs.taking import TakingGame
+from cprl.learners.decisions import Bandit
+from cprl.learners.preferences import SocialValueOrientation
 from cprl.learners.settings import Exploring
-from cprl.networks import Conv
+from cprl.networks import GRU, LSTM, Conv
 from cprl.policies.rng import LaneRng
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.files import read_json
@@ -35,7 +41,7 @@ from cprl.runs.recipe import read_recipe
 from cprl.system.memory import TooLargeError
 from cprl.theory import appropriation, herders
 from cprl.training.running import run
-from cprl.values import from_config, to_config
+from cprl.values import KINDS, differences, from_config, to_config
 
 GAME = presets.game("two_complex")
 REPLAY, ROLLOUTS, TABLES = DQNSettings(), RolloutSettings(), TabularSettings()
@@ -176,21 +182,21 @@ def itself():
 
 
 @pytest.mark.parametrize("deep", [nested(100_000), itself()], ids=["deep", "in itself"])
-def test_what_is_nested_without_end_is_refused_in_a_sentence(deep):
-    table = {**to_config(REPLAY), "hidden_cells": deep}
-    for refuses in (
-        lambda: Custom("a:b", arguments={"x": deep}),
-        lambda: to_config(deep),
-        lambda: from_config(deep),
-        lambda: from_config(table),
-        lambda: Experiment.from_config({"name": deep}),
-        lambda: Experiment.from_recipe({"format": 2, "experiment": {"name": deep}}),
-    ):
-        with pytest.raises(ValueError, match=r"nested|recursion|cannot hold"):
-            refuses()
-    for refuses in (lambda: DQNSettings(hidden_cells=deep), lambda: Rules(regrow_prob=deep)):
-        with pytest.raises(ValueError, match=r"^(DQNSettings\.hidden_cells|Rules\.regrow_prob) is "):
-            refuses()
+@pytest.mark.parametrize(
+    "refuses",
+    [
+        lambda deep: Custom("a:b", arguments={"x": deep}),
+        to_config,
+        from_config,
+        lambda deep: from_config({**to_config(REPLAY), "hidden_cells": deep}),
+        lambda deep: Experiment.from_config({"name": deep}),
+        lambda deep: Experiment.from_recipe({"format": 2, "experiment": {"name": deep}}),
+        lambda deep: DQNSettings(hidden_cells=deep),
+    ],
+)
+def test_what_is_nested_without_end_is_refused_in_a_sentence(deep, refuses):
+    with pytest.raises(ValueError, match=r"nested|recursion|cannot hold|^DQNSettings\.hidden_cells is "):
+        refuses(deep)
 
 
 @pytest.mark.parametrize(
@@ -389,3 +395,146 @@ def test_a_text_of_another_class_becomes_a_plain_one():
         pass
 
     assert type(Scripted(Text("random")).policy) is str
+
+
+BOARD = maps.parse("A>.#.\n.A.vA\n..A..")
+SOMETHING = Custom("mine:nested.Class", arguments={"x": [1, {"kind": 2.5}], "": None})
+UNUSUAL = (
+    DQN(
+        settings=DQNSettings(hidden_cells=(8,), tau=0.05, replay_transforms=(SOMETHING,), optimizer="sgd"),
+        double=True,
+        network=SOMETHING,
+    ),
+    PPO(settings=RolloutSettings(max_grad_norm=None), network=LSTM(encoder=Conv(channels=(4, 8)))),
+    Tabular(settings=TabularSettings(learning_rate="1/visits")),
+    Learning(
+        PPO(settings=RolloutSettings(), network=GRU(recurrent_cells=3)),
+        reward=SocialValueOrientation(angle=-2.5, weight=0.25),
+        start_from=Frozen("runs/earlier", agent=1, replica=None),
+        decisions=Bandit(step_size=1e-6),
+    ),
+    Team(LOLA(settings=LOLASettings(), estimator="dice"), agents=(0, 2), reward="individual"),
+    MatrixGame((((((1.0,) * 4,) * 2,) * 2,) * 2,) * 2, turns=3, memory=2, continue_prob=0.9),
+    Game(
+        map=BOARD,
+        rules=Rules(regrow_prob=(0.0, 5e-9), beam_length_cells=(1, 2, 3, 4), shuffle_starts=True),
+        observation=Observation(encoding="one_hot"),
+        institutions=(
+            institutions.Boundaries(regions=(".01..", "aa...", "...1."), owners=("0a", "1")),
+            institutions.ClosedSeason(closed_steps=3, fine=0.5),
+            institutions.Vote(on=institutions.Tax(brackets=((0, 0.1), (3, 0.5))), override_prob=0.5),
+            institutions.Monitoring(prob=0.5, monitor="elected"),
+        ),
+    ),
+    Game(
+        map=BOARD,
+        rules=Rules(),
+        observation=Observation(agents_apart=True),
+        institutions=(
+            institutions.Mediation(turns=3),
+            institutions.Sanctioner(agents=(1,)),
+            institutions.GraduatedSanctions(freeze_steps=((1,), (2,)), on="tags"),
+        ),
+    ),
+)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [value for value in (*VALUES, *UNUSUAL, GAME, BOARD) if type(value) in KINDS.values()],
+    ids=lambda value: type(value).__name__,
+)
+def test_a_value_comes_back_from_its_table_as_it_was(value):
+    table = json.loads(json.dumps(to_config(value), allow_nan=False))
+    assert KINDS[table["kind"]] is type(value)
+    with allowing(custom_targets(table)):
+        back = from_config(table)
+    assert back == value
+    assert hash(back) == hash(value)
+    assert to_config(back) == table
+
+
+def test_what_a_table_leaves_out_takes_its_default():
+    assert from_config({"kind": "DQNSettings", "gamma": 0.9}) == DQNSettings(gamma=0.9)
+
+
+TABLE = to_config([Learning(DQN(settings=DQNSettings()))], "agents")
+
+
+def changed(place, value):
+    """The table of one DQN agent with something else somewhere."""
+    table = json.loads(json.dumps(TABLE))
+    *way, last = place
+    inner = table
+    for step in way:
+        inner = inner[step]
+    inner[last] = value
+    return table
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        ((0, "algorithm", "settings", "gama"), 0.9, r"settings\.gama is no field of .* mean 'gamma'\?"),
+        ((0, "algorithm", "settings", "gamma"), "0.9", r"settings\.gamma is '0\.9'"),
+        ((0, "algorithm", "settings", "batch_size"), 8.5, r"settings\.batch_size is 8\.5"),
+        ((0, "algorithm", "settings", "batch_size"), True, r"settings\.batch_size is True"),
+        ((0, "algorithm", "settings", "gamma"), float("inf"), r"settings\.gamma is inf"),
+        ((0, "algorithm", "settings", "kind"), "DQNSetting", r"settings\.kind is 'DQNSetting' \(did you mea"),
+        ((0, "algorithm", "settings"), {"gamma": 1}, r'settings is a table without "kind"'),
+        ((0, "algorithm", "settings", "hidden_cells"), [8, "x"], r"hidden_cells is \(8, 'x'\)"),
+        ((0, "algorithm", "settings"), {"kind": "RolloutSettings"}, r"allowed: a DQNSettings"),
+        ((0, "algorithm"), {"kind": "DQN"}, r"\.algorithm lacks settings"),
+        (
+            (0, "algorithm"),
+            {"kind": "QMIX", "settings": {"kind": "DQNSettings"}},
+            r": QMIX is learned by a team",
+        ),
+        ((0, "reward"), "own", r"\.reward is 'own'"),
+    ],
+)
+def test_what_is_not_known_is_refused_by_the_place_where_it_stands(place, value, message):
+    with pytest.raises(ValueError, match=r"^agents\[0\].*" + message):
+        from_config(changed(place, value), "agents")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MyDQN(DQN):
+    """An algorithm of somebody's own, which is not in the registry."""
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (torch.nn.Linear(1, 1), r"is a Linear"),
+        (torch.nn.Linear, r"is a class"),
+        (lambda: 0, r'is a function, .*Custom\("module:name", .*at the top of a module'),
+        (MyDQN(settings=DQNSettings()), r"is a MyDQN"),
+        (float("nan"), r"is nan"),
+        ({"a": 1}, r"is a dict"),
+    ],
+)
+def test_a_live_object_is_refused_with_what_to_write_instead(value, message):
+    with pytest.raises(ValueError, match=r"^callbacks\[1\] ?" + message):
+        to_config((None, value), "callbacks")
+
+
+def test_what_would_be_imported_is_refused_unless_it_is_allowed():
+    table = to_config((Custom("a:B"), Custom("c:D", arguments={"kind": "Custom", "target": "not:one"})))
+    assert custom_targets(table) == ["a:B", "c:D"]
+    with pytest.raises(ValueError, match=r"^a:B, c:D would be imported.*--allow a:B --allow c:D"):
+        from_config(table)
+    with allowing(["a:B"]), pytest.raises(ValueError, match=r"^c:D would be imported"):
+        from_config(table)
+    with allowing(["a:B", "c:D"]):
+        assert from_config(table)[0] == Custom("a:B")
+    with pytest.raises(ValueError, match="would be imported"):
+        from_config(table)
+
+
+def test_two_tables_are_told_apart_by_place():
+    before, now = TABLE, changed((0, "algorithm", "settings", "gamma"), 0.5)
+    assert differences(before, now, "agents") == ["agents[0].algorithm.settings.gamma was 0.995, is 0.5"]
+    assert differences(before, before, "agents") == []
+    assert differences({"a": 1}, {}, "x") == ["x.a was 1, is not there"]
+    assert differences([1], [1, 2], "x") == ["x was [1], is [1, 2]"]
