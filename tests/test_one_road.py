@@ -54,14 +54,26 @@ MEADOW = Experiment(
 ALLOW = ("one_road_parts:Bored", "one_road_parts:Fatigue", "torchrl.envs.transforms:RewardScaling")
 
 
-def assert_same_run(run, other):
-    """Episodes, weights, transforms and evaluation are the same bit for bit."""
+def assert_same_training(run, other, names=("final",)):
+    """Episodes and weights are the same bit for bit."""
     assert read_episodes(run).equals(read_episodes(other))
-    for name in ("final", "transforms"):
+    for name in names:
         mine, theirs = (load_weights(one / "checkpoints" / f"{name}.pt") for one in (run, other))
         assert repr(mine) == repr(theirs), name
-    one, two = (cprl.evaluate_run(each, episodes=2, allow=ALLOW).table() for each in (run, other))
-    assert repr(one.to_pydict()) == repr(two.to_pydict())
+
+
+@pytest.fixture
+def stopped(monkeypatch):
+    """Runs an experiment in a directory until it is stopped at a step; the exit code."""
+
+    def stop(experiment, run, at_step):
+        monkeypatch.setenv("STOP_AT_STEP", str(at_step))
+        with pytest.raises(SystemExit) as error:
+            cprl.run(experiment, run, watch="off")
+        monkeypatch.delenv("STOP_AT_STEP")
+        return error.value.code
+
+    return stop
 
 
 @pytest.fixture(scope="module")
@@ -71,21 +83,19 @@ def in_one_go(tmp_path_factory):
 
 @pytest.mark.integration
 def test_an_experiment_with_parts_of_its_own_is_stopped_resumed_evaluated_and_filmed(
-    in_one_go, tmp_path, monkeypatch, capsys
+    in_one_go, stopped, tmp_path, monkeypatch, capsys
 ):
     run = tmp_path / "run"
-    monkeypatch.setenv("STOP_AT_STEP", "71")
-    with pytest.raises(SystemExit) as stopped:
-        cprl.run(MEADOW, run, watch="off")
-    assert stopped.value.code == 128 + signal.SIGTERM
+    assert stopped(MEADOW, run, 71) == 128 + signal.SIGTERM
     told = capsys.readouterr().out
     flags = " ".join(f"--allow {target}" for target in ALLOW)
     assert f"To resume: {' '.join(cprl_here())} run {run} --resume {flags}" in told
     assert len(checkpoints_in(run / "checkpoints")) == 1
-    monkeypatch.delenv("STOP_AT_STEP")
     monkeypatch.setattr("sys.argv", ["cprl", "run", str(run), "--resume", *flags.split(), "--watch", "off"])
     cli.main()
-    assert_same_run(run, in_one_go)
+    assert_same_training(run, in_one_go, ("final", "transforms"))
+    tables = [cprl.evaluate_run(each, episodes=2, allow=ALLOW).table() for each in (run, in_one_go)]
+    assert repr(tables[0].to_pydict()) == repr(tables[1].to_pydict())
     assert cprl.load(run, allow=ALLOW).experiment == MEADOW
     _, episode = film(run, allow=ALLOW)
     assert episode.steps <= 20
@@ -138,21 +148,15 @@ DILEMMA_ALLOW = ("one_road_parts:Dilemma",)
 
 
 @pytest.mark.integration
-def test_a_matrix_game_is_trained_stopped_resumed_evaluated_and_cross_played(tmp_path, monkeypatch, capsys):
+def test_a_matrix_game_is_trained_stopped_resumed_evaluated_and_cross_played(tmp_path, stopped, capsys):
     experiment = replace(DILEMMA, callbacks=MEADOW.callbacks)
     whole = cprl.run(experiment, tmp_path / "whole")
     assert "left out" in capsys.readouterr().out
-    monkeypatch.setenv("STOP_AT_STEP", "23")
-    with pytest.raises(SystemExit):
-        cprl.run(experiment, tmp_path / "parts")
-    monkeypatch.delenv("STOP_AT_STEP")
+    stopped(experiment, tmp_path / "parts", 23)
     parts = cprl.run(experiment, tmp_path / "parts", resume=True)
     allow = (*DILEMMA_ALLOW, "one_road_parts:Bored")
-    assert read_episodes(parts).equals(read_episodes(whole))
+    assert_same_training(parts, whole)
     assert "harvest" not in read_episodes(whole).column_names
-    assert repr(load_weights(parts / "checkpoints" / "final.pt")) == repr(
-        load_weights(whole / "checkpoints" / "final.pt")
-    )
     loaded = cprl.load(whole, allow=allow)
     assert loaded.experiment == experiment
     found = cprl.evaluate_run(loaded, episodes=4)
@@ -164,26 +168,24 @@ def test_a_matrix_game_is_trained_stopped_resumed_evaluated_and_cross_played(tmp
     film(whole, allow=allow)
 
 
+FLAT = Custom(
+    "torchrl.envs.transforms:FlattenObservation",
+    arguments={"first_dim": -3, "last_dim": -1, "in_keys": [["agents", "observation"]]},
+)
+
+
 def test_scripted_policies_that_read_a_window_are_refused_where_there_is_none():
     with pytest.raises(ValueError, match=r"Scripted\('greedy'\) reads the window of a"):
         cprl.run(replace(DILEMMA, agents=[Scripted("greedy"), Scripted()]), "never")
-    flat = Custom(
-        "torchrl.envs.transforms:FlattenObservation",
-        arguments={"first_dim": -3, "last_dim": -1, "in_keys": [["agents", "observation"]]},
-    )
     with pytest.raises(ValueError, match="reads the window of the game; transforms make"):
-        cprl.run(replace(MEADOW, agents=[Scripted("greedy"), Scripted()], transforms=[flat]), "never")
+        cprl.run(replace(MEADOW, agents=[Scripted("greedy"), Scripted()], transforms=[FLAT]), "never")
     assert not Path("never").exists()
 
 
 @pytest.mark.integration
 def test_a_transform_that_changes_the_shape_of_observations_is_learned_from(tmp_path, capsys):
-    flat = Custom(
-        "torchrl.envs.transforms:FlattenObservation",
-        arguments={"first_dim": -3, "last_dim": -1, "in_keys": [["agents", "observation"]]},
-    )
     agents = [Learning(DQN(settings=REPLAY))] * 2
-    experiment = replace(MEADOW, agents=agents, transforms=[flat], callbacks=(), loggers=(), episodes=2)
+    experiment = replace(MEADOW, agents=agents, transforms=[FLAT], callbacks=(), loggers=(), episodes=2)
     run = cprl.run(experiment, tmp_path / "run", watch="off")
     loaded = cprl.load(run, allow=["torchrl.envs.transforms:FlattenObservation"])
     assert loaded.spaces.observation_shape == (45,)
@@ -216,7 +218,7 @@ def test_normalised_observations_are_floats_from_the_environment_to_the_stored_p
 
 
 @pytest.mark.integration
-def test_an_experiment_with_torchrls_own_engine_is_stopped_loaded_and_resumed(tmp_path, monkeypatch, capsys):
+def test_an_experiment_with_torchrls_own_engine_is_stopped_loaded_and_resumed(tmp_path, stopped):
     experiment = replace(
         MEADOW,
         agents=[Learning(DQN(settings=replace(REPLAY, hidden_cells=(8,)))), Scripted("greedy")],
@@ -226,14 +228,9 @@ def test_an_experiment_with_torchrls_own_engine_is_stopped_loaded_and_resumed(tm
         episodes=3,
     )
     whole = cprl.run(experiment, tmp_path / "whole", watch="off")
-    monkeypatch.setenv("STOP_AT_STEP", "33")
-    with pytest.raises(SystemExit):
-        cprl.run(experiment, tmp_path / "parts", watch="off")
-    monkeypatch.delenv("STOP_AT_STEP")
-    stopped = cprl.load(tmp_path / "parts", allow=ALLOW)
-    assert stopped.weights_from.name.startswith("training-000000000033")
-    assert cprl.evaluate_run(stopped, episodes=1).trained.keys() == {0, 1}
+    stopped(experiment, tmp_path / "parts", 33)
+    loaded = cprl.load(tmp_path / "parts", allow=ALLOW)
+    assert loaded.weights_from.name.startswith("training-000000000033")
+    assert cprl.evaluate_run(loaded, episodes=1).trained.keys() == {0, 1}
     parts = cprl.run(experiment, tmp_path / "parts", watch="off", resume=True)
-    assert read_episodes(parts).equals(read_episodes(whole))
-    mine, theirs = (load_weights(run / "checkpoints" / "final.pt") for run in (parts, whole))
-    assert repr(mine) == repr(theirs)
+    assert_same_training(parts, whole)

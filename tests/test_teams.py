@@ -1,4 +1,5 @@
-"""Teams learn together: VDN, QMIX, MADDPG from replay, MAPPO, IPPO on-policy, one team in each replica."""
+"""Teams learn together, one in each replica: VDN, QMIX, MADDPG from replay, MAPPO, IPPO on-policy. Their members
+may share one network, as those of other algorithms may; it learns from what all of them meet."""
 
 from dataclasses import replace
 from statistics import fmean
@@ -7,16 +8,22 @@ import pytest
 import test_optimum
 import torch
 from tensordict import TensorDict
-from test_population import GAME, REPLAY, ROLLOUTS, population, weights
+from test_population import ALGORITHMS, GAME, REPLAY, ROLLOUTS, population, ran, trained, weights
+from test_recurrent import DQNS
+from test_recurrent import ON_POLICY as RECURRENT
 
-from cprl import CommonsEnv, Game, Rules, maps
+from cprl import CommonsEnv, Custom, Experiment, Game, Rules, maps
+from cprl.algorithms import PPO, Tabular, TabularSettings
+from cprl.algorithms.base import TeamAlgorithm
 from cprl.algorithms.off_policy import DQN
 from cprl.algorithms.teams import IPPO, MADDPG, MAPPO, QMIX, VDN
 from cprl.learners.ring import TransitionForm
+from cprl.learners.settings import DEFAULT_HIDDEN_CELLS
 from cprl.learners.trial import trial_batch
 from cprl.measuring.evaluate import evaluate
+from cprl.networks import Conv
 from cprl.networks.team import Mixing
-from cprl.population import Learning, Scripted, Team
+from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.training import train
 from cprl.training.agents import Population
 
@@ -137,33 +144,153 @@ def test_the_teams_value_grows_with_each_members_value():
     assert not torch.equal(doubled, mixing(chosen, state)), "how it mixes depends on what is seen"
 
 
-@pytest.mark.parametrize("name", ["VDN", "QMIX", "MAPPO"])
-def test_who_shares_a_reward_but_is_paid_for_itself_is_refused(name):
-    with pytest.raises(ValueError, match=r'reward is "individual"'):
-        population([Team(TEAMS[name], FOUR, reward="individual")])
+def of(algorithm, agents=FOUR, **options):
+    return Team(algorithm, agents, **options)
 
 
-def test_what_is_no_team_is_refused_and_says_what_fits():
-    with pytest.raises(ValueError, match="the team has 1 agents"):
-        population([Team(TEAMS["QMIX"], (0,)), *[Scripted()] * 3])
-    with pytest.raises(ValueError, match=r"QMIX is learned by a team: Team\(QMIX\(...\), agents=\(0, 1\)\)"):
-        Learning(TEAMS["QMIX"])
-    with pytest.raises(ValueError, match=r"Team\.algorithm is a DQN"):
-        Team(DQN(settings=REPLAY), FOUR)
-    with pytest.raises(ValueError, match=r"QMIX\.settings is a RolloutSettings"):
-        population([Team(QMIX(settings=ROLLOUTS), FOUR)])
-    for agents, message in [((1, 0), "ascending agent indices"), ((), "at least one"), ((0, 0), "ascending")]:
-        with pytest.raises(ValueError, match=message):
-            Team(TEAMS["QMIX"], agents)
+REFUSED = [
+    *(
+        (lambda name=name: population([of(TEAMS[name], reward="individual")]), 'reward is "individual"')
+        for name in ("VDN", "QMIX", "MAPPO")
+    ),
+    (lambda: population([of(TEAMS["QMIX"], (0,)), *[Scripted()] * 3]), "the team has 1 agents"),
+    (lambda: Learning(TEAMS["QMIX"]), r"QMIX is learned by a team: Team\(QMIX\(...\), agents=\(0, 1\)\)"),
+    (lambda: of(DQN(settings=REPLAY)), r"Team\.algorithm is a DQN"),
+    (lambda: QMIX(settings=ROLLOUTS), r"QMIX\.settings is a RolloutSettings"),
+    (lambda: of(TEAMS["QMIX"], (1, 0)), "ascending agent indices"),
+    (lambda: of(TEAMS["QMIX"], ()), "at least one"),
+    (lambda: of(TEAMS["QMIX"], (0, 0)), "ascending"),
+    (lambda: population([of(TEAMS["QMIX"], pair) for pair in ((0, 2), (2, 3))]), "agent 2 is in two teams"),
+    (
+        lambda: population([of(TEAMS["QMIX"], (0, 4)), *[Scripted()] * 3]),
+        "a team has agent 4; the game has the agents 0 to 3",
+    ),
+    (lambda: shared(Tabular(settings=TabularSettings())), "share_parameters is True"),
+    (lambda: of(TEAMS["VDN"], share_parameters=1), r"Team\.share_parameters is 1"),
+    (lambda: population([shared(Custom("cprl.algorithms:Tabular", {"settings": None}))]), "settings"),
+    (
+        lambda: Population(
+            CommonsEnv(GAME, 2, seed=3), [shared(DQN(settings=REPLAY))], seed=3, engine="torchrl"
+        ),
+        "share_parameters is True",
+    ),
+    (
+        lambda: Experiment(
+            name="shared", game=GAME, agents=(shared(PPO(settings=ROLLOUTS)),), episodes=1, engine="torchrl"
+        ),
+        r"a Team, which engine=\"torchrl\" cannot train",
+    ),
+]
+
+
+@pytest.mark.parametrize(("make", "message"), REFUSED)
+def test_what_is_no_team_or_cannot_be_shared_is_refused_by_name(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
 
 
 def test_two_equal_teams_stay_two_teams():
     pairs = [Team(TEAMS["QMIX"], (0, 2)), Team(TEAMS["QMIX"], (1, 3))]
     assert list(population(pairs).learners) == [(0, 2), (1, 3)]
-    with pytest.raises(ValueError, match="agent 2 is in two teams"):
-        population([Team(TEAMS["QMIX"], (0, 2)), Team(TEAMS["QMIX"], (2, 3))])
-    with pytest.raises(ValueError, match="a team has agent 4; the game has the agents 0 to 3"):
-        population([Team(TEAMS["QMIX"], (0, 4)), *[Scripted()] * 3])
+
+
+EVERY = {
+    **ALGORITHMS,
+    **TEAMS,
+    "recurrent PPO": RECURRENT["PPO"],
+    "recurrent MAPPO": RECURRENT["MAPPO"],
+    "recurrent DQN": DQNS["GRU"],
+    "DQN, convolutions": DQN(
+        settings=replace(REPLAY, hidden_cells=DEFAULT_HIDDEN_CELLS), network=Conv(channels=(2,))
+    ),
+}
+
+
+def shared(algorithm, agents=FOUR, **how):
+    reward = "team" if isinstance(algorithm, TeamAlgorithm) else "individual"
+    return Team(algorithm, agents, **{"reward": reward, "share_parameters": True, **how})
+
+
+def by_member(agents):
+    """The weights of each member's network, in one row: [R, S, ...]."""
+    flat = [
+        torch.cat([value.flatten() for value in network.state_dict().values()])
+        for network in agents.networks().values()
+    ]
+    return torch.stack(flat).unflatten(0, (agents.replicas, -1))
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", EVERY)
+def test_members_share_one_network_in_each_replica_which_learns_as_it_would_alone(name):
+    together = population([shared(EVERY[name])], replicas=3)
+    alone = population([shared(EVERY[name])], replicas=1, first_replica=2)
+    before = by_member(together)
+    _, returns = trained(together, episodes=4)
+    _, returns_alone = trained(alone, first=2, episodes=4)
+    assert returns[2] == returns_alone[0]
+    after = by_member(together)
+    assert (after == after[:, :1]).all(), "every member has the same"
+    assert (after != before).any(-1).all(), "it learns"
+    assert len({float(row.sum()) for row in after[:, 0]}) == 3, "each replica has its own"
+    torch.testing.assert_close(after[2], by_member(alone)[0], rtol=1e-4, atol=1e-5)
+
+
+def test_the_shared_network_starts_as_that_of_the_first_member_alone():
+    alone = by_member(population([Learning(DQN(settings=REPLAY))] * 4))
+    for name in ("DQN", "VDN"):
+        assert torch.equal(by_member(population([shared(EVERY[name])])), alone[:, :1].expand(-1, 4, -1))
+
+
+def test_the_loss_is_the_mean_over_the_transitions_of_all_members():
+    agents = population([shared(DQN(settings=REPLAY), (1, 3)), Scripted(), Scripted()], replicas=2)
+    (learner,) = agents.learners.values()
+    network = agents.networks()["replica_1/agent_1"]
+    batch = trial_batch(4, TransitionForm(observation_shape=GAME.observation_shape), len(GAME.actions))
+    mine = batch[2:].reshape(-1)  # lanes are replicas times members
+    with torch.no_grad():  # r + gamma max Q', the target is still a copy
+        chosen = network(mine["observation"]).gather(-1, mine["action"].unsqueeze(-1))
+        best = network(mine["next", "observation"]).amax(-1, keepdim=True)
+        target = mine["next", "reward"] + REPLAY.gamma * ~mine["next", "terminated"] * best
+    losses = learner.engine.update_from(batch)
+    assert losses.shape == (2,), "of each network"
+    torch.testing.assert_close(losses[1], (target - chosen).square().mean())
+
+
+def test_a_member_acts_on_what_it_sees_itself_and_is_paid_for_itself():
+    agents = population([shared(DQN(settings=REPLAY), (1, 2)), Scripted(), Scripted()])
+    (learner,) = agents.learners.values()
+    learner.store(first_turn(2))
+    assert learner.buffer.fields["reward"][0].tolist() == [1.0, 2.0, 1.0, 2.0]
+    seen = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"][:, 1:3]
+    actor = learner.evaluation_actor(1)
+    actor.epsilon = 0.0
+    for replica in range(2):
+        network = agents.networks()[f"replica_{replica}/agent_1"]
+        assert torch.equal(actor.choose(seen)[replica], network(seen[replica]).argmax(-1))
+
+
+def test_members_explore_each_by_random_numbers_of_its_own():
+    alone = population([Learning(DQN(settings=REPLAY))] * 4)
+    team = population([shared(DQN(settings=REPLAY))])
+    seen = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"]
+    chosen = [next(iter(own.learners.values())).actor.choose(seen) for own in (alone, team)]
+    assert torch.equal(*chosen), "epsilon is 1 at first"
+    assert len(set(chosen[1][0].tolist())) > 1
+
+
+@pytest.mark.integration
+def test_weights_that_differ_are_refused_as_a_start(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run, _ = ran(tmp_path, [Team(TEAMS["VDN"], FOUR)])
+    with pytest.raises(ValueError, match=r"the agents \[0, 1, 2, 3\] would start from different weights"):
+        population([shared(TEAMS["VDN"], start_from=Frozen(run, 0))])
+
+
+def test_sharing_takes_the_engine_that_agents_of_their_own_take():
+    for name, way in (("DQN", "lane_axis"), ("SAC", "vmapped"), ("C51", "lane_axis_flat")):
+        (learner,) = population([shared(EVERY[name])]).learners.values()
+        assert (learner.engine.sharing, learner.engine.batching) == (4, way)
 
 
 ROWS = Game(
