@@ -1,5 +1,5 @@
-"""Teams learn together, one in each replica: VDN, QMIX, MADDPG from replay, MAPPO, IPPO on-policy. Their members
-may share one network, as those of other algorithms may; it learns from what all of them meet."""
+"""Teams learn together, one in each replica: VDN, QMIX, MADDPG from replay, MAPPO, IPPO on-policy. Agents
+that share one network, whatever they learn by, learn from what all of them meet."""
 
 from dataclasses import replace
 from statistics import fmean

@@ -281,7 +281,9 @@ class Engine(ABC):
         """
         if self.sharing == 1:
             return self._outputs(part, observation, *recurrent)
-        by_network = [entry.unflatten(0, (-1, self.sharing)) for entry in (observation, *recurrent)]
+        by_network = [
+            entry.reshape(-1, self.sharing, *entry.shape[1:]) for entry in (observation, *recurrent)
+        ]
         if recurrent:  # the time of sequences stays an axis of its own
             return tuple(given.flatten(0, 1) for given in self._outputs(part, *by_network))
         given: Tensor = self._outputs(part, by_network[0].flatten(1, 2))

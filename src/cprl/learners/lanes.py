@@ -238,7 +238,8 @@ def _of_members(engine: Acts, size: int) -> Callable[..., Any]:
     [R, k, S, ...]; of recurrent ones also states, likewise."""
 
     def outputs(*seen: Tensor) -> Any:
-        given = engine.outputs(*(entry.unflatten(0, (-1, size)).transpose(1, 2) for entry in seen))
+        by_team = (entry.reshape(-1, size, *entry.shape[1:]).transpose(1, 2) for entry in seen)
+        given = engine.outputs(*by_team)
         if isinstance(given, tuple):
             return tuple(output.transpose(1, 2).flatten(0, 1) for output in given)
         return given.transpose(1, 2).flatten(0, 1)

@@ -37,7 +37,8 @@ class StackedMLP(nn.Module):
     @property
     def lane_axis(self) -> int:
         """The place of the axis of S lanes: 0, or 1 after an axis of R stacks."""
-        return self.weights[0].ndim - 3
+        dims: int = self.weights[0].ndim
+        return dims - 3
 
     def stacked(self, stacks: Sequence["StackedMLP"]) -> "StackedMLP":
         """R such networks as one; copies."""
