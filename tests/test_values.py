@@ -406,7 +406,7 @@ UNUSUAL = (
         institutions=(
             institutions.Boundaries(regions=(".01..", "aa...", "...1."), owners=("0a", "1")),
             institutions.ClosedSeason(closed_steps=3, fine=0.5),
-            institutions.Vote(on=institutions.Tax(brackets=((0, 0.1), (3, 0.5))), override_prob=0.5),
+            institutions.Vote(on=institutions.Tax(), override_prob=0.5),
             institutions.Monitoring(prob=0.5, monitor="elected"),
         ),
     ),
@@ -415,6 +415,7 @@ UNUSUAL = (
         rules=Rules(),
         observation=Observation(agents_apart=True),
         institutions=(
+            institutions.Tax(brackets=((0, 0.1), (3, 0.5))),
             institutions.Mediation(turns=3),
             institutions.Sanctioner(agents=(1,)),
             institutions.GraduatedSanctions(freeze_steps=((1,), (2,)), on="tags"),

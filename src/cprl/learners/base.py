@@ -174,10 +174,9 @@ class LaneLosses:
 
     def take(self, replica: int) -> dict[int, float]:
         """Returns the mean loss of each agent of a replica, NaN without an update, and resets the replica."""
-        updates = self.updates[replica]
-        means = (self.total[replica] / updates).tolist() if updates else [nan] * len(self.agents)
+        means = self.total[replica] / (self.updates[replica] or nan)
         self.total[replica], self.updates[replica] = 0.0, 0
-        return dict(zip(self.agents, means, strict=True))
+        return dict(zip(self.agents, means.tolist(), strict=True))
 
     def state_dict(self) -> dict[str, Tensor]:
         return {"total": torch.tensor(self.total), "updates": torch.tensor(self.updates)}
