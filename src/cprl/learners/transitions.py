@@ -120,25 +120,16 @@ def transitions_of(agent: int, batch: TensorDictBase) -> TensorDict:
         "observation", "reward" float32 [.., 1], "done", "terminated", "truncated" bool [.., 1].
         Turns that the agent spends out of play are included, with the action that it chose.
     """
-    before, after = batch.get(keys.AGENTS), batch.get("next")
-    agents_after = after.get(keys.AGENTS)
-    dim = len(batch.batch_size)
-    following = TensorDict(
-        {
-            "observation": agents_after.get("observation").select(dim, agent),
-            "reward": agents_after.get("reward").select(dim, agent),
-            **{name: after.get(name) for name in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)},
+    before, after, size = batch.get(keys.AGENTS), batch.get("next"), batch.batch_size
+    now = {name: before.get(name).select(len(size), agent) for name in ("observation", "action")}
+    following = {
+        **{
+            name: after.get((keys.AGENTS, name)).select(len(size), agent)
+            for name in ("observation", "reward")
         },
-        batch_size=batch.batch_size,
-    )
-    return TensorDict(
-        {
-            "observation": before.get("observation").select(dim, agent),
-            "action": before.get("action").select(dim, agent),
-            "next": following,
-        },
-        batch_size=batch.batch_size,
-    ).reshape(-1)
+        **{name: after.get(name) for name in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)},
+    }
+    return TensorDict({**now, "next": TensorDict(following, size)}, size).reshape(-1)
 
 
 def refuse_other_dtype(dtype: Any, allowed: Any) -> None:
