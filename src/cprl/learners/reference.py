@@ -123,13 +123,14 @@ class TorchRLReplayLearner(ReplayLearner):
         super().__init__(who, method, compile=False)
 
     def _refuse_other_sequences(self) -> None:
-        for name in ("n_steps", "sequence_steps"):
-            if (steps := getattr(self.settings, name)) > 1 or self._lanes.state_cells:
-                raise ValueError(
-                    f'settings.{name} is {steps}; allowed with engine="torchrl", whose buffers give single '
-                    'transitions: 1, with MLP, Conv, Custom; engine="compiled" and "eager" learn from '
-                    "sequences and from returns of several steps"
-                )
+        name = "n_steps" if self.settings.n_steps > 1 else "sequence_steps"
+        steps = getattr(self.settings, name)
+        if steps > 1 or self._lanes.state_cells:
+            raise ValueError(
+                f'settings.{name} is {steps}; allowed with engine="torchrl", whose buffers give single '
+                'transitions: 1, with MLP, Conv, Custom; engine="compiled" and "eager" learn from sequences '
+                "and from returns of several steps"
+            )
 
     def _trial(self, lanes: int) -> TensorDict:
         batch = super()._trial(lanes)
