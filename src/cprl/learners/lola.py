@@ -9,8 +9,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from cprl.learners.engine import UpdateRule, shortened, torch_optimizer, total
 from cprl.learners.base import WEIGHTS, LearningAgents
+from cprl.learners.engine import UpdateRule, shortened, torch_optimizer, total
 from cprl.learners.lanes import Acts, LaneLearner, Method
 from cprl.learners.rollouts import refuse_full, refuse_other_parts, rollout_fields, write_turn
 from cprl.learners.settings import LOLASettings
