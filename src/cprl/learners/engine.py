@@ -186,15 +186,17 @@ WITH_SQUARE: Final = ("adam", "adamw", *RMSPROP_ALPHAS)
 """Optimisers with a running mean of squared gradients."""
 
 
-def torch_optimizer(rule: UpdateRule, parameters: Iterable[Tensor]) -> torch.optim.Optimizer:
-    """The optimiser of one lane; fused where torch has such a form of it."""
+def torch_optimizer(
+    rule: UpdateRule, parameters: Iterable[Tensor], *, fused: bool | None = True
+) -> torch.optim.Optimizer:
+    """The optimiser of one lane; `fused` where torch has such a form of it, None for torch's default."""
     name, rate, eps = rule.optimizer, rule.learning_rate, rule.adam_eps
     if name in RMSPROP_ALPHAS:
         return torch.optim.RMSprop(parameters, lr=rate, eps=eps, alpha=RMSPROP_ALPHAS[name])
     if name == "sgd":
-        return torch.optim.SGD(parameters, lr=rate, fused=True)
+        return torch.optim.SGD(parameters, lr=rate, fused=fused)
     kind = torch.optim.Adam if name == "adam" else torch.optim.AdamW
-    return kind(parameters, lr=rate, eps=eps, fused=True)
+    return kind(parameters, lr=rate, eps=eps, fused=fused)
 
 
 def change_weights(
