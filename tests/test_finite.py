@@ -239,18 +239,18 @@ def step(training, steps):
 
 
 @pytest.mark.parametrize(
-    ("entry", "poison", "message"),
+    ("entry", "poison", "at_step"),
     [
-        ("reward", {"step": 4}, "at step 4 .*the reward"),
-        ("observation", {"step": 3}, "at step 3 the observation"),
-        ("observation", {"step": 99, "reset": True}, "at step 1 the observation"),
+        ("reward", {"step": 4}, 4),
+        ("observation", {"step": 3}, 3),
+        ("observation", {"step": 99, "reset": True}, 1),
     ],
 )
 def test_rewards_and_observations_that_are_not_finite_are_blamed_on_the_environment(
-    entry, poison, message, looks_every_step
+    entry, poison, at_step, looks_every_step
 ):
     whose = r"of agent 1 in replica 2(,| is).* not finite.*it comes from the environment.* transforms"
-    with pytest.raises(NotFiniteError, match=f"^{message} {whose}"):
+    with pytest.raises(NotFiniteError, match=rf"^at step {at_step} .*the {entry} {whose}"):
         step(poisoned(entry, **poison), 12)
 
 
@@ -259,8 +259,7 @@ def test_rewards_and_observations_that_are_not_finite_are_blamed_on_the_environm
 def test_what_a_game_gives_is_looked_at_every_sixteen_steps_and_when_episodes_end(entry, steps, found_at):
     training = poisoned(entry, step=2, steps=steps, learning_starts=90)
     step(training, found_at - 1)
-    match = rf"^at step {found_at} the {entry} of agent 1 in replica 2 is not finite"
-    with pytest.raises(NotFiniteError, match=match):
+    with pytest.raises(NotFiniteError, match=rf"^at step {found_at} the {entry} of agent 1 in replica 2"):
         training.step()
 
 

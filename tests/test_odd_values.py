@@ -93,20 +93,16 @@ def test_sites_far_apart_are_counted_without_walking_over_the_board():
 @pytest.mark.parametrize(
     "which", [np.ones(1, bool), np.ones(3, bool), np.ones(2, np.int64), np.ones((2, 1), bool)]
 )
-def test_a_mask_of_another_form_is_refused_before_the_kernel_reads_it(which):
-    batch = Batch(GAME, 2)
-    output = batch.begin(batch.new_output())
-    with pytest.raises(ValueError, match=r"which is .*"):
-        batch.begin(output, which)
-    assert batch.now.episode.tolist() == [[0], [0]]
-
-
-def test_worlds_that_have_not_begun_are_not_played():
+def test_a_mask_of_another_form_is_refused_before_the_kernel_reads_it_and_worlds_that_have_not_begun(which):
     batch = Batch(GAME, 2)
     with pytest.raises(ValueError, match="have not begun"):
         batch.check(np.zeros((2, 1), np.int64))
     with pytest.raises(ValueError, match="which leaves worlds out"):
         batch.begin(batch.new_output(), np.array([True, False]))
+    output = batch.begin(batch.new_output())
+    with pytest.raises(ValueError, match=r"which is .*"):
+        batch.begin(output, which)
+    assert batch.now.episode.tolist() == [[0], [0]]
 
 
 def stepped(env, action, how):

@@ -453,15 +453,6 @@ def test_a_stored_run_is_loaded_evaluated_filmed_and_played_against(ran, tmp_pat
     assert [int(own.steps) for own in greedy] == moved.played.sum(0).tolist()
 
 
-def test_what_an_agent_does_depends_on_what_it_saw(ran):
-    """The same observation after different turns gives other probabilities."""
-    loaded = cprl.load(ran[1])
-    actor = loaded.policy().actors[0]
-    seen = torch.zeros(1, 2, *GAME.observation_shape, dtype=torch.uint8)
-    once, twice = torch.zeros(1, 2, 5), torch.ones(1, 2, 5)
-    assert not torch.equal(actor.preferences(seen, once), actor.preferences(seen, twice))
-
-
 def test_states_of_other_policies_are_refused(ran):
     policy = cprl.load(ran[1]).policy()
     moment = cprl.load(ran[1]).env().reset()

@@ -14,7 +14,6 @@ import cprl
 from cprl import CommonsEnv, Experiment
 from cprl.algorithms import DQN, IPPO, MADDPG, MAPPO, PPO, QMIX, SAC, VDN, Tabular, TabularSettings
 from cprl.commands import main as cli
-from cprl.commands.recipe import parse
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.checkpoints import checkpoints_in
 from cprl.runs.weights import load_weights, save_weights
@@ -218,11 +217,3 @@ def test_a_frozen_agent_can_be_that_of_its_own_replica(stored):
     torch.testing.assert_close(values[0], each[0].others[0,].values(seen)[0])
     torch.testing.assert_close(values[1], each[1].others[0,].values(seen)[1])
     assert not torch.allclose(values[1], each[0].others[0,].values(seen)[1])
-
-
-def test_where_to_start_is_a_flag(stored):
-    def made():
-        return experiment((replace(ALONE[0], start_from=Frozen("a", 0)), *[Scripted()] * 3))
-
-    words = ["recipe.py", "--agents.0.start-from.run", "b", "--agents.0.start-from.agent", "2"]
-    assert parse(made, words)[0].agents[0].start_from == Frozen("b", 2)

@@ -523,17 +523,19 @@ class FunctionalEngine(Engine):
     def update(self, ring: Ring) -> Tensor:
         if ring.sequence_steps > 1 or self.sharing > 1:
             return super().update(ring)
-        columns = [*ring.fields.values(), ring.draw()]
+        index = ring.draw()
+        columns = [*ring.fields.values(), index]
         if ring.noise is not None:
             columns.append(ring.noise.next())
-        return self._run(_FromRing(ring.rows, ring.horizon), columns)
+        return self._run(_FromRing(ring.rows, ring.horizon), columns, (ring.sizes, index.shape))
 
     def _update(self, batch: TensorDict) -> Tensor:
         entries = sorted(batch.items(True, True), key=lambda entry: str(entry[0]))
         given = _Given(tuple(name for name, _ in entries), tuple(batch.batch_size))
-        return self._run(given, [column for _, column in entries])
+        sizes = tuple((column.shape, column.dtype) for _, column in entries)
+        return self._run(given, [column for _, column in entries], sizes)
 
-    def _run(self, source: _FromRing | _Given, columns: list[Tensor]) -> Tensor:
+    def _run(self, source: _FromRing | _Given, columns: list[Tensor], sizes: tuple[Any, ...]) -> Tensor:
         self.steps += 1
         if not self._is_warm:
             # TensorDict fills a cache at first use, which compiled code would refill at each call.
@@ -543,9 +545,9 @@ class FunctionalEngine(Engine):
         step_size, scale = self._scalars
         step_size.fill_(self._rule.learning_rate / (1 - BETA_1**self.steps))
         scale.fill_((1 - BETA_2**self.steps) ** -0.5)
-        # All that code is compiled for; the engine's own tensors never change their shapes.
-        form = source, *((column.shape, column.dtype) for column in columns)
-        losses: Tensor = self._compiled(form, self, source, columns, step_size, scale, self._tensors)
+        # Code is compiled for the source and its sizes; the engine's own tensors never change theirs.
+        arguments = source, columns, step_size, scale, self._tensors
+        losses: Tensor = self._compiled((source, sizes), self, *arguments)
         return losses
 
     def _step(

@@ -249,6 +249,7 @@ class Ring:
         """Observations [L x rows, ...], actions and rewards [T, L, ...], the rest [T, L]; `row` counts the
         observations that a lane has written. A state [L x rows, K] stands in the row of the observation that
         the lane saw next."""
+        self.sizes = tuple((field.shape, field.dtype) for field in self.fields.values())
         self._of_rows = [name for name in self.fields if name in ("observation", STATE)]
         # Steps are written with numpy on the CPU: for so few numbers torch takes five times as long.
         self._arrays = {name: array_of(field) for name, field in self.fields.items()}
