@@ -82,8 +82,8 @@ def tensors_of(learner, replica, agent):
     if isinstance(learner.engine, ListEngine):
         return [weights.data for weights in learner.engine.losses[lane].parameters()]
     if isinstance(learner.engine, LOLANetworks):
-        stacks = (learner.engine.acting, learner.engine.playing)
-        return [weights.data[replica] for stack in stacks for weights in stack.parameters()[agent]]
+        stacks = (learner.engine.actors, learner.engine.playing)
+        return [weights.data[replica] for stack in stacks for weights in stack[agent].parameters()]
     return [weights[lane] for weights in learner.engine.params.values()]
 
 
