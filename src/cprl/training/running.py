@@ -1,12 +1,12 @@
 """run: one experiment from its learners to its report: train, save, evaluate in fresh worlds, summarise."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from torchrl.envs import EnvBase
 
@@ -113,10 +113,9 @@ def run(
     trust(*allow)
     prepare_process(experiment.seed)
     out = None if out is None else Path(out)
-    is_new, is_begun = out is None or not out.exists(), False
-    weights: dict[str, str] = {}
-    if resume and out is not None:
-        is_begun, weights = bool(checkpoints_in(out / FOLDER)), _weights_of_partners(experiment, out)
+    is_new = out is None or not out.exists()
+    is_begun = resume and out is not None and bool(checkpoints_in(out / FOLDER))
+    weights = _weights_of_partners(experiment, out) if resume and out is not None else {}
     env, population = make_agents(experiment, starts=not is_begun, weights=weights)
     observers: list[Any] = [*(made(callback) for callback in experiment.callbacks), *callbacks]
     check_callbacks(observers)
@@ -137,22 +136,13 @@ def run(
             if resume:
                 _begin_again(directory, experiment, is_begun=is_begun, episodes=episodes)
             viewer = closing.enter_context(_make_viewer(watch, directory, experiment, env, population))
-            random = None if viewer is None else random_play(experiment, population)
-            if viewer is not None and random is not None:
-                viewer.random_play(random)
-                observers.append(viewer)
-            training = _train(directory, experiment, env, population, observers, checkpointer)
-            if viewer is not None:
-                viewer.flush()
-            played = evaluate_population(experiment, env, population, random=random)
-            write_evaluation(directory, played, of_replica=experiment.evaluation_episodes)
-            if viewer is not None:
-                viewer.finished(played)
-            figure = _draw(directory, experiment, played["random"]) if figures else None
-            _write_report(directory, training, times)
-            columns = {"random": played["random"], _heading(population): played["trained"]}
-            note = summary(training.finite.reported)
-            summarise(directory, title=_title(experiment), played=columns, figure=figure, note=note)
+            work = _Work(directory, experiment, env, population, viewer)
+            random = _play_at_random(work)
+            training = _train(work, observers, checkpointer)
+            played = _evaluate(work, random)
+            figure = _draw(work, played["random"]) if figures else None
+            _write_report(work, training, times)
+            _summarise(work, training, played, figure)
             checkpointer.done()
             _say_what_is_kept(directory)
     except BaseException as error:
@@ -171,22 +161,36 @@ def run(
     return directory
 
 
-def _train(
-    directory: Path,
-    experiment: Experiment,
-    env: EnvBase,
-    population: Population,
-    observers: Sequence[Any],
-    checkpointer: Checkpointer,
-) -> Training:
+class _Work(NamedTuple):
+    """A run that is being written."""
+
+    directory: Path
+    experiment: Experiment
+    env: EnvBase
+    population: Population
+    viewer: "ViewerCallback | None"
+
+
+def _play_at_random(work: _Work) -> list[Episode] | None:
+    """Random play for the viewer, if there is one."""
+    if work.viewer is None:
+        return None
+    random = random_play(work.experiment, work.population)
+    work.viewer.random_play(random)
+    return random
+
+
+def _train(work: _Work, observers: Sequence[Any], checkpointer: Checkpointer) -> Training:
     """Trains with the callbacks that write the table of episodes, show the progress and write to loggers, and
     saves what was learned."""
+    directory, experiment, env, population, viewer = work
     replicas, names = experiment.replicas, agent_names(env)
+    watching = [] if viewer is None else [viewer]
     with ExitStack() as stack:
         table = stack.enter_context(EpisodeTable(directory / "episodes.parquet", resumable=True))
         bar = stack.enter_context(ProgressBar(env, episodes=experiment.episodes, replicas=replicas))
         loggers = [make_logger(made(logger), directory) for logger in experiment.loggers]
-        callbacks = [LoggerCallback(logger, replicas=replicas, agents=names) for logger in loggers]
+        logging = [LoggerCallback(logger, replicas=replicas, agents=names) for logger in loggers]
         evaluations = Evaluations(directory, experiment, env, population)
         training = train(
             env,
@@ -194,7 +198,7 @@ def _train(
             others=population.others,
             decisions=population.decisions,
             episodes=experiment.episodes,
-            callbacks=[evaluations, table, bar, *observers, *map(stack.enter_context, callbacks)],
+            callbacks=[evaluations, table, bar, *observers, *watching, *map(stack.enter_context, logging)],
             checkpointer=checkpointer,
             update_every=experiment.update_every,
             on_nan=experiment.on_nan,
@@ -204,6 +208,54 @@ def _train(
         if population.decisions is not None:
             save_decisions(directory, population.decisions.learned())
     return training
+
+
+def _evaluate(work: _Work, random: list[Episode] | None) -> dict[str, list[Episode]]:
+    """Evaluates the agents, and writes and shows it."""
+    if work.viewer is not None:
+        work.viewer.flush()
+    played = evaluate_population(work.experiment, work.env, work.population, random=random)
+    write_evaluation(work.directory, played, of_replica=work.experiment.evaluation_episodes)
+    if work.viewer is not None:
+        work.viewer.finished(played)
+    return played
+
+
+def _draw(work: _Work, random: list[Episode]) -> Path:
+    ends = exploration_steps(work.experiment.agents)
+    return training_curve(
+        work.directory, title=_title(work.experiment), random=random, exploration_steps=ends
+    )
+
+
+def _write_report(work: _Work, training: Training, times: RunTimes) -> None:
+    """Writes `report.json`, the sign that a run is finished."""
+    report = {
+        **times.report(training.times),
+        "steps": training.steps,
+        "finished": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "episodes": training.episodes,
+    }
+    if training.finite.reported:
+        report["not_finite"] = [asdict(finding) for finding in training.finite.reported]
+    write_json(work.directory / REPORT, report)
+
+
+def _summarise(
+    work: _Work, training: Training, played: Mapping[str, list[Episode]], figure: Path | None
+) -> None:
+    """Prints the outcome. Agents are called trained, where any learns, with the probability with which those
+    with action values explore; others draw from a policy."""
+    learners = work.population.learners.values()
+    chances = {learner.settings.epsilon_evaluation for learner in learners if not learner.actor.stochastic}
+    heading = "trained" + "".join(f", epsilon {chance:g}" for chance in sorted(chances))
+    columns = {"random": played["random"], heading if learners else "agents": played["trained"]}
+    note = summary(training.finite.reported)
+    summarise(work.directory, title=_title(work.experiment), played=columns, figure=figure, note=note)
+
+
+def _title(experiment: Experiment) -> str:
+    return f"{experiment.name}, {experiment.replicas} replicas, {experiment.episodes} episodes"
 
 
 def _recipe(experiment: Experiment, directory: Path) -> dict[str, Any]:
@@ -254,41 +306,6 @@ def _make_viewer(
         live=None if watch == "file" else watch,
         exhibited=None if watch == "file" else exhibited(experiment, env, population),
     )
-
-
-def _draw(directory: Path, experiment: Experiment, random: list[Episode]) -> Path:
-    ends = exploration_steps(experiment.agents)
-    return training_curve(directory, title=_title(experiment), random=random, exploration_steps=ends)
-
-
-def _write_report(directory: Path, training: Training, times: RunTimes) -> None:
-    """Writes `report.json`, the sign that a run is finished."""
-    report = {
-        **times.report(training.times),
-        "steps": training.steps,
-        "finished": datetime.now().astimezone().isoformat(timespec="seconds"),
-        "episodes": training.episodes,
-    }
-    if training.finite.reported:
-        report["not_finite"] = [asdict(finding) for finding in training.finite.reported]
-    write_json(directory / REPORT, report)
-
-
-def _title(experiment: Experiment) -> str:
-    return f"{experiment.name}, {experiment.replicas} replicas, {experiment.episodes} episodes"
-
-
-def _heading(population: Population) -> str:
-    """What a table of the evaluation calls the agents: trained, where any learns, and with which probability
-    those with action values explore; others draw from a policy."""
-    if not population.learners:
-        return "agents"
-    chances = {
-        learner.settings.epsilon_evaluation
-        for learner in population.learners.values()
-        if not learner.actor.stochastic
-    }
-    return "trained" + "".join(f", epsilon {chance:g}" for chance in sorted(chances))
 
 
 def _tidy_up(finished: Path, *, keep_checkpoint: bool, take_over: bool) -> None:
