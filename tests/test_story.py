@@ -14,14 +14,13 @@ from rerun.chunk import RrdReader
 from test_watch import connected, fake
 
 from cprl import CommonsEnv, Game, Rules, maps, presets
-from cprl.commons.colours import APPLE, FIRST_AGENT, GROUND, PALETTE, WALL, agent_colour
+from cprl.commons.colours import GROUND, PALETTE, WALL, agent_colour
 from cprl.measuring import social
 from cprl.measuring.metrics import reported_by
 from cprl.measuring.phases import LONGEST, PHASES_BEGIN
 from cprl.policies.lanes import random_agents
 from cprl.runs.episodes import EpisodeTable
 from cprl.training import train
-from cprl.viewer.board import boards
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.layout import Curves, Panels, curves_of, layout
 from cprl.viewer.live import LiveStream, Stream
@@ -422,12 +421,3 @@ def test_viewers_get_the_wall_every_two_seconds_and_the_file_does_not(run, monke
     boards_at = [at for name, at in listener.rows if name == "wall/boards"]
     assert boards_at == [{"step": [step], "episode": [3], "frame": [12]} for step in (1, 4, 7)]
     assert listener.live_only == [True] * 3
-
-
-def test_boards_of_many_worlds_are_drawn_as_frames_of_one(run):
-    _, viewer, _ = run
-    now = viewer.env.worlds.now
-    state = {name: getattr(now, name) for name in ("stock", "in_play", "row", "col")}
-    drawn = boards(viewer.logger.scene, {"step": now.step, **state})
-    assert drawn.shape == (2, 5, 7)
-    assert set(np.unique(drawn)) <= {GROUND, WALL, APPLE, FIRST_AGENT, FIRST_AGENT + 1}
