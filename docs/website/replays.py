@@ -66,7 +66,7 @@ def _fetched(address: str) -> bytes:
     while True:
         try:
             with opener.open(address, timeout=START_S) as answer:
-                return answer.read()
+                return bytes(answer.read())
         except URLError:
             if time.monotonic() > ends:
                 raise
