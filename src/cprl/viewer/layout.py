@@ -425,9 +425,9 @@ def _replay(scene: Scene) -> Any:
         [
             _board(f"What agents see, {WINDOW_CAPTION}", "windows"),
             bars.view("What policies say (L, R turn, B beam, S stay), taken: white", "decisions"),
-            _plot("Harvest so far, apples", *_of(scene.agents, "harvested")),
-            _plot("Apples on the board", "turn/stock"),
-            _plot("Fined (down) and given (up) in the turn, apples", *paid) if paid else None,
+            _plot("Harvest so far, apples", _of(scene.agents, "harvested")),
+            _plot("Apples on the board", ["turn/stock"]),
+            _plot("Fined (down) and given (up) in the turn, apples", paid),
         ]
     )
     left = [_board("Board", "world"), rrb.Tabs(_events(), _recipe(), active_tab=0)]
@@ -475,7 +475,10 @@ def _tabs(curves: Curves) -> list[Any]:
         [f"institutions/{name}" for name in names if name in curves.institutions]
         for names in (SHARES, [name for name in INSTITUTIONAL if "equality" in name])
     )
+    equalities += [f"{RANDOM_PLAY}/institutions/net_equality"] if equalities else []
     decided = [f"institutions/in_force_{ballot}" for ballot in range(len(curves.in_force))]
+    lorenz = _drawn_plot("Lorenz curve: harvest in %", "lorenz") if curves.has_lorenz else None
+    tags = rrb.TensorView(name="Who tagged whom", origin="/tags") if curves.has_tags_between else None
     wall, visits, stock = None, None, None
     if isinstance(curves, Scene):
         stock = _drawn_plot("Apples on the board, over the turn", "turn")
@@ -486,64 +489,41 @@ def _tabs(curves: Curves) -> list[Any]:
             wall = boards_of(curves, curves.replicas).view(
                 "All replicas; framed: died in its last episode", "wall"
             )
-    return _present(
-        [
-            _row(
-                "Outcome",
-                social("Harvest of all, apples", "collective_return"),
-                social("Survival, steps", "survival_steps"),
-                social("Equality, 0 to 1", "equality", share=True),
-            ),
-            _row(
-                "Agents",
-                _plot(f"Return of each, {unit}", *_of(agents, "return"), "evaluation/greedy_return"),
-                social("Peacefulness, steps in play", "peacefulness"),
-                rrb.TensorView(name="Who tagged whom", origin="/tags") if curves.has_tags_between else None,
-            ),
-            _row(
-                "Institutions",
-                *(
-                    _plot(title, *_of(agents, name))
-                    for name, title in PAYMENTS.items()
-                    if name in curves.institutions
-                ),
-            ),
-            _row(
-                "Rules kept",
-                _plot("Shares of violations, bites, tags", *shares, share=True) if shares else None,
-                _plot(
-                    "Equality of net incomes",
-                    *equalities,
-                    f"{RANDOM_PLAY}/institutions/net_equality",
-                    share=True,
-                )
-                if equalities
-                else None,
-                _plot(f"In force: {', '.join(curves.in_force)}", *decided) if decided else None,
-            ),
-            _row("Replicas", wall, stock),
-            _row(
-                "Places and shares",
-                visits,
-                _drawn_plot("Lorenz curve: harvest in %", "lorenz") if curves.has_lorenz else None,
-            ),
-            _row(
-                "Learning",
-                _plot("Loss", *_of(agents, "loss")),
-                _plot("Highest Q value, apples", *_of(agents, "q")),
-                _plot("Epsilon, 0 to 1", *_of(agents, "epsilon"), share=True),
-            ),
-            _row(
-                "More metrics",
-                social("Apples per step", "efficiency"),
-                social("Mean time of harvest, steps", "sustainability"),
-                social("Apples left at the end", "stock_left"),
-                social("Yield share of the steps played", "yield_share"),
-            ),
-            _plot("Steps per second", "time/env_steps_per_s"),
-            _recipe(),
-        ]
-    )
+    tabs = {
+        "Outcome": [
+            social("Harvest of all, apples", "collective_return"),
+            social("Survival, steps", "survival_steps"),
+            social("Equality, 0 to 1", "equality", share=True),
+        ],
+        "Agents": [
+            _plot(f"Return of each, {unit}", [*_of(agents, "return"), "evaluation/greedy_return"]),
+            social("Peacefulness, steps in play", "peacefulness"),
+            tags,
+        ],
+        "Institutions": [
+            _plot(title, _of(agents, name)) for name, title in PAYMENTS.items() if name in curves.institutions
+        ],
+        "Rules kept": [
+            _plot("Shares of violations, bites, tags", shares, share=True),
+            _plot("Equality of net incomes", equalities, share=True),
+            _plot(f"In force: {', '.join(curves.in_force)}", decided),
+        ],
+        "Replicas": [wall, stock],
+        "Places and shares": [visits, lorenz],
+        "Learning": [
+            _plot("Loss", _of(agents, "loss")),
+            _plot("Highest Q value, apples", _of(agents, "q")),
+            _plot("Epsilon, 0 to 1", _of(agents, "epsilon"), share=True),
+        ],
+        "More metrics": [
+            social("Apples per step", "efficiency"),
+            social("Mean time of harvest, steps", "sustainability"),
+            social("Apples left at the end", "stock_left"),
+            social("Yield share of the steps played", "yield_share"),
+        ],
+    }
+    rows = [rrb.Horizontal(*views, name=name) for name, tab in tabs.items() if (views := _present(tab))]
+    return [*rows, _plot("Steps per second", ["time/env_steps_per_s"]), _recipe()]
 
 
 def _recipe() -> Any:
@@ -554,23 +534,18 @@ def _present(views: Iterable[Any]) -> list[Any]:
     return [view for view in views if view is not None]
 
 
-def _row(name: str, *views: Any) -> Any:
-    """Views side by side; None where there is none."""
-    present = _present(views)
-    return rrb.Horizontal(*present, name=name) if present else None
-
-
 def _social(curves: Curves, name: str, metric: str, *, share: bool = False) -> Any:
     """The plot of a metric with the lines of random play and of evaluations; None if the game does not report
     it."""
-    if metric not in curves.metrics:
-        return None
-    return _plot(name, *(f"{of}/{metric}" for of in ("social", RANDOM_PLAY, EVALUATION)), share=share)
+    folders = ("social", RANDOM_PLAY, EVALUATION) if metric in curves.metrics else ()
+    return _plot(name, [f"{folder}/{metric}" for folder in folders], share=share)
 
 
-def _plot(name: str, *entities: str, share: bool = False) -> Any:
+def _plot(name: str, entities: Sequence[str], *, share: bool = False) -> Any:
     """A plot over the whole run, without a legend, which would hide its lines: they are named where the
-    pointer is, and `header` says which is which. The axis of a share is 0..1."""
+    pointer is, and `header` says which is which. The axis of a share is 0..1. None for no lines."""
+    if not entities:
+        return None
     return rrb.TimeSeriesView(
         name=name,
         contents=[f"+ /{entity}" for entity in entities],
