@@ -366,12 +366,13 @@ class Population:
         commons = commons_of(env)
         self._game = None if commons is None else commons.game
         self._device = env.device or torch.device("cpu")
-        self._groups = grouped(specs, self.spaces.agents)
-        check_scripted(self._groups, self.spaces, self._game)
+        groups = grouped(specs, self.spaces.agents)
+        self._by_agent = specs_by_agent(specs, self.spaces.agents)
+        check_scripted(groups, self.spaces, self._game)
         self._numbers = range(first_replica, first_replica + self.replicas)
         self._stored = self._agents_that_do_not_learn(weights or {})
         self.learners: dict[tuple[int, ...], Learner] = {}
-        for spec, agents in self._groups:
+        for spec, agents in groups:
             if isinstance(spec, Learning | Team):
                 self.learners[agents] = self._learner(spec, agents, engine, starts)
         self.others: dict[AgentIndices, nn.Module] = self._others(EXPLORATION, worlds=1)
@@ -429,32 +430,28 @@ class Population:
         """Copies of the agents as they are now, by agent and replica, of these replicas."""
         networks = self.networks()
         decisions = {} if self.decisions is None else self.decisions.learned()
-        agents: dict[int, list[StoredAgent]] = {}
-        for spec, indices in self._groups:
-            for agent in indices:
+        agents: list[list[StoredAgent]] = []
+        for agent, spec in enumerate(self._by_agent):
+            if isinstance(spec, Learning | Team):
                 lanes = [lane_name(replica, agent) for replica in replicas]
-                if isinstance(spec, Learning | Team):
-                    agents[agent] = [_trained(spec, networks[lane], decisions.get(lane)) for lane in lanes]
-                else:
-                    agents[agent] = [self._stored[agent][self._numbers.index(r)] for r in replicas]
-        return [agents[agent] for agent in sorted(agents)]
+                agents.append([_trained(spec, networks[lane], decisions.get(lane)) for lane in lanes])
+            else:
+                agents.append([self._stored[agent][self._numbers.index(replica)] for replica in replicas])
+        return agents
 
     def _agents_that_do_not_learn(self, weights: Mapping[str, str]) -> dict[int, list[StoredAgent]]:
         """The agents of each replica, by their index; each stored run is read once."""
         runs: dict[str, LoadedRun] = {}
         agents: dict[int, list[StoredAgent]] = {}
-        for spec, indices in self._groups:
-            of_replicas: list[StoredAgent] = []
+        for agent, spec in enumerate(self._by_agent):
             if isinstance(spec, Scripted):
-                of_replicas = [StoredAgent(scripted=spec.policy)] * self.replicas
+                agents[agent] = [StoredAgent(scripted=spec.policy)] * self.replicas
             elif isinstance(spec, Frozen):
                 if spec.run not in runs:
                     runs[spec.run] = load(spec.run, weights=weights.get(spec.run))
                     _refuse_unfitting(runs[spec.run], self.spaces, self._game, is_to_decide=True)
-                for replica in self._numbers:
-                    there = spec.replica_for(replica)
-                    of_replicas.append(runs[spec.run].agent(spec.agent, replica=there))
-            agents |= dict.fromkeys(indices, of_replicas) if of_replicas else {}
+                replicas = map(spec.replica_for, self._numbers)
+                agents[agent] = [runs[spec.run].agent(spec.agent, replica=replica) for replica in replicas]
         return agents
 
     def _others(
@@ -466,10 +463,8 @@ class Population:
         numbers = self._numbers[:replicas]
         agents = {agent: of_replicas[: len(numbers)] for agent, of_replicas in self._stored.items()}
         kinds = {
-            agent: (getattr(spec, "run", None), self._stored[agent][0].kind)
-            for spec, indices in self._groups
-            for agent in indices
-            if agent in agents
+            agent: (getattr(self._by_agent[agent], "run", None), of_replicas[0].kind)
+            for agent, of_replicas in agents.items()
         }
         seeds = partial(lane_seeds, self.seed, replicas=numbers, purpose=purpose)
         return _actors(agents, self.playing, kinds=kinds, seeds=seeds, worlds=worlds)
@@ -479,11 +474,10 @@ class Population:
         refuse_undecided(self.specs, len(sizes))
         if not sizes:
             return None
-        bandits: list[Bandit | None] = [None] * self.spaces.agents
-        for spec, indices in self._groups:
-            if isinstance(spec, Learning | Team):
-                for agent in indices:
-                    bandits[agent] = spec.decisions or Bandit()
+        bandits = [
+            (spec.decisions or Bandit()) if isinstance(spec, Learning | Team) else None
+            for spec in self._by_agent
+        ]
         stored: dict[int, list[Tensor]] = {}
         for agent, of_replicas in self._stored.items():
             values = [agent_of_replica.decisions for agent_of_replica in of_replicas]
