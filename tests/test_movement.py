@@ -56,18 +56,22 @@ class Doing(TensorDictModuleBase):
         return tensordict.set(keys.ACTION, action)
 
 
-def test_a_trace_has_the_cells_of_all_agents_at_the_start_of_each_step():
+def test_a_trace_has_the_cells_of_all_agents_at_the_start_of_each_step_and_every_tag_with_who_fired():
     game = Game(
         map=maps.parse("A...A\n>...<\n....."),
         rules=Rules(regrow_prob=(0.0,), episode_steps=4, window_rows=3, window_columns=5, freeze_steps=9),
     )
-    found = trace(CommonsEnv(game), Doing([(FORWARD, STAY), (BEAM, STAY), (STAY, STAY), (STAY, STAY)]))
-    assert found.row[:, 0].tolist() == [[1, 1]] * 4
-    assert found.col[:, 0, 0].tolist() == [0, 1, 1, 1]
-    assert found.fired[:, 0].tolist() == [[False, False], [True, False], [False, False], [False, False]]
-    assert found.in_play[:, 0, 1].tolist() == [True, True, False, False], "hit in the second step"
-    assert found.played.all()
-    assert found.board == (3, 5)
+    played = trace(CommonsEnv(game), Doing([(FORWARD, STAY), (BEAM, FORWARD), (STAY, STAY), (STAY, STAY)]))
+    assert played.row[:, 0].tolist() == [[1, 1]] * 4
+    assert played.col[:, 0, 0].tolist() == [0, 1, 1, 1]
+    assert played.fired[:, 0].tolist() == [[False, False], [True, False], [False, False], [False, False]]
+    assert played.in_play[:, 0, 1].tolist() == [True, True, False, False], "hit in the second step"
+    assert played.played.all()
+    assert played.board == (3, 5)
+    assert played.tags.tolist() == [[1, 0, 1, 0]], "agent 1 in step 1, by agent 0"
+    assert taggings(played)[0].tolist() == [[0, 0], [1, 0]]
+    where = np.argwhere(tagged_where(played))
+    assert where.tolist() == [[0, 1, 1, 4]], "world 0, agent 1, at the cell from which it walked"
 
 
 def test_a_trace_marks_the_steps_of_worlds_that_have_ended_as_not_played():
@@ -162,18 +166,6 @@ def test_agents_exclude_each_other_as_far_as_a_cell_says_who_they_are(shares, ex
 def test_the_owner_of_a_cell_spends_the_largest_share_there():
     assert owners([[[0.75, 0.25, 0]], [[0.25, 0.75, 0]]]).tolist() == [[0, 1, -1]]
     assert owners(ALIKE).tolist() == [[0, 0, -1, -1]], "of equal ones the first"
-
-
-def test_a_trace_has_every_tag_with_who_fired():
-    game = Game(
-        map=maps.parse("A...A\n>...<\n....."),
-        rules=Rules(regrow_prob=(0.0,), episode_steps=4, window_rows=3, window_columns=5, freeze_steps=9),
-    )
-    played = trace(CommonsEnv(game), Doing([(FORWARD, STAY), (BEAM, FORWARD), (STAY, STAY), (STAY, STAY)]))
-    assert played.tags.tolist() == [[1, 0, 1, 0]], "agent 1 in step 1, by agent 0"
-    assert taggings(played)[0].tolist() == [[0, 0], [1, 0]]
-    where = np.argwhere(tagged_where(played))
-    assert where.tolist() == [[0, 1, 1, 4]], "world 0, agent 1, at the cell from which it walked"
 
 
 def test_two_beams_at_once_count_for_both_who_fired_and_once_for_the_tagged():
