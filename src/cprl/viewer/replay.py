@@ -60,14 +60,11 @@ class Decisions:
         self._panels = decision_panels(len(names), len(actions), window)
         many = 2 * len(names) * len(actions) > np.iinfo(np.uint8).max
         self._dtype = np.uint16 if many else np.uint8
-        self._kinds = [""] * len(names)
-        for agents, actor in self._actors:
-            for agent in agents:
-                self._kinds[agent] = _kind(actor)
+        kinds = {agent: _kind(actor) for agents, actor in self._actors for agent in agents}
+        self._kinds = [kinds[agent] for agent in range(len(names))]
         self._rows: list[tuple[NDArray[np.float64], NDArray[np.int64]]] = []
         self._step = 0
-        for entity, parts in self._fixed().items():
-            logger.log_static(entity, *parts)
+        self._log_fixed()
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Notes what the agents' policies say of what they saw before this turn, and what they did."""
@@ -135,8 +132,8 @@ class Decisions:
             for agent, (name, kind) in enumerate(zip(self._names, self._kinds, strict=True))
         ]
 
-    def _fixed(self) -> dict[str, list[Any]]:
-        """The form of the image, the classes of its bars, and the names of actions."""
+    def _log_fixed(self) -> None:
+        """Logs the form of the image, the classes of its bars, and the names of actions."""
         rows, columns = self._panels.shape
         kind = rr.ChannelDatatype.U16 if self._dtype is np.uint16 else rr.ChannelDatatype.U8
         form = rr.components.ImageFormat(width=columns, height=rows, channel_datatype=kind)
@@ -148,21 +145,15 @@ class Decisions:
                 classes.append(rr.AnnotationInfo(id=first, label=f"{name}: {what}", color=hue))
                 label = f"{name} takes: {what}"
                 classes.append(rr.AnnotationInfo(id=first + 1, label=label, color=_TAKEN))
-        parts: dict[str, list[Any]] = {
-            ENTITY: [
-                rr.AnnotationContext(classes),
-                rr.SegmentationImage.from_fields(format=form, opacity=1.0),
-            ],
-            f"{ENTITY}/labels": [self._panels.labels()],
-        }
+        image = rr.SegmentationImage.from_fields(format=form, opacity=1.0)
+        self._logger.log_static(ENTITY, rr.AnnotationContext(classes), image)
+        self._logger.log_static(f"{ENTITY}/labels", self._panels.labels())
         if len(self._names) <= _MOST_LABELLED:
             bars = APART + BAR / 2 + (APART + BAR) * np.arange(len(self._actions))
             places = [(left + bar, top + HIGH) for top, left in self._panels.corners.tolist() for bar in bars]
             signs = [SIGNS.get(action, action) for action in self._actions] * len(self._names)
-            parts[f"{ENTITY}/actions"] = [
-                rr.Points2D(places, labels=signs, radii=0.0, colors=(170, 170, 170), show_labels=True)
-            ]
-        return parts
+            labels = rr.Points2D(places, labels=signs, radii=0.0, colors=(170, 170, 170), show_labels=True)
+            self._logger.log_static(f"{ENTITY}/actions", labels)
 
 
 def _range(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
