@@ -204,8 +204,9 @@ def _with_keys(value: Any) -> Any:
     """The same with each list of strings within a list as a tuple, a nested TensorDict key."""
     if not isinstance(value, list):
         return value
-    return [tuple(entry) if _is_key(entry) else _with_keys(entry) for entry in value]
-
-
-def _is_key(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(part, str) for part in value)
+    return [
+        tuple(entry)
+        if isinstance(entry, list) and all(isinstance(part, str) for part in entry)
+        else _with_keys(entry)
+        for entry in value
+    ]

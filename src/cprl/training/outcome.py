@@ -67,12 +67,7 @@ def fresh_env(experiment: Experiment) -> EnvBase:
 
 
 def _worlds(
-    experiment: Experiment,
-    count: int,
-    *,
-    first: int = 0,
-    fresh: bool = False,
-    device: str = "cpu",
+    experiment: Experiment, count: int, *, first: int = 0, fresh: bool = False, device: str = "cpu"
 ) -> EnvBase:
     return make_env(
         experiment.game,

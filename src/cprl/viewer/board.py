@@ -24,7 +24,7 @@ from cprl.commons.colours import (
 )
 from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.commons.picture import DIGIT_HIGH, INK_COLOUR, MARK_COLOUR, POINTS, number_paths
-from cprl.commons.world import Bools, Bytes
+from cprl.commons.world import Bytes
 from cprl.envs.commons_env import CommonsEnv
 from cprl.viewer.layout import Curves, Scene, classes, styles, window_corners
 
@@ -391,8 +391,11 @@ def _out(frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
 
     The squares have labels that name who tagged the agent; the viewer shows them on request.
     """
-    out, by, alone = ~frames["in_play"], frames["tagged_by"], alone_of(frames)
-    places = [np.where(out, frames[name], 0) for name in ("row", "col")]
+    row, col, out, by = frames["row"], frames["col"], ~frames["in_play"], frames["tagged_by"]
+    same = (row[:, :, None] == row[:, None]) & (col[:, :, None] == col[:, None])
+    first = np.tri(row.shape[1], k=-1, dtype=np.bool_) | ~out[:, None]
+    alone = out & ~(same & first).any(2)  # nobody in play is in the cell, nor anyone out with a lower index
+    places = [np.where(out, row, 0), np.where(out, col, 0)]
     changed = _changes(np.concatenate([out, np.where(out, by, 0), alone, *places], 1))
     out, by, alone, centres = out[changed], by[changed], alone[changed], centres_of(frames)[changed]
     rgb = np.array([agent_colour(agent) for agent in range(out.shape[1])], np.uint8)
@@ -407,15 +410,6 @@ def _out(frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
     owner = strokes.owner[np.nonzero(alone[:, strokes.owner])[1]]
     digits = rr.LineStrips2D.columns(strips=lines, colors=rgb[owner]).partition(counts)
     return {"out": (changed, squares), "out/numbers": (changed, digits)}
-
-
-def alone_of(frames: Frames) -> Bools:
-    """The agents out of play in whose cell there is nobody in play, nor anyone out with a lower index."""
-    row, col, in_play = frames["row"], frames["col"], frames["in_play"]
-    same = (row[:, :, None] == row[:, None]) & (col[:, :, None] == col[:, None])
-    first = np.tri(row.shape[1], k=-1, dtype=np.bool_) | in_play[:, None]
-    alone: Bools = ~in_play & ~(same & first).any(2)
-    return alone
 
 
 def centres_of(frames: Frames) -> NDArray[np.float32]:
