@@ -76,26 +76,13 @@ class Play:
         self.batch.begin(self.whole)
         return self
 
-    @property
-    def payments(self) -> Payments:
-        """What institutions output in the last turn."""
-        return self.whole.payments
-
-    @property
-    def fines(self) -> list[float]:
-        return self.payments.fines[0].tolist()
-
-    @property
-    def transfers(self) -> list[float]:
-        return self.payments.transfers[0].tolist()
-
-    @property
-    def reward(self) -> list[float]:
-        return self.payments.reward[0].tolist()
-
-    @property
-    def violated(self) -> list[bool]:
-        return self.payments.violated[0].tolist()
+    payments = property(lambda play: play.whole.payments, doc="What institutions output in the last turn.")
+    fines = property(lambda play: play.payments.fines[0].tolist())
+    transfers = property(lambda play: play.payments.transfers[0].tolist())
+    reward = property(lambda play: play.payments.reward[0].tolist())
+    violated = property(lambda play: play.payments.violated[0].tolist())
+    in_play = property(lambda play: play.batch.now.in_play[0].tolist())
+    harvest = property(lambda play: play.output.harvest[0].tolist())
 
     def counts(self, name: str) -> list[int]:
         """What was counted for each agent in this episode, by its name in `COUNTS`."""
@@ -119,14 +106,6 @@ class Play:
             if worlds.in_play[0, i]:
                 signs[worlds.row[0, i]][worlds.col[0, i]] = SIGN_OF_HEADING[int(worlds.heading[0, i])]
         return "\n".join("".join(row) for row in signs)
-
-    @property
-    def in_play(self) -> list[bool]:
-        return self.batch.now.in_play[0].tolist()
-
-    @property
-    def harvest(self) -> list[float]:
-        return self.output.harvest[0].tolist()
 
     def window(self, agent: int) -> str:
         """An agent's observation in the signs of `RGB_SIGN`; other agents by index under `agents_apart`."""

@@ -15,17 +15,9 @@ from numba import cuda
 from numba.core import config
 
 from cprl import Game, Observation, Rules, maps, presets
+from cprl import institutions as law
 from cprl.commons.batch import Batch, turn_of
 from cprl.commons.cuda import THREADS_PER_BLOCK, CudaThreads
-from cprl.institutions import (
-    Boundaries,
-    ClosedPatches,
-    ClosedSeason,
-    GraduatedSanctions,
-    Quota,
-    Rotation,
-    Sanctioner,
-)
 
 WALLS = maps.parse(
     """
@@ -154,10 +146,10 @@ def institutions() -> None:
 def stopped() -> None:
     """Institutions that stop bites and shots, on a board as run; the tables of others are empty."""
     own = (
-        Boundaries.drawn("001122-\n.......\n..3..22", owners=("01", "13", "2")),
-        *(Quota(share=0.5), ClosedSeason(period_steps=4, closed_steps=1), ClosedPatches()),
-        *(Rotation(window_steps=4), Sanctioner(agents=(1, 2))),
-        GraduatedSanctions(freeze_steps=((1,), (2,), (3,)), on="tags"),
+        law.Boundaries.drawn("001122-\n.......\n..3..22", owners=("01", "13", "2")),
+        *(law.Quota(share=0.5), law.ClosedSeason(period_steps=4, closed_steps=1), law.ClosedPatches()),
+        *(law.Rotation(window_steps=4), law.Sanctioner(agents=(1, 2))),
+        law.GraduatedSanctions(freeze_steps=((1,), (2,), (3,)), on="tags"),
     )
     rules = replace(
         EVERYTHING.rules,

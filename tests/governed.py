@@ -8,20 +8,7 @@ from hypothesis import strategies as st
 from test_worlds import games
 
 from cprl import Game, Observation, Rules, maps
-from cprl.institutions import (
-    Boundaries,
-    ClosedPatches,
-    ClosedSeason,
-    GraduatedSanctions,
-    Levies,
-    Mediation,
-    Monitoring,
-    Quota,
-    Rotation,
-    Sanctioner,
-    Tax,
-    Vote,
-)
+from cprl import institutions as law
 
 EVERYTHING = Game(
     map=maps.parse(
@@ -34,20 +21,20 @@ EVERYTHING = Game(
     rules=Rules(regrow_prob=(0.05, 0.5), freeze_steps=4, episode_steps=25, window_rows=3, window_columns=5),
     observation=Observation(agents_apart=True),
     institutions=(
-        Boundaries.drawn("001122-\n.......\n..3..22", owners=("01", "13", "2"), bite_fine=0.5),
-        Boundaries.drawn(".......\n..012..\n.......", step_fine=0.25, observed=False),
-        Quota(share=0.5, window_steps=4, fine=1),
-        Vote(on=Quota(window_steps=6, by_stock=True), choices=(0.5, 1, 2)),
-        ClosedSeason(period_steps=9, closed_steps=2, fine=0.75),
-        ClosedPatches(below=2, fine=0.1),
-        Rotation(window_steps=5, fine=0.2),
-        Vote(on=Tax(period_steps=3), choices=(0.0, 0.3), override_prob=0.5, period_episodes=2),
-        Tax(brackets=((0, 0.1), (2, 0.4)), redistribution="none", period_steps=5),
-        Levies(groups=((1,), (2, 0))),
-        Monitoring(prob=0.7, cost=0.2, monitor="elected"),
-        GraduatedSanctions(freeze_steps=(1, 2, 6), fines=(0, 0.5), recovery_steps=5),
-        Mediation(turns=2, refund=0.6),
-        Sanctioner(override_prob=0.3),
+        law.Boundaries.drawn("001122-\n.......\n..3..22", owners=("01", "13", "2"), bite_fine=0.5),
+        law.Boundaries.drawn(".......\n..012..\n.......", step_fine=0.25, observed=False),
+        law.Quota(share=0.5, window_steps=4, fine=1),
+        law.Vote(on=law.Quota(window_steps=6, by_stock=True), choices=(0.5, 1, 2)),
+        law.ClosedSeason(period_steps=9, closed_steps=2, fine=0.75),
+        law.ClosedPatches(below=2, fine=0.1),
+        law.Rotation(window_steps=5, fine=0.2),
+        law.Vote(on=law.Tax(period_steps=3), choices=(0.0, 0.3), override_prob=0.5, period_episodes=2),
+        law.Tax(brackets=((0, 0.1), (2, 0.4)), redistribution="none", period_steps=5),
+        law.Levies(groups=((1,), (2, 0))),
+        law.Monitoring(prob=0.7, cost=0.2, monitor="elected"),
+        law.GraduatedSanctions(freeze_steps=(1, 2, 6), fines=(0, 0.5), recovery_steps=5),
+        law.Mediation(turns=2, refund=0.6),
+        law.Sanctioner(override_prob=0.3),
     ),
 )
 """A game with every kind of institution at once."""
@@ -60,12 +47,12 @@ def boundaries(board, fine, step_fine):
     signs = ".-" + "".join(str(agent) for agent in range(board.agents))
     row = st.text(signs, min_size=board.width, max_size=board.width)
     rows = st.lists(row, min_size=board.height, max_size=board.height).map(tuple)
-    return st.builds(Boundaries, regions=rows, bite_fine=fine, step_fine=step_fine)
+    return st.builds(law.Boundaries, regions=rows, bite_fine=fine, step_fine=step_fine)
 
 
 def quotas(fine):
     return st.builds(
-        Quota,
+        law.Quota,
         share=st.sampled_from([0.0, 0.5, 2.0]),
         window_steps=st.integers(1, 9),
         by_stock=st.booleans(),
@@ -79,7 +66,7 @@ def taxes():
     kinds = st.sampled_from(["equal", "none"])
     periods = st.integers(1, 7)
     return st.builds(
-        Tax,
+        law.Tax,
         rate=st.floats(0, 1, allow_subnormal=False),
         redistribution=kinds,
         period_steps=periods,
@@ -90,14 +77,14 @@ def taxes():
 def levies(agents):
     def grouped(order, cut):
         groups = [group for group in (order[:cut], order[cut:]) if group]
-        return Levies(groups=tuple(map(tuple, groups)), local_rate=0.25, joint_rate=0.5)
+        return law.Levies(groups=tuple(map(tuple, groups)), local_rate=0.25, joint_rate=0.5)
 
     return st.builds(grouped, st.permutations(range(agents)), st.integers(0, agents))
 
 
 def votes(on):
     return st.builds(
-        Vote,
+        law.Vote,
         on=on,
         choices=st.sampled_from([(0.0, 1.0), (0.1, 0.5, 0.9)]),
         period_episodes=st.integers(1, 2),
@@ -106,14 +93,14 @@ def votes(on):
 
 
 MONITORS = st.builds(
-    Monitoring,
+    law.Monitoring,
     prob=st.sampled_from([0.0, 0.5, 1.0]),
     cost=st.sampled_from([0.0, 0.5]),
     monitor=st.sampled_from([None, 0, "elected"]),
 )
-MEDIATIONS = st.builds(Mediation, turns=st.integers(1, 5), refund=FINES)
+MEDIATIONS = st.builds(law.Mediation, turns=st.integers(1, 5), refund=FINES)
 SANCTIONS = st.builds(
-    GraduatedSanctions,
+    law.GraduatedSanctions,
     freeze_steps=st.sampled_from([(0,), (2, 5), (1, 2, 3)]),
     fines=st.sampled_from([(0.0,), (1.0, 2.5)]),
     recovery_steps=st.sampled_from([None, 1, 4]),
@@ -130,8 +117,10 @@ def governed_games(draw, *, harmless=False, ballots=True, **fixed):
     several = [
         boundaries(game.map, fine, FINES | st.none()),
         quotas(fine),
-        st.builds(ClosedSeason, period_steps=st.integers(5, 9), closed_steps=st.integers(0, 5), fine=fine),
-        st.builds(Rotation, window_steps=st.integers(1, 9), fine=fine),
+        st.builds(
+            law.ClosedSeason, period_steps=st.integers(5, 9), closed_steps=st.integers(0, 5), fine=fine
+        ),
+        st.builds(law.Rotation, window_steps=st.integers(1, 9), fine=fine),
         taxes(),
         levies(game.agents),
     ]
@@ -140,13 +129,13 @@ def governed_games(draw, *, harmless=False, ballots=True, **fixed):
         several.append(votes(plain | quotas(fine)))
     chosen = draw(st.lists(st.one_of(several), max_size=4))
     monitors = MONITORS if ballots else MONITORS.map(lambda own: replace(own, monitor=None))
-    one_each = [monitors, st.builds(ClosedPatches, below=st.integers(0, 4), fine=fine), MEDIATIONS]
+    one_each = [monitors, st.builds(law.ClosedPatches, below=st.integers(0, 4), fine=fine), MEDIATIONS]
     if not harmless:
-        sanctioners = st.just(Sanctioner(agents=(0,)))
-        one_each += [SANCTIONS, sanctioners | st.just(Sanctioner()) if ballots else sanctioners]
+        sanctioners = st.just(law.Sanctioner(agents=(0,)))
+        one_each += [SANCTIONS, sanctioners | st.just(law.Sanctioner()) if ballots else sanctioners]
     for kind in one_each:
         chosen += draw(st.lists(kind, max_size=1))
-    if not any(isinstance(own, Mediation) for own in chosen):
+    if not any(isinstance(own, law.Mediation) for own in chosen):
         chosen.append(draw(quotas(FINES)))  # so that there is a rule to break
     order = draw(st.permutations(chosen))
     return replace(game, observation=Observation(agents_apart=True), institutions=tuple(order))

@@ -1,13 +1,27 @@
 """Beams: the agents they hit, the walls that stop them, and time-outs."""
 
+import pytest
 from boards import Play
 
 from cprl.institutions import Sanctioner
 
+BY_HEADING = {"beam_length_cells": (1, 4, 1, 1)}
 
-def test_a_beam_reaches_its_length_and_no_further():
-    board = "A.......\n.>...^^."
-    assert Play(board, beam_length_cells=4).turn("beam", "stay", "stay").in_play == [True, False, True]
+
+@pytest.mark.parametrize(
+    ("board", "actions", "rules", "in_play"),
+    [
+        # A beam reaches its length and no further; the length may depend on the heading.
+        ("A.......\n.>...^^.", "beam stay stay", {"beam_length_cells": 4}, [True, False, True]),
+        ("A.....\n.>...^", "beam stay", BY_HEADING, [True, False]),
+        ("A.....\n.v...<", "stay beam", BY_HEADING, [True, True]),
+        # Two that shoot each other are both tagged; hits are found on the cells after the moves.
+        ("A....\n.>.<.", "beam beam", {}, [False, False]),
+        ("A....\n.....\n.>.^.", "beam forward", {"beam_width_cells": 1}, [True, True]),
+    ],
+)
+def test_a_beam_tags_whom_it_reaches(board, actions, rules, in_play):
+    assert Play(board, **rules).turn(*actions.split()).in_play == in_play
 
 
 def test_a_beam_is_three_cells_wide_and_misses_an_agent_beside_the_shooter():
@@ -35,10 +49,6 @@ def test_a_wall_stops_each_column_of_a_beam_on_its_own():
     assert play.window(1).splitlines() == ["#####", "..b.#", ".obo#", "..b.#", ".#b##", "..S.#"]
 
 
-def test_two_agents_that_shoot_each_other_are_both_tagged():
-    assert Play("A....\n.>.<.").turn("beam").in_play == [False, False]
-
-
 def test_an_agent_tagged_as_it_fires_still_hits_another():
     play = Play("A.......\n.>.^.^..", beam_length_cells=2)
     play.turn("stay", "turn_right", "stay").turn("beam", "beam", "stay")
@@ -49,10 +59,6 @@ def test_an_agent_tagged_in_a_turn_still_harvests_in_that_turn():
     play = Play("..A..\n.>^..").turn("beam", "forward")
     assert play.harvest == [0, 1]
     assert play.in_play == [True, False]
-
-
-def test_hits_are_found_on_the_cells_after_the_moves():
-    assert Play("A....\n.....\n.>.^.", beam_width_cells=1).turn("beam", "forward").in_play == [True, True]
 
 
 def test_an_agent_in_two_beams_takes_one_hit_per_turn():
@@ -82,9 +88,3 @@ def test_the_beam_action_of_an_agent_that_may_not_fire_does_nothing():
     play = Play("A...\n.>.^", institutions=[Sanctioner(agents=(1,))]).turn("beam", "stay")
     assert not play.output.fired.any()
     assert play.in_play == [True, True]
-
-
-def test_the_length_of_a_beam_may_depend_on_the_heading():
-    lengths = (1, 4, 1, 1)
-    assert Play("A.....\n.>...^", beam_length_cells=lengths).turn("beam", "stay").in_play == [True, False]
-    assert Play("A.....\n.v...<", beam_length_cells=lengths).turn("stay", "beam").in_play == [True, True]

@@ -1,5 +1,6 @@
 """Boundaries: who may harvest and stand where, and what it costs."""
 
+import pytest
 from boards import Play, drawn
 
 from cprl.institutions import Boundaries, ClosedPatches
@@ -30,21 +31,31 @@ def test_nobody_harvests_in_the_region_of_others_and_no_rule_is_broken():
     assert play.counts("trespasses") == [1, 1], "standing there is counted, though it is allowed"
 
 
-def test_a_bite_with_a_fine_happens_and_is_paid():
-    play = Play(BOARD, institutions=[Boundaries.drawn(REGIONS, bite_fine=1.5)])
-    play.turn("forward").turn("forward", "stay")
-    # One apple for 1.5: 1 - 1.5 = -0.5.
-    assert (play.harvest, play.fines, play.reward) == ([1, 0], [1.5, 0], [-0.5, 0])
-    assert play.violated == [True, False]
-    assert play.counts("foreign_bites") == [1, 0]
-    assert play.counts("violations") == play.counts("detections") == [1, 0]
-    assert play.turn("stay").fines == [0, 0], "standing there without an apple costs nothing"
-    assert play.violated == [False, False]
+FINED = Boundaries.drawn(REGIONS, bite_fine=1)
+CLOSED = Boundaries.drawn(REGIONS, step_fine=0.5)
+BOTH = Boundaries.drawn(REGIONS, bite_fine=0.25, step_fine=0.5)
 
 
-def test_a_fine_of_zero_is_a_violation_that_costs_nothing():
-    play = Play(BOARD, institutions=[Boundaries.drawn(REGIONS, bite_fine=0)]).turn("forward").turn("forward")
-    assert (play.harvest, play.fines, play.violated) == ([1, 1], [0, 0], [True, True])
+@pytest.mark.parametrize(
+    ("boundaries", "second", "harvest", "fines", "foreign_bites"),
+    [
+        # One apple for 1.5; standing there without an apple costs nothing.
+        ([Boundaries.drawn(REGIONS, bite_fine=1.5)], "stay", [1, 0], [1.5, 0], 1),
+        ([Boundaries.drawn(REGIONS, bite_fine=0)], "forward", [1, 1], [0, 0], 1),
+        # Step and bite fines of one turn add up to one violation: 2 + 0.5.
+        ([Boundaries.drawn(REGIONS, bite_fine=2, step_fine=0.5)], "stay", [1, 0], [2.5, 0], 1),
+        # Of two boundaries the second one stops the bite; or both are fined, 1 + 0.25 + 0.5, and both count.
+        ([FINED, CLOSED], "forward", [0, 0], [0.5, 0.5], 0),
+        ([FINED, BOTH], "forward", [1, 1], [1.75, 1.75], 2),
+    ],
+)
+def test_what_a_second_turn_in_the_region_of_others_costs(boundaries, second, harvest, fines, foreign_bites):
+    play = Play(BOARD, institutions=boundaries).turn("forward").turn("forward", second)
+    assert (play.harvest, play.fines) == (harvest, fines)
+    assert play.reward == [apple - fine for apple, fine in zip(harvest, fines, strict=True)]
+    assert play.counts("foreign_bites")[0] == foreign_bites, "once for each boundary"
+    assert play.counts("trespasses")[0] == len(boundaries)
+    assert play.counts("violations")[0] == play.counts("detections")[0] == play.violated[0] == 1
 
 
 def test_each_turn_in_the_region_of_others_costs_the_step_fine_where_bites_are_stopped():
@@ -59,15 +70,6 @@ def test_each_turn_in_the_region_of_others_costs_the_step_fine_where_bites_are_s
     assert play.counts("trespasses") == play.counts("violations") == [2, 3]
 
 
-def test_step_and_bite_fines_of_one_turn_add_up_to_one_violation():
-    play = Play(BOARD, institutions=[Boundaries.drawn(REGIONS, bite_fine=2, step_fine=0.5)])
-    play.turn("forward").turn("forward", "stay")
-    # 1 - 2 - 0.5 = -1.5.
-    assert (play.fines, play.reward) == ([2.5, 0], [-1.5, 0])
-    assert play.counts("violations") == [1, 0]
-    assert play.counts("trespasses") == play.counts("foreign_bites") == [1, 0]
-
-
 def test_an_agent_that_is_out_of_play_is_not_fined_for_where_it_lies():
     # Agent 1 stands in the region of agent 0, and is tagged there in the first turn.
     boundaries = Boundaries.drawn(".....\n...0.", step_fine=1)
@@ -78,39 +80,21 @@ def test_an_agent_that_is_out_of_play_is_not_fined_for_where_it_lies():
     assert play.turn("stay").fines == [0, 1]
 
 
-def test_owners_are_named_by_the_signs_of_their_regions():
-    regions = ".ab..\n..ab."
-    play = Play(BOARD, institutions=[Boundaries.drawn(regions, owners=("b", "ab"))])
-    assert play.turn("forward").harvest == [0, 1]
-    assert play.turn("forward").harvest == [1, 1]
-    assert play.counts("own_bites") == [1, 2]
-
-
-def test_where_it_may_bite_counts_as_its_own_open_ground_included():
-    play = Play(BOARD, institutions=[Boundaries.drawn(".....\n...0.", bite_fine=1)])
-    play.turn("forward")
-    assert play.harvest == [1, 1]
-    assert play.counts("own_bites") == [1, 0]
-    assert play.counts("foreign_bites") == [0, 1]
-
-
-def test_a_reserve_is_closed_to_all():
-    play = Play(BOARD, institutions=[Boundaries.drawn(".-...\n...-.", owners=("", ""))])
-    assert play.turn("forward").harvest == [0, 0]
-    assert play.turn("forward").harvest == [1, 1]
-
-
-def test_two_boundaries_both_count():
-    first, second = Boundaries.drawn(REGIONS, bite_fine=1), Boundaries.drawn(REGIONS, step_fine=0.5)
-    play = Play(BOARD, institutions=[first, second]).turn("forward").turn("forward")
-    assert play.harvest == [0, 0], "the second one stops the bite"
-    assert play.fines == [0.5, 0.5]
-    fined = Boundaries.drawn(REGIONS, bite_fine=0.25, step_fine=0.5)
-    play = Play(BOARD, institutions=[first, fined]).turn("forward").turn("forward")
-    # 1 + 0.25 + 0.5.
-    assert (play.harvest, play.fines) == ([1, 1], [1.75, 1.75])
-    assert play.counts("foreign_bites") == [2, 2], "once for each"
-    assert play.counts("violations") == [1, 1]
+@pytest.mark.parametrize(
+    ("boundaries", "harvests", "own_bites"),
+    [
+        # Owners are named by the signs of their regions: agent 0 may not bite in a, agent 1 may in both.
+        (Boundaries.drawn(".ab..\n..ab.", owners=("b", "ab")), ([0, 1], [1, 1]), [1, 2]),
+        # Open ground is everybody's; a bite there counts as an own one.
+        (Boundaries.drawn(".....\n...0.", bite_fine=1), ([1, 1], [1, 1]), [2, 1]),
+        # A reserve is closed to all.
+        (Boundaries.drawn(".-...\n...-.", owners=("", "")), ([0, 0], [1, 1]), [1, 1]),
+    ],
+)
+def test_who_may_bite_where(boundaries, harvests, own_bites):
+    play = Play(BOARD, institutions=[boundaries])
+    assert tuple(play.turn("forward").harvest for _ in range(2)) == harvests
+    assert play.counts("own_bites") == own_bites
 
 
 def test_drawings_may_be_indented_and_strips_are_as_wide_as_can_be():

@@ -8,36 +8,24 @@ import torch
 from governed import EVERYTHING
 
 from cprl import CommonsEnv, Game, Rules, keys, maps
+from cprl import institutions as law
 from cprl.commons.batch import Batch
 from cprl.envs import parallel_env
-from cprl.institutions import (
-    Boundaries,
-    ClosedSeason,
-    GraduatedSanctions,
-    Institution,
-    Levies,
-    Mediation,
-    Monitoring,
-    Quota,
-    Sanctioner,
-    Tax,
-    Vote,
-)
 
 PLAIN = Game(map=maps.parse(">A.\n.A<"), rules=Rules(regrow_prob=(0.0, 0.5)))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mine(Tax):
+class Mine(law.Tax):
     """A kind of the user's own."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Own(Institution):
+class Own(law.Institution):
     """Another one."""
 
 
-VOTES = tuple(Vote(on=Tax(), choices=tuple(n / 10 for n in range(11))) for _ in range(6))
+VOTES = tuple(law.Vote(on=law.Tax(), choices=tuple(n / 10 for n in range(11))) for _ in range(6))
 
 
 def governed(*institutions, **changes):
@@ -48,60 +36,70 @@ NOBODY_FIRES = {"rules": Rules(may_fire=False)}
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("kind", "fields", "field"),
     [
-        (lambda: Boundaries(regions=("0.", "0")), r"Boundaries\.regions"),
-        (lambda: Boundaries(regions=("a",), owners=("a.",)), r"Boundaries\.owners"),
-        (lambda: Boundaries.strips(height=1, width=40, agents=37), r"agents is 37"),
-        (lambda: Boundaries.strips(height=2, width=3, agents=4), r"agents is 4; allowed: 1 to 3"),
-        (lambda: ClosedSeason(period_steps=5, closed_steps=6), r"closed_steps is 6"),
-        (lambda: Tax(brackets=((1, 0.5),)), r"Tax\.brackets"),
-        (lambda: Tax(brackets=((0, 0.5), (0, 0.6))), r"Tax\.brackets"),
-        (lambda: Tax(brackets=((0, 1.5),)), r"Tax\.brackets"),
-        (lambda: Levies(groups=((0,), ())), r"Levies\.groups"),
-        (lambda: Levies(groups=((0,),), local_rate=0.6, joint_rate=0.5), r"Levies\.joint_rate"),
-        (lambda: Vote(on=Tax(brackets=((0, 0.1),))), r"Vote\.on"),
-        (lambda: Vote(on=Tax(), choices=(0, 2)), r"Vote\.choices"),
-        (lambda: Vote(on=Tax(), choices=(0.5, 0.1)), r"Vote\.choices"),
-        (lambda: Sanctioner(agents=(1, 0)), r"Sanctioner\.agents"),
-        (lambda: Sanctioner(agents=(0,), override_prob=0.5), r"override_prob is 0\.5 and nobody is elected"),
-        (lambda: Sanctioner(agents=(0,), period_episodes=3), "period_episodes is 3 and nobody is elected"),
-        (lambda: Monitoring(monitor=1, period_episodes=2), "period_episodes is 2 and nobody is elected"),
-        (lambda: GraduatedSanctions(freeze_steps=((1,), (2,)), on="both"), r"GraduatedSanctions\.on"),
-        (lambda: governed(Boundaries(regions=("0..",))), r"Boundaries\.regions is 1 x 3; allowed: 2 x 3"),
-        (lambda: governed(Boundaries(regions=("0..", "..2"))), r"Boundaries\.regions has '2' in row 1"),
-        (lambda: governed(Boundaries(regions=("a..", "..b"), owners=("a", "a"))), r"Boundaries\.regions"),
-        (lambda: governed(Boundaries(regions=("a..", "..a"), owners=("a",))), r"Boundaries\.owners has 1"),
-        (lambda: governed(Levies(groups=((0,),))), r"Levies\.groups"),
-        (lambda: governed(Levies(groups=((0, 1), (1,)))), r"Levies\.groups"),
-        (lambda: governed(Levies(groups=((0, 1), (2,)))), r"Levies\.groups has agent 2"),
-        (lambda: governed(Sanctioner(agents=(0, 2))), r"Sanctioner\.agents has agent 2"),
-        (lambda: governed(Quota(), Monitoring()), r"Monitoring has no violation to detect"),
-        (lambda: governed(Quota(), GraduatedSanctions(on="violations")), r"GraduatedSanctions .* no offence"),
-        (lambda: governed(Monitoring(monitor=2)), r"Monitoring\.monitor has agent 2"),
-        (
-            lambda: governed(GraduatedSanctions(freeze_steps=((1,),), on="tags")),
-            r"GraduatedSanctions\.freeze_steps has 1",
-        ),
-        (lambda: governed(Monitoring(), Tax(), Monitoring()), r"has 2 of Monitoring"),
-        (lambda: governed(*[Sanctioner()] * 3), r"has 3 of Sanctioner"),
-        (lambda: governed(Mediation()), r"Mediation\.observed .* Observation\.agents_apart"),
-        (lambda: governed(Mine()), r"Game\.institutions has a Mine"),
-        (lambda: governed(Own()), r"Game\.institutions has a Own"),
-        (lambda: governed(*[Tax()] * 65), r"Game\.institutions has 65"),
-        (lambda: governed(*VOTES), r"lets agents choose from 1,771,561 options"),
-        (lambda: governed(Sanctioner(), **NOBODY_FIRES), "a Sanctioner and Rules.may_fire"),
-        (lambda: governed(Mediation(observed=False), **NOBODY_FIRES), "a Mediation and Rules.may_fire"),
-        (lambda: governed(GraduatedSanctions(on="tags"), **NOBODY_FIRES), "a GraduatedSanctions and Rules.m"),
+        (law.Boundaries, {"regions": ("0.", "0")}, r"Boundaries\.regions"),
+        (law.Boundaries, {"regions": ("a",), "owners": ("a.",)}, r"Boundaries\.owners"),
+        (law.Boundaries.strips, {"height": 1, "width": 40, "agents": 37}, "agents is 37"),
+        (law.Boundaries.strips, {"height": 2, "width": 3, "agents": 4}, "agents is 4; allowed: 1 to 3"),
+        (law.ClosedSeason, {"period_steps": 5, "closed_steps": 6}, "closed_steps is 6"),
+        (law.Tax, {"brackets": ((1, 0.5),)}, r"Tax\.brackets"),
+        (law.Tax, {"brackets": ((0, 0.5), (0, 0.6))}, r"Tax\.brackets"),
+        (law.Tax, {"brackets": ((0, 1.5),)}, r"Tax\.brackets"),
+        (law.Levies, {"groups": ((0,), ())}, r"Levies\.groups"),
+        (law.Levies, {"groups": ((0,),), "local_rate": 0.6, "joint_rate": 0.5}, r"Levies\.joint_rate"),
+        (law.Vote, {"on": law.Tax(brackets=((0, 0.1),))}, r"Vote\.on"),
+        (law.Vote, {"on": law.Tax(), "choices": (0, 2)}, r"Vote\.choices"),
+        (law.Vote, {"on": law.Tax(), "choices": (0.5, 0.1)}, r"Vote\.choices"),
+        (law.Sanctioner, {"agents": (1, 0)}, r"Sanctioner\.agents"),
+        (law.Sanctioner, {"agents": (0,), "override_prob": 0.5}, "override_prob is 0.5"),
+        (law.Sanctioner, {"agents": (0,), "period_episodes": 3}, "period_episodes is 3"),
+        (law.Monitoring, {"monitor": 1, "period_episodes": 2}, "period_episodes is 2"),
+        (law.GraduatedSanctions, {"freeze_steps": ((1,), (2,))}, r"GraduatedSanctions\.on"),
+        (law.Rotation, {"window_steps": 0}, r"Rotation\.window_steps"),
     ],
 )
-def test_what_an_institution_cannot_be_and_what_does_not_fit_the_game_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+def test_what_an_institution_cannot_be_is_refused(kind, fields, field):
+    with pytest.raises(ValueError, match=field):
+        kind(**fields)
 
 
-def test_where_nobody_fires_violations_can_be_sanctioned():
-    governed(Quota(fine=1), GraduatedSanctions(on="violations"), **NOBODY_FIRES)
+@pytest.mark.parametrize(
+    ("institutions", "place"),
+    [
+        ((law.Boundaries(regions=("0..",)),), r"Boundaries\.regions is 1 x 3; allowed: 2 x 3"),
+        ((law.Boundaries(regions=("0..", "..2")),), r"Boundaries\.regions has '2' in row 1"),
+        ((law.Boundaries(regions=("a..", "..b"), owners=("a", "a")),), r"Boundaries\.regions"),
+        ((law.Boundaries(regions=("a..", "..a"), owners=("a",)),), r"Boundaries\.owners has 1"),
+        ((law.Levies(groups=((0,),)),), r"Levies\.groups"),
+        ((law.Levies(groups=((0, 1), (1,))),), r"Levies\.groups"),
+        ((law.Levies(groups=((0, 1), (2,))),), r"Levies\.groups has agent 2"),
+        ((law.Sanctioner(agents=(0, 2)),), r"Sanctioner\.agents has agent 2"),
+        ((law.Quota(), law.Monitoring()), "Monitoring has no violation"),
+        ((law.Quota(), law.GraduatedSanctions(on="violations")), "GraduatedSanctions .* no offence"),
+        ((law.Monitoring(monitor=2),), r"Monitoring\.monitor has agent 2"),
+        ((law.GraduatedSanctions(freeze_steps=((1,),), on="tags"),), r"GraduatedSanctions\.freeze_steps"),
+        ((law.Monitoring(), law.Tax(), law.Monitoring()), "has 2 of Monitoring"),
+        ((law.Sanctioner(),) * 3, "has 3 of Sanctioner"),
+        ((law.Mediation(),), r"Mediation\.observed .* Observation\.agents_apart"),
+        ((Mine(),), r"Game\.institutions has a Mine"),
+        ((Own(),), r"Game\.institutions has a Own"),
+        ((law.Tax(),) * 65, r"Game\.institutions has 65"),
+        (VOTES, "lets agents choose from 1,771,561 options"),
+    ],
+)
+def test_what_does_not_fit_the_game_is_refused(institutions, place):
+    with pytest.raises(ValueError, match=place):
+        governed(*institutions)
+
+
+@pytest.mark.parametrize(
+    "needs_tags", [law.Sanctioner(), law.Mediation(observed=False), law.GraduatedSanctions(on="tags")]
+)
+def test_where_nobody_fires_tags_cannot_be_judged_but_violations_sanctioned(needs_tags):
+    governed(law.Quota(fine=1), law.GraduatedSanctions(on="violations"), **NOBODY_FIRES)
+    with pytest.raises(ValueError, match=rf"a {type(needs_tags).__name__} and Rules\.may_fire"):
+        governed(needs_tags, **NOBODY_FIRES)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +107,7 @@ def test_where_nobody_fires_violations_can_be_sanctioned():
     [
         (EVERYTHING, np.full((2, 3), EVERYTHING.decisions), "decision .* of agent 0 in world 0 is unknown"),
         (EVERYTHING, np.array([[0, 0, 0], [0, -1, 0]]), "decision -1 of agent 1 in world 1 is unknown"),
-        (governed(Tax()), np.ones((2, 2), np.int64), "decision 1 of agent 0 in world 0 is unknown"),
+        (governed(law.Tax()), np.ones((2, 2), np.int64), "decision 1 of agent 0 in world 0 is unknown"),
     ],
 )
 def test_wrong_decisions_are_refused(game, decisions, message):
@@ -158,9 +156,9 @@ def test_an_unobserved_vote_hides_its_result_and_not_the_quota_that_is_voted_on(
     observation = replace(PLAIN.observation, encoding="one_hot")
     shown = [
         replace(
-            PLAIN, observation=observation, institutions=(Vote(on=quota, observed=observed),)
+            PLAIN, observation=observation, institutions=(law.Vote(on=quota, observed=observed),)
         ).entries_shown
-        for quota, observed in ((Quota(), False), (Quota(observed=False), True))
+        for quota, observed in ((law.Quota(), False), (law.Quota(observed=False), True))
     ]
     assert [entry.startswith("quota left") for entry in shown[0]] == [True, False]
     assert len(shown[1]) == 1

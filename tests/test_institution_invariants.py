@@ -23,18 +23,9 @@ from hypothesis import strategies as st
 from test_worlds import games
 
 from cprl import Observation, presets
+from cprl import institutions as law
 from cprl.commons.batch import Batch
 from cprl.commons.world import PLAYING
-from cprl.institutions import (
-    COUNTS,
-    Boundaries,
-    ClosedPatches,
-    ClosedSeason,
-    GraduatedSanctions,
-    Monitoring,
-    Quota,
-    Sanctioner,
-)
 from cprl.institutions.arrays import STATE, STEPS, lasting
 
 # Random walls and boundaries may part all agents from all apples.
@@ -99,9 +90,9 @@ def test_counts_add_up(game, seed):
     for before, moment in itertools.pairwise(moments):
         grown = moment.counts - before.counts
         assert (grown >= 0).all()
-        assert np.array_equal(grown[..., COUNTS.index("violations")], moment.violated)
+        assert np.array_equal(grown[..., law.COUNTS.index("violations")], moment.violated)
     for moment in moments:
-        counts = {name: moment.counts[..., n] for n, name in enumerate(COUNTS)}
+        counts = {name: moment.counts[..., n] for n, name in enumerate(law.COUNTS)}
         assert (moment.counts >= 0).all()
         assert (counts["detections"] <= counts["violations"]).all()
         assert (counts["returns_to_violation"] <= counts["violations"]).all()
@@ -125,7 +116,7 @@ def sums(game, seed):
         np.array([getattr(moment.payments, name) for moment in moments], np.float64)
         for name in ("fines", "transfers")
     )
-    counts = {name: moments[-1].payments.counts[..., n] for n, name in enumerate(COUNTS)}
+    counts = {name: moments[-1].payments.counts[..., n] for n, name in enumerate(law.COUNTS)}
     return harvest, fines, transfers, counts
 
 
@@ -179,9 +170,9 @@ def test_boundaries_charge_so_much_for_each_bite_and_step(game, seed):
 
 
 FINED_LIMITS = (
-    st.builds(Quota, share=st.sampled_from([0.0, 0.5]), window_steps=st.integers(1, 9), fine=FINES)
-    | st.builds(ClosedSeason, period_steps=st.just(5), closed_steps=st.integers(0, 5), fine=FINES)
-    | st.builds(ClosedPatches, below=st.integers(0, 4), fine=FINES)
+    st.builds(law.Quota, share=st.sampled_from([0.0, 0.5]), window_steps=st.integers(1, 9), fine=FINES)
+    | st.builds(law.ClosedSeason, period_steps=st.just(5), closed_steps=st.integers(0, 5), fine=FINES)
+    | st.builds(law.ClosedPatches, below=st.integers(0, 4), fine=FINES)
 )
 
 
@@ -197,7 +188,7 @@ def test_limits_charge_so_much_for_each_bite_beyond_them(game, seed):
 @QUICK
 @given(game=games(), seed=SEEDS, share=st.sampled_from([0.3, 1.0]), window=st.integers(1, 9))
 def test_nobody_harvests_more_than_a_quota_in_a_window(game, seed, share, window):
-    game = replace(game, institutions=(Quota(share=share, window_steps=window),))
+    game = replace(game, institutions=(law.Quota(share=share, window_steps=window),))
     most = share * game.law_parameters["quotas"]["unit"][0]
     harvest, fines, _, counts = sums(game, seed)
     for first in range(0, len(harvest), window):
@@ -221,8 +212,8 @@ def test_nobody_harvests_in_the_region_of_others(game, seed):
 @QUICK
 @given(game=games(), seed=SEEDS, cost=FINES, monitor=st.sampled_from([None, 0]))
 def test_inspection_costs_the_same_in_every_turn_until_the_end(game, seed, cost, monitor):
-    never_broken = Quota(share=1e6, fine=0)
-    game = replace(game, institutions=(Monitoring(cost=cost, monitor=monitor), never_broken))
+    never_broken = law.Quota(share=1e6, fine=0)
+    game = replace(game, institutions=(law.Monitoring(cost=cost, monitor=monitor), never_broken))
     for before, moment in zip(*(random_play(game, seed=seed)[n:] for n in (0, 1)), strict=False):
         is_playing = before.worlds.ended[:, 0] == PLAYING
         close(moment.payments.fines.sum(-1), cost * is_playing)
@@ -232,7 +223,7 @@ def test_inspection_costs_the_same_in_every_turn_until_the_end(game, seed, cost,
 @given(game=games(), seed=SEEDS)
 def test_fines_without_recovery_are_those_of_so_many_sanctions(game, seed):
     levels = (0.5, 2.0, 7.0)
-    own = GraduatedSanctions(freeze_steps=(1, 2), fines=levels, recovery_steps=None)
+    own = law.GraduatedSanctions(freeze_steps=(1, 2), fines=levels, recovery_steps=None)
     game = replace(game, institutions=(own,))
     _, fines, _, counts = sums(game, seed)
     owed = np.cumsum([0, *levels, *[levels[-1]] * 99])
@@ -242,7 +233,7 @@ def test_fines_without_recovery_are_those_of_so_many_sanctions(game, seed):
 @QUICK
 @given(game=games(), seed=SEEDS)
 def test_only_the_sanctioner_fires(game, seed):
-    game = replace(game, institutions=(Sanctioner(agents=(0,)),))
+    game = replace(game, institutions=(law.Sanctioner(agents=(0,)),))
     for moment in random_play(game, seed=seed):
         assert not moment.turn.fired[:, 1:].any()
 
@@ -332,7 +323,7 @@ def test_the_number_of_threads_changes_nothing(threads):
 def test_everything_at_once_happens_somewhere():
     moments = random_play(EVERYTHING, worlds=20, turns=24, seed=1)
     counts = np.max([moment.payments.counts for moment in moments], (0, 1, 2))
-    assert all(counts), dict(zip(COUNTS, counts.tolist(), strict=True))
+    assert all(counts), dict(zip(law.COUNTS, counts.tolist(), strict=True))
     assert any(moment.payments.transfers.any() for moment in moments)
     assert len({tuple(row) for moment in moments for row in moment.payments.in_force.tolist()}) > 5
 
@@ -340,11 +331,11 @@ def test_everything_at_once_happens_somewhere():
 @pytest.mark.parametrize("variant", ["published", "as_run"])
 def test_the_published_board_under_its_owners_plays_as_without_them_where_all_is_allowed(variant):
     game = presets.game("commons", variant=variant)
-    as_the_rules_say = GraduatedSanctions(
+    as_the_rules_say = law.GraduatedSanctions(
         freeze_steps=(game.rules.freeze_steps,), fines=(0,), recovery_steps=None, on="tags"
     )
     harmless = (
-        *(Boundaries(regions=("." * game.map.width,) * game.map.height), Quota(share=1e6)),
-        *(ClosedSeason(closed_steps=0), ClosedPatches(below=0), Sanctioner(agents=(0, 1, 2, 3))),
+        *(law.Boundaries(regions=("." * game.map.width,) * game.map.height), law.Quota(share=1e6)),
+        *(law.ClosedSeason(closed_steps=0), law.ClosedPatches(below=0), law.Sanctioner(agents=(0, 1, 2, 3))),
     )
     check_untouched(replace(game, institutions=(*harmless, as_the_rules_say)), seed=3)

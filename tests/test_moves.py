@@ -71,10 +71,7 @@ CLASHES = {
 def test_when_all_go_forward(rule):
     before, after = CLASHES[rule]
     assert Play(before).turn("forward").board == after
-
-
-def test_no_agent_enters_a_cell_that_another_keeps():
-    assert Play("A....\n.>>..").turn("forward", "stay").places == [(1, 1), (1, 2)]
+    assert Play("A....\n.>>..").turn("forward", "stay").places == [(1, 1), (1, 2)], "one keeps its cell"
 
 
 def test_clashes_do_not_depend_on_agent_indices():
@@ -107,12 +104,8 @@ def test_a_tagged_agent_occupies_no_cell_and_waits_until_its_cell_is_free():
 
 def test_agents_that_wait_for_one_cell_return_in_the_order_in_which_they_were_tagged():
     # 1 is tagged at (1, 3), then 2 comes there and is tagged too; the freeze of 1 is the longer wait.
-    play = Play(
-        "A......\n.>.^...\n...^...",
-        freeze_steps=3,
-        beam_length_cells=2,
-        beam_width_cells=1,
-    )
+    beam = {"beam_length_cells": 2, "beam_width_cells": 1}
+    play = Play("A......\n.>.^...\n...^...", freeze_steps=3, **beam)
     play.turn("beam", "stay", "stay").turn("stay", "stay", "forward")
     assert play.places == [(1, 1), (1, 3), (1, 3)]
     play.turn("beam", "stay", "stay")

@@ -18,15 +18,87 @@ BOARD = """
 SURE = {"regrow_prob": (1.0,)}
 
 
-def test_a_quota_stops_what_is_above_it_until_the_next_window():
-    # Four sites bear 4 x 1/2 = 2 apples a turn, so 1 for each of two agents; half of it in 2 turns is 1.
-    play = Play(BOARD, institutions=[Quota(share=0.5, window_steps=2)], **SURE)
-    assert play.turn("forward").harvest == [1, 1]
-    assert play.turn("forward").harvest == [0, 0]
-    assert not any(play.violated)
-    assert play.turn("stay").harvest == [1, 1], "the apple is still there, and a new window begins"
-    assert play.turn("backward").harvest == [0, 0]
-    assert play.counts("excess_bites") == [0, 0]
+PATCHES = ">AA....A.<"
+"""A patch of two sites, and one of a single site."""
+FIELD, LATE = ">.AA.A\n.....<", "forward/stay"
+NEXT, BOTH, NONE, FIRST = [0, 1], [1, 1], [0, 0], [1, 0]
+
+
+@pytest.mark.parametrize(
+    ("board", "limits", "rules", "turns", "harvests"),
+    [
+        # Four sites bear 4 x 1/2 = 2 apples a turn, so 1 for each of two agents; half of it in 2 turns is 1.
+        # In turn 3 the apple is still there, and a new window begins.
+        (
+            BOARD,
+            [Quota(share=0.5, window_steps=2)],
+            SURE,
+            "forward forward stay backward",
+            [BOTH, NONE, BOTH, NONE],
+        ),
+        # 10 x 0.1 x 1 is 1 apple, although 0.1 cannot be held exactly; a share of 0 is none.
+        (BOARD, [Quota(share=0.1, window_steps=10)], SURE, "forward", [BOTH]),
+        (BOARD, [Quota(share=1, window_steps=1)], SURE, "forward", [BOTH]),
+        (BOARD, [Quota(share=0)], SURE, "forward", [NONE]),
+        # A share of 1 in 2 turns is 2 apples on a full board, and 1 in the window that begins with 2 of 4
+        # sites full; an apple grew in turn 3 where one bites in turn 4, but the quota is used up.
+        (
+            BOARD,
+            [Quota(share=1, window_steps=2, by_stock=True)],
+            SURE,
+            "forward forward backward forward",
+            [BOTH, BOTH, BOTH, NONE],
+        ),
+        # Two quotas both hold, 1 apple in 2 turns and 1 in 4.
+        (
+            BOARD,
+            [Quota(share=0.5, window_steps=2), Quota(share=0.25, window_steps=4)],
+            SURE,
+            "forward forward stay stay stay",
+            [BOTH, NONE, NONE, NONE, BOTH],
+        ),
+        # Every third turn is closed; a season may be open or closed for ever.
+        (
+            FIELD,
+            [ClosedSeason(period_steps=3, closed_steps=1)],
+            {},
+            f"stay {LATE} {LATE} stay",
+            [NONE] * 3 + [FIRST],
+        ),
+        (BOARD, [ClosedSeason(period_steps=2, closed_steps=0)], {}, "forward forward", [BOTH, BOTH]),
+        (BOARD, [ClosedSeason(period_steps=2, closed_steps=2)], {}, "forward forward", [NONE, NONE]),
+        # A patch is closed in turns that begin with too few apples on it: from the start, after one bite, or
+        # not any more, where the site in column 1 has grown in turn 2.
+        (PATCHES, [ClosedPatches(below=2)], {}, "forward forward", [FIRST, NONE]),
+        (PATCHES, [ClosedPatches(below=2)], SURE, f"forward stay {LATE}", [FIRST, NONE, FIRST]),
+        # Turns 1 and 2 are agent 0's, turns 3 and 4 agent 1's, turn 5 is agent 0's again.
+        (
+            ">AAAAA.\n.AAAAA<",
+            [Rotation(window_steps=2)],
+            {},
+            "forward forward forward forward forward",
+            [FIRST, FIRST, NEXT, NEXT, FIRST],
+        ),
+    ],
+)
+def test_a_limit_without_a_fine_stops_bites_and_no_rule_is_broken(board, limits, rules, turns, harvests):
+    play = Play(board, institutions=limits, **rules)
+    for turn, harvest in zip(turns.split(), harvests, strict=True):
+        before = play.output.stock[0, 0]
+        assert play.turn(*turn.split("/")).harvest == harvest
+        assert play.output.stock[0, 0] == before - sum(harvest) + play.output.regrown[0, 0]
+        assert (play.fines, play.violated) == ([0, 0], [False, False])
+    assert play.counts("excess_bites") == play.counts("closed_bites") == [0, 0]
+
+
+def test_a_bite_in_a_closed_season_costs_its_fine():
+    play = Play(FIELD, institutions=[ClosedSeason(period_steps=3, closed_steps=1, fine=0.5)])
+    play.turn("stay").turn("forward", "stay").turn("forward", "stay")
+    assert (play.harvest, play.fines, play.reward) == ([1, 0], [0.5, 0], [0.5, 0])
+    assert play.violated == [True, False]
+    assert play.counts("closed_bites") == [1, 0]
+    assert play.turn("forward", "stay").fines == [0, 0]
+    assert play.harvest == [1, 0]
 
 
 def test_a_quota_with_a_fine_lets_bites_happen_and_charges_those_above_it():
@@ -46,37 +118,6 @@ def test_a_part_of_an_apple_is_none():
     with pytest.warns(UserWarning, match=r"window_steps is 1: .* 0\.9 apples at most, .* 2 turns"):
         play = Play(BOARD, institutions=[Quota(share=0.9, window_steps=1)], **SURE)
     assert play.turn("forward").harvest == [0, 0]
-    play = Play(BOARD, institutions=[Quota(share=1, window_steps=1)], **SURE)
-    assert play.turn("forward").harvest == [1, 1]
-    assert Play(BOARD, institutions=[Quota(share=0)], **SURE).turn("forward").harvest == [0, 0]
-
-
-def test_a_rounding_error_does_not_cost_an_apple():
-    # 10 x 0.1 x 1 is 1 apple, although 0.1 cannot be held exactly.
-    play = Play(BOARD, institutions=[Quota(share=0.1, window_steps=10)], **SURE)
-    assert play.turn("forward").harvest == [1, 1]
-
-
-def test_a_quota_by_stock_shrinks_with_the_stock_that_a_window_begins_with():
-    # A share of 1 in 2 turns is 2 apples on a full board.
-    play = Play(BOARD, institutions=[Quota(share=1, window_steps=2, by_stock=True)], **SURE)
-    assert play.turn("forward").harvest == [1, 1]
-    assert play.turn("forward").harvest == [1, 1]
-    # (0, 1) and (1, 3) have grown again, the other two sites are empty: 2 of 4, so 1 apple.
-    assert play.output.stock[0, 0] == 2
-    assert play.turn("backward").harvest == [1, 1]
-    assert play.turn("forward").harvest == [0, 0], "an apple grew there in turn 3, but the quota is used up"
-
-
-def test_two_quotas_both_hold():
-    # 1 apple in 2 turns, and 1 in 4 turns.
-    quotas = [Quota(share=0.5, window_steps=2), Quota(share=0.25, window_steps=4)]
-    play = Play(BOARD, institutions=quotas, **SURE)
-    assert play.turn("forward").harvest == [1, 1]
-    play.turn("forward")
-    assert play.turn("stay").harvest == [0, 0], "a window of the first begins, not of the second"
-    play.turn("stay")
-    assert play.turn("stay").harvest == [1, 1]
 
 
 def test_agents_see_what_is_left_of_their_quota_and_of_the_window():
@@ -98,46 +139,11 @@ def test_what_is_shown_is_relative_to_the_largest_quota():
     assert play.shown(2)[0] == [128, 255], "half of the sites are empty, so half of the quota"
 
 
-def test_a_closed_season_stops_bites_or_charges_them():
-    # Turns 3, 6, 9, ... are closed.
-    def at_turn_3(**fine):
-        season = ClosedSeason(period_steps=3, closed_steps=1, **fine)
-        play = Play(">.AA.A\n.....<", institutions=[season])
-        assert play.turn("stay").turn("forward", "stay").harvest == [0, 0]
-        return play.turn("forward", "stay")
-
-    play = at_turn_3()
-    assert (play.harvest, play.fines, play.violated) == ([0, 0], [0, 0], [False, False])
-    assert play.turn("stay").harvest == [1, 0], "open again"
-    play = at_turn_3(fine=0.5)
-    assert (play.harvest, play.fines, play.reward) == ([1, 0], [0.5, 0], [0.5, 0])
-    assert play.violated == [True, False]
-    assert play.counts("closed_bites") == [1, 0]
-    assert play.turn("forward", "stay").fines == [0, 0]
-    assert play.harvest == [1, 0]
-
-
 def test_agents_see_whether_the_season_is_closed_and_until_when():
     play = Play(BOARD, institutions=[ClosedSeason(period_steps=4, closed_steps=1)])
     # Open for turns 1 to 3 of 4: 3/4, 2/4, 1/4 of a period until it closes, then 1/4 until it opens.
     seen = [play.shown(2)[0], *(play.turn("stay").shown(2)[0] for _ in range(4))]
     assert seen == [[0, 191], [0, 128], [0, 64], [255, 64], [0, 191]]
-
-
-@pytest.mark.parametrize(("closed", "harvest"), [(0, 1), (2, 0)])
-def test_a_season_may_be_open_or_closed_for_ever(closed, harvest):
-    season = ClosedSeason(period_steps=2, closed_steps=closed)
-    play = Play(BOARD, institutions=[season])
-    for _ in range(2):
-        assert play.turn("forward").harvest == [harvest] * 2
-
-
-def test_agents_take_turns_in_harvesting():
-    # Windows of 2 turns: turns 1 and 2 are agent 0's, turns 3 and 4 agent 1's, turn 5 is agent 0's again.
-    play = Play(">AAAAA.\n.AAAAA<", institutions=[Rotation(window_steps=2)])
-    assert [play.turn("forward").harvest for _ in range(5)] == [[1, 0], [1, 0], [0, 1], [0, 1], [1, 0]]
-    assert play.board == "...AA>.\n.<..AA."
-    assert not any(play.violated)
 
 
 def test_a_bite_in_the_window_of_another_costs_its_fine():
@@ -156,18 +162,6 @@ def test_agents_see_whether_they_may_harvest_in_the_coming_turn_and_what_is_left
     assert play.again().shown(2) == [[255, 255], [0, 255]], "an episode begins with agent 0"
 
 
-PATCHES = ">AA....A.<"
-
-
-def test_a_patch_is_closed_in_turns_that_begin_with_too_few_apples_on_it():
-    # The sites in columns 1 and 2 are a patch of 2, the one in column 7 a patch of 1.
-    play = Play(PATCHES, institutions=[ClosedPatches(below=2)])
-    assert play.turn("forward").harvest == [1, 0]
-    assert play.turn("forward").harvest == [0, 0], "both patches hold one apple"
-    assert play.output.stock[0, 0] == 2
-    assert not any(play.violated)
-
-
 def test_a_bite_in_a_closed_patch_costs_its_fine():
     play = Play(PATCHES, institutions=[ClosedPatches(below=2, fine=3)])
     assert play.turn("forward").fines == [0, 0]
@@ -176,12 +170,6 @@ def test_a_bite_in_a_closed_patch_costs_its_fine():
     assert (play.harvest, play.fines, play.reward) == ([1, 1], [3, 3], [-2, -2])
     assert play.counts("closed_bites") == [1, 1]
     assert play.violated == [True, True]
-
-
-def test_a_patch_that_grows_is_open_again():
-    play = Play(PATCHES, institutions=[ClosedPatches(below=2)], **SURE)
-    play.turn("forward").turn("stay")
-    assert play.turn("forward", "stay").harvest == [1, 0], "the site in column 1 grew in turn 2"
 
 
 def test_patches_are_sites_that_are_connected_by_being_near():

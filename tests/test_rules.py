@@ -1,11 +1,13 @@
-"""Rules and presets: every field is checked, and quirks, windows and learners match the study."""
+"""Rules, presets and chance: each field is checked, quirks match the study, numbers are those of Philox."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
 
 from cprl import Rules, presets
+from cprl.commons.chance import philox4x32
+from cprl.institutions.base import threshold
 
 WRONG = {
     "regrow_prob": [(), (0.5, 1.5), (float("nan"),), (1e-10,)],
@@ -44,15 +46,6 @@ def test_every_quirk_is_off_as_published_and_on_as_run():
         assert all(getattr(as_run, quirk) for quirk in quirks)
 
 
-@pytest.mark.parametrize(
-    ("board", "published", "as_run"),
-    [("single_basic", (6, 13), (5, 13)), ("two_complex", (6, 13), (5, 13)), ("commons", (7, 15), (7, 15))],
-)
-def test_windows_have_the_published_sizes(board, published, as_run):
-    assert presets.game(board).observation_shape == (3, *published)
-    assert presets.game(board, variant="as_run").observation_shape == (3, *as_run)
-
-
 def test_without_a_beam_there_are_seven_actions_and_six_is_stay():
     assert presets.game("single_basic").actions[6] == "stay"
     assert len(presets.game("single_basic").actions) == 7
@@ -67,28 +60,37 @@ def test_an_unknown_preset_is_refused_with_what_is_allowed(board, variant):
         presets.dqn_settings(board, variant=variant)
 
 
-def test_learners_differ_between_boards_and_variants_only_where_the_study_says():
-    assert presets.dqn_settings("commons").epsilon_decay_steps == 1_000_000
-    assert presets.dqn_settings("two_complex").epsilon_decay_steps == 500_000
-    as_run = presets.dqn_settings("single_basic", variant="as_run")
-    assert as_run.relu_on_outputs
-    assert as_run.glorot_uniform
-    assert as_run.own_target_weights
-    assert as_run.mean_over_all_outputs
-    assert as_run.adam_eps == 1e-7
-    written = replace(
-        as_run,
-        relu_on_outputs=False,
-        glorot_uniform=False,
-        own_target_weights=False,
-        mean_over_all_outputs=False,
-        adam_eps=1e-8,
-    )
-    assert written == presets.dqn_settings("single_basic")
-
-
 def test_epsilon_is_constant_then_falls_linearly_then_is_constant():
     settings = presets.dqn_settings("single_basic")
     assert [settings.epsilon(step) for step in (0, 800)] == [1.0, 1.0]
     assert settings.epsilon(800 + 250_000) == pytest.approx(0.55)
     assert [settings.epsilon(step) for step in (500_800, 10**7)] == pytest.approx([0.1, 0.1])
+
+
+KNOWN_ANSWERS = [  # from the vectors published with Random123, philox4x32, 10 rounds
+    ("00000000 00000000 00000000 00000000", "00000000 00000000", "6627e8d5 e169c58d bc57ac4c 9b00dbd8"),
+    ("ffffffff ffffffff ffffffff ffffffff", "ffffffff ffffffff", "408f276d 41c83b0e a20bc7c6 6d5451fd"),
+    ("243f6a88 85a308d3 13198a2e 03707344", "a4093822 299f31d0", "d16cfe09 94fdcceb 5001e420 24126ea1"),
+]
+
+
+def words(text):
+    return [np.uint64(int(word, 16)) for word in text.split()]
+
+
+@pytest.mark.parametrize(("counter", "key", "answer"), KNOWN_ANSWERS)
+def test_philox_gives_the_known_answers(counter, key, answer):
+    assert list(philox4x32(*words(counter), *words(key))) == words(answer)
+
+
+@pytest.mark.parametrize(("counter", "key", "answer"), KNOWN_ANSWERS)
+def test_the_compiled_philox_gives_the_known_answers(counter, key, answer):
+    import numba
+
+    assert list(numba.njit(philox4x32)(*words(counter), *words(key))) == words(answer)
+
+
+def test_a_threshold_is_the_probability_of_a_word_below_it():
+    assert threshold(0.0) == 0
+    assert threshold(1.0) == 2**32
+    assert threshold(0.01) / 2**32 == pytest.approx(0.01, abs=2**-33)

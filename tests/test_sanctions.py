@@ -202,13 +202,39 @@ def mediated(board, *others, turns=3, refund=1.0, **rules):
     )
 
 
-def test_the_shooter_refunds_an_unjust_tag():
-    play = mediated("A....\n>..^.", refund=0.75).turn("beam", "stay")
-    assert (play.fines, play.transfers) == ([0.75, 0], [0, 0.75])
-    assert play.reward == [-0.75, 0.75]
-    assert play.violated == [True, False]
-    assert play.counts("unjust_tags") == play.counts("violations") == [1, 0]
-    assert play.turn("turn_left", "stay").turn("beam", "stay").fines == [0, 0], "a miss costs nothing"
+PAIR, DUEL, THREE = "A....\n>..^.", ".....\nA....\n>..<.", "A......\n>..^..<"
+
+
+@pytest.mark.parametrize(
+    ("board", "others", "rules", "turns", "fines", "transfers", "unjust"),
+    [
+        # The shooter refunds an unjust tag, detected or not; a miss costs nothing.
+        (PAIR, (), {"refund": 0.75}, ["beam stay"], [0.75, 0], [0, 0.75], [1, 0]),
+        (PAIR, (Monitoring(prob=0),), {}, ["beam stay"], [1, 0], [0, 1], [1, 0]),
+        (PAIR, (), {}, ["beam stay", "turn_left stay", "beam stay"], [0, 0], [0, 0], [1, 0]),
+        # Only the hit that tags is judged.
+        (PAIR, (), {"hits_to_tag": 2}, ["beam stay"], [0, 0], [0, 0], [0, 0]),
+        (PAIR, (), {"hits_to_tag": 2}, ["beam stay", "beam stay"], [1, 0], [0, 1], [1, 0]),
+        # An unjust tag justifies one in return; two at once are both unjust, whatever their numbers.
+        (DUEL, (), {}, ["beam stay", "stay beam"], [0, 0], [0, 0], [1, 0]),
+        (DUEL, (), {}, ["beam beam"], [1, 1], [1, 1], [1, 1]),
+        (DUEL, (), {"order": (1, 0)}, ["beam beam"], [1, 1], [1, 1], [1, 1]),
+        # Shooters share the refund of one tag. In reading order agent 1 of the last board is the shooter, who
+        # pays for each of several.
+        (THREE, (), {}, ["beam stay beam"], [0.5, 0, 0.5], [0, 1, 0], [1, 0, 1]),
+        ("A.^....\n>..^...", (), {}, ["stay beam stay"], [0, 2, 0], [1, 0, 1], [0, 2, 0]),
+    ],
+)
+def test_tags_are_refunded_by_who_tagged_unjustly(board, others, rules, turns, fines, transfers, unjust):
+    play = mediated(board, *others, **rules)
+    for turn in turns:
+        play.turn(*turn.split())
+    assert (play.fines, play.transfers) == (fines, transfers)
+    assert play.reward == [given - taken for given, taken in zip(transfers, fines, strict=True)]
+    assert play.violated == [fine > 0 for fine in fines]
+    assert play.counts("unjust_tags") == unjust
+    assert play.counts("violations") == [min(1, tags) for tags in unjust]
+    assert play.counts("detections") == ([0, 0] if others else [min(1, tags) for tags in unjust])
 
 
 def test_a_violation_justifies_tags_for_so_many_turns():
@@ -224,44 +250,6 @@ def test_a_violation_justifies_tags_for_so_many_turns():
     # The turn after the violation is spent on leaving: so these are 0, 2, 3 and 4 turns after it. A violation
     # justifies in its own turn and the two after it.
     assert [refunded(waited) for waited in (0, 1, 2, 3)] == [False, False, True, True]
-
-
-def test_an_unjust_tag_justifies_one_in_return():
-    play = mediated(".....\nA....\n>..<.")
-    assert play.turn("beam", "stay").fines == [1, 0]
-    assert play.turn("stay", "beam").fines == [0, 0]
-    assert play.counts("unjust_tags") == [1, 0]
-
-
-@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_two_that_tag_each_other_at_once_are_both_unjust_whatever_their_numbers(order):
-    play = mediated("A....\n>..<.", order=order).turn("beam")
-    assert (play.fines, play.transfers, play.reward) == ([1, 1], [1, 1], [0, 0])
-    assert play.violated == [True, True]
-    assert play.counts("unjust_tags") == [1, 1]
-
-
-def test_shooters_share_the_refund_of_one_tag_and_pay_for_each_of_several():
-    play = mediated("A......\n>..^..<").turn("beam", "stay", "beam")
-    assert (play.fines, play.transfers) == ([0.5, 0, 0.5], [0, 1, 0])
-    assert play.counts("unjust_tags") == [1, 0, 1]
-    # In reading order agent 1 is the shooter; agents 0 and 2 are both in its beam.
-    play = mediated("A.^....\n>..^...").turn("stay", "beam", "stay")
-    assert (play.fines, play.transfers) == ([0, 2, 0], [1, 0, 1])
-    assert play.counts("unjust_tags") == [0, 2, 0]
-    assert play.counts("violations") == [0, 1, 0]
-
-
-def test_only_the_hit_that_tags_is_judged():
-    play = mediated("A....\n>..^.", hits_to_tag=2)
-    assert play.turn("beam", "stay").fines == [0, 0]
-    assert play.turn("beam", "stay").fines == [1, 0]
-
-
-def test_an_unjust_tag_can_go_undetected_and_is_refunded_all_the_same():
-    play = mediated("A....\n>..^.", Monitoring(prob=0)).turn("beam", "stay")
-    assert (play.fines, play.transfers) == ([1, 0], [0, 1])
-    assert play.counts("detections") == [0, 0]
 
 
 def test_an_unjust_shooter_is_sanctioned():

@@ -52,17 +52,15 @@ FIRE_OVER_APPLES = drawn(
 )
 
 
-def test_marks_and_beams_are_never_painted_over_apples_or_agents():
-    play = Play(FIRE_OVER_APPLES, window_rows=6, window_columns=3, hits_to_tag=2)
-    play.turn("beam", "stay", "stay")
-    assert windows(play, 0) == [["bob", "bbb", "bob", "bbb", "AAb", "AS."]]
-
-
-def test_as_run_beams_are_painted_over_apples_and_agents():
-    play = Play(FIRE_OVER_APPLES, window_rows=6, window_columns=3, paint_over=True, hits_to_tag=2)
+@pytest.mark.parametrize(
+    ("paint_over", "seen"),
+    [(False, ["bob", "bbb", "bob", "bbb", "AAb", "AS."]), (True, ["bbb", "bbb", "bbb", "bbb", "bbb", "AS."])],
+)
+def test_marks_and_beams_are_painted_over_apples_and_agents_as_run_alone(paint_over, seen):
+    play = Play(FIRE_OVER_APPLES, window_rows=6, window_columns=3, paint_over=paint_over, hits_to_tag=2)
     play.turn("beam", "stay", "stay")
     assert play.in_play == [True, True, True]
-    assert windows(play, 0) == [["bbb", "bbb", "bbb", "bbb", "bbb", "AS."]]
+    assert windows(play, 0) == [seen]
 
 
 def test_an_agent_out_of_play_sees_itself_but_is_hidden_from_others():

@@ -10,6 +10,7 @@ In reading order:
     world        the arrays of B worlds: state, step output, scratch memory
     colours      the classes of cells and their colours
     near         which sites are near each other
+    yields       what a map can bear: a proven lower bound
     tables       a game as lookup tables for the compiled rules
     chance       counter-based random numbers
     moves        turning, walking and clashes, on one world
@@ -25,10 +26,4 @@ In reading order:
     batch        Batch: B worlds, played a turn at a time
     decoding     observations back to classes of cells
     picture      an image of the board for people, in which agents have number, heading and second mark
-
-Of games with institutions (`cprl.institutions`):
-
-    yields               what a map can bear
-    institution_tables  that they fit each other and the game, which entries they show agents, and their
-                        lookup tables for the compiled rules
 """

@@ -149,18 +149,9 @@ class Batch:
 
     def show(self, output: Output, *, world: int = 0) -> Shown:
         """A copy of one world for display; `output` holds its latest observation."""
-        output = turn_of(output)
-        read, now = self.driver.read, self.now
-        return Shown(
-            observation=read(output.observation[world]),
-            board=read(self.boards(output))[world],
-            stock=read(now.stock)[world],
-            row=read(now.row)[world],
-            col=read(now.col)[world],
-            heading=read(now.heading)[world],
-            in_play=read(now.in_play)[world],
-            harvested=read(now.harvested)[world],
-        )
+        read, observation = self.driver.read, turn_of(output).observation[world]
+        of_world = {name: read(getattr(self.now, name))[world] for name in Shown._fields[2:]}
+        return Shown(read(observation), read(self.boards(output))[world], **of_world)
 
     def state(self) -> states.State:
         """The state of all worlds: copies of arrays [B, ...] by the names of `Worlds`.

@@ -105,7 +105,7 @@ def kernels() -> dict[str, Any]:
     return {**plain, **governed, "find_unknown": _find_unknown(rules["first_unknown"])}
 
 
-def _kernel(loop: Callable[..., None], cut: Callable[..., Scratch]) -> Callable[..., Any]:
+def _kernel(loop: Callable[..., None], cut: Callable[..., Scratch]) -> Any:
     """Thread b runs the loop on world b alone, without institutions: a kernel takes no None, a loop does."""
 
     @cuda.jit
@@ -114,11 +114,10 @@ def _kernel(loop: Callable[..., None], cut: Callable[..., Scratch]) -> Callable[
         if b < argument.shape[0]:
             loop(Played(worlds, tables, output, None, None, None), argument, cut(scratch, b), b, b + 1)
 
-    launched: Callable[..., Any] = kernel
-    return launched
+    return kernel
 
 
-def _governed_kernel(loop: Callable[..., None], cut: Callable[..., Scratch]) -> Callable[..., Any]:
+def _governed_kernel(loop: Callable[..., None], cut: Callable[..., Scratch]) -> Any:
     """Thread b runs the loop on world b alone, with institutions."""
 
     @cuda.jit
@@ -128,11 +127,10 @@ def _governed_kernel(loop: Callable[..., None], cut: Callable[..., Scratch]) -> 
             game = Played(worlds, tables, output, law, law.decisions, law.payments)
             loop(game, argument, cut(scratch, b), b, b + 1)
 
-    launched: Callable[..., Any] = kernel
-    return launched
+    return kernel
 
 
-def _find_unknown(first_unknown: Callable[..., int]) -> Callable[..., Any]:
+def _find_unknown(first_unknown: Callable[..., int]) -> Any:
     """Thread b checks the actions of world b."""
 
     @cuda.jit
@@ -143,8 +141,7 @@ def _find_unknown(first_unknown: Callable[..., int]) -> Callable[..., Any]:
             if at >= 0:
                 cuda.atomic.min(lowest, 0, b * actions.shape[1] + at)
 
-    launched: Callable[..., Any] = kernel
-    return launched
+    return kernel
 
 
 def _placed(array: NDArray[Any], is_of_worlds: bool) -> Any:

@@ -117,7 +117,6 @@ class Arrays(NamedTuple):
     may_use: Annotated[Bools, "R N cells"]
     """Whether the agent may use the cell; cells as in `cprl.commons.tables.Tables`."""
     is_stopped: Annotated[Bools, "R"]
-    """Whether bites that break the rule do not happen."""
     fine: Annotated[Numbers, "R"]
     step_is_violation: Annotated[Bools, "R"]
     step_fine: Annotated[Numbers, "R"]

@@ -41,7 +41,6 @@ class Arrays(NamedTuple):
     below: Annotated[Ints, "L"]
     """Of axis L there is one, or none."""
     is_stopped: Annotated[Bools, "L"]
-    """Whether bites that break the rule do not happen."""
     fine: Annotated[Numbers, "L"]
     observed: Annotated[Bools, "L"]
     closed: Annotated[Bools, "B P", DERIVED]

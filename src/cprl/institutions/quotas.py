@@ -54,7 +54,6 @@ class Arrays(NamedTuple):
     window_steps: Annotated[Ints, "Q"]
     by_stock: Annotated[Bools, "Q"]
     is_stopped: Annotated[Bools, "Q"]
-    """Whether bites that break the rule do not happen."""
     fine: Annotated[Numbers, "Q"]
     allowed: Annotated[Numbers, "B Q", STATE]
     """The apples that an agent may harvest in the current window."""

@@ -34,7 +34,6 @@ class Arrays(NamedTuple):
 
     window_steps: Annotated[Ints, "R"]
     is_stopped: Annotated[Bools, "R"]
-    """Whether bites that break the rule do not happen."""
     fine: Annotated[Numbers, "R"]
 
 

@@ -44,7 +44,6 @@ class Arrays(NamedTuple):
     period_steps: Annotated[Ints, "S"]
     closed_steps: Annotated[Ints, "S"]
     is_stopped: Annotated[Bools, "S"]
-    """Whether bites that break the rule do not happen."""
     fine: Annotated[Numbers, "S"]
 
 

@@ -233,17 +233,14 @@ def _end(table: PayoffTable, start: Values) -> Values | None:
 def check_extras() -> None:
     """Raises a ModuleNotFoundError, which says how to install it, if OpenSpiel or nashpy is missing."""
     for package in _PACKAGES:
-        _check(package)
+        extra(package)
 
 
 def extra(module: str) -> Any:
     """A module of OpenSpiel or nashpy."""
-    _check(module.partition(".")[0])
-    return import_module(module)
-
-
-def _check(package: str) -> None:
+    package = module.partition(".")[0]
     if find_spec(package) is None:
         raise ModuleNotFoundError(
             f'{_PACKAGES[package]} need {package}, which is not installed; run pip install "cprl[theory]"'
         )
+    return import_module(module)
