@@ -13,14 +13,7 @@ from test_yields import AS_RUN, CROSS, PUBLISHED
 from cprl import Map, Rules, maps, presets
 from cprl.commons.near import neighbours
 from cprl.commons.yields import sustainable_yield
-from cprl.theory import (
-    CallableWorth,
-    PowerWorth,
-    SharingGame,
-    appropriation,
-    herders,
-    yield_bounds,
-)
+from cprl.theory import CallableWorth, PowerWorth, SharingGame, appropriation, herders, yield_bounds
 
 
 @pytest.mark.parametrize(

@@ -11,16 +11,7 @@ from cprl.commons.game import Game, check_worlds_fit, output_forms
 from cprl.commons.loops import Loop, Played
 from cprl.commons.tables import Tables
 from cprl.commons.threads import CpuThreads
-from cprl.commons.world import (
-    Actions,
-    Bools,
-    Bytes,
-    GovernedOutput,
-    Shown,
-    StepOutput,
-    Worlds,
-    empty_worlds,
-)
+from cprl.commons.world import Actions, Bools, Bytes, GovernedOutput, Shown, StepOutput, Worlds, empty_worlds
 from cprl.institutions.arrays import STATE, STEPS, lasting
 from cprl.institutions.law import new_law
 from cprl.institutions.ledger import Payments

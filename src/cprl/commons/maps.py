@@ -186,7 +186,7 @@ _DRAWINGS: Final = {
 }
 
 _NUMBERED_STARTS: Final[dict[str, tuple[Start, ...]]] = {
-    "commons": ((0, 1, RIGHT), (2, 2, DOWN), (1, 3, DOWN), (0, 2, RIGHT)),
+    "commons": ((0, 1, RIGHT), (2, 2, DOWN), (1, 3, DOWN), (0, 2, RIGHT))
 }
 """Starts of boards on which the published program does not number its agents in reading order."""
 
@@ -252,23 +252,13 @@ _NORTH_STARTS: Final = ((3, 6), (3, 46), (3, 10), (3, 42), (3, 14), (3, 38))
 ROOM_NAMES: Final = ("north-west", "north-east", "south-east", "south-west")
 _ROOMS: Final = tuple(
     (slice(*rows), slice(*columns))
-    for rows, columns in (
-        ((0, 7), (0, 24)),
-        ((0, 7), (29, 53)),
-        ((12, 19), (29, 53)),
-        ((12, 19), (0, 24)),
-    )
+    for rows, columns in (((0, 7), (0, 24)), ((0, 7), (29, 53)), ((12, 19), (29, 53)), ((12, 19), (0, 24)))
 )
 """Rows and columns of each room; all else is corridor or wall."""
 
 
 def crosses(
-    *,
-    height: int,
-    width: int,
-    centres: Iterable[Cell],
-    starts: Iterable[Start],
-    walls: Iterable[Cell] = (),
+    *, height: int, width: int, centres: Iterable[Cell], starts: Iterable[Start], walls: Iterable[Cell] = ()
 ) -> Map:
     """A board whose sites form crosses: each centre and its four neighbours.
 
@@ -281,11 +271,7 @@ def crosses(
         for down, right in ((0, 0), (-1, 0), (0, 1), (1, 0), (0, -1))
     }
     return Map(
-        height=height,
-        width=width,
-        sites=tuple(sorted(sites)),
-        starts=tuple(starts),
-        walls=tuple(walls),
+        height=height, width=width, sites=tuple(sorted(sites)), starts=tuple(starts), walls=tuple(walls)
     )
 
 
