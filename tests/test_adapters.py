@@ -61,14 +61,17 @@ def test_both_envs_pass_pettingzoos_tests_of_their_interface_and_seeds(game):
     seed_test(lambda: env(game), num_cycles=60)
 
 
-def test_the_aec_env_passes_pettingzoos_render_test():
+def test_the_aec_env_passes_pettingzoos_render_test_without_a_display(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    parallel_api_test(parallel_env(SHORT, render_mode="rgb_array"), num_cycles=100)
     render_test(lambda render_mode: env(SHORT, render_mode="rgb_array"))  # it also asks for "human"
 
 
+@pytest.mark.parametrize("render_mode", [None, "rgb_array"])
 @pytest.mark.parametrize("game", SINGLE, ids=["single_basic", "rich", "institutions"])
-def test_the_gymnasium_env_passes_gymnasiums_check(game):
-    made = gymnasium.make("cprl/Commons-v0", game=game).unwrapped
-    check_env(made, skip_render_check=bool(game.institutions))
+def test_the_gymnasium_env_passes_gymnasiums_check_without_a_display(game, render_mode, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    check_env(gymnasium.make("cprl/Commons-v0", game=game, render_mode=render_mode).unwrapped)
 
 
 @pytest.mark.parametrize(

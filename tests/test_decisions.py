@@ -7,7 +7,7 @@ from recordings import column
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.policies.assignment import AgentPolicies
-from cprl.policies.lanes import LaneActor, random_lanes
+from cprl.policies.lanes import LaneActor
 from cprl.policies.scripted import scripted_lanes
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
@@ -32,7 +32,7 @@ def replay(run):
     actors = {
         (0,): LaneActor(fixed, 8, seeds=seeds[:1], agents=1),
         (1,): LaneActor(fixed, 8, seeds=seeds[1:2], agents=1, stochastic=True),
-        (2,): random_lanes(8, seeds=seeds[2:3], agents=1),
+        (2,): LaneActor(None, 8, seeds=seeds[2:3], agents=1),
         (3,): scripted_lanes("greedy", GAME, seeds=seeds[3:], agents=1),
     }
     actors[0,].epsilon = 0.0
@@ -117,4 +117,4 @@ def test_asking_for_preferences_draws_no_random_numbers():
         chosen.append((asked.choose(observation).item(), other.choose(observation).item()))
     assert all(one == two for one, two in chosen)
     assert len(set(chosen)) > 1
-    assert random_lanes(8, seeds=[(3, 0)], agents=1).preferences(observation) is None
+    assert LaneActor(None, 8, seeds=[(3, 0)], agents=1).preferences(observation) is None

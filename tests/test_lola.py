@@ -13,7 +13,7 @@ from cprl import Custom, Experiment
 from cprl.algorithms import LOLA, LOLASettings
 from cprl.envs.make_env import make_env, spaces_of
 from cprl.envs.matrix import prisoners_dilemma
-from cprl.networks import MLP, Conv
+from cprl.networks import Conv
 from cprl.objectives import loaded_dice, lola_gradients, look_ahead_losses, looked_ahead
 from cprl.population import Scripted, Team
 from cprl.training import train
@@ -256,10 +256,10 @@ SAMPLED = LOLASettings(
 """Rollouts of 50 episodes; policies and critics are tables of the last joint action, as in the paper."""
 
 
-def course(estimator, *, updates, is_table=True, **changes):
-    """The mean payoff a turn in the last tenth of training, by replica; policies are tables or linear."""
-    network = Custom("lola_policies:Table") if is_table else MLP(hidden_cells=())
-    algorithm = LOLA(settings=replace(SAMPLED, **changes), estimator=estimator, network=network)
+def course(estimator, *, updates, look_ahead_rate):
+    """The mean payoff a turn in the last tenth of training, by replica."""
+    settings = replace(SAMPLED, look_ahead_rate=look_ahead_rate)
+    algorithm = LOLA(settings=settings, estimator=estimator, network=Custom("lola_policies:Table"))
     env = make_env(prisoners_dilemma(turns=TURNS), worlds=REPLICAS, seed=0)
     agents = Population(env, (Team(algorithm, PAIR, reward="individual"),), seed=1, engine="eager")
     (learner,) = agents.learners.values()
@@ -279,17 +279,17 @@ def test_naive_policy_gradients_defect_in_the_iterated_dilemma():
 
 
 @pytest.mark.slow
-def test_lola_by_policy_gradients_learns_to_cooperate_from_samples():
-    # Published: -1.17 (0.34) a turn, Foerster et al. (2018), table 3, LOLA-PG, of 4,000 rollouts of 150 turns
-    # an update; these are 2 of 1,000 turns.
-    found = course("policy_gradient", updates=40, look_ahead_rate=2.0)
-    assert found.mean() > -1.6
-    assert (found > -1.5).mean() >= 0.5
-
-
-@pytest.mark.slow
-def test_lola_by_dice_learns_to_cooperate_from_samples():
-    # Foerster et al., "DiCE" (2018), print a figure and no number: returns near -1 with enough rollouts.
-    found = course("dice", updates=40, look_ahead_rate=1.0)
-    assert found.mean() > -1.75
-    assert (found > -1.5).mean() >= 0.3
+@pytest.mark.parametrize(
+    ("estimator", "rate", "mean", "share"),
+    [
+        # Published: -1.17 (0.34) a turn, Foerster et al. (2018), table 3, LOLA-PG, of 4,000 rollouts of 150
+        # turns an update; these are 2 of 1,000 turns.
+        ("policy_gradient", 2.0, -1.6, 0.5),
+        # Foerster et al., "DiCE" (2018), print a figure and no number: near -1 with enough rollouts.
+        ("dice", 1.0, -1.75, 0.3),
+    ],
+)
+def test_lola_learns_to_cooperate_from_samples(estimator, rate, mean, share):
+    found = course(estimator, updates=40, look_ahead_rate=rate)
+    assert found.mean() > mean
+    assert (found > -1.5).mean() >= share

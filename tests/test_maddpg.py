@@ -29,7 +29,6 @@ from cprl.training.agents import Population
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater:UserWarning")
 TEAM = MADDPG(settings=REPLAY)
-FOUR = tuple(range(4))
 
 
 class Linear(nn.Module):
@@ -180,8 +179,7 @@ def test_without_noise_samples_come_from_torchs_generator_and_with_it_not():
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("action_space", ["categorical", "one-hot"])
-def test_the_loss_works_with_torchrl_alone(action_space):
+def test_the_loss_works_with_torchrl_alone():
     """Two agents are paid 2 if both choose action 1, 1 if both choose 0; from chance play, they learn to."""
     torch.manual_seed(0)
     action = torch.randint(2, (400, 2))
@@ -189,8 +187,7 @@ def test_the_loss_works_with_torchrl_alone(action_space):
     see, over = torch.ones(400, 2, 1), torch.ones(400, 1, dtype=torch.bool)
     group = {"observation": see, "reward": paid[:, None, None].expand(400, 2, 1).clone()}
     after = TensorDict({"agents": TensorDict(group, [400, 2]), "done": over, "terminated": over}, [400])
-    done = nn.functional.one_hot(action, 2) if action_space == "one-hot" else action
-    own = TensorDict({"observation": see, "action": done}, [400, 2])
+    own = TensorDict({"observation": see, "action": action}, [400, 2])
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(400), batch_size=32)
     buffer.extend(TensorDict({"agents": own, "next": after}, [400]))
     actors, hidden = (
@@ -200,9 +197,8 @@ def test_the_loss_works_with_torchrl_alone(action_space):
     loss = MADDPGLoss(
         TensorDictModule(actors, [("agents", "observation")], [("agents", "logits")]),
         TensorDictModule(nn.Sequential(nn.Flatten(2), hidden), ["joint_action"], ["state_action_value"]),
-        action_space=action_space,
     )
-    loss.set_keys(action=("agents", "action"), logits=("agents", "logits"), reward=("agents", "reward"))
+    loss.set_keys(action=("agents", "action"), reward=("agents", "reward"))
     updater, optimizer = SoftUpdate(loss, tau=0.05), torch.optim.Adam(loss.parameters(), lr=0.02)
     before = loss.target_actor_network_params.get(("module", "weight")).clone()
     for _ in range(200):
@@ -295,13 +291,6 @@ def test_returns_of_several_steps_are_those_of_each_member():
     wanted = [[[3, 30], [4, 40], [24, 240]], [[9, 90], [12, 120], [72, 720]]]
     assert got["next", "reward"].squeeze(-1).tolist() == wanted
     assert got["steps_to_next_obs"].squeeze(-1).tolist() == [[3, 2, 3], [3, 1, 3]]
-
-
-def test_the_fastest_way_is_found_for_teams_of_two_and_of_four():
-    for members in (FOUR, (1, 3)):
-        others = [Scripted()] * (4 - len(members))
-        _, learner = learner_of([Team(TEAM, members, reward="individual"), *others])
-        assert not learner.engine._vmapped, "networks have a lane axis"
 
 
 # ---- noise, for any algorithm that samples

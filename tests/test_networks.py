@@ -1,4 +1,4 @@
-"""Which network an agent has: fully connected, convolutional, or one of your own."""
+"""Which network an agent has: fully connected, convolutional, or one of your own; who acts by which."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from dqn_parts import learner_of_parts, make_learner
 from tensordict import TensorDict
 from torch import nn
 
-from cprl import CommonsEnv, Game, Rules, maps
+from cprl import CommonsEnv, Game, Rules, keys, maps, presets
 from cprl.algorithms import (
     A2C,
     CQL,
@@ -36,6 +36,8 @@ from cprl.learners.replay import ReplayLearner
 from cprl.networks import MLP, Conv, ConvNetwork, MLPNetwork
 from cprl.networks.specification import new_network
 from cprl.networks.stacked import stack_lanes
+from cprl.policies.assignment import AgentPolicies
+from cprl.policies.lanes import RandomActor
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -98,15 +100,24 @@ def test_a_convolutional_network_is_the_layers_that_one_would_write_down():
     assert (network(seen) >= 0).all()
 
 
-def test_glorot_uniform_weights_have_zero_biases():
-    network = CONV.make(SPACES, 8, glorot_uniform=True)
-    layers = [layer for layer in network.modules() if isinstance(layer, nn.Linear | nn.Conv2d)]
-    assert len(layers) == 4
-    for layer in layers:
-        assert not layer.bias.any()
-        fan_in, fan_out = nn.init._calculate_fan_in_and_fan_out(layer.weight)
-        limit = (6 / (fan_in + fan_out)) ** 0.5
-        assert 0.8 * limit < layer.weight.abs().max() <= limit
+def test_a_fully_connected_network_reads_bytes_as_brightness_in_0_to_1():
+    network = MLP(hidden_cells=(6,)).make(SPACES, 7)
+    by_hand = network.layers(torch.full((2, 45), 0.2))
+    torch.testing.assert_close(network(torch.full((2, 3, 3, 5), 51, dtype=torch.uint8)), by_hand)
+
+
+@pytest.mark.parametrize("network", [MLP(), CONV])
+def test_the_study_as_run_has_relu_on_the_values_and_glorot_weights_with_zero_biases(network):
+    made = network.make(SPACES, 8, relu_on_outputs=True, glorot_uniform=True)
+    values = made(torch.randint(256, (500, *SPACES.observation_shape), dtype=torch.uint8))
+    assert (values >= 0).all()
+    assert (values == 0).any()
+    for layer in made.modules():
+        if isinstance(layer, nn.Linear | nn.Conv2d):
+            assert not layer.bias.any()
+            fan_in, fan_out = nn.init._calculate_fan_in_and_fan_out(layer.weight)
+            limit = (6 / (fan_in + fan_out)) ** 0.5
+            assert 0.8 * limit < layer.weight.abs().max() <= limit
 
 
 def test_without_a_network_the_settings_say_the_hidden_layers():
@@ -299,3 +310,37 @@ def test_c51_takes_returns_beyond_its_range_for_its_first_and_last_atom(lowest, 
     expected = -chances[torch.arange(4), atom]
     torch.testing.assert_close(loss(batch)["loss"], expected, rtol=1e-4, atol=1e-4)
     assert network.support[[0, -1]].tolist() == pytest.approx([lowest, highest], rel=1e-6, abs=1e-6)
+
+
+def test_a_random_actor_uses_every_action_and_its_own_seed():
+    def actions(seed):
+        return RandomActor(5, seed=seed)(TensorDict({}, [4000]))["action"]
+
+    assert torch.equal(actions(1), actions(1))
+    assert not torch.equal(actions(1), actions(2))
+    assert torch.bincount(actions(1), minlength=5).min() > 700
+    state = torch.get_rng_state()
+    actions(3)
+    assert torch.equal(torch.get_rng_state(), state), "nothing is drawn from torch's global generator"
+
+
+class Brightest(torch.nn.Module):
+    """Acts by the first pixel that it is shown."""
+
+    def forward(self, tensordict):
+        return tensordict.set("action", tensordict["observation"][..., 0, 0, 0].long())
+
+
+def test_each_actor_sees_the_window_of_its_own_agent():
+    windows = torch.zeros(3, 2, 3, 4, 5, dtype=torch.uint8)
+    windows[:, 0, 0, 0, 0] = torch.tensor([1, 2, 3])
+    windows[:, 1, 0, 0, 0] = torch.tensor([4, 5, 6])
+    moment = TensorDict({"agents": TensorDict({"observation": windows}, (3, 2))}, (3,))
+    chosen = AgentPolicies([Brightest(), Brightest()])(moment)[keys.ACTION]
+    assert chosen.tolist() == [[1, 4], [2, 5], [3, 6]]
+
+
+def test_actors_must_be_as_many_as_agents():
+    env = CommonsEnv(presets.game("two_complex"), 3)
+    with pytest.raises(ValueError, match="1 actors for 2 agents"):
+        AgentPolicies([RandomActor(8)])(env.reset())

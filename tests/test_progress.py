@@ -9,7 +9,7 @@ from rich.console import Console
 from tensordict import TensorDict
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.policies.lanes import random_lanes
+from cprl.policies.lanes import LaneActor
 from cprl.system.compile_clock import CLOCK
 from cprl.terminal import progress
 from cprl.terminal.progress import ProgressBar
@@ -22,7 +22,7 @@ def lines(monkeypatch, *, before):
     """What is printed of a training of 6 episodes, as if so many episodes of 2 replicas had ended before."""
     monkeypatch.setattr(progress, "_LINE_PERIOD_S", 0.0)
     told = io.StringIO()
-    walker = random_lanes(8, seeds=[(0,), (1,)], agents=1)
+    walker = LaneActor(None, 8, seeds=[(0,), (1,)], agents=1)
     with ProgressBar(GAME, episodes=9, replicas=2, console=Console(file=told, width=200)) as bar:
         if before:
             bar.load_state_dict({"episodes": before})

@@ -18,11 +18,9 @@ from torchrl.envs import (
     DTypeCastTransform,
     EnvBase,
     ParallelEnv,
-    RewardSum,
     SerialEnv,
     StepCounter,
     TimeMaxPool,
-    TransformedEnv,
     VecNormV2,
 )
 from torchrl.envs.utils import check_env_specs
@@ -120,13 +118,6 @@ def test_entries_have_the_shapes_and_types_of_the_house_and_each_spec_is_there_f
     assert observation.expand(worlds, *observation.shape) == env.observation_spec
 
 
-def test_flags_are_drawn_as_both_values():
-    drawn = CommonsEnv(presets.game("commons"), worlds=50).observation_spec.rand()
-    for key in (keys.IN_PLAY, keys.FIRED, keys.HIT_BY, keys.TAGGED_BY):
-        assert drawn[key].dtype == torch.bool
-        assert 0.3 < drawn[key].float().mean() < 0.7, key
-
-
 def test_the_reward_is_the_harvest_and_changing_it_leaves_the_harvest_alone():
     env = CommonsEnv(SHORT, worlds=4)
     steps = env.rollout(9, break_when_any_done=False)["next"]
@@ -201,14 +192,6 @@ def test_rollouts_collectors_and_a_world_alone_give_the_same_turns():
     assert rolled["next", "done"].any()
     one = CommonsEnv(SHORT, worlds=1, seed=1, first_world=2)
     assert_close(rolled[2:3], one.rollout(30, ByWindow(), break_when_any_done=False))
-
-
-def test_transforms_wrap_it():
-    env = TransformedEnv(CommonsEnv(SHORT, worlds=2), RewardSum(in_keys=[keys.REWARD]))
-    check_env_specs(env)
-    steps = env.rollout(9, break_when_any_done=False)
-    total = steps["next", "agents", "episode_reward"][:, -1]
-    assert torch.equal(total[..., 0], steps["next", "agents", "harvest"].sum(1))
 
 
 @pytest.mark.parametrize("game", [GOVERNED, RICH], ids=["rgb", "rich"])

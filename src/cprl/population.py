@@ -196,13 +196,13 @@ def exploration_steps(specs: Sequence[AgentSpec]) -> int | None:
     None if no agent explores by epsilon, or only by an algorithm of the user's own. Agents that draw from a
     policy do not, though the settings of those that learn from replay have an epsilon.
     """
-    algorithms = [spec.algorithm for spec in specs if isinstance(spec, Learning | Team)]
-    settings = [own.settings for own in algorithms if not isinstance(own, Custom) and not own.stochastic]
-    ends = [
-        own.epsilon_hold_steps + own.epsilon_decay_steps
-        for own in settings
-        if isinstance(own, Exploring) and own.epsilon_end < own.epsilon_start
-    ]
+    ends = []
+    for spec in specs:
+        algorithm = spec.algorithm if isinstance(spec, Learning | Team) else None
+        if isinstance(algorithm, Algorithm) and not algorithm.stochastic:
+            settings = algorithm.settings
+            if isinstance(settings, Exploring) and settings.epsilon_end < settings.epsilon_start:
+                ends.append(settings.epsilon_hold_steps + settings.epsilon_decay_steps)
     return max(ends, default=None)
 
 

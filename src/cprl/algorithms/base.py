@@ -33,10 +33,7 @@ from cprl.values import Range, Value, Where, checked
 
 TrainingEngine: TypeAlias = Literal["compiled", "eager", "torchrl"]
 """How agents are updated. "compiled": all together, in one update that torch compiles; "eager": the same
-update, uncompiled; "torchrl": by TorchRL's stock parts, one agent after the other, see
-`cprl.learners.reference`."""
-
-
+update, uncompiled; "torchrl": by TorchRL's stock parts, one agent after the other."""
 Weight = Annotated[float, Range(0, 1e6)]
 """Of a term of a loss."""
 
@@ -60,7 +57,7 @@ class Algorithm(Value, stored=False):
     loss_functions: ClassVar[tuple[str, ...]] = TORCHRL_DISTANCES
     """What its field `loss_function` may be, if it has one."""
     can_share_parameters: ClassVar[bool] = False
-    """Whether agents of a team can share one network, see `cprl.population.Team`."""
+    """Whether agents of a team can share one network."""
     can_be_recurrent: ClassVar[bool] = False
     """Whether its networks can be recurrent: its loss must pass on the states of sequences, see
     `cprl.algorithms.base.module_of`."""
@@ -85,8 +82,8 @@ class Algorithm(Value, stored=False):
             )
 
     def new_network(self, spaces: Spaces, outputs: int, **options: Any) -> nn.Module:
-        """Return a new network of the algorithm's architecture; see `cprl.networks.specification.new_network`
-        for `options`."""
+        """Return a new network of the algorithm's architecture; `options` are those of
+        `cprl.networks.specification.new_network`."""
         network, cells = self.network, self.settings.hidden_cells
         if network is not None and cells != DEFAULT_HIDDEN_CELLS:
             raise ValueError(
@@ -120,12 +117,8 @@ class Algorithm(Value, stored=False):
         )
 
     def make_learner(self, who: LearningAgents, engine: TrainingEngine = "compiled") -> Learner:
-        """The learner of these agents in every replica.
-
-        Raises:
-            ValueError: if the algorithm does not support these agents, or the engine does not support the
-                algorithm.
-        """
+        """The learner of these agents in every replica; raises a ValueError where the algorithm does not
+        support them, or the engine not the algorithm."""
         raise NotImplementedError(f"{type(self).__name__} must define make_learner(who, engine)")
 
     def _refuse_torchrl(self, engine: TrainingEngine) -> None:
@@ -245,12 +238,12 @@ class TeamAlgorithm(Algorithm, stored=False):
             )
 
 
-def refuse_relu(name: str, settings: DQNSettings) -> None:
+def refuse_relu(algorithm: Algorithm) -> None:
     """Raises a ValueError for `relu_on_outputs` of an algorithm without Q values to act by."""
-    if settings.relu_on_outputs:
+    if algorithm.settings.relu_on_outputs:
         raise ValueError(
-            f"settings.relu_on_outputs is True; allowed for {name}, whose acting network does not output Q "
-            "values: False"
+            f"settings.relu_on_outputs is True; allowed for {type(algorithm).__name__}, whose acting network "
+            "does not output Q values: False"
         )
 
 
@@ -266,16 +259,14 @@ def module_of(network: nn.Module, name: str, *, state: str = "recurrent_state") 
 
 
 def q_actor(network: nn.Module) -> QValueActor:
-    """TorchRL's `QValueActor` with a network's outputs as action values; for recurrent ones see
-    `module_of`."""
+    """TorchRL's `QValueActor` with a network's outputs as action values."""
     return QValueActor(module_of(network, "action_value"), spec=None, action_space="categorical")
 
 
 def policy(network: nn.Module) -> ProbabilisticTensorDictSequential:
-    """TorchRL's categorical policy with a network's outputs as logits; a recurrent network also reads
-    "recurrent_state" and "is_init", as `cprl.networks.recurrent` says."""
+    """TorchRL's categorical policy with a network's outputs as logits."""
     return ProbabilisticActor(
-        module_of(network, "logits", state="recurrent_state"),
+        module_of(network, "logits"),
         in_keys=["logits"],
         out_keys=["action"],
         distribution_class=LaneCategorical,

@@ -31,9 +31,7 @@ from cprl.algorithms.base import (
 from cprl.commons.spaces import Spaces
 from cprl.learners.base import Learner, LearningAgents
 from cprl.learners.engine import Batching
-from cprl.learners.settings import (
-    TabularSettings,
-)
+from cprl.learners.settings import TabularSettings
 from cprl.learners.tabular import TabularLearner, table_network
 from cprl.networks.agent import AgentNetworks, AtomNetwork, JointNetwork, OtherOutputs
 from cprl.networks.mlp import MOST_CELLS
@@ -111,7 +109,7 @@ class DistributionalDQN(OffPolicy):
         )
 
     def make_loss(self, network: nn.Module) -> LossModule:
-        refuse_relu(type(self).__name__, self.settings)
+        refuse_relu(self)
         assert isinstance(network, AtomNetwork)
         actor = DistributionalQValueActor(
             OtherOutputs(network, "atom_logits"),
@@ -156,7 +154,6 @@ class _WeightedCQLLoss(DiscreteCQLLoss):
         self._weight = weight
 
     def cql_loss(self, tensordict: TensorDictBase) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """The weighted conservative term."""
         loss, metadata = super().cql_loss(tensordict)
         return self._weight * loss, metadata
 
@@ -182,7 +179,7 @@ class SAC(OffPolicy):
         return self.new_networks(spaces, actor=actions, critic_0=actions, critic_1=actions)
 
     def make_loss(self, network: nn.Module) -> LossModule:
-        refuse_relu(type(self).__name__, self.settings)
+        refuse_relu(self)
         assert isinstance(network, AgentNetworks)
         loss = DiscreteSACLoss(
             policy(network["actor"]),
@@ -217,7 +214,7 @@ class IQL(OffPolicy):
         return self.new_networks(spaces, actor=actions, critic_0=actions, critic_1=actions, value=1)
 
     def make_loss(self, network: nn.Module) -> LossModule:
-        refuse_relu(type(self).__name__, self.settings)
+        refuse_relu(self)
         assert isinstance(network, AgentNetworks)
         loss = DiscreteIQLLoss(
             policy(network["actor"]),
@@ -260,19 +257,14 @@ class PR2(OffPolicy):
     batching: ClassVar[Batching | None] = "lane_axis"
 
     def make_network(self, spaces: Spaces) -> nn.Module:
-        """New networks of one agent.
-
-        Raises:
-            ValueError: for a game of one agent.
-        """
         if spaces.agents < 2:
             raise ValueError(
                 f"{type(self).__name__} learns from the actions of its peers, and the game has "
                 f"{spaces.agents} agent; allowed: games of 2 agents or more; for one agent use DQN or SAC"
             )
         peers, actions = spaces.agents - 1, spaces.actions
-        relu = self.settings.relu_on_outputs
-        values = self.new_network(spaces, peers * actions * actions, relu_on_outputs=relu)
+        options = {"relu_on_outputs": self.settings.relu_on_outputs}
+        values = self.new_network(spaces, peers * actions * actions, **options)
         return JointNetwork(values, actions=actions, peers=peers, temperature=self.temperature)
 
     def make_loss(self, network: nn.Module) -> LossModule:
@@ -294,11 +286,6 @@ class Tabular(Algorithm):
     settings_kind: ClassVar[type[Any]] = TabularSettings
 
     def make_network(self, spaces: Spaces) -> TableNetwork:
-        """The table of one agent, initially empty.
-
-        Raises:
-            ValueError: if agents observe more than ("agents", "observation").
-        """
         return table_network(spaces)
 
     def make_learner(self, who: LearningAgents, engine: TrainingEngine = "compiled") -> Learner:

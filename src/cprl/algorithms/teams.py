@@ -160,10 +160,9 @@ class MADDPG(TeamAlgorithm, OffPolicy):
     loss_function: str = "l2"
     """The loss of the critics' temporal-difference errors, as `DQN.loss_function`."""
     network: Network | Custom | None = None
-    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`. The
-    critics' fully connected layers read observations and actions side by side. Another network maps the
-    observations of all members to as many features as the last of `settings.hidden_cells` has units, and one
-    more layer of that size joins them with the actions."""
+    """As `DQN.network`. The critics' fully connected layers read observations and actions side by side.
+    Another network maps the observations of all members to as many features as the last of
+    `settings.hidden_cells` has units, and one more layer of that size joins them with the actions."""
     shares_reward: ClassVar[bool] = False
     fewest_members: ClassVar[int] = 2
     stochastic: ClassVar[bool] = True
@@ -189,12 +188,9 @@ class MADDPG(TeamAlgorithm, OffPolicy):
             features, cells = cells[-1], cells[-1:]
             each = [self.new_network(spaces, features, shape=everything) for _ in range(members)]
             encoders = Team(each, observation_dims=dims)
-        names = "relu_on_outputs", "glorot_uniform"
-        options = {name: getattr(self.settings, name) for name in names}
-        heads = [
-            MLPNetwork((features + joint,), 1, hidden_cells=cells, highest=1.0, **options)
-            for _ in range(members)
-        ]
+        options = {name: getattr(self.settings, name) for name in ("relu_on_outputs", "glorot_uniform")}
+        shape = (features + joint,)
+        heads = [MLPNetwork(shape, 1, hidden_cells=cells, highest=1.0, **options) for _ in range(members)]
         return JointCritics(
             Team(heads, observation_dims=1),
             encoders,
@@ -241,23 +237,17 @@ class LOLA(TeamAlgorithm):
     fewest_members: ClassVar[int] = 2
 
     def make_network(self, spaces: Spaces) -> nn.Module:
-        """New networks of one member: "actor" and "critic"."""
         return self.new_networks(spaces, actor=spaces.actions, critic=1)
 
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
-        """The members' networks in a row, as `make_loss` reads them."""
         return nn.ModuleList(members)
 
     def make_loss(self, network: nn.Module) -> LossModule:
-        """The loss of a team, from `make_team`."""
         of_members: Any = network
         actors = [policy(member["actor"]) for member in of_members]
-        options: dict[str, Any] = {
-            "look_ahead_rate": self.settings.look_ahead_rate,
-            "gamma": self.settings.gamma,
-            "entropy_coeff": self.entropy_coeff,
-        }
-        return LOLADiCELoss(actors, **options) if self.estimator == "dice" else LOLALoss(actors, **options)
+        make = LOLADiCELoss if self.estimator == "dice" else LOLALoss
+        rate, gamma = self.settings.look_ahead_rate, self.settings.gamma
+        return make(actors, look_ahead_rate=rate, gamma=gamma, entropy_coeff=self.entropy_coeff)
 
     def method(self, spaces: Spaces) -> Method:
         return replace(super().method(spaces), make_team=None)  # members are lanes of their own

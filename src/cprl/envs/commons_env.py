@@ -31,12 +31,9 @@ _AHEAD_TURNS = 16
 _BALLOT_ENTRIES = (keys.IN_FORCE, keys.BALLOTS_DUE)
 _PAID_ENTRIES = ("fines", "transfers", "violated", "counts")
 """Entries of agents in games with institutions."""
-_REPLACED = frozenset(
-    (
-        *(*WORLD_ENTRIES, *DONE_ENTRIES, *_BALLOT_ENTRIES, keys.STATE, keys.AGENTS, "next", "_reset"),
-        *(*_AGENT_ENTRIES, *_PAID_ENTRIES, "scoreboard", "stock_gauge", "reward"),
-    )
-)
+_REPLACED = frozenset((*WORLD_ENTRIES, *DONE_ENTRIES, *_BALLOT_ENTRIES, *_AGENT_ENTRIES, *_PAID_ENTRIES)) | {
+    *(keys.STATE, keys.AGENTS, "next", "_reset", "scoreboard", "stock_gauge", "reward")
+}
 """The entries that the environment writes anew in each turn."""
 
 
@@ -107,10 +104,8 @@ class CommonsEnv(LeanStepEnv):
     def _make_specs(self) -> None:
         game, worlds, per_agent = self.game, self._size, self._agents_size
         highest = {"observation": game.observation_highest, "harvest": 1, "stock_gauge": 1}
-        highest |= {
-            "scoreboard": game.rules.episode_steps,
-            **dict.fromkeys(WORLD_ENTRIES, len(game.map.sites)),
-        }
+        highest |= {"scoreboard": game.rules.episode_steps}
+        highest |= dict.fromkeys(WORLD_ENTRIES, len(game.map.sites))
 
         def specs(names: Iterable[str]) -> dict[str, TensorSpec]:
             return {name: spec(name, *self._forms[name]) for name in names}
@@ -122,24 +117,19 @@ class CommonsEnv(LeanStepEnv):
                 return Bounded(0, highest[name], shape=shape, dtype=dtype)
             return Unbounded(shape=shape, dtype=dtype)
 
-        def group(**of_agents: TensorSpec) -> Composite:
-            return Composite(agents=Composite(**of_agents, shape=per_agent), shape=(worlds,))
+        def group(of_agents: dict[str, TensorSpec], **of_worlds: TensorSpec) -> Composite:
+            return Composite(agents=Composite(of_agents, shape=per_agent), **of_worlds, shape=(worlds,))
 
         choices = {"action": len(game.actions), **({"decision": game.decisions} if self._decides else {})}
         self.action_spec = group(
-            **{
-                name: Categorical(count, shape=per_agent, dtype=torch.int64)
-                for name, count in choices.items()
-            }
+            {name: Categorical(count, shape=per_agent, dtype=torch.int64) for name, count in choices.items()}
         )
-        observation = group(**specs(self._agent_entries))
-        for name, of_worlds in specs(self._world_entries).items():
-            observation[name] = of_worlds
+        of_worlds = specs(self._world_entries)
         if self._with_state:
             board = worlds, 3, game.map.height, game.map.width
-            observation[keys.STATE] = Bounded(0, 255, shape=board, dtype=torch.uint8)
-        self.observation_spec = observation
-        self.reward_spec = group(reward=Unbounded(shape=(*per_agent, 1), dtype=torch.float32))
+            of_worlds[keys.STATE] = Bounded(0, 255, shape=board, dtype=torch.uint8)
+        self.observation_spec = group(specs(self._agent_entries), **of_worlds)
+        self.reward_spec = group({"reward": Unbounded(shape=(*per_agent, 1), dtype=torch.float32)})
         self.done_spec = Composite(specs(DONE_ENTRIES), shape=(worlds,))
 
     def __repr__(self) -> str:
@@ -148,17 +138,14 @@ class CommonsEnv(LeanStepEnv):
     def _fresh(self) -> tuple[dict[str, Tensor], Output]:
         """New memory for the output of a turn: as tensors by name, and the same memory as arrays."""
         if not self._ahead:
-            names, blocks = (
-                list(self._forms),
-                [
-                    torch.empty((self._turns_ahead, *shape), dtype=dtype, device=self.device)
-                    for shape, dtype in self._forms.values()
-                ],
-            )
+            blocks = [
+                torch.empty((self._turns_ahead, *shape), dtype=dtype, device=self.device)
+                for shape, dtype in self._forms.values()
+            ]
             tensors = zip(*(block.unbind() for block in blocks), strict=True)
             arrays = zip(*(self._turns_of(block) for block in blocks), strict=True)
             for turn, output in zip(tensors, arrays, strict=True):
-                self._ahead.append((dict(zip(names, turn, strict=True)), output_of(output)))
+                self._ahead.append((dict(zip(self._forms, turn, strict=True)), output_of(output)))
         return self._ahead.pop()
 
     def _show_in(self, tensors: dict[str, Tensor], output: Output) -> None:
@@ -186,9 +173,7 @@ class CommonsEnv(LeanStepEnv):
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Restarts from a seed, 0 to 2**64 - 1; see `EnvBase.set_seed`."""
-        following: int | None = super().set_seed(
-            None if seed is None else checked("seed", seed, Seed), static_seed
-        )
+        following: int | None = super().set_seed(checked("seed", seed, Seed | None), static_seed)
         return following
 
     def _set_seed(self, seed: int | None) -> None:

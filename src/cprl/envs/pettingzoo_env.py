@@ -33,8 +33,8 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
     "violated" a rule.
 
     Args:
-        seed: The seed of all random numbers, 0 to 2**64 - 1; `reset(seed=...)` restarts with another one.
-            None draws one from torch's generator, another for each environment, as `CommonsEnv` does.
+        seed: of all random numbers; `reset(seed=...)` restarts with another one. None draws one from torch's
+            generator, another for each environment, as `CommonsEnv` does.
     """
 
     metadata: ClassVar[dict[str, Any]] = {
@@ -91,7 +91,6 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         """Begins the next episode, or the first episode of a new seed.
 
         Args:
-            seed: The new seed, or None for the next episode.
             options: "decisions", a dict by agent, is what agents decide in this episode where institutions
                 ask them (`Game.decisions` options, the first one by default); others are ignored.
         """
@@ -119,12 +118,8 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
     def step(
         self, actions: dict[str, int]
     ) -> tuple[dict[str, Observed], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
-        """Plays one turn with one action per agent.
-
-        Raises:
-            ValueError: If an action is missing, superfluous, no integer or out of range, or the episode has
-                not begun or has ended; the world is unchanged.
-        """
+        """Plays one turn with one action per agent; actions that do not fit, and steps before or after an
+        episode, raise a ValueError and leave the world unchanged."""
         self._check_begun("the first step")
         if not self.agents:
             raise ValueError("the episode has ended; allowed: reset() before the next step")
@@ -172,9 +167,8 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
             "tagged": bool(output.tagged_by[0, agent].any()),
         }
         if payments is not None:
-            info["fines"], info["transfers"] = (
-                float(paid[0, agent]) for paid in (payments.fines, payments.transfers)
-            )
+            info["fines"] = float(payments.fines[0, agent])
+            info["transfers"] = float(payments.transfers[0, agent])
             info["violated"] = bool(payments.violated[0, agent])
         return info
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.parameter import is_lazy
 from torchrl.envs import Compose, EnvBase, TransformedEnv
@@ -98,24 +98,13 @@ def _load(env: TransformedEnv, state: dict[str, Any]) -> None:
 
 def carried_state(carried: TensorDictBase) -> dict[str, Any]:
     """The TensorDict that an environment is stepped with as nested tables of tensors."""
-    return {
-        name: carried_state(value) if isinstance(value, TensorDictBase) else value
-        for name, value in carried.items()
-    }
+    table: dict[str, Any] = carried.to_dict()
+    return table
 
 
 def load_carried(fresh: TensorDictBase, state: Mapping[str, Any]) -> TensorDictBase:
     """The TensorDict of `carried_state`, in the form of what `env.reset()` gives."""
-    carried = fresh.empty()
-    for name, value in state.items():
-        if isinstance(value, Tensor):
-            carried.set(name, value.to(carried.device) if carried.device else value)
-        else:
-            inner = fresh.get(name, None)
-            size = carried.batch_size if inner is None else inner.batch_size
-            empty = TensorDict({}, batch_size=size, device=carried.device)
-            carried.set(name, load_carried(empty if inner is None else inner, value))
-    return carried
+    return fresh.empty(recurse=True).update(dict(state))
 
 
 def _array(name: str, tensor: Any) -> Any:

@@ -78,14 +78,8 @@ class TabularLearner(Learner):
         next_seen = states_of(keys.entry(after, keys.AGENTS), self._observed, self.agents)
         next_rows = np.full(self.lanes, NEVER_MET, np.int64)
         next_rows[on] = self.tables.find_or_add([next_seen[lane] for lane in on], on.tolist())
-        self._turns.append(
-            {
-                "row": rows,
-                "action": turn.action.copy(),
-                "reward": turn.reward.astype(np.float64),
-                "next_row": next_rows,
-            }
-        )
+        reward, action = turn.reward.astype(np.float64), turn.action.copy()
+        self._turns.append({"row": rows, "action": action, "reward": reward, "next_row": next_rows})
         self.steps += 1
         self.actor.epsilon = self.settings.epsilon(self.steps)
 

@@ -1,7 +1,7 @@
 """MADDPGLoss: actors with centralised critics, for discrete actions."""
 
 from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias
+from typing import ClassVar, Final
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -10,8 +10,6 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
 from cprl.objectives.td import TDLoss, distance
-
-ActionSpace: TypeAlias = Literal["categorical", "one-hot"]
 
 NUMBERS: Final = 2
 """Uniform numbers that the loss takes for each transition and member: one samples the member's next action
@@ -32,35 +30,31 @@ class MADDPGLoss(TDLoss):
     Source: Lowe et al., "Multi-Agent Actor-Critic for Mixed Cooperative-Competitive Environments" (2017).
 
     Args:
-        actor_network: writes "logits", float [.., S, A], of member i from what member i observes. It reads
-            entries that the batch has at its root and under "next".
-        critic_network: writes "state_action_value", float [.., S, 1], from such entries and "joint_action",
-            float one-hot [.., S, S, A]: row i holds the actions of all members by which the critic of member
-            i judges.
+        actor_network: its output are logits, float [.., S, A], of member i from what member i observes. It
+            reads entries that the batch has at its root and under "next".
+        critic_network: its output are values, float [.., S, 1], from such entries and "joint_action", float
+            one-hot [.., S, S, A]: row i holds the actions of all members by which the critic of member i
+            judges.
         loss_function: of the critics' errors: "l2", "smooth_l1", "l1" or "log_cosh".
         logit_penalty: the weight of the mean squared logit of each member in the actors' loss, 0 or more;
             1e-3 in the published program.
-        action_space: "categorical" for actions int64 [.., S], "one-hot" for actions [.., S, A].
         reduction: "mean" or "sum" over transitions, or "none" for losses [..].
 
     Call `make_value_estimator(ValueEstimators.TD0, gamma=0.95)` for the discount, 0.99 by default; it is
     raised to "steps_to_next_obs" where the batch has that entry. Targets are moved by TorchRL's `SoftUpdate`
     or `HardUpdate`.
 
-    `forward` reads the entries of the networks, "action", and under "next" "reward" float [.., S, 1], and
-    "done" and "terminated" bool [.., 1] or [.., S, 1]; other names are set by `set_keys`. "noise", float
-    [.., S, 2] of uniform numbers in 0..1, decides what is sampled; without it they come from torch's global
-    generator. It writes nothing into the batch, and returns, summed over members and then reduced,
-    "loss_actor" and "loss_value", and without gradients "entropy", in nats, "pred_value", "target_value" and
-    "td_error", float [.., S, 1], squared.
+    `forward` reads the entries of the networks, "action" int64 [.., S], and under "next" "reward" float
+    [.., S, 1], "done" and "terminated" bool [.., 1] or [.., S, 1]; other names are set by `set_keys`.
+    "noise", float [.., S, 2] of uniform numbers in 0..1, decides what is sampled; without it they come from
+    torch's global generator. It writes nothing into the batch, and returns, summed over members and then
+    reduced, "loss_actor" and "loss_value", and without gradients "entropy", in nats, "pred_value",
+    "target_value" and "td_error", float [.., S, 1], squared.
     """
 
     @dataclass
     class _AcceptedKeys:
         action: NestedKey = "action"
-        logits: NestedKey = "logits"
-        joint_action: NestedKey = "joint_action"
-        state_action_value: NestedKey = "state_action_value"
         reward: NestedKey = "reward"
         done: NestedKey = "done"
         terminated: NestedKey = "terminated"
@@ -68,6 +62,7 @@ class MADDPGLoss(TDLoss):
         noise: NestedKey = "noise"
 
     default_keys = _AcceptedKeys
+    estimated: ClassVar[tuple[str, ...]] = ("reward", "done", "terminated", "steps_to_next_obs")
     out_keys = ("loss_actor", "loss_value", "entropy", "pred_value", "target_value", "td_error")
 
     actor_network: TensorDictModule
@@ -84,7 +79,6 @@ class MADDPGLoss(TDLoss):
         *,
         loss_function: str = "l2",
         logit_penalty: float = 1e-3,
-        action_space: ActionSpace = "categorical",
         reduction: str = "mean",
     ) -> None:
         super().__init__()
@@ -96,32 +90,25 @@ class MADDPGLoss(TDLoss):
             compare_against=list(actor_network.parameters()),
         )
         self.loss_function, self.logit_penalty = loss_function, logit_penalty
-        self.action_space, self.reduction = action_space, reduction
+        self.reduction = reduction
 
     @property
     def in_keys(self) -> list[NestedKey]:
         """The entries that `forward` reads."""
         keys = self.tensor_keys
-        seen = {*self.actor_network.in_keys, *self.critic_network.in_keys} - {keys.joint_action}
+        seen = {*self.actor_network.in_keys, *self.critic_network.in_keys} - {"joint_action"}
         after = {keys.reward, keys.done, keys.terminated, *seen}
         every = {keys.action, *seen, *(("next", key) for key in after)}
         return sorted(map(unravel_key, every), key=str)
 
-    def _estimator_keys(self) -> dict[str, NestedKey]:
-        keys = self.tensor_keys
-        names = ("reward", "done", "terminated", "steps_to_next_obs")
-        return {"value": keys.state_action_value, **{name: getattr(keys, name) for name in names}}
-
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The losses of a batch of transitions."""
-        logits = self._logits(tensordict, self.actor_network_params)
-        taken = self._one_hot(tensordict.get(self.tensor_keys.action), logits)
+        logits = self.outputs_of("actor_network", self.actor_network_params, tensordict)
+        taken = _one_hot(tensordict.get(self.tensor_keys.action), logits)
         next_noise, noise = self._noise(tensordict, logits).unbind(-1)
         target = self._target_value(tensordict, next_noise)
-        value = self._values(
-            tensordict, taken.unsqueeze(-3).expand(*_joint(taken)), self.critic_network_params
-        )
+        value = self._values(tensordict, _for_each_member(taken), self.critic_network_params)
         errors = distance(value, target, self.loss_function)
         actor_losses = self._actor_losses(tensordict, logits, taken, noise)
         with torch.no_grad():
@@ -148,9 +135,8 @@ class MADDPGLoss(TDLoss):
         keys, after = self.tensor_keys, tensordict.get("next")
         reward = after.get(keys.reward)
         with torch.no_grad():
-            logits = self._logits(after, self.target_actor_network_params)
-            actions = sampled_one_hot(logits.softmax(-1), noise)
-            joint = actions.unsqueeze(-3).expand(*_joint(actions))
+            logits = self.outputs_of("actor_network", self.target_actor_network_params, after)
+            joint = _for_each_member(sampled_one_hot(logits.softmax(-1), noise))
             value = self._values(after, joint, self.target_critic_network_params)
             entries = {
                 ("next", keys.reward): reward,
@@ -166,27 +152,9 @@ class MADDPGLoss(TDLoss):
             target: Tensor = self.value_estimator.value_estimate(transitions, next_value=value)
         return target
 
-    def _logits(self, tensordict: TensorDictBase, weights: TensorDictBase) -> Tensor:
-        """Of the policy of each member, [.., S, A]."""
-        seen = tensordict.select(*self.actor_network.in_keys)
-        with weights.to_module(self.actor_network, preserve_module_state=False):
-            logits: Tensor = self.actor_network(seen).get(self.tensor_keys.logits)
-        return logits
-
     def _values(self, tensordict: TensorDictBase, joint: Tensor, weights: TensorDictBase) -> Tensor:
         """Of joint actions [.., S, S, A] by the critic of each member, [.., S, 1]."""
-        key = self.tensor_keys.joint_action
-        seen = tensordict.select(*(entry for entry in self.critic_network.in_keys if entry != key))
-        seen.set(key, joint)
-        with weights.to_module(self.critic_network, preserve_module_state=False):
-            values: Tensor = self.critic_network(seen).get(self.tensor_keys.state_action_value)
-        return values
-
-    def _one_hot(self, action: Tensor, logits: Tensor) -> Tensor:
-        """Actions as one-hot, float [.., S, A]."""
-        if self.action_space == "one-hot":
-            return action.to(logits.dtype)
-        return _one_hot(action, logits)
+        return self.outputs_of("critic_network", weights, tensordict, joint_action=joint)
 
     def _noise(self, tensordict: TensorDictBase, logits: Tensor) -> Tensor:
         """Uniform numbers, float [.., S, 2]: those of the batch, or new ones."""
@@ -214,10 +182,10 @@ def _one_hot(action: Tensor, like: Tensor) -> Tensor:
     return (action.unsqueeze(-1) == torch.arange(like.shape[-1], device=like.device)).to(like.dtype)
 
 
-def _joint(actions: Tensor) -> tuple[int, ...]:
-    """The shape of joint actions, [.., S, S, A], of actions [.., S, A]."""
+def _for_each_member(actions: Tensor) -> Tensor:
+    """Actions [.., S, A] as joint actions [.., S, S, A], the same for each member."""
     members = actions.shape[-2]
-    return *actions.shape[:-2], members, members, actions.shape[-1]
+    return actions.unsqueeze(-3).expand(*actions.shape[:-2], members, *actions.shape[-2:])
 
 
 def _as(flag: Tensor, reward: Tensor) -> Tensor:

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from math import log
-from typing import Final
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -12,8 +11,6 @@ from torch import Tensor, nn
 
 from cprl.networks.agent import chosen, marginal, soft_value
 from cprl.objectives.td import TDLoss, distance
-
-_VALUES: Final = "joint_action_value"
 
 
 class PR2Loss(TDLoss):
@@ -35,7 +32,7 @@ class PR2Loss(TDLoss):
 
     Args:
         value_network: maps observations to the values of pairs, float [..., N - 1, A, A]: a
-            `TensorDictModule` that writes "joint_action_value", or a module that reads "observation".
+            `TensorDictModule` whose first output they are, or a module that reads "observation".
         temperature: T, in units of reward, above 0.
         entropy_bonus: whether soft values contain T times the entropy of the joint action, as in the paper:
             up to T log A for each agent and step, which pays them for living on. Else the sums are means, by
@@ -52,10 +49,7 @@ class PR2Loss(TDLoss):
     class _AcceptedKeys:
         """The entries by the names that `set_keys` takes."""
 
-        joint_action_value: NestedKey = _VALUES
         action: NestedKey = "action"
-        value: NestedKey = "state_value"
-        value_target: NestedKey = "value_target"
         reward: NestedKey = "reward"
         done: NestedKey = "done"
         terminated: NestedKey = "terminated"
@@ -84,7 +78,7 @@ class PR2Loss(TDLoss):
         self.entropy_bonus, self.loss_function, self.reduction = entropy_bonus, loss_function, reduction
         self.delay_value = delay_value
         if not isinstance(value_network, TensorDictModule):
-            value_network = TensorDictModule(value_network, ["observation"], [_VALUES])
+            value_network = TensorDictModule(value_network, ["observation"], ["joint_action_value"])
         self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
 
     @property
@@ -94,15 +88,13 @@ class PR2Loss(TDLoss):
         after = [*seen, keys.reward, keys.done, keys.terminated]
         return [keys.action, *seen, *(unravel_key(("next", key)) for key in after)]
 
-    def _estimator_keys(self) -> dict[str, NestedKey]:
-        keys = self.tensor_keys
-        names = "value", "value_target", "reward", "done", "terminated"
-        return {name: getattr(keys, name) for name in names}
-
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The loss of a batch, under "loss"."""
         keys = self.tensor_keys
-        value = chosen(self._joint(tensordict, self.value_network_params), tensordict.get(keys.action))
+        value = chosen(
+            self.outputs_of("value_network", self.value_network_params, tensordict),
+            tensordict.get(keys.action),
+        )
         target = self._target(tensordict)
         tensordict.set(keys.priority, (value.detach() - target).square().unsqueeze(-1))
         loss = distance(value, target, self.loss_function)
@@ -111,7 +103,7 @@ class PR2Loss(TDLoss):
     def _target(self, tensordict: TensorDictBase) -> Tensor:
         """r + gamma V(s'), float [...]."""
         with torch.no_grad():
-            joint = self._joint(tensordict.get("next"), self.target_value_network_params)
+            joint = self.outputs_of("value_network", self.target_value_network_params, tensordict.get("next"))
             following = soft_value(marginal(joint, self.temperature), self.temperature)
             if not self.entropy_bonus:
                 agents, actions = joint.shape[-3] + 1, joint.shape[-1]
@@ -120,10 +112,3 @@ class PR2Loss(TDLoss):
                 tensordict, next_value=following.unsqueeze(-1)
             )
         return estimated.squeeze(-1)
-
-    def _joint(self, moment: TensorDictBase, weights: TensorDictBase) -> Tensor:
-        """The values of pairs, [..., N - 1, A, A]."""
-        seen = moment.select(*self.value_network.in_keys)
-        with weights.to_module(self.value_network, preserve_module_state=False):
-            values: Tensor = self.value_network(seen).get(self.tensor_keys.joint_action_value)
-        return values

@@ -2,8 +2,9 @@
 what losses of our own share whose targets bootstrap so."""
 
 from math import log
-from typing import Any, Final, Self
+from typing import Any, ClassVar, Final, Self
 
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import softplus
@@ -70,12 +71,14 @@ class LogCoshDQNLoss(ReshapedLoss, DQNLoss):
 
 
 class TDLoss(LossModule):
-    """A loss with TorchRL's TD(0) estimator, over the entries that `_estimator_keys` names."""
+    """A loss with TorchRL's TD(0) estimator, over the entries that `tensor_keys` names."""
 
     default_value_estimator = ValueEstimators.TD0
+    estimated: ClassVar[tuple[str, ...]] = ("reward", "done", "terminated")
+    """The names among `tensor_keys` that the estimator reads."""
 
     def _estimator_keys(self) -> dict[str, NestedKey]:
-        raise NotImplementedError
+        return {name: getattr(self.tensor_keys, name) for name in self.estimated}
 
     def _forward_value_estimator_keys(self, **_: Any) -> None:
         if self._value_estimator is not None:
@@ -92,3 +95,17 @@ class TDLoss(LossModule):
             **hyperparams,
         )
         return self
+
+    def outputs_of(
+        self, name: str, weights: TensorDictBase, tensordict: TensorDictBase, **entries: Tensor
+    ) -> Tensor:
+        """The first output of a network of this name with these weights.
+
+        Args:
+            tensordict: has the entries that the network reads, but for those given.
+        """
+        network = getattr(self, name)
+        seen = tensordict.select(*(key for key in network.in_keys if key not in entries)).update(entries)
+        with weights.to_module(network, preserve_module_state=False):
+            output: Tensor = network(seen).get(network.out_keys[0])
+        return output

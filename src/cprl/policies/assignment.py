@@ -110,14 +110,21 @@ class AgentPolicies(TensorDictModuleBase):
         return tensordict
 
     def _choose(self, actor: nn.Module, agents: TensorDictBase, index: Any, batch_size: torch.Size) -> Tensor:
-        """One actor's actions for the agents at an index, None for all; passes the entries it reads."""
+        """One actor's actions for the agents at an index, None for all; passes the entries that it reads, and
+        writes the states of a recurrent one."""
         if isinstance(actor, LaneActor):  # the same as its forward, without a TensorDict
-            observation = _at(agents, "observation", index)
-            return self._choose_with(actor, agents, index) if actor.state_cells else actor.choose(observation)
+            seen = [_at(agents, "observation", index)]
+            if actor.state_cells:
+                seen.append(_at(agents, "recurrent_state_before", index)[..., : actor.state_cells])
+            action, *after = actor.choose_with(*seen)
+            for state in after:
+                place = (*(index or ()), ..., slice(actor.state_cells))
+                keys.entry(agents, "recurrent_state")[place] = state
+            return action
         names = getattr(actor, "in_keys", ("observation",))
         view = unchecked_tensordict({name: _at(agents, name, index) for name in names}, batch_size)
-        action: Tensor = actor(view).get("action")
-        return action
+        chosen: Tensor = actor(view).get("action")
+        return chosen
 
     def _begin_states(self, agents: TensorDictBase, observation: Tensor, dim: int) -> None:
         """Notes the states that actors read in this turn, zeros where there are none; makes room for those
@@ -134,14 +141,6 @@ class AgentPolicies(TensorDictModuleBase):
             )
         keys.put(agents, "recurrent_state_before", before)
         keys.put(agents, "recurrent_state", torch.zeros_like(before))
-
-    def _choose_with(self, actor: LaneActor, agents: TensorDictBase, index: Any) -> Tensor:
-        """A recurrent actor's actions; writes its states."""
-        index = () if index is None else index
-        before = _at(agents, "recurrent_state_before", index)[..., : actor.state_cells]
-        action, after = actor.choose_with(_at(agents, "observation", index), before)
-        keys.entry(agents, "recurrent_state")[(*index, ..., slice(actor.state_cells))] = after
-        return action
 
 
 def _at(agents: TensorDictBase, name: str, index: Any) -> Tensor:

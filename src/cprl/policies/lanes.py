@@ -129,8 +129,7 @@ class LaneActor(ActorOfLanes):
         return tensordict
 
     def choose(self, observation: Tensor) -> Tensor:
-        """Return actions, int64 [R x k, S], for observations [R x k, S, C, X, Y]; for actors without a
-        state."""
+        """Return actions, int64 [R x k, S], for observations [R x k, S, C, X, Y]; without a state."""
         return self.choose_with(observation)[0]
 
     def choose_with(self, *seen: Tensor) -> list[Tensor]:
@@ -152,13 +151,11 @@ class LaneActor(ActorOfLanes):
         return chosen
 
     def _explored(self, numbers: Tensor, epsilon: Tensor, observation: Tensor) -> list[Tensor]:
-        """Exploring actions."""
         return self._chosen(numbers, epsilon, *self._outputs(observation))
 
     def _explored_with(
         self, numbers: Tensor, epsilon: Tensor, observation: Tensor, state: Tensor
     ) -> list[Tensor]:
-        """Exploring actions of recurrent networks, and the states afterwards."""
         return self._chosen(numbers, epsilon, *self._outputs(observation, state))
 
     def _chosen(self, numbers: Tensor, epsilon: Tensor, values: Tensor, *after: Tensor) -> list[Tensor]:
@@ -214,15 +211,7 @@ def random_agents(
 ) -> dict[int | tuple[int, ...], nn.Module]:
     """Uniformly random actors of some agents of every replica, by the indices of the agents."""
     seeds = [(seed, replica, agent) for replica in range(replicas) for agent in agents]
-    return {agents: random_lanes(spaces, seeds=seeds, agents=len(agents), worlds=worlds)}
-
-
-def random_lanes(
-    actions: int | Spaces, *, seeds: Sequence[Sequence[int]], agents: int, worlds: int = 1
-) -> LaneActor:
-    """An actor of agents that act uniformly at random, given how many actions there are or the spaces."""
-    count = actions.actions if isinstance(actions, Spaces) else actions
-    return LaneActor(None, count, seeds=seeds, agents=agents, worlds=worlds)
+    return {agents: LaneActor(None, spaces.actions, seeds=seeds, agents=len(agents), worlds=worlds)}
 
 
 class RandomActor(TensorDictModuleBase):

@@ -19,7 +19,8 @@ from cprl.system.compat import unchecked_tensordict
 class FirstReplica(TensorDictModuleBase):
     """What an actor of R replicas chooses in the first of them.
 
-    Reads entries [1, S, ...], writes "action", int64 [1, S].
+    Reads entries [1, S, ...], writes "action", int64 [1, S]; the other replicas see the same, and what they
+    choose is not used.
     """
 
     out_keys = ("action",)
@@ -30,7 +31,6 @@ class FirstReplica(TensorDictModuleBase):
         self.in_keys = tuple(getattr(actor, "in_keys", ("observation",)))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the actions; the other replicas see the same, and what they choose is not used."""
         seen = {}
         for name in self.in_keys:
             value = tensordict.get(name)

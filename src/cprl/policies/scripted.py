@@ -51,7 +51,7 @@ from cprl.commons.near import distance
 from cprl.commons.spaces import Spaces
 from cprl.commons.world import Bytes
 from cprl.policies import scripted_rules
-from cprl.policies.lanes import ActorOfLanes, random_lanes
+from cprl.policies.lanes import ActorOfLanes, LaneActor
 from cprl.policies.scripted_rules import AGENT, APPLE, NUMBERS, OPEN, UNKNOWN, WALL, Frame, Scratch, Settings
 
 ScriptedPolicy = Literal["random", "greedy", "sustainable", "territorial", "aggressive", "pacifist"]
@@ -72,7 +72,7 @@ class ScriptedActor(ActorOfLanes):
     seconds; the compiled code is cached on disk.
 
     Args:
-        spare: For "sustainable": the number of other apples near an apple that it harvests, at least 1.
+        spare: for "sustainable": the number of other apples near an apple that it harvests, at least 1.
 
     `epsilon`, initially 0, is the probability of a random action under `ExplorationType.RANDOM`; under other
     exploration types it has no effect.
@@ -101,7 +101,6 @@ class ScriptedActor(ActorOfLanes):
         self._scratch = Scratch(*np.zeros((2, size), np.bool_), *np.zeros((3, size), np.int32))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Reads "observation", uint8 [replicas x k, S, C, X, Y]; writes "action", int64 [replicas x k, S]."""
         return tensordict.set("action", self.choose(tensordict.get("observation")))
 
     def choose(self, observation: Tensor) -> Tensor:
@@ -143,14 +142,10 @@ def scripted_lanes(
     agents: int,
     worlds: int = 1,
 ) -> nn.Module:
-    """The fastest actor for agents that follow a scripted policy; for other arguments see `ScriptedActor`.
-
-    Args:
-        playing: the game; its spaces alone where it is not a `Game`, for the random policy.
-    """
+    """The fastest actor for agents that follow a scripted policy in a game, or at random in any spaces."""
     if policy == "random":
         spaces = playing if isinstance(playing, Spaces) else playing.spaces
-        return random_lanes(spaces, seeds=seeds, agents=agents, worlds=worlds)
+        return LaneActor(None, spaces.actions, seeds=seeds, agents=agents, worlds=worlds)
     if isinstance(playing, Spaces):
         raise ValueError(
             f"Scripted({policy!r}) reads the window of a cprl.Game; in a game of another kind, allowed: "

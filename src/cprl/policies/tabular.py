@@ -33,7 +33,7 @@ class QTables:
         self.size = 1
 
     def find(self, states: Sequence[bytes], lanes: Sequence[int]) -> NDArray[np.int64]:
-        """The row of each state in the table of its lane, int64 [n]; NEVER_MET if it has none."""
+        """The row of each state in the table of its lane, int64 [n]; `NEVER_MET` if it has none."""
         rows = [self.rows[lane].get(state, NEVER_MET) for state, lane in zip(states, lanes, strict=True)]
         return np.array(rows, np.int64)
 
@@ -58,11 +58,7 @@ class QTables:
         return rows[state]
 
     def add_lane(self, lane: int, states: NDArray[np.uint8], values: NDArray[np.float64]) -> None:
-        """Adds n states, uint8 [n, bytes], with their values [n, A] to the table of a lane.
-
-        Raises:
-            MemoryError: If the lane would have more than `max_states` states.
-        """
+        """Adds n states, uint8 [n, bytes], with their values [n, A] to the table of a lane."""
         rows = self.find_or_add([state.tobytes() for state in states], [lane] * len(states))
         self.values[rows] = values
 
@@ -104,14 +100,8 @@ def observed_entries(spaces: Spaces) -> tuple[str, ...]:
 def states_of(
     observed: TensorDictBase, names: Sequence[str], agents: Sequence[int] | None = None
 ) -> list[bytes]:
-    """The state of each agent: the bytes of everything it observes.
-
-    Args:
-        observed: Holds the entries of `observed_entries`, [B, S, ...] each.
-
-    Returns:
-        B x S states, world by world.
-    """
+    """The B x S states of agents, world by world: the bytes of everything that each observes, of entries
+    [B, S, ...]."""
     arrays = [observed.get(name).numpy(force=True) for name in names]
     if agents is not None:
         arrays = [array[:, list(agents)] for array in arrays]
@@ -139,8 +129,14 @@ class TableNetwork(nn.Module):
         self.register_buffer("states", torch.zeros((0, size), dtype=torch.uint8))
         self.register_buffer("values", torch.zeros((0, actions), dtype=torch.float64))
         self._rows: dict[bytes, int] = {}
-        self.register_load_state_dict_pre_hook(_resize_to_stored_states)  # type: ignore[no-untyped-call]
-        self.register_load_state_dict_post_hook(_find_them_again)  # type: ignore[no-untyped-call]
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *options: Any) -> None:
+        for name in ("states", "values"):
+            buffer, stored = getattr(self, name), state_dict.get(prefix + name)
+            if stored is not None and stored.shape[1:] == buffer.shape[1:]:
+                setattr(self, name, buffer.new_zeros(stored.shape))
+        super()._load_from_state_dict(state_dict, prefix, *options)  # type: ignore[no-untyped-call]
+        self._rows = {state.tobytes(): row for row, state in enumerate(self.states.numpy(force=True))}
 
     def forward(self, observation: Tensor) -> Tensor:
         """Maps observations, [..., C, X, Y], to values, float64 [..., A]; 0 for states never met."""
@@ -150,19 +146,6 @@ class TableNetwork(nn.Module):
         values, known = self.values.new_zeros((len(rows), self.values.shape[1])), rows >= 0
         values[known] = self.values[rows[known]]
         return values.reshape(*seen.shape[:-1], -1)
-
-
-def _resize_to_stored_states(
-    network: TableNetwork, state_dict: Mapping[str, Tensor], prefix: str, *_hook: Any
-) -> None:
-    for name in ("states", "values"):
-        buffer, stored = getattr(network, name), state_dict.get(prefix + name)
-        if stored is not None and stored.shape[1:] == buffer.shape[1:]:
-            setattr(network, name, buffer.new_zeros(stored.shape))
-
-
-def _find_them_again(network: TableNetwork, *_hook: Any) -> None:
-    network._rows = {state.tobytes(): row for row, state in enumerate(network.states.numpy(force=True))}
 
 
 class TabularActor(ActorOfLanes):
@@ -190,7 +173,6 @@ class TabularActor(ActorOfLanes):
         self._lanes = np.broadcast_to(lanes, (self.replicas, worlds, agents)).reshape(-1).tolist()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes "action"; see the class."""
         rows = self.tables.find(states_of(tensordict, self.in_keys), self._lanes)
         chosen = self.tables.values[rows].argmax(1)
         if exploration_type() in (ExplorationType.RANDOM, None):
