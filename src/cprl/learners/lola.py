@@ -48,6 +48,8 @@ class LOLANetworks(nn.Module):
         networks: `AgentNetworks` of "actor" and "critic" for each lane, replica by replica.
     """
 
+    loss: Any
+
     def __init__(self, networks: Sequence[Any], method: Method, *, members: int) -> None:
         super().__init__()
         settings: LOLASettings = method.settings
@@ -86,7 +88,8 @@ class LOLANetworks(nn.Module):
     def update_policies(self, rollouts: TensorDict) -> None:
         policies, _ = self.optimizers
         policies.zero_grad()
-        total(self.loss(rollouts), self.loss).backward()
+        loss: Any = total(self.loss(rollouts), self.loss)
+        loss.backward()
         if self.rule.max_grad_norm is not None:
             for network in self.actors:
                 weights = list(network.parameters())

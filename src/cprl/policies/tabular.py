@@ -135,7 +135,7 @@ class TableNetwork(nn.Module):
             buffer, stored = getattr(self, name), state_dict.get(prefix + name)
             if stored is not None and stored.shape[1:] == buffer.shape[1:]:
                 setattr(self, name, buffer.new_zeros(stored.shape))
-        super()._load_from_state_dict(state_dict, prefix, *options)  # type: ignore[no-untyped-call]
+        super()._load_from_state_dict(state_dict, prefix, *options)
         self._rows = {state.tobytes(): row for row, state in enumerate(self.states.numpy(force=True))}
 
     def forward(self, observation: Tensor) -> Tensor:
