@@ -13,11 +13,9 @@ from cprl.algorithms.base import OffPolicy
 from cprl.algorithms.off_policy import CQL, DQN, IQL, PR2, SAC, DistributionalDQN, Tabular
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
 from cprl.evaluation import evaluate_run
-from cprl.learners.preferences import WantedRewards
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.rollouts import RolloutLearner
 from cprl.learners.settings import DQNSettings, RolloutSettings, TabularSettings
-from cprl.learners.transitions import lane_turn, wanted_in
 from cprl.networks.agent import acting_part
 from cprl.population import Frozen, Learning, Scripted
 from cprl.training import train
@@ -170,21 +168,6 @@ def of_gamma(gamma):
 )
 def test_equal_learners_are_lanes_and_those_of_another_value_or_reward_are_not(members, lanes):
     assert list(population(members).learners) == lanes
-
-
-def test_who_is_paid_for_the_group_gets_the_sum_of_all_rewards():
-    env = CommonsEnv(GAME, 2, seed=1)
-    policy = population([Scripted("greedy")] * 4).policy(1)
-    moment = env.step(policy(env.reset()))
-    while not moment["next", "agents", "reward"].any():
-        moment = env.step(policy(moment["next"].exclude(("agents", "reward"))))
-    rewards = moment["next", "agents", "reward"].squeeze(-1)
-    alone, group = (
-        lane_turn((1, 3), moment, wanted_in(WantedRewards(preference), moment)).reward
-        for preference in ("individual", "team")
-    )
-    assert alone.tolist() == rewards[:, [1, 3]].flatten().tolist()
-    assert group.tolist() == rewards.sum(1).repeat_interleave(2).tolist()
 
 
 def ran(tmp_path, members, name="run"):

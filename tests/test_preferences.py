@@ -132,19 +132,6 @@ def test_agents_in_another_order_want_the_same_in_that_order(preference, rewards
 
 
 @settings(deadline=None)
-@given(preference=PREFERENCES, rewards=REWARDS)
-def test_tensors_and_arrays_give_the_same_and_are_left_as_they_are(preference, rewards):
-    given_tensor = torch.tensor(rewards, dtype=torch.float64)
-    kept = given_tensor.clone()
-    wants = WantedRewards(preference)
-    ended = np.ones(len(rewards), np.bool_)
-    for _ in range(2):
-        got = wants.add(given_tensor, torch.from_numpy(ended))
-        np.testing.assert_allclose(got.numpy(), WantedRewards(preference).add(rewards, ended), rtol=1e-6)
-    assert torch.equal(given_tensor, kept)
-
-
-@settings(deadline=None)
 @given(rewards=REWARDS, share=SHARES, angle=between(-3, 3))
 def test_without_a_weight_the_own_reward_is_wanted_and_an_exchange_keeps_the_sum(rewards, share, angle):
     for idle in (
@@ -218,8 +205,6 @@ class TestRefusals:
             TransformedEnv(CommonsEnv(alone, 1), PreferenceTransform(preference)).reward_spec  # noqa: B018
         with pytest.raises(ValueError, match=f"preferences is {name}"):
             PreferenceWrapper(parallel_env(alone), preference)
-
-    def test_alone_an_agent_has_its_own_reward_and_the_team_is_itself(self):
         assert wanted("individual", 3) == wanted("team", 3) == [3]
 
     @pytest.mark.parametrize(

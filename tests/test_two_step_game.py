@@ -98,20 +98,15 @@ def returns(learner):
 
 
 @pytest.mark.slow
-def test_qmix_dares_and_coordinates_where_independent_learners_and_vdn_play_safe():
+def test_qmix_dares_and_coordinates_where_independent_learners_and_vdn_play_safe_by_the_nearest_sum():
     assert returns(taught(QMIX(settings=SETTINGS))) == [8.0] * REPLICAS
-    assert returns(taught(VDN(settings=SETTINGS))) == [7.0] * REPLICAS
     assert returns(taught(DQN(settings=SETTINGS))) == [7.0] * REPLICAS
-
-
-@pytest.mark.slow
-def test_vdn_tells_the_nearest_sum_of_the_daring_game():
     learner = taught(VDN(settings=SETTINGS))
-    daring = torch.full((REPLICAS,), DARING)
+    assert returns(learner) == [7.0] * REPLICAS
     with torch.no_grad():
-        values = learner.engine.outputs(seen(daring).unsqueeze(1)).squeeze(1)
+        values = learner.engine.outputs(seen(torch.full((REPLICAS,), DARING)).unsqueeze(1)).squeeze(1)
     by_choice = values.unflatten(-1, (4, 2)).mean(-2)
-    told = by_choice[:, 0, :, None] + by_choice[:, 1, None, :]
+    sums = by_choice[:, 0, :, None] + by_choice[:, 1, None, :]
     # row and column means 0.5 and 4.5, less the mean 2.5
-    wanted = torch.tensor([[-1.5, 2.5], [2.5, 6.5]]).expand_as(told)
-    torch.testing.assert_close(told, wanted, atol=0.3, rtol=0)
+    wanted = torch.tensor([[-1.5, 2.5], [2.5, 6.5]]).expand_as(sums)
+    torch.testing.assert_close(sums, wanted, atol=0.3, rtol=0)

@@ -14,14 +14,7 @@ from torchrl.modules import VDNMixer
 from torchrl.objectives import LossModule
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss, QMixerLoss
 
-from cprl.algorithms.base import (
-    OffPolicy,
-    TeamAlgorithm,
-    TrainingEngine,
-    Weight,
-    policy,
-    q_actor,
-)
+from cprl.algorithms.base import OffPolicy, TeamAlgorithm, TrainingEngine, Weight, policy, q_actor
 from cprl.algorithms.on_policy import Clipped
 from cprl.commons.spaces import Spaces
 from cprl.custom import Custom

@@ -268,12 +268,7 @@ class LOLALearner(LaneLearner):
         return self.engine.finite()
 
     def state_dict(self) -> dict[str, Any]:
-        return {
-            **super().state_dict(),
-            "rollouts": self._rollouts,
-            "size": self._size,
-            "phase": self._phase,
-        }
+        return {**super().state_dict(), "rollouts": self._rollouts, "size": self._size, "phase": self._phase}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         super().load_state_dict(state)

@@ -15,8 +15,7 @@ from cprl.values import Value, Where
 Channels = Annotated[
     Layers,
     Where(
-        lambda channels: len(channels) > 0,
-        f"1 to {MOST_LAYERS} layers, each an integer in 1..{MOST_CELLS}",
+        lambda channels: len(channels) > 0, f"1 to {MOST_LAYERS} layers, each an integer in 1..{MOST_CELLS}"
     ),
 ]
 Kernel = Annotated[int, Where(lambda cells: 1 <= cells <= 999 and cells % 2 == 1, "1, 3, 5 and so on")]
@@ -34,12 +33,7 @@ class Conv(Value):
     """Units of each fully connected layer after the convolutions."""
 
     def make(
-        self,
-        spaces: Spaces,
-        outputs: int,
-        *,
-        shape: Sequence[int] | None = None,
-        **options: Unpack[Options],
+        self, spaces: Spaces, outputs: int, *, shape: Sequence[int] | None = None, **options: Unpack[Options]
     ) -> "ConvNetwork":
         """Return a new network; raises a ValueError if observations have no rows and columns."""
         shape = shape or spaces.observation_shape

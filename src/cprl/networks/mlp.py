@@ -53,12 +53,7 @@ class MLP(Value):
     """Units of each hidden layer."""
 
     def make(
-        self,
-        spaces: Spaces,
-        outputs: int,
-        *,
-        shape: Sequence[int] | None = None,
-        **options: Unpack[Options],
+        self, spaces: Spaces, outputs: int, *, shape: Sequence[int] | None = None, **options: Unpack[Options]
     ) -> "MLPNetwork":
         """Return a new network of observations, or of inputs of another shape."""
         shape, highest = shape or spaces.observation_shape, spaces.observation_scale

@@ -41,12 +41,7 @@ class Recurrent(Value, stored=False):
     kind: ClassVar[Kind]
 
     def make(
-        self,
-        spaces: Spaces,
-        outputs: int,
-        *,
-        shape: Sequence[int] | None = None,
-        **options: Unpack[Options],
+        self, spaces: Spaces, outputs: int, *, shape: Sequence[int] | None = None, **options: Unpack[Options]
     ) -> "RecurrentNetwork":
         """Return a new network."""
         for name, value in options.items():
