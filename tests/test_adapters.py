@@ -138,46 +138,34 @@ def options(game, decided):
     return {"decisions": decisions if game.decisions else {}}
 
 
-def played_in_parallel(game, turns, decisions):
-    adapter, names, episode = parallel_env(game, 5), game.agent_names, 0
-    adapter.reset(options=options(game, decisions[0]))
+def stepped_in_parallel(world, names, actions):
+    seen, rewards, terminated, truncated, infos = world.step(dict(zip(names, actions, strict=True)))
+    (end,) = set(zip(terminated.values(), truncated.values(), strict=True))
+    assert world.agents == ([] if any(end) else list(names))
+    return seen.get, rewards, infos, end
+
+
+def stepped_in_turn(world, names, actions):
+    for name, action in zip(names, actions, strict=True):
+        assert world.agent_selection == name
+        world.step(action)
+    return world.observe, world.rewards, world.infos, (world.terminations[name], world.truncations[name])
+
+
+def stepped_alone(world, names, actions):
+    seen, reward, *end, info = world.step(actions[0])
+    return {"agent_0": seen}.get, {"agent_0": reward}, {"agent_0": info}, tuple(end)
+
+
+def played(make, step, game, turns, decisions):
+    world, episode = make(game, seed=5), 0
+    world.reset(options=options(game, decisions[0]))
     for turn in turns:
-        seen, rewards, terminated, truncated, infos = adapter.step(
-            dict(zip(names, turn.tolist(), strict=True))
-        )
-        ends = set(zip(terminated.values(), truncated.values(), strict=True))
-        assert len(ends) == 1
-        yield step_output(names, seen.get, rewards, infos, end := ends.pop())
-        assert adapter.agents == ([] if any(end) else list(names))
+        observe, rewards, infos, end = step(world, game.agent_names, turn.tolist())
+        yield step_output(game.agent_names, observe, rewards, infos, end)
         if any(end):
             episode += 1
-            adapter.reset(options=options(game, decisions[episode]))
-
-
-def played_turn_by_turn(game, turns, decisions):
-    adapter, names, episode = env(game, 5), game.agent_names, 0
-    adapter.reset(options=options(game, decisions[0]))
-    for turn in turns:
-        for name, action in zip(names, turn.tolist(), strict=True):
-            assert adapter.agent_selection == name
-            adapter.step(action)
-        end = adapter.terminations[names[0]], adapter.truncations[names[0]]
-        yield step_output(names, adapter.observe, adapter.rewards, adapter.infos, end)
-        if any(end):
-            episode += 1
-            adapter.reset(options=options(game, decisions[episode]))
-
-
-def played_alone(game, turns, decisions):
-    adapter, episode = CommonsGymnasiumEnv(game, seed=5), 0
-    adapter.reset(options=options(game, decisions[0]))
-    for turn in turns:
-        seen, reward, *end, info = adapter.step(int(turn[0]))
-        one = {"agent_0": reward}
-        yield step_output(["agent_0"], {"agent_0": seen}.get, one, {"agent_0": info}, tuple(end))
-        if any(end):
-            episode += 1
-            adapter.reset(options=options(game, decisions[episode]))
+            world.reset(options=options(game, decisions[episode]))
 
 
 SHORTER = {
@@ -197,11 +185,11 @@ SHORTER = {
 def test_all_adapters_play_the_same_game_for_the_same_seed(game):
     turns = random_actions(300, 1, game, seed=1)[:, 0]
     decisions = random_decisions(99, 1, game, seed=2)[:, 0]
-    adapters = [played_in_parallel, played_turn_by_turn, *([played_alone] if game.agents == 1 else [])]
+    adapters = [(parallel_env, stepped_in_parallel), (env, stepped_in_turn)]
+    adapters += [(CommonsGymnasiumEnv, stepped_alone)] if game.agents == 1 else []
+    others = [played(*adapter, game, turns, decisions) for adapter in adapters]
     ends, paid = 0, set()
-    for number, outputs in enumerate(
-        zip(*(play(game, turns, decisions) for play in (played_by_torchrl, *adapters)), strict=True)
-    ):
+    for number, outputs in enumerate(zip(played_by_torchrl(game, turns, decisions), *others, strict=True)):
         for other in outputs[1:]:
             assert set(other) == set(outputs[0])
             for entry, value in outputs[0].items():
