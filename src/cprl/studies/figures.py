@@ -318,9 +318,9 @@ def courses(table: StudyTable, path: Path | str, *, metrics: Sequence[str] = ())
     else:
         reference = design.reference
         beside = {reference: ("#777777", f"reference: {names[reference]}")} if reference in conditions else {}
-        own = "#08519c", "the condition of the panel"
+        alone = "#08519c", "the condition of the panel"
         others = [name for name in conditions if name != reference]
-        views = [(chosen[0], [name], {**beside, name: own}) for name in others]
+        views = [(chosen[0], [name], {**beside, name: alone}) for name in others]
         rows = -(-len(views) // _PANELS)
         figure, panels = _panels(12.0, 2.5 * rows + 1.6, rows, _PANELS, len(views), shared="xy")
         figure.supylabel(metric_title(chosen[0]), fontsize=SMALL_PT + 1)
