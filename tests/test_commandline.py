@@ -395,7 +395,7 @@ def elsewhere(tmp_path, monkeypatch):
     before = set(sys.modules)
     yield tmp_path
     for name in set(sys.modules) - before:
-        if not name.startswith("cprl"):
+        if str(getattr(sys.modules[name], "__file__", "")).startswith((str(ROOT / "recipes"), str(tmp_path))):
             sys.modules.pop(name)
 
 

@@ -132,9 +132,10 @@ def test_each_world_counts_its_own_episodes_and_starts_anew():
         ended += tracker.add(turn(worlds=2, harvest=[[1, 0], [0, 1]], done=done))
     harvests = [(e.world, e.episode, e.steps, e.harvest.tolist()) for e in ended]
     assert harvests == [(0, 0, 1, [1, 0]), (0, 1, 1, [1, 0]), (1, 0, 2, [0, 2]), (1, 1, 1, [0, 1])]
-    assert tracker.add(turn(worlds=2, done=[[True]] * 2, had_ended=[[True]] * 2)) == [], "no second time"
-    episodes = tracker.add(turn(worlds=2, done=[[True]] * 2))
-    assert [(episode.episode, episode.steps) for episode in episodes] == [(2, 1), (2, 1)]
+    (episode,) = tracker.add(turn(worlds=2, done=[[True], [True]], had_ended=[[False], [True]]))
+    assert (episode.world, episode.episode, episode.steps) == (0, 2, 2), "world 1 ends no second time"
+    (episode,) = tracker.add(turn(worlds=2, done=[[False], [True]], had_ended=[[True], [False]]))
+    assert (episode.world, episode.episode, episode.steps) == (1, 2, 1)
 
 
 def test_what_a_collector_yields_is_measured_as_the_whole_episodes_would_be():
