@@ -9,7 +9,6 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.collectors import BaseCollector
@@ -197,9 +196,11 @@ class Training:
             learner.end_episode(worlds)
         recorded: list[tuple[Episode, dict[str, float]]] = []
         for episode, of_agents in zip(ended, learning, strict=True):
-            episode = replace(episode, wanted_return=self._wanted.take(episode.world))
+            wanted = self._wanted.take(episode.world)
+            episode = replace(episode, wanted_return=wanted)
             if self.decisions is not None and episode.decision is not None:
-                self.decisions.learn(episode.world, episode.decision, _return_to_decide_by(episode))
+                returns = np.where(np.isnan(wanted), episode.return_, wanted)
+                self.decisions.learn(episode.world, episode.decision, returns)
             self._played[episode.world] += 1
             if self._played[episode.world] <= self.episodes:
                 recorded.append((episode, of_agents))
@@ -267,7 +268,10 @@ class Training:
             )
         self.times.load_state_dict(state)
         self.steps, self._played = int(state["steps"]), list(state["played"])
-        self._load_env(state)
+        fresh = self.env.reset()  # the form of what is carried; the state then says where the worlds are
+        load_env_state(self.env, state["env"])
+        if state["carried"] is not None:
+            self._step_collector().carried = load_carried(fresh, state["carried"])
         parts: dict[str, Any] = {"learners": self.learners, "others": self.others, "losses": self._losses}
         for name, of_agents in parts.items():
             for part, part_state in zip(of_agents.values(), state[name], strict=True):
@@ -281,18 +285,6 @@ class Training:
             if name in state["callbacks"]:  # a viewer may be added or left out from now on
                 callback.load_state_dict(state["callbacks"][name])
         torch.set_rng_state(state["torch"])
-
-    def _load_env(self, state: Mapping[str, Any]) -> None:
-        fresh = self.env.reset()  # the form of what is carried; the state then says where the worlds are
-        load_env_state(self.env, state["env"])
-        if state["carried"] is not None:
-            self._step_collector().carried = load_carried(fresh, state["carried"])
-
-
-def _return_to_decide_by(episode: Episode) -> NDArray[np.float64]:
-    """What each agent's decisions are learned from, float64 [N]: its wanted return, else its return."""
-    wanted = episode.wanted_return
-    return episode.return_ if wanted is None else np.where(np.isnan(wanted), episode.return_, wanted)
 
 
 def train(
