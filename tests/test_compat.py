@@ -644,3 +644,18 @@ def test_vector_instructions_are_looked_for_once_for_all_processes(tmp_path, mon
         compat.remember_vector_instructions.__wrapped__()
         assert cpu_vec_isa.valid_vec_isa_list() == []
         assert len(searches) == 3
+
+
+def test_what_ends_a_recording_waits_for_its_viewer_and_is_in_a_private_part():
+    """`RecordingStream.__del__` flushes; `keep_native` keeps `inner` alive in its place."""
+    import rerun as rr
+
+    with relies_on("RecordingStream.inner", used_by="compat.keep_native"):
+        recording = rr.RecordingStream("cprl", recording_id="kept")
+        native = recording.inner
+        before = sys.getrefcount(native)
+        compat.keep_native(recording)
+        assert sys.getrefcount(native) == before + 1
+    with relies_on("RecordingStream.__del__", used_by="live.exit_in_time"):
+        assert callable(vars(rr.RecordingStream)["__del__"])
+    recording.disconnect()

@@ -1,5 +1,6 @@
 """The streams of one recording, to a file and to viewers: each may fail without harm to the run."""
 
+import atexit
 import os
 import shutil
 import subprocess
@@ -7,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from queue import Full, Queue
 from threading import Thread
@@ -16,6 +17,7 @@ from typing import Any, Final, TypeAlias
 import rerun as rr
 from rerun.chunk import RrdReader
 
+from cprl.system.compat import keep_native
 from cprl.system.output import legible, printed
 from cprl.values import checked
 from cprl.viewer.page import LOCALHOST, Served, WebViewer, free_port, has_display, viewer
@@ -23,7 +25,7 @@ from cprl.viewer.page import LOCALHOST, Served, WebViewer, free_port, has_displa
 STALL_S: Final = 2.0
 """Seconds that a training waits for a place in the queue of a viewer that has stopped taking data."""
 CLOSE_S: Final = 5.0
-"""Seconds within which a viewer must take the last data when a run ends."""
+"""Seconds within which a viewer must take the last data when a run ends, and when the interpreter exits."""
 QUEUED_CALLS: Final = 256
 """Calls that wait for a viewer; the frames of about thirty episodes."""
 FLUSH_TIMEOUT_S: Final = 5.0
@@ -37,6 +39,9 @@ EXHIBITION_MEMORY: Final = "1MB"
 """The same of the exhibition, of which viewers need the newest frame alone."""
 NEEDED_BYTES: Final = 2_000_000
 """The free disk space needed to start a recording; its layout and static parts take a tenth."""
+
+_STALLED: Final[list[Any]] = []
+"""Recordings whose viewers do not answer: the end of the last reference to one would wait for them."""
 
 Row: TypeAlias = tuple[int, int, int, list[float] | str]
 """Step, episode, frame, and a number for each line or a Markdown text."""
@@ -80,7 +85,9 @@ class Stream:
         try:
             what()
         except Exception as error:
-            self.is_open, self.has_failed = False, True  # the recording stays: its end waits for viewers
+            self.is_open, self.has_failed = False, True
+            if self.is_live:
+                _STALLED.append(self.recording)
             warnings.warn(
                 f"the Rerun {self.name} failed, the run continues without it: {error}",
                 RuntimeWarning,
@@ -140,6 +147,22 @@ class LiveStream(Stream):
                 return
 
 
+@cache
+def exit_in_time() -> None:
+    """Give Rerun's own last flush, when the interpreter exits, a deadline; it has none of itself."""
+
+    def shut_down() -> None:
+        flush = Thread(target=rr.rerun_shutdown, daemon=True)
+        flush.start()
+        flush.join(STALL_S if _STALLED else CLOSE_S)
+        if _STALLED or flush.is_alive():
+            # A flush that waits holds a lock, for which the end of any other recording would wait.
+            rr.RecordingStream.__del__ = keep_native  # type: ignore[method-assign]
+
+    rr.unregister_shutdown()
+    atexit.register(shut_down)
+
+
 class Live:
     """What viewers of a run are sent, served on free ports of 127.0.0.1; they can connect at any time and get
     the history.
@@ -161,6 +184,7 @@ class Live:
         exhibits: bool = False,
     ) -> None:
         checked("live", how, Served)
+        exit_in_time()
 
         def serve(name: str, memory: str, *, send_properties: bool) -> LiveStream:
             recording = _recording(application, recording_id, send_properties=send_properties)

@@ -1,6 +1,9 @@
 """Recordings of Rerun."""
 
+import ctypes
+from collections.abc import Callable
 from importlib import import_module
+from typing import Any
 
 from cprl.system.libraries import relying_on
 
@@ -11,3 +14,14 @@ def end_recordings() -> None:
     with relying_on("rerun-sdk", "rerun_bindings.flush_and_cleanup_orphaned_recordings"):
         end = import_module("rerun_bindings").flush_and_cleanup_orphaned_recordings
     end()
+
+
+def keep_native(recording: Any, keep: Callable[..., object] = ctypes.pythonapi.Py_IncRef) -> None:
+    """In place of a recording's end, which waits for a viewer: its native part, the private `inner`, stays
+    until the process ends.
+
+    Args:
+        recording: a `rerun.RecordingStream`, as its `__del__` gets it.
+        keep: bound here, because the interpreter clears modules before it deletes the last recordings.
+    """
+    keep(ctypes.py_object(recording.inner))
