@@ -58,18 +58,19 @@ def summarise(
         console.print(f"Watch again: {printed(to_watch(*recordings))}", soft_wrap=True)
 
 
-def _new_table(title: str, caption: str, names: Sequence[str]) -> Table:
+def _new_table(title: str, caption: str, heads: Sequence[str], *, folds_heads: bool) -> Table:
+    """A table whose heads fold where the terminal is too narrow, or else the names of its rows."""
     table = Table(title=title, caption=caption)
-    table.add_column(no_wrap=True)
-    for name in names:
-        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column(no_wrap=folds_heads)
+    for head in heads:
+        table.add_column(head, justify="right", no_wrap=not folds_heads)
     return table
 
 
 def _table(title: str, played: Mapping[str, list[Episode]]) -> Table:
     """A column for each policy, a row for each number; the first policy is the baseline."""
     names = [name if place or len(played) == 1 else f"{name} (baseline)" for place, name in enumerate(played)]
-    table = _new_table(title, "means over episodes ± their standard errors", names)
+    table = _new_table(title, "means over episodes ± their standard errors", names, folds_heads=True)
     harvests = [_harvests(episodes) for episodes in played.values()]
     returns = [[float(episode.return_.sum()) for episode in episodes] for episodes in played.values()]
     if not all(harvests):
@@ -137,7 +138,7 @@ def institutions_table(played: Mapping[str, Sequence[Episode]]) -> Table | None:
     first = next(iter(played.values()))[0]
     if all(getattr(first, name) is None for name in INSTITUTIONAL):
         return None
-    table = _new_table("institutions", "means over episodes", list(played))
+    table = _new_table("institutions", "means over episodes", list(played), folds_heads=False)
     measured = [[institution_metrics(episode) for episode in episodes] for episodes in played.values()]
     for metric in institution_metrics(first):
         values = [metrics[metric] for episodes in measured for metrics in episodes]
