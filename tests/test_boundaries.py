@@ -39,23 +39,29 @@ BOTH = Boundaries.drawn(REGIONS, bite_fine=0.25, step_fine=0.5)
 @pytest.mark.parametrize(
     ("boundaries", "second", "harvest", "fines", "foreign_bites"),
     [
-        # One apple for 1.5; standing there without an apple costs nothing.
-        ([Boundaries.drawn(REGIONS, bite_fine=1.5)], "stay", [1, 0], [1.5, 0], 1),
-        ([Boundaries.drawn(REGIONS, bite_fine=0)], "forward", [1, 1], [0, 0], 1),
+        # One apple for 1.5.
+        ([Boundaries.drawn(REGIONS, bite_fine=1.5)], "stay", [1, 0], [1.5, 0], [1, 0]),
+        ([Boundaries.drawn(REGIONS, bite_fine=0)], "forward", [1, 1], [0, 0], [1, 1]),
         # Step and bite fines of one turn add up to one violation: 2 + 0.5.
-        ([Boundaries.drawn(REGIONS, bite_fine=2, step_fine=0.5)], "stay", [1, 0], [2.5, 0], 1),
+        ([Boundaries.drawn(REGIONS, bite_fine=2, step_fine=0.5)], "stay", [1, 0], [2.5, 0], [1, 0]),
         # Of two boundaries the second one stops the bite; or both are fined, 1 + 0.25 + 0.5, and both count.
-        ([FINED, CLOSED], "forward", [0, 0], [0.5, 0.5], 0),
-        ([FINED, BOTH], "forward", [1, 1], [1.75, 1.75], 2),
+        ([FINED, CLOSED], "forward", [0, 0], [0.5, 0.5], [0, 0]),
+        ([FINED, BOTH], "forward", [1, 1], [1.75, 1.75], [2, 2]),
     ],
 )
 def test_what_a_second_turn_in_the_region_of_others_costs(boundaries, second, harvest, fines, foreign_bites):
     play = Play(BOARD, institutions=boundaries).turn("forward").turn("forward", second)
     assert (play.harvest, play.fines) == (harvest, fines)
     assert play.reward == [apple - fine for apple, fine in zip(harvest, fines, strict=True)]
-    assert play.counts("foreign_bites")[0] == foreign_bites, "once for each boundary"
-    assert play.counts("trespasses")[0] == len(boundaries)
-    assert play.counts("violations")[0] == play.counts("detections")[0] == play.violated[0] == 1
+    assert play.counts("foreign_bites") == foreign_bites, "once for each boundary"
+    broken = [1, int(second == "forward")]
+    assert play.counts("trespasses") == [own * len(boundaries) for own in broken]
+    assert play.counts("violations") == play.counts("detections") == play.violated == broken
+
+
+def test_standing_in_the_region_of_others_without_an_apple_costs_no_bite_fine():
+    play = Play(BOARD, institutions=[FINED]).turn("forward").turn("forward", "stay").turn("stay")
+    assert (play.fines, play.violated) == ([0, 0], [False, False])
 
 
 def test_each_turn_in_the_region_of_others_costs_the_step_fine_where_bites_are_stopped():

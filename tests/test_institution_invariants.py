@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from boards import assert_same, play_on, random_actions
+from boards import assert_same, kept, play_on, random_actions
 from boards import played as played_without
 from governed import (
     EVERYTHING,
@@ -279,6 +279,21 @@ def test_at_an_episodes_begin_everything_but_what_is_in_force_is_as_in_a_new_wor
     apart = {name for name in new if not np.array_equal(new[name], again[name])}
     # A quota that is voted on begins with the share in force.
     assert apart <= {"episode", *(("in_force", "allowed") if game.ballots else ())}
+
+
+@pytest.mark.integration
+@QUICK
+@given(game=governed_games(), seed=SEEDS)
+def test_an_episode_does_not_know_what_was_done_in_the_one_before(game, seed):
+    second_episodes = []
+    for was_idle in (False, True):
+        batch, output, actions, decisions = begun(game, seed)
+        first = np.full_like(actions, game.actions.index("stay")) if was_idle else actions
+        play_on(batch, output, first, decisions)
+        batch.begin(output)
+        second_episodes.append([kept(batch, output), *play_on(batch, output, actions, decisions)])
+    for one, other in zip(*second_episodes, strict=True):
+        assert_same(one, other)
 
 
 @pytest.mark.integration

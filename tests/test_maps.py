@@ -16,11 +16,12 @@ BOARDS_OF_THE_STUDY = {  # name: (height, width, sites, agents), from shared/pap
 
 def test_agents_and_sites_are_numbered_in_reading_order_unless_they_are_given():
     board = maps.parse("..A<\n^#.A")
-    assert board.drawing() == "..A<\n^#.A"
     assert (board.height, board.width) == (2, 4)
     assert board.sites == ((0, 2), (1, 3))
     assert board.starts == ((0, 3, 3), (1, 0, 0))
     assert board.walls == ((1, 1),)
+    drawing = ".>A.\nv##.\nA<.^"
+    assert maps.parse(drawing).drawing() == drawing
     given = Map(height=2, width=3, sites=[(0, 0)], starts=[(1, 2, 1), (1, 0, 3)])
     assert given.starts == ((1, 2, 1), (1, 0, 3))
 

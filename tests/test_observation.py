@@ -1,10 +1,12 @@
 """The forms of observations, and walls that block sight."""
 
+import numpy as np
 import pytest
 from boards import Play, drawn, random_actions
 from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Observation, Rules, keys, maps, presets
+from cprl.commons.batch import Batch
 from cprl.commons.colours import COLOURS, FIRST_AGENT, MAX_AGENTS_APART, class_colour
 from cprl.commons.tables import cells_between
 
@@ -104,6 +106,21 @@ def test_specs_match_the_form_of_the_observation(form):
     assert (keys.SCOREBOARD in moment.keys(True)) == form.scoreboard
     assert (keys.STOCK_GAUGE in moment.keys(True)) == form.stock_gauge
     assert moment[keys.OBSERVATION].max() <= env.observation_spec[keys.OBSERVATION].space.high.max()
+
+
+def test_the_form_of_the_observation_does_not_change_the_game():
+    game = presets.game("commons", variant="as_run")
+    batches = [
+        Batch(Game(map=game.map, rules=game.rules, observation=form), 2) for form in (Observation(), *FORMS)
+    ]
+    outputs = [batch.begin(batch.new_output()) for batch in batches]
+    for turn in random_actions(100, 2, game):
+        plain, *others = (batch.play(turn, out) for batch, out in zip(batches, outputs, strict=True))
+        for form, other in zip(FORMS, others, strict=True):
+            assert np.array_equal(other.harvest, plain.harvest)
+            assert np.array_equal(other.stock, plain.stock)
+            if form == Observation(stock_gauge=True):
+                assert np.array_equal(other.observation, plain.observation)
 
 
 WALLED = """

@@ -46,6 +46,15 @@ def test_every_quirk_is_off_as_published_and_on_as_run():
         assert all(getattr(as_run, quirk) for quirk in quirks)
 
 
+@pytest.mark.parametrize(
+    ("board", "published", "as_run"),
+    [("single_basic", (6, 13), (5, 13)), ("two_complex", (6, 13), (5, 13)), ("commons", (7, 15), (7, 15))],
+)
+def test_windows_have_the_published_sizes(board, published, as_run):
+    assert presets.game(board).observation_shape == (3, *published)
+    assert presets.game(board, variant="as_run").observation_shape == (3, *as_run)
+
+
 def test_without_a_beam_there_are_seven_actions_and_six_is_stay():
     assert presets.game("single_basic").actions[6] == "stay"
     assert len(presets.game("single_basic").actions) == 7

@@ -52,6 +52,20 @@ def test_a_state_is_a_copy_of_plain_arrays():
     assert_same(batch.now, before)
 
 
+def test_an_environment_loads_the_state_of_another_and_returns_its_observation():
+    env, other = CommonsEnv(GAME, 2, seed=1), CommonsEnv(GAME, 2, seed=8)
+    moment = env.rollout(5, break_when_any_done=False)[:, -1]["next"]
+    shown = other.load(env.worlds.state())
+    assert torch.equal(shown[keys.OBSERVATION], moment[keys.OBSERVATION])
+    assert torch.equal(shown[keys.STOCK], moment[keys.STOCK])
+    actions = torch.tensor([[0, 1], [2, 3]])
+    after = [
+        one.step(entry.set(keys.ACTION, actions))["next"]
+        for one, entry in ((env, moment.exclude(keys.REWARD)), (other, shown))
+    ]
+    assert (after[0] == after[1]).all()
+
+
 def test_events_of_the_turn_before_are_not_told_but_windows_show_its_beams():
     env = CommonsEnv(GAME, 1, seed=1)
     moment = env.reset()
