@@ -21,6 +21,7 @@ from cprl.envs.make_env import spaces_of
 from cprl.evaluation import draw_gains, gains
 from cprl.evaluation.evaluate import differences
 from cprl.evaluation.lanes import Fresh, Part, Turns, agents_of
+from cprl.learners.base import EVALUATION, lane_seeds
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.metrics import with_unit
 from cprl.measuring.movement import trace
@@ -98,12 +99,14 @@ def test_greedy_agents_play_what_the_policy_of_the_loaded_run_plays(name, learne
     assert values(found.measures())["collective_return"] == pytest.approx(np.mean(means))
 
 
-def test_a_policy_for_another_number_of_worlds_is_refused(learned):
-    loaded = cprl.load(learned["mixed"])
-    message = r"the policy plays 1 world and the environment has 4; allowed: as many, e\.g\. run\.policy\("
-    with pytest.raises(ValueError, match=message):
-        loaded.env(worlds=4).rollout(3, loaded.policy(0))
-    assert loaded.env(worlds=4).rollout(3, loaded.policy(0, worlds=4)).batch_size[0] == 4
+@pytest.mark.parametrize(("worlds", "of_policy", "plays"), [(4, 1, "1 world"), (2, 4, "4 worlds")])
+@pytest.mark.parametrize("name", ["alike", "mixed"])
+def test_a_policy_for_another_number_of_worlds_is_refused(name, worlds, of_policy, plays, learned):
+    loaded = cprl.load(learned[name])
+    message = f"the policy plays {plays} and the environment has {worlds}; allowed: as many"
+    with pytest.raises(ValueError, match=rf"{message}, e\.g\. run\.policy\(replica, worlds={worlds}\)"):
+        loaded.env(worlds=worlds).rollout(3, loaded.policy(0, worlds=of_policy))
+    assert loaded.env(worlds=worlds).rollout(3, loaded.policy(0, worlds=worlds)).batch_size[0] == worlds
 
 
 class Own(torch.nn.Module):
@@ -166,6 +169,14 @@ def test_agents_that_learned_a_policy_draw_from_it(learned):
         assert told(found.trained[replica]) == told(found.random[replica])
     greedy = cprl.evaluate_run(undecided, episodes=2, greedy=True)
     assert told(greedy.trained[0]) != told(greedy.random[0])
+
+
+def test_the_random_policy_draws_by_the_seeds_of_agents_in_evaluation(learned):
+    found = cprl.evaluate_run(learned["mixed"], episodes=2, seed=SEED, replicas=[1])
+    seeds = lane_seeds(SEED, replicas=[1], agents=[0, 1], purpose=EVALUATION)
+    actor = LaneActor(None, len(MEADOW.actions), seeds=seeds, agents=2, worlds=2)
+    env = CommonsEnv(MEADOW, 2, seed=SEED, first_world=2)
+    assert told(evaluate(env, AgentPolicies({(0, 1): actor}), explore=True)) == told(found.random[1])
 
 
 @pytest.mark.parametrize("name", ["alike", "mixed"])

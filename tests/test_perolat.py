@@ -121,3 +121,15 @@ def test_the_share_of_the_rich_is_that_of_every_fourth_agent(recipes, monkeypatc
     monkeypatch.setattr(claims, "evaluated", lambda run, policy: returns)
     # Agents 0 and 4 begin in the north-west room: 4 of 10 apples.
     assert claims.rich_share(Path("anywhere"), "trained").tolist() == [0.4]
+
+
+def test_a_file_of_claims_that_cannot_be_written_is_refused_before_anything_is_played(
+    recipes, monkeypatch, tmp_path
+):
+    claims = recipes["perolat_claims"]
+    monkeypatch.setattr(claims, "table", lambda runs, episodes: "cannot be told \u2212")
+    claims.main(out=tmp_path / "new" / "claims.md")
+    assert (tmp_path / "new" / "claims.md").read_text(encoding="utf-8") == "cannot be told \u2212\n"
+    monkeypatch.setattr(claims, "table", None)  # it would be called
+    with pytest.raises(IsADirectoryError, match="a directory; allowed: the name of a file"):
+        claims.main(out=tmp_path / "new")

@@ -135,8 +135,10 @@ def test_ctrl_c_ends_an_episode_like_quit(run, capsys):
     def interrupted():
         raise KeyboardInterrupt
 
-    play_in_terminal(open_session(str(run), seed=1), interrupted)
-    assert "The end: stopped after turn 0." in capsys.readouterr().out
+    session = open_session(str(run), seed=1)
+    session.act("stay")
+    play_in_terminal(session, interrupted)
+    assert "The end: stopped after turn 1." in capsys.readouterr().out
 
 
 def test_a_game_without_a_beam_has_no_key_for_it():

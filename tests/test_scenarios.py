@@ -215,6 +215,7 @@ def test_the_command_scenarios_tells_returns_and_social_metrics(runs, tmp_path, 
     for wrong, said in (
         (words, r"scenarios\.parquet exists and is not"),
         (["scenarios", runs["greedy"], "--figure", figure], r"scenarios\.png exists and is not"),
+        (["scenarios", runs["greedy"], "--figure", tmp_path / "other.svg"], r"--figure is '.*other\.svg'"),
     ):
         with pytest.raises(SystemExit, match=f"cprl: .*{said}"):
             command(monkeypatch, capsys, *wrong)

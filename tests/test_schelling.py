@@ -164,12 +164,15 @@ def test_the_command_prints_the_dilemma(tmp_path, monkeypatch, capsys):
     drawing = tmp_path / "patch.txt"
     drawing.write_text(">.AA.<\n..AA..\n")
     words = ["schelling", drawing, "--episodes", "1", "--replicas", "2", "--out", tmp_path / "all.parquet"]
-    printed = command(monkeypatch, capsys, *words, "--figure", tmp_path / "diagram.png")
+    figure = ["--figure", tmp_path / "diagram.png"]
+    printed = command(monkeypatch, capsys, *words, *figure)
     assert "fear, G(0) - R(0)" in printed
     assert (tmp_path / "all.parquet").exists()
     assert imread(tmp_path / "diagram.png").shape[1] > 1000
     with pytest.raises(SystemExit, match=r"all\.parquet exists and is not overwritten"):
         command(monkeypatch, capsys, *words)
+    with pytest.raises(SystemExit, match=r"diagram\.png exists and is not overwritten"):
+        command(monkeypatch, capsys, *words[:-2], *figure)
 
 
 def test_the_recipe_leaves_out_diagrams_of_trained_agents_that_are_not_there(tmp_path, monkeypatch, capsys):
