@@ -51,6 +51,12 @@ def test_what_a_recipe_would_import_is_refused_by_name():
     ("change", "message"),
     [
         ({"episodes": 0}, r"experiment\.episodes is 0"),
+        ({"evaluation_episodes": 0}, r"experiment\.evaluation_episodes is 0"),
+        ({"update_every": -1}, r"experiment\.update_every is -1"),
+        ({"replicas": True}, r"experiment\.replicas is True"),
+        ({"engine": "quick"}, r"experiment\.engine is 'quick'"),
+        ({"agents": DQN_AGENT}, r"experiment\.agents is a Learning"),
+        ({"seed": -1}, r"experiment\.seed is -1"),
         ({"seed": 2**64 - 1}, r"experiment\.seed is 18446744073709551615"),
         ({"name": "a/b"}, r"experiment\.name is 'a/b'"),
         ({"replicas": 2**20, "evaluation_episodes": 5}, r"experiment\.evaluation_episodes is 5"),

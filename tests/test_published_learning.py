@@ -48,9 +48,10 @@ def test_log_cosh_and_its_derivative_are_those_worked_by_hand_and_never_overflow
         loss = log_cosh(error)
         assert loss.dtype == dtype
         by_hand = [math.log(5 / 4), math.log(5 / 3), 0.0, *[large - math.log(2)] * 2]
-        assert loss.tolist() == pytest.approx(by_hand, rel=1e-5)
+        assert loss.tolist() == pytest.approx(by_hand)
         loss.sum().backward()
-        assert error.grad.tolist() == pytest.approx([0.6, -0.8, 0.0, 1.0, -1.0], rel=1e-5)
+        assert error.grad[:3].tolist() == pytest.approx([0.6, -0.8, 0.0])
+        assert error.grad[3:].tolist() == [1.0, -1.0]
     error = torch.linspace(-20, 20, 4001, requires_grad=True)
     log_cosh(error).sum().backward()
     torch.testing.assert_close(error.grad, error.detach().tanh(), rtol=0, atol=3e-7)

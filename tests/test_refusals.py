@@ -180,6 +180,23 @@ def test_what_no_network_sees_is_refused_but_tables_read_it(observed):
     TabularLearner(LearningAgents(spaces, agents=(0,), replicas=1), TabularSettings())
 
 
+class OnlyTheCritics(ClipPPOLoss):
+    """Returns the loss of the critic itself."""
+
+    def forward(self, tensordict):
+        return super().forward(tensordict)["loss_critic"]
+
+
+@pytest.mark.parametrize("kind", [RolloutLearner, TorchRLRolloutLearner])
+def test_a_loss_of_rollouts_that_returns_none_is_refused_too(kind):
+    def make_loss(network):
+        made = PPO(settings=ROLLOUTS).make_loss(network)
+        return OnlyTheCritics(made.actor_network, made.critic_network)
+
+    with pytest.raises(ValueError, match="the loss test_refusals:OnlyTheCritics returns a Tensor; allowed: "):
+        rollout_learner(make_loss, kind=kind)
+
+
 @dataclass(frozen=True, kw_only=True)
 class OwnDQN(DQN):
     """Its loss returns something else than TorchRL's."""

@@ -14,9 +14,13 @@ import cprl
 from cprl import CommonsEnv, Experiment
 from cprl.algorithms import DQN, IPPO, MADDPG, MAPPO, PPO, QMIX, SAC, VDN, Tabular, TabularSettings
 from cprl.commands import main as cli
+from cprl.commands.recipe import parse
+from cprl.learners.preferences import Exchange
+from cprl.measuring.evaluate import evaluate
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.checkpoints import checkpoints_in
 from cprl.runs.weights import load_weights, save_weights
+from cprl.training import train
 from cprl.training.agents import Population
 
 FOUR = replace(GAME, map=cprl.maps.parse(".A>.A.A\nA<A.v.A\n..<.A.A"))
@@ -89,13 +93,36 @@ def test_members_of_a_team_start_with_the_weights_of_the_members_of_a_stored_one
     stored, algorithm, stored_agents
 ):
     kept = load_weights(Path(f"{stored}/teams/checkpoints/final.pt"))
-    first = stored_agents[min(stored_agents)]
-    start = Frozen(f"{stored}/teams", first, replica=None)
-    begun = population([Team(algorithm, tuple(stored_agents), start_from=start), Scripted(), Scripted()])
-    for replica in (0, 1):
-        for agent, theirs in stored_agents.items():
-            network = begun.networks()[f"replica_{replica}/agent_{agent}"]
-            assert same(network, kept[f"replica_{replica}/agent_{theirs}"])
+    for replicas in ((None, (0, 1)), (1, (1, 1))):
+        start = Frozen(f"{stored}/teams", max(stored_agents.values()), replica=replicas[0])
+        begun = population([Team(algorithm, tuple(stored_agents), start_from=start), Scripted(), Scripted()])
+        for replica, theirs in enumerate(replicas[1]):
+            for agent, stored_agent in stored_agents.items():
+                network = begun.networks()[f"replica_{replica}/agent_{agent}"]
+                assert same(network, kept[f"replica_{theirs}/agent_{stored_agent}"])
+
+
+def test_without_updates_it_plays_what_was_stored(stored):
+    frozen = Frozen(f"{stored}/alone", 0)
+    played = []
+    for spec in (replace(ALONE[0], start_from=frozen), frozen):
+        policy = population([spec, *[Scripted("sustainable")] * 3]).policy(1)
+        played.append([own.return_.tolist() for own in evaluate(CommonsEnv(FOUR, 2, seed=1), policy)])
+    assert played[0] == played[1]
+
+
+def test_who_starts_from_stored_weights_wants_what_it_is_told(stored):
+    spec = replace(ALONE[0], reward=Exchange(0.5), start_from=Frozen(f"{stored}/alone", 0, replica=None))
+    agents = population([spec, *[Scripted()] * 3])
+    (learner,) = agents.learners.values()
+    assert learner.wants.preferences == Exchange(0.5)
+    train(CommonsEnv(FOUR, 2, seed=1), agents.learners, others=agents.others, episodes=1)
+
+
+def test_where_to_start_is_a_flag():
+    begun = experiment((replace(ALONE[0], start_from=Frozen("a", 0)), *[Scripted()] * 3))
+    words = ["recipe.py", "--agents.0.start-from.run", "b", "--agents.0.start-from.agent", "2"]
+    assert parse(lambda: begun, words)[0].agents[0].start_from == Frozen("b", 2)
 
 
 @pytest.mark.parametrize("engine", ["eager", "torchrl"])

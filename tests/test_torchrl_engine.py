@@ -208,6 +208,25 @@ def resumable(algorithm, **how):
     return make_learner(algorithm, SPACES, engine="torchrl", **HOW, **how)
 
 
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("adam", torch.optim.Adam),
+        ("adamw", torch.optim.AdamW),
+        ("rmsprop", torch.optim.RMSprop),
+        ("keras_rmsprop", torch.optim.RMSprop),
+        ("sgd", torch.optim.SGD),
+    ],
+)
+def test_the_optimiser_its_rate_and_its_epsilon_are_those_of_the_settings(name, kind):
+    settings = replace(REPLAY, optimizer=name, adam_eps=1e-3)
+    for optimizer in resumable(DQN(settings=settings)).engine.optimizers:
+        (group,) = optimizer.param_groups
+        assert type(optimizer) is kind
+        assert group["lr"] == settings.learning_rate
+        assert group.get("eps", 1e-3) == 1e-3
+
+
 RESUMED = {
     **ALGORITHMS,
     "everything of replay": DQN(

@@ -193,10 +193,12 @@ def itself():
         lambda deep: Experiment.from_config({"name": deep}),
         lambda deep: Experiment.from_recipe({"format": 2, "experiment": {"name": deep}}),
         lambda deep: DQNSettings(hidden_cells=deep),
+        lambda deep: Rules(regrow_prob=deep),
     ],
 )
 def test_what_is_nested_without_end_is_refused_in_a_sentence(deep, refuses):
-    with pytest.raises(ValueError, match=r"nested|recursion|cannot hold|^DQNSettings\.hidden_cells is "):
+    own = r"^(DQNSettings\.hidden_cells|Rules\.regrow_prob) is "
+    with pytest.raises(ValueError, match=rf"nested|recursion|cannot hold|{own}"):
         refuses(deep)
 
 
@@ -332,6 +334,12 @@ def test_what_no_memory_has_is_refused_before_it_is_allocated(algorithm, how, en
         monkeypatch.setattr(f"cprl.{place}.free_bytes", lambda device="cpu": 2 * 2**30)
     with pytest.raises(TooLargeError, match=cure):
         make_learner(algorithm, SPACES, **{**how, "engine": engine})
+
+
+def test_tables_of_too_many_agents_are_refused_too(monkeypatch):
+    monkeypatch.setattr("cprl.system.memory.free_bytes", lambda device="cpu": 2 * 2**30)
+    with pytest.raises(TooLargeError, match="1048576 replicas of 2 agents take 8"):
+        make_learner(Tabular(settings=TABLES), SPACES, **MANY)
 
 
 def test_an_evaluation_that_no_memory_has_is_refused_before_anything_is_written(tmp_path, monkeypatch):
