@@ -123,8 +123,10 @@ def test_where_nothing_happened_shares_are_undefined_and_totals_are_zero():
 
 
 def test_edges_of_equality():
-    found = whole(harvest=torch.tensor([6.0, 2.0, 0.0, 0.0]))
+    harvest = torch.tensor([6.0, 2.0, 0.0, 0.0])
+    found = whole(harvest=harvest)
     assert found["equality_within"].item() == 0.75, "a group without income is left out of the mean"
+    assert institutions.equality_within(harvest, GROUPS)[1].isnan()
     assert found["equality_between"].item() == 0.5, "means 4 and 0: one of two has everything"
     assert institutions.equality(torch.tensor([3.0, -1.0])).isnan(), "an income below zero"
     assert institutions.equality(torch.tensor([3.0, 3.0])).item() == 1
@@ -286,6 +288,8 @@ def test_the_table_has_a_column_for_each_number_and_keeps_it(tmp_path):
     assert kept.column_names[first : first + len(expected)] == expected
     numbers = {"fines": [0.5, 1.5], "violations": [0, 2], "own_bites": [2, 0], "in_force_0": [0.25, 0.25]}
     assert kept.select(list(numbers)).to_pydict() == numbers
+    without = as_table(played(turn(done=[[True]])), 0)
+    assert set(kept.column_names) - set(expected) <= set(without.column_names)
 
 
 def test_curves_and_logged_numbers_are_those_of_the_episode():

@@ -95,7 +95,7 @@ def entities(path):
 
 
 def test_the_lines_of_institutions_are_each_replica_their_mean_and_its_running_mean(run):
-    path, _, seen = run
+    path, viewer, seen = run
     _, logged = column(path, "institutions/violations", "Scalars:scalars", "episode")
     for number, line in enumerate(logged):
         episodes = [episode for episode in seen.episodes if episode.episode == number]
@@ -107,7 +107,10 @@ def test_the_lines_of_institutions_are_each_replica_their_mean_and_its_running_m
     _, in_force = column(path, "institutions/in_force_0", "Scalars:scalars", "episode")
     assert [line[0] for line in in_force] == [0.5] * 4
     _, texts = column(path, "log", "TextLog:text", "episode")
-    assert any(text.startswith("episode 0: decision 0: 0.5; ") for (text,) in texts), "an event says it"
+    said = next(text for (text,) in texts if text.startswith("episode 0: decision 0: 0.5; "))
+    first = next(one for one in seen.episodes if (one.world, one.episode) == (0, 0))
+    assert said == f"episode 0: {in_words(first, viewer.logger.curves)}"
+    assert f"{first.violations.sum()} violations; agent 0 fined {first.fines[0]:.4g}, " in said
 
 
 def test_each_agent_has_lines_of_what_it_paid_got_and_broke(run):
