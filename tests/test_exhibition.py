@@ -112,7 +112,8 @@ class Kept:
     def rows(self, component, entity="board"):
         """The values that viewers were sent."""
         batches = [chunk.to_record_batch() for chunk in self.newest.chunks(entity)]
-        assert not {name for batch in batches for name in batch.schema.names} & {"step", "episode", "frame"}
+        timelines = {"step", "episode", "frame", "log_time"}
+        assert not {name for batch in batches for name in batch.schema.names} & timelines
         columns = (batch.column(component) for batch in batches if component in batch.schema.names)
         return [value for column in columns for value in column.to_pylist()]
 

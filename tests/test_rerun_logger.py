@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import replace
+from urllib.parse import urlsplit
 
 import gymnasium
 import numpy as np
@@ -12,6 +13,7 @@ from recordings import GAME, SCENE, column, frames, static, strict_rerun, watche
 from rerun.chunk import RrdReader
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
+from test_watch import listens, wait
 from torchrl.collectors import Collector
 from torchrl.envs import GymWrapper, TransformedEnv
 from torchrl.modules import EGreedyModule, QValueModule
@@ -211,6 +213,8 @@ def test_the_live_recording_is_served_on_this_machine_and_rows_that_another_clie
         assert host == "127.0.0.1"
         assert logger.addresses["browser"].startswith("http://127.0.0.1:")
         assert f"127.0.0.1%3A{port}" in logger.addresses["browser"]
+        page = urlsplit(logger.addresses["browser"]).port
+        wait(lambda: listens(int(port)) and listens(page))
         other = rr.RecordingStream("cprl", recording_id="one", send_properties=False)
         other.connect_grpc(address)
         times = [rr.TimeColumn("step", sequence=np.arange(3))]

@@ -118,6 +118,7 @@ def test_where_exploration_ends_the_strip_changes_and_an_event_says_so(tmp_path)
     assert states == ([0, 19], [["exploring"], ["harvesting"]])
 
 
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_get_all_of_it(tmp_path):
     """Running means, label and new bests go on from the episodes in the table, which are not logged again."""
 
@@ -155,6 +156,11 @@ def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_g
         episodes, values = column(resumed, name, "Scalars:scalars", "episode")
         assert episodes == list(range(49, 70))
         assert values == column(complete, name, "Scalars:scalars", "episode")[1][49:]
+    titles = [
+        dict(zip(*column(path, "lorenz/title", "Points2D:labels", "episode"), strict=True))
+        for path in (complete, resumed)
+    ]
+    assert titles[1] == {episode: title for episode, title in titles[0].items() if episode > 48}
     states = dict(zip(*column(complete, "now", "StateChange:state", "episode"), strict=True))
     later = {episode: state for episode, state in states.items() if episode > 48}
     goes_on = dict(zip(*column(resumed, "now", "StateChange:state", "episode"), strict=True))
@@ -264,6 +270,9 @@ def test_the_numbers_of_an_evaluation_are_means_with_their_error():
 
 def test_the_header_says_where_a_run_is_and_how_to_read_its_plots():
     header = Header(episodes=4800, replicas=8, unit="apples")
+    assert header.begins("compiling, 3 s so far").splitlines()[0] == (
+        "# Episode 1 of 4,800 · compiling, 3 s so far"
+    )
     line = header.line(episode=640, label="tragedy", mean=436.4, random_play=282.1, died=2.0, over=64)
     words = ("640", "4,800", "tragedy", "436", "282", "2 of 8", "64 episodes", "96 episodes", "8 replicas")
     assert all(word in line for word in words)
