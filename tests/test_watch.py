@@ -522,6 +522,10 @@ def test_without_a_display_or_on_request_a_run_is_served_until_it_is_interrupted
     assert ("There is no display" in said[0]) != serve
     assert static(got / "got.rrd", "header", "TextDocument:text") == ["# Finished"], "before the history"
     assert column(got / "got.rrd", "world/board", "SegmentationImage:buffer")[0] == [1, 2, 3]
+    served, whole = (RrdReader(path) for path in (got / "got.rrd", tmp_path / "run.rrd"))
+    ids = [[store.recording_id for store in reader.recordings()] for reader in (served, whole)]
+    assert ids[0] == ids[1], "header and history are of one recording"
+    assert served.blueprints()
 
 
 def test_a_run_without_a_recording_is_refused(tmp_path):
