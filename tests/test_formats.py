@@ -88,7 +88,8 @@ def test_a_checkpoint_of_a_newer_cprl_is_refused_by_name(tmp_path):
     written = tmp_path / "written.pt"
     torch.save({"format": TRAINING_STATE_FORMAT + 1}, written)
     path = written.rename(tmp_path / f"training-{20:012d}-{checksum(written)}.pt")
-    with pytest.raises(ValueError, match=r"training-\S+\.pt " + REFUSED.format(4, 3)):
+    refused = REFUSED.format(TRAINING_STATE_FORMAT + 1, TRAINING_STATE_FORMAT)
+    with pytest.raises(ValueError, match=r"training-\S+\.pt " + refused):
         read_checkpoint(path)
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, ClassVar, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple, TypeVar
 
 from cprl.values import Range, Value
 
@@ -86,11 +86,10 @@ class Institution(Value, stored=False):
 
 @dataclass(frozen=True, kw_only=True)
 class Limit(Institution, stored=False):
-    """A rule about who may harvest where, when or how much."""
+    """A rule about who may harvest where, when or how much; `fine` is the last field of each."""
 
-    fine: Amount | None = None
-    """None: a bite that breaks the rule does not happen. A number: it does, is a violation, and costs so many
-    apples if it is detected."""
+    if TYPE_CHECKING:
+        fine: Amount | None
 
     @property
     def is_stopped(self) -> bool:

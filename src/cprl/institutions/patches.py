@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Final, NamedTuple
 import numpy as np
 
 from cprl.institutions.arrays import DERIVED, Bools, Bytes, Ints, Numbers
-from cprl.institutions.base import Limit, columns, with_ballots
+from cprl.institutions.base import Amount, Limit, columns, with_ballots
 from cprl.institutions.ledger import CLOSED_BITES, Ledger
 from cprl.values import Natural
 
@@ -24,6 +24,10 @@ class ClosedPatches(Limit):
 
     below: Natural = 2
     """The number of apples below which a patch is closed."""
+
+    fine: Amount | None = None
+    """None: nobody can harvest in a closed patch. A number: it can be done, is a violation, and each bite
+    costs so many apples if it is detected."""
 
     principle: ClassVar[str] = "2 rules that fit local conditions"
     at_most: ClassVar[int | None] = 1

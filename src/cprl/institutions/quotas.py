@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, NamedTuple
 
 from cprl.institutions.arrays import STATE, STEPS, Bools, Ints, Numbers
-from cprl.institutions.base import Limit, columns, with_ballots
+from cprl.institutions.base import Amount, Limit, columns, with_ballots
 from cprl.institutions.ledger import EXCESS_BITES, Ledger
 from cprl.values import Positive, Range
 
@@ -34,6 +34,10 @@ class Quota(Limit):
     by_stock: bool = False
     """Whether the quota of a window is multiplied by the share of all sites that hold an apple when it
     begins."""
+
+    fine: Amount | None = None
+    """None: nobody can harvest more. A number: it can be done, is a violation, and each bite above the quota
+    costs so many apples if it is detected."""
 
     principle: ClassVar[str] = "2 rules that fit local conditions"
     counts: ClassVar[tuple[str, ...]] = ("excess_bites",)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, NamedTuple
 
 from cprl.institutions.arrays import Bools, Ints, Numbers
-from cprl.institutions.base import Limit, columns
+from cprl.institutions.base import Amount, Limit, columns
 from cprl.institutions.ledger import CLOSED_BITES, Ledger
 from cprl.values import Positive
 
@@ -23,6 +23,10 @@ class Rotation(Limit):
 
     window_steps: Positive = 25
     """The length of a window in turns."""
+
+    fine: Amount | None = None
+    """None: nobody else can harvest. A number: it can be done, is a violation, and each bite costs so many
+    apples if it is detected."""
 
     principle: ClassVar[str] = "2 rules that fit local conditions"
     counts: ClassVar[tuple[str, ...]] = ("closed_bites",)

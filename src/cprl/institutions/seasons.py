@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, NamedTuple
 
 from cprl.institutions.arrays import Bools, Ints, Numbers
-from cprl.institutions.base import Limit, columns
+from cprl.institutions.base import Amount, Limit, columns
 from cprl.institutions.ledger import CLOSED_BITES, Ledger
 from cprl.values import Natural, Positive
 
@@ -24,6 +24,10 @@ class ClosedSeason(Limit):
 
     closed_steps: Natural = 25
     """The last turns of each period, in which the season is closed: 0 to `period_steps`."""
+
+    fine: Amount | None = None
+    """None: nobody can harvest in a closed season. A number: it can be done, is a violation, and each bite
+    costs so many apples if it is detected."""
 
     principle: ClassVar[str] = "2 rules that fit local conditions"
     counts: ClassVar[tuple[str, ...]] = ("closed_bites",)

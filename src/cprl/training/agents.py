@@ -225,7 +225,8 @@ def _networks(run: LoadedRun, weights: Mapping[str, Any]) -> dict[str, nn.Module
     networks = {}
     refusal = no_weights = f"{run.weights_from} holds no weights of this run"
     try:
-        for lane, state in weights.items():
+        for name, state in weights.items():
+            lane = name if "/" in name else f"replica_0/{name}"
             spec = run.specs[int(lane.rpartition("_")[2])]
             if not isinstance(spec, Learning | Team):
                 raise ValueError(f"{lane} is the network of an agent that does not learn")
