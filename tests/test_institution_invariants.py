@@ -173,6 +173,7 @@ FINED_LIMITS = (
     st.builds(law.Quota, share=st.sampled_from([0.0, 0.5]), window_steps=st.integers(1, 9), fine=FINES)
     | st.builds(law.ClosedSeason, period_steps=st.just(5), closed_steps=st.integers(0, 5), fine=FINES)
     | st.builds(law.ClosedPatches, below=st.integers(0, 4), fine=FINES)
+    | st.builds(law.Rotation, window_steps=st.integers(1, 9), fine=FINES)
 )
 
 
@@ -195,6 +196,18 @@ def test_nobody_harvests_more_than_a_quota_in_a_window(game, seed, share, window
         assert (harvest[first : first + window].sum(0) <= most + 1e-6).all()
     assert not fines.any()
     assert not counts["excess_bites"].any()
+
+
+@QUICK
+@given(game=games(), seed=SEEDS, window=st.integers(1, 9))
+def test_nobody_harvests_in_the_window_of_another(game, seed, window):
+    game = replace(game, institutions=(law.Rotation(window_steps=window),))
+    harvest, fines, _, counts = sums(game, seed)
+    whose = np.arange(len(harvest)) // window % game.agents
+    of_another = whose[:, None] != np.arange(game.agents)
+    assert not harvest[np.broadcast_to(of_another[:, None], harvest.shape)].any()
+    assert not fines.any()
+    assert not counts["closed_bites"].any()
 
 
 @pytest.mark.integration
