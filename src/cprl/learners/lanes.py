@@ -149,8 +149,7 @@ class Lanes:
     def by_agent(self, values: Tensor) -> Tensor:
         """Values of networks as values of the agents of each replica, [R, S]; members of a team, and agents
         that share a network, have the same."""
-        everyone = self.replicas * len(self.agents)
-        return values.repeat_interleave(everyone // len(values)).view(self.replicas, len(self.agents))
+        return values.view(self.replicas, -1).expand(-1, len(self.agents))
 
     def of_replicas(self, marked: Tensor) -> Tensor:
         """Flags of replicas, [R], as flags of networks."""
