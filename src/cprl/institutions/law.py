@@ -186,10 +186,11 @@ def parameters(game: Any) -> dict[str, dict[str, Any]]:
         for kind in KINDS
         for what, entry in enumerate(kind.entries)
     }
+    shown_entries = entries_shown(game)
     entries = {
-        "module": [places[entry][0] for entry, _ in entries_shown(game)],
-        "what": [places[entry][1] for entry, _ in entries_shown(game)],
-        "argument": [number for _, number in entries_shown(game)],
+        "module": [places[entry][0] for entry, _ in shown_entries],
+        "what": [places[entry][1] for entry, _ in shown_entries],
+        "argument": [number for _, number in shown_entries],
         "places": shows_places(game),
         "first_plane": len(game.cell_channels),
     }
