@@ -8,8 +8,8 @@ import torch
 import cprl
 from cprl import presets
 from cprl.algorithms import DQN
-from cprl.custom import allowing
 from cprl.population import Learning, Scripted
+from cprl.values import allowing
 
 
 @pytest.fixture(autouse=True)

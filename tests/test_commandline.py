@@ -21,7 +21,6 @@ from cprl import Experiment, presets
 from cprl.algorithms import DQN, PPO, QMIX, DQNSettings, RolloutSettings
 from cprl.commands import main as cli
 from cprl.commands.recipe import RunOptions, parse, recipe_main, refuse_mistyped_flags
-from cprl.custom import Custom, allowed, allowing
 from cprl.institutions import Boundaries, GraduatedSanctions, Quota
 from cprl.learners.preferences import Exchange
 from cprl.networks import MLP
@@ -30,6 +29,7 @@ from cprl.runs.recipe import resume_command, start_run
 from cprl.system import shipped
 from cprl.system.output import Output, console, printed
 from cprl.system.shipped import command_of, cprl_here, import_from, is_shipped, recipe_named, shipped_recipes
+from cprl.values import Custom, allowed, allowing
 
 ROOT = Path(__file__).parents[1]
 RECIPES = sorted(

@@ -19,7 +19,6 @@ import cprl.algorithms as algorithms
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.algorithms import DQN, IQL, MADDPG, QMIX, SAC, VDN, DistributionalDQN, DQNSettings, RolloutSettings
 from cprl.algorithms.base import OffPolicy, OnPolicy, TeamAlgorithm
-from cprl.custom import Custom
 from cprl.learners import lanes
 from cprl.learners.engine import WAYS, FunctionalEngine, ListEngine, UpdateRule
 from cprl.learners.ring import Horizon, TransitionForm
@@ -28,6 +27,7 @@ from cprl.networks import GRU, Conv
 from cprl.networks.mlp import MLPNetwork
 from cprl.networks.stacked import StackedMLP
 from cprl.training import train
+from cprl.values import Custom
 
 ENGINES = {
     "list": ListEngine,

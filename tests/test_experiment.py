@@ -8,10 +8,10 @@ from my_game import Callback, Dilemma
 
 from cprl import presets
 from cprl.algorithms import DQN, PPO, QMIX, DQNSettings, RolloutSettings, Tabular, TabularSettings
-from cprl.custom import Custom
 from cprl.experiment import Experiment, changes
 from cprl.institutions import Tax
 from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.values import Custom
 
 DQN_AGENT = Learning(DQN(settings=DQNSettings()))
 EXPERIMENT = Experiment(

@@ -18,10 +18,9 @@ from valid_values import valid
 
 import cprl
 from cprl import Experiment
-from cprl.custom import allowing, custom_targets
 from cprl.runs.episodes import read_episodes, read_table
 from cprl.runs.files import RunLock, read_json
-from cprl.values import KINDS, from_config, to_config
+from cprl.values import KINDS, allowing, custom_targets, from_config, to_config
 
 LONGEST_S = 10.0
 STORED = Path(__file__).parent / "stored" / "run"

@@ -44,7 +44,7 @@ def test_every_package_is_in_the_list():
 
 
 @pytest.mark.parametrize(
-    "line", ["from cprl.training import train", "import cprl.viewer.logger", "from cprl import presets"]
+    "line", ["from cprl.training import train", "import cprl.viewer.logger", "from cprl import population"]
 )
 def test_an_import_from_below_is_noticed(line):
     assert imports_from_below("commons", line)

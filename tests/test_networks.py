@@ -29,7 +29,6 @@ from cprl.algorithms import (
     TeamAlgorithm,
 )
 from cprl.commons.spaces import Spaces
-from cprl.custom import Custom
 from cprl.learners import lanes
 from cprl.learners.engine import FunctionalEngine, ListEngine, own_targets
 from cprl.learners.replay import ReplayLearner
@@ -38,6 +37,7 @@ from cprl.networks.specification import new_network
 from cprl.networks.stacked import stack_lanes
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
+from cprl.values import Custom
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),

@@ -12,13 +12,13 @@ from torchrl.envs import Transform
 
 import cprl
 from cprl.algorithms import DQN
-from cprl.custom import Custom
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.learners.settings import DQNSettings
 from cprl.measuring.evaluate import evaluate
 from cprl.population import Learning, Scripted
 from cprl.runs.episodes import read_table
 from cprl.training.outcome import evaluate_population, fresh_env, is_same_later, make_agents, random_play
+from cprl.values import Custom
 
 SETTINGS = DQNSettings(buffer_size=200, learning_rate=1e-3, hidden_cells=(8,))
 EXPERIMENT = cprl.Experiment(

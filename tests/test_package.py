@@ -22,7 +22,7 @@ from cprl.envs.matrix import stag_hunt
 
 PACKAGES = (
     *("algorithms", "commons", "envs", "evaluation", "institutions", "keys"),
-    *("learners", "measuring", "networks", "objectives", "policies", "population", "presets"),
+    *("learners", "measuring", "networks", "objectives", "policies", "population"),
     *("studies", "theory", "training", "viewer"),
 )
 """What users import."""

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.policies.lanes import LaneActor
-from cprl.system.compile_clock import CLOCK
+from cprl.system.times import CLOCK
 from cprl.terminal import progress
 from cprl.terminal.progress import ProgressBar
 from cprl.training import train

@@ -26,7 +26,6 @@ import cprl
 from cprl import presets
 from cprl.algorithms import DQN
 from cprl.commands import main as cli
-from cprl.custom import Custom
 from cprl.evaluation.film import film
 from cprl.experiment import Experiment
 from cprl.measuring import EpisodeTracker
@@ -40,6 +39,7 @@ from cprl.runs.recipe import read_recipe, refuse_another_run, resume_command, ru
 from cprl.studies.factors import changed
 from cprl.system.shipped import cprl_here
 from cprl.training.collectors import StepCollector
+from cprl.values import Custom
 
 AGENT = Learning(DQN(settings=presets.dqn_settings("commons")))
 EXPERIMENT = Experiment(

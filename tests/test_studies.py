@@ -14,7 +14,7 @@ from tiny_study import FREEZE, GAMMA, LEARNING, MIXED, SETTINGS, TINY
 
 from cprl import Custom, Study, maps
 from cprl.algorithms import DQN, PPO, VDN, DQNSettings
-from cprl.experiment import MOST_SEED, Experiment
+from cprl.experiment.experiment import MOST_SEED, Experiment
 from cprl.institutions import Quota, Sanctioner
 from cprl.learners.settings import RolloutSettings
 from cprl.networks import MLP

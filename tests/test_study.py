@@ -46,7 +46,6 @@ from verdicts import CONTRADICTED, NOT_CONTRADICTED, curve_prediction, predictio
 import cprl
 from cprl import Game, Rules, maps, presets
 from cprl.algorithms import DQN
-from cprl.custom import Custom, allowing
 from cprl.institutions import Tax
 from cprl.measuring.movement import Trace
 from cprl.measuring.statistics import estimate
@@ -55,6 +54,7 @@ from cprl.runs.curves import as_curves
 from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
 from cprl.theory import yield_bounds
+from cprl.values import Custom, allowing
 
 EPISODES = np.arange(4800)
 COURSE = [0, 600, 1500, 2600, 4799]

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from cprl.system import compile_clock, times
-from cprl.system.compile_clock import cleared_up, free_earlier, set_aside
-from cprl.system.times import RunTimes, Times
+from cprl.system import compiling, times
+from cprl.system.compiling import cleared_up, set_aside
+from cprl.system.times import Times
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def clock(monkeypatch):
 
 
 def test_acting_storing_and_updating_is_told_apart_from_compiling(clock):
-    run = RunTimes()
+    run = Times()
     clock.seconds, clock.total_s = 101.0, 7.5  # half a second of compiling before the training
     training = Times()
     clock.seconds, clock.total_s = 111.0, 9.5
@@ -42,7 +42,7 @@ def test_a_training_that_goes_on_counts_what_it_took_before(clock):
     clock.seconds, clock.total_s, first.busy_s = 110.0, 10.0, 9.0
     state = first.state_dict()
     clock.seconds, clock.total_s = 500.0, 0.0  # another process
-    run, second = RunTimes(), Times()
+    run, second = Times(), Times()
     second.load_state_dict(state)
     clock.seconds, clock.total_s, second.busy_s = 504.0, 1.0, second.busy_s + 3.0
     # 10 + 4 s, of them busy 9 + 3, of which compiling 3 + 1
@@ -74,7 +74,7 @@ def test_what_a_training_leaves_in_cycles_is_freed_at_its_end():
 
 @pytest.mark.integration
 def test_a_training_that_compiled_is_freed_when_the_next_one_begins(monkeypatch):
-    monkeypatch.setattr(compile_clock, "_is_set_aside", False)
+    monkeypatch.setattr(compiling, "_is_set_aside", False)
     with cleared_up():
         learner = Learner()
         left = weakref.ref(learner)
@@ -82,5 +82,5 @@ def test_a_training_that_compiled_is_freed_when_the_next_one_begins(monkeypatch)
         del learner
     gc.collect()
     assert left() is not None, "it was set aside with what was compiled"
-    free_earlier()
-    assert left() is None
+    with cleared_up():
+        assert left() is None

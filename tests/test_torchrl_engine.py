@@ -16,11 +16,11 @@ from torchrl.objectives.value import GAE
 
 from cprl import CommonsEnv, Game, Rules, algorithms, keys, maps
 from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
-from cprl.custom import Custom
 from cprl.learners.reference import TorchRLReplayLearner, TorchRLRolloutLearner
 from cprl.learners.replay import ReplayLearner
 from cprl.objectives import LogCoshDQNLoss, PR2Loss
 from cprl.policies.lanes import LaneActor
+from cprl.values import Custom
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),

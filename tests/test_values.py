@@ -27,7 +27,6 @@ from cprl.algorithms import (
     TabularSettings,
 )
 from cprl.commands.recipe import parse, recipe_main
-from cprl.custom import allowing, custom_targets
 from cprl.envs.matrix import MatrixGame
 from cprl.envs.taking import TakingGame
 from cprl.learners.base import LearningAgents
@@ -42,7 +41,7 @@ from cprl.runs.recipe import read_recipe
 from cprl.system.memory import TooLargeError
 from cprl.theory import appropriation, herders
 from cprl.training.running import run
-from cprl.values import KINDS, differences, from_config, to_config
+from cprl.values import KINDS, allowing, custom_targets, differences, from_config, to_config
 
 GAME = presets.game("two_complex")
 REPLAY, ROLLOUTS, TABLES = DQNSettings(), RolloutSettings(), TabularSettings()

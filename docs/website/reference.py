@@ -18,35 +18,35 @@ FOLDER: Final = "reference"
 REFERENCE: Final = {
     "cprl": "what most programs need",
     "commons": "the game: rules, boards, observations, the state",
-    "presets": "the published games and settings",
     "keys": "the TensorDict entries",
     "envs": "TorchRL, PettingZoo, Gymnasium",
     "institutions": "rules that people make",
     "theory": "games with a known answer",
-    "custom": "code of your own in a recipe",
     "networks": "from observations to numbers",
     "objectives": "losses that TorchRL lacks",
     "policies": "agents that follow a rule",
     "algorithms": "what agents learn by",
     "learners": "the hyper-parameters",
     "population": "how each agent is specified",
-    "experiment": "an experiment, a value",
+    "experiment": "an experiment, a value; the published games and settings",
     "training": "the loop",
     "measuring": "metrics and statistics",
     "viewer": "recordings for the Rerun viewer",
     "evaluation": "stored agents in fresh worlds and among each other",
     "studies": "one experiment under many conditions",
-    "values": "frozen values, whose annotations say what a field allows, as JSON tables and back",
+    "values": "frozen values, whose annotations say what a field allows, as tables; code of your own",
 }
 """A page each, in reading order, and what it is about."""
 
 _MODULES: Final = {
     "commons": ("maps", "observation", "rules", "game", "spaces", "state"),
     "envs": ("make_env",),
+    "experiment": ("presets",),
     "learners": ("settings", "preferences"),
     "measuring": ("social", "phases", "statistics"),
     "policies": ("scripted", "assignment"),
     "training": ("training",),
+    "values": ("custom",),
     "viewer": ("callback",),
 }
 """Modules of a package that its page shows too, beside what the package exports."""
@@ -81,10 +81,9 @@ def _public_names(package: str) -> list[str]:
     """The full names of what a package exports, of a module what it defines; then those of its modules."""
     module = import_module(package)
     exported = list(getattr(module, "__all__", ()))
-    defines = not hasattr(module, "__path__") and not exported
     found = [
         _path_of(package, name)
-        for name in (_defined_by(module) if defines else exported)
+        for name in (exported or _defined_by(module))
         if not _is_elsewhere(module, name)
     ]
     for name in _MODULES.get(package.removeprefix("cprl."), ()):

@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.presets import Board
+from cprl.experiment.presets import Board
 
 Values = NDArray[np.float64]
 

@@ -1,8 +1,7 @@
 """cprl: common-pool resources and multi-agent reinforcement learning on TorchRL.
 
 A package imports only from those above it:
-    custom       the user's own code, as a text that a recipe can keep, and what is allowed of it
-    values       frozen values: a field's annotation says its range; tables that JSON holds, and back
+    values       frozen values: a field's annotation says its range; tables that JSON holds, and back; Custom
     system       compilation, caches, memory, output, private parts of libraries
     keys         the TensorDict entries, their shapes and types
     institutions  rules that people make: boundaries, quotas, taxes, sanctions, votes; numpy alone
@@ -15,10 +14,9 @@ A package imports only from those above it:
     learners     replay and rollouts, updates of many agents at once
     algorithms   what agents learn by: DQN, PPO, QMIX and so on, frozen values
     population   how each agent is specified: Learning, Team, Scripted, Frozen
-    presets      the published games and hyper-parameters by name
     measuring    social metrics, episodes, phases, statistics
     runs         what is kept of a run: recipe, table of episodes, checkpoints, weights
-    experiment   Experiment: what is trained and how, a value
+    experiment   Experiment: what is trained and how, a value; presets: what was published, by name
     viewer       recordings for the Rerun viewer
     terminal     progress, summary, figures
     training     the loop: act, store, update, measure, record; run, load
@@ -46,7 +44,6 @@ if TYPE_CHECKING:
         objectives,
         policies,
         population,
-        presets,
         studies,
         theory,
         training,
@@ -59,14 +56,14 @@ if TYPE_CHECKING:
     from cprl.commons.maps import Map
     from cprl.commons.observation import Observation
     from cprl.commons.rules import Rules
-    from cprl.custom import Custom
     from cprl.envs import CommonsEnv
     from cprl.evaluation import crossplay, evaluate_run
-    from cprl.experiment import Experiment
+    from cprl.experiment import Experiment, presets
     from cprl.studies import Study, run_study
     from cprl.training import train
     from cprl.training.agents import load
     from cprl.training.running import run
+    from cprl.values import Custom
 
     __version__: str
 
@@ -110,7 +107,7 @@ __all__ = [
 
 _MODULES: Final = {
     "CommonsEnv": "cprl.envs",
-    "Custom": "cprl.custom",
+    "Custom": "cprl.values",
     "Experiment": "cprl.experiment",
     "Game": "cprl.commons.game",
     "Map": "cprl.commons.maps",
@@ -126,6 +123,7 @@ _MODULES: Final = {
     "study_main": "cprl.commands.studies",
     "train": "cprl.training",
 }
+_INNER: Final = {"maps": "cprl.commons.maps", "presets": "cprl.experiment.presets"}
 """Where names are that no package is called. All are imported when they are used: torch alone takes seconds,
 which `cprl --help` and mistyped commands need not wait for."""
 
@@ -137,11 +135,9 @@ def __getattr__(name: str) -> Any:
         return version("cprl")
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if name == "maps":
-        return import_module("cprl.commons.maps")
     if name in _MODULES:
         return getattr(import_module(_MODULES[name]), name)
-    return import_module(f"cprl.{name}")
+    return import_module(_INNER.get(name, f"cprl.{name}"))
 
 
 def __dir__() -> list[str]:
@@ -155,7 +151,7 @@ def _register() -> None:
     gymnasium.register("cprl/Commons-v0", entry_point="cprl.envs.gymnasium_env:CommonsGymnasiumEnv")
     for name, board in (("SingleBasic", "single_basic"), ("SingleComplex", "single_complex")):
         gymnasium.register(
-            f"cprl/{name}-v0", entry_point="cprl.presets:gymnasium_env", kwargs={"board": board}
+            f"cprl/{name}-v0", entry_point="cprl.experiment.presets:gymnasium_env", kwargs={"board": board}
         )
 
 

@@ -11,16 +11,14 @@ from posixpath import normpath
 from typing import Annotated, Any, Final, TypeAlias
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
-from cprl.custom import Custom
 from cprl.learners.decisions import Bandit
 from cprl.learners.preferences import Preference
 from cprl.learners.settings import Exploring
 from cprl.policies.scripted import ScriptedPolicy
-from cprl.values import AgentIndices, Natural, Value, Where, checked
+from cprl.values import AgentIndices, Custom, Natural, Value, Where, checked
 
 
 def _is_path(value: Any) -> bool:
-    """Whether a value can be the path of a directory, on this machine or another."""
     try:
         return isinstance(value, str) and "\0" not in value and 0 < len(os.fsencode(value)) <= _MOST_PATH
     except UnicodeEncodeError:
@@ -53,7 +51,6 @@ class Frozen(Value):
         object.__setattr__(self, "run", normpath(self.run))  # of "runs/x/" and "runs/x", the same checksum
 
     def replica_for(self, replica: int) -> int:
-        """The replica of that run for a replica here."""
         if not isinstance(self.replica, tuple):
             return replica if self.replica is None else self.replica
         if replica >= len(self.replica):
@@ -124,7 +121,6 @@ class Team(Value):
 
 
 def refuse_sharing(algorithm: Algorithm, share_parameters: bool) -> None:
-    """Raises a ValueError for an algorithm whose agents cannot share parameters, but shall."""
     if share_parameters and not algorithm.can_share_parameters:
         raise ValueError(
             f"Team.share_parameters is True; allowed for {type(algorithm).__name__}, whose agents each have "
@@ -164,7 +160,6 @@ def specs_by_agent(specs: Sequence[AgentSpec], agents: int) -> list[AgentSpec]:
 
 
 def refuse_undecided(specs: Sequence[AgentSpec], ballots: int) -> None:
-    """Raises a ValueError for agents that would learn decisions in a game without any."""
     for place, spec in enumerate(specs):
         if isinstance(spec, Learning | Team) and spec.decisions is not None and not ballots:
             raise ValueError(

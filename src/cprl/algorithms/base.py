@@ -14,7 +14,6 @@ from torchrl.modules import ProbabilisticActor, QValueActor
 from torchrl.objectives import LossModule, ValueEstimators
 
 from cprl.commons.spaces import Spaces
-from cprl.custom import Custom
 from cprl.learners.base import Learner, LearningAgents
 from cprl.learners.engine import Batching
 from cprl.learners.lanes import Method
@@ -29,7 +28,7 @@ from cprl.networks.recurrent import Recurrent, state_shape_of
 from cprl.networks.specification import Network, new_network
 from cprl.objectives.td import TORCHRL_DISTANCES
 from cprl.system.compat.losses import LaneCategorical
-from cprl.values import Range, Value, Where, checked
+from cprl.values import Custom, Range, Value, Where, checked
 
 TrainingEngine: TypeAlias = Literal["compiled", "eager", "torchrl"]
 """How agents are updated. "compiled": all together, in one update that torch compiles; "eager": the same

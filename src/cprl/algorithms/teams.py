@@ -17,7 +17,6 @@ from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss, QMixerLoss
 from cprl.algorithms.base import OffPolicy, TeamAlgorithm, TrainingEngine, Weight, policy, q_actor
 from cprl.algorithms.on_policy import Clipped
 from cprl.commons.spaces import Spaces
-from cprl.custom import Custom
 from cprl.learners.base import Learner, LearningAgents
 from cprl.learners.engine import Batching
 from cprl.learners.lanes import Method
@@ -30,6 +29,7 @@ from cprl.networks.team import CentralCritic, JointCritics, Mixing, Team
 from cprl.objectives import LOLADiCELoss, LOLALoss
 from cprl.objectives.maddpg import NUMBERS, MADDPGLoss
 from cprl.objectives.td import DISTANCES
+from cprl.values import Custom
 
 _CHOSEN, _OF_TEAM = "chosen_action_value", "team_value"
 

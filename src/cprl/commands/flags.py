@@ -20,8 +20,7 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from cprl.custom import Custom
-from cprl.values import fits
+from cprl.values import Custom, fits
 
 if TYPE_CHECKING:
     from cprl.experiment import Experiment
@@ -74,7 +73,6 @@ class ValueFlags(ConstructorRegistry):
         return StructConstructorSpec(instantiate=changed, fields=tuple(flag for flag in flags if flag))
 
     def _flag(self, field: StructFieldSpec, above: str) -> StructFieldSpec | None:
-        """The flags of a field of a value; None where no word can say it."""
         value, place = field.default, f"{above}.{field.name}".lstrip(".")
         kind: Any
         if _is_code(value):
@@ -106,7 +104,6 @@ class ValueFlags(ConstructorRegistry):
 
 
 def _is_code(value: Any) -> bool:
-    """Whether a value is, or holds, the name of somebody's own code."""
     from cprl.commons.maps import Map
 
     parts = value if isinstance(value, tuple) else (value,)
@@ -114,7 +111,6 @@ def _is_code(value: Any) -> bool:
 
 
 def _sayable(hint: Any, value: Any) -> Any:
-    """The part of a type that words can say, if it is that of the value; else None."""
     simple = _simple(hint)
     return None if simple in (None, NoneType) or not fits(value, simple) else simple
 
@@ -212,7 +208,6 @@ def _snake(name: str) -> str:
 
 
 def shape_of(experiment: "Experiment") -> Shape:
-    """Return the board, the number of agents and the institutions of an experiment, for help."""
     from cprl.commons import maps
     from cprl.commons.game import Game
 

@@ -1,23 +1,23 @@
 """What plays stored agents, none of which learns, in fresh worlds: `cprl film`, `evaluate`, `egta` ..."""
 
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from cprl.presets import Variant, check_board
+from cprl.experiment.presets import Variant, check_board
 from cprl.system.defaults import EGTA_RESAMPLES, FILM_SEED, FILM_SUFFIXES, PLAY_SEED, SEED, Diagonal
 from cprl.system.output import OUT, console, printed, say
 from cprl.system.process import prepare_process
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     from rich.table import Table
 
-Policy = Literal["trained", "random"]
+    from cprl.evaluation.lanes import Results
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,20 +54,6 @@ class Files:
 
             check_picture(self.figure, "--figure")
 
-    def keep(self, table: "Callable[[], pa.Table]") -> None:
-        """Write the episodes."""
-        if self.out is not None:
-            from cprl.runs.episodes import write_table
-
-            write_table(self.out, table())
-
-    def tell(self, draw: Callable[[Path], Path] | None = None) -> None:
-        """Say where the episodes are, and draw the figure."""
-        if self.out is not None:
-            say(f"Episodes: {self.out}")
-        if self.figure is not None and draw is not None:
-            say(f"Figure: {draw(self.figure)}")
-
 
 FreshFlags = Annotated[Fresh, tyro.conf.arg(name="")]
 FileFlags = Annotated[Files, tyro.conf.arg(name="")]
@@ -90,11 +76,6 @@ class FilmOptions:
     width: int | None = None
     """Of a .gif or .mp4, in pixels, at most 1920 and at least 240 for each run; by default 640 for each that
     has room."""
-
-    @property
-    def given(self) -> dict[str, Any]:
-        """The options that differ from the defaults."""
-        return {name: value for name, value in vars(self).items() if value not in (None, ())}
 
 
 def film(
@@ -122,11 +103,11 @@ def film(
     """
     if out is not None and out.suffix not in (".rrd", *FILM_SUFFIXES):
         raise ValueError(f"--out is {out}; allowed: a name that ends in .rrd, {', '.join(FILM_SUFFIXES)}")
+    given = {name: value for name, value in vars(options).items() if value not in (None, ())}
     is_video = out is not None and out.suffix in FILM_SUFFIXES
-    if options.given and not is_video:
-        name = next(iter(options.given))
-        raise ValueError(f"--{name} is for films; allowed: with --out FILE.gif or FILE.mp4")
-    _begin(run, *options.beside, seed=seed)
+    if given and not is_video:
+        raise ValueError(f"--{next(iter(given))} is for films; allowed: with --out FILE.gif or FILE.mp4")
+    _begin(seed, run, *options.beside)
 
     from cprl.evaluation.film import Style, film_video
     from cprl.evaluation.film import film as film_run
@@ -138,10 +119,10 @@ def film(
         say(f"{played.steps} steps, {played.outcome}")
         say(f"Watch: {printed(to_watch(path))}")
         return
-    style = {name: value for name, value in options.given.items() if name != "beside"}
-    path, episodes = film_video(run, out, beside=options.beside, style=Style(**style), **which)
-    for path_of_run, played in zip((run, *options.beside), episodes, strict=True):
-        say(f"{f'{path_of_run}: ' if options.beside else ''}{played.steps} steps, {played.outcome}")
+    beside = given.pop("beside", ())
+    path, episodes = film_video(run, out, beside=beside, style=Style(**given), **which)
+    for path_of_run, played in zip((run, *beside), episodes, strict=True):
+        say(f"{f'{path_of_run}: ' if beside else ''}{played.steps} steps, {played.outcome}")
     say(f"{path}: {path.stat().st_size / 1000:.0f} kB")
 
 
@@ -174,7 +155,7 @@ def play(board: str, /, *, session: Annotated[Session, tyro.conf.arg(name="")] =
             is then; or a file with a drawing.
     """
     check_board(board)
-    _begin(seed=session.seed)
+    _begin(session.seed)
 
     from cprl.evaluation.play import open_session, play_in_terminal
 
@@ -189,15 +170,12 @@ def evaluate(run: Path, /, *, fresh: FreshFlags = Fresh(), out: Path | None = No
         out: a parquet file to be, with every episode.
     """
     files = Files(out=out)
-    _begin_fresh(fresh, files, run)
+    _begin(fresh.seed, run, files=files)
 
     from cprl.evaluation.evaluate import evaluate_run, run_table
 
     evaluation = evaluate_run(run, **vars(fresh))
-    files.keep(evaluation.table)
-    print_tables([run_table(evaluation)])
-    say(f"Weights: {evaluation.run.weights_from}")
-    files.tell()
+    _show(evaluation, files, [run_table(evaluation)], below=f"Weights: {evaluation.run.weights_from}")
 
 
 def visits(
@@ -213,15 +191,14 @@ def visits(
     if random and figure is None:
         raise ValueError("--random says who is drawn; allowed: with --figure FILE.png")
     files = Files(figure=figure)
-    _begin_fresh(fresh, files, run)
+    _begin(fresh.seed, run, files=files)
 
     from cprl.evaluation.territory import draw_visits, territory_of, territory_table
 
     territory = territory_of(run, **vars(fresh))
-    print_tables([territory_table(territory)])
-    say(f"Weights: {territory.run.weights_from}")
-    policy: Policy = "random" if random else "trained"
-    files.tell(lambda path: draw_visits(territory, path, policy=policy))
+    draw = partial(draw_visits, territory, policy="random" if random else "trained")
+    below = f"Weights: {territory.run.weights_from}"
+    _show(None, files, [territory_table(territory)], below=below, draw=draw)
 
 
 def crossplay(
@@ -241,16 +218,14 @@ def crossplay(
         diagonal: whom a run's agents meet there: "self", those they were trained with, or "cross_seed", those
             of the run's next replica.
     """
-    named = _begin_named(fresh, files, runs)
+    named = runs_by_name(runs)
+    _begin(fresh.seed, *_paths(named), files=files)
 
     from cprl.evaluation.cross_play import crossplay as play_each_other
     from cprl.evaluation.cross_play import crossplay_tables, draw_gains, heading
 
     played = play_each_other(named, diagonal=diagonal, **vars(fresh))
-    files.keep(played.table)
-    say(heading(played))
-    print_tables(crossplay_tables(played))
-    files.tell(lambda path: draw_gains(played, path))
+    _show(played, files, crossplay_tables(played), above=heading(played), draw=partial(draw_gains, played))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -288,9 +263,8 @@ def schelling(
         variant: of the boards with a name: published, as_run or, of two_complex, as_run_10_april; see
             docs/game.md.
     """
-    files.check()
     check_board(board)
-    _begin(seed=mixes.seed)
+    _begin(mixes.seed, files=files)
 
     from cprl.evaluation.populations import board_named
     from cprl.evaluation.schelling import draw_schelling, schelling_tables
@@ -298,9 +272,7 @@ def schelling(
 
     game, run = board_named(board, variant)
     diagram = play_all_mixes(game if run is None else run, **vars(mixes))
-    files.keep(diagram.table)
-    print_tables(schelling_tables(diagram))
-    files.tell(lambda path: draw_schelling(diagram, path))
+    _show(diagram, files, schelling_tables(diagram), draw=partial(draw_schelling, diagram))
 
 
 def egta(
@@ -323,7 +295,8 @@ def egta(
             and a reduction where there are more than two agents.
         resamples: of the replicas, for intervals.
     """
-    named = _begin_named(fresh, files, runs)
+    named = runs_by_name(runs)
+    _begin(fresh.seed, *_paths(named), files=files)
 
     from cprl.evaluation.cross_play import crossplay
     from cprl.evaluation.empirical_game import (
@@ -337,16 +310,12 @@ def egta(
     from cprl.theory.solutions import check_extras
 
     check_extras()
-    game = (
-        pairwise_game(crossplay(named, **vars(fresh)))
-        if pairwise
-        else play_empirical_game(named, **vars(fresh))
-    )
-    files.keep(game.table)
+    if pairwise:
+        game = pairwise_game(crossplay(named, **vars(fresh)))
+    else:
+        game = play_empirical_game(named, **vars(fresh))
     analysis = analyse(game, resamples=resamples)
-    say(egta_heading(game))
-    print_tables(egta_tables(analysis))
-    files.tell(lambda path: draw_egta(analysis, path))
+    _show(game, files, egta_tables(analysis), above=egta_heading(game), draw=partial(draw_egta, analysis))
 
 
 def scenarios(
@@ -366,16 +335,20 @@ def scenarios(
         run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
         scenarios: their names, e.g. minority_among_greedy; by default all of the run's game.
     """
-    _begin_fresh(fresh, files, run)
+    _begin(fresh.seed, run, files=files)
 
     from cprl.evaluation.scenarios import draw_scenarios, heading, run_scenarios, scenario_tables
 
     scores = run_scenarios(run, scenarios=scenarios, **vars(fresh))
-    files.keep(scores.table)
-    say(heading(scores))
-    print_tables(scenario_tables(scores))
-    say(f"Weights: {scores.run.weights_from}")
-    files.tell(lambda path: draw_scenarios(scores, path))
+    below = f"Weights: {scores.run.weights_from}"
+    _show(
+        scores,
+        files,
+        scenario_tables(scores),
+        above=heading(scores),
+        below=below,
+        draw=partial(draw_scenarios, scores),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -420,7 +393,7 @@ def exploit(
         jobs: processes that train at the same time, one for each place and algorithm.
         dry_run: list all trainings and their states; run and write nothing.
     """
-    _begin(run, seed=responses.seed)
+    _begin(responses.seed, run)
 
     from cprl.commands.studies import StudyOptions, carry_out, executor_of
     from cprl.evaluation.exploit import TABLE, exploitability_tables, measure, plan_responses
@@ -439,29 +412,44 @@ def exploit(
     say(f"Episodes: {folder / TABLE}")
 
 
-def _begin(*runs: Path | str, seed: int) -> None:
-    """Check that runs are there, before what plays their agents is imported; prepare the process."""
-    check_runs(*runs)
+def _begin(seed: int, *runs: Path | str, files: Files = Files()) -> None:
+    """Refuse files that are there and runs that are not, before what plays agents is imported; prepare the
+    process."""
+    from cprl.runs.recipe import read_recipe
+
+    files.check()
+    for run in runs:
+        read_recipe(Path(run))
     prepare_process(seed)
 
 
-def _begin_fresh(fresh: Fresh, files: Files, *runs: Path | str) -> None:
-    files.check()
-    _begin(*runs, seed=fresh.seed)
+def _show(
+    played: "Results | None",
+    files: Files,
+    tables: "Iterable[Table]",
+    *,
+    above: str = "",
+    below: str = "",
+    draw: Callable[[Path], Path] | None = None,
+) -> None:
+    """Write every episode, print tables with a line above and below them, and draw."""
+    if files.out is not None and played is not None:
+        from cprl.runs.episodes import write_table
+
+        write_table(files.out, played.table())
+    if above:
+        say(above)
+    print_tables(tables)
+    if below:
+        say(below)
+    if files.out is not None:
+        say(f"Episodes: {files.out}")
+    if files.figure is not None and draw is not None:
+        say(f"Figure: {draw(files.figure)}")
 
 
-def _begin_named(fresh: Fresh, files: Files, words: Sequence[str]) -> list[str] | dict[str, str]:
-    named = runs_by_name(words)
-    _begin_fresh(fresh, files, *(named.values() if isinstance(named, dict) else named))
-    return named
-
-
-def check_runs(*runs: Path | str) -> None:
-    """Refuse what is no directory of a run."""
-    from cprl.runs.recipe import read_recipe
-
-    for run in runs:
-        read_recipe(Path(run))
+def _paths(named: Sequence[str] | Mapping[str, str]) -> Iterable[str]:
+    return named.values() if isinstance(named, Mapping) else named
 
 
 def runs_by_name(words: Sequence[str]) -> list[str] | dict[str, str]:
@@ -483,7 +471,6 @@ def runs_by_name(words: Sequence[str]) -> list[str] | dict[str, str]:
 
 
 def print_tables(tables: "Iterable[Table]") -> None:
-    """Print tables; into a file or pipe as wide as they are."""
     terminal = console(width=None if OUT.isatty() else 250)
     for table in tables:
         terminal.print(table)

@@ -21,10 +21,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 import tyro
 
 from cprl.commands.flags import RefusedError, Shape, ValueFlags, in_shape, numbered, shape_of
-from cprl.custom import trust
 from cprl.system.output import RESUMES, say
 from cprl.system.shipped import Recipe, program_of
-from cprl.values import meant, refusal
+from cprl.values import meant, refusal, trust
 
 if TYPE_CHECKING:
     from cprl.experiment import Experiment
@@ -121,7 +120,6 @@ def run_with(
     command: Sequence[str],
     callbacks: Sequence[object] = (),
 ) -> Path:
-    """Run an experiment with the options of a command line."""
     from cprl.runs.recipe import started_by
     from cprl.training.running import run
 
@@ -253,7 +251,6 @@ def parse_with(
 
 
 def _refuse_names(make_experiment: "Callable[..., Experiment]", taken: set[str]) -> None:
-    """Refuse a recipe with an argument of the name of a flag that every experiment has."""
     # "runs" is the directory of a study's runs, which no recipe.json and no line that resumes keeps.
     taken = {*taken, *RunOptions.__dataclass_fields__, "runs"}
     for name in inspect.signature(make_experiment).parameters:
@@ -296,7 +293,7 @@ def _names_of(recipe: Recipe) -> set[str] | None:
     calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and node.args]
     makers = [ast.unparse(call.args[0]) for call in calls if ast.unparse(call.func).endswith("recipe_main")]
     functions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
-    experiment = find_spec("cprl.experiment")
+    experiment = find_spec("cprl.experiment.experiment")
     if not makers or makers[0] not in functions or experiment is None or experiment.origin is None:
         return None
     arguments = functions[makers[0]].args

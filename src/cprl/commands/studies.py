@@ -309,7 +309,6 @@ _CONFIG: Final = (tyro.conf.HelptextFromCommentsOff,)
 
 
 def executor_of(options: TrialOptions) -> "Executor":
-    """Return where trials are run."""
     from cprl.studies.executors import InProcess, Processes, Ray
 
     jobs = 1 if options.jobs is None else checked("--jobs", options.jobs, Annotated[int, Range(1, 4096)])

@@ -18,9 +18,9 @@ import numba
 from filelock import FileLock
 
 from cprl.commons import loops
-from cprl.system.compile_clock import CLOCK
 from cprl.system.libraries import relying_on
 from cprl.system.process import cache_folder
+from cprl.system.times import CLOCK
 
 Compiled = dict[str, Callable[..., Any]]
 

@@ -12,13 +12,12 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 from cprl import keys
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
-from cprl.custom import Custom, made
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.matrix import MatrixGame, nested_tuples
 from cprl.envs.state import env_state, load_env_state
 from cprl.envs.taking import TakingGame
 from cprl.envs.unwrap import commons_of
-from cprl.values import Seed, checked, refusal
+from cprl.values import Custom, Seed, checked, made, refusal
 
 
 @runtime_checkable

@@ -9,7 +9,6 @@ from typing import Any, Final, Literal
 import torch
 from rich.table import Table
 
-from cprl.custom import trust
 from cprl.envs.unwrap import agent_names
 from cprl.evaluation.lanes import Fresh, Part, Played, Results, agents_of, scripted
 from cprl.measuring.metrics import left_out, with_unit
@@ -17,7 +16,7 @@ from cprl.measuring.series import OF_AGENTS
 from cprl.measuring.statistics import Measured, agents_without_harvest, over_replicas
 from cprl.system.defaults import SEED as SEED
 from cprl.training.agents import LoadedRun, load
-from cprl.values import Positive, Seed, checked
+from cprl.values import Positive, Seed, checked, trust
 
 _LONGEST: Final = 80
 """The largest number of characters of two values in a message."""

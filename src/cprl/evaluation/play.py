@@ -17,20 +17,19 @@ from cprl.commons.colours import APPLE, BEAM, PALETTE, WALL, Colour, agent_colou
 from cprl.commons.game import Game
 from cprl.commons.maps import SIGN_OF_HEADING
 from cprl.commons.world import Shown, StepOutput
-from cprl.custom import trust
 from cprl.envs.make_env import make_env
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.lanes import Policy, Turns, board_now
 from cprl.evaluation.populations import agent_named, board_named
+from cprl.experiment.presets import Variant
 from cprl.measuring import social
 from cprl.measuring.metrics import title
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import Scripted
-from cprl.presets import Variant
 from cprl.system.defaults import PLAY_SEED
 from cprl.system.output import OUT, console, say
 from cprl.training.agents import Population
-from cprl.values import Range, checked, refusal
+from cprl.values import Range, checked, refusal, trust
 
 KEYS: Final = {
     "w": ("forward", "step forward"),

@@ -7,21 +7,20 @@ from typing import Any, Final
 
 from torchrl.envs import EnvBase
 
-from cprl import presets
 from cprl.commons import maps
 from cprl.commons.game import Game
 from cprl.commons.rules import Rules
 from cprl.commons.spaces import Spaces
-from cprl.custom import made, trust
 from cprl.envs.make_env import is_playable, make_env, spaces_of
 from cprl.evaluation.evaluate import SEED, check
 from cprl.evaluation.lanes import Place, Played
+from cprl.experiment import presets
+from cprl.experiment.presets import Variant
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
-from cprl.presets import Variant
 from cprl.training.agents import LoadedRun, Population, load
-from cprl.values import Positive, checked, refusal
+from cprl.values import Positive, checked, made, refusal, trust
 
 _SPECS: Final = "Scripted(policy) or Frozen(run, agent, replica)"
 

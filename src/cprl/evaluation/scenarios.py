@@ -24,7 +24,6 @@ import pyarrow as pa
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from cprl import presets
 from cprl.commons.game import Game
 from cprl.evaluation.evaluate import (
     INTERVALS,
@@ -38,6 +37,7 @@ from cprl.evaluation.evaluate import (
     unlike,
 )
 from cprl.evaluation.lanes import Agent, Part, Results, Whose, agents_of, more, scripted
+from cprl.experiment import presets
 from cprl.measuring.metrics import with_unit
 from cprl.measuring.statistics import HOLM, Estimate, Measured, starred
 from cprl.population import Frozen, Scripted

@@ -35,13 +35,13 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from cprl.commons.game import Game
-from cprl.custom import trust
 from cprl.evaluation.evaluate import INTERVALS, SEED, table_of
 from cprl.evaluation.lanes import Fresh, Part, Played, Results, Values, Whose
 from cprl.evaluation.populations import agent_named, place_of, play_population
 from cprl.measuring.statistics import Estimate, Measured, difference, estimate
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.terminal import style
+from cprl.values import trust
 
 NONE: Final = "no dilemma"
 UNTOLD: Final = "cannot be told"

@@ -17,7 +17,6 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler, Sampler, SamplerWithoutReplacement
 from torchrl.objectives.value import GAE
 
-from cprl.custom import made
 from cprl.learners.base import NOISE, SAMPLING, LearningAgents
 from cprl.learners.engine import ListEngine
 from cprl.learners.lanes import Lanes, Method, seed_of
@@ -27,6 +26,7 @@ from cprl.learners.rollouts import ACTOR, CRITIC, RolloutLearner
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.learners.transitions import LaneTurn
 from cprl.system.memory import check_memory
+from cprl.values import made
 
 MakeSampler = Callable[[int], Sampler]
 """Makes a TorchRL sampler for an agent, by its lane = replica x S + position among the agents. Comparisons

@@ -6,9 +6,8 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.custom import Custom
 from cprl.networks.mlp import Layers
-from cprl.values import MOST_INT64, Natural, Positive, Range, Share, Steps, Value
+from cprl.values import MOST_INT64, Custom, Natural, Positive, Range, Share, Steps, Value
 
 Optimizer = Literal["adam", "adamw", "rmsprop", "keras_rmsprop", "sgd"]
 """Optimisers of `torch.optim` with torch's defaults; "keras_rmsprop" is `torch.optim.RMSprop` with the decay

@@ -8,10 +8,10 @@ import torch
 from torch import nn
 
 from cprl.commons.spaces import Spaces
-from cprl.custom import Custom
 from cprl.networks.convolutional import Conv
 from cprl.networks.mlp import MLP, Options
 from cprl.networks.recurrent import GRU, LSTM
+from cprl.values import Custom
 
 Network: TypeAlias = MLP | Conv | GRU | LSTM
 """A network of cprl. A network of your own is a `Custom`, called with (spaces, outputs) and its arguments."""

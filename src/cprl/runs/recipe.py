@@ -16,12 +16,11 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.custom import custom_targets, source_of
 from cprl.runs.files import LOCK_FILE, RECIPE_FORMAT, RunLock, digest_of, read_json, refuse_newer, write_json
 from cprl.system.output import ERR, console, printed
 from cprl.system.process import cpu
 from cprl.system.shipped import PROGRAM, command_of, cprl_here
-from cprl.values import differences, refusal, shown
+from cprl.values import custom_targets, differences, refusal, shown, source_of
 
 RECIPE_FILE: Final = "recipe.json"
 

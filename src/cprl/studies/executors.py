@@ -186,7 +186,6 @@ def _attend(is_over: Callable[[], object], stops: Sequence[int], stop: Callable[
 
 
 def _started(arguments: Sequence[str], log: str, variables: Mapping[str, str]) -> "subprocess.Popen[bytes]":
-    """The process of a trial; it reads from a pipe that it shall stop, or that nobody is left to say so."""
     with open(log, "ab") as file:
         return subprocess.Popen(
             [sys.executable, *arguments],
@@ -296,7 +295,6 @@ class Ray(Value, _SideBySide, stored=False):
 
 
 def _wait(arguments: Sequence[str], log: str, variables: Mapping[str, str]) -> int:
-    """The exit code of the process of a trial; what Ray's workers do, which need not import cprl for it."""
     with _started(arguments, log, variables) as process:
         while True:
             try:

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from cprl.commons import maps
 from cprl.commons.maps import Map
-from cprl.custom import Custom, allowing, custom_targets
 from cprl.envs.make_env import game_of, stored_game
 from cprl.experiment import Experiment
 from cprl.runs.recipe import STORED_RUN
@@ -29,9 +28,12 @@ from cprl.values import (
     KINDS,
     MOST_INT32,
     MOST_NUMBER,
+    Custom,
     Range,
     Value,
+    allowing,
     checked,
+    custom_targets,
     fits,
     from_config,
     hints_of,
@@ -90,7 +92,6 @@ def places(table: dict[str, Any], path: str) -> list[tuple[Any, Any]]:
 
 
 def _named(holder: Any, name: str, at: list[str]) -> list[tuple[Any, Any]]:
-    """Return what a word of a path names in a table or list, at least one place."""
     where, path = ".".join(at) or "the experiment", ".".join([*at, name])
     if isinstance(holder, list) and name == ALL:
         learns = [entry["kind"] in ("Learning", "Team") if at == ["agents"] else True for entry in holder]
@@ -111,7 +112,6 @@ def _named(holder: Any, name: str, at: list[str]) -> list[tuple[Any, Any]]:
 
 
 def normalised(path: object) -> str:
-    """Return a path as it is kept, without "-"."""
     if not isinstance(path, str) or not path or not all(path.split(".")):
         raise refusal("path", path, 'names with dots between them, e.g. "game.rules.freeze_steps"')
     return path.replace("-", "_")
@@ -279,7 +279,6 @@ def _shares(dimensions: int, draws: int, seed: int, design: Design) -> Iterable[
 
 
 def factor_to_config(factor: Factor) -> dict[str, Any]:
-    """Return a factor as JSON can hold it."""
     if isinstance(factor, Distribution):
         return {"distribution": type(factor).__name__, "low": factor.low, "high": factor.high}
     if isinstance(factor, Mapping):
@@ -288,7 +287,6 @@ def factor_to_config(factor: Factor) -> dict[str, Any]:
 
 
 def factor_from_config(name: str, table: Mapping[str, Any]) -> Factor:
-    """Return the factor that `factor_to_config` gave."""
     if "distribution" in table:
         distribution: Distribution = DISTRIBUTIONS[table["distribution"]](table["low"], table["high"])
         return distribution
@@ -298,12 +296,10 @@ def factor_from_config(name: str, table: Mapping[str, Any]) -> Factor:
 
 
 def changes_to_config(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values by path as JSON can hold them."""
     return {path: to_config(stored_game(value), path) for path, value in changes.items()}
 
 
 def changes_from_config(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values by path that `changes_to_config` gave."""
     return {path: _value_of(path, value) for path, value in table.items()}
 
 

@@ -60,12 +60,10 @@ class Snapshot:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Trials by state; those at work are running."""
         return Counter("running" if row.state in AT_WORK else row.state for row in self.rows)
 
     @property
     def line(self) -> str:
-        """The study in a line."""
         counts = self.counts
         parts = [f"{counts.get('finished', 0)} of {len(self.rows)} trials finished"]
         parts += [f"{counts[state]} {state}" for state in ("running", "failed") if counts.get(state)]
@@ -93,7 +91,6 @@ class Overview:
         self._per_s: float | None = None
 
     def look(self) -> Snapshot:
-        """All trials as they are now."""
         rows = sorted(map(self._row, self._trials), key=lambda row: ORDER.index(row.state))
         self._per_s = sum(row.per_s for row in rows) or self._per_s
         to_do = sum(row.of - row.episodes for row in rows if row.state not in ("finished", "failed"))
@@ -156,12 +153,10 @@ class Progress:
         self._thread = Thread(target=self._watch, daemon=True, name="cprl study")
 
     def say(self, text: str) -> None:
-        """Prints a line, above the table where there is one."""
         if self._is_shown:
             self._console.print(text, soft_wrap=True, markup=False, highlight=False)
 
     def ended(self, outcome: Outcome) -> None:
-        """Notes how a trial has ended."""
         self._ended += 1
         if outcome.worked and self._live is None:
             why = f": {outcome.reason}" if outcome.reason else ""

@@ -136,8 +136,6 @@ class Search(Value, stored=False):
 
 @dataclass(frozen=True, eq=False)
 class SearchResult(StudyResult):
-    """What a search has produced; its study has all points, as named conditions."""
-
     search: Search
     points: tuple[Point, ...] = field(repr=False)
 
@@ -193,8 +191,6 @@ def run_search(
 
 
 class _Proposals:
-    """The points that Optuna has proposed, in its own storage."""
-
     def __init__(self, search: Search, out: Path, optuna: Any) -> None:
         self._search, self._optuna, self._failed = search, optuna, optuna.trial.TrialState.FAIL
         path, backends = str(out / FOLDER / JOURNAL), optuna.storages.journal
@@ -217,7 +213,6 @@ class _Proposals:
 
     @property
     def points(self) -> list[Point]:
-        """All points, in order."""
         return list(self._by_number.values())
 
     def next_batch(self) -> list[Point]:

@@ -19,8 +19,8 @@ from tensordict import TensorDictBase
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
 from cprl.runs.files import RunLockedError, write_json
-from cprl.system.compile_clock import CLOCK
 from cprl.system.process import cpu
+from cprl.system.times import CLOCK
 from cprl.training import Training
 
 PATIENCE_S: Final = 60.0

@@ -9,8 +9,7 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeAlias
 
-from cprl.custom import trust
-from cprl.experiment import MOST_SEED, Experiment
+from cprl.experiment.experiment import MOST_SEED, Experiment
 from cprl.population import stored_of
 from cprl.runs.files import STUDY_FORMAT, read_json, refuse_newer, write_json
 from cprl.runs.recipe import RECIPE_FILE, with_runs_moved
@@ -29,7 +28,7 @@ from cprl.studies.factors import (
     grid,
 )
 from cprl.system.defaults import BLOCK
-from cprl.values import DirectoryName, Range, Value, refusal, shown, without_defaults
+from cprl.values import DirectoryName, Range, Value, refusal, shown, trust, without_defaults
 
 CONDITION_FORMAT: Final = 1
 """Of checksums: counted up when a default of any value of `cprl.values.KINDS`, or of `Experiment`, changes,
@@ -164,7 +163,6 @@ class Study(Value, stored=False):
 
     @cached_property
     def all_conditions(self) -> tuple[Condition, ...]:
-        """Every condition, in order, each once."""
         by_checksum: dict[str, Condition] = {}
         for name, levels in self._levels():
             values = {factor: level.value for factor, level in levels.items()}
@@ -201,7 +199,6 @@ class Study(Value, stored=False):
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
-        """The blocks of replicas of each condition, in order."""
         assert self.replicas is not None
         return tuple(
             Block(
@@ -381,7 +378,6 @@ def directory_of(study: Study, out: Path | str | None) -> Path:
 
 
 def write_study(study: Study, out: Path) -> None:
-    """Write what a study is into its directory."""
     write_json(out / FILE_NAME, study.to_config(out))
 
 

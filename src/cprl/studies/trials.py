@@ -17,7 +17,6 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
-from cprl.custom import allowed, custom_targets
 from cprl.experiment import Experiment
 from cprl.population import Frozen, with_stored
 from cprl.runs.checkpoints import FOLDER, REPORT, checkpoints_in, depends_on_episodes, is_ending
@@ -28,7 +27,7 @@ from cprl.studies.status import LOCKED, STOPPED, Status, StatusFile
 from cprl.studies.study import Block, Condition, Study
 from cprl.system.output import printed
 from cprl.system.shipped import cprl_here
-from cprl.values import differences
+from cprl.values import allowed, custom_targets, differences
 
 State = Literal["missing", "unfinished", "finished", "refused"]
 ATTEMPTS: Final = 5
@@ -143,8 +142,6 @@ def move_aside(run: Path) -> Path | None:
 
 
 class Outcome(NamedTuple):
-    """How a trial ended."""
-
     name: str
     state: Literal["finished", "failed", "elsewhere"]
     """"elsewhere" while another process runs it."""
@@ -171,12 +168,10 @@ class Task:
 
     @property
     def name(self) -> str:
-        """Of the trial, and of its directory."""
         return self.trial.name
 
     @property
     def directory(self) -> Path:
-        """Of the trial."""
         return self.runs / self.name
 
     @property
@@ -200,7 +195,6 @@ class Task:
 
     @property
     def command(self) -> str:
-        """The same to be copied, to repeat the trial by hand."""
         return printed([*cprl_here(), *self.words])
 
     @property
@@ -290,14 +284,12 @@ class Task:
         return self.failed(f"{lines[-1].strip()} (exit code {code})", "\n".join(lines[-100:]))
 
     def given_up(self) -> Outcome:
-        """The outcome where its process died at every attempt."""
         reason = (
             f"its process died, {ATTEMPTS} times; one that is killed is often one for which memory was short"
         )
         return self.failed(reason, f"What it printed is in {self.status.log}.")
 
     def failed(self, reason: str, trace: str = "") -> Outcome:
-        """The outcome of a failure, noted beside the trial's status unless that was done."""
         if trace:
             self.status.fail(reason, trace)
         return Outcome(self.name, "failed", reason, worked=True, command=self.command)

@@ -3,12 +3,11 @@
 Modules:
     libraries      what an upgrade of a library has taken away, said by name
     compat         what relies on private parts of libraries, a module a library
-    compile_clock  whether code is being compiled, for how long, and what it leaves in memory
-    compiling      functions compiled by torch
+    compiling      functions compiled by torch, and what that leaves in memory
     memory         devices, and what would not fit into their memory
     output         text for the terminal
     process        settings of the process that trains, and where compiled code is kept
     shipped        the recipes that come with cprl, and how a command is typed again
     defaults       defaults that functions share with the command line
-    times          where the time of a training and of a run goes
+    times          where the time of a training goes; whether code is being compiled
 """

@@ -5,8 +5,10 @@ for its arguments. Weights, moments, buffers and what a loss keeps in tensors ar
 each call; whatever else the code depends on is guarded, so a learner that differs in it gets code of its own.
 """
 
+import gc
 import warnings
 from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
 from types import CodeType, FunctionType
 from typing import Any, Final, NamedTuple
 
@@ -24,7 +26,7 @@ from cprl.system.compat import (
     with_own_code,
     without_lookup,
 )
-from cprl.system.compile_clock import CLOCK, set_aside
+from cprl.system.times import CLOCK
 
 TOLERANCE: Final = 1e-4
 """The tolerance between float32 results of the same operations in another order."""
@@ -41,8 +43,6 @@ _TO_MODULE_CURE: Final = (
 
 
 class _Shared(NamedTuple):
-    """What was compiled for some learner."""
-
     form: Hashable
     guarded: Any
     """By whose code torch finds its guards."""
@@ -159,13 +159,11 @@ class Compiled:
         return None if difference is None or self._is_random(before) else difference
 
     def _put_back(self, arguments: Sequence[Any], values: Sequence[Any]) -> None:
-        """Sets the arguments that the function changes."""
         for place, right in zip(self._changes, values, strict=True):
             for tensor, value in zip(tensors_in(arguments[place]), tensors_in(right), strict=True):
                 tensor.copy_(value)
 
     def _copies(self, arguments: Sequence[Any]) -> list[Any]:
-        """The arguments, with copies of those that the function changes."""
         return [copied(value) if place in self._changes else value for place, value in enumerate(arguments)]
 
     def _outcome(self, arguments: Sequence[Any], *, seed: int | None = None) -> list[Any]:
@@ -179,13 +177,11 @@ class Compiled:
         return [result, *(copies[place] for place in self._changes)]
 
     def _is_random(self, arguments: Sequence[Any]) -> bool:
-        """Whether the result of the plain function depends on torch's seed."""
         first, second = (self._outcome(arguments, seed=seed) for seed in (1, 2))
         return largest_difference(first, second) is not None
 
 
 def _fitting(plain: FunctionType, form: Hashable, arguments: Sequence[Any]) -> Iterator[_Shared]:
-    """What was compiled for other learners and fits these arguments too."""
     for shared in list(_shared.get(plain.__code__, ())):
         if shared.form == form and fits(shared.guarded, arguments):
             yield shared
@@ -198,12 +194,10 @@ def _share(plain: FunctionType, compiled: _Shared) -> None:
 
 
 def copied(value: Any) -> Any:
-    """A copy of a tensor, or of a list of tensors."""
     return [copied(tensor) for tensor in value] if isinstance(value, list) else value.clone()
 
 
 def tensors_in(value: Any) -> list[torch.Tensor]:
-    """The tensors of a tensor or of nested lists, in order."""
     return [tensor for part in value for tensor in tensors_in(part)] if isinstance(value, list) else [value]
 
 
@@ -228,3 +222,37 @@ def _agree(result: torch.Tensor, reference: torch.Tensor) -> bool:
     near = min(TOLERANCE, 10 * TOLERANCE * scale) + 1e-8
     off = ~torch.isclose(result.double(), reference.double(), TOLERANCE, near, equal_nan=True)
     return int(off.sum()) <= (max(1, size // 100) if size > 10 else 0)
+
+
+_is_set_aside = False
+
+
+def set_aside() -> None:
+    """Make the collector skip all that is there now, after a compilation.
+
+    Compilation leaves millions of permanent objects. Python's collector would scan them again and again,
+    which takes up to a third of a training.
+    """
+    global _is_set_aside
+    gc.collect()
+    gc.freeze()
+    _is_set_aside = True
+
+
+@contextmanager
+def cleared_up() -> Iterator[None]:
+    """Free what a training leaves in reference cycles, such as replay buffers, which a process that goes on
+    would keep. One during which code was compiled was set aside with it, and is freed before the next one,
+    which looks at all objects once more and takes half a second."""
+    global _is_set_aside
+    if _is_set_aside:
+        with CLOCK.running():  # a late part of compiling
+            gc.unfreeze()
+            gc.collect()
+            gc.freeze()
+        _is_set_aside = False
+    try:
+        yield
+    finally:
+        if not _is_set_aside:
+            gc.collect()

@@ -3,7 +3,6 @@
 `cprl.system.compat` and `cprl.commons.compiled` use private parts of libraries through this.
 """
 
-import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,54 +12,38 @@ from types import ModuleType
 
 
 def require(library: str, holder: object, *parts: str) -> None:
-    """Checks that a class or module of a library has parts that cprl relies on.
-
-    Args:
-        library: the name of its distribution.
-        holder: the class or module.
-        parts: the names of attributes.
-    """
+    """Check that a class or module of a library, by the name of its distribution, has these attributes."""
+    name = getattr(holder, "__qualname__", None) or getattr(holder, "__name__", holder)
     for part in parts:
-        if not hasattr(holder, part):
-            name = getattr(holder, "__qualname__", None) or getattr(holder, "__name__", holder)
-            raise ImportError(missing(library, f"{name}.{part}"))
+        with relying_on(library, f"{name}.{part}"):
+            getattr(holder, part)
 
 
 @contextmanager
 def relying_on(library: str, part: str) -> Iterator[None]:
-    """While it is open, a part that cannot be imported or found is said to be missing from a library.
-
-    Only the look-up of the part belongs inside.
-    """
+    """Say that a part is missing from a library where the block, the look-up of it, fails."""
     try:
         yield
     except (ImportError, AttributeError) as error:
-        raise ImportError(missing(library, part)) from error
-
-
-def missing(library: str, part: str) -> str:
-    """A sentence that says which part of a library is missing, and which versions of it fit."""
-    fitting = fitting_versions(library)
-    allowed = f"{library}{fitting}" if fitting else "the versions in pyproject.toml of cprl"
-    return (
-        f"{library} {_installed(library)} has no {part}, on which cprl {_installed('cprl')} relies; allowed: "
-        f"{allowed} (docs/upgrading.md)"
-    )
+        versions = fitting_versions(library)
+        allowed = f"{library}{versions}" if versions else "the versions in pyproject.toml of cprl"
+        raise ImportError(
+            f"{library} {_installed(library)} has no {part}, on which cprl {_installed('cprl')} relies; "
+            f"allowed: {allowed} (docs/upgrading.md)"
+        ) from error
 
 
 def fitting_versions(library: str) -> str:
-    """The versions of a library that cprl asks for, e.g. "<2.14,>=2.13"; "" if it does not say."""
+    """Return the versions of a library that cprl asks for, e.g. "<2.14,>=2.13"; "" if it does not say."""
     from importlib.metadata import PackageNotFoundError, requires
 
+    from packaging.requirements import Requirement
+
     try:
-        wanted = requires("cprl") or []
+        wanted = [Requirement(text) for text in requires("cprl") or []]
     except PackageNotFoundError:
         wanted = []
-    for requirement in wanted:
-        parts = re.fullmatch(r"([\w.-]+)(?:\[[^\]]*\])?\s*([^;]*?)\s*(?:;.*)?", requirement)
-        if parts is not None and parts[1].lower() == library:
-            return parts[2]
-    return ""
+    return next((str(each.specifier) for each in wanted if each.name.lower() == library), "")
 
 
 def _installed(library: str) -> str:
@@ -84,8 +67,7 @@ def when_imported(name: str, call: Callable[[], object]) -> None:
 
 
 class _Waiting:
-    """Finds a module as Python does without it, and calls a function behind its import; looking for a module
-    does not import it."""
+    """Finds a module as Python does without it, and calls a function behind its import."""
 
     def __init__(self, name: str, call: Callable[[], object]) -> None:
         self._name, self._call = name, call

@@ -32,7 +32,6 @@ class TooLargeError(ValueError, MemoryError):
 
 
 def free_bytes(device: "str | torch.device" = "cpu") -> int:
-    """The bytes that can be allocated on a device."""
     if str(device).startswith("cuda"):
         import torch
 

@@ -31,16 +31,13 @@ class Output:
 
     @property
     def encoding(self) -> str:
-        """That of the stream."""
         return getattr(self._stream(), "encoding", None) or "utf-8"
 
     def isatty(self) -> bool:
-        """Whether the stream is a terminal."""
         stream = self._stream()
         return stream is not None and not stream.closed and stream.isatty()
 
     def fileno(self) -> int:
-        """The file descriptor of the stream."""
         stream = self._stream()
         if stream is None:
             raise io.UnsupportedOperation("fileno")
@@ -58,7 +55,6 @@ class Output:
         return len(text)
 
     def flush(self) -> None:
-        """Flushes the stream."""
         stream = self._stream()
         if stream is not None:
             stream.flush()
@@ -90,7 +86,6 @@ def legible(name: str) -> str:
 
 
 def say(*what: object) -> None:
-    """Print a line, like `print`."""
     OUT.write(" ".join(map(str, what)) + "\n")
     OUT.flush()
 

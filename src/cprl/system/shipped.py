@@ -35,7 +35,6 @@ class Recipe:
 
     @cached_property
     def source(self) -> str:
-        """Its text as it stands."""
         return self.path.read_text(encoding="utf-8")
 
     @property
@@ -45,7 +44,6 @@ class Recipe:
 
     @property
     def about(self) -> str:
-        """The first line of its docstring."""
         return self.source.partition("\n")[0].strip('"')
 
     def text(self) -> str:
@@ -81,7 +79,6 @@ def recipes_folder() -> Path:
 
 
 def shipped_recipes() -> dict[str, Recipe]:
-    """All recipes by name, and the modules that they share, in the order of their names."""
     folder = recipes_folder()
     paths = sorted(folder.rglob("*.py"), key=lambda path: (len(path.relative_to(folder).parts), path))
     names = [path.relative_to(folder).with_suffix("").as_posix() for path in paths]
@@ -89,7 +86,6 @@ def shipped_recipes() -> dict[str, Recipe]:
 
 
 def recipe_named(name: str) -> Recipe:
-    """A recipe by its name."""
     recipes = shipped_recipes()
     if name not in recipes:
         raise ValueError(f"there is no recipe {name!r}; allowed: {recipe_names()}")

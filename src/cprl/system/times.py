@@ -1,63 +1,85 @@
-"""Times: where the time of a training and of a run goes, in seconds."""
+"""Where the time of a training goes, in seconds; CLOCK: that of compiling in this process."""
 
 import time
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Final
 
-from cprl.system.compile_clock import CLOCK
+
+class CompileClock:
+    """Counts the seconds in which the rules (Numba) and updates (torch) are compiled.
+
+    Compilations run in the training's thread; other threads may read the clock.
+    """
+
+    def __init__(self) -> None:
+        self._spent_s = 0.0
+        self._began: float | None = None
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Count the time that the block takes; a block within a block counts once."""
+        if self._began is not None:
+            yield
+            return
+        self._began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._spent_s, self._began = self.total_s, None
+
+    @property
+    def is_running(self) -> bool:
+        return self._began is not None
+
+    @property
+    def total_s(self) -> float:
+        """Seconds of all compilations so far, the one under way included."""
+        began = self._began
+        return self._spent_s + (0.0 if began is None else time.perf_counter() - began)
+
+
+CLOCK: Final = CompileClock()
 
 
 class Times:
-    """The time that a training takes, what it took before it was stopped included.
+    """The time that something takes from now on; of a training what it took before it was stopped, too.
 
     Attributes:
         busy_s: seconds of acting, storing and updating, compiling included.
     """
 
     def __init__(self) -> None:
-        self._began, self._compiled_s = time.monotonic(), CLOCK.total_s
-        self._before = {"spent_s": 0.0, "compiling_s": 0.0}
-        self.busy_s = 0.0
+        self.load_state_dict({"spent_s": 0.0, "compiling_s": 0.0, "busy_s": 0.0})
 
     @property
     def spent_s(self) -> float:
-        """Seconds of everything since the training was made."""
-        return self._before["spent_s"] + time.monotonic() - self._began
+        """Seconds of everything."""
+        return self._before_s["spent_s"] + time.monotonic() - self._began
 
     @property
     def compiling_s(self) -> float:
         """Seconds in which code was compiled, or read from torch's and Numba's caches."""
-        return self._before["compiling_s"] + CLOCK.total_s - self._compiled_s
+        return self._before_s["compiling_s"] + CLOCK.total_s - self._compiled_s
 
     @property
     def acting_storing_updating_s(self) -> float:
         """Seconds of acting, storing and updating alone, the game included."""
         return max(0.0, self.busy_s - self.compiling_s)
 
-    def state_dict(self) -> dict[str, float]:
-        """What it took so far."""
-        return {"spent_s": self.spent_s, "compiling_s": self.compiling_s, "busy_s": self.busy_s}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a state of `state_dict`."""
-        self._began, self._compiled_s = time.monotonic(), CLOCK.total_s
-        self._before = {name: float(state[name]) for name in self._before}
-        self.busy_s = float(state["busy_s"])
-
-
-class RunTimes:
-    """The time of a whole run: its training, and all that comes before and after."""
-
-    def __init__(self) -> None:
-        self._began, self._compiled_s = time.monotonic(), CLOCK.total_s
-
-    def report(self, training: Times) -> dict[str, float]:
-        """The entries of `report.json`; of a run that was resumed with what the training took before."""
-        wall_s = time.monotonic() - self._began + training._before["spent_s"]
-        compiling_s = CLOCK.total_s - self._compiled_s + training._before["compiling_s"]
+    def report(self, training: "Times") -> dict[str, float]:
+        """The entries of `report.json` for a run and its training."""
         return {
             "training_s": round(training.spent_s, 1),
             "acting_storing_updating_s": round(training.acting_storing_updating_s, 3),
-            "compiling_s": round(compiling_s, 3),
-            "wall_s": round(wall_s, 3),
+            "compiling_s": round(self.compiling_s + training._before_s["compiling_s"], 3),
+            "wall_s": round(self.spent_s + training._before_s["spent_s"], 3),
         }
+
+    def state_dict(self) -> dict[str, float]:
+        return {"spent_s": self.spent_s, "compiling_s": self.compiling_s, "busy_s": self.busy_s}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self._began, self._compiled_s = time.monotonic(), CLOCK.total_s
+        self._before_s = {name: float(state[name]) for name in ("spent_s", "compiling_s")}
+        self.busy_s = float(state["busy_s"])

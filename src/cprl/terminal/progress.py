@@ -12,8 +12,8 @@ from rich.text import Text
 from tensordict import TensorDictBase
 
 from cprl.measuring.episodes import Episode
-from cprl.system.compile_clock import CLOCK
 from cprl.system.output import console as safe_console
+from cprl.system.times import CLOCK
 
 _BAR_PERIOD_S: Final = 0.25
 _LINE_PERIOD_S: Final = 10.0

@@ -14,7 +14,6 @@ from torchrl.envs import EnvBase
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
-from cprl.custom import Custom, made
 from cprl.envs.make_env import make_env, spaces_of
 from cprl.envs.state import load_transforms_state
 from cprl.envs.unwrap import commons_of
@@ -54,7 +53,7 @@ from cprl.runs.checkpoints import FOLDER
 from cprl.runs.episodes import read_episodes
 from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, say_changes
 from cprl.runs.weights import weights_in, weights_of
-from cprl.values import shown
+from cprl.values import Custom, made, shown
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

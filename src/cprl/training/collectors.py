@@ -33,7 +33,6 @@ class StepCollector(BaseCollector):
         """The input of the environment's next step; None before the first step."""
 
     def iterator(self) -> Iterator[TensorDictBase]:
-        """An endless iterator; resets the environment at its start."""
         if self.carried is None:
             self.carried = self.env.reset()
         while True:

@@ -21,7 +21,7 @@ from torch import Tensor, float64
 
 from cprl import keys
 from cprl.commons.spaces import Spaces
-from cprl.experiment import OnNan
+from cprl.experiment.experiment import OnNan
 from cprl.learners.base import LaneLosses, Learner
 
 EVERY_STEPS: Final = 16

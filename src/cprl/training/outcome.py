@@ -61,7 +61,6 @@ def make_agents(
 
 
 def fresh_env(experiment: Experiment) -> EnvBase:
-    """The worlds of the evaluation, `evaluation_episodes` for each replica, which no training plays."""
     worlds = experiment.replicas * experiment.evaluation_episodes
     return _worlds(experiment, worlds, fresh=True, device=experiment.device)
 
@@ -126,7 +125,6 @@ class Evaluations:
         self._tables: list[pa.Table] = []
 
     def on_ended(self, ended: Sequence[tuple[Episode, dict[str, float]]]) -> None:
-        """Evaluates the replicas that are due."""
         every = self._experiment.evaluate_every
         due = {
             episode.world: (episode.episode + 1, learning)
@@ -177,7 +175,6 @@ class Evaluations:
 
 
 def _means(episodes: Sequence[Episode]) -> dict[str, float]:
-    """The mean of each social metric over the episodes in which it is defined, and of the summed return."""
     means = {"return": fmean(float(episode.return_.sum()) for episode in episodes)}
     for name in social_metrics(episodes[0]):
         values = [social_metrics(episode)[name] for episode in episodes]
@@ -192,7 +189,6 @@ def is_same_later(experiment: Experiment) -> bool:
 
 
 def _keeps_decisions(env: EnvBase) -> bool:
-    """Whether what agents decided stays in force for several episodes."""
     commons = commons_of(env)
     return commons is not None and any(ballot.period_episodes > 1 for ballot in commons.game.ballots)
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from torchrl.envs import EnvBase
 
-from cprl.custom import Custom, made, trust
 from cprl.envs.state import transforms_state
 from cprl.envs.unwrap import agent_names
 from cprl.experiment import Experiment
@@ -31,10 +30,10 @@ from cprl.runs.recipe import (
     write_on_nan,
 )
 from cprl.runs.weights import partners_of, save_decisions, save_transforms, save_weights, weights_of
-from cprl.system.compile_clock import cleared_up, free_earlier
+from cprl.system.compiling import cleared_up
 from cprl.system.output import RESUMES, console, say
 from cprl.system.process import prepare_process
-from cprl.system.times import RunTimes
+from cprl.system.times import Times
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
@@ -49,6 +48,7 @@ from cprl.training.outcome import (
     write_evaluation,
 )
 from cprl.training.training import Training, check_callbacks, train
+from cprl.values import Custom, made, trust
 from cprl.viewer.page import check_watch
 from cprl.viewer.page import linger as stay_served
 
@@ -105,8 +105,7 @@ def run(
         OSError: for a full disk or a deleted directory; the message names it. What was written before is
             intact, and the run can be resumed.
     """
-    times = RunTimes()
-    free_earlier()
+    times = Times()
     check_watch(watch, linger=linger)
     for logger in experiment.loggers:
         check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
@@ -119,9 +118,13 @@ def run(
     env, population = make_agents(experiment, starts=not is_begun, weights=weights)
     observers: list[Any] = [*(made(callback) for callback in experiment.callbacks), *callbacks]
     check_callbacks(observers)
+
+    def recipe_in(directory: Path) -> dict[str, Any]:
+        return {**experiment.to_recipe(directory), **partners_of(directory, _partners(experiment))}
+
     episodes = refuse_another_run(out, experiment.to_recipe, Experiment) if resume else experiment.episodes
     if not resume or out is None:
-        directory = start_run(out, experiment.name, lambda directory: _recipe(experiment, directory))
+        directory = start_run(out, experiment.name, recipe_in)
     elif episodes < experiment.episodes or not (out / REPORT).exists():
         directory = out
         if episodes < experiment.episodes:
@@ -137,11 +140,13 @@ def run(
                 _begin_again(directory, experiment, is_begun=is_begun, episodes=episodes)
             viewer = closing.enter_context(_make_viewer(watch, directory, experiment, env, population))
             work = _Work(directory, experiment, env, population, viewer)
-            random = _play_at_random(work)
+            random = None if viewer is None else random_play(experiment, population)
+            if viewer is not None and random is not None:
+                viewer.random_play(random)
             training = _train(work, observers, checkpointer)
             played = _evaluate(work, random)
-            figure = _draw(work, played["random"]) if figures else None
-            _write_report(work, training, times)
+            figure = _draw(experiment, directory, played["random"]) if figures else None
+            _write_report(directory, training, times)
             _summarise(work, training, played, figure)
             checkpointer.done()
             _say_what_is_kept(directory)
@@ -162,22 +167,11 @@ def run(
 
 
 class _Work(NamedTuple):
-    """A run that is being written."""
-
     directory: Path
     experiment: Experiment
     env: EnvBase
     population: Population
     viewer: "ViewerCallback | None"
-
-
-def _play_at_random(work: _Work) -> list[Episode] | None:
-    """Random play for the viewer, if there is one."""
-    if work.viewer is None:
-        return None
-    random = random_play(work.experiment, work.population)
-    work.viewer.random_play(random)
-    return random
 
 
 def _train(work: _Work, observers: Sequence[Any], checkpointer: Checkpointer) -> Training:
@@ -211,7 +205,6 @@ def _train(work: _Work, observers: Sequence[Any], checkpointer: Checkpointer) ->
 
 
 def _evaluate(work: _Work, random: list[Episode] | None) -> dict[str, list[Episode]]:
-    """Evaluates the agents, and writes and shows it."""
     if work.viewer is not None:
         work.viewer.flush()
     played = evaluate_population(work.experiment, work.env, work.population, random=random)
@@ -221,14 +214,12 @@ def _evaluate(work: _Work, random: list[Episode] | None) -> dict[str, list[Episo
     return played
 
 
-def _draw(work: _Work, random: list[Episode]) -> Path:
-    ends = exploration_steps(work.experiment.agents)
-    return training_curve(
-        work.directory, title=_title(work.experiment), random=random, exploration_steps=ends
-    )
+def _draw(experiment: Experiment, directory: Path, random: list[Episode]) -> Path:
+    ends = exploration_steps(experiment.agents)
+    return training_curve(directory, title=_title(experiment), random=random, exploration_steps=ends)
 
 
-def _write_report(work: _Work, training: Training, times: RunTimes) -> None:
+def _write_report(directory: Path, training: Training, times: Times) -> None:
     """Writes `report.json`, the sign that a run is finished."""
     report = {
         **times.report(training.times),
@@ -238,7 +229,7 @@ def _write_report(work: _Work, training: Training, times: RunTimes) -> None:
     }
     if training.finite.reported:
         report["not_finite"] = [asdict(finding) for finding in training.finite.reported]
-    write_json(work.directory / REPORT, report)
+    write_json(directory / REPORT, report)
 
 
 def _summarise(
@@ -258,12 +249,7 @@ def _title(experiment: Experiment) -> str:
     return f"{experiment.name}, {experiment.replicas} replicas, {experiment.episodes} episodes"
 
 
-def _recipe(experiment: Experiment, directory: Path) -> dict[str, Any]:
-    return {**experiment.to_recipe(directory), **partners_of(directory, _partners(experiment))}
-
-
 def _partners(experiment: Experiment) -> list[str]:
-    """The runs whose agents play."""
     return sorted({spec.run for spec in experiment.agents if isinstance(spec, Frozen)})
 
 
@@ -318,7 +304,6 @@ def _tidy_up(finished: Path, *, keep_checkpoint: bool, take_over: bool) -> None:
 
 
 def _remove(directory: Path, *, with_directory: bool) -> None:
-    """Removes a run that never began; nobody else has written into its directory."""
     with suppress(OSError):
         for path in directory.iterdir():
             if path.is_dir():
@@ -330,7 +315,6 @@ def _remove(directory: Path, *, with_directory: bool) -> None:
 
 
 def _say_what_is_kept(directory: Path) -> None:
-    """Says what of a finished run serves to extend it, and how large it is."""
     for checkpoint in checkpoints_in(directory / FOLDER):
         console().print(
             f"Kept so that it can be extended (--resume with more --episodes): {checkpoint}, "

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.state import carried_state, env_state, load_carried, load_env_state
 from cprl.envs.unwrap import commons_of
-from cprl.experiment import OnNan
+from cprl.experiment.experiment import OnNan
 from cprl.learners.base import (
     LaneLosses,
     Learner,
@@ -106,7 +106,6 @@ class Training:
 
     @property
     def is_over(self) -> bool:
-        """Whether every replica has played its episodes."""
         return min(self._played) >= self.episodes
 
     @property
@@ -141,7 +140,6 @@ class Training:
                 checkpointer.after_step(self)
 
     def _hooks(self, name: str) -> list[Callable[..., None]]:
-        """The methods of this name of the callbacks that have one."""
         return [getattr(callback, name) for callback in self.callbacks if hasattr(callback, name)]
 
     def step(self) -> None:
@@ -153,7 +151,6 @@ class Training:
             self._take(turn)
 
     def _take(self, batch: TensorDictBase) -> None:
-        """One turn of every replica."""
         self.steps += 1
         self.finite.add(batch)
         began = time.perf_counter()
@@ -250,7 +247,6 @@ class Training:
         return named
 
     def _step_collector(self) -> StepCollector:
-        """The collector, if a training can resume with it."""
         if not isinstance(self._collector, StepCollector):
             kind = type(self._collector).__name__
             raise ValueError(

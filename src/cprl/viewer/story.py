@@ -9,14 +9,14 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from cprl import presets
 from cprl.commons.game import Game
+from cprl.experiment import presets
 from cprl.measuring import phases
 from cprl.measuring.episodes import Episode
 from cprl.measuring.now import BEGINS, EXPLORING, Now
 from cprl.measuring.series import Values, mean_of
 from cprl.runs.curves import running_mean
-from cprl.system.compile_clock import CLOCK
+from cprl.system.times import CLOCK
 from cprl.viewer.board import Filming
 from cprl.viewer.layout import ANOTHER, STRIPS, Curves
 from cprl.viewer.logger import RerunLogger

@@ -64,7 +64,6 @@ def check_board(board: str) -> None:
 
 
 def game(board: Board, *, variant: Variant = "published") -> "Game":
-    """A published board with its rules, in one of `VARIANTS`."""
     from cprl.commons import maps
     from cprl.commons.game import Game
     from cprl.commons.rules import Rules

@@ -8,7 +8,6 @@ from typing import Annotated, Any, Final, Literal
 from cprl.algorithms import Tabular
 from cprl.algorithms.base import TeamAlgorithm, TrainingEngine
 from cprl.commons.game import Game
-from cprl.custom import Custom, custom_targets, trust
 from cprl.envs.make_env import PlayableGame, game_of, stored_game
 from cprl.learners.preferences import check_preference
 from cprl.population import (
@@ -24,16 +23,19 @@ from cprl.runs.files import RECIPE_FORMAT, written_by_another
 from cprl.runs.recipe import recipe_config, with_runs_moved
 from cprl.system.memory import Device
 from cprl.values import (
+    Custom,
     DirectoryName,
     Positive,
     Range,
     Value,
     build,
     checked,
+    custom_targets,
     differences,
     hints_of,
     shown,
     to_config,
+    trust,
 )
 
 LoggerName = Literal["tensorboard", "wandb"]
@@ -100,7 +102,6 @@ class Experiment(Value, stored=False, called="experiment"):
         _check_engine(self)
 
     def to_config(self) -> dict[str, Any]:
-        """Its fields as JSON can hold them."""
         values = {name: getattr(self, name) for name in hints_of(type(self))}
         values["game"] = stored_game(self.game)
         return {name: to_config(value, f"experiment.{name}") for name, value in values.items()}
@@ -152,7 +153,6 @@ class Experiment(Value, stored=False, called="experiment"):
 
 
 def changes(before: Experiment, now: Experiment) -> list[str]:
-    """How two experiments differ, a sentence for each place."""
     return differences(before.to_config(), now.to_config(), "experiment", Experiment)
 
 

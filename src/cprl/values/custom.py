@@ -75,7 +75,6 @@ class Custom:
         return target
 
     def make(self, *positional: Any) -> Any:
-        """Calls the target with these arguments."""
         target = self.resolve()
         try:
             return target(*positional, **{name: _with_keys(value) for name, value in self.arguments.items()})
@@ -109,7 +108,6 @@ def allowed() -> tuple[str, ...]:
 
 
 def custom_targets(table: object) -> list[str]:
-    """Return the targets of each `Custom` in a table, sorted, each once."""
     return sorted(set(_targets(table)))
 
 
@@ -201,7 +199,6 @@ def _refuse_other_keys(value: Any, depth: int = 0) -> None:
 
 
 def _with_keys(value: Any) -> Any:
-    """The same with each list of strings within a list as a tuple, a nested TensorDict key."""
     if not isinstance(value, list):
         return value
     return [

@@ -30,8 +30,15 @@ from typing import (
     get_type_hints,
 )
 
-from cprl.custom import Custom, refuse_targets
-from cprl.custom import shown as shown
+from cprl.values.custom import Custom as Custom
+from cprl.values.custom import allowed as allowed
+from cprl.values.custom import allowing as allowing
+from cprl.values.custom import custom_targets as custom_targets
+from cprl.values.custom import made as made
+from cprl.values.custom import refuse_targets
+from cprl.values.custom import shown as shown
+from cprl.values.custom import source_of as source_of
+from cprl.values.custom import trust as trust
 
 T = TypeVar("T")
 
@@ -312,7 +319,6 @@ _WORDS: Final = {
 
 
 def _bound(bound: float) -> str:
-    """A bound as people write it: 2**31 - 1 rather than its digits."""
     if isinstance(bound, int):
         bits = (bound + 1).bit_length() - 1
         return f"2**{bits} - 1" if bits > 20 and bound + 1 == 2**bits else str(bound)
@@ -320,7 +326,6 @@ def _bound(bound: float) -> str:
 
 
 def refusal(name: str, value: object, allowed: str) -> ValueError:
-    """Return the error for a value that is not allowed."""
     return ValueError(f"{name} is {shown(value)}; allowed: {allowed}")
 
 
@@ -372,7 +377,6 @@ def _config(value: object, where: str) -> Any:
 
 
 def _not_stored(value: object, where: str) -> str:
-    """Why a recipe cannot hold an object, and what to write instead."""
     named = value if isinstance(value, type) or hasattr(value, "__qualname__") else type(value)
     name = getattr(named, "__qualname__", "<none>")
     target = f"{named.__module__}:{name}" if "<" not in name else "module:name"
@@ -391,7 +395,7 @@ def from_config(table: object, where: str = "value") -> Any:
 
     Raises:
         ValueError: for what is not known, with its place; for code of the user's own that is not allowed, see
-            `cprl.custom.allowing`.
+            `cprl.values.allowing`.
     """
     with _not_too_deep(where):
         refuse_targets(table)

@@ -1,0 +1,20 @@
+"""What is trained, as values.
+
+Modules:
+    experiment  Experiment: everything that decides a training
+    presets     the published games and hyper-parameters by name
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from cprl.experiment.experiment import Experiment, changes
+
+__all__ = ["Experiment", "changes"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__:  # with which comes torch, which the published games do without
+        return getattr(import_module("cprl.experiment.experiment"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
