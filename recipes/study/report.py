@@ -33,9 +33,9 @@ from possible import shares_of
 from results import PooledResult, Result, pooled, read_result, table, told
 from tragedies import combat_section
 
-from cprl.commands.play_stored import check_runs
 from cprl.commands.recipe import in_a_sentence, trusting
 from cprl.runs.files import write_atomically
+from cprl.runs.recipe import read_recipe
 from cprl.system.defaults import SEED
 from cprl.system.output import say
 from cprl.system.process import prepare_process
@@ -216,7 +216,8 @@ def main(runs: tuple[Path, ...], /, *, out: Path = Path("report"), pool: bool = 
     """
     if not runs:
         raise ValueError("the report wants at least one run: python recipes/study/report.py RUN...")
-    check_runs(*runs)
+    for run in runs:
+        read_recipe(run)
     prepare_process(SEED)
     say(write_report(runs, out, pool=pool))
 
