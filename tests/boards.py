@@ -1,7 +1,10 @@
 """Helpers of the tests: play a drawn board and draw the result."""
 
+import importlib.util
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -182,3 +185,11 @@ def assert_same(record: Any, other: Any, *, rows: Any = slice(None), other_rows:
             assert_same(one, other[name], rows=rows, other_rows=other_rows)
         elif one is not None:
             assert np.array_equal(one[rows], other[name][other_rows]), name
+
+
+def module_at(path: Path) -> ModuleType:
+    """A module, e.g. a recipe, imported by its path."""
+    spec: Any = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

@@ -1,6 +1,5 @@
 """The command line: every number of an experiment by its place, recipes by name, any terminal."""
 
-import importlib.util
 import io
 import json
 import os
@@ -13,6 +12,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
+from boards import module_at
 from my_game import Dilemma
 from rich.table import Table
 
@@ -62,10 +62,7 @@ def read(line, make=experiment):
 
 
 def recipe(name):
-    spec = importlib.util.spec_from_file_location(name, ROOT / "recipes" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return module_at(ROOT / "recipes" / f"{name}.py")
 
 
 def test_every_number_is_changed_by_its_place():

@@ -1,12 +1,12 @@
 """A loop of one's own in miniature: it leaves a run's directory like any other."""
 
-import importlib.util
 import json
 import shlex
 from pathlib import Path
 
 import pytest
 import torch
+from boards import module_at
 from torch import nn
 
 from cprl import CommonsEnv, Experiment, Game, Rules, maps, presets
@@ -20,11 +20,7 @@ from cprl.runs.recipe import read_recipe
 from cprl.runs.weights import load_weights
 from cprl.system.shipped import cprl_here
 
-_SPEC = importlib.util.spec_from_file_location(
-    "own_loop", Path(__file__).parents[1] / "recipes" / "own_loop.py"
-)
-LOOP = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(LOOP)
+LOOP = module_at(Path(__file__).parents[1] / "recipes" / "own_loop.py")
 
 pytestmark = pytest.mark.usefixtures("shorter_episodes")
 

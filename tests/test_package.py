@@ -1,5 +1,6 @@
-"""What the package and its repository show from outside: names, version and types, no path of a machine."""
+"""The package: its public names, what an import takes, its layers, its oldest requirements."""
 
+import ast
 import re
 import subprocess
 import sys
@@ -10,6 +11,8 @@ from pathlib import Path
 
 import pytest
 from dqn_parts import dqn_learner
+from oldest import PYPROJECT, oldest
+from packaging.requirements import Requirement
 from tiny_study import FREEZE, SETTINGS, TINY
 from torchrl.envs import StepCounter, TransformedEnv
 
@@ -206,3 +209,94 @@ def test_what_a_page_links_to_is_in_the_source_distribution_too(page):
     assert links
     assert [own for own in links if not lies_in(own, sdist["include"] + always)] == []
     assert [own for own in links if lies_in(own, sdist["exclude"])] == []
+
+
+# A package imports only from packages above it, in the order that the docstring of cprl lists.
+
+
+SOURCE = Path(cprl.__file__).parent
+LAYERS = [line.split()[0] for line in (cprl.__doc__ or "").splitlines() if line.startswith("    ")]
+
+
+def modules_imported(text):
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom) and node.module == "cprl":
+            yield from (f"cprl.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield node.module or ""
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+
+
+def imports_from_below(package, text):
+    names = [name.split(".") for name in modules_imported(text)]
+    imported = {name[1] for name in names if name[0] == "cprl" and len(name) > 1}
+    return sorted(other for other in imported if LAYERS.index(other) > LAYERS.index(package))
+
+
+@pytest.mark.parametrize("package", LAYERS)
+def test_a_package_imports_only_from_packages_above_it(package):
+    files = [*(SOURCE / package).rglob("*.py"), *SOURCE.glob(f"{package}.py")]
+    assert files
+    assert {
+        file.name: below for file in files if (below := imports_from_below(package, file.read_text()))
+    } == {}
+
+
+def test_every_package_is_in_the_list():
+    entries = {
+        path.stem for path in SOURCE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
+    }
+    assert entries - {"__init__", "__main__"} == set(LAYERS)
+
+
+@pytest.mark.parametrize(
+    "line", ["from cprl.training import train", "import cprl.viewer.logger", "from cprl import population"]
+)
+def test_an_import_from_below_is_noticed(line):
+    assert imports_from_below("commons", line)
+
+
+def test_the_game_knows_nothing_of_torch():
+    for path in (SOURCE / "commons").rglob("*.py"):
+        roots = {name.split(".")[0] for name in modules_imported(path.read_text())}
+        assert not {"torch", "tensordict", "torchrl"} & roots, path.name
+
+
+# `make test-oldest` installs the lowest version of everything that pyproject.toml asks for.
+
+
+PROJECT = {
+    "name": "cprl",
+    "dependencies": ["torch>=2.13,<2.14", "Pillow>=11"],
+    "optional-dependencies": {
+        "film": ["imageio-ffmpeg>=0.6,<0.9; python_version < '3.14'"],
+        "all": ["cprl[film]", "ray~=2.60"],
+        "dev": ["cprl[all,film]", "pytest==8.1"],
+    },
+}
+
+
+def test_each_requirement_is_pinned_to_its_lower_bound_with_those_of_extras_of_extras():
+    lines = {line.partition("=")[0]: line for line in oldest(PROJECT, ["dev"])}
+    assert lines == {
+        "torch": "torch==2.13",
+        "Pillow": "Pillow==11",
+        "pytest": "pytest==8.1",
+        "ray": "ray==2.60",
+        "imageio-ffmpeg": 'imageio-ffmpeg==0.6; python_version < "3.14"',
+    }
+    assert list(oldest(PROJECT, [])) == ["torch==2.13", "Pillow==11"]
+
+
+def test_a_requirement_without_a_lower_bound_is_refused():
+    with pytest.raises(ValueError, match="'torch<3' has no lower bound; allowed: NAME>=VERSION"):
+        list(oldest({**PROJECT, "dependencies": ["torch<3"]}, []))
+
+
+def test_everything_that_the_package_asks_for_has_a_lower_bound():
+    project = tomllib.loads(PYPROJECT.read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    pinned = {Requirement(line).name for line in oldest(project, list(extras))}
+    asked = {Requirement(line).name for own in (project["dependencies"], *extras.values()) for line in own}
+    assert pinned == asked - {"cprl"}

@@ -1,6 +1,5 @@
 """Recipes run, in miniature, and keep what they promise."""
 
-import importlib.util
 import json
 import sys
 from collections import Counter
@@ -11,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
+from boards import module_at
 from dqn_parts import dqn_learner
 from rerun.chunk import RrdReader
 
@@ -35,10 +35,7 @@ pytestmark = pytest.mark.usefixtures("shorter_episodes")
 
 
 def recipe(name, folder=RECIPES):
-    spec = importlib.util.spec_from_file_location(name, folder / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return module_at(folder / f"{name}.py")
 
 
 @pytest.fixture

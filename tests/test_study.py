@@ -1,6 +1,5 @@
 """The report beside the published study: what committed tables do not show, by hand or on made-up runs."""
 
-import importlib.util
 import json
 import signal
 import threading
@@ -16,6 +15,7 @@ import pytest
 import report
 import reproduce
 import verdicts
+from boards import module_at
 from claims import (
     of_experiment_1,
     of_experiment_2,
@@ -319,10 +319,7 @@ def test_agents_at_play_are_measured_replica_by_replica():
 
 
 def recipe(name):
-    spec = importlib.util.spec_from_file_location(name, RECIPES / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return module_at(RECIPES / f"{name}.py")
 
 
 @pytest.mark.integration

@@ -11,6 +11,7 @@ import time
 from contextlib import nullcontext
 from dataclasses import replace
 from importlib import invalidate_caches
+from pathlib import Path
 from threading import Thread
 from types import ModuleType, SimpleNamespace
 
@@ -25,7 +26,7 @@ from tiny_study import FREEZE, OFTEN_SAVED, TINY
 import cprl
 from cprl import Custom, Study, run_study
 from cprl.runs.checkpoints import FOLDER as CHECKPOINTS
-from cprl.runs.episodes import read_episodes
+from cprl.runs.episodes import read_episodes, read_table
 from cprl.runs.files import LOCK_FILE, RunLock, RunLockedError, write_json
 from cprl.runs.recipe import changed_circumstances, start_run
 from cprl.studies import InProcess, Processes, Ray, executors, progress, read_study, run
@@ -34,7 +35,7 @@ from cprl.studies.results import write_results
 from cprl.studies.run import trials_with
 from cprl.studies.status import PATIENCE_S, Status, StatusFile
 from cprl.studies.study import STATUS
-from cprl.studies.trials import Outcome, Task, state_of, trials_of
+from cprl.studies.trials import Outcome, Task, begin_from_shorter, state_of, trials_of
 from cprl.training import running
 
 STUDY = Study(TINY, {FREEZE: [5, 25]})
@@ -712,3 +713,117 @@ def test_in_a_terminal_one_table_is_drawn_again_and_again_where_progress_is_want
         assert "1 of 1 trials finished, 1 of 1 episodes" in printed.splitlines()[-2]
     else:
         assert printed == ""
+
+
+# A study of more episodes goes on from the runs of a shorter one that kept the state of its trainings.
+
+
+def study_of(episodes):
+    return Study(replace(TINY, episodes=episodes), {FREEZE: [2, 5]}, name="tiny")
+
+
+def run_of(study, runs, place=0):
+    return runs / trials_of(study)[place].name
+
+
+def ran(study, out, runs, **options):
+    result = run_study(study, out, runs=runs, progress=False, results=False, **options)
+    assert not result.failed
+    return result
+
+
+@pytest.mark.integration
+def test_what_is_extended_equals_what_was_longer_from_the_first_episode_on(tmp_path):
+    pool, apart = tmp_path / "pool", tmp_path / "apart"
+    short, long = study_of(2), study_of(5)
+    ran(short, tmp_path / "short", pool, keep_checkpoints=True)
+    before = written_at(run_of(short, pool))
+    ran(long, tmp_path / "long", pool)
+    ran(long, tmp_path / "again", apart)
+    for place in (0, 1):
+        extended, whole = run_of(long, pool, place), run_of(long, apart, place)
+        assert (extended / "evaluation-2").is_dir(), "it went on from the shorter one"
+        assert not (whole / "evaluation-2").exists()
+        for name in ("episodes.parquet", "evaluation/trained.parquet", "evaluation/random.parquet"):
+            one, other = (repr(read_table(run / name).to_pydict()) for run in (extended, whole))  # with NaN
+            assert one == other, name
+    assert written_at(run_of(short, pool)) == before
+    assert [path.name for path in pool.iterdir() if path.name.startswith(".")] == []
+
+
+@pytest.mark.integration
+def test_it_goes_on_from_the_longest_and_keeps_its_own_state_only_if_asked(tmp_path):
+    pool = tmp_path / "pool"
+    for episodes in (2, 3):
+        ran(study_of(episodes), tmp_path / "study", pool, only=["freeze_steps=2"], keep_checkpoints=True)
+    ran(study_of(4), tmp_path / "study", pool, only=["freeze_steps=2"])
+    assert (run_of(study_of(4), pool) / "evaluation-3").is_dir()
+    ran(study_of(5), tmp_path / "study", pool, only=["freeze_steps=2"])
+    evaluations = sorted(path.name for path in run_of(study_of(5), pool).glob("evaluation-*"))
+    assert evaluations == ["evaluation-2", "evaluation-3"], "the one of 4 episodes kept no state"
+
+
+@pytest.mark.integration
+def test_runs_that_kept_nothing_or_differ_are_no_beginning(tmp_path):
+    pool = tmp_path / "pool"
+    ran(study_of(2), tmp_path / "short", pool)
+    ran(study_of(4), tmp_path / "long", pool)
+    assert not (run_of(study_of(4), pool) / "evaluation-2").exists()
+    other = Study(replace(TINY, episodes=2), {FREEZE: [9]}, name="tiny")
+    ran(other, tmp_path / "other", pool, keep_checkpoints=True)
+    ran(study_of(3), tmp_path / "more", pool)
+    assert not list(run_of(study_of(3), pool).glob("evaluation-*"))
+
+
+@pytest.mark.integration
+def test_a_trial_that_somebody_else_begins_meanwhile_is_left_to_them(tmp_path, monkeypatch):
+    pool, long = tmp_path / "pool", study_of(4)
+    ran(study_of(2), tmp_path / "short", pool, only=["freeze_steps=2"], keep_checkpoints=True)
+    trial = trials_of(long)[0]
+    copy = shutil.copytree
+
+    def overtaken(source, target, *more, **options):
+        if not (pool / trial.name).exists():
+            (pool / trial.name).mkdir()
+            (pool / trial.name / "recipe.json").write_text("{}")
+        return copy(source, target, *more, **options)
+
+    monkeypatch.setattr(shutil, "copytree", overtaken)
+    recipe = trial.experiment.to_recipe(pool / trial.name)
+    assert begin_from_shorter(pool / trial.name, trial.experiment, recipe) is None
+    assert len(list(pool.iterdir())) == 2
+
+
+class SeesTheEnd:
+    """What it does could depend on how long the training is to be."""
+
+    def on_start(self, training):
+        """Sees the number of episodes."""
+
+
+@pytest.mark.integration
+def test_a_training_that_sees_how_long_it_is_to_be_begins_anew(tmp_path):
+    pool = tmp_path / "pool"
+    for episodes in (2, 4):
+        watched = replace(TINY, episodes=episodes, callbacks=(Custom(f"{__name__}:SeesTheEnd"),))
+        ran(Study(watched, name="tiny"), tmp_path / "study", pool, keep_checkpoints=True)
+    assert len(list(pool.iterdir())) == 2
+    assert not list(pool.glob("*/evaluation-2"))
+
+
+@pytest.mark.integration
+def test_a_copy_that_was_cut_off_is_made_anew(tmp_path, monkeypatch):
+    pool, long = tmp_path / "pool", study_of(4)
+    ran(study_of(2), tmp_path / "short", pool, keep_checkpoints=True)
+
+    def cut_off(*given, **options):
+        Path(given[1]).mkdir()
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(shutil, "copytree", cut_off)
+        failed = run_study(long, tmp_path / "long", runs=pool, progress=False, results=False).failed
+    assert [outcome.reason for outcome in failed] == ["OSError: [Errno 28] No space left on device"] * 2
+    assert len(list(pool.iterdir())) == 2
+    ran(long, tmp_path / "long", pool)
+    assert (run_of(long, pool) / "evaluation-2").is_dir()
