@@ -531,10 +531,7 @@ def test_a_file_or_a_run_of_that_name_comes_first_but_not_the_folder_of_a_study(
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        (
-            "run comons --replicas 2",
-            "'comons' is no file, .* .did you mean 'commons'.*allowed: .* mixed, ",
-        ),
+        ("run comons --replicas 2", "'comons' is no file, .* .did you mean 'commons'.*allowed: .* mixed, "),
         ("run --episodes 2 commons", r"stands first, its flags behind it: cprl run commons \[FLAGS\]"),
         ("run study/base", "study/base runs nothing: other recipes import it; cprl recipe study/base"),
         ("run mine.py", r"mine\.py is a recipe of your own"),

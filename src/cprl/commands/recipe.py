@@ -14,14 +14,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from threading import current_thread, main_thread
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 import tyro
 
 from cprl.commands.flags import RefusedError, Shape, ValueFlags, in_shape, numbered, shape_of
 from cprl.system.output import RESUMES, say
+from cprl.system.process import at_signals
 from cprl.system.shipped import Recipe, program_of
 from cprl.values import meant, refusal, trust
 
@@ -114,11 +113,7 @@ class _AtEnd:
 
 
 def run_with(
-    experiment: "Experiment",
-    options: RunOptions,
-    *,
-    command: Sequence[str],
-    callbacks: Sequence[object] = (),
+    experiment: "Experiment", options: RunOptions, *, command: Sequence[str], callbacks: Sequence[object] = ()
 ) -> Path:
     from cprl.runs.recipe import started_by
     from cprl.training.running import run
@@ -157,17 +152,11 @@ def in_a_sentence(program: str) -> Iterator[None]:
 def ended_by_sigterm() -> Iterator[None]:
     """Ends the block at SIGTERM as Ctrl-C does, so that no half of a file stays, by `SystemExit` with 143."""
 
-    def stop(number: int, frame: FrameType | None) -> None:
+    def stop(number: int) -> None:
         raise SystemExit(128 + number)
 
-    if current_thread() is not main_thread():  # which alone gets signals
+    with at_signals(stop, signal.SIGTERM):
         yield
-        return
-    usual = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, usual)
 
 
 def _shortened(text: str) -> str:

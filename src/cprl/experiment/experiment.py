@@ -10,15 +10,7 @@ from cprl.algorithms.base import TeamAlgorithm, TrainingEngine
 from cprl.commons.game import Game
 from cprl.envs.make_env import PlayableGame, game_of, stored_game
 from cprl.learners.preferences import check_preference
-from cprl.population import (
-    AgentSpec,
-    Frozen,
-    Learning,
-    Team,
-    refuse_undecided,
-    specs_by_agent,
-    stored_of,
-)
+from cprl.population import AgentSpec, Frozen, Learning, Team, refuse_undecided, specs_by_agent, stored_of
 from cprl.runs.files import RECIPE_FORMAT, written_by_another
 from cprl.runs.recipe import recipe_config, with_runs_moved
 from cprl.system.memory import Device

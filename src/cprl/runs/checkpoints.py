@@ -7,8 +7,6 @@ import signal
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from threading import current_thread, main_thread
-from types import FrameType
 from typing import Any, Final, NoReturn, Protocol, Self
 
 import torch
@@ -26,6 +24,7 @@ from cprl.runs.files import (
 )
 from cprl.runs.recipe import resume_command, write_more_episodes
 from cprl.system.output import RESUMES, say
+from cprl.system.process import at_signals
 
 FOLDER: Final = "checkpoints"
 REPORT: Final = "report.json"
@@ -35,7 +34,6 @@ KEPT: Final = 2
 """Checkpoints that are kept: the newest, and one more in case it is unreadable."""
 
 _NAME: Final = re.compile(r"(training|ending)-(\d{12})-[0-9a-f]{32}\.pt")
-_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
 class HasState(Protocol):
@@ -90,7 +88,6 @@ class Checkpointer:
         self._place: tuple[int, int] | None = None
         self._lock = RunLock(run, take_over=take_over)
         self._sound: Path | None = None
-        self._usual: dict[int, Any] = {}
 
     def restore(self, training: HasState) -> None:
         """Restore the newest readable checkpoint, if there is one."""
@@ -177,17 +174,15 @@ class Checkpointer:
         self._lock.__enter__()
         self._place = _place_of(self.run)
         remove_partial(self.run, self.folder, self.run / "evaluation", self.run / "figures")
-        # Python handles signals in the main thread only; in other threads handlers stay as they are.
-        for number in _SIGNALS if current_thread() is main_thread() else ():
-            self._usual[number] = signal.signal(number, self._stop)
+        self._signals = at_signals(self._stop)
+        self._signals.__enter__()
         return self
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
-        for number, usual in self._usual.items():
-            signal.signal(number, usual)
+        self._signals.__exit__(None, None, None)
         self._lock.__exit__(kind, error, traceback)
 
-    def _stop(self, number: int, frame: FrameType | None) -> None:
+    def _stop(self, number: int) -> None:
         if self._asked_to_stop is not None:
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)

@@ -18,14 +18,13 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, supp
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.util import find_spec
-from threading import current_thread, main_thread
-from types import FrameType
 from typing import Annotated, Any, Final, Protocol
 
 from cprl.runs.checkpoints import interruption
 from cprl.studies.status import STOPPED, Status
 from cprl.studies.trials import ATTEMPTS, Outcome, Task
 from cprl.system.output import console
+from cprl.system.process import at_signals
 from cprl.values import Range, Value, Where
 
 Jobs = Annotated[int, Range(1, 4096)]
@@ -57,14 +56,11 @@ class InProcess:
 
 @contextmanager
 def signals() -> Iterator[list[int]]:
-    """The signals by which this process is asked to stop in the block, as they come.
-
-    What is done about them is up to the block. Python handles signals in the main thread only; in other
-    threads handlers stay as they are.
-    """
+    """The signals by which this process is asked to stop in the block, as they come; what is done about them
+    is up to the block."""
     numbers: list[int] = []
 
-    def note(number: int, frame: FrameType | None) -> None:
+    def note(number: int) -> None:
         numbers.append(number)
         if len(numbers) == 1:
             console().print(
@@ -72,13 +68,8 @@ def signals() -> Iterator[list[int]]:
                 soft_wrap=True,
             )
 
-    handled = (signal.SIGINT, signal.SIGTERM) if current_thread() is main_thread() else ()
-    usual = {number: signal.signal(number, note) for number in handled}
-    try:
+    with at_signals(note):
         yield numbers
-    finally:
-        for number, handler in usual.items():
-            signal.signal(number, handler)
 
 
 class _SideBySide(ABC):
@@ -247,17 +238,10 @@ class Ray(Value, _SideBySide, stored=False):
         if ray.is_initialized():
             yield
             return
-        options: dict[str, Any] = {
-            "log_to_driver": False,
-            "logging_level": logging.ERROR,
-        }
+        options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
         if self.address is None:
             cores = min(self.jobs or sys.maxsize, os.cpu_count() or 1)
-            options |= {
-                "num_cpus": cores,
-                "include_dashboard": False,
-                "object_store_memory": _STORE_BYTES,
-            }
+            options |= {"num_cpus": cores, "include_dashboard": False, "object_store_memory": _STORE_BYTES}
         ray.init(self.address or "local", **options)
         try:
             yield

@@ -6,11 +6,12 @@ import os
 import platform
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from threading import Thread
+from threading import Thread, current_thread, main_thread
+from types import FrameType
 from typing import Final
 
 from cprl.system.output import OUT
@@ -44,6 +45,25 @@ def prepare_process(seed: int) -> None:
     logger.setLevel(logging.INFO)
     if not logger.handlers:
         logger.addHandler(logging.StreamHandler(OUT))
+
+
+@contextmanager
+def at_signals(call: Callable[[int], object], *numbers: signal.Signals) -> Iterator[None]:
+    """Call a function with its number at a signal in the block, by default at SIGINT and SIGTERM.
+
+    Python handles signals in the main thread alone; in other threads handlers stay as they are.
+    """
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        call(number)
+
+    handled = (numbers or (signal.SIGINT, signal.SIGTERM)) if current_thread() is main_thread() else ()
+    usual = {number: signal.signal(number, handle) for number in handled}
+    try:
+        yield
+    finally:
+        for number, handler in usual.items():
+            signal.signal(number, handler)
 
 
 def obey_parent() -> None:

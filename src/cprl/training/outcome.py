@@ -32,10 +32,7 @@ EXHIBITED_WORLD: Final = 2**31
 
 
 def make_agents(
-    experiment: Experiment,
-    *,
-    starts: bool = True,
-    weights: Mapping[str, str] | None = None,
+    experiment: Experiment, *, starts: bool = True, weights: Mapping[str, str] | None = None
 ) -> tuple[EnvBase, Population]:
     """Make the worlds of a training and its agents; refuse what does not fit, in the evaluation too.
 
@@ -46,12 +43,7 @@ def make_agents(
     """
     env = _worlds(experiment, experiment.replicas, device=experiment.device)
     population = Population(
-        env,
-        experiment.agents,
-        seed=experiment.seed,
-        engine=experiment.engine,
-        starts=starts,
-        weights=weights,
+        env, experiment.agents, seed=experiment.seed, engine=experiment.engine, starts=starts, weights=weights
     )
     with torch.random.fork_rng(devices=[]):
         fresh_env(experiment)  # what the evaluation cannot have is refused now, not after hours

@@ -2,18 +2,17 @@
 
 import os
 import shutil
-import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from threading import Event, current_thread, main_thread
-from types import FrameType
 from typing import TYPE_CHECKING, Final, Literal, get_args
 from urllib.parse import quote
 
 from cprl.system.output import console
+from cprl.system.process import at_signals
 from cprl.values import checked
 
 if TYPE_CHECKING:
@@ -127,22 +126,13 @@ def linger(logger: "RerunLogger", play_on: Callable[[Event], None] | None = None
         console().print("The recording is no longer served.")
         return
     stopping = Event()
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        stopping.set()
-
-    usual = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with at_signals(lambda number: stopping.set()):
+        where = logger.addresses["browser"]
         console().print(
-            f"The recording stays served at {logger.addresses['browser']} until Ctrl-C",
-            soft_wrap=True,
-            highlight=False,
+            f"The recording stays served at {where} until Ctrl-C", soft_wrap=True, highlight=False
         )
         if play_on is not None:
             play_on(stopping)
         while not stopping.wait(1.0):
             pass
         logger.shutdown()
-    finally:
-        for number, handler in usual.items():
-            signal.signal(number, handler)
