@@ -4,9 +4,9 @@ import importlib.util
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar
 
@@ -125,6 +125,7 @@ class SearchOptions(TrialOptions):
     """Points that are proposed together; a multiple of --jobs keeps all of them busy."""
 
 
+T = TypeVar("T")
 RecipeOptions = TypeVar("RecipeOptions", SweepOptions, SearchOptions)
 
 
@@ -206,16 +207,7 @@ def search(words: Sequence[str], /) -> None:
         out = directory_of(wanted.study_of([]), options.out)
         say(f"{wanted.points} points of {factors}, found one after the other, in {out}; nothing was written")
         return
-    with _interruptible(command):
-        result = run_search(
-            wanted,
-            options.out,
-            on=executor,
-            runs=options.runs,
-            results=options.figures,
-            last=options.last,
-            again=_published(command),
-        )
+    result = _run(partial(run_search, wanted), options, executor, command)
     _say_best(result)
     _say_result(result, command)
 
@@ -337,26 +329,24 @@ def carry_out(study: "Study", options: StudyOptions, command: Sequence[str]) -> 
     executor = executor_of(options)
     if options.dry_run:
         return _list(study, options)
-    with _interruptible(command):
-        result = run_study(
-            study,
-            options.out,
-            on=executor,
-            runs=options.runs,
-            only=options.only,
-            keep_checkpoints=options.keep_checkpoints,
-            results=options.figures,
-            last=options.last,
-            again=_published(command),
-        )
+    run = partial(run_study, study, only=options.only, keep_checkpoints=options.keep_checkpoints)
+    result = _run(run, options, executor, command)
     _say_result(result, command)
     return result.out
 
 
-def _published(command: Sequence[str]) -> str:
-    """The line that runs what a study lacks, whole and as its summary has it, which names no place."""
+def _run(run: "Callable[..., T]", options: TrialOptions, executor: "Executor", command: Sequence[str]) -> T:
+    """Run a study or a search; note what continues it where Ctrl-C (SIGINT) or SIGTERM ends it."""
     program, *words = named_command(command)
-    return printed([without_directories(program), *without_options(words, ["--only"])])
+    # The line that runs what is lacking, whole and as a summary has it, which names no place.
+    again = printed([without_directories(program), *without_options(words, ["--only"])])
+    out, runs, results, last = options.out, options.runs, options.figures, options.last
+    try:
+        with ended_by_sigterm():
+            return run(out, on=executor, runs=runs, results=results, last=last, again=again)
+    except (KeyboardInterrupt, SystemExit) as error:
+        error.add_note(f"To continue: {printed(command_of(command))}")
+        raise
 
 
 def _list(study: "Study", options: StudyOptions) -> Path:
@@ -407,14 +397,3 @@ def _say_result(result: "StudyResult", command: Sequence[str]) -> None:
         lines += [f"  {labels[name]}: {outcome.reason}", f"    {where}", f"    {outcome.command}"]
     say("\n".join([*lines, f"To try them again: {printed(command_of(command))}"]))
     sys.exit(1)
-
-
-@contextmanager
-def _interruptible(command: Sequence[str]) -> Iterator[None]:
-    """Note what continues where the block is ended by Ctrl-C (SIGINT) or SIGTERM."""
-    try:
-        with ended_by_sigterm():
-            yield
-    except (KeyboardInterrupt, SystemExit) as error:
-        error.add_note(f"To continue: {printed(command_of(command))}")
-        raise
