@@ -255,11 +255,8 @@ class Study(Value, stored=False):
             directory: where it is kept; runs of `Frozen` agents are then relative to where we stand.
         """
         refuse_newer("the study", table, STUDY_FORMAT)
-        if table.get("format") != STUDY_FORMAT or table.get("pairing") is False:
-            raise ValueError(
-                f"the study has the format {shown(table.get('format'))} and pairing "
-                f"{table.get('pairing', True)}; allowed: {STUDY_FORMAT} and True"
-            )
+        if table.get("format") != STUDY_FORMAT:
+            raise refusal("the study's format", table.get("format"), str(STUDY_FORMAT))
         trust(*allow)
         try:
             values = {"experiment": table["experiment"]}
