@@ -186,11 +186,8 @@ def grouped(specs: Sequence[AgentSpec], agents: int) -> list[tuple[AgentSpec, tu
 
 
 def exploration_steps(specs: Sequence[AgentSpec]) -> int | None:
-    """The environment step of a replica at which the last agent's epsilon has reached its end.
-
-    None if no agent explores by epsilon, or only by an algorithm of the user's own. Agents that draw from a
-    policy do not, though the settings of those that learn from replay have an epsilon.
-    """
+    """The environment step of a replica at which the last agent's epsilon has reached its end; None if no
+    agent explores by epsilon, or only by an algorithm of the user's own."""
     ends = []
     for spec in specs:
         algorithm = spec.algorithm if isinstance(spec, Learning | Team) else None

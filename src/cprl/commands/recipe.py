@@ -167,11 +167,7 @@ def _shortened(text: str) -> str:
 def parse(
     make_experiment: "Callable[..., Experiment]", command: Sequence[str]
 ) -> "tuple[Experiment, RunOptions]":
-    """Return the experiment that a command line, script first, asks for, and how it is to be run.
-
-    Raises:
-        SystemExit: for `--help`, and for an argument that is unknown or of another type.
-    """
+    """Return the experiment that a command line, script first, asks for, and how it is to be run."""
     words, program = trusting(command[1:]), program_of(command[0])
     return parse_with(make_experiment, words, RunOptions(), program=program)
 
@@ -184,12 +180,9 @@ def parse_with(
     program: str,
     note: str = "",
 ) -> "tuple[Experiment, OptionsT]":
-    """Like `parse`, with options of another kind.
+    """Like `parse`, with options of another kind: a dataclass whose fields become flags.
 
     Args:
-        make_experiment: gives the experiment.
-        words: what stands after the program.
-        options: a dataclass whose fields become flags, with their values as defaults.
         program: what stands before these words, for messages.
         note: what `--help` says after the recipe's own text.
     """
@@ -255,10 +248,8 @@ def _about(make_experiment: "Callable[..., Experiment]") -> str:
 
 
 def refuse_mistyped_flags(recipe: Recipe, words: Sequence[str]) -> None:
-    """End the process with exit code 2 where the name of a flag is mistyped, before torch is imported.
-
-    Names with dots are places in the experiment, which needs torch: `parse` refuses those.
-    """
+    """End the process with exit code 2 for a mistyped flag, before torch is imported; names with dots are
+    places in the experiment, which needs torch: `parse` refuses those."""
     names = _names_of(recipe)
     if names is None:
         return
@@ -274,10 +265,8 @@ def refuse_mistyped_flags(recipe: Recipe, words: Sequence[str]) -> None:
 
 
 def _names_of(recipe: Recipe) -> set[str] | None:
-    """Return the flags of a recipe whose names have no dot; None of one that does not end with recipe_main.
-
-    They are read from the text of the recipe and of `Experiment`: importing them imports torch.
-    """
+    """Return the flags of a recipe whose names have no dot, read from its text and that of `Experiment`, as
+    importing them imports torch; None of one that does not end with recipe_main."""
     tree = ast.parse(recipe.path.read_text(encoding="utf-8"))
     calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and node.args]
     makers = [ast.unparse(call.args[0]) for call in calls if ast.unparse(call.func).endswith("recipe_main")]

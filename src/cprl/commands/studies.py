@@ -247,12 +247,8 @@ def _print_help(options: RecipeOptions, program: str) -> None:
 
 
 def recipe_of(source: Path) -> "Callable[..., Experiment]":
-    """What makes the experiment of a recipe.
-
-    Args:
-        source: a Python file with a function `experiment`, which is imported and not run; a recipe.json; or
-            the directory of a run.
-    """
+    """What makes the experiment of a recipe: a Python file with a function `experiment`, which is imported
+    and not run; a recipe.json; or the directory of a run."""
     if source.suffix != ".py" or source.is_dir():
         directory, content = source if source.is_dir() else source.parent, read_recipe(source)
 
@@ -316,14 +312,8 @@ def executor_of(options: TrialOptions) -> "Executor":
 
 
 def carry_out(study: "Study", options: StudyOptions, command: Sequence[str]) -> Path:
-    """Run a study as the command line asks for it, say what came of it, and return its directory.
-
-    Args:
-        command: the command line, script first, which is said where it can be used again.
-
-    Raises:
-        SystemExit: with code 1 where trials have failed, and 130 or 143 where it was interrupted.
-    """
+    """Run a study as the command line, script first, asks for it, say what came of it, and return its
+    directory."""
     from cprl.studies import run_study
 
     executor = executor_of(options)

@@ -123,10 +123,9 @@ class Experiment(Value, stored=False, called="experiment"):
     def from_recipe(
         cls, recipe: Mapping[str, Any], *, allow: Iterable[str] = (), directory: str | Path | None = None
     ) -> "Experiment":
-        """The experiment of a recipe.
+        """The experiment of a recipe, as `recipe.json` holds it.
 
         Args:
-            recipe: what `recipe.json` holds.
             allow: the targets of `Custom` that it may hold, "module:Class" each.
             directory: where the recipe is kept; runs of `Frozen` are then relative to where we stand.
         """

@@ -92,12 +92,6 @@ class _SideBySide(ABC):
         return nullcontext()
 
     def run(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
-        """Runs every trial; they begin in order.
-
-        Raises:
-            KeyboardInterrupt: after SIGINT, when every process has saved a checkpoint.
-            SystemExit: with code 143 after SIGTERM, likewise.
-        """
         waiting: list[Task] = []
         for task in tasks:
             outcome = task.settled()

@@ -309,11 +309,8 @@ def _value_of(path: str, table: Any) -> Any:
 
 
 def factors_of(experiment: Experiment, flags: Iterable[str]) -> dict[str, Factor]:
-    """Return the factors that words of a command line say, for a `Study` of this experiment.
-
-    Args:
-        flags: "PATH=VALUES" each; values with commas between them, or a distribution with its range.
-    """
+    """Return the factors that words of a command line say, "PATH=VALUES" each: values with commas between
+    them, or a distribution with its range."""
     factors: dict[str, Factor] = {}
     for flag in flags:
         path, equals, text = flag.partition("=")

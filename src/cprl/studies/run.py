@@ -117,11 +117,8 @@ def trials_with(trials: Sequence[Trial], only: Sequence[str]) -> list[Trial]:
 
 @contextmanager
 def shared(study: Study, out: Path, *, progress: bool) -> Iterator[None]:
-    """Makes a study's directory, and locks it together with all who run the same study.
-
-    Raises:
-        RunLockedError: where another study is run there.
-    """
+    """Makes a study's directory, and locks it together with all who run the same study; another one is
+    refused."""
     out.mkdir(parents=True, exist_ok=True)
     content = json.dumps(study.to_config(out), sort_keys=True).encode()
     with RunLock(out, study=hashlib.blake2b(content, digest_size=6).hexdigest()) as lock:
@@ -137,11 +134,7 @@ def _run(tasks: Sequence[Task], executor: Executor, title: str, *, progress: boo
     """Runs trials, shows how far they are, and returns those that failed.
 
     Those that another process runs come last: all others first, then it waits for these. Those that were made
-    with other code of the user's own are moved aside and run anew.
-
-    Raises:
-        RunLockedError: where another process runs such a trial.
-    """
+    with other code of the user's own are moved aside and run anew."""
     runs, status = tasks[0].runs, tasks[0].status.folder
     moved = [aside for task in tasks if (aside := move_aside(task.directory)) is not None]
     if moved and progress:

@@ -224,11 +224,8 @@ class Study(Value, stored=False):
         return tuple(self.factors) if self.factors else (CONDITION,)
 
     def to_config(self, directory: str | Path | None = None) -> dict[str, Any]:
-        """Return the study as JSON can hold it.
-
-        Args:
-            directory: where it is kept: runs of `Frozen` agents are then given relative to it.
-        """
+        """Return the study as JSON can hold it; in a directory, runs of `Frozen` agents are given relative to
+        it."""
         table: dict[str, Any] = {
             "experiment": self.experiment.to_config(),
             "factors": {name: factor_to_config(factor) for name, factor in self.factors.items()},
@@ -248,11 +245,10 @@ class Study(Value, stored=False):
     def from_config(
         cls, table: Mapping[str, Any], *, allow: Iterable[str] = (), directory: str | Path | None = None
     ) -> "Study":
-        """Return the study that `to_config` gave.
+        """Return the study that `to_config` gave in a directory.
 
         Args:
             allow: the targets of `Custom` that it may hold, "module:Class" each.
-            directory: where it is kept; runs of `Frozen` agents are then relative to where we stand.
         """
         refuse_newer("the study", table, STUDY_FORMAT)
         if table.get("format") != STUDY_FORMAT:
@@ -379,11 +375,7 @@ def write_study(study: Study, out: Path) -> None:
 
 
 def read_study(out: Path | str, *, allow: Sequence[str] = ()) -> Study:
-    """Return the study of a directory.
-
-    Args:
-        allow: the user's own code, "module:Class", that it may import.
-    """
+    """Return the study of a directory; `allow` is the user's own code, "module:Class", that it may import."""
     path = Path(out) / FILE_NAME
     try:
         table = read_json(path)

@@ -117,14 +117,8 @@ def state_of(run: Path) -> State:
 
 
 def move_aside(run: Path) -> Path | None:
-    """Moves a run out of the way that was made with other code of the user's own; nothing of it is lost.
-
-    Returns:
-        Where it is now: in a folder beside that of the runs, `runs-earlier`; None for any other run.
-
-    Raises:
-        RunLockedError: if another process runs it.
-    """
+    """Moves a run out of the way that was made with other code of the user's own, into a folder beside that
+    of the runs, `runs-earlier`; returns where it is now, None for any other run."""
     try:
         if state_of(run) == "missing" or not changed_code(read_recipe(run)):
             return None
@@ -208,18 +202,12 @@ class Task:
         return {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
 
     def settled(self) -> Outcome | None:
-        """What there is to say of a trial that cannot be run now; None of one that can.
-
-        A finished one is left as it is. Refused are one in whose directory another trial's run is, and a
-        finished one that lost a file.
-        """
+        """What there is to say of a trial that cannot be run now: a finished one, one in whose directory
+        another trial's run is, or a finished one that lost a file; None of one that can."""
         return self._tried(self._check)
 
     def begin(self) -> Outcome | None:
-        """Make the directory ready for `cprl run`; an outcome where there is nothing to be run.
-
-        A trial that is not there goes on from a shorter one if that can be, see `begin_from_shorter`.
-        """
+        """Make the directory ready for `cprl run`; an outcome where there is nothing to be run."""
         return self._tried(self._check) or self._tried(self._prepare)
 
     def _tried(self, step: Callable[[], Outcome | None]) -> Outcome | None:
@@ -325,17 +313,8 @@ def begin_from_shorter(run: Path, experiment: Experiment, recipe: Mapping[str, A
     """Makes a run that is not there of the longest finished one beside it that has fewer episodes, keeps the
     state of its training and is the same otherwise; it is then to be resumed with its own episodes.
 
-    The other run stays as it is. A copy that was interrupted is made anew.
-
-    Args:
-        run: the directory that is not there.
-        experiment: what is to be run; one with callbacks that may depend on the number of episodes goes on
-            from nothing.
-        recipe: what `Experiment.to_recipe` gave for it.
-
-    Returns:
-        The run that was copied; None if there is none such.
-    """
+    Returns the run that was copied, which stays as it is; None if there is none such, and where callbacks may
+    depend on the number of episodes. A copy that was interrupted is made anew."""
     callbacks = [callback.resolve() for callback in experiment.callbacks]
     if any(not isinstance(callback, type) or depends_on_episodes(callback) for callback in callbacks):
         return None

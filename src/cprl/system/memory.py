@@ -42,13 +42,11 @@ def free_bytes(device: "str | torch.device" = "cpu") -> int:
 def check_memory(
     what: str, needed: int, instead: str, *, device: "str | torch.device" = "cpu", free: int | None = None
 ) -> None:
-    """Refuses what would not fit.
+    """Refuses what would not fit: what takes the memory, in the plural, and how many bytes it takes,
+    estimated.
 
     Args:
-        what: takes the memory, in the plural, e.g. "the replay buffers of 4 lanes".
-        needed: bytes that it takes, estimated.
         instead: what to use in its place.
-        device: where it would be allocated.
         free: how many bytes are free; None to ask the device.
     """
     if needed <= _SMALL:

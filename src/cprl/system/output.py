@@ -70,11 +70,8 @@ ERR: Final = Output(lambda: _behind(sys.stderr))
 
 
 def console(output: Output = OUT, *, width: int | None = None) -> "Console":
-    """A console that no encoding can stop, by default on standard output.
-
-    Square brackets and colons in texts are shown as they are: they may be those of a path or a name. What is
-    to have a style is a `rich.text.Text`.
-    """
+    """A console that no encoding can stop, by default on standard output; square brackets and colons in
+    texts, which may be those of a path, are shown as they are."""
     from rich.console import Console
 
     return Console(file=cast(TextIO, output), width=width, markup=False, emoji=False)

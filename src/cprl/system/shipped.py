@@ -67,11 +67,7 @@ class Recipe:
 
 
 def recipes_folder() -> Path:
-    """The folder that holds the recipes.
-
-    Raises:
-        FileNotFoundError: if there is none, as where the source was copied alone.
-    """
+    """The folder that holds the recipes; a FileNotFoundError where the source was copied alone."""
     for folder in (_PACKAGE / "recipes", _PACKAGE.parents[1] / "recipes"):
         if folder.is_dir():
             return folder
@@ -124,11 +120,8 @@ def run_shipped(name: str, words: Sequence[str]) -> None:
 
 
 def import_from(folder: str) -> None:
-    """Lets the modules that the recipes of a folder share be imported by name, as copies of recipes do.
-
-    Args:
-        folder: e.g. "studies". Modules beside the script that runs come first.
-    """
+    """Lets the modules that the recipes of a folder share be imported by name, as copies of recipes do;
+    modules beside the script that runs come first."""
     folders = sorted({recipe.folder for recipe in shipped_recipes().values()} - {""})
     if folder not in folders:
         raise ValueError(f"folder is {folder!r}; allowed: {', '.join(folders)}")

@@ -210,12 +210,8 @@ def evaluate_population(
 
 
 def write_evaluation(run: Path, played: Mapping[str, Sequence[Episode]], *, of_replica: int) -> None:
-    """Write `evaluation/<policy>.parquet` of a run; again where one is there.
-
-    Args:
-        played: the episodes by policy.
-        of_replica: how many of them each replica has.
-    """
+    """Write `evaluation/<policy>.parquet` of a run, so many episodes of each replica; again where one is
+    there."""
     for name, episodes in played.items():
         path = run / "evaluation" / f"{name}.parquet"
         path.parent.mkdir(exist_ok=True)

@@ -298,12 +298,8 @@ def train(
 ) -> Training:
     """Plays so many episodes of every replica; each learner stores every turn and then updates.
 
-    Args:
-        checkpointer: where the training resumes from, and saves its state now and then; all else is as of
-            `Training`.
-
-    Returns:
-        The training, which is over.
+    Returns the `Training`, which is over; arguments are its own. The checkpointer says where it resumes from,
+    and saves its state now and then.
 
     Raises:
         NotFiniteError: where a number is not finite, before a checkpoint holds it.

@@ -145,7 +145,11 @@ class Value:
             object.__setattr__(self, name, checked(place, getattr(self, name), hint))
 
     def to_config(self) -> dict[str, Any]:
-        """Return the fields as JSON can hold them."""
+        """Return a value as JSON can hold it: tables, lists, texts, numbers, booleans and None.
+
+        Raises:
+            ValueError: for what is neither of `KINDS` nor of JSON, with its place and what to write instead.
+        """
         names = hints_of(type(self))
         return {name: to_config(getattr(self, name), f"{self._called}.{name}") for name in names}
 
@@ -346,12 +350,8 @@ def _not_too_deep(where: str) -> Iterator[None]:
 def to_config(value: object, where: str = "value") -> Any:
     """Return a value as JSON can hold it: tables, lists, texts, numbers, booleans and None.
 
-    Args:
-        value: a value of `KINDS`, tuples of them, or what JSON has.
-        where: its place, for messages.
-
     Raises:
-        ValueError: for anything else, with what to write instead.
+        ValueError: for what is neither of `KINDS` nor of JSON, with its place and what to write instead.
     """
     with _not_too_deep(where):
         return _config(value, where)
