@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeAlias
 
 from cprl.experiment.experiment import MOST_SEED, Experiment
-from cprl.population import stored_of
 from cprl.runs.files import STUDY_FORMAT, read_json, refuse_newer, write_json
 from cprl.runs.recipe import RECIPE_FILE, with_runs_moved
 from cprl.studies.factors import (
@@ -144,29 +143,16 @@ class Study(Value, stored=False):
         names = [condition.name for condition in self.all_conditions]
         if self.reference_name not in names:
             raise refusal("reference", self.reference, f"the name of a condition: {', '.join(names[:10])}")
-        for condition in self.all_conditions:
-            self._check_stored(condition)
         self.to_config()  # refuses what `study.json` could not hold
-
-    def _check_stored(self, condition: Condition) -> None:
-        """Refuse stored agents that are named for another number of replicas than the study's."""
-        for place, spec in enumerate(condition.experiment.agents):
-            stored = stored_of(spec)
-            replicas = None if stored is None else stored.replica
-            if isinstance(replicas, tuple) and len(replicas) != self.replicas:
-                where = f"agents.{place}" if stored is spec else f"agents.{place}.start_from"
-                raise ValueError(
-                    f"{where}.replica of condition {condition.name!r} is {shown(replicas)}, of "
-                    f"{len(replicas)} numbers; allowed: {self.replicas} of them, one for each replica of the "
-                    "study; one number for all; or None"
-                )
 
     @cached_property
     def all_conditions(self) -> tuple[Condition, ...]:
         by_checksum: dict[str, Condition] = {}
+        assert self.replicas is not None
+        base = replace(self.experiment, replicas=self.replicas)
         for name, levels in self._levels():
             values = {factor: level.value for factor, level in levels.items()}
-            condition = Condition(experiment_at(self.experiment, levels), values, name)
+            condition = Condition(experiment_at(base, levels), values, name)
             same = by_checksum.setdefault(condition.checksum, condition)
             if same is not condition and self.draws is None:
                 raise ValueError(f"conditions {same.name!r} and {name!r} are equal; allowed: each once")
