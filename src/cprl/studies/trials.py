@@ -13,6 +13,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import count
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
@@ -42,8 +43,22 @@ class Trial:
 
     condition: Condition
     block: Block
-    experiment: Experiment
-    """What is run."""
+
+    @cached_property
+    def experiment(self) -> Experiment:
+        """What is run; stored agents play in its replicas, which a run numbers from 0 again."""
+        first, last = self.block.first, self.block.first + self.block.replicas
+
+        def in_block(stored: Frozen) -> Frozen:
+            if isinstance(stored.replica, tuple):
+                return replace(stored, replica=stored.replica[first:last])
+            if stored.replica is None and first:
+                return replace(stored, replica=tuple(range(first, last)))
+            return stored
+
+        of_condition = self.condition.experiment
+        agents = tuple(with_stored(spec, in_block) for spec in of_condition.agents)
+        return replace(of_condition, seed=self.block.seed, replicas=self.block.replicas, agents=agents)
 
     @property
     def name(self) -> str:
@@ -87,26 +102,7 @@ class Trial:
 
 def trials_of(study: Study) -> list[Trial]:
     """Every trial of a study: the first blocks of all conditions, then their second ones, and so on."""
-    return [
-        Trial(condition, block, _experiment_of(condition, block))
-        for block in study.blocks
-        for condition in study.all_conditions
-    ]
-
-
-def _experiment_of(condition: Condition, block: Block) -> Experiment:
-    """The experiment of a block; stored agents play in its replicas, which a run numbers from 0 again."""
-    last = block.first + block.replicas
-
-    def in_block(stored: Frozen) -> Frozen:
-        if isinstance(stored.replica, tuple):
-            return replace(stored, replica=stored.replica[block.first : last])
-        if stored.replica is None and block.first:
-            return replace(stored, replica=tuple(range(block.first, last)))
-        return stored
-
-    agents = tuple(with_stored(spec, in_block) for spec in condition.experiment.agents)
-    return replace(condition.experiment, seed=block.seed, replicas=block.replicas, agents=agents)
+    return [Trial(condition, block) for block in study.blocks for condition in study.all_conditions]
 
 
 def state_of(run: Path) -> State:
