@@ -146,23 +146,21 @@ def test_a_field_of_an_algorithm_of_somebodys_own_is_their_own():
         Mine(settings=REPLAY, double="yes")
 
 
-@pytest.mark.parametrize("target", ["no colon", ":", "a:", ":b", ".a:b", "a..b:c", "a:b\n", "a:b c"])
-def test_the_target_of_a_custom_is_a_module_and_a_name(target):
-    with pytest.raises(ValueError, match=r"Custom\.target"):
-        Custom(target)
-
-
 @pytest.mark.parametrize(
-    "arguments",
-    [[1], {"x": NAN}, {"x": object()}, {"x": {1: 2}}, {2: 2}, {"x": 10**5000}, {"x": np.float32(1)}],
+    ("target", "arguments", "field"),
+    [
+        *(
+            (target, {}, "target")
+            for target in ("no colon", ":", "a:", ":b", ".a:b", "a..b:c", "a:b\n", "a:b c")
+        ),
+        *(("a:b", arguments, "arguments") for arguments in ([1], {2: 2}, {"x": {1: 2}})),
+        *(("a:b", {"x": value}, "arguments") for value in (NAN, object(), 10**5000, np.float32(1))),
+    ],
 )
-def test_a_custom_holds_what_json_can_hold(arguments):
-    with pytest.raises(ValueError, match=r"Custom\.arguments"):
-        Custom("a:b", arguments=arguments)
-
-
-def test_the_arguments_of_a_custom_may_be_any_table():
+def test_a_custom_has_a_module_a_name_and_a_table_that_json_can_hold(target, arguments, field):
     assert Custom("a:b", MappingProxyType({"x": (1, 2)})) == Custom("a:b", UserDict(x=[1, 2]))
+    with pytest.raises(ValueError, match=rf"Custom\.{field}"):
+        Custom(target, arguments=arguments)
 
 
 def nested(depth):
