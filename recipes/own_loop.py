@@ -46,8 +46,7 @@ from cprl.system.shipped import cprl_here
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
-from cprl.training.collectors import StepCollector
-from cprl.training.training import Callback
+from cprl.training.training import Callback, StepCollector
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.page import check_watch
 

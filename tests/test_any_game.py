@@ -41,7 +41,7 @@ from cprl.runs.episodes import COLUMNS, LEFT_OUT, EpisodeTable, as_table, labell
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
-from cprl.training.collectors import StepCollector
+from cprl.training.training import StepCollector
 from cprl.viewer.callback import ViewerCallback
 
 GAME = Game(

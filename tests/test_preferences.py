@@ -24,7 +24,7 @@ from cprl.learners.preferences import (
     SocialValueOrientation,
     WantedRewards,
 )
-from cprl.training.collectors import StepCollector
+from cprl.training.training import StepCollector
 
 AVERSE = InequityAversion(alpha=5, beta=0.05, smoothing=0.9)
 FAIR = SocialValueOrientation(angle=math.pi / 4, weight=0.5)

@@ -33,7 +33,7 @@ from cprl.networks.stacked import lane_state, stack_lanes
 from cprl.policies.assignment import AgentPolicies
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.training import train
-from cprl.training.collectors import StepCollector
+from cprl.training.training import StepCollector
 from cprl.values import from_config, to_config
 
 SMALL = GRU(encoder=MLP(hidden_cells=(6,)), recurrent_cells=5)

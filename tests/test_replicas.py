@@ -21,7 +21,7 @@ from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import LaneActor, RandomActor
 from cprl.runs.episodes import EpisodeTable, read_episodes
 from cprl.training import train
-from cprl.training.collectors import StepCollector
+from cprl.training.training import StepCollector
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),

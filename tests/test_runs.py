@@ -38,7 +38,7 @@ from cprl.runs.files import remove_listed, rename_listed, verify, write_listed
 from cprl.runs.recipe import read_recipe, refuse_another_run, resume_command, runs_in, start_run
 from cprl.studies.factors import changed
 from cprl.system.shipped import cprl_here
-from cprl.training.collectors import StepCollector
+from cprl.training.training import StepCollector
 from cprl.values import Custom
 
 AGENT = Learning(DQN(settings=presets.dqn_settings("commons")))

@@ -1,8 +1,8 @@
 """train: a training from its first step to its last."""
 
 import time
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -13,9 +13,11 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.state import carried_state, env_state, load_carried, load_env_state
+from cprl.envs.stepping import begin_states
 from cprl.envs.unwrap import commons_of
 from cprl.experiment.experiment import OnNan
 from cprl.learners.base import (
@@ -33,9 +35,52 @@ from cprl.policies.decisions import Decider
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.files import TRAINING_STATE_FORMAT
 from cprl.system.times import Times
-from cprl.training.collectors import StepCollector
 from cprl.training.finite import EVERY_STEPS, FiniteCheck
 from cprl.values import shown
+
+
+class StepCollector(BaseCollector):
+    """Yields steps of all worlds one by one, batch size [B].
+
+    Equivalent to `Collector(env, policy, frames_per_batch=B)` without its time axis of length 1, as a test
+    checks, and several times faster. It does not stack, copy or track anything: batches contain the
+    environment's own tensors. Environment and policy have states of their own, so that it has none.
+
+    Args:
+        env: B worlds, whose steps return new tensors.
+    """
+
+    def __init__(self, env: EnvBase, policy: nn.Module) -> None:
+        super().__init__()
+        self.env, self.policy = env, policy
+        self.frames_per_batch = env.batch_size.numel()
+        self.carried: TensorDictBase | None = None
+        """The input of the environment's next step; None before the first step."""
+
+    def iterator(self) -> Iterator[TensorDictBase]:
+        if self.carried is None:
+            self.carried = self.env.reset()
+        while True:
+            with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+                now, self.carried = self.env.step_and_maybe_reset(self.policy(self.carried))
+                begin_states(self.carried, self.carried, now)
+            yield now
+
+    def set_seed(self, seed: int, static_seed: bool = False) -> int:
+        return int(self.env.set_seed(seed, static_seed=static_seed))
+
+    def shutdown(
+        self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True
+    ) -> None:
+        if close_env and not self.env.is_closed:
+            self.env.close(raise_if_closed=raise_on_error)
+
+    def state_dict(self) -> "OrderedDict[str, Any]":
+        return OrderedDict()
+
+    def load_state_dict(self, state_dict: "OrderedDict[str, Any]") -> None:
+        pass
+
 
 MakeCollector = Callable[[EnvBase, nn.Module], BaseCollector]
 """A collector out of an environment and a policy; it yields batches [R], or [R, T] of T turns."""
