@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 import tyro
@@ -101,15 +102,8 @@ def recipe_main(
     command = list(sys.argv if argv is None else argv)
     with in_a_sentence(program_of(command[0])):
         experiment, options = parse(make_experiment, command)
-        callbacks = [] if at_end is None else [_AtEnd(at_end)]
+        callbacks = [] if at_end is None else [SimpleNamespace(on_finished=at_end)]
         return run_with(experiment, options, command=command, callbacks=callbacks)
-
-
-@dataclass(frozen=True)
-class _AtEnd:
-    """A callback that calls a function with the directory of a run that has finished."""
-
-    on_finished: Callable[[Path], object]
 
 
 def run_with(
