@@ -5,7 +5,7 @@ import json
 from collections import UserDict
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -256,41 +256,28 @@ def test_a_name_is_that_of_a_directory_anywhere_and_a_device_one_that_torch_take
         replace(EXPERIMENT, **{field: value})
 
 
-class Strange:
-    """A game of somebody's own whose number of agents is none."""
+def test_games_that_cannot_be_played_or_that_no_recipe_can_name_are_refused_in_a_sentence():
+    class Local(Dilemma):
+        pass
 
-    agents = 1.5
-
-    def to_config(self):
-        return {}
-
-    def make(self, worlds, seed, device):
-        raise AssertionError
-
-
-def test_games_that_cannot_be_played_are_refused_in_a_sentence():
     for game, message in (
-        (type(GAME), "is the class Game"),
-        (Strange(), r"agents is 1\.5"),
-        (Strange, "the class"),
+        *((type(GAME), "is the class Game"), (Dilemma, "the class"), (Local(), ".*Local")),
+        (SimpleNamespace(agents=1.5, to_config=dict, make=print), r"agents is 1\.5"),
     ):
         with pytest.raises(ValueError, match=rf"^experiment\.game.*{message}"):
             replace(EXPERIMENT, game=game)
-    with pytest.raises(ValueError, match=r"^experiment\.evaluation_episodes is 8192"):
-        replace(EXPERIMENT, replicas=1024, evaluation_episodes=8192)
 
 
 HOW = {"agents": (0, 1), "replicas": 1, "engine": "eager"}
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [{"agents": ()}, {"agents": (0, 2)}, {"agents": (0, 0)}, {"replicas": 0}, {"reward_kind": "group"}],
-    ids=str,
-)
-def test_who_learns_cannot_be_agents_and_replicas_that_there_are_not(changes):
-    with pytest.raises(ValueError, match=next(iter(changes))):
-        LearningAgents(SPACES, **{"agents": (0, 1), "replicas": 1, **changes})
+def test_who_learns_cannot_be_agents_and_replicas_that_there_are_not():
+    for field, value in (
+        *(("agents", agents) for agents in ((), (0, 2), (0, 0))),
+        *(("replicas", 0), ("reward_kind", "group")),
+    ):
+        with pytest.raises(ValueError, match=field):
+            LearningAgents(SPACES, **{"agents": (0, 1), "replicas": 1, field: value})
 
 
 WIDE = (2**16,) * 64
@@ -569,14 +556,6 @@ def test_a_custom_that_makes_a_game_stays_the_same_text(stored):
     again = Experiment.from_recipe(as_stored(experiment.to_recipe()), allow=[stored.target])
     assert again == experiment
     assert again.game == stored
-
-
-def test_a_game_that_no_recipe_can_name_is_refused():
-    class Local(Dilemma):
-        pass
-
-    with pytest.raises(ValueError, match=r"experiment\.game is a .*Local"):
-        Experiment(name="local", game=Local(), agents=[DQN_AGENT] * 2, episodes=1)
 
 
 def test_a_run_of_frozen_agents_is_kept_relative_to_the_run_that_has_them(tmp_path, monkeypatch):
