@@ -98,20 +98,14 @@ def twin(tmp_path_factory):
 
 
 @pytest.mark.integration
-def test_a_run_that_is_killed_in_its_training_ends_bit_identical(twin, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "stages"),
+    [("DQN", ["training"]), *(pytest.param(name, MOMENTS, marks=pytest.mark.slow) for name in AGENTS)],
+)
+def test_a_run_that_is_killed_in_stages_of_it_ends_bit_identical(name, stages, twin, tmp_path):
     run = tmp_path / "run"
-    assert lived("DQN", run, MOMENTS["training"]) == -signal.SIGKILL
+    assert {lived(name, run, MOMENTS[stage]) for stage in stages} == {-signal.SIGKILL}
     assert list((run / "checkpoints").glob("training-*.pt"))
-    assert lived("DQN", run) == 0
-    assert differences(run, twin("DQN")) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", AGENTS)
-def test_a_run_that_is_killed_in_every_stage_ends_bit_identical(name, twin, tmp_path):
-    run = tmp_path / "run"
-    codes = {stage: lived(name, run, moment) for stage, moment in MOMENTS.items()}
-    assert codes == dict.fromkeys(MOMENTS, -signal.SIGKILL)
     assert not (run / "report.json").exists()
     assert lived(name, run) == 0
     assert differences(run, twin(name)) == []
