@@ -285,8 +285,9 @@ def called_first(own, *arguments):
 
 @pytest.mark.integration
 @ignored
-def test_torch_hands_over_the_code_that_it_compiled():
-    own = compiled_of_its_own(3)
+def test_torch_hands_over_what_it_compiled_and_keeps_it_by_code_object():
+    own, five = compiled_of_its_own(3), compiled_of_its_own(5)
+    assert compat.compiled_code(own) is not compat.compiled_code(five)
     assert own.__code__ is not doubled.__code__
     code = compat.compiled_code(own)
     assert code is not None
@@ -294,13 +295,6 @@ def test_torch_hands_over_the_code_that_it_compiled():
     torch._dynamo.reset()  # as somebody else in the process may
     assert direct(torch.full((3,), 4.0)).tolist() == [8.0] * 3
     assert compat.compiled_code(own) is None, "it is gone from the cache"
-
-
-@pytest.mark.integration
-@ignored
-def test_torch_keeps_what_it_compiled_by_code_object():
-    two, five = compiled_of_its_own(2), compiled_of_its_own(5)
-    assert compat.compiled_code(two) is not compat.compiled_code(five)
 
 
 @pytest.mark.integration
@@ -403,11 +397,14 @@ def test_numba_refuses_allocations():
         numba.njit(**compiled.CPU_OPTIONS)(allocates)(np.ones(3))
 
 
-def test_numba_gives_the_machine_code_of_a_function():
+def test_numba_gives_the_machine_code_of_a_function_unless_it_is_told_not_to_compile(monkeypatch):
     function = numba.njit(**compiled.CPU_OPTIONS)(summed)
     code = compiled.machine_code(function, np.ones(3))
     assert code is not function
     assert code(np.arange(5.0)) == 10
+    monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
+    with pytest.raises(ValueError, match="NUMBA_DISABLE_JIT"):
+        compiled.machine_code(summed, np.ones(3))
 
 
 def test_numba_keeps_compiled_functions_where_it_is_told(tmp_path):
@@ -474,12 +471,6 @@ def test_of_processes_that_start_together_one_compiles_and_the_others_read(tmp_p
         for number in range(3)
     ]
     assert sorted(process.communicate(timeout=100)[0].strip() for process in started) == ["0", "0", "1"]
-
-
-def test_rules_that_numba_is_told_not_to_compile_are_refused_by_the_variable(monkeypatch):
-    monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
-    with pytest.raises(ValueError, match="NUMBA_DISABLE_JIT"):
-        compiled.machine_code(summed, np.ones(3))
 
 
 LIBRARY_PARTS = (

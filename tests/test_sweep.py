@@ -101,7 +101,10 @@ def test_the_end_of_the_training_that_is_compared_may_be_longer():
     assert not Path("elsewhere").exists()
 
 
-def test_a_dry_run_lists_all_trials_and_writes_nothing(here, capsys):
+def test_a_dry_run_lists_all_trials_drawn_ones_too_and_writes_nothing(here, capsys):
+    sweep(f"mine.py --vary {FREEZE}=integers(1,8) --draws 8 --design latin_hypercube --dry-run")
+    said = capsys.readouterr().out
+    assert all(f"freeze_steps={steps}, replica 0  missing" in said for steps in range(1, 9))
     sweep(f"mine.py --vary {FREEZE}=2,5 --dry-run")
     said = capsys.readouterr().out
     assert "freeze_steps=5, replica 0  missing" in said
@@ -186,12 +189,6 @@ def test_flags_of_other_commands_are_unknown(capsys):
         with pytest.raises(SystemExit, match="2"):
             command(["mine.py", "--vary", f"{FREEZE}=2,3", flag])
         assert flag.partition("=")[0] in "".join(capsys.readouterr())
-
-
-def test_a_design_draws_the_conditions_of_a_sweep(capsys):
-    sweep(f"mine.py --vary {FREEZE}=integers(1,8) --draws 8 --design latin_hypercube --dry-run")
-    said = capsys.readouterr().out
-    assert all(f"freeze_steps={steps}, replica 0  missing" in said for steps in range(1, 9))
 
 
 def test_a_search_is_a_command_of_its_own(monkeypatch, capsys, here):

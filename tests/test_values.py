@@ -101,7 +101,7 @@ def as_numpy(value):
     return kinds[type(value)](value) if type(value) in kinds else value
 
 
-def test_numbers_are_stored_exactly_and_never_rounded():
+def test_numbers_are_stored_exactly_and_texts_of_another_class_as_plain_ones():
     settings = DQNSettings(batch_size=np.int64(3), gamma=np.float32(0.5), tau=1, hidden_cells=range(4, 7))
     assert (settings.batch_size, settings.gamma, settings.tau) == (3, 0.5, 1)
     assert settings.hidden_cells == (4, 5, 6)
@@ -109,6 +109,7 @@ def test_numbers_are_stored_exactly_and_never_rounded():
     for wrong in (1.9, 2.0, np.float64(2), True, np.array([2]), "2"):
         with pytest.raises(ValueError, match=r"DQNSettings\.batch_size"):
             DQNSettings(batch_size=wrong)
+    assert type(Scripted(type("Text", (str,), {})("random")).policy) is str
 
 
 @pytest.mark.parametrize(
@@ -318,13 +319,6 @@ def test_tables_random_numbers_and_evaluations_that_no_memory_has_are_refused_to
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_text_of_another_class_becomes_a_plain_one():
-    class Text(str):
-        pass
-
-    assert type(Scripted(Text("random")).policy) is str
-
-
 BOARD = maps.parse("A>.#.\n.A.vA\n..A..")
 SOMETHING = Custom("mine:nested.Class", arguments={"x": [1, {"kind": 2.5}], "": None})
 UNUSUAL = (
@@ -381,10 +375,6 @@ def test_a_value_comes_back_from_its_table_as_it_was(value):
     assert back == value
     assert hash(back) == hash(value)
     assert to_config(back) == table
-
-
-def test_what_a_table_leaves_out_takes_its_default():
-    assert from_config({"kind": "DQNSettings", "gamma": 0.9}) == DQNSettings(gamma=0.9)
 
 
 TABLE = to_config([Learning(DQN(settings=DQNSettings()))], "agents")
@@ -450,7 +440,8 @@ def test_what_would_be_imported_is_refused_unless_it_is_allowed():
         from_config(table)
 
 
-def test_two_tables_are_told_apart_by_place():
+def test_two_tables_are_told_apart_by_place_and_what_one_leaves_out_takes_its_default():
+    assert from_config({"kind": "DQNSettings", "gamma": 0.9}) == DQNSettings(gamma=0.9)
     before, now = TABLE, changed(TABLE, (0, "algorithm", "settings", "gamma"), 0.5)
     assert differences(before, now, "agents") == ["agents[0].algorithm.settings.gamma was 0.995, is 0.5"]
     assert differences(before, before, "agents") == []
