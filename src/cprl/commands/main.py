@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
+from contextvars import ContextVar
 from dataclasses import replace
 from importlib import import_module
 from inspect import getdoc
@@ -52,6 +53,9 @@ them. A command imports what it needs once its words are checked: torch takes se
 not."""
 
 _OPTIONS: Final = RunOptions()
+_TRIAL: Final[ContextVar[Path | None]] = ContextVar("trial", default=None)
+"""--trial FILE of `cprl run` where a study started it, which is in no help: the run says there every second
+how far it is, draws no figure, and ends with the process that has its standard input."""
 _ARGS: Final = "\n\nArgs:"
 
 
@@ -79,8 +83,12 @@ def main() -> None:
             function = _function(words[0])
             about = f"{(getdoc(function) or '').partition(_ARGS)[0]}\n\n{ALLOW}"
             config = (tyro.conf.HelptextFromCommentsOff,)
-            program = f"cprl {words[0]}"
-            tyro.cli(function, args=trusting(words[1:]), prog=program, description=about, config=config)
+            others = trusting(words[1:])
+            if words[0] == "run" and "--trial" in others[:-1]:
+                place = others.index("--trial")
+                _TRIAL.set(Path(others[place + 1]))
+                del others[place : place + 2]
+            tyro.cli(function, args=others, prog=f"cprl {words[0]}", description=about, config=config)
 
 
 def _function(command: str) -> Callable[..., Any]:
@@ -102,7 +110,6 @@ def run(
     *,
     options: Annotated[RunOptions, tyro.conf.arg(name="")] = _OPTIONS,
     episodes: int | None = None,
-    trial: Annotated[Path | None, tyro.conf.Suppress] = None,
 ) -> None:
     """Trains the experiment of a recipe or of a run anew, or resumes a run that was stopped.
 
@@ -113,9 +120,8 @@ def run(
         recipe: a recipe.json, or the directory of a run.
         options: --out is with --resume the run itself.
         episodes: instead of those of the recipe; with --resume more of them extend the run.
-        trial: the file where a study that started this run is told every second how far it is; no figure is
-            drawn, and the run ends with the process that has its standard input.
     """
+    trial = _TRIAL.get()
     if trial is not None:
         obey_parent()
     _refuse_unknown(recipe)
