@@ -14,32 +14,14 @@ import numpy as np
 import pytest
 import report
 import reproduce
+import results
 import verdicts
 from boards import module_at
-from claims import (
-    of_experiment_1,
-    of_experiment_2,
-    of_experiment_3,
-    of_experiment_4,
-    of_experiment_5,
-    undefined_in,
-)
-from curves import appendix
 from planner import Planner, planned_harvest
 from possible import KNOWN, computed, possible
 from published import agreement, curve, estimate_window, published_experiment
 from report import write_report
-from results import (
-    ROUNDS,
-    Result,
-    dip_depth,
-    of_play,
-    of_training,
-    pooled,
-    read_result,
-    returns_by_chance,
-    study_of,
-)
+from results import dip_depth, pooled, read_result, returns_by_chance, study_of
 from tragedies import METRICS, combat
 from verdicts import CONTRADICTED, NOT_CONTRADICTED, curve_prediction, prediction, share
 
@@ -170,7 +152,7 @@ def test_a_pool_has_what_its_runs_have_replica_by_replica(run, other):
     assert both.of_agents("no such column") is None
     trained, random = both.measures.trained, both.measures.random
     assert {len(values) for values in (*trained.values(), *random.values())} == {5}
-    name = ROUNDS.format(agent=0)
+    name = results.ROUNDS.format(agent=0)
     np.testing.assert_array_equal(trained[name][:2], parts[0].measures.trained[name])
     assert not np.array_equal(random[name][:2], random[name][2:4]), "each run plays in worlds of its own"
 
@@ -275,8 +257,8 @@ def test_a_report_lists_a_run_by_the_command_or_the_recipe_that_made_it(stored, 
 
 def test_undefined_episodes_are_counted_and_a_dip_is_measured_from_the_peak_before_it():
     equality = np.array([[0.5, np.nan, 1.0], [np.nan, np.nan, 1.0]])
-    assert undefined_in(equality) == ", undefined in 3 of 6 episodes"
-    assert undefined_in(equality[:, 2:]) == ""
+    assert claims.undefined_in(equality) == ", undefined in 3 of 6 episodes"
+    assert claims.undefined_in(equality[:, 2:]) == ""
     assert dip_depth(np.array([[10.0, 20.0, 5.0, 30.0], [1.0, 2.0, 3.0, 4.0]])).tolist() == [0.75, 0.0]
     published = np.interp(np.arange(600), *curve("exp1/return"))[None]
     assert dip_depth(published)[0] == pytest.approx(1 - 104 / 146, abs=0.02)
@@ -285,13 +267,13 @@ def test_undefined_episodes_are_counted_and_a_dip_is_measured_from_the_peak_befo
 def test_measures_of_training_know_rich_and_poor():
     levels = {"collective_return": 4, "return_0": 3, "return_1": 1, "survival_steps": 900}
     curves = {name: level * np.ones((3, 700)) for name, level in levels.items()}
-    measures = of_training(curves)
+    measures = results.of_training(curves)
     share = measures["return of the poorest agent over that of the richest, last 500 episodes"]
     assert share.tolist() == [1 / 3] * 3
     assert measures["mean collective return over training"].tolist() == [4.0] * 3
     dip, peak = "depth of the deepest dip before episode 600", "episode of the highest collective return"
     assert all(any(name.startswith(start) for name in measures) for start in (dip, peak))
-    short = of_training({name: values[:, :20] for name, values in curves.items()})
+    short = results.of_training({name: values[:, :20] for name, values in curves.items()})
     assert list(short) == [
         "mean collective return over training",
         "return of the poorest agent over that of the richest, whole training",
@@ -311,7 +293,7 @@ def test_agents_at_play_are_measured_replica_by_replica():
         played=np.ones(shape[:2], bool),
         board=(3, 9),
     )
-    measures = of_play(played, replicas=2)
+    measures = results.of_play(played, replicas=2)
     assert measures["shots per 1000 steps, all agents"].tolist() == [250.0, 0.0]
     assert measures["overlap of the cells that two agents visit"].tolist() == [0.0, 1.0]
     nearness = measures["steps to the nearest other when firing, over that in all steps"]
@@ -402,7 +384,7 @@ def test_every_published_experiment_is_reproduced():
 
 def a_result(tmp_path, recipe, metrics, *, name="made_up", algorithm=None):
     agents = [] if algorithm is None else [Learning(algorithm)]
-    result = Result(
+    result = results.Result(
         path=tmp_path / name,
         recipe={},
         experiment=SimpleNamespace(agents=agents, game=None),
@@ -474,7 +456,7 @@ def test_a_longer_training_is_compared_over_as_many_episodes_as_the_study_had(tm
 
     def row(metrics):
         result = a_result(tmp_path, "single_basic", metrics)
-        return next(line for line in appendix([result]) if line.startswith("| made_up"))
+        return next(line for line in curves.appendix([result]) if line.startswith("| made_up"))
 
     assert row(longer) == row(whole)
     assert "too few" not in row(longer)
@@ -486,21 +468,21 @@ def test_claims_on_more_episodes_than_there_were_have_no_verdict(tmp_path):
 
     def said(claims_of, recipe, *others, curves=short):
         result = a_result(tmp_path, recipe, curves)
-        result.measures = SimpleNamespace(training=of_training(curves), trained={}, random={})
+        result.measures = SimpleNamespace(training=results.of_training(curves), trained={}, random={})
         result.of_agents = lambda column: curves["equality"][..., None].repeat(2, -1)
         return {one.claim: one.verdict for one in claims_of(result, *others)}
 
     few = "too few episodes"
-    assert set(said(of_experiment_1, "single_basic").values()) == {few}
-    assert said(of_experiment_2, "single_complex") == {"no dip": few}
-    two = said(of_experiment_3, "two_complex", [])
+    assert set(said(claims.of_experiment_1, "single_basic").values()) == {few}
+    assert said(claims.of_experiment_2, "single_complex") == {"no dip": few}
+    two = said(claims.of_experiment_3, "two_complex", [])
     assert two == {"both earn almost the same": few, "two manage the resource sustainably": few}
-    assert set(said(of_experiment_4, "two_against_random", []).values()) == {few}
-    four = said(of_experiment_5, "commons")
+    assert set(said(claims.of_experiment_4, "two_against_random", []).values()) == {few}
+    four = said(claims.of_experiment_5, "commons")
     assert four["survival falls to 612 steps"] == few
     longer = {name: curve[:, :2000] for name, curve in society(FELL).items()}
-    assert said(of_experiment_5, "commons", curves=longer)["survival falls to 612 steps"] != few
-    early = said(of_experiment_1, "single_basic", curves=longer)
+    assert said(claims.of_experiment_5, "commons", curves=longer)["survival falls to 612 steps"] != few
+    early = said(claims.of_experiment_1, "single_basic", curves=longer)
     assert early.pop("then it recovers") == few, "before 6,000 episodes"
     assert few not in early.values()
 
