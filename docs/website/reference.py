@@ -39,7 +39,7 @@ REFERENCE: Final = {
 """A page each, in reading order, and what it is about."""
 
 _MODULES: Final = {
-    "commons": ("maps", "observation", "rules", "game", "spaces", "state"),
+    "commons": ("maps", "published", "observation", "rules", "game", "spaces", "state"),
     "envs": ("make_env",),
     "experiment": ("presets",),
     "learners": ("settings", "preferences"),

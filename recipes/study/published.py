@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.experiment.presets import Board
+from cprl.commons.published import Board
 
 Values = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from cprl.experiment.presets import Variant, check_board
+from cprl.commons.published import Variant, check_board
 from cprl.system.defaults import EGTA_RESAMPLES, FILM_SEED, FILM_SUFFIXES, PLAY_SEED, SEED, Diagonal
 from cprl.system.output import OUT, console, printed, say
 from cprl.system.process import prepare_process

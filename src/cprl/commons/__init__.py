@@ -4,6 +4,7 @@ In reading order:
 
     rules        every number of the game, with unit, range and source
     maps         boards: drawn, named or generated
+    published    the published games by name: boards with their rules
     observation  what agents observe, and in which form
     reach        whether any agent can come to an apple site
     game         Game: a map, its rules and its observations; the memory that worlds of it take

@@ -16,12 +16,12 @@ from cprl import keys
 from cprl.commons.colours import APPLE, BEAM, PALETTE, WALL, Colour, agent_colour
 from cprl.commons.game import Game
 from cprl.commons.maps import SIGN_OF_HEADING
+from cprl.commons.published import Variant
 from cprl.commons.world import Shown, StepOutput
 from cprl.envs.make_env import make_env
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.lanes import Policy, Turns, board_now
 from cprl.evaluation.populations import agent_named, board_named
-from cprl.experiment.presets import Variant
 from cprl.measuring import social
 from cprl.measuring.metrics import title
 from cprl.policies.scripted import SCRIPTED_POLICIES

@@ -9,13 +9,13 @@ from torchrl.envs import EnvBase
 
 from cprl.commons import maps
 from cprl.commons.game import Game
+from cprl.commons.published import Variant, check_board
 from cprl.commons.rules import Rules
 from cprl.commons.spaces import Spaces
 from cprl.envs.make_env import is_playable, make_env, spaces_of
 from cprl.evaluation.evaluate import SEED, check
 from cprl.evaluation.lanes import Place, Played
 from cprl.experiment import presets
-from cprl.experiment.presets import Variant
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
@@ -99,7 +99,7 @@ def board_named(
             drawing, see `cprl.maps.parse`, played by the published rules.
     """
     checked("variant", variant, Variant)
-    presets.check_board(board)
+    check_board(board)
     if board in presets.BOARDS:
         return presets.game(board, variant=variant), None
     path = Path(board)

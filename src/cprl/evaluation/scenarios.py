@@ -106,7 +106,7 @@ _COMMITTED: Final[tuple[tuple[presets.Board, presets.Variant, bool, str], ...]] 
 def results_folder() -> Path:
     """The folder with the results that come with a checkout of cprl, which is `docs/results`; an installed
     wheel has none."""
-    return Path(presets.__file__).parents[2] / "docs" / "results"
+    return Path(presets.__file__).parents[3] / "docs" / "results"
 
 
 def stored_for(game: Game) -> Path | None:

@@ -10,7 +10,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from cprl.commons.game import Game
-from cprl.experiment import presets
+from cprl.commons.published import GAMES
+from cprl.commons.published import game as published_game
 from cprl.measuring import phases
 from cprl.measuring.episodes import Episode
 from cprl.measuring.now import BEGINS, EXPLORING, Now
@@ -280,9 +281,8 @@ class Story(View):
 
 def published_phases(game: Game | None) -> dict[int, str]:
     """The phases of the study's figures by the episode in which they begin; empty for another game."""
-    if all(
-        game != presets.game(board, variant=variant) for board, variant in presets.GAMES if board == "commons"
-    ):
+    variants = [variant for board, variant in GAMES if board == "commons"]
+    if all(game != published_game("commons", variant=variant) for variant in variants):
         return {}
     return dict(zip((0, *phases.PHASES_BEGIN), phases.PHASES, strict=True))
 

@@ -1,0 +1,79 @@
+"""The published boards with their rules, as in the text of the study and as in its program.
+
+Every number is from [W] M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement Learning" (2019),
+its appendix A, and the parameters and behaviour of the study's program. The game is imported when it is made,
+so that command lines are checked without it.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+
+from cprl.values import checked, refusal
+
+if TYPE_CHECKING:
+    from cprl.commons.game import Game
+
+Board = Literal["single_basic", "single_complex", "two_complex", "commons"]
+Variant = Literal["published", "as_run", "as_run_10_april"]
+
+BOARDS: Final[tuple[Board, ...]] = get_args(Board)
+VARIANTS: Final[tuple[Variant, ...]] = get_args(Variant)
+"""`published`: as in the study's text; `as_run`: as in its program; `as_run_10_april`: as in its program for
+two agents from 10 to 13 April 2019, with a discount of 0.999 and `agent_1_right_moves_agent_0`; `two_complex`
+alone has it."""
+
+TO_THE_EDGE_CELLS: Final = 7
+"""A beam of this length crosses all rows of `two_complex`."""
+
+_AS_RUN: Final[dict[str, Any]] = {
+    "hits_to_tag": 2,
+    "pairwise_clashes": True,
+    "regrow_before_bites": True,
+    "freeze_counts_tag_turn": True,
+    "ends_one_turn_late": True,
+    "picture_shows_old_stock": True,
+    "paint_over": True,
+    "mark_behind_if_vertical": True,
+    "self_paint_stays": True,
+}
+_TWO_AS_RUN: Final[dict[str, Any]] = {
+    "window_rows": 5,
+    "beam_length_cells": (TO_THE_EDGE_CELLS, 6, TO_THE_EDGE_CELLS, 7),
+}
+_BOARD_RULES: Final[dict[tuple[Board, Variant], dict[str, Any]]] = {
+    ("single_basic", "published"): {"may_fire": False},
+    ("single_complex", "published"): {"may_fire": False},
+    ("two_complex", "published"): {},
+    ("commons", "published"): {"window_rows": 7, "window_columns": 15, "beam_length_cells": 6},
+    ("single_basic", "as_run"): {"window_rows": 5, "may_fire": False},
+    ("single_complex", "as_run"): {"window_rows": 5, "may_fire": False},
+    ("two_complex", "as_run"): _TWO_AS_RUN,
+    ("two_complex", "as_run_10_april"): {**_TWO_AS_RUN, "agent_1_right_moves_agent_0": True},
+    ("commons", "as_run"): {"window_rows": 7, "window_columns": 15, "beam_length_cells": 6},
+}
+GAMES: Final[tuple[tuple[Board, Variant], ...]] = tuple(_BOARD_RULES)
+"""Every board with each of its variants."""
+
+
+def check_board(board: str) -> None:
+    """Refuse a word that names neither a published board nor a run's directory nor a file."""
+    if board not in BOARDS and not Path(board).exists():
+        raise refusal("board", board, f"{', '.join(BOARDS)}, a run's directory, or a file with a drawing")
+
+
+def game(board: Board, *, variant: Variant = "published") -> "Game":
+    from cprl.commons import maps
+    from cprl.commons.game import Game
+    from cprl.commons.rules import Rules
+
+    check_variant(board, variant)
+    quirks = {} if variant == "published" else _AS_RUN
+    return Game(map=maps.named(board), rules=Rules(**quirks, **_BOARD_RULES[board, variant]))
+
+
+def check_variant(board: str, variant: str) -> None:
+    checked("board", board, Board)
+    checked("variant", variant, Variant)
+    if (board, variant) not in GAMES:
+        allowed = ", ".join(repr(known) for of, known in GAMES if of == board)
+        raise refusal(f"variant of {board}", variant, allowed)
