@@ -10,7 +10,8 @@ from stored_runs import MEADOW, SEED, command, ran
 import cprl
 from cprl import Game, Rules, maps
 from cprl.evaluation import analyse, draw_egta, pairwise_game, play_empirical_game
-from cprl.evaluation.empirical_game import _choices, egta_tables
+from cprl.evaluation.empirical_game import egta_tables
+from cprl.evaluation.lanes import shifted
 from cprl.population import Scripted
 from cprl.theory import PayoffTable, compositions
 
@@ -64,7 +65,7 @@ def test_payoffs_are_means_over_who_plays_where(made):
 
 def test_each_run_has_each_index_as_often_as_every_other():
     for counts in compositions(4, 3).tolist():
-        choices = _choices(counts)
+        choices = shifted(counts)
         assert len(choices) == (4 if max(counts) < 4 else 1)
         for run, count in enumerate(counts):
             at = [sum(who[index] == run for who in choices) for index in range(4)]
@@ -125,24 +126,6 @@ def test_analyses_are_drawn_for_any_number_of_runs(runs, made, tmp_path):
 
 
 @pytest.mark.integration
-def test_the_command_tells_and_draws_which_run_lasts(corridors, tmp_path, monkeypatch, capsys):
-    pytest.importorskip("open_spiel")
-    pytest.importorskip("nashpy")
-    figure, out = tmp_path / "game.png", tmp_path / "game.parquet"
-    words = [f"bites={corridors['greedy']}", corridors["sustainable"], "--episodes", 1, "--resamples", 5]
-    printed = command(monkeypatch, capsys, "egta", *words, "--figure", figure, "--out", out)
-    assert "Empirical game: 2 replicas, 1 episode each for each choice of who plays where" in printed
-    assert "1.00 [1.00, 1.00]" in printed
-    assert "2 bites" in printed
-    assert "in 100% of the resamples" in printed
-    assert "from 100% of the starts" in printed
-    assert figure.exists()
-    assert out.exists()
-    with pytest.raises(SystemExit, match=r"game\.parquet exists and is not overwritten"):
-        command(monkeypatch, capsys, "egta", *words, "--out", out)
-
-
-@pytest.mark.integration
 def test_the_command_tells_all_compositions_of_more_agents(three, tmp_path, monkeypatch, capsys):
     pytest.importorskip("open_spiel")
     pytest.importorskip("nashpy")
@@ -151,13 +134,6 @@ def test_the_command_tells_all_compositions_of_more_agents(three, tmp_path, monk
     assert "2 greedy, 1 random" in printed
     assert "Nash equilibrium of pairs (nashpy)" in printed
     assert "Pairwise reduction" in command(monkeypatch, capsys, *words, "--pairwise")
-
-
-def test_what_makes_no_game_is_refused(corridors, three):
-    with pytest.raises(ValueError, match="the number of runs is 1"):
-        play_empirical_game([corridors["greedy"]])
-    with pytest.raises(ValueError, match="have different games"):
-        play_empirical_game([corridors["greedy"], three["greedy"]])
 
 
 def test_more_profiles_than_alpha_rank_takes_are_refused_before_play(three, monkeypatch):

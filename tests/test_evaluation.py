@@ -13,13 +13,37 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from PIL import Image
-from stored_runs import C51, CORRIDORS, MEADOW, PPO, SAC, SEED, an_experiment, command, ran, told, values
+from stored_runs import (
+    C51,
+    CORRIDORS,
+    DQN,
+    MEADOW,
+    PPO,
+    SAC,
+    SEED,
+    an_experiment,
+    command,
+    ran,
+    stored,
+    told,
+    values,
+)
 
 import cprl
 from cprl import CommonsEnv, Game, Observation, maps, presets
 from cprl.envs.make_env import spaces_of
-from cprl.evaluation import draw_gains, gains
-from cprl.evaluation.evaluate import differences
+from cprl.envs.matrix import prisoners_dilemma
+from cprl.evaluation import (
+    Scenario,
+    draw_gains,
+    gains,
+    play_empirical_game,
+    play_population,
+    run_scenarios,
+    scenarios_of,
+    schelling,
+    territory_of,
+)
 from cprl.evaluation.lanes import Fresh, Part, Turns, agents_of
 from cprl.learners.base import EVALUATION, lane_seeds
 from cprl.measuring.evaluate import evaluate
@@ -179,22 +203,6 @@ def test_the_random_policy_draws_by_the_seeds_of_agents_in_evaluation(learned):
     assert told(evaluate(env, AgentPolicies({(0, 1): actor}), explore=True)) == told(found.random[1])
 
 
-@pytest.mark.parametrize("name", ["alike", "mixed"])
-def test_the_same_call_plays_the_same_whoever_drew_before_and_a_replica_the_same_alone(name, learned):
-    first = cprl.evaluate_run(learned[name], episodes=2)
-    torch.manual_seed(len(name))
-    state = torch.get_rng_state()
-    again = cprl.evaluate_run(learned[name], episodes=2, replicas=[2, 0])
-    assert torch.equal(torch.get_rng_state(), state), "nothing of ours draws from torch's generator"
-    assert list(again.trained) == [0, 2]
-    for replica in (0, 2):
-        assert told(again.trained[replica]) == told(first.trained[replica])
-        assert told(again.random[replica]) == told(first.random[replica])
-    other = cprl.evaluate_run(learned[name], episodes=2, seed=SEED)
-    assert told(other.trained[0]) != told(first.trained[0])
-    assert told(first.trained[0]) != told(first.trained[1]), "replicas play different worlds"
-
-
 def test_an_evaluation_computes_in_one_thread_and_leaves_their_number_as_it_was():
     env, threads = CommonsEnv(presets.game("two_complex"), 1, seed=0), []
     random = AgentPolicies(random_agents(spaces_of(env), (0, 1), replicas=1, seed=0))
@@ -306,7 +314,6 @@ def test_each_cell_is_what_the_loaded_runs_agents_play_with_one_focal_agent(lear
         assert {cell.measures()[name].estimate.replicas for name in names} == {3}
     diagonal = found.cell("mixed", "mixed")
     at_home = cprl.evaluate_run(learned["mixed"], episodes=3, seed=SEED, greedy=True)
-    assert diagonal.is_self_play
     assert told(diagonal.by_agent[1][2]) == told(at_home.trained[2])
 
 
@@ -321,49 +328,9 @@ def test_on_the_diagonal_a_cross_seed_agent_is_of_the_next_replica(learned):
         fresh = Fresh(replicas=(background,), episodes=2, seed=SEED, greedy=True)
         alone = fresh.play(loaded, mixed)[background]
         assert told(alone) == told(cell.by_agent[1][background])
-    assert not cell.is_self_play
     usual = cprl.crossplay(runs, replicas=[0, 2], **how)
     for at in (("alike", "mixed"), ("mixed", "alike")):
         assert values(usual.cell(*at).measures()) == values(found.cell(*at).measures())
-    with pytest.raises(ValueError, match=r"the replicas are \[1\]"):
-        cprl.crossplay(runs, diagonal="cross_seed", replicas=[1])
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize(
-    ("function", "runs", "given", "answer"),
-    [
-        ("evaluate_run", "alike", {"episodes": 0}, "episodes is 0"),
-        ("evaluate_run", "alike", {"seed": 3}, r"seed is 3, the training seed of .*alike"),
-        ("evaluate_run", "alike", {"replicas": [1, 9, 3]}, r"alike has no replicas \[3, 9\]"),
-        ("crossplay", ["alike"], {}, "the number of runs is 1"),
-        ("crossplay", ["alike", "mixed", "alike"], {}, "alike is given twice"),
-        ("crossplay", ["alike", "mixed", "greedy"], {}, r"alike and greedy .* different games: Game\.map\."),
-        ("crossplay", ["lonely", "alone"], {}, r"the game has 1 agent; .* use `cprl evaluate`"),
-    ],
-)
-def test_what_does_not_fit_is_refused(function, runs, given, answer, learned, corridors, tmp_path):
-    there = {**learned, **corridors}
-    if "lonely" in runs:
-        lonely = Game(map=maps.parse(">A"), rules=CORRIDORS.rules)
-        there = {name: ran(tmp_path / name, lonely, [Scripted("greedy")], replicas=1) for name in runs}
-    chosen = [there[name] for name in runs] if isinstance(runs, list) else there[runs]
-    with pytest.raises(ValueError, match=answer):
-        getattr(cprl, function)(chosen, **given)
-
-
-def test_games_differ_in_what_a_message_tells():
-    assert differences(MEADOW, MEADOW) == []
-    other = Game(
-        map=MEADOW.map,
-        rules=replace(MEADOW.rules, freeze_steps=7),
-        observation=Observation(agents_apart=True),
-    )
-    assert differences(MEADOW, other) == [
-        "Game.rules.freeze_steps 2 and 7",
-        "Game.observation.agents_apart False and True",
-    ]
-    assert "Game.map.sites differ" in differences(MEADOW, CORRIDORS), "forty cells would help nobody"
 
 
 def test_runs_have_given_names_those_of_their_directories_or_their_paths(corridors, tmp_path):
@@ -441,70 +408,6 @@ def shade(at):
     return np.round(255 * np.array(matplotlib.colormaps["RdBu"](at)[:3]))
 
 
-def test_the_command_evaluate_tells_every_metric_and_writes_the_episodes(
-    learned, tmp_path, monkeypatch, capsys
-):
-    out = tmp_path / "new" / "episodes.parquet"
-    text = command(monkeypatch, capsys, "evaluate", learned["alike"], "--episodes", 2, "--out", out)
-    found = cprl.evaluate_run(learned["alike"], episodes=2)
-    rows = rows_of(text)
-    for name, random in found.measures("random").items():
-        cells = [with_unit(name, rewards="apples"), str(found.measures()[name]), str(random)]
-        assert cells in rows
-    assert "run's agents, epsilon 0.05" in text
-    table = pq.read_table(out)
-    assert table.num_rows == 2 * 3 * 2 * 2, "policies, replicas, episodes, agents"
-    assert table.equals(found.table())
-    with pytest.raises(SystemExit, match=r"cprl: .*episodes\.parquet exists and is not"):
-        command(monkeypatch, capsys, "evaluate", learned["alike"], "--out", out)
-    assert pq.read_table(out).equals(table)
-
-
-def rows_of(text):
-    """The cells of the rows of all tables."""
-    return [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines() if "│" in line]
-
-
-@pytest.mark.integration
-def test_the_command_crossplay_tells_a_matrix_for_each_number_and_draws_the_gains(
-    corridors, tmp_path, monkeypatch, capsys
-):
-    out, figure = tmp_path / "cross.parquet", tmp_path / "gains.png"
-    greedy, sustainable = corridors.values()
-    words = ["crossplay", f"bites={greedy}", sustainable, "--episodes", 1, "--out", out, "--figure", figure]
-    text = command(monkeypatch, capsys, *words)
-    assert "2 replicas, 1 episode each with focal agent at each index, seed 30011, diagonal: self" in text
-    for name in ("focal/return (apples)", "group/return (apples)", "sustainability (steps)"):
-        assert name in (line.strip() for line in text.splitlines())
-    for row in (
-        ["bites", "2.5 [2.5, 2.5]", "2.5 [2.5, 2.5]"],
-        ["sustainable", "0 [0, 0]", "0 [0, 0]"],
-        ["bites", "sustainable", "1", "3 [3, 3]", "0 [0, 0]", "3 [3, 3]"],
-        ["sustainable", "0.5 [0.5, 0.5]", "undefined in all 2"],  # equality
-        # In place of a sustainable agent, which gets nothing, a greedy one gets 2.5; the other as before. All
-        # replicas are alike, so that of four differences those have a star that are not 0.
-        ["bites", "", "2.5 [2.5, 2.5] *"],
-        ["sustainable", "-2.5 [-2.5, -2.5] *", ""],
-        ["bites", "", "0 [0, 0]"],
-    ):
-        assert row in rows_of(text)
-    assert text.count("* not 0 by Holm's method for all 4 differences") == 2
-    agents = pq.read_table(out, columns=["focal", "background", "focal_agent"]).to_pylist()
-    assert len(agents) == (1 + 2 + 2 + 1) * 2 * 2, "visits, replicas, agents"
-    assert {row["focal_agent"] for row in agents if row["focal"] == row["background"]} == {-1}
-    assert text.splitlines()[-1] == f"Figure: {figure}"
-    assert figure.exists()
-    for wrong, said in (
-        (words, r"cross\.parquet exists and is not"),
-        (["crossplay", greedy, sustainable, "--figure", figure], r"gains\.png exists and is not overwritten"),
-        (["crossplay", greedy, sustainable, "--figure", tmp_path / "a.jpg"], r"--figure is '.*a\.jpg'"),
-        (["crossplay", f"bites={greedy}", f"bites={sustainable}"], "bites names 2 runs"),
-        (["crossplay", greedy], "the number of runs is 1"),
-    ):
-        with pytest.raises(SystemExit, match=f"cprl: .*{said}"):
-            command(monkeypatch, capsys, *wrong)
-
-
 def test_social_measures_are_those_of_the_docs(corridors):
     found = cprl.evaluate_run(corridors["greedy"], episodes=1)
     text = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
@@ -513,3 +416,256 @@ def test_social_measures_are_those_of_the_docs(corridors):
     (single,) = [one for name, one in social_measures({0: found.trained[0]}).items() if name == "peace"]
     assert str(single) == "2", "one replica alone has no interval"
     assert isnan(single.estimate.low)
+
+
+def rows_of(text):
+    """The cells of the rows of all tables."""
+    return [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines() if "│" in line]
+
+
+WRITTEN = [
+    (["evaluate", "{alike}", "--episodes", 2], ["run's agents, epsilon 0.05"], [], 2 * 3 * 2 * 2, False),
+    (
+        ["evaluate", "{greedy}", "--episodes", 1],
+        ["greedy: 2 replicas, 1 episode each, seed 30011", "Weights: "],
+        [["collective_return (apples)", "5 [5, 5]"], ["equality", "0.9 [0.9, 0.9]"]],
+        2 * 2 * 2,
+        False,
+    ),
+    (
+        ["visits", "{greedy}", "--episodes", 1, "--random"],
+        ["Weights: "],
+        [["exclusion (0 to 1)", "1 [1, 1]"], ["tags in one's own territory (0 to 1)", "-", "-"]],
+        None,
+        True,
+    ),
+    (
+        ["crossplay", "bites={greedy}", "{sustainable}", "--episodes", 1],
+        [
+            "2 replicas, 1 episode each with focal agent at each index, seed 30011, diagonal: self",
+            "focal/return (apples)",
+            "group/return (apples)",
+            "sustainability (steps)",
+            "* not 0 by Holm's method for all 4 differences",
+        ],
+        [
+            ["bites", "2.5 [2.5, 2.5]", "2.5 [2.5, 2.5]"],
+            ["sustainable", "0 [0, 0]", "0 [0, 0]"],
+            ["bites", "sustainable", "1", "3 [3, 3]", "0 [0, 0]", "3 [3, 3]"],
+            ["sustainable", "0.5 [0.5, 0.5]", "undefined in all 2"],  # equality
+            # In place of a sustainable agent, which gets nothing, a greedy one gets 2.5; the other as before.
+            # Replicas are alike, so that of four differences those have a star that are not 0.
+            ["bites", "", "2.5 [2.5, 2.5] *"],
+            ["sustainable", "-2.5 [-2.5, -2.5] *", ""],
+            ["bites", "", "0 [0, 0]"],
+        ],
+        (1 + 2 + 2 + 1) * 2 * 2,  # visits, replicas, agents
+        True,
+    ),
+    (
+        ["schelling", "{drawing}", "--episodes", 1, "--replicas", 2],
+        ["fear, G(0) - R(0)", "2 replicas, 1 episode each for each choice of restrained agents"],
+        [],
+        (1 + 2 + 1) * 2 * 2,
+        True,
+    ),
+    (
+        ["egta", "bites={greedy}", "{sustainable}", "--episodes", 1, "--resamples", 5],
+        [
+            "Empirical game: 2 replicas, 1 episode each for each choice of who plays where",
+            "in 100% of the resamples",
+            "from 100% of the starts",
+        ],
+        [["bites", "1.00 [1.00, 1.00]"], ["no agent gains by another run", "2 bites"]],
+        (1 + 2 + 1) * 2 * 2,
+        True,
+    ),
+    (
+        ["scenarios", "{sustainable}", "--episodes", 1, "--scenarios", "minority_among_greedy"],
+        [
+            "Scenarios of sustainable: 2 replicas, 1 episode each in each placement, seed 30011",
+            "* not 0 by Holm's method for all 2 differences",
+        ],
+        # What is not 0 differs for certain; all together get 3 or 2, as one of them plays greedy.
+        [
+            ["minority_among_greedy", "0 [0, 0]"],
+            ["minority_among_greedy", "2.5 [2.5, 2.5]", "0.5 [0.5, 0.5]"],
+        ],
+        3 * 2 * 2 * 2,  # who is focal, placements, replicas, agents
+        True,
+    ),
+]
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    ("words", "said", "rows", "episodes", "is_drawn"),
+    WRITTEN,
+    ids=[f"{words[0]} {words[1]}" for words, *_ in WRITTEN],
+)
+def test_a_command_prints_its_numbers_and_writes_its_files_once(
+    words, said, rows, episodes, is_drawn, alike, corridors, tmp_path, monkeypatch, capsys
+):
+    if words[0] == "egta":
+        pytest.importorskip("open_spiel")
+        pytest.importorskip("nashpy")
+    (tmp_path / "patch.txt").write_text(">.AA.<\n..AA..\n")
+    places = {"alike": alike, "drawing": tmp_path / "patch.txt", **corridors}
+    words = [str(word).format(**places) for word in words]
+    files = {"--out": tmp_path / "new" / "episodes.parquet"} if episodes else {}
+    files |= {"--figure": tmp_path / "new" / "figure.png"} if is_drawn else {}
+    text = command(monkeypatch, capsys, *words, *(word for pair in files.items() for word in pair))
+    assert [fragment for fragment in said if fragment not in text] == []
+    printed = rows_of(text)
+    assert [row for row in rows if row not in [cells[: len(row)] for cells in printed]] == []
+    if episodes:
+        assert pq.read_table(files["--out"]).num_rows == episodes
+    if is_drawn:
+        with Image.open(files["--figure"]) as picture:
+            assert picture.width > 700
+    for option, path in files.items():
+        with pytest.raises(SystemExit, match=rf"cprl: .*{path.name} exists and is not overwritten"):
+            command(monkeypatch, capsys, *words, option, path)
+    if is_drawn:
+        with pytest.raises(SystemExit, match=r"--figure is '.*a\.jpg'"):
+            command(monkeypatch, capsys, *words, "--figure", tmp_path / "a.jpg")
+
+
+def test_the_table_of_an_evaluation_has_every_metric(alike, monkeypatch, capsys):
+    found = cprl.evaluate_run(alike, episodes=1)
+    rows = rows_of(command(monkeypatch, capsys, "evaluate", alike, "--episodes", 1))
+    for name, random in found.measures("random").items():
+        assert [with_unit(name, rewards="apples"), str(found.measures()[name]), str(random)] in rows
+
+
+@pytest.mark.parametrize(
+    ("words", "answer"),
+    [
+        (["crossplay", "bites={greedy}", "bites={sustainable}"], "bites names 2 runs"),
+        (["crossplay", "{greedy}"], "the number of runs is 1"),
+        (["visits", "{greedy}", "--random"], "allowed: with --figure"),
+    ],
+)
+def test_words_that_do_not_fit_are_refused(words, answer, corridors, monkeypatch, capsys):
+    with pytest.raises(SystemExit, match=f"cprl: .*{answer}"):
+        command(monkeypatch, capsys, *(word.format(**corridors) for word in words))
+
+
+PLAYS = {
+    "evaluate_run": lambda runs, **fresh: cprl.evaluate_run(runs["mixed"], **fresh),
+    "run_scenarios": lambda runs, **fresh: run_scenarios(
+        runs["alike"], scenarios=["minority_among_greedy"], **fresh
+    ),
+    "crossplay": cprl.crossplay,
+    "play_empirical_game": play_empirical_game,
+}
+
+
+@pytest.mark.parametrize("play", PLAYS.values(), ids=PLAYS)
+def test_replicas_play_the_same_alone_and_whoever_drew_before(play, learned):
+    everything = play(learned, episodes=2).table()
+    torch.manual_seed(7)
+    state = torch.get_rng_state()
+    alone = play(learned, episodes=2, replicas=[2, 0])
+    assert torch.equal(torch.get_rng_state(), state), "nothing of ours draws from torch's generator"
+    assert list(alone.played) == [0, 2]
+    replica = np.array(everything["replica"])
+    assert repr(alone.table().to_pydict()) == repr(everything.filter(replica != 1).to_pydict())
+    returns = [everything.filter(replica == number)["return"].to_pylist() for number in (0, 1)]
+    assert returns[0] != returns[1], "replicas play different worlds"
+    assert (
+        play(learned, episodes=2, seed=SEED).table()["return"].to_pylist() != everything["return"].to_pylist()
+    )
+
+
+FULL = replace(MEADOW, observation=Observation(area="full"))
+ALONE = presets.game("single_basic")
+RANDOM = [Scripted("random")] * 2
+
+
+@pytest.mark.parametrize(
+    ("play", "answer"),
+    [
+        (lambda runs: cprl.evaluate_run(runs["alike"], episodes=0), "episodes is 0"),
+        (lambda runs: cprl.evaluate_run(runs["alike"], seed=3), r"seed is 3, the training seed of .*alike"),
+        (lambda runs: cprl.evaluate_run(runs["alike"], replicas=[1, 9, 3]), r"no replicas \[3, 9\]"),
+        (lambda runs: cprl.crossplay([runs["alike"]]), "the number of runs is 1"),
+        (lambda runs: cprl.crossplay([runs["alike"], runs["mixed"], runs["alike"]]), "alike is given twice"),
+        (
+            lambda runs: cprl.crossplay([runs["alike"], runs["mixed"], runs["greedy"]]),
+            r"alike and greedy .* different games: Game\.map\.",
+        ),
+        (lambda runs: cprl.crossplay([runs["lonely"], runs["alone"]]), "the game has 1 agent"),
+        (
+            lambda runs: cprl.crossplay([runs["alike"], runs["mixed"]], diagonal="cross_seed", replicas=[1]),
+            r"the replicas are \[1\]",
+        ),
+        (lambda runs: play_empirical_game([runs["greedy"]]), "the number of runs is 1"),
+        (lambda runs: play_empirical_game([runs["greedy"], runs["alike"]]), "have different games"),
+        (lambda _: play_population("meadow", RANDOM), "where is 'meadow'"),
+        (lambda _: play_population(MEADOW, [DQN, *RANDOM[1:]]), r"agents\[0\] is a Learning"),
+        (lambda _: play_population(MEADOW, RANDOM[1:]), "1 agents are specified for a game of 2"),
+        (lambda _: play_population(MEADOW, RANDOM, replicas=0), "replicas is"),
+        (lambda _: play_population(MEADOW, RANDOM, episodes=0), "episodes is 0"),
+        (lambda runs: play_population(MEADOW, among(runs["alike"]), seed=3), "seed is 3, the training seed"),
+        (
+            lambda runs: play_population(MEADOW, among(runs["alike"]), replicas=4),
+            "keeps no network of replica_3/agent_0",
+        ),
+        (lambda _: schelling(None), "where is None"),
+        (lambda _: schelling(ALONE), "the game has 1 agent"),
+        (lambda _: schelling(CORRIDORS, replicas=0), "replicas is"),
+        (lambda _: schelling(CORRIDORS, restrained="kind"), "restrained is 'kind'"),
+        (lambda _: schelling(CORRIDORS, greedy="sustainable"), "greedy is 'sustainable'"),
+        (lambda _: schelling(CORRIDORS, restrained="territorial"), "greedy is 'greedy'"),
+        (
+            lambda runs: schelling(MEADOW, restrained=str(runs["alike"]), greedy=f"{runs['alike']}/"),
+            "greedy is '.*alike/'",
+        ),
+        (
+            lambda runs: run_scenarios(runs["greedy"], scenarios=["among_wolves"]),
+            "a scenario is 'among_wolves'",
+        ),
+        (
+            lambda runs: run_scenarios(runs["greedy"], scenarios=["minority_among_greedy"] * 2),
+            "minority_among_greedy is given twice",
+        ),
+        (
+            lambda runs: run_scenarios(runs["alike"], scenarios=scenarios_of(CORRIDORS)[:1]),
+            "have different games: Game.map",
+        ),
+        (
+            lambda runs: run_scenarios(runs["greedy"], scenarios=[its_like(CORRIDORS, runs["alike"])]),
+            "greedy and the background .*alike have",
+        ),
+        (lambda runs: run_scenarios(runs["greedy"], replicas=[2]), r"has no replicas \[2\]"),
+        (lambda _: scenarios_of(prisoners_dilemma(turns=2)), "the game is a MatrixGame"),
+        (lambda _: scenarios_of(ALONE), "the game has 1 agent"),
+        (lambda _: scenarios_of(FULL), "Observation.area is 'full'"),
+        (lambda runs: territory_of(runs["matrix"]), "plays a game without a board of cprl"),
+    ],
+)
+def test_what_cannot_be_played_is_refused_by_name(play, answer, learned, corridors, odd):
+    with pytest.raises(ValueError, match=answer):
+        play({**learned, **corridors, **odd})
+
+
+@pytest.fixture(scope="module")
+def odd(tmp_path_factory):
+    """Two runs of one agent, and one of a game without a board."""
+    folder, lonely = tmp_path_factory.mktemp("odd"), Game(map=maps.parse(">A"), rules=CORRIDORS.rules)
+    return {
+        "lonely": stored(folder / "lonely", lonely),
+        "alone": stored(folder / "alone", lonely),
+        "matrix": stored(folder / "matrix", prisoners_dilemma(turns=2), "random"),
+    }
+
+
+def among(run):
+    return [Frozen(str(run), 0, replica=None), Scripted("random")]
+
+
+def its_like(game, run):
+    """A scenario whose background is of a run."""
+    background = tuple(Frozen(str(run), agent, replica=None) for agent in range(2))
+    return Scenario(name="its_like", game=game, focal="minority", background=background)

@@ -155,7 +155,7 @@ def test_a_game_without_a_beam_has_no_key_for_it():
         (["commons", "--replica", "3"], 'replica is 3, and others is "greedy"'),
         (["commons", "--steps", "0"], "steps is 0"),
         (["odd.txt"], r"odd\.txt: unknown sign 'x' at row 0, column 1"),
-        (["odd.txt", "--variant", "as_run"], 'variant is "as_run"'),
+        (["odd.txt", "--variant", "as_run"], "variant is 'as_run'"),
     ],
 )
 def test_what_cannot_be_played_is_refused(tmp_path, monkeypatch, words, said):

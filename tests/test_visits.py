@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from stored_runs import SEED, command, ran
+from stored_runs import SEED
 
 import cprl
-from cprl.envs.matrix import stag_hunt
 from cprl.evaluation import territory_of
 from cprl.evaluation.territory import DEFENCE, EXCLUSION, OVERLAP, TAGS, VISITORS, draw_visits
-from cprl.population import Scripted
 
 
 def test_agents_in_corridors_of_their_own_exclude_each_other(corridors):
@@ -40,15 +38,6 @@ def test_the_episodes_are_those_of_an_evaluation(alike):
     assert found.random.taggings.sum() > 0
 
 
-def test_a_replica_alone_stays_where_it_stays_among_all(alike):
-    both = territory_of(alike, episodes=3)
-    alone = territory_of(alike, episodes=3, replicas=[2])
-    np.testing.assert_array_equal(alone.trained.visits[0], both.trained.visits[2])
-    np.testing.assert_array_equal(alone.random.tagged_where[0], both.random.tagged_where[2])
-    for name, values in both.random.by_replica.items():
-        np.testing.assert_array_equal(alone.random.by_replica[name], values[2:])
-
-
 def test_the_maps_show_where_each_agent_was_and_are_not_written_over(corridors, tmp_path):
     found = territory_of(corridors["greedy"], episodes=2)
     path = draw_visits(found, tmp_path / "new" / "visits.png", replica=1)
@@ -72,23 +61,3 @@ def test_what_cannot_be_drawn_is_refused(more, message, corridors, tmp_path):
     with pytest.raises(ValueError, match=message):
         draw_visits(found, **{"path": tmp_path / "visits.png", **more})
     assert not list(tmp_path.iterdir())
-
-
-def test_a_game_without_a_board_is_refused(tmp_path):
-    run = ran(tmp_path / "matrix", stag_hunt(), [Scripted("random")] * 2, replicas=1)
-    with pytest.raises(ValueError, match="plays a game without a board of cprl"):
-        territory_of(run)
-
-
-def test_the_command_visits_tells_and_draws(alike, tmp_path, monkeypatch, capsys):
-    out = tmp_path / "visits.png"
-    text = command(monkeypatch, capsys, "visits", alike, "--episodes", 2, "--figure", out, "--random")
-    found = territory_of(alike, episodes=2)
-    for name, own in found.random.measures().items():
-        (row,) = [row for row in text.splitlines() if row.startswith(f"│ {name} ")]
-        assert row.split("│")[3].strip() == str(own)
-    assert f"Figure: {out}" in text
-    assert imread(out).shape[1] == 1500
-    for words in (("--figure", out), ("--random",), ("--figure", tmp_path / "visits.gif")):
-        with pytest.raises(SystemExit, match=r"cprl: .*(exists|allowed: with --figure|ends in \.png)"):
-            command(monkeypatch, capsys, "visits", alike, *words)

@@ -266,7 +266,7 @@ def schelling(
     check_board(board)
     _begin(mixes.seed, files=files)
 
-    from cprl.evaluation.populations import board_named
+    from cprl.evaluation.play import board_named
     from cprl.evaluation.schelling import draw_schelling, schelling_tables
     from cprl.evaluation.schelling import schelling as play_all_mixes
 

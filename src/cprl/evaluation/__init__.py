@@ -1,11 +1,10 @@
 """Evaluation: the agents of stored runs in fresh worlds, with their own run or among others.
 
 Modules, in the order in which one reads them:
-    lanes           stored agents of all replicas side by side, or one world turn by turn; Results, what
-                    labelled populations did in the same worlds
+    lanes           stored and scripted agents of all replicas side by side, in fresh worlds; Results, what
+                    labelled populations did in the same worlds; play_population
     evaluate        evaluate_run: all replicas of a run, beside the random policy
     cross_play      crossplay: a focal agent of one run among background agents of another, and what it gains
-    populations     play_population: scripted and stored agents in any mix
     schelling       what restrained and greedy agents get, by how many of the others are restrained
     empirical_game  play_empirical_game: the game whose strategies are runs; pairwise_game: of a cross-play;
                     analyse: which runs last in it, by alpha-rank, equilibria and replicator dynamics
@@ -35,7 +34,7 @@ from cprl.evaluation.exploit import (
     plan_responses,
     play_responses,
 )
-from cprl.evaluation.populations import play_population
+from cprl.evaluation.lanes import play_population
 from cprl.evaluation.scenarios import Scenario, Score, Scores, draw_scenarios, run_scenarios, scenarios_of
 from cprl.evaluation.schelling import SchellingDiagram, draw_schelling, schelling
 from cprl.evaluation.territory import Territory, draw_visits, territory_of

@@ -1,9 +1,8 @@
 """crossplay: a focal agent of one stored run plays with background agents of another.
 
 In cell (i, j) of the matrix the focal agent, with index s, is from run i, and all others, the background
-agents, are from run j. Each cell is played for every index s and every replica r, with replica r of both
-runs, in the same worlds for all cells and indices. A number of a cell is the mean over focal agents,
-estimated over replicas, because only replicas are independent.
+agents, are from run j. Each cell is played for every index s and every replica r of both runs, in the same
+worlds. A number of a cell is the mean over focal agents, estimated over replicas.
 
 The diagonal is self-play: the focal agent was trained with the background agents, in the same replica. In all
 other cells it is from another run and was not trained with them. diagonal="cross_seed" separates the two
@@ -15,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -26,21 +25,20 @@ from rich.table import Table
 from cprl.evaluation.evaluate import (
     INTERVALS,
     SEED,
-    check_same_game,
-    fresh_episodes,
     how_they_play,
     opened,
+    refuse_other_games,
     says_nothing,
     table_of,
     unit_of_rewards,
 )
-from cprl.evaluation.lanes import Part, Played, Results, Whose, agents_of, more
+from cprl.evaluation.lanes import Part, Played, Results, Whose, agents_of, fresh_of, more
 from cprl.measuring.metrics import with_unit
 from cprl.measuring.statistics import HOLM, Estimate, Measured, starred
 from cprl.system.defaults import Diagonal
 from cprl.terminal import style
 from cprl.training.agents import LoadedRun
-from cprl.values import Range, checked
+from cprl.values import checked, refusal
 
 SELF_PLAY: Final = -1
 """The focal agent of self-play in tables: every agent is focal and background."""
@@ -54,10 +52,6 @@ class Cell(Results):
     """The episodes of focal agents of one run with background agents of another."""
 
     @property
-    def is_self_play(self) -> bool:
-        return len(self.parts) == 1
-
-    @property
     def by_agent(self) -> dict[int, Played]:
         """The episodes by the index of the focal agent; in self-play the same episodes for each."""
         return {agent: part.played for part in self.parts for (agent,) in part.focal}
@@ -69,12 +63,10 @@ class Cell(Results):
         Args:
             agent: the index of the focal agent; None for all of them.
         """
-        cell = self
+        parts = self.parts
         if agent is not None:
-            agent = checked("agent", agent, Annotated[int, Range(0, len(self.by_agent) - 1)])
-            part = self.parts[0 if self.is_self_play else agent]
-            cell = replace(self, parts=[part._replace(focal=((agent,),))])
-        return cell.estimates("focal", "background", "group")
+            parts = [part._replace(focal=((agent,),)) for part in parts if (agent,) in part.focal]
+        return replace(self, parts=parts).estimates("focal", "background", "group")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,9 +86,10 @@ class CrossPlay(Results):
         return {(focal, other): self.cell(focal, other) for focal in self.runs for other in self.runs}
 
     def cell(self, focal: str, background: str) -> Cell:
-        if not {focal, background} <= set(self.runs):
-            raise ValueError(f"the cell is {(focal, background)}; allowed: two of the runs {list(self.runs)}")
-        return Cell(parts=self.where(focal=focal, background=background).parts, fresh=self.fresh)
+        parts = self.where(focal=focal, background=background).parts
+        if not parts:
+            raise refusal("the cell", (focal, background), f"two of the runs {list(self.runs)}")
+        return Cell(parts=parts, fresh=self.fresh)
 
 
 def crossplay(
@@ -120,10 +113,7 @@ def crossplay(
     """
     checked("diagonal", diagonal, Diagonal)
     named = named_runs(runs, allow)
-    agents = range(next(iter(named.values())).game.agents)
-    if len(agents) == 1:
-        raise ValueError("the game has 1 agent; allowed for cross-play: at least 2; use `cprl evaluate`")
-    fresh = fresh_episodes(named.values(), episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
+    fresh = fresh_of(named.values(), episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
     numbers = fresh.replicas
     if diagonal == "cross_seed" and len(numbers) < 2:
         raise ValueError(f"the replicas are {list(numbers)}; allowed for cross_seed: at least 2")
@@ -133,36 +123,35 @@ def crossplay(
         where, labels = named[background], {"focal": focal, "background": background}
         home = agents_of(where)
         if focal == background and diagonal == "self":
-            each = tuple((agent,) for agent in agents)
+            each = tuple((agent,) for agent in range(len(home)))
             parts.append(Part({**labels, "focal_agent": SELF_PLAY}, fresh.play(where, home), each))
             continue
-        visitors = agents_of(named[focal], following if focal == background else None)
-        for agent in agents:
-            mixed = [*home[:agent], visitors[agent], *home[agent + 1 :]]
+        for agent, visitor in enumerate(agents_of(named[focal], following if focal == background else None)):
+            mixed = [*home[:agent], visitor, *home[agent + 1 :]]
             parts.append(Part({**labels, "focal_agent": agent}, fresh.play(where, mixed), ((agent,),)))
     return CrossPlay(runs=named, parts=parts, fresh=fresh, diagonal=diagonal)
 
 
-def named_runs(runs: Runs, allow: Sequence[str], command: str = "crossplay") -> dict[str, LoadedRun]:
-    """Runs of the same game by given names, by names of their directories, or by their paths if those
-    coincide."""
-    given: list[str] = []
+def named_runs(runs: Runs, allow: Sequence[str] = ()) -> dict[str, LoadedRun]:
+    """Runs of the same game of several agents by given names, by names of their directories, or by their
+    paths if those coincide."""
+    names: list[str] = []
     if isinstance(runs, Mapping):
-        given, runs = list(runs), list(runs.values())
+        names, runs = list(runs), list(runs.values())
     loaded = [opened(run, allow) for run in runs]
     if len(loaded) < 2:
-        raise ValueError(
-            f"the number of runs is {len(loaded)}; allowed: at least two: cprl {command} RUN RUN..."
-        )
+        raise refusal("the number of runs", len(loaded), "at least two")
     paths = [run.path.resolve() for run in loaded]
-    for place, path in enumerate(paths):
-        if path in paths[:place]:
-            raise ValueError(f"{loaded[place].path} is given twice; allowed: different runs")
-    names = given or [path.name for path in paths]
+    for path in paths:
+        if paths.count(path) > 1:
+            raise ValueError(f"{path} is given twice; allowed: different runs")
+    names = names or [path.name for path in paths]
     if len(set(names)) < len(names):
-        names = [str(path) for path in paths]
+        names = list(map(str, paths))
     named = dict(zip(names, loaded, strict=True))
-    check_same_game(named)
+    refuse_other_games(named)
+    if loaded[0].game.agents == 1:
+        raise ValueError("the game has 1 agent; allowed: at least 2; use `cprl evaluate`")
     return named
 
 
@@ -193,23 +182,21 @@ def gains(played: CrossPlay) -> dict[Pair, Gain]:
     }
 
 
+_BESIDE: Final[Mapping[Whose, str]] = {
+    "focal": "the focal agent, beside the agent whose place it takes",
+    "background": "the background agents, beside themselves without it",
+}
+
+
 def _texts(by_cell: Mapping[Pair, Gain], form: str = "") -> dict[Whose, dict[Pair, str]]:
     """The texts of all gains, with a star where one is not 0 among all of them."""
-    texts = iter(starred([difference for gain in by_cell.values() for difference in gain], form))
-    both = {pair: (next(texts), next(texts)) for pair in by_cell}
-    return {
-        "focal": {pair: focal for pair, (focal, _) in both.items()},
-        "background": {pair: background for pair, (_, background) in both.items()},
-    }
+    both = starred([difference for gain in by_cell.values() for difference in gain], form)
+    return {whose: dict(zip(by_cell, both[at::2], strict=True)) for at, whose in enumerate(_BESIDE)}
 
 
 _COLOURS: Final = "RdBu"
 _CELL_IN: Final = (0.82, 0.45)
 _NARROWEST_IN: Final = 7.0
-_PANELS: Final[Mapping[Whose, str]] = {
-    "focal": "the focal agent, beside the agent whose place it takes",
-    "background": "the background agents, beside themselves without it",
-}
 
 
 def draw_gains(played: CrossPlay, path: Path | str) -> Path:
@@ -218,13 +205,15 @@ def draw_gains(played: CrossPlay, path: Path | str) -> Path:
     path, by_cell = style.picture_path(path), gains(played)
     names, texts = list(played.runs), _texts(by_cell, "+.3g")
     at_home = {(name, name): f"{played.cell(name, name).mean_returns('focal').mean():.3g}" for name in names}
-    returns = with_unit("focal/return", rewards=unit_of_rewards(played.played)).partition("/")[2]
+    returns = with_unit("focal/return", rewards=unit_of_rewards(played)).partition("/")[2]
     width = max(_CELL_IN[0] * len(names) + 2.6, _NARROWEST_IN)
     figure = Figure((width, 2 * (_CELL_IN[1] * len(names) + 0.9) + 1.2), layout="constrained")
-    for axes, (whose, title) in zip(figure.subplots(2, 1), _PANELS.items(), strict=True):
+    for axes, (whose, beside) in zip(figure.subplots(2, 1), _BESIDE.items(), strict=True):
         differences = {pair: getattr(gain, whose).value for pair, gain in by_cell.items()}
-        _draw_matrix(axes, names, differences, texts[whose] | at_home)
-        axes.set_title(f"difference in {returns} of {title}", fontsize=style.SMALL_PT + 1)
+        draw_matrix(axes, names, differences, texts[whose] | at_home)
+        style.write_small(
+            axes, x="background agents", y="focal agent", title=f"difference in {returns} of {beside}"
+        )
     note = (
         f"{played.fresh} with focal agent at each index; diagonal ({played.diagonal.replace('_', '-')}): an "
         f"agent's return. {HOLM} for these {2 * len(by_cell)}."
@@ -233,20 +222,19 @@ def draw_gains(played: CrossPlay, path: Path | str) -> Path:
     return style.save(figure, path, colours=style.SHADES)
 
 
-def _draw_matrix(
+def draw_matrix(
     axes: Axes, names: Sequence[str], values: Mapping[Pair, float], texts: Mapping[Pair, str]
 ) -> None:
     """A matrix of differences in colours about 0; cells without a value are empty but for their text."""
     reach = max(map(abs, values.values())) or 1.0
     scale, colours = Normalize(-reach, reach), matplotlib.colormaps[_COLOURS]
-    for (focal, background), text in texts.items():
-        value = values.get((focal, background))
+    for (row, column), text in texts.items():
+        value = values.get((row, column))
         colour = style.EMPTY if value is None else colours(scale(value))
-        style.draw_cell(axes, names.index(background), names.index(focal), colour, text)
+        style.draw_cell(axes, names.index(column), names.index(row), colour, text)
     axes.set_xticks(range(len(names)), [style.wrapped(name, _CELL_IN[0]) for name in names])
     axes.set_yticks(range(len(names)), names)
     axes.set(xlim=(-0.5, len(names) - 0.5), ylim=(len(names) - 0.5, -0.5))
-    style.write_small(axes, x="background agents", y="focal agent")
     axes.tick_params(length=0)
     bar = axes.figure.colorbar(matplotlib.cm.ScalarMappable(scale, _COLOURS), ax=axes)
     bar.ax.tick_params(labelsize=style.SMALL_PT)
@@ -264,38 +252,31 @@ def crossplay_tables(played: CrossPlay) -> Iterator[Table]:
     """A matrix for each metric, rows the focal agent's run, columns the background agents' run; one for what
     focal agents gain and one for what background agents do; and all returns by the focal agent's index."""
     cells = {pair: cell.measures() for pair, cell in played.cells.items()}
-    rewards = unit_of_rewards(played.played)
+    rewards, names = unit_of_rewards(played), list(played.runs)
     # A reward is an apple but for what institutions take and give.
     repeats = () if any("institutions/fines" in cell for cell in cells.values()) else ("collective_return",)
     for name in next(iter(cells.values())):
         measured = {pair: cell[name] for pair, cell in cells.items()}
         if name not in repeats and not says_nothing(name, measured.values()):
-            texts = {pair: str(of_cell) for pair, of_cell in measured.items()}
-            yield _matrix(with_unit(name, rewards=rewards), played, texts)
+            yield matrix_table(with_unit(name, rewards=rewards), "focal \\ background", names, measured)
     by_cell = gains(played)
     for whose, texts in _texts(by_cell).items():
-        beside = "the agent whose place it takes" if whose == "focal" else "the diagonal"
-        title = (
-            f"{with_unit(f'{whose}/return', rewards=rewards)}, difference from {beside}, paired by replica"
-        )
-        table = _matrix(f"{title} [95 % interval by Student's t]", played, texts)
+        name = with_unit(f"{whose}/return", rewards=rewards)
+        title = f"{name}, difference of {_BESIDE[whose]}, paired by replica [95 % interval by Student's t]"
+        table = matrix_table(title, "focal \\ background", names, texts)
         table.caption = f"{HOLM} for all {2 * len(by_cell)} differences"
         yield table
-    yield _agents_table(played, rewards)
-
-
-def _matrix(title: str, played: CrossPlay, texts: Mapping[Pair, str]) -> Table:
-    """A text for each pair of runs, "" where there is none."""
-    rows = [(focal, *(texts.get((focal, other), "") for other in played.runs)) for focal in played.runs]
-    return table_of(title, ["focal \\ background", *played.runs], rows)
-
-
-def _agents_table(played: CrossPlay, rewards: str) -> Table:
-    names = ("focal/return", "background/return", "group/return")
-    headings = ["focal", "background", "focal agent", *(with_unit(name, rewards=rewards) for name in names)]
+    returns = ("focal/return", "background/return", "group/return")
+    headings = ["focal", "background", "focal agent", *(with_unit(name, rewards=rewards) for name in returns)]
     rows = []
     for pair, cell in played.cells.items():
         for agent in cell.by_agent:
-            measured = cell.measures(agent)
-            rows.append((*pair, str(agent), *(str(measured[name]) for name in names)))
-    return table_of("returns by the focal agent's index", headings, rows, texts=3)
+            measures = cell.measures(agent)
+            rows.append((*pair, str(agent), *(str(measures[name]) for name in returns)))
+    yield table_of("returns by the focal agent's index", headings, rows, texts=3)
+
+
+def matrix_table(title: str, corner: str, names: Sequence[str], cells: Mapping[Pair, object]) -> Table:
+    """A row and a column for each name, with the text of each pair, "" where there is none."""
+    rows = [(row, *(str(cells.get((row, column), "")) for column in names)) for row in names]
+    return table_of(title, [corner, *names], rows)

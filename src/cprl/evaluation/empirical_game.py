@@ -1,40 +1,37 @@
 """play_empirical_game: the game whose strategies are stored runs, and whose payoffs are their returns.
 analyse: what it amounts to, with what replicas leave open.
 
-Each agent plays as a run, i.e. as the run's agent with its index. For N agents and S runs every composition
-is played, so many agents of one run and so many of the next: C = (N + S - 1)! / (N! (S - 1)!). A composition
-of several runs is played N times, with the agents of the first run from index s on, cyclically, then those of
-the second and so on, for each s, so that each run has each index as often as every other index. Replica r is
-that of all runs, in the same worlds for all compositions; agents of one run learned together.
+For N agents and S runs every composition is played, so many agents of one run and so many of the next:
+C = (N + S - 1)! / (N! (S - 1)!), each shifted by one index at a time, so that each run has each index as
+often as every other. An agent plays as the run's agent with its index, replica r with replica r.
 
-`pairwise_game` makes a game of two agents of what `crossplay` played, the payoffs of one focal agent by its
-run and that of the background agents. For N = 2 it is the same game. For more agents it is a reduction that
-knows what the first agent gains who deviates from the run of all others, and nothing of mixes; its equilibria
-in which one run is played are those of the whole game, the others need not be.
+`pairwise_game` makes a game of two agents of what `crossplay` played. For N = 2 it is the same game; for more
+agents a reduction that knows what the first agent gains who deviates from the run of all others, and nothing
+of mixes; its equilibria in which one run is played are those of the whole game, the others need not be.
 
-The means over replicas are one game; alpha-rank, the equilibria and the replicator dynamics are those of this
-game. Only replicas are independent, so the bootstrap draws as many replicas with replacement, the same ones
-for all payoffs, and analyses the game of their means anew: the interval of a run's share is that between the
-2.5 and the 97.5 per cent quantiles, and an equilibrium is as certain as the share of these games that have
-it. With few replicas such intervals are too narrow rather than too wide.
+The means over replicas are one game, which is analysed. Only replicas are independent, so the bootstrap draws
+as many with replacement, the same ones for all payoffs, and analyses the game of their means anew: the
+interval of a run's share is that between the 2.5 and the 97.5 per cent quantiles, and an equilibrium is as
+certain as the share of these games that have it. With few replicas such intervals are too narrow.
 """
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from math import isnan
+from functools import cached_property
+from itertools import permutations, product
+from math import isnan, nan
 from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from cprl.evaluation.cross_play import CrossPlay, Runs, named_runs
-from cprl.evaluation.evaluate import SEED, fresh_episodes, how_they_play, table_of
-from cprl.evaluation.lanes import Part, Played, Results, agents_of
-from cprl.measuring.statistics import CONFIDENCE, Estimate, estimate
+from cprl.evaluation.cross_play import CrossPlay, Runs, draw_matrix, matrix_table, named_runs
+from cprl.evaluation.evaluate import SEED, how_they_play, table_of
+from cprl.evaluation.lanes import Part, Played, Results, Who, agents_of, fresh_of, shifted
+from cprl.measuring.statistics import CONFIDENCE, HOLM, Estimate, estimate, starred
 from cprl.system.defaults import EGTA_RESAMPLES
 from cprl.terminal import style
 from cprl.theory.payoff_table import PayoffTable, Values, compositions
@@ -46,14 +43,10 @@ from cprl.theory.solutions import (
     Equilibrium,
     alpha_rank,
     equilibria,
-    replicator,
     replicator_ends,
 )
 from cprl.training.agents import LoadedRun
 from cprl.values import Range, checked
-
-Who = tuple[int, ...]
-"""Which run each agent plays as."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -92,7 +85,7 @@ class EmpiricalGame(Results):
         payoffs = self.payoffs if replicas is None else self.payoffs[list(replicas)]
         return PayoffTable(agents=self.agents, payoffs=payoffs.mean(0))
 
-    @property
+    @cached_property
     def pairs(self) -> Values:
         """Of a game of two agents, or of the reduction to pairs, float64 [R, S, S]."""
         return np.array([self.payoff_table([place]).pairs for place in range(len(self.payoffs))])
@@ -115,22 +108,20 @@ def play_empirical_game(
         episodes: episodes of each replica and choice of who plays where, each in its own world; the choices
             are N (C - S) + S.
     """
-    named = named_runs(runs, allow, command="egta")
+    named = named_runs(runs, allow)
     names = list(named)
     agents = named[names[0]].game.agents
-    if agents < 2:
-        raise ValueError("the game has 1 agent; allowed for an empirical game: at least 2")
     if (profiles := len(named) ** agents) > MOST_PROFILES:
         raise ValueError(
             f"{len(named)} runs of {agents} agents have {profiles:,} profiles; allowed: at most "
             f"{MOST_PROFILES}; crossplay and pairwise_game (cprl egta --pairwise) take more"
         )
-    fresh = fresh_episodes(named.values(), episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
+    fresh = fresh_of(named.values(), episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
     of_runs = [agents_of(run) for run in named.values()]
     parts, payoffs = [], []
     for counts in compositions(agents, len(named)).tolist():
         played = {}
-        for who in _choices(counts):
+        for who in shifted(counts):
             mixed = [of_runs[run][agent] for agent, run in enumerate(who)]
             played[who] = fresh.play(named[names[who[0]]], mixed)
             parts.append(Part({"runs": " ".join(names[run] for run in who)}, played[who]))
@@ -165,25 +156,16 @@ def pairwise_game(played: CrossPlay) -> EmpiricalGame:
     )
 
 
-def _choices(counts: Sequence[int]) -> list[Who]:
-    """Who plays at which index, for each of N shifts; of one run alone the one way."""
-    first = tuple(int(run) for run in np.repeat(np.arange(len(counts)), counts))
-    shifts = len(first) if len(set(first)) > 1 else 1
-    return [(*first[-shift:], *first[:-shift]) if shift else first for shift in range(shifts)]
-
-
 def _payoffs(runs: int, played: Mapping[Who, Played]) -> Values:
     """The mean return of an agent of each run, [R, S]; NaN for a run that does not play."""
-    payoffs = np.full((len(next(iter(played.values()))), runs), np.nan)
-    for place, replica in enumerate(next(iter(played.values()))):
-        for run in range(runs):
-            returns = [
-                episode.return_[np.array(who) == run]
-                for who, by_replica in played.items()
-                for episode in by_replica[replica]
+    replicas = next(iter(played.values()))
+    payoffs = np.full((len(replicas), runs), np.nan)
+    for place, replica in enumerate(replicas):
+        for run in {run for who in played for run in who}:
+            of_run = [
+                one.return_[np.array(who) == run] for who, all_ in played.items() for one in all_[replica]
             ]
-            if len(of_run := np.concatenate(returns)):
-                payoffs[place, run] = of_run.mean()
+            payoffs[place, run] = np.concatenate(of_run).mean()
     return payoffs
 
 
@@ -222,47 +204,35 @@ def analyse(game: EmpiricalGame, *, resamples: int = EGTA_RESAMPLES, seed: int =
         ModuleNotFoundError: if OpenSpiel or nashpy is not installed.
     """
     resamples = checked("resamples", resamples, Annotated[int, Range(1, 100_000)])
-    rng, replicas = np.random.default_rng(seed), len(game.payoffs)
-    table = game.payoff_table()
+    rng, replicas, table = np.random.default_rng(seed), len(game.payoffs), game.payoff_table()
     drawn = rng.integers(replicas, size=(resamples if replicas > 1 else 0, replicas))
     # Few replicas have few resamples that differ: each is analysed once.
     times = Counter(tuple(sorted(places)) for places in drawn.tolist())
     again = [game.payoff_table(places) for places in times]
-    weights = np.array(list(times.values())) / max(1, len(drawn))
-    is_small = table.strategies <= MOST_STRATEGIES
-    rank = alpha_rank(table)
+    is_small, rank = table.strategies <= MOST_STRATEGIES, alpha_rank(table)
+    bounds = np.full((2, table.strategies), np.nan)
+    pure, in_support = dict.fromkeys(table.pure_equilibria, nan), np.full(table.strategies, nan)
+    if again:
+        weights = np.array(list(times.values())) / len(drawn)
+        ranks = np.repeat([alpha_rank(resample).shares for resample in again], list(times.values()), axis=0)
+        margin = (1 - CONFIDENCE) / 2
+        bounds = np.quantile(ranks, [margin, 1 - margin], axis=0)
+        pure = {counts: float(weights @ [counts in one.pure_equilibria for one in again]) for counts in pure}
+        if table.agents == 2 and is_small:
+            in_support = weights @ np.array([_is_played(resample) for resample in again], float)
     return Analysis(
         game=game,
         table=table,
         resamples=len(drawn),
         rank=rank,
-        shares=_shares(rank, again, list(times.values()), replicas),
-        pure={
-            counts: float(weights @ [counts in resample.pure_equilibria for resample in again])
-            if again
-            else float("nan")
-            for counts in table.pure_equilibria
-        },
+        shares=tuple(
+            Estimate(value=float(share), low=float(low), high=float(high), replicas=replicas)
+            for share, low, high in zip(rank.shares, *bounds, strict=True)
+        ),
+        pure=pure,
         equilibria=equilibria(table.reduced) if is_small else (),
-        in_support=weights @ np.array([_is_played(resample) for resample in again], float)
-        if again and table.agents == 2 and is_small
-        else np.full(table.strategies, np.nan),
+        in_support=in_support,
         ends=replicator_ends(table, seed=seed),
-    )
-
-
-def _shares(
-    rank: AlphaRank, again: Sequence[PayoffTable], times: Sequence[int], replicas: int
-) -> tuple[Estimate, ...]:
-    """The shares of alpha-rank, with the middle of those of resamples that were drawn so many times."""
-    bounds = np.full((2, len(rank.shares)), np.nan)
-    if again:
-        ranks = np.repeat([alpha_rank(resample).shares for resample in again], times, axis=0)
-        margin = (1 - CONFIDENCE) / 2
-        bounds = np.quantile(ranks, [margin, 1 - margin], axis=0)
-    return tuple(
-        Estimate(value=float(share), low=float(low), high=float(high), replicas=replicas)
-        for share, low, high in zip(rank.shares, *bounds, strict=True)
     )
 
 
@@ -295,8 +265,16 @@ def egta_tables(analysis: Analysis) -> Iterator[Table]:
         title += f" [95 % interval, {analysis.resamples} resamples of the replicas]"
     is_certain = not np.isnan(analysis.in_support).any()
     columns = ["run", "share", *["resamples in which a symmetric equilibrium plays it"] * is_certain]
-    shares = zip(analysis.game.names, analysis.shares, analysis.in_support, strict=True)
-    rows = [(name, _share(share), *[f"{certain:.0%}"] * is_certain) for name, share, certain in shares]
+    rows = [
+        (
+            name,
+            f"{share.value:.2f}" + f" [{share.low:.2f}, {share.high:.2f}]" * (not isnan(share.low)),
+            *[f"{certain:.0%}"] * is_certain,
+        )
+        for name, share, certain in zip(
+            analysis.game.names, analysis.shares, analysis.in_support, strict=True
+        )
+    ]
     yield table_of(title, columns, rows)
     yield table_of("equilibria", ["", "what is played", "how certain"], _ends(analysis), texts=2)
 
@@ -305,18 +283,14 @@ def _payoff_table(game: EmpiricalGame) -> Table:
     """By the runs of both of two agents, else by how many agents play as each."""
     if game.agents == 2:
         others = "the other" if game.of_agents == 2 else f"all other {game.of_agents - 1}"
-        rows = [
-            (name, *(str(estimate(payoffs)) for payoffs in game.pairs[:, place].T))
-            for place, name in enumerate(game.names)
-        ]
         title = f"return of an agent, by its run and that of {others}"
-        return table_of(title, ["an agent \\ others", *game.names], rows)
+        of_pairs = map(estimate, game.pairs.reshape(len(game.payoffs), -1).T)
+        cells = dict(zip(product(game.names, repeat=2), of_pairs, strict=True))
+        return matrix_table(title, "an agent \\ others", game.names, cells)
     rows = []
     for place, counts in enumerate(compositions(game.agents, len(game.names)).tolist()):
-        payoffs = game.payoffs[:, place].T
-        texts = (
-            str(estimate(of_run)) if count else "" for of_run, count in zip(payoffs, counts, strict=True)
-        )
+        means = zip(game.payoffs[:, place].T, counts, strict=True)
+        texts = (str(estimate(of_run)) if count else "" for of_run, count in means)
         rows.append((composition_text(counts, game.names), *texts))
     title = "return of an agent of each run, by how many agents play as each"
     return table_of(title, ["agents", *game.names], rows)
@@ -353,137 +327,41 @@ def mixture_text(mixture: Values, names: Sequence[str]) -> str:
     return played[0][0] if len(played) == 1 else ", ".join(f"{name} {share:.2f}" for name, share in played)
 
 
-def _share(share: Estimate) -> str:
-    text = f"{share.value:.2f}"
-    return text if isnan(share.low) else f"{text} [{share.low:.2f}, {share.high:.2f}]"
-
-
 _SIZE_IN: Final = (9.0, 4.3)
-_POINTS: Final = 41
-_GRID: Final = 14
-_CORNERS: Final = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, 3**0.5 / 2]])
-_UNCERTAIN: Final = "#9a9a9a"
 
 
 def draw_egta(analysis: Analysis, path: Path | str) -> Path:
-    path = style.check_picture(path)
+    """Draws what one agent gains that plays as another run than all others, with a star where it is not 0 by
+    Holm's method; and each run's share by alpha-rank, with the most frequent end of replicator dynamics."""
+    path, game, names = style.check_picture(path), analysis.game, analysis.game.names
+    usual = np.diagonal(game.pairs, axis1=1, axis2=2)
+    gains = {
+        (names[played], names[others]): estimate(game.pairs[:, played, others] - usual[:, others])
+        for played, others in permutations(range(len(names)), 2)
+    }
+    texts = dict(zip(gains, starred(list(gains.values()), "+.3g"), strict=True))
+    texts |= {(name, name): f"{mean:.3g}" for name, mean in zip(names, usual.mean(0), strict=True)}
     figure = Figure(_SIZE_IN, layout="constrained")
-    dynamics, rank = figure.subplots(1, 2, width_ratios=(1.35, 1))
-    draw = {2: _draw_line, 3: _draw_simplex}.get(len(analysis.game.names), _draw_deviations)
-    draw(dynamics, analysis)
-    _draw_rank(rank, analysis)
-    game = analysis.game
+    matrix, rank = figure.subplots(1, 2, width_ratios=(1.35, 1))
+    draw_matrix(matrix, names, {pair: gain.value for pair, gain in gains.items()}, texts)
+    style.write_small(
+        matrix, x="run of all others", y="run of an agent", title="what it gains over their run"
+    )
+    places = np.arange(len(names))
+    share, low, high = np.array([(share.value, share.low, share.high) for share in analysis.shares]).T
+    rank.barh(places, share, color=style.REPLICA, height=0.6)
+    rank.hlines(places, low, high, color=style.PUBLISHED)
+    if len(analysis.ends.mixtures):
+        label = f"end of replicator dynamics, from {analysis.ends.shares[0]:.0%} of the starts"
+        rank.plot(analysis.ends.mixtures[0], places, "D", color=style.MARK, label=label, clip_on=False)
+        rank.legend(loc="lower center", bbox_to_anchor=(0.5, 1.08), fontsize=style.SMALL_PT, frameon=False)
+    rank.set_yticks(places, [style.wrapped(name, 1.6) for name in names])
+    rank.set(xlim=(0, 1), ylim=(len(places) - 0.5, -0.5))
+    style.write_small(rank, x="share of the agents in the long run", title="alpha-rank, infinite alpha")
     kind = f"pairwise reduction of {game.of_agents} agents" if game.is_reduction else f"{game.agents} agents"
     note = (
-        f"{kind}; {game.fresh}{_CHOICES}; intervals: 95 %, of payoffs by Student's t, of shares by "
-        f"{analysis.resamples} resamples of the replicas"
+        f"{kind}; {game.fresh}{_CHOICES}. {HOLM} for these {len(gains)}; diagonal: an agent's return; "
+        f"intervals of shares: 95 % of {analysis.resamples} resamples of the replicas"
     )
-    style.head(figure, f"Empirical game of {', '.join(game.names)}", note)
+    style.head(figure, f"Empirical game of {', '.join(names)}", note)
     return style.save(figure, path, colours=style.SHADES)
-
-
-def _draw_line(axes: Axes, analysis: Analysis) -> None:
-    """What the first run gains over the second, by its share, with the points of rest."""
-    shares, (first, second) = np.linspace(0, 1, _POINTS), analysis.game.names
-    tables = [analysis.game.payoff_table([place]) for place in range(len(analysis.game.payoffs))]
-    curves = [[np.subtract(*table.against([share, 1 - share])) for share in shares] for table in tables]
-    means = [estimate(gains) for gains in np.transpose(curves)]
-    middle, low, high = np.array([(mean.value, mean.low, mean.high) for mean in means]).T
-    axes.fill_between(shares, low, high, color=style.REPLICA, alpha=0.35, lw=0)
-    axes.plot(shares, middle, color=style.MEAN)
-    axes.axhline(0, color=style.RAW, lw=1, zorder=1)
-    for at, is_stable in _rests(shares, middle):
-        face = style.MARK if is_stable else "white"
-        axes.plot(at, 0, "o", markersize=8, color=style.MARK, markerfacecolor=face, clip_on=False, zorder=4)
-    for start in (0.12, 0.37, 0.62, 0.87):
-        ahead = 0.03 if np.interp(start, shares, middle) > 0 else -0.03
-        axes.annotate(
-            "", (start + ahead, 0), (start - ahead, 0), arrowprops={"arrowstyle": "->", "color": style.MARK}
-        )
-    axes.set_xlim(-0.02, 1.02)
-    style.write_small(
-        axes,
-        x=f"share that plays as {first}",
-        y=f"return as {first} less that as {second}",
-        title="replicator dynamics: rests that attract (filled) or repel",
-    )
-
-
-def _rests(shares: Values, gains: Values) -> list[tuple[float, bool]]:
-    """Where nothing changes, and whether shares nearby move there."""
-    rests = [(0.0, bool(gains[0] < 0)), (1.0, bool(gains[-1] > 0))]
-    for place in np.flatnonzero(gains[:-1] * gains[1:] < 0):
-        low, high = gains[place], gains[place + 1]
-        at = shares[place] + (shares[place + 1] - shares[place]) * low / (low - high)
-        rests.append((float(at), bool(low > 0)))
-    return rests
-
-
-def _draw_simplex(axes: Axes, analysis: Analysis) -> None:
-    """The direction in which shares move, where they end, and the corners by name."""
-    axes.plot(*np.vstack([_CORNERS, _CORNERS[:1]]).T, color=style.RAW, lw=1)
-    mixtures = (compositions(_GRID - 3, 3) + 1) / _GRID
-    moves = np.array([replicator(analysis.table.normalised, mixture) for mixture in mixtures]) @ _CORNERS
-    lengths = np.linalg.norm(moves, axis=1, keepdims=True)
-    arrows = np.divide(moves, lengths, out=np.zeros_like(moves), where=lengths > 0)
-    quiver = axes.quiver(
-        *(mixtures @ _CORNERS).T, *arrows.T, lengths[:, 0], cmap="viridis", scale=24, width=0.005, pivot="mid"
-    )
-    bar = axes.figure.colorbar(quiver, ax=axes, shrink=0.6)
-    bar.set_label("speed, of payoffs scaled to 0..1", fontsize=style.SMALL_PT)
-    bar.ax.tick_params(labelsize=style.SMALL_PT)
-    for mixture, share in zip(analysis.ends.mixtures, analysis.ends.shares, strict=True):
-        at = mixture @ _CORNERS
-        axes.plot(*at, "o", color=style.MARK, markersize=9, zorder=4)
-        axes.annotate(f"{share:.0%}", at, (8, 8), textcoords="offset points", fontsize=style.SMALL_PT)
-    for corner, name in zip(_CORNERS, analysis.game.names, strict=True):
-        is_top = corner[1] > 0
-        axes.annotate(
-            name,
-            corner,
-            (0, 16 if is_top else -12),
-            textcoords="offset points",
-            ha="center",
-            va="bottom" if is_top else "top",
-            fontsize=style.SMALL_PT,
-        )
-    axes.set(xlim=(-0.08, 1.08), ylim=(-0.1, 1.06), aspect="equal")
-    axes.set_axis_off()
-    style.write_small(axes, title="replicator dynamics; dots: where starts end")
-
-
-def _draw_deviations(axes: Axes, analysis: Analysis) -> None:
-    """An arrow from the run that all play to each by which one agent gains."""
-    game, names = analysis.game, analysis.game.names
-    angles = np.pi / 2 - 2 * np.pi * np.arange(len(names)) / len(names)
-    places = np.stack([np.cos(angles), np.sin(angles)], 1)
-    pairs = game.pairs
-    for to in range(len(names)):
-        for start in range(len(names)):
-            gain = estimate(pairs[:, to, start] - pairs[:, start, start])
-            if to == start or gain.value <= 0:
-                continue
-            colour, line = (style.MEAN, "-") if gain.low > 0 else (_UNCERTAIN, "--")
-            arrow = {"arrowstyle": "-|>", "color": colour, "linestyle": line, "shrinkA": 16, "shrinkB": 16}
-            arrow["connectionstyle"] = "arc3,rad=0.12"
-            axes.annotate("", places[to], places[start], arrowprops=arrow)
-    for (x, y), name, share in zip(places, names, analysis.shares, strict=True):
-        axes.plot(x, y, "o", color=style.MARK, markersize=5 + 14 * share.value, zorder=4)
-        axes.text(1.32 * x, 1.22 * y, name, ha="center", va="center", fontsize=style.SMALL_PT)
-    axes.set(xlim=(-1.6, 1.6), ylim=(-1.4, 1.4), aspect="equal")
-    axes.set_axis_off()
-    title = "by which run one agent gains where all play another\n(dashed: the interval holds 0)"
-    style.write_small(axes, title=title)
-
-
-def _draw_rank(axes: Axes, analysis: Analysis) -> None:
-    """The share of each run in the long run of alpha-rank, with its interval."""
-    places = np.arange(len(analysis.shares))
-    values = np.array([share.value for share in analysis.shares])
-    axes.barh(places, values, color=style.REPLICA, height=0.6)
-    for place, share in enumerate(analysis.shares):
-        if not isnan(share.low):
-            axes.plot([share.low, share.high], [place, place], color=style.PUBLISHED, lw=1.4)
-    axes.set_yticks(places, [style.wrapped(name, 1.6) for name in analysis.game.names])
-    axes.set(xlim=(0, 1), ylim=(len(places) - 0.5, -0.5))
-    style.write_small(axes, x="share of the agents in the long run", title="alpha-rank, infinite alpha")

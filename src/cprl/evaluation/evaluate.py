@@ -1,66 +1,56 @@
 """evaluate_run: compares the agents of a stored run with the random policy in fresh worlds; and what all
-evaluations share: the check of runs, and tables for the terminal."""
+evaluations share: whether runs have the same game, and tables for the terminal."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
+import numpy as np
 import torch
 from rich.table import Table
 
 from cprl.envs.unwrap import agent_names
-from cprl.evaluation.lanes import Fresh, Part, Played, Results, agents_of, scripted
+from cprl.evaluation.lanes import Fresh, Part, Played, Results, Values, agents_of, fresh_of, scripted
 from cprl.measuring.metrics import left_out, with_unit
 from cprl.measuring.series import OF_AGENTS
-from cprl.measuring.statistics import Measured, agents_without_harvest, over_replicas
+from cprl.measuring.statistics import Estimate, Measured, agents_without_harvest, over_replicas
 from cprl.system.defaults import SEED as SEED
 from cprl.training.agents import LoadedRun, load
-from cprl.values import Positive, Seed, checked, trust
+from cprl.values import checked, differences, to_config
 
-_LONGEST: Final = 80
-"""The largest number of characters of two values in a message."""
+MOST_DIFFERENCES: Final = 3
+"""Of those in which games differ, in a message."""
 
 
-def check_same_game(runs: Mapping[str, LoadedRun]) -> None:
-    """Checks that all runs, by name, have the game of the first."""
+def refuse_other_games(runs: Mapping[str, LoadedRun]) -> None:
+    """Raises a ValueError where a run, by its name, has another game than the first, or other transforms."""
     first, *others = runs
-    for other in others:
-        refuse_unlike(f"{first} and {other}", unlike(runs[first], runs[other]))
+    for name in others:
+        run, other = runs[first].experiment, runs[name].experiment
+        refuse_unlike(f"{first} and {name}", run.game, other.game)
+        refuse_unlike(f"{first} and {name}", run.transforms, other.transforms, "transforms")
+        learned = differing(runs[first].transforms_state, runs[name].transforms_state)
+        if learned:
+            raise ValueError(f"{first} and {name}: the learned state of transforms differs: {learned}")
 
 
-def refuse_unlike(names: str, lines: Sequence[str]) -> None:
+def differing(state: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """The entries of what transforms have learned that another has not, or otherwise."""
+    return [
+        name
+        for name, value in state.items()
+        if name not in other or not torch.equal(torch.as_tensor(value), torch.as_tensor(other[name]))
+    ]
+
+
+def refuse_unlike(names: str, game: Any, other: Any, what: str = "") -> None:
+    """Raises a ValueError that says where two games differ."""
+    lines = differences(to_config(game), to_config(other), what or type(game).__name__)
     if lines:
-        raise ValueError(f"{names} have different games: {'; '.join(lines)}; allowed: the same game")
-
-
-def unlike(run: LoadedRun, other: LoadedRun) -> list[str]:
-    """The differences between the games of two runs and between their transforms, with what these learned."""
-    lines = differences(run.game, other.game)
-    transforms = run.experiment.transforms, other.experiment.transforms
-    if transforms[0] != transforms[1]:
-        return [*lines, f"transforms {transforms[0]} and {transforms[1]}"]
-    learned = {
-        name: (torch.as_tensor(value), torch.as_tensor(other.transforms_state[name]))
-        for name, value in run.transforms_state.items()
-    }
-    names = [name for name, pair in learned.items() if not torch.equal(*pair)]
-    return [*lines, f"the learned state of the transforms differs: {', '.join(names)}"] if names else lines
-
-
-def differences(game: Any, other: Any, path: str = "") -> list[str]:
-    """The fields in which games differ, as "Game.rules.freeze_steps 2 and 7", with their values if they are
-    short."""
-    if game == other:
-        return []
-    lines: list[str] = []
-    path = path or type(game).__name__
-    if is_dataclass(game) and type(game) is type(other):
-        for entry in fields(game):
-            pair = getattr(game, entry.name), getattr(other, entry.name)
-            lines += differences(*pair, path=f"{path}.{entry.name}")
-    values = f"{game!r} and {other!r}"
-    return lines or [f"{path} {values if len(values) <= _LONGEST else 'differ'}"]
+        raise ValueError(
+            f"{names} have different games: {'; '.join(lines[:MOST_DIFFERENCES])}; allowed: the same game"
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -124,56 +114,14 @@ def evaluate_run(
             the others.
     """
     loaded = opened(run, allow)
-    fresh = fresh_episodes([loaded], episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
-    random = [scripted("random")] * loaded.game.agents
-    parts = [
-        Part({"policy": "trained"}, fresh.play(loaded, agents_of(loaded))),
-        Part({"policy": "random"}, fresh.play(loaded, random, explore=True)),
-    ]
+    fresh = fresh_of([loaded], episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
+    policies = {"trained": agents_of(loaded), "random": [scripted("random")] * loaded.game.agents}
+    parts = [Part({"policy": policy}, fresh.play(loaded, agents)) for policy, agents in policies.items()]
     return Evaluation(run=loaded, fresh=fresh, parts=parts)
 
 
 def opened(run: str | Path | LoadedRun, allow: Sequence[str] = ()) -> LoadedRun:
-    trust(*allow)
     return run if isinstance(run, LoadedRun) else load(run, allow=allow)
-
-
-def fresh_episodes(
-    runs: Iterable[LoadedRun],
-    *,
-    episodes: int,
-    greedy: bool,
-    seed: int,
-    replicas: Sequence[int],
-    trained: Iterable[LoadedRun] = (),
-) -> Fresh:
-    """Fresh episodes of the chosen replicas, or of all that every run has.
-
-    Args:
-        trained: more runs of which no agent may have been trained in the worlds.
-    """
-    runs, chosen = list(runs), set(replicas)
-    check(episodes=episodes, seed=seed, runs=[*runs, *trained])
-    common = set.intersection(*(set(run.replicas) for run in runs))
-    for run in runs:
-        missing = sorted(chosen - set(run.replicas))
-        if missing:
-            raise ValueError(f"{run.path} has no replicas {missing}; allowed: {run.replicas}")
-    if not common:
-        has = {str(run.path): run.replicas for run in runs}
-        raise ValueError(f"the replicas of the runs are {has}; allowed: runs with a replica in common")
-    return Fresh(replicas=tuple(sorted(chosen or common)), episodes=episodes, seed=seed, greedy=greedy)
-
-
-def check(*, episodes: int, seed: int, runs: Sequence[LoadedRun]) -> None:
-    """Checks the arguments of an evaluation, and that no agent was trained in the worlds."""
-    checked("episodes", episodes, Positive)
-    checked("seed", seed, Seed)
-    for run in runs:
-        if run.experiment.seed == seed:
-            raise ValueError(
-                f"seed is {seed}, the training seed of {run.path}; allowed: any other seed, for fresh worlds"
-            )
 
 
 INTERVALS: Final = "mean over replicas [95 % interval by Student's t]"
@@ -189,13 +137,20 @@ def table_of(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], 
     return table
 
 
+def bars_of(estimates: Iterable[Estimate]) -> tuple[Values, Values]:
+    """Values, float64 [K], and how far their intervals reach below and above, [2, K], as `errorbar` takes
+    them; 0 where there is none."""
+    means, low, high = np.array([(mean.value, mean.low, mean.high) for mean in estimates]).T
+    return means, np.nan_to_num([means - low, high - means])
+
+
 def run_table(evaluation: Evaluation) -> Table:
     """A row for each metric: mean over replicas and 95 % interval, of the run's agents and random agents.
 
     Metrics of institutions that are undefined everywhere, since the game has other institutions, have none.
     """
     trained, random = evaluation.measures("trained"), evaluation.measures("random")
-    rewards = unit_of_rewards(evaluation.trained)
+    rewards = unit_of_rewards(evaluation)
     rows: list[tuple[str, ...]] = [
         (with_unit(name, rewards=rewards), str(measured), str(random[name]))
         for name, measured in trained.items()
@@ -221,9 +176,9 @@ def says_nothing(name: str, measured: Iterable[Measured]) -> bool:
     return name.startswith("institutions/") and all(of_run.estimate is None for of_run in measured)
 
 
-def unit_of_rewards(played: Played) -> str:
+def unit_of_rewards(results: Results) -> str:
     """Rewards are apples in a game that reports harvests; in another they have no unit."""
-    return "apples" if next(iter(played.values()))[0].harvest is not None else ""
+    return "apples" if next(iter(results.played.values()))[0].harvest is not None else ""
 
 
 def how_they_play(runs: Iterable[LoadedRun], fresh: Fresh) -> str:

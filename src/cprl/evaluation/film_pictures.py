@@ -1,7 +1,6 @@
 """The pictures of a film: one population's board, stock and harvests so far; and its files."""
 
 import shutil
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import closing
 from functools import cache
@@ -244,63 +243,26 @@ def write_gif(path: Path, pictures: Iterable[Bytes], samples: Sequence[Bytes], *
 
     Args:
         pictures: uint8 [height, width, 3] each, RGB.
-        samples: some of the pictures; their most frequent colours are exact, others become the nearest.
+        samples: some of the pictures; the palette has their most frequent colours.
         fps: pictures per second; a GIF counts hundredths of a second, so it is rounded to 100 / n.
     """
-    palette = _Palette(samples)
-    frames = (palette.image(picture) for picture in pictures)
-    duration_ms = 10 * max(2, round(100 / fps))
-    first, *others = frames
-    durations = [duration_ms] * len(others) + [round(1000 * HOLD_S)]
-
-    def write(file: BinaryIO) -> None:
-        first.save(
-            file,
-            format="GIF",
-            save_all=True,
-            append_images=others,
-            duration=durations,
-            loop=0,
-            optimize=True,
-            palette=palette.bytes,
-            transparency=palette.unchanged,
-        )
-
-    write_atomically(path, write)
-
-
-class _Palette:
-    """The most frequent colours of some pictures; each other colour becomes the nearest of them."""
-
-    def __init__(self, samples: Sequence[Bytes]) -> None:
-        counts: Counter[int] = Counter()
-        for picture in samples:
-            colours, times = np.unique(_packed(picture), return_counts=True)
-            counts.update(dict(zip(colours.tolist(), times.tolist(), strict=True)))
-        known = np.array([colour for colour, _ in counts.most_common(_COLOURS)], np.int64)
-        self._colours = np.stack([known >> 16, known >> 8 & 255, known & 255], -1)
-        self._index = np.full(2**24, -1, np.int16)
-        self._index[known] = np.arange(len(known))
-        self.unchanged = len(known)
-        """The index of pixels that do not change."""
-        self.bytes = bytes(self._colours.astype(np.uint8).tobytes()) + bytes(3)
-        """Red, green and blue of each index."""
-
-    def image(self, picture: Bytes) -> Image.Image:
-        """A picture [height, width, 3] in colours of the palette."""
-        packed = _packed(picture)
-        for colour in np.unique(packed[self._index[packed] < 0]).tolist():
-            apart = self._colours - [colour >> 16, colour >> 8 & 255, colour & 255]
-            self._index[colour] = (apart**2).sum(-1).argmin()
-        image = Image.fromarray(self._index[packed].astype(np.uint8), "P")
-        image.putpalette(self.bytes)
-        return image
-
-
-def _packed(picture: Bytes) -> NDArray[Any]:
-    wide = picture.astype(np.uint32)
-    packed: NDArray[Any] = wide[..., 0] << 16 | wide[..., 1] << 8 | wide[..., 2]
-    return packed
+    counts = Image.fromarray(np.concatenate(samples)).getcolors(2**24)
+    colours = [channel for _, colour in sorted(counts, reverse=True)[:_COLOURS] for channel in colour]
+    colours += [0] * (3 * (_COLOURS + 1) - len(colours))
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(colours)
+    first, *others = (
+        Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures
+    )
+    options = {
+        "append_images": others,
+        "duration": [10 * max(2, round(100 / fps))] * len(others) + [round(1000 * HOLD_S)],
+        "palette": bytes(colours),
+        "transparency": _COLOURS,
+    }
+    write_atomically(
+        path, lambda file: first.save(file, format="GIF", save_all=True, loop=0, optimize=True, **options)
+    )
 
 
 def write_mp4(path: Path, pictures: Iterable[Bytes], size: tuple[int, int], *, fps: float) -> None:

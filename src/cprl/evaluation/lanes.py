@@ -1,13 +1,14 @@
-"""Plays stored agents in fresh worlds, with all replicas at once as lanes; what came of it, by labels.
+"""Plays labelled populations of stored agents in the same fresh worlds; `Results` is what came of it.
 
-A step of all replicas takes as long as a step of one, and each lane's random numbers depend on (seed,
-replica, agent) alone.
+All replicas play at once, as lanes: a step of all takes as long as a step of one, and each lane's random
+numbers depend on (seed, replica, agent) alone.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Final, Literal, NamedTuple, Protocol, Self, TypeAlias
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, NamedTuple, Self, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -21,6 +22,7 @@ from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.commons.world import Shown
 from cprl.envs.commons_env import CommonsEnv
+from cprl.envs.make_env import is_playable, make_env, spaces_of
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.statistics import (
@@ -32,10 +34,13 @@ from cprl.measuring.statistics import (
     social_measures,
 )
 from cprl.policies.assignment import AgentPolicies
-from cprl.policies.scripted import ScriptedPolicy
+from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
+from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
 from cprl.runs.episodes import Label, labelled
+from cprl.system.defaults import SEED
 from cprl.system.process import one_thread
-from cprl.training.agents import LoadedRun, StoredAgent, stored_policies
+from cprl.training.agents import LoadedRun, Population, StoredAgent, load, stored_policies
+from cprl.values import Positive, Seed, Value, Where, made, refusal, trust
 
 Values = NDArray[np.float64]
 
@@ -44,6 +49,8 @@ Played: TypeAlias = dict[int, list[Episode]]
 
 Agent: TypeAlias = Callable[[int], StoredAgent]
 """Who plays at an index, by the number of the replica."""
+
+Who: TypeAlias = tuple[int, ...]
 
 
 def agents_of(run: LoadedRun, numbers: Mapping[int, int] | None = None) -> list[Agent]:
@@ -63,27 +70,53 @@ def scripted(policy: ScriptedPolicy) -> Agent:
     return lambda _: StoredAgent(scripted=policy)
 
 
-class Place(Protocol):
-    """A game whose fresh worlds can be played, e.g. a `LoadedRun`."""
+def frozen(run: LoadedRun, spec: Frozen) -> Agent:
+    """An agent of a run, of the replica that a specification names."""
+    return lambda replica: run.agent(spec.agent, replica=spec.replica_for(replica))
+
+
+@dataclass(frozen=True)
+class FreshGame:
+    """A game of which fresh worlds are made, like those of a `LoadedRun`."""
+
+    game: Any
 
     @property
-    def game(self) -> Any: ...
+    def playing(self) -> Game | Spaces:
+        return self.game if isinstance(self.game, Game) else spaces_of(self.env())
 
-    @property
-    def playing(self) -> Game | Spaces: ...
+    def env(self, worlds: int = 1, *, seed: int = 0, first_world: int = 0) -> EnvBase:
+        return make_env(self.game, worlds=worlds, seed=seed, first_world=first_world)
 
-    def env(self, worlds: int = 1, *, seed: int = 0, first_world: int = 0) -> EnvBase: ...
+
+def commons_game(run: LoadedRun) -> Game:
+    """The game of a run that has a board; raises a ValueError for others."""
+    if not isinstance(run.game, Game):
+        raise ValueError(f"{run.path} plays a game without a board of cprl; allowed: a run of a cprl.Game")
+    return run.game
+
+
+Place: TypeAlias = LoadedRun | FreshGame
+
+
+def place_of(where: Any) -> Place:
+    """A run as it is, a game as what makes fresh worlds of it."""
+    if isinstance(where, LoadedRun):
+        return where
+    if not is_playable(where):
+        raise refusal("where", where, "a game such as cprl.Game, or a value of cprl.load")
+    return FreshGame(made(where))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fresh:
+class Fresh(Value, stored=False):
     """Fresh episodes of some replicas; replica r plays the worlds from r x episodes on."""
 
-    replicas: tuple[int, ...]
+    replicas: Annotated[tuple[int, ...], Where(bool, "at least one")]
     """Their numbers, ascending."""
-    episodes: int
+    episodes: Positive
     """Of each replica with each choice of who plays where, each in its own world."""
-    seed: int
+    seed: Seed
     """Of the worlds and of all random numbers."""
     greedy: bool = False
     """Whether stored agents take their best action; else they explore as in evaluation."""
@@ -92,12 +125,11 @@ class Fresh:
         counts = {"replica": len(self.replicas), "episode": self.episodes}
         return ", ".join(f"{count} {name}{'s' * (count != 1)}" for name, count in counts.items()) + " each"
 
-    def play(self, where: Place, agents: Sequence[Agent], *, explore: bool | None = None) -> Played:
-        """The episodes by replica; agents explore unless they are greedy, or as is said."""
-        explore = not self.greedy if explore is None else explore
+    def play(self, where: Place, agents: Sequence[Agent]) -> Played:
+        """The episodes by replica."""
         played: Played = {}
         for group, env in self.worlds(where):
-            ended = evaluate(env, self.policies(where, agents, group), explore=explore)
+            ended = evaluate(env, self.policies(where, agents, group), explore=not self.greedy)
             for place, replica in enumerate(group):
                 played[replica] = ended[place * self.episodes : (place + 1) * self.episodes]
         return played
@@ -116,6 +148,38 @@ class Fresh:
         return stored_policies(stored, where.playing, replicas=replicas, worlds=self.episodes, seed=self.seed)
 
 
+def fresh_of(
+    runs: Iterable[LoadedRun], *, replicas: Sequence[int] = (), among: Iterable[LoadedRun] = (), **which: Any
+) -> Fresh:
+    """Fresh episodes of the chosen replicas, or of all that every run has.
+
+    Args:
+        among: more runs of which no agent may have been trained in the worlds.
+        which: episodes, seed and greedy, see `Fresh`.
+    """
+    runs, chosen = list(runs), set(replicas)
+    common = set.intersection(*(set(run.replicas) for run in runs))
+    for run in runs:
+        missing = sorted(chosen - set(run.replicas))
+        if missing:
+            raise ValueError(f"{run.path} has no replicas {missing}; allowed: {run.replicas}")
+    if not common:
+        has = {str(run.path): run.replicas for run in runs}
+        raise ValueError(f"the replicas of the runs are {has}; allowed: runs with a replica in common")
+    fresh = Fresh(replicas=tuple(sorted(chosen or common)), **which)
+    refuse_trained_in(fresh.seed, [*runs, *among])
+    return fresh
+
+
+def refuse_trained_in(seed: int, runs: Iterable[LoadedRun]) -> None:
+    """Raises a ValueError for the seed of worlds in which agents of a run were trained."""
+    for run in runs:
+        if run.experiment.seed == seed:
+            raise ValueError(
+                f"seed is {seed}, the training seed of {run.path}; allowed: any other seed, for fresh worlds"
+            )
+
+
 Whose: TypeAlias = Literal["focal", "background", "group"]
 
 _RETURNS: Final[Mapping[Whose, Callable[[Values, list[int]], float]]] = {
@@ -131,7 +195,7 @@ class Part(NamedTuple):
 
     labels: Label
     played: Played
-    focal: tuple[tuple[int, ...], ...] = ()
+    focal: tuple[Who, ...] = ()
     """The indices of the agents that are judged; several choices where the same episodes stand for each."""
 
 
@@ -190,6 +254,66 @@ class Results:
 def more(reached: Results, usual: Results, whose: Whose) -> Estimate:
     """How much higher a return is in the first results, paired by replica, which played the same worlds."""
     return difference(reached.mean_returns(whose), usual.mean_returns(whose), paired=True)
+
+
+def shifted(counts: Sequence[int]) -> list[Who]:
+    """Which kind plays at each index, where so many agents are of the first kind, of the second and so on:
+    shifted by an index at a time, so that all kinds have each index equally often; one way for one kind."""
+    first = tuple(np.repeat(np.arange(len(counts)), counts).tolist())
+    shifts = range(len(first) if len(set(first)) > 1 else 1)
+    return [first[len(first) - shift :] + first[: len(first) - shift] for shift in shifts]
+
+
+def play_population(
+    where: Any,
+    agents: Sequence[AgentSpec],
+    *,
+    episodes: int = 20,
+    replicas: int = 8,
+    greedy: bool = False,
+    seed: int = SEED,
+    allow: Sequence[str] = (),
+) -> Played:
+    """Plays fresh episodes of a population that does not learn.
+
+    Args:
+        where: a game, or a run, a value of `cprl.load`, whose game and transforms are used.
+        agents: the specification of each agent, `Scripted` or `Frozen`. `Frozen(run, agent, replica=None)`
+            plays in replica r what the run's replica r learned.
+        episodes: episodes of each replica, each in its own world.
+        replicas: the number R of replicas; where all agents are scripted, of independent groups of episodes.
+        greedy: whether stored agents take their best action; else they explore as in evaluation.
+        seed: the seed of the worlds and of all random numbers; with one seed all populations play in the
+            same worlds.
+
+    Returns:
+        Episodes by the index of the replica, 0 to R - 1.
+    """
+    trust(*allow)
+    place = place_of(where)
+    fresh = Fresh(replicas=tuple(range(replicas)), episodes=episodes, seed=seed, greedy=greedy)
+    return fresh.play(place, agents_specified(place, agents, fresh))
+
+
+def agents_specified(place: Place, specs: Sequence[AgentSpec], fresh: Fresh) -> list[Agent]:
+    """The agents of specifications, `Scripted` or `Frozen`, none of which was trained in the worlds."""
+    by_agent = specs_by_agent(specs, place.game.agents)
+    for agent, spec in enumerate(by_agent):
+        if not isinstance(spec, Scripted | Frozen):
+            allowed = "Scripted(policy) or Frozen(run, agent, replica)"
+            raise ValueError(f"agents[{agent}] is a {type(spec).__name__}; allowed: {allowed}")
+    refuse_trained_in(fresh.seed, (load(spec.run) for spec in by_agent if isinstance(spec, Frozen)))
+    population = Population(place.env(len(fresh.replicas)), specs)
+    return [of_replicas.__getitem__ for of_replicas in population.as_stored(fresh.replicas)]
+
+
+def agent_named(who: str, agent: int, *, replica: int | None = None, name: str) -> AgentSpec:
+    """Who plays at an index: a scripted policy, or the agent of a run with that index."""
+    if who in SCRIPTED_POLICIES:
+        return Scripted(who)
+    if not Path(who).is_dir():
+        raise refusal(name, who, f"{', '.join(SCRIPTED_POLICIES)}, or a run's directory")
+    return Frozen(who, agent, replica)
 
 
 Policy = Callable[[TensorDictBase], TensorDictBase]

@@ -4,6 +4,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from math import isnan
+from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
@@ -12,23 +13,24 @@ from rich.text import Text
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from cprl import keys
+from cprl import keys, maps
 from cprl.commons.colours import APPLE, BEAM, PALETTE, WALL, Colour, agent_colour
 from cprl.commons.game import Game
 from cprl.commons.maps import SIGN_OF_HEADING
-from cprl.commons.published import Variant
+from cprl.commons.published import Variant, check_board
+from cprl.commons.rules import Rules
 from cprl.commons.world import Shown, StepOutput
 from cprl.envs.make_env import make_env
 from cprl.envs.unwrap import commons_of
-from cprl.evaluation.lanes import Policy, Turns, board_now
-from cprl.evaluation.populations import agent_named, board_named
+from cprl.evaluation.lanes import Policy, Turns, agent_named, board_now, commons_game
+from cprl.experiment import presets
 from cprl.measuring import social
 from cprl.measuring.metrics import title
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import Scripted
 from cprl.system.defaults import PLAY_SEED
 from cprl.system.output import OUT, console, say
-from cprl.training.agents import Population
+from cprl.training.agents import LoadedRun, Population, load
 from cprl.values import Range, checked, refusal, trust
 
 KEYS: Final = {
@@ -43,6 +45,7 @@ KEYS: Final = {
 }
 """The action of each key, and what it is called."""
 QUIT: Final = "quit"
+_LONGEST_DRAWING_BYTES: Final = 10_000_000
 _PROMPT: Final = "keys> "
 
 
@@ -222,6 +225,33 @@ def board_text(session: Session) -> Text:
     return text
 
 
+def board_named(
+    board: str, variant: Variant = "published", *, allow: Sequence[str] = ()
+) -> tuple[Game, LoadedRun | None]:
+    """A game, and the run that has it.
+
+    Args:
+        board: the name of a published board, the directory of a run, whose game it is then, or a file with a
+            drawing, see `cprl.maps.parse`, played by the published rules.
+    """
+    checked("variant", variant, Variant)
+    check_board(board)
+    if board in presets.BOARDS:
+        return presets.game(board, variant=variant), None
+    if variant != "published":
+        raise refusal("variant", variant, f'"published" with {board}, which names no preset')
+    path = Path(board)
+    if path.is_dir():
+        run = load(path, allow=allow)
+        return commons_game(run), run
+    if path.stat().st_size > _LONGEST_DRAWING_BYTES:
+        raise ValueError(f"{path} has more than {_LONGEST_DRAWING_BYTES:,} bytes; allowed: a drawing")
+    try:
+        return Game(map=maps.parse(path.read_text(encoding="utf-8")), rules=Rules()), None
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
 def open_session(
     board: str,
     *,
@@ -253,7 +283,7 @@ def open_session(
     others = others if others is not None else "greedy" if run is None else board
     if replica and others in SCRIPTED_POLICIES:
         raise ValueError(f'replica is {replica}, and others is "{others}"; allowed: with the agents of a run')
-    specs = [agent_named(others, index, replica=replica) for index in range(game.agents)]
+    specs = [agent_named(others, index, replica=replica, name="others") for index in range(game.agents)]
     specs[agent] = Scripted("random")
     if run is None:
         env = make_env(game, seed=seed)

@@ -1,25 +1,21 @@
-"""Scenarios: agents of a stored run among named backgrounds that they never met.
+"""Scenarios: agents of a stored run among named backgrounds that they never met, called by their focal agents
+and their background, e.g. "minority_among_greedy".
 
-In the manner of Melting Pot (J. Z. Leibo et al., "Scalable Evaluation of Multi-Agent Reinforcement Learning
-with Melting Pot", 2021): focal agents, which are judged, share a board with background agents, which are part
-of the test. A focal majority receives one of the background agents ("resident mode"); a focal minority is one
-agent among background agents ("visitor mode").
+As in Melting Pot (J. Z. Leibo et al., "Scalable Evaluation of Multi-Agent Reinforcement Learning with Melting
+Pot", 2021), focal agents, which are judged, share a board with background agents, which are part of the test.
+A focal majority receives one of the background agents; a focal minority is one agent among them.
 
-A scenario is called by its focal agents and its background, e.g. "minority_among_greedy". Together with the
-board and its variant this names a score that others can hold theirs against.
-
-The focal agents are those of the run, each with its own index, so that everybody starts where it was trained
-to. Every placement of a scenario is played by every replica, in the same worlds for the run's agents and for
-those that it is held against; a number is a replica's mean over episodes and placements, estimated over
-replicas, because only replicas are independent.
+The focal agents are those of the run, each with its own index. Every placement is played by every replica, in
+the same worlds for the run's agents and for those that it is held against; a number is a replica's mean over
+episodes and placements, estimated over replicas, because only replicas are independent.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import isnan
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeAlias, get_args
 
+import numpy as np
 import pyarrow as pa
 from matplotlib.figure import Figure
 from rich.table import Table
@@ -28,27 +24,35 @@ from cprl.commons.game import Game
 from cprl.evaluation.evaluate import (
     INTERVALS,
     SEED,
-    differences,
-    fresh_episodes,
+    bars_of,
     how_they_play,
     opened,
+    refuse_other_games,
     refuse_unlike,
     table_of,
-    unlike,
 )
-from cprl.evaluation.lanes import Agent, Part, Results, Whose, agents_of, more, scripted
+from cprl.evaluation.lanes import (
+    Agent,
+    Part,
+    Results,
+    Who,
+    Whose,
+    agents_of,
+    fresh_of,
+    frozen,
+    more,
+    scripted,
+)
 from cprl.experiment import presets
 from cprl.measuring.metrics import with_unit
-from cprl.measuring.statistics import HOLM, Estimate, Measured, starred
+from cprl.measuring.statistics import HOLM, Estimate, Measured, estimate, starred
 from cprl.population import Frozen, Scripted
 from cprl.terminal import style
-from cprl.training.agents import LoadedRun, StoredAgent, check_scripted, load
+from cprl.training.agents import LoadedRun, check_scripted, load
 from cprl.values import Value, Where, refusal
 
 Focal: TypeAlias = Literal["majority", "minority"]
 """How many agents are focal: "majority", all but one; "minority", one."""
-
-_BACKGROUND: Final = "Scripted(policy) or Frozen(run, agent, replica) for each agent of the game"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,24 +72,21 @@ class Scenario(Value, stored=False):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.game.agents < 2:
-            raise ValueError(
-                f"Scenario.game has {self.game.agents} agent; allowed: at least 2, focal and background"
-            )
+        check_game(self.game, "Scenario.game")
         if len(self.background) != self.game.agents:
-            raise ValueError(
-                f"Scenario.background has {len(self.background)} agents for a game of {self.game.agents} "
-                f"agents; allowed: {_BACKGROUND}"
+            raise refusal(
+                "Scenario.background", self.background, f"one for each of {self.game.agents} agents"
             )
 
     @property
-    def placements(self) -> tuple[tuple[int, ...], ...]:
+    def placements(self) -> tuple[Who, ...]:
         """The indices of the focal agents in turn, so that every agent is focal equally often: as a minority
         each alone, as a majority all without agent 0, without agent 1 and so on."""
         everyone = range(self.game.agents)
-        if self.focal == "minority":
-            return tuple((agent,) for agent in everyone)
-        return tuple(tuple(agent for agent in everyone if agent != other) for other in everyone)
+        is_minority = self.focal == "minority"
+        return tuple(
+            tuple(agent for agent in everyone if (agent == alone) == is_minority) for alone in everyone
+        )
 
 
 SCRIPTED: Final = ("greedy", "sustainable", "territorial", "aggressive")
@@ -106,7 +107,7 @@ _COMMITTED: Final[tuple[tuple[presets.Board, presets.Variant, bool, str], ...]] 
 def results_folder() -> Path:
     """The folder with the results that come with a checkout of cprl, which is `docs/results`; an installed
     wheel has none."""
-    return Path(presets.__file__).parents[3] / "docs" / "results"
+    return Path(__file__).parents[3] / "docs" / "results"
 
 
 def stored_for(game: Game) -> Path | None:
@@ -124,7 +125,7 @@ def left_out_of(game: Game) -> str:
     folder = stored_for(game)
     if folder is None or folder.is_dir():
         return ""
-    names = " and ".join(_name(focal, STORED) for focal in _modes(game))
+    names = " and ".join(f"{focal}_among_{STORED}" for focal in _modes(game))
     return f"{names}: the stored population {folder} comes with a checkout of cprl, and is not there"
 
 
@@ -136,7 +137,6 @@ def scenarios_of(game: Game) -> tuple[Scenario, ...]:
     Without a beam "territorial" and "aggressive" have nothing to fire, and are left out.
     """
     check_game(game)
-    everyone = range(game.agents)
     backgrounds: dict[str, tuple[Scripted | Frozen, ...]] = {
         policy: (Scripted(policy),) * game.agents
         for policy in SCRIPTED
@@ -144,32 +144,25 @@ def scenarios_of(game: Game) -> tuple[Scenario, ...]:
     }
     folder = stored_for(game)
     if folder is not None and folder.is_dir():
-        backgrounds[STORED] = tuple(Frozen(str(folder), agent, replica=None) for agent in everyone)
+        backgrounds[STORED] = tuple(Frozen(str(folder), agent, replica=None) for agent in range(game.agents))
     return tuple(
-        Scenario(name=_name(focal, name), game=game, focal=focal, background=background)
+        Scenario(name=f"{focal}_among_{name}", game=game, focal=focal, background=background)
         for name, background in backgrounds.items()
         for focal in _modes(game)
     )
 
 
-def check_game(game: Any) -> None:
+def check_game(game: Any, name: str = "the game") -> None:
     if not isinstance(game, Game):
-        raise refusal("game", game, "a cprl.Game, because scripted agents read its windows")
+        raise refusal(name, game, "a cprl.Game, because scripted agents read its windows")
     if game.agents < 2:
-        raise ValueError(f"the game has {game.agents} agent; allowed for scenarios: at least 2")
+        raise ValueError(f"{name} has {game.agents} agent; allowed for scenarios: at least 2")
     if game.observation.area != "window":
-        raise ValueError(
-            f"Observation.area is {game.observation.area!r}; allowed for scenarios: 'window', because "
-            "scripted agents rely on the agent's position in it"
-        )
+        raise refusal("Observation.area", game.observation.area, '"window", which scripted agents read')
 
 
 def _modes(game: Game) -> tuple[Focal, ...]:
     return ("minority",) if game.agents == 2 else ("majority", "minority")
-
-
-def _name(focal: Focal, background: str) -> str:
-    return f"{focal}_among_{background}"
 
 
 FocalAgents: TypeAlias = Literal["run", "random", "greedy"]
@@ -200,9 +193,6 @@ class Scores(Results):
     indices, e.g. "0 2 3"."""
 
     run: LoadedRun
-    left_out: str
-    """Which named scenarios of the game were not at hand and why; "" if none was, or others were asked
-    for."""
 
     @property
     def by_scenario(self) -> dict[str, Score]:
@@ -234,9 +224,12 @@ def run_scenarios(
     everyone = range(loaded.game.agents)
     check_scripted([(Scripted("greedy"), tuple(everyone))], loaded.spaces, loaded.game)
     chosen = _chosen(loaded, scenarios)
-    stored = _stored(loaded, chosen)
-    fresh = fresh_episodes(
-        [loaded], episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, trained=stored.values()
+    specs = [spec for scenario in chosen for spec in scenario.background]
+    stored = {path: load(path) for path in {spec.run: None for spec in specs if isinstance(spec, Frozen)}}
+    for path, background_run in stored.items():
+        refuse_other_games({str(loaded.path): loaded, f"the background {path}": background_run})
+    fresh = fresh_of(
+        [loaded], episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, among=stored.values()
     )
     _refuse_meeting_itself(loaded, chosen, stored, fresh.replicas)
     focal_agents: dict[FocalAgents, Sequence[Agent]] = {
@@ -253,36 +246,22 @@ def run_scenarios(
                 indices = " ".join(map(str, places))
                 labels = {"scenario": scenario.name, "focal": who, "focal_agents": indices}
                 parts.append(Part(labels, fresh.play(loaded, agents), (places,)))
-    left_out = "" if scenarios else left_out_of(loaded.game)
-    return Scores(run=loaded, parts=parts, fresh=fresh, left_out=left_out)
+    return Scores(run=loaded, parts=parts, fresh=fresh)
 
 
 def _chosen(run: LoadedRun, scenarios: Sequence[str | Scenario]) -> list[Scenario]:
     """The scenarios by their names or as they are, checked against the run's game."""
     named = {scenario.name: scenario for scenario in scenarios_of(run.game)}
     chosen: dict[str, Scenario] = {}
-    for given in scenarios:
+    for given in scenarios or named:
         if isinstance(given, str) and given not in named:
-            why = left_out_of(run.game)
-            raise ValueError(
-                f"a scenario is {given!r}; allowed for this game: {', '.join(named)}"
-                + (f"; not at hand are {why}" if why else "")
-            )
+            raise refusal("a scenario", given, f"{', '.join(named)}; {left_out_of(run.game)}".rstrip("; "))
         scenario = named[given] if isinstance(given, str) else given
         if scenario.name in chosen:
             raise ValueError(f"{scenario.name} is given twice; allowed: scenarios with different names")
-        refuse_unlike(f"{run.path} and the scenario {scenario.name}", differences(run.game, scenario.game))
+        refuse_unlike(f"{run.path} and the scenario {scenario.name}", run.game, scenario.game)
         chosen[scenario.name] = scenario
-    return list((chosen or named).values())
-
-
-def _stored(run: LoadedRun, scenarios: Sequence[Scenario]) -> dict[str, LoadedRun]:
-    specs = (spec for scenario in scenarios for spec in scenario.background)
-    paths = dict.fromkeys(spec.run for spec in specs if isinstance(spec, Frozen))
-    runs = {path: load(path) for path in paths}
-    for path, stored in runs.items():
-        refuse_unlike(f"{run.path} and the background {path}", unlike(run, stored))
-    return runs
+    return list(chosen.values())
 
 
 def _background(spec: Scripted | Frozen, stored: Mapping[str, LoadedRun]) -> Agent:
@@ -290,12 +269,9 @@ def _background(spec: Scripted | Frozen, stored: Mapping[str, LoadedRun]) -> Age
     if isinstance(spec, Scripted):
         return scripted(spec.policy)
     run = stored[spec.run]
-
-    def theirs(replica: int) -> StoredAgent:
-        number = _following(run, replica) if spec.replica is None else spec.replica_for(replica)
-        return run.agent(spec.agent, replica=number)
-
-    return theirs
+    if spec.replica is not None:
+        return frozen(run, spec)
+    return lambda replica: run.agent(spec.agent, replica=_following(run, replica))
 
 
 def _following(run: LoadedRun, replica: int) -> int:
@@ -311,20 +287,16 @@ def _refuse_meeting_itself(
 ) -> None:
     """Raises a ValueError for a background that has no other replica than one that it would play beside."""
     for scenario in scenarios:
-        for spec in scenario.background:
-            if not isinstance(spec, Frozen) or spec.replica is not None:
-                continue
-            background = stored[spec.run]
-            if (
-                background.experiment.seed == run.experiment.seed
-                and len(background.replicas) == 1
-                and background.replicas[0] in replicas
-            ):
+        of_any = {
+            spec.run for spec in scenario.background if isinstance(spec, Frozen) and spec.replica is None
+        }
+        for background in map(stored.__getitem__, of_any):
+            is_alike = background.experiment.seed == run.experiment.seed
+            if is_alike and len(background.replicas) == 1 and background.replicas[0] in replicas:
                 raise ValueError(
                     f"the scenario {scenario.name} has the background {background.path}, which keeps the "
-                    f"single replica {background.replicas[0]}, so that agents trained together or from the "
-                    f"same seed, {run.experiment.seed}, would meet; allowed: a run of at least 2 replicas, "
-                    "one of another seed, or a Frozen with the number of its replica"
+                    f"single replica {background.replicas[0]} of the same seed; allowed: a run of at least 2 "
+                    "replicas, one of another seed, or a Frozen with the number of its replica"
                 )
 
 
@@ -352,8 +324,8 @@ def scenario_tables(scores: Scores) -> Iterator[Table]:
         focal = [str(score.measures(who)["focal/return"]) for who in FOCAL_AGENTS]
         rows.append((name, *focal, next(texts), next(texts), str(score.measures()["background/return"])))
     table = table_of("return per agent (apples)", columns, rows)
-    left_out = f". Left out: {scores.left_out}" if scores.left_out else ""
-    table.caption = f"{HOLM} for all {len(ahead)} differences{left_out}"
+    left_out = left_out_of(scores.run.game)
+    table.caption = f"{HOLM} for all {len(ahead)} differences" + f". Left out: {left_out}" * bool(left_out)
     yield table
     title = "all agents together, with the run's agents in the focal places"
     measured = {name: score.measures() for name, score in by_scenario.items()}
@@ -372,24 +344,17 @@ def estimates(scores: Scores) -> pa.Table:
         for who in FOCAL_AGENTS:
             measures = score.measures(who)
             for whose in ("focal", "background") if who != "run" else ():
-                ahead, episodes = score.advantage(who, whose=whose), measures["focal/return"].episodes
-                measures[f"{whose}/advantage"] = Measured(estimate=ahead, undefined=0, episodes=episodes)
-            rows += [
-                {"scenario": scenario, "focal": who, "metric": metric}
-                | {name: _number(measured.estimate, name) for name in ("value", "low", "high")}
-                | {"replicas": getattr(measured.estimate, "replicas", 0)}
-                | {"episodes": measured.episodes, "undefined": measured.undefined}
-                for metric, measured in measures.items()
-            ]
-    kinds = dict.fromkeys(("scenario", "focal", "metric"), pa.string())
-    kinds |= dict.fromkeys(("value", "low", "high"), pa.float64())
-    kinds |= dict.fromkeys(("replicas", "episodes", "undefined"), pa.int32())
-    return pa.Table.from_pylist(rows, schema=pa.schema(kinds))
-
-
-def _number(estimated: Estimate | None, name: str) -> float | None:
-    number = float(getattr(estimated, name, "nan"))
-    return None if isnan(number) else number
+                ahead = score.advantage(who, whose=whose)
+                measures[f"{whose}/advantage"] = replace(
+                    measures["focal/return"], estimate=ahead, undefined=0
+                )
+            for metric, measured in measures.items():
+                numbers = {name: getattr(measured.estimate, name, None) for name in ("value", "low", "high")}
+                replicas = getattr(measured.estimate, "replicas", 0)
+                counts = {"episodes": measured.episodes, "undefined": measured.undefined}
+                labels = {"scenario": scenario, "focal": who, "metric": metric}
+                rows.append({**labels, **numbers, "replicas": replicas, **counts})
+    return pa.table({name: pa.array([row[name] for row in rows], from_pandas=True) for name in rows[0]})
 
 
 _LOOKS: Final[dict[tuple[FocalAgents, Whose], tuple[str, str, str]]] = {
@@ -410,18 +375,15 @@ def draw_scenarios(scores: Scores, path: Path | str) -> Path:
     """
     path, by_scenario = style.picture_path(path), scores.by_scenario
     figure = Figure((8.0, _ROW_IN * len(by_scenario) + 2.0), layout="constrained")
-    axes = figure.subplots()
+    axes, rows = figure.subplots(), np.arange(len(by_scenario))
     for place, ((who, whose), (marker, colour, label)) in enumerate(_LOOKS.items()):
-        for row, score in enumerate(by_scenario.values()):
-            at = row + _BAND * (place - (len(_LOOKS) - 1) / 2)
-            estimate = score.measures(who)[f"{whose}/return"].estimate
-            assert estimate is not None  # a return is always defined
-            axes.plot([estimate.low, estimate.high], [at, at], color=colour, linewidth=2)
-            look: dict[str, Any] = {"color": colour, "markersize": 6, "linestyle": "none", "zorder": 3}
-            axes.plot(estimate.value, at, marker, label="" if row else label, **look)
+        returns = [score.where(focal=who).mean_returns(whose) for score in by_scenario.values()]
+        means, reach = bars_of(map(estimate, returns))
+        at = rows + _BAND * (place - (len(_LOOKS) - 1) / 2)
+        axes.errorbar(means, at, xerr=reach, fmt=marker, color=colour, markersize=6, label=label)
     for row in range(1, len(by_scenario)):
         axes.axhline(row - 0.5, color="#dddddd", linewidth=0.8)
-    axes.set_yticks(range(len(by_scenario)), [name.replace("_", " ") for name in by_scenario])
+    axes.set_yticks(rows, [name.replace("_", " ") for name in by_scenario])
     axes.set_ylim(len(by_scenario) - 0.5, -0.5)
     style.write_small(axes, x="return per agent, apples")
     figure.legend(loc="outside lower center", ncols=2, fontsize=style.SMALL_PT, frameon=False)

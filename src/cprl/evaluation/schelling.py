@@ -1,14 +1,12 @@
 """schelling: what restrained and greedy agents get, by how many of the others are restrained, and which
 social dilemma that makes.
 
-All mixes of N agents are played: k restrained and N - k greedy ones, for k = 0 to N. Where both kinds play, a
-mix is played N times, with the restrained agents at the indices s to s + k - 1, cyclically, for each s, so
-that each index is restrained as often as every other. A replica's payoff is the mean over those and its
-episodes.
+All mixes of N agents are played: k restrained and N - k greedy ones, for k = 0 to N, each shifted by one
+index at a time, so that each index is restrained as often as every other.
 
 R(k) is what an agent gets that restrains itself while k of the N - 1 others do, G(k) what it gets if it is
-greedy instead. There is a dilemma if all agents prefer restraint of all to greed of all, R(N-1) > G(0), and
-to being the only one who restrains itself, R(N-1) > R(0), and yet one of two things pulls an agent from it:
+greedy instead. There is a dilemma if all prefer restraint of all to greed of all, R(N-1) > G(0), and to being
+the only one who restrains itself, R(N-1) > R(0), and yet one of two things pulls an agent from it:
 
     fear    G(0) > R(0): who meets greedy agents only had better be greedy
     greed   G(N-1) > R(N-1): who meets restrained agents only had better be greedy
@@ -35,18 +33,26 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from cprl.commons.game import Game
-from cprl.evaluation.evaluate import INTERVALS, SEED, table_of
-from cprl.evaluation.lanes import Fresh, Part, Played, Results, Values, Whose
-from cprl.evaluation.populations import agent_named, place_of, play_population
+from cprl.evaluation.evaluate import INTERVALS, SEED, bars_of, table_of
+from cprl.evaluation.lanes import (
+    Fresh,
+    Part,
+    Played,
+    Results,
+    Values,
+    Who,
+    Whose,
+    agent_named,
+    agents_specified,
+    place_of,
+    shifted,
+)
 from cprl.measuring.statistics import Estimate, Measured, difference, estimate
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.terminal import style
-from cprl.values import trust
+from cprl.values import refusal, trust
 
-NONE: Final = "no dilemma"
-UNTOLD: Final = "cannot be told"
-_ALL: Final = 4
-"""The number of names: three dilemmas, and none."""
+_NAMES: Final = ("prisoner's dilemma", "chicken", "stag hunt", "no dilemma")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +78,7 @@ class Dilemma:
     @property
     def name(self) -> str:
         """The dilemma, or those that it may be."""
-        return " or ".join(self.candidates) if len(self.candidates) < _ALL else UNTOLD
+        return " or ".join(self.candidates) if len(self.candidates) < len(_NAMES) else "cannot be told"
 
 
 def dilemma(restrained: Values, greedy: Values) -> Dilemma:
@@ -97,9 +103,10 @@ def dilemma(restrained: Values, greedy: Values) -> Dilemma:
 
 
 def _name(restraint: bool, company: bool, fear: bool, greed: bool) -> str:
+    prisoners, chicken, stag_hunt, none = _NAMES
     if not (restraint and company and (fear or greed)):
-        return NONE
-    return "prisoner's dilemma" if fear and greed else "chicken" if greed else "stag hunt"
+        return none
+    return prisoners if fear and greed else chicken if greed else stag_hunt
 
 
 def _signs(margin: Estimate) -> Iterator[bool]:
@@ -108,12 +115,6 @@ def _signs(margin: Estimate) -> Iterator[bool]:
         yield True
     if isnan(margin.low) or margin.low <= 0:
         yield False
-
-
-_ALIKE_WITHOUT_A_BEAM: Final = {"greedy", "territorial"}
-
-Who = tuple[int, ...]
-"""The indices of the restrained agents, ascending."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -152,7 +153,7 @@ class SchellingDiagram(Results):
 
     @property
     def by_mix(self) -> dict[Who, Played]:
-        """The episodes by the indices of the restrained agents."""
+        """The episodes by the indices of the restrained agents, ascending."""
         return {focal: part.played for part in self.parts for focal in part.focal}
 
     def _mixes(self, count: int) -> Results:
@@ -184,42 +185,31 @@ def schelling(
         seed: the seed of the worlds, in which all mixes play, and of all random numbers.
     """
     trust(*allow)
-    agents = place_of(where).game.agents
+    place = place_of(where)
+    agents = place.game.agents
     if agents < 2:
         raise ValueError("the game has 1 agent; allowed for a Schelling diagram: at least 2")
-    _check_unlike(place_of(where).game, restrained, greedy)
-    specs = {
-        is_restrained: [agent_named(name_of, agent, replica=None, name=name) for agent in range(agents)]
-        for is_restrained, name, name_of in ((True, "restrained", restrained), (False, "greedy", greedy))
-    }
-    parts = []
-    for who in _mixes(agents):
-        mix = [specs[agent in who][agent] for agent in range(agents)]
-        played = play_population(where, mix, episodes=episodes, replicas=replicas, seed=seed)
-        parts.append(Part({"restrained": " ".join(map(str, who))}, played, (who,)))
+    _refuse_alike(place.game, restrained, greedy)
     fresh = Fresh(replicas=tuple(range(replicas)), episodes=episodes, seed=seed)
+    kinds = [
+        agents_specified(place, [agent_named(who, agent, name=name) for agent in range(agents)], fresh)
+        for name, who in (("restrained", restrained), ("greedy", greedy))
+    ]
+    parts = []
+    for count in range(agents + 1):
+        for kind_of_agent in shifted((count, agents - count)):
+            who = tuple(agent for agent, kind in enumerate(kind_of_agent) if kind == 0)
+            mix = [kinds[kind][agent] for agent, kind in enumerate(kind_of_agent)]
+            parts.append(Part({"restrained": " ".join(map(str, who))}, fresh.play(place, mix), (who,)))
     return SchellingDiagram(agents=agents, restrained=restrained, greedy=greedy, parts=parts, fresh=fresh)
 
 
-def _check_unlike(game: Any, restrained: str, greedy: str) -> None:
+def _refuse_alike(game: Any, restrained: str, greedy: str) -> None:
     """Refuses the same policy twice, also in other words."""
-    one, other = (who if who in SCRIPTED_POLICIES else Path(who).resolve() for who in (restrained, greedy))
-    if one == other:
-        words = f"both {greedy!r}" if restrained == greedy else f"{restrained!r} and {greedy!r}, the same run"
-        raise ValueError(f"restrained and greedy are {words}; allowed: two ways to play")
-    if isinstance(game, Game) and not game.rules.may_fire and {one, other} <= _ALIKE_WITHOUT_A_BEAM:
-        raise ValueError(
-            f"restrained is {restrained!r} and greedy {greedy!r}, which play alike without a beam; "
-            "allowed: two ways to play"
-        )
-
-
-def _mixes(agents: int) -> list[Who]:
-    return [
-        tuple(sorted((first + place) % agents for place in range(count)))
-        for count in range(agents + 1)
-        for first in range(agents if 0 < count < agents else 1)
-    ]
+    pair = {who if who in SCRIPTED_POLICIES else Path(who).resolve() for who in (restrained, greedy)}
+    has_no_beam = isinstance(game, Game) and not game.rules.may_fire
+    if len(pair) == 1 or (has_no_beam and pair == {"greedy", "territorial"}):
+        raise refusal("greedy", greedy, f"another way to play than restrained, {restrained!r}")
 
 
 _RESTRAINED: Final = "#1b7837"
@@ -251,12 +241,10 @@ def draw_schelling(diagram: SchellingDiagram, path: Path | str) -> Path:
     return style.save(figure, path)
 
 
-def _line(axes: Axes, values: Values, **style_of_line: Any) -> None:
+def _line(axes: Axes, values: Values, **look: Any) -> None:
     """Means of [R, K] at 0 to K - 1 with their intervals."""
-    estimates = [estimate(payoffs) for payoffs in values.T]
-    means = np.array([mean.value for mean in estimates])
-    reach = np.abs(np.array([(mean.low, mean.high) for mean in estimates]).T - means)
-    axes.errorbar(range(len(means)), means, np.nan_to_num(reach), capsize=2, markersize=5, **style_of_line)
+    means, reach = bars_of(map(estimate, values.T))
+    axes.errorbar(range(len(means)), means, reach, capsize=2, markersize=5, **look)
     axes.set_xticks(range(len(means)))
 
 

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, agent_colour
-from cprl.commons.game import Game
 from cprl.commons.maps import Map
-from cprl.evaluation.evaluate import SEED, fresh_episodes, heading_beside_random, opened, table_of
-from cprl.evaluation.lanes import Agent, Fresh, agents_of, scripted
+from cprl.evaluation.evaluate import SEED, heading_beside_random, opened, table_of
+from cprl.evaluation.lanes import Agent, Fresh, agents_of, commons_game, fresh_of, scripted
 from cprl.measuring import movement
 from cprl.measuring.movement import Trace, overlap, owners, trace, visits
 from cprl.measuring.statistics import Estimate, estimate
@@ -84,22 +83,21 @@ def territory_of(
     The episodes are those of `cprl.evaluate_run` with the same arguments.
     """
     loaded = opened(run, allow)
-    if not isinstance(loaded.game, Game):
-        raise ValueError(f"{loaded.path} plays a game without a board of cprl; allowed: a run of a cprl.Game")
-    fresh = fresh_episodes([loaded], episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
+    commons_game(loaded)
+    fresh = fresh_of([loaded], episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
     random = [scripted("random")] * loaded.game.agents
     return Territory(
         run=loaded,
         fresh=fresh,
-        trained=_stays(loaded, agents_of(loaded), fresh, explore=not greedy),
-        random=_stays(loaded, random, fresh, explore=True),
+        trained=_stays(loaded, agents_of(loaded), fresh),
+        random=_stays(loaded, random, fresh),
     )
 
 
-def _stays(run: LoadedRun, agents: Sequence[Agent], fresh: Fresh, *, explore: bool) -> Stays:
+def _stays(run: LoadedRun, agents: Sequence[Agent], fresh: Fresh) -> Stays:
     by_replica: list[dict[str, Any]] = []
     for group, env in fresh.worlds(run):
-        played = trace(env, fresh.policies(run, agents, group), explore=explore)
+        played = trace(env, fresh.policies(run, agents, group), explore=not fresh.greedy)
         firsts = range(0, len(group) * fresh.episodes, fresh.episodes)
         by_replica += [_of_replica(played.worlds(first, first + fresh.episodes)) for first in firsts]
     stacked = {name: np.stack([arrays[name] for arrays in by_replica]) for name in by_replica[0]}
@@ -155,14 +153,27 @@ def draw_visits(
         raise refusal("replica", number, f"one that played, of {list(replicas)}")
     place = replicas.index(number)
     board, shares = territory.run.game.map, stays.visits[place]
-    figure, panels = _panels(len(shares) + 1, board)
+    columns = min(COLUMNS, len(shares) + 1)
+    lines, wide = ceil((len(shares) + 1) / columns), style.WIDTH_IN * 1.25 / columns
+    size = wide * columns, lines * (wide * board.height / board.width + 0.3) + 0.7
+    figure = Figure(size, layout="constrained")
+    panels = [figure.add_subplot(lines, columns, at + 1) for at in range(len(shares) + 1)]
+    owner, longest, total = owners(shares), shares.max(0), shares.sum(0)
+    hues = np.stack([_rgb(agent_colour(agent)) for agent in range(len(shares))])
     for agent, panel in enumerate(panels[:-1]):
-        tagged = f"agent {agent}, tagged {int(stays.taggings[place, agent].sum()):,} times"
-        hue = np.broadcast_to(_rgb(agent_colour(agent)), (board.height, board.width, 3))
-        _show(panel, board, hue, _light(shares[agent], shares.max()), tagged)
+        title = f"agent {agent}, tagged {int(stays.taggings[place, agent].sum()):,} times"
+        _show(panel, board, hues[agent], _light(shares[agent], shares.max()), title)
         row, col, _ = board.starts[agent]
         panel.plot(col, row, "o", markersize=5, fillstyle="none", color="white", markeredgewidth=0.8)
-    _show_owners(panels[-1], board, shares)
+        owned = np.where(owner == agent, shares[agent], 0.0)
+        if owned.any():
+            row, col = divmod(int(owned.argmax()), board.width)
+            look = {"color": "white", "fontsize": 7, "ha": "center", "va": "center_baseline"}
+            panels[-1].text(col, row, str(agent), **look)
+    alone = np.divide(longest, total, out=np.zeros_like(total), where=total > 0)
+    light = DARKEST + (1 - DARKEST) * np.sqrt(longest / max(longest.max(), 1e-12)) * alone
+    owned_light = np.where(owner >= 0, light, 0.0)
+    _show(panels[-1], board, hues[owner], owned_light, "who spends most time where")
     index, sharing = (float(stays.by_replica[name][place]) for name in (EXCLUSION, VISITORS))
     who = "random agents" if policy == "random" else "its agents"
     title = (
@@ -171,26 +182,6 @@ def draw_visits(
     )
     figure.suptitle(fill(title, style.TITLE_CHARACTERS), fontsize=11)
     return style.save(figure, path, colours=style.SHADES)
-
-
-def _panels(count: int, board: Map) -> tuple[Figure, list[Axes]]:
-    columns = min(COLUMNS, count)
-    rows = ceil(count / columns)
-    wide = style.WIDTH_IN * 1.25 / columns
-    figure = Figure(
-        figsize=(wide * columns, rows * (wide * board.height / board.width + 0.3) + 0.7), layout="constrained"
-    )
-    panels = [figure.add_subplot(rows, columns, place + 1) for place in range(count)]
-    return figure, panels
-
-
-def _light(shares: Array, longest: float) -> Array:
-    """The brightness of cells, 0..1, by the square root of the share of an agent's time."""
-    return np.where(shares > 0, DARKEST + (1 - DARKEST) * np.sqrt(shares / max(longest, 1e-12)), 0.0)
-
-
-def _rgb(colour: tuple[int, int, int]) -> Array:
-    return np.array(colour) / 255
 
 
 def _show(panel: Axes, board: Map, hues: Array, light: Array, title: str) -> None:
@@ -205,19 +196,13 @@ def _show(panel: Axes, board: Map, hues: Array, light: Array, title: str) -> Non
     panel.set_title(title, fontsize=style.SMALL_PT)
 
 
-def _show_owners(panel: Axes, board: Map, shares: Array) -> None:
-    """Shows who owns each cell, with the owner's number in the middle of what it owns."""
-    owner, longest, total = owners(shares), shares.max(0), shares.sum(0)
-    alone = np.divide(longest, total, out=np.zeros_like(total), where=total > 0)
-    light = DARKEST + (1 - DARKEST) * np.sqrt(longest / max(longest.max(), 1e-12)) * alone
-    hues = np.stack([_rgb(agent_colour(agent)) for agent in range(len(shares))])
-    title = "who spends most time where"
-    _show(panel, board, hues[owner], np.where(owner >= 0, light, 0.0), title)
-    for agent, share in enumerate(shares):
-        owned = np.where(owner == agent, share, 0.0)
-        if owned.any():
-            row, col = divmod(int(owned.argmax()), board.width)
-            panel.text(col, row, str(agent), color="white", fontsize=7, ha="center", va="center_baseline")
+def _light(shares: Array, longest: float) -> Array:
+    """The brightness of cells, 0..1, by the square root of the share of an agent's time."""
+    return np.where(shares > 0, DARKEST + (1 - DARKEST) * np.sqrt(shares / max(longest, 1e-12)), 0.0)
+
+
+def _rgb(colour: tuple[int, int, int]) -> Array:
+    return np.array(colour) / 255
 
 
 def territory_table(territory: Territory) -> Table:
