@@ -1,24 +1,19 @@
-"""Where agents go, when they fire, who keeps to which cells: on boards small enough to count by hand."""
+"""Where agents go, when they fire, who keeps to which cells: on boards small enough to count by hand, and of
+stored runs in fresh worlds beside random play."""
 
 import numpy as np
 import pytest
 import torch
+from matplotlib.image import imread
 from results import distance_to_nearest, rounds, shooting_distance
+from stored_runs import SEED
 from tensordict.nn import TensorDictModuleBase
 
+import cprl
 from cprl import CommonsEnv, Game, Rules, keys, maps
-from cprl.measuring.movement import (
-    Trace,
-    defence,
-    exclusion,
-    overlap,
-    owners,
-    tagged_where,
-    taggings,
-    trace,
-    visitors,
-    visits,
-)
+from cprl.evaluation import territory_of
+from cprl.evaluation.territory import DEFENCE, EXCLUSION, OVERLAP, TAGS, VISITORS, draw_visits
+from cprl.measuring import movement
 
 FORWARD, LEFT, RIGHT, TURN_RIGHT, BEAM, STAY = 0, 2, 3, 5, 6, 7
 
@@ -31,7 +26,7 @@ def drawn(cells, *, fired=(), in_play=None, board=(3, 4)):
     for step, agent in fired:
         shots[step, 0, agent] = True
     here = np.ones(shape, bool) if in_play is None else np.array(in_play, bool)[:, None]
-    return Trace(
+    return movement.Trace(
         row=places[..., 0],
         col=places[..., 1],
         in_play=here,
@@ -61,7 +56,9 @@ def test_a_trace_has_the_cells_of_all_agents_at_the_start_of_each_step_and_every
         map=maps.parse("A...A\n>...<\n....."),
         rules=Rules(regrow_prob=(0.0,), episode_steps=4, window_rows=3, window_columns=5, freeze_steps=9),
     )
-    played = trace(CommonsEnv(game), Doing([(FORWARD, STAY), (BEAM, FORWARD), (STAY, STAY), (STAY, STAY)]))
+    played = movement.trace(
+        CommonsEnv(game), Doing([(FORWARD, STAY), (BEAM, FORWARD), (STAY, STAY), (STAY, STAY)])
+    )
     assert played.row[:, 0].tolist() == [[1, 1]] * 4
     assert played.col[:, 0, 0].tolist() == [0, 1, 1, 1]
     assert played.fired[:, 0].tolist() == [[False, False], [True, False], [False, False], [False, False]]
@@ -69,33 +66,33 @@ def test_a_trace_has_the_cells_of_all_agents_at_the_start_of_each_step_and_every
     assert played.played.all()
     assert played.board == (3, 5)
     assert played.tags.tolist() == [[1, 0, 1, 0]], "agent 1 in step 1, by agent 0"
-    assert taggings(played)[0].tolist() == [[0, 0], [1, 0]]
-    where = np.argwhere(tagged_where(played))
+    assert movement.taggings(played)[0].tolist() == [[0, 0], [1, 0]]
+    where = np.argwhere(movement.tagged_where(played))
     assert where.tolist() == [[0, 1, 1, 4]], "world 0, agent 1, at the cell from which it walked"
 
 
 def test_a_trace_marks_the_steps_of_worlds_that_have_ended_as_not_played():
     game = Game(map=maps.parse("A>.\n..."), rules=Rules(regrow_prob=(0.0,), episode_steps=3))
     actions = torch.tensor([[1], [7 - 1]])  # backward onto the only apple; stay
-    found = trace(CommonsEnv(game, 2), lambda moment: moment.set(keys.ACTION, actions))
+    found = movement.trace(CommonsEnv(game, 2), lambda moment: moment.set(keys.ACTION, actions))
     assert found.played.sum(0).tolist() == [1, 3]
 
 
 def test_visits_are_shares_of_the_steps_in_play():
     cells = [[(0, 0), (2, 3)], [(0, 1), (2, 3)], [(0, 1), (2, 3)], [(0, 1), (0, 0)]]
     in_play = [[1, 1], [1, 1], [1, 0], [1, 1]]
-    shares = visits(drawn(cells, in_play=in_play))[0]
+    shares = movement.visits(drawn(cells, in_play=in_play))[0]
     assert shares[0, 0, :2].tolist() == [0.25, 0.75]
     assert shares[1, 2, 3] == pytest.approx(2 / 3)
     assert shares.sum((-2, -1)).tolist() == pytest.approx([1.0, 1.0])
 
 
 def test_overlap_is_one_for_the_same_cells_and_zero_for_different_ones():
-    assert overlap(drawn([[(0, 0), (0, 1)], [(0, 1), (0, 0)]])).tolist() == [1.0]
-    assert overlap(drawn([[(0, 0), (2, 3)], [(0, 1), (2, 2)]])).tolist() == [0.0]
+    assert movement.overlap(drawn([[(0, 0), (0, 1)], [(0, 1), (0, 0)]])).tolist() == [1.0]
+    assert movement.overlap(drawn([[(0, 0), (2, 3)], [(0, 1), (2, 2)]])).tolist() == [0.0]
     # (0, 0): 1/2 and 1/2; only one agent visits (0, 1), only the other (0, 2).
-    assert overlap(drawn([[(0, 0), (0, 0)], [(0, 1), (0, 2)]])).tolist() == [0.5]
-    assert np.isnan(overlap(drawn([[(0, 0)], [(0, 1)]]))).all()
+    assert movement.overlap(drawn([[(0, 0), (0, 0)], [(0, 1), (0, 2)]])).tolist() == [0.5]
+    assert np.isnan(movement.overlap(drawn([[(0, 0)], [(0, 1)]]))).all()
 
 
 def test_rounds_count_signed_turns_about_the_centre():
@@ -159,29 +156,84 @@ NOBODY = [[0, 0, 0, 0]]
     ],
 )
 def test_agents_exclude_each_other_as_far_as_a_cell_says_who_they_are(shares, excluded, sharing):
-    np.testing.assert_allclose(exclusion(shares), excluded, atol=1e-6)
-    np.testing.assert_allclose(visitors(shares), sharing, atol=1e-6)
+    np.testing.assert_allclose(movement.exclusion(shares), excluded, atol=1e-6)
+    np.testing.assert_allclose(movement.visitors(shares), sharing, atol=1e-6)
 
 
 def test_the_owner_of_a_cell_spends_the_largest_share_there():
-    assert owners([[[0.75, 0.25, 0]], [[0.25, 0.75, 0]]]).tolist() == [[0, 1, -1]]
-    assert owners(ALIKE).tolist() == [[0, 0, -1, -1]], "of equal ones the first"
+    assert movement.owners([[[0.75, 0.25, 0]], [[0.25, 0.75, 0]]]).tolist() == [[0, 1, -1]]
+    assert movement.owners(ALIKE).tolist() == [[0, 0, -1, -1]], "of equal ones the first"
 
 
 def test_two_beams_at_once_count_for_both_who_fired_and_once_for_the_tagged():
     played = shot([(0, 0, 2, 0), (0, 0, 2, 1), (1, 0, 0, 1)], [[(0, 0), (0, 3), (2, 2)]] * 2)
-    assert taggings(played)[0].tolist() == [[0, 1, 0], [0, 0, 0], [1, 1, 0]]
-    assert tagged_where(played).sum((0, 2, 3)).tolist() == [1, 0, 1]
-    assert tagged_where(played)[0, 2, 2, 2] == 1
+    assert movement.taggings(played)[0].tolist() == [[0, 1, 0], [0, 0, 0], [1, 1, 0]]
+    assert movement.tagged_where(played).sum((0, 2, 3)).tolist() == [1, 0, 1]
+    assert movement.tagged_where(played)[0, 2, 2, 2] == 1
 
 
 def test_to_defend_is_to_tag_whom_one_finds_in_ones_own_cells():
     # Agent 1 comes into (0, 0) in the last of four steps, where agent 0 was in three of its four.
     cells = [[(0, 0), (2, 3)], [(0, 0), (2, 3)], [(0, 0), (2, 3)], [(0, 1), (0, 0)]]
     at_home = shot([(3, 0, 1, 0)], cells)
-    assert defence(at_home, visits(at_home)).tolist() == [1.0]
+    assert movement.defence(at_home, movement.visits(at_home)).tolist() == [1.0]
     intruding = shot([(3, 0, 1, 0), (0, 0, 1, 0)], cells)
-    assert defence(intruding, visits(intruding)).tolist() == [0.5], "the second one at (2, 3), the other's"
+    assert movement.defence(intruding, movement.visits(intruding)).tolist() == [0.5], (
+        "the second one at (2, 3), the other's"
+    )
     nowhere = np.zeros((2, 3, 4))
-    assert defence(at_home, nowhere).tolist() == [0.5], "neither is at home"
-    assert np.isnan(defence(shot([], cells), nowhere)).all()
+    assert movement.defence(at_home, nowhere).tolist() == [0.5], "neither is at home"
+    assert np.isnan(movement.defence(shot([], cells), nowhere)).all()
+
+
+def test_agents_in_corridors_of_their_own_exclude_each_other(corridors):
+    found = territory_of(corridors["greedy"], episodes=4)
+    measured = found.trained.measures()
+    assert measured[EXCLUSION].value == measured[VISITORS].value == 1
+    assert measured[OVERLAP].value == measured[TAGS].value == 0
+    assert DEFENCE not in measured, "nobody can fire"
+    # Agent 0 starts at (0, 0) and bites at columns 1 and 3 in steps 1 and 3; the cell of step t is that at
+    # its start. Agent 1 starts at (2, 4) and walks left. After step 3 the board is dead.
+    assert found.trained.visits.shape == (2, 2, 3, 5)
+    np.testing.assert_allclose(found.trained.visits[0, 0, 0], [1 / 3, 1 / 3, 1 / 3, 0, 0])
+    np.testing.assert_allclose(found.trained.visits[1, 1, 2], [0, 0, 1 / 3, 1 / 3, 1 / 3])
+
+
+def test_the_episodes_are_those_of_an_evaluation(alike):
+    found, played = (ask(alike, episodes=5, seed=SEED) for ask in (territory_of, cprl.evaluate_run))
+    for policy in ("trained", "random"):
+        stays = found.of(policy)
+        for place, replica in enumerate(found.fresh.replicas):
+            episodes = getattr(played, policy)[replica]
+            tagged_by = sum(own.tagged_by for own in episodes)
+            assert stays.taggings[place].tolist() == tagged_by.tolist()
+            tagged = sum(own.tagged for own in episodes)
+            assert stays.tagged_where[place].sum((1, 2)).tolist() == tagged.tolist()
+            per_1000 = 1000 * tagged_by.sum() / sum(own.steps for own in episodes)
+            assert stays.by_replica[TAGS][place] == pytest.approx(per_1000)
+    assert found.random.taggings.sum() > 0
+
+
+def test_the_maps_show_where_each_agent_was_and_are_not_written_over(corridors, tmp_path):
+    found = territory_of(corridors["greedy"], episodes=2)
+    path = draw_visits(found, tmp_path / "new" / "visits.png", replica=1)
+    picture = (imread(path)[..., :3] * 255).round()
+    for agent, colour in ((0, (86, 180, 233)), (1, (230, 97, 0))):
+        assert (np.abs(picture - colour).max(-1) < 2).sum() > 1000, f"agent {agent} in its hue"
+    with pytest.raises(FileExistsError, match=r"visits\.png exists and is not overwritten"):
+        draw_visits(found, path)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"replica": 2}, "replica is 2"),
+        ({"policy": "greedy"}, "policy is 'greedy'"),
+        ({"path": "visits.pdf"}, "path is '.*visits.pdf'"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(more, message, corridors, tmp_path):
+    found = territory_of(corridors["greedy"], episodes=1)
+    with pytest.raises(ValueError, match=message):
+        draw_visits(found, **{"path": tmp_path / "visits.png", **more})
+    assert not list(tmp_path.iterdir())

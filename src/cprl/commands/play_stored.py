@@ -222,10 +222,16 @@ def crossplay(
     _begin(fresh.seed, *_paths(named), files=files)
 
     from cprl.evaluation.cross_play import crossplay as play_each_other
-    from cprl.evaluation.cross_play import crossplay_tables, draw_gains, heading
+    from cprl.evaluation.cross_play import crossplay_heading, crossplay_tables, draw_gains
 
     played = play_each_other(named, diagonal=diagonal, **vars(fresh))
-    _show(played, files, crossplay_tables(played), above=heading(played), draw=partial(draw_gains, played))
+    _show(
+        played,
+        files,
+        crossplay_tables(played),
+        above=crossplay_heading(played),
+        draw=partial(draw_gains, played),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -337,7 +343,7 @@ def scenarios(
     """
     _begin(fresh.seed, run, files=files)
 
-    from cprl.evaluation.scenarios import draw_scenarios, heading, run_scenarios, scenario_tables
+    from cprl.evaluation.scenarios import draw_scenarios, run_scenarios, scenario_heading, scenario_tables
 
     scores = run_scenarios(run, scenarios=scenarios, **vars(fresh))
     below = f"Weights: {scores.run.weights_from}"
@@ -345,7 +351,7 @@ def scenarios(
         scores,
         files,
         scenario_tables(scores),
-        above=heading(scores),
+        above=scenario_heading(scores),
         below=below,
         draw=partial(draw_scenarios, scores),
     )

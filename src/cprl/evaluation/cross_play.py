@@ -23,9 +23,8 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from cprl.evaluation.evaluate import (
-    INTERVALS,
     SEED,
-    how_they_play,
+    heading,
     opened,
     refuse_other_games,
     says_nothing,
@@ -174,12 +173,14 @@ def gains(played: CrossPlay) -> dict[Pair, Gain]:
     """
     cells = played.cells
     return {
-        (focal, background): Gain(
-            *(more(cell, cells[background, background], whose) for whose in ("focal", "background"))
-        )
+        (focal, background): gain_over(cell, cells[background, background])
         for (focal, background), cell in cells.items()
         if focal != background
     }
+
+
+def gain_over(reached: Results, usual: Results) -> Gain:
+    return Gain(focal=more(reached, usual, "focal"), background=more(reached, usual, "background"))
 
 
 _BESIDE: Final[Mapping[Whose, str]] = {
@@ -240,12 +241,9 @@ def draw_matrix(
     bar.ax.tick_params(labelsize=style.SMALL_PT)
 
 
-def heading(played: CrossPlay) -> str:
-    exploring = how_they_play(played.runs.values(), played.fresh)
-    return (
-        f"Cross-play: {played.fresh} with focal agent at each index, seed {played.fresh.seed}{exploring}, "
-        f"diagonal: {played.diagonal}\n{INTERVALS}"
-    )
+def crossplay_heading(played: CrossPlay) -> str:
+    each = " with focal agent at each index"
+    return heading("Cross-play", played.fresh, played.runs.values(), each, f", diagonal: {played.diagonal}")
 
 
 def crossplay_tables(played: CrossPlay) -> Iterator[Table]:

@@ -29,7 +29,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from cprl.evaluation.cross_play import CrossPlay, Runs, draw_matrix, matrix_table, named_runs
-from cprl.evaluation.evaluate import SEED, how_they_play, table_of
+from cprl.evaluation.evaluate import SEED, heading, table_of
 from cprl.evaluation.lanes import Part, Played, Results, Who, agents_of, fresh_of, shifted
 from cprl.measuring.statistics import CONFIDENCE, HOLM, Estimate, estimate, starred
 from cprl.system.defaults import EGTA_RESAMPLES
@@ -249,12 +249,8 @@ _CHOICES: Final = " for each choice of who plays where"
 
 
 def egta_heading(game: EmpiricalGame) -> str:
-    exploring = how_they_play(game.runs.values(), game.fresh)
     kind = "Pairwise reduction of the empirical game" if game.is_reduction else "Empirical game"
-    return (
-        f"{kind}: {game.fresh}{_CHOICES}, seed {game.fresh.seed}{exploring}\n"
-        "returns: mean over replicas [95 % interval by Student's t]"
-    )
+    return heading(kind, game.fresh, game.runs.values(), _CHOICES)
 
 
 def egta_tables(analysis: Analysis) -> Iterator[Table]:
@@ -345,7 +341,10 @@ def draw_egta(analysis: Analysis, path: Path | str) -> Path:
     matrix, rank = figure.subplots(1, 2, width_ratios=(1.35, 1))
     draw_matrix(matrix, names, {pair: gain.value for pair, gain in gains.items()}, texts)
     style.write_small(
-        matrix, x="run of all others", y="run of an agent", title="what it gains over their run"
+        matrix,
+        x="run of all others",
+        y="run of an agent",
+        title="what an agent gains by another run than all others",
     )
     places = np.arange(len(names))
     share, low, high = np.array([(share.value, share.low, share.high) for share in analysis.shares]).T

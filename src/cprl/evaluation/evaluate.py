@@ -124,9 +124,6 @@ def opened(run: str | Path | LoadedRun, allow: Sequence[str] = ()) -> LoadedRun:
     return run if isinstance(run, LoadedRun) else load(run, allow=allow)
 
 
-INTERVALS: Final = "mean over replicas [95 % interval by Student's t]"
-
-
 def table_of(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1) -> Table:
     """Return a table for the terminal whose first columns are texts and all others numbers."""
     table = Table(title=title, title_justify="left")
@@ -167,8 +164,7 @@ def run_table(evaluation: Evaluation) -> Table:
 
 def heading_beside_random(run: LoadedRun, fresh: Fresh) -> tuple[str, list[str]]:
     """The title and the columns of a table of a run's agents and of random ones."""
-    title = f"{run.path.name}: {fresh}, seed {fresh.seed}\n{INTERVALS}"
-    return title, ["", f"run's agents{how_they_play([run], fresh)}", "random"]
+    return heading(run.path.name, fresh, [run]), ["", "run's agents", "random"]
 
 
 def says_nothing(name: str, measured: Iterable[Measured]) -> bool:
@@ -181,10 +177,12 @@ def unit_of_rewards(results: Results) -> str:
     return "apples" if next(iter(results.played.values()))[0].harvest is not None else ""
 
 
-def how_they_play(runs: Iterable[LoadedRun], fresh: Fresh) -> str:
-    """The epsilon of the agents that learned values, as text."""
-    if fresh.greedy:
-        return ", greedy"
+def heading(what: str, fresh: Fresh, runs: Iterable[LoadedRun], each: str = "", end: str = "") -> str:
+    """What was played, with the epsilon of the agents that learned values, and what numbers are."""
     agents = [run.agent(agent, replica=run.replicas[0]) for run in runs for agent in range(run.game.agents)]
     chances = {agent.epsilon for agent in agents if agent.scripted is None and not agent.stochastic}
-    return "".join(f", epsilon {chance:g}" for chance in sorted(chances))
+    exploring = ", greedy" if fresh.greedy else "".join(f", epsilon {chance:g}" for chance in sorted(chances))
+    return (
+        f"{what}: {fresh}{each}, seed {fresh.seed}{exploring}{end}\n"
+        "mean over replicas [95 % interval by Student's t]"
+    )

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import ceil
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
 from tensordict import TensorDictBase
@@ -13,7 +13,6 @@ from torchrl.envs import EnvBase
 
 from cprl import keys
 from cprl.commons.world import Bytes, Shown
-from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.film_pictures import (
     DEFAULT_WIDTH,
@@ -24,7 +23,7 @@ from cprl.evaluation.film_pictures import (
     write_gif,
     write_mp4,
 )
-from cprl.evaluation.lanes import Turns, board_now
+from cprl.evaluation.lanes import Turns, board_now, commons_game
 from cprl.measuring.episodes import Episode, tracker_of
 from cprl.policies.assignment import AgentPolicies
 from cprl.runs.files import refuse_to_write_over
@@ -106,38 +105,33 @@ def film(
 
 
 def _recorded(fresh: FreshEpisode, target: Path, title: str) -> Episode:
+    policies, env = fresh.policies, fresh.env
     with ViewerCallback(
         target.parent,
-        fresh.env,
+        env,
         title=title,
         episodes=1,
         recipe=fresh.run.recipe,
         file_name=target.name,
         is_replay=True,
     ) as viewer:
-        log = _Events(viewer)
+        log, scene, logger, commons = _Events(viewer), viewer.logger.scene, viewer.logger, commons_of(env)
+        views: list[Any] = []
+        if scene is not None:
+            actions = fresh.run.game.actions
+            views = [Decisions(logger, policies, actions=actions, names=scene.agents, window=scene.window)]
+            if commons is not None and scene.has_institutions:
+                views.append(Offences(logger, commons, names=scene.agents))
         train(
-            fresh.env,
+            env,
             {},
-            others=dict(zip(fresh.policies.indices, fresh.policies.actors, strict=True)),
-            decisions=fresh.policies.decisions,
+            others=dict(zip(policies.indices, policies.actors, strict=True)),
+            decisions=policies.decisions,
             episodes=1,
-            callbacks=[viewer, *_views(viewer, fresh), log],
+            callbacks=[viewer, *views, log],
         )
     assert log.episode is not None
     return log.episode
-
-
-def _views(viewer: ViewerCallback, fresh: FreshEpisode) -> Iterator[Decisions | Offences]:
-    """Of games whose boards are shown what agents choose by, and under institutions who breaks rules and what
-    is paid."""
-    scene, commons, logger = viewer.logger.scene, commons_of(fresh.env), viewer.logger
-    if scene is None:
-        return
-    actions = fresh.run.game.actions
-    yield Decisions(logger, fresh.policies, actions=actions, names=scene.agents, window=scene.window)
-    if commons is not None and scene.has_institutions:
-        yield Offences(logger, commons, names=scene.agents)
 
 
 class _Events:
@@ -279,7 +273,9 @@ def film_video(
 
 def _titles(fresh: Sequence[FreshEpisode]) -> Sequence[str]:
     """Return what tells runs apart: their institutions, their names, or the names of their directories."""
-    kinds = [[type(kind).__name__ for kind in _commons(population).game.institutions] for population in fresh]
+    kinds = [
+        [type(kind).__name__ for kind in commons_game(population.run).institutions] for population in fresh
+    ]
     rules = [re.sub("(?<=[a-z])(?=[A-Z])", " ", " and ".join(names)).lower() for names in kinds]
     names = [population.run.experiment.name.replace("_", " ") for population in fresh]
     titles = [rule or "no rule" for rule in rules] if any(rules) else names
@@ -289,18 +285,7 @@ def _titles(fresh: Sequence[FreshEpisode]) -> Sequence[str]:
     return [legible(population.run.path.resolve().name) for population in fresh]
 
 
-def _commons(fresh: FreshEpisode) -> CommonsEnv:
-    """The world that is filmed, of a game with a board."""
-    commons = commons_of(fresh.env)
-    if commons is None:
-        raise ValueError(
-            f"{fresh.run.path} plays a game without a board of cprl; allowed: a run of a cprl.Game"
-        )
-    return commons
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Panel:
+class _Panel(NamedTuple):
     """What a film shows of one population."""
 
     title: str
@@ -333,22 +318,21 @@ class _Panel:
 
 def _panels(fresh: Sequence[FreshEpisode], titles: Sequence[str], width: int) -> list[_Panel]:
     """Play the episodes; return what is shown of each, in panels of one size with one axis of harvests."""
-    games = [_commons(population).game for population in fresh]
+    games = [commons_game(population.run) for population in fresh]
     episodes = [_play(population) for population in fresh]
     most = max(int(moments[-1].harvested.max()) for moments, _, _ in episodes)
     height = max(EpisodePicture(game.map, steps=1, width=width).size[1] for game in games)
     sizes = {"width": width, "height": height, "most_harvested": most}
     pictures = [EpisodePicture(game.map, steps=game.rules.episode_steps, **sizes) for game in games]
-    return [
-        _Panel(title=title, picture=picture, moments=moments, violators=violators, played=played)
-        for title, picture, (moments, violators, played) in zip(titles, pictures, episodes, strict=True)
-    ]
+    return [_Panel(*shown) for shown in zip(titles, pictures, *zip(*episodes, strict=True), strict=True)]
 
 
 def _play(fresh: FreshEpisode) -> tuple[list[Shown], list[set[int]], Episode]:
     """All boards of the episode, that at its start first, without what agents observe; the agents that broke
     a rule in the turn that led to each; and the episode."""
-    tracker, turns, commons = tracker_of(fresh.env), Turns(fresh.env, fresh.policies), _commons(fresh)
+    commons = commons_of(fresh.env)
+    assert commons is not None
+    tracker, turns = tracker_of(fresh.env), Turns(fresh.env, fresh.policies)
     ended: list[Episode] = []
     moments, violators = [board_now(commons)], [set[int]()]
     while not ended:

@@ -246,7 +246,7 @@ def write_gif(path: Path, pictures: Iterable[Bytes], samples: Sequence[Bytes], *
         samples: some of the pictures; the palette has their most frequent colours.
         fps: pictures per second; a GIF counts hundredths of a second, so it is rounded to 100 / n.
     """
-    counts = Image.fromarray(np.concatenate(samples)).getcolors(2**24)
+    counts: Any = Image.fromarray(np.concatenate(samples)).getcolors(2**24)
     colours = [channel for _, colour in sorted(counts, reverse=True)[:_COLOURS] for channel in colour]
     colours += [0] * (3 * (_COLOURS + 1) - len(colours))
     palette = Image.new("P", (1, 1))

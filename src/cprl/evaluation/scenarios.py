@@ -22,10 +22,9 @@ from rich.table import Table
 
 from cprl.commons.game import Game
 from cprl.evaluation.evaluate import (
-    INTERVALS,
     SEED,
     bars_of,
-    how_they_play,
+    heading,
     opened,
     refuse_other_games,
     refuse_unlike,
@@ -304,12 +303,8 @@ SOCIAL: Final = ("collective_return", "equality", "sustainability", "survival_st
 """The social metrics of the table in the terminal; the others are in `estimates`."""
 
 
-def heading(scores: Scores) -> str:
-    exploring = how_they_play([scores.run], scores.fresh)
-    return (
-        f"Scenarios of {scores.run.path.name}: {scores.fresh} in each placement, seed {scores.fresh.seed}"
-        f"{exploring}\n{INTERVALS}"
-    )
+def scenario_heading(scores: Scores) -> str:
+    return heading(f"Scenarios of {scores.run.path.name}", scores.fresh, [scores.run], " in each placement")
 
 
 def scenario_tables(scores: Scores) -> Iterator[Table]:

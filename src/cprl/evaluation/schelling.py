@@ -33,7 +33,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from cprl.commons.game import Game
-from cprl.evaluation.evaluate import INTERVALS, SEED, bars_of, table_of
+from cprl.evaluation.evaluate import SEED, bars_of, heading, table_of
 from cprl.evaluation.lanes import (
     Fresh,
     Part,
@@ -252,7 +252,7 @@ def schelling_tables(diagram: SchellingDiagram) -> Iterator[Table]:
     """The payoffs by the number of restrained others, and the margins between them that make a dilemma."""
     payoffs = zip(diagram.restrained_payoffs.T, diagram.greedy_payoffs.T, strict=True)
     yield table_of(
-        f"{diagram.fresh} for each choice of restrained agents, seed {diagram.fresh.seed}\n{INTERVALS}",
+        heading("Schelling diagram", diagram.fresh, (), " for each choice of restrained agents"),
         [
             f"restrained among the other {diagram.agents - 1}",
             f"return of {diagram.restrained} (restrained)",

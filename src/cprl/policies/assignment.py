@@ -18,7 +18,6 @@ AgentIndices: TypeAlias = int | tuple[int, ...]
 
 
 def agent_indices(indices: AgentIndices) -> tuple[int, ...]:
-    """The indices of the agents as a tuple."""
     return indices if isinstance(indices, tuple) else (indices,)
 
 
@@ -74,7 +73,6 @@ class AgentPolicies(TensorDictModuleBase):
             self.out_keys = (keys.ACTION, keys.DECISION)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the action of every agent, and its decision, in all worlds at once."""
         agents = keys.entry(tensordict, keys.AGENTS)
         if self._worlds and tensordict.batch_size.numel() != self._worlds:
             there = tensordict.batch_size.numel()

@@ -136,11 +136,9 @@ class Decider(nn.Module):
         return numbers
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What was decided, and how often; part of `state_dict`."""
         return {"choices": torch.tensor(self._choices), "decided": torch.tensor(self._decided)}
 
     def set_extra_state(self, state: Mapping[str, Any]) -> None:
-        """Continues from that state."""
         self._choices[:] = state["choices"].numpy(force=True)
         self._decided[:] = state["decided"].numpy(force=True)
         held = self._held

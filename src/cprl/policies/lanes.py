@@ -33,11 +33,9 @@ class ActorOfLanes(TensorDictModuleBase):
         self.rng = LaneRng(seeds, count * worlds)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """The state of its random numbers; part of `state_dict`."""
         return self.rng.state_dict()
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Continue from that state."""
         self.rng.load_state_dict(state)
 
 
@@ -196,7 +194,7 @@ class LaneActor(ActorOfLanes):
         return (numbers.view(-1, self.worlds, 2)[..., 1] * self.actions).long()
 
     def _by_replica(self, values: Tensor) -> Tensor:
-        """Reshape [L, k, ...] to [R x k, S, ...]."""
+        """[L, k, ...] as [R x k, S, ...]."""
         by_replica = values.view(self.replicas, self.agents, self.worlds, *values.shape[2:]).transpose(1, 2)
         return by_replica.reshape(-1, *by_replica.shape[2:])
 

@@ -42,7 +42,6 @@ class LaneRng:
         return self._numbers[self._used - 1]
 
     def state_dict(self) -> dict[str, Any]:
-        """The generators' states and the numbers generated ahead."""
         return {
             "chance": [_plain(chance.bit_generator.state) for chance in self._chance],
             "numbers": self._numbers,
@@ -50,7 +49,6 @@ class LaneRng:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a state that `state_dict` returned."""
         for chance, generator in zip(self._chance, state["chance"], strict=True):
             chance.bit_generator.state = _arrays(generator)
         self._numbers, self._used = state["numbers"].clone(), int(state["used"])

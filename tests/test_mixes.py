@@ -1,0 +1,321 @@
+"""Agents of any kinds in all mixes: populations put together, the dilemma of restrained and greedy ones, the
+game whose strategies are stored runs."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from stored_runs import CORRIDORS, MEADOW, SEED, command, ran
+
+import cprl
+from cprl import Game, Rules, maps
+from cprl.envs.matrix import stag_hunt
+from cprl.evaluation import analyse, draw_egta, pairwise_game, play_empirical_game, play_population, schelling
+from cprl.evaluation.empirical_game import egta_tables
+from cprl.evaluation.lanes import shifted
+from cprl.evaluation.schelling import dilemma
+from cprl.population import Frozen, Scripted
+from cprl.theory import PayoffTable, compositions
+
+
+def returns(played):
+    return {replica: [episode.return_.tolist() for episode in own] for replica, own in played.items()}
+
+
+@pytest.mark.integration
+def test_the_agents_of_a_run_play_as_in_its_evaluation(alike):
+    agents = [Frozen(str(alike), agent, replica=None) for agent in range(2)]
+    played = play_population(MEADOW, agents, episodes=4, replicas=3, seed=SEED)
+    assert returns(played) == returns(cprl.evaluate_run(alike, episodes=4, seed=SEED).trained)
+    on_the_runs_game = play_population(cprl.load(alike), agents, episodes=4, replicas=3, seed=SEED)
+    assert returns(on_the_runs_game) == returns(played)
+
+
+def test_scripted_agents_harvest_their_own_corridors():
+    played = play_population(CORRIDORS, [Scripted("greedy"), Scripted("sustainable")], episodes=2, replicas=3)
+    assert list(played) == [0, 1, 2]
+    # Nothing regrows. The greedy agent bites both apples of its corridor; the sustainable one sees at most
+    # two others near an apple, fewer than it spares, and bites none.
+    assert returns(played) == dict.fromkeys(range(3), [[2.0, 0.0]] * 2)
+
+
+def test_populations_meet_the_same_worlds():
+    both = [play_population(MEADOW, [Scripted("random")] * 2, episodes=3, seed=seed) for seed in (5, 5, 6)]
+    assert returns(both[0]) == returns(both[1]) != returns(both[2])
+
+
+def test_games_without_a_board_are_played():
+    played = play_population(stag_hunt(turns=3), [Scripted("random")] * 2, episodes=2, replicas=2)
+    assert [[episode.steps for episode in own] for own in played.values()] == [[3, 3], [3, 3]]
+
+
+PATCH = Game(
+    map=maps.parse(
+        """
+        >.AA.<
+        ..AA..
+        v.AA.^
+        """
+    ),
+    rules=Rules(regrow_prob=(0.0, 0.05, 0.3), window_rows=6, window_columns=7, episode_steps=60),
+)
+"""Four agents around one patch that does not come back once it is bare."""
+
+
+@pytest.fixture(scope="module")
+def diagram():
+    return schelling(CORRIDORS, episodes=2, replicas=3)
+
+
+@pytest.fixture(scope="module")
+def patch():
+    return schelling(PATCH, episodes=3, replicas=2, seed=SEED)
+
+
+def test_payoffs_are_means_over_who_is_restrained(diagram):
+    # Nothing regrows. Greedy agents bite all that is in their corridors, 2 and 3 apples, restrained ones
+    # none: they never see three others near an apple. One restrained agent is once agent 0 and once agent 1.
+    assert sorted(diagram.by_mix) == [(), (0,), (0, 1), (1,)]
+    assert diagram.restrained_payoffs.tolist() == [[0.0, 0.0]] * 3
+    assert diagram.greedy_payoffs.tolist() == [[2.5, 2.5]] * 3
+    assert diagram.group_payoffs.tolist() == [[5.0, 2.5, 0.0]] * 3
+    assert diagram.dilemma().name == "no dilemma"
+    assert diagram.measures(1)["collective_return"].estimate.value == 2.5
+
+
+def test_each_agent_is_as_often_restrained_as_every_other(patch):
+    assert sorted(map(len, patch.by_mix)) == [0, *[1] * 4, *[2] * 4, *[3] * 4, 4]
+    for count in range(5):
+        restrained = [agent for who in patch.by_mix if len(who) == count for agent in who]
+        assert len({restrained.count(agent) for agent in range(4)}) == 1
+    table = patch.table()
+    assert len(table) == 14 * 2 * 3 * 4, "mixes, replicas, episodes, agents"
+    assert set(table["restrained"].to_pylist()) >= {"", "0", "0 3", "0 1 2 3"}
+
+
+def test_a_mix_is_the_population_of_its_agents(patch):
+    agents = [Scripted("sustainable" if agent in (0, 3) else "greedy") for agent in range(4)]
+    played = play_population(PATCH, agents, episodes=3, replicas=2, seed=SEED)
+    for replica, episodes in patch.by_mix[0, 3].items():
+        assert [one.return_.tolist() for one in episodes] == [one.return_.tolist() for one in played[replica]]
+    # R(1): in each of the mixes (0, 1), (1, 2), (2, 3) and (0, 3) the two restrained agents.
+    pairs = ((0, 1), (1, 2), (2, 3), (0, 3))
+    own = [[one.return_[list(pair)].mean() for one in patch.by_mix[pair][0]] for pair in pairs]
+    assert patch.restrained_payoffs[0, 1] == pytest.approx(np.mean(own))
+    group = [sum(one.return_.sum() for one in patch.by_mix[pair][0]) for pair in pairs]
+    assert patch.group_payoffs[0, 2] == pytest.approx(sum(group) / 12)
+
+
+@pytest.mark.integration
+def test_agents_of_runs_play_restrained_or_greedy(alike):
+    found = schelling(cprl.load(alike), restrained="sustainable", greedy=str(alike), episodes=2, replicas=3)
+    assert returns(found.by_mix[()]) == returns(cprl.evaluate_run(alike, episodes=2).trained)
+
+
+def test_the_recipe_leaves_out_diagrams_of_trained_agents_that_are_not_there(tmp_path, monkeypatch, capsys):
+    path = Path(__file__).parents[1] / "recipes" / "study" / "theory" / "schelling.py"
+    spec = importlib.util.spec_from_file_location("schelling_recipe", path)
+    recipe = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(recipe)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "commons").mkdir()
+    (tmp_path / "commons" / "recipe.json").touch()
+    asked = [(board, who) for board, rules, who in recipe.diagrams(Path()) if rules == "as run"]
+    assert asked == [
+        ("commons", "greedy"),
+        ("commons", "territorial"),
+        ("commons", "commons"),
+        ("two_complex", "greedy"),
+        ("two_complex", "territorial"),
+    ]
+    told = capsys.readouterr().out
+    assert told == "two_complex holds no run; the diagram of two_complex with trained agents is left out\n"
+    (tmp_path / "commons_as_run_trained.png").touch()
+    monkeypatch.setattr(recipe, "schelling", None)  # it would be called
+    with pytest.raises(FileExistsError, match=r"commons_as_run_trained\.png exists"):
+        recipe.main(out=Path(), trained=Path())
+
+
+def of(reward, sucker, temptation, punishment, *, spread=0.0, replicas=4):
+    """Two agents: R(0) is what the sucker gets, R(1) the reward, G(0) the punishment, G(1) the temptation."""
+    noise = spread * np.linspace(-1, 1, replicas)[:, None]
+    restrained, greedy = np.array([[sucker, reward]]), np.array([[punishment, temptation]])
+    return dilemma(restrained + noise, greedy - noise)
+
+
+@pytest.mark.parametrize(
+    ("payoffs", "name"),
+    [
+        ((3, 0, 5, 1), "prisoner's dilemma"),
+        ((3, 1, 5, 0), "chicken"),
+        ((4, 0, 3, 1), "stag hunt"),
+        ((4, 2, 3, 1), "no dilemma"),  # harmony: neither fear nor greed
+        ((1, 0, 5, 3), "no dilemma"),  # greed of all is better than restraint of all
+        ((3, 3, 5, 1), "no dilemma"),  # the only restrained agent is as well off: 3 > 3 is false
+        ((3, 0, 3, 0), "no dilemma"),  # G(0) = R(0) and G(1) = R(1): nothing pulls
+    ],
+)
+def test_dilemmas_have_their_names(payoffs, name):
+    assert of(*payoffs).name == name
+
+
+def test_margins_are_the_differences_that_define_them():
+    found = of(3, 0, 5, 1)
+    values = {name: getattr(found, name).value for name in ("restraint", "company", "fear", "greed")}
+    # R(1) - G(0) = 3 - 1, R(1) - R(0) = 3 - 0, G(0) - R(0) = 1 - 0, G(1) - R(1) = 5 - 3.
+    assert values == {"restraint": 2.0, "company": 3.0, "fear": 1.0, "greed": 2.0}
+
+
+def test_with_several_agents_only_both_ends_count():
+    restrained, greedy = np.array([[0.0, 9.0, 1.0, 4.0]] * 3), np.array([[1.0, 0.0, 9.0, 5.0]] * 3)
+    assert dilemma(restrained, greedy).name == "prisoner's dilemma"  # 4 > 1, 4 > 0, 1 > 0, 5 > 4
+
+
+def test_intervals_that_hold_0_leave_several_dilemmas():
+    # Noise of ± 0.5 in both kinds gives fear 1 ± (t(3) = 3.18) x 0.745 / 2 = 1 ± 1.19; greed is 4 ± 1.19.
+    assert of(5, 0, 9, 1, spread=0.5).candidates == ("prisoner's dilemma", "chicken")
+    assert of(3, 0, 5, 1, spread=0.1).candidates == ("prisoner's dilemma",)
+
+
+def test_one_replica_tells_nothing_for_certain():
+    found = of(3, 0, 5, 1, replicas=1)
+    assert found.name == "cannot be told"
+    assert found.candidates[0] == "prisoner's dilemma"
+    assert set(found.candidates) == {"prisoner's dilemma", "chicken", "stag hunt", "no dilemma"}
+
+
+@pytest.mark.parametrize("shapes", [((3, 1), (3, 1)), ((3,), (3,)), ((3, 2), (2, 2))])
+def test_payoffs_of_other_shapes_are_refused(shapes):
+    restrained, greedy = map(np.zeros, shapes)
+    with pytest.raises(ValueError, match=r"restrained is .* and greedy .*; allowed: \[R, N\]"):
+        dilemma(restrained, greedy)
+
+
+THREE = Game(
+    map=maps.parse(
+        """
+        >.AA.<
+        v.AA..
+        """
+    ),
+    rules=Rules(regrow_prob=(0.0, 0.05, 0.3), window_rows=6, window_columns=7, episode_steps=12),
+)
+"""Three agents around one patch."""
+
+
+def scripted_runs(folder, game, *policies, replicas=2):
+    return {
+        name: ran(folder / name, game, [Scripted(name)] * game.agents, replicas=replicas) for name in policies
+    }
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory):
+    return scripted_runs(tmp_path_factory.mktemp("three"), THREE, "greedy", "random")
+
+
+@pytest.fixture(scope="module")
+def made(corridors):
+    """A game of two runs that is played for nothing but its fields, to put payoffs in."""
+    return play_empirical_game(corridors, episodes=1)
+
+
+def with_payoffs(made, names, matrices):
+    """A game of two agents with these payoffs, [S, S] by replica."""
+    run = next(iter(made.runs.values()))
+    return replace(
+        made,
+        runs=dict.fromkeys(names, run),
+        payoffs=np.array([PayoffTable.of_pairs(own).payoffs for own in matrices]),
+        fresh=replace(made.fresh, replicas=tuple(range(len(matrices)))),
+    )
+
+
+def test_payoffs_are_means_over_who_plays_where(made):
+    # A greedy agent bites all of its corridor, 2 or 3 apples, whoever plays in the other; others bite none.
+    assert made.payoffs == pytest.approx(np.array([[[2.5, np.nan], [2.5, 0], [np.nan, 0]]] * 2), nan_ok=True)
+    assert made.payoff_table().pure_equilibria == [(2, 0)]
+    assert made.names == ["greedy", "sustainable"]
+    assert not made.is_reduction
+
+
+def test_each_run_has_each_index_as_often_as_every_other():
+    for counts in compositions(4, 3).tolist():
+        choices = shifted(counts)
+        assert len(choices) == (4 if max(counts) < 4 else 1)
+        for run, count in enumerate(counts):
+            at = [sum(who[index] == run for who in choices) for index in range(4)]
+            assert at == [count * len(choices) / 4] * 4
+
+
+@pytest.mark.integration
+def test_of_two_agents_crossplay_makes_the_same_game(tmp_path):
+    runs = scripted_runs(tmp_path, MEADOW, "greedy", "random")
+    whole = play_empirical_game(runs, episodes=2, seed=SEED)
+    pairs = pairwise_game(cprl.crossplay(runs, episodes=2, seed=SEED))
+    assert pairs.payoffs == pytest.approx(whole.payoffs, nan_ok=True)
+    assert not pairs.is_reduction
+
+
+def test_of_more_agents_crossplay_makes_the_reduction(three):
+    whole = play_empirical_game(three, episodes=2, seed=SEED)
+    pairs = pairwise_game(cprl.crossplay(three, episodes=2, seed=SEED))
+    assert (whole.agents, pairs.agents, pairs.of_agents) == (3, 2, 3)
+    assert pairs.is_reduction
+    for place in range(2):
+        assert pairs.payoff_table([place]).pairs == pytest.approx(whole.payoff_table([place]).pairs)
+    # 3 (4 - 2) + 2 choices of who plays where, 2 replicas, 2 episodes, 3 agents.
+    assert len(whole.table()) == 8 * 2 * 2 * 3
+    assert "greedy greedy random" in whole.table()["runs"].to_pylist()
+
+
+@pytest.mark.integration
+def test_certainty_is_the_share_of_resampled_replicas(made):
+    pytest.importorskip("open_spiel")
+    pytest.importorskip("nashpy")
+    # In two of three replicas the second strategy gains 1 over the first whatever the other plays, in the
+    # third it loses 1: of the means it gains unless the third is drawn twice or more, with chance 7 / 27.
+    gains = np.array([[0.0, 0.0], [1.0, 1.0]])
+    found = analyse(with_payoffs(made, ["a", "b"], [gains, gains, -gains]), resamples=400)
+    assert found.rank.shares == pytest.approx([0, 1], abs=1e-4)
+    assert found.pure == pytest.approx({(0, 2): 20 / 27}, abs=0.07)
+    assert found.in_support == pytest.approx([7 / 27, 20 / 27], abs=0.07)
+    assert (found.shares[1].low, found.shares[1].high) == pytest.approx((0, 1), abs=1e-4)
+    one = analyse(with_payoffs(made, ["a", "b"], [gains]))
+    assert np.isnan([one.shares[0].low, *one.pure.values(), *one.in_support]).all()
+    assert one.resamples == 0
+    assert all(list(table.columns) for table in egta_tables(one))
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("runs", [3, 4])
+def test_analyses_are_drawn_for_any_number_of_runs(runs, made, tmp_path):
+    pytest.importorskip("open_spiel")
+    pytest.importorskip("nashpy")
+    rng = np.random.default_rng(runs)
+    game = with_payoffs(made, [f"run {own}" for own in range(runs)], rng.random((3, runs, runs)))
+    found = analyse(game, resamples=3)
+    drawn = draw_egta(found, tmp_path / "new" / "game.png")
+    assert imread(drawn).shape[1] > 1000
+    with pytest.raises(FileExistsError):
+        draw_egta(found, drawn)
+
+
+@pytest.mark.integration
+def test_the_command_tells_all_compositions_of_more_agents(three, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("open_spiel")
+    pytest.importorskip("nashpy")
+    words = ["egta", three["greedy"], three["random"], "--episodes", 1, "--resamples", 3]
+    printed = command(monkeypatch, capsys, *words, "--figure", tmp_path / "game.png")
+    assert "2 greedy, 1 random" in printed
+    assert "Nash equilibrium of pairs (nashpy)" in printed
+    assert "Pairwise reduction" in command(monkeypatch, capsys, *words, "--pairwise")
+
+
+def test_more_profiles_than_alpha_rank_takes_are_refused_before_play(three, monkeypatch):
+    monkeypatch.setattr("cprl.evaluation.empirical_game.MOST_PROFILES", 7)
+    with pytest.raises(ValueError, match="2 runs of 3 agents have 8 profiles"):
+        play_empirical_game(three)
