@@ -81,7 +81,7 @@ def apples_in(picture):
 
 def is_near(picture, colour):
     """Where a picture has a colour, but for the palette of a GIF."""
-    return (np.abs(picture.astype(int) - colour) <= 4).all(-1)
+    return (np.abs(picture.astype(int) - colour) <= 8).all(-1)
 
 
 def test_a_gif_shows_the_board_die_and_ends_with_a_card_of_two_seconds(runs, tmp_path, drawn):

@@ -1,12 +1,12 @@
 """Agents of any kinds in all mixes: populations put together, the dilemma of restrained and greedy ones, the
 game whose strategies are stored runs."""
 
-import importlib.util
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from boards import module_at
 from matplotlib.image import imread
 from stored_runs import CORRIDORS, MEADOW, SEED, command, ran
 
@@ -116,10 +116,7 @@ def test_agents_of_runs_play_restrained_or_greedy(alike):
 
 
 def test_the_recipe_leaves_out_diagrams_of_trained_agents_that_are_not_there(tmp_path, monkeypatch, capsys):
-    path = Path(__file__).parents[1] / "recipes" / "study" / "theory" / "schelling.py"
-    spec = importlib.util.spec_from_file_location("schelling_recipe", path)
-    recipe = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(recipe)
+    recipe = module_at(Path(__file__).parents[1] / "recipes" / "study" / "theory" / "schelling.py")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "commons").mkdir()
     (tmp_path / "commons" / "recipe.json").touch()

@@ -1,10 +1,10 @@
 """Stored runs play among named backgrounds, and the numbers are those worked by hand."""
 
-import importlib.util
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from boards import module_at
 from stored_runs import CORRIDORS, DQN, MEADOW, SEED, ran
 
 import cprl
@@ -211,9 +211,7 @@ def test_odd_scenarios_are_refused(given, answer):
 
 def test_the_page_has_the_numbers_of_the_committed_estimates():
     docs = Path(__file__).parents[1] / "docs"
-    spec = importlib.util.spec_from_file_location("scenarios_baseline", docs / "scenarios_baseline.py")
-    baseline = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(baseline)
+    baseline = module_at(docs / "scenarios_baseline.py")
     page = (docs / "scenarios.md").read_text()
     played = sorted(path.stem for path in baseline.OUT.glob("*.csv"))
     assert played
