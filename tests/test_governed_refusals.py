@@ -84,7 +84,6 @@ def test_what_an_institution_cannot_be_is_refused(kind, fields, field):
         ((law.Mediation(),), r"Mediation\.observed .* Observation\.agents_apart"),
         ((Mine(),), r"Game\.institutions has a Mine"),
         ((Own(),), r"Game\.institutions has a Own"),
-        ((law.Tax(),) * 65, r"Game\.institutions has 65"),
         (VOTES, "lets agents choose from 1,771,561 options"),
     ],
 )

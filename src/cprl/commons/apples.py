@@ -1,7 +1,5 @@
 """Apples: harvest and random regrowth, on one world."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +17,7 @@ from cprl.commons.chance import (
 from cprl.commons.moves import cell_of
 from cprl.commons.tables import Tables
 from cprl.commons.world import Scratch, Worlds
+from cprl.institutions import Law
 from cprl.institutions.law import note_bite, note_step, stops_bite
 
 
@@ -117,7 +116,7 @@ def grow(world: Worlds, tables: Tables, scratch: Scratch, sprouts: int) -> None:
         add_apple(world, tables, scratch.sprouts[s])
 
 
-def bite(world: Worlds, tables: Tables, law: Any, harvest: NDArray[np.float32]) -> None:
+def bite(world: Worlds, tables: Tables, law: Law | None, harvest: NDArray[np.float32]) -> None:
     """Each agent in play harvests the apple on its cell, unless an institution stops it, which notes what the
     agent breaks; `harvest`: float32 [N], 0 or 1.
 
@@ -138,7 +137,7 @@ def bite(world: Worlds, tables: Tables, law: Any, harvest: NDArray[np.float32]) 
                     note_bite(law, i, cell, k, world.step[0])
 
 
-def may_bite(law: Any, i: int, cell: int, k: int, step: int) -> bool:
+def may_bite(law: Law | None, i: int, cell: int, k: int, step: int) -> bool:
     """Whether no institution stops agent i from harvesting site k."""
     if law is None:
         return True

@@ -8,10 +8,11 @@ from numpy.typing import DTypeLike, NDArray
 
 from cprl.commons import state as states
 from cprl.commons.game import Game, check_worlds_fit, output_forms
-from cprl.commons.loops import Loop, Played
+from cprl.commons.loops import Loop
 from cprl.commons.tables import Tables
 from cprl.commons.threads import CpuThreads
 from cprl.commons.world import Actions, Bools, Bytes, GovernedOutput, Shown, StepOutput, Worlds, empty_worlds
+from cprl.institutions import Law
 from cprl.institutions.arrays import STATE, STEPS, lasting
 from cprl.institutions.law import new_law
 from cprl.institutions.ledger import Payments
@@ -32,7 +33,7 @@ class Driver(Protocol):
     def read(self, array: NDArray[Any]) -> NDArray[Any]: ...
     def write(self, array: NDArray[Any], values: NDArray[Any]) -> None: ...
     def first_unknown(self, actions: Actions, known: int) -> int: ...
-    def run(self, loop: Loop, game: Played, argument: NDArray[Any]) -> None: ...
+    def run(self, loop: Loop, game: tuple[Any, ...], argument: NDArray[Any]) -> None: ...
 
 
 class Batch:
@@ -73,8 +74,8 @@ class Batch:
         host.number[:, 0] = np.arange(first_world, first_world + worlds, dtype=np.uint64)
         self.now: Worlds = self.driver.place(host)
         """The current state of the worlds, in the driver's arrays."""
-        self.law: Any = self.driver.place(new_law(game, worlds)) if game.institutions else None
-        """The `Law` of the worlds, likewise, without decisions or payments; None without institutions."""
+        self.law: Law | None = self.driver.place(new_law(game, worlds)) if game.institutions else None
+        """Likewise, without decisions or payments; None without institutions."""
         self._no_decisions: Actions = self.driver.empty((worlds, game.agents), np.int64)
         self.driver.write(self._no_decisions, np.zeros((worlds, game.agents), np.int64))
         self._all_worlds: Bools = self.driver.empty((worlds,), np.bool_)
@@ -94,10 +95,10 @@ class Batch:
     def _run(self, loop: Loop, argument: NDArray[Any], output: Any, decisions: Actions | None = None) -> None:
         """Runs a loop of the game, with its institutions if it has any."""
         if self.law is None:
-            game = Played(self.now, self.driver.tables, output, None, None, None)
+            game: tuple[Any, ...] = self.now, self.driver.tables, output, None, None, None
         else:
             decided = self._no_decisions if decisions is None else decisions
-            game = Played(self.now, self.driver.tables, output.turn, self.law, decided, output.payments)
+            game = self.now, self.driver.tables, output.turn, self.law, decided, output.payments
         self.driver.run(loop, game, argument)
 
     def begin(self, output: Output, which: Bools | None = None) -> Output:
@@ -134,7 +135,7 @@ class Batch:
     def boards(self, output: Output) -> Bytes:
         """The current boards: uint8 [B, H, W], classes of `cprl.commons.colours`."""
         boards = self.driver.empty((self.size, self.game.map.height, self.game.map.width), np.uint8)
-        game = Played(self.now, self.driver.tables, turn_of(output), None, None, None)
+        game = self.now, self.driver.tables, turn_of(output), None, None, None
         self.driver.run("show_worlds", game, boards)
         return boards
 

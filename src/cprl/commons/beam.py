@@ -1,11 +1,10 @@
 """The beam: the cells it covers, the agents it hits, and how they are tagged, on one world."""
 
-from typing import Any
-
 from cprl.commons.colours import WALL
 from cprl.commons.moves import cell_of
 from cprl.commons.tables import Tables
 from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Worlds
+from cprl.institutions import Law
 from cprl.institutions.mediation import mediate
 from cprl.institutions.sanctions import sanction_tag
 
@@ -68,7 +67,7 @@ def find_hits(world: Worlds, tables: Tables, hit_by: Bools) -> None:
             hit_by[i, j] = world.fired[j] and i != j and world.in_play[i] and is_hit(world, tables, i, j)
 
 
-def tag(world: Worlds, tables: Tables, law: Any, hit_by: Bools, tagged_by: Bools) -> None:
+def tag(world: Worlds, tables: Tables, law: Law | None, hit_by: Bools, tagged_by: Bools) -> None:
     """Counts hits, at most one per agent and turn, and tags agents with `hits_to_tag` hits; [N, N] each.
 
     Institutions may have other time-outs, and fines, and refund unjust tags.

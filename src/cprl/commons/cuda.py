@@ -83,15 +83,16 @@ class CudaThreads:
         at = int(self._unknown.copy_to_host()[0])
         return -1 if at == NONE_UNKNOWN else at
 
-    def run(self, loop: Loop, game: Played, argument: NDArray[Any]) -> None:
+    def run(self, loop: Loop, game: tuple[Any, ...], argument: NDArray[Any]) -> None:
         """Start a loop over all worlds on the default stream, as `CpuThreads.run`; returns before it has
         finished."""
         launch = _blocks(len(argument)), THREADS_PER_BLOCK
-        if game.law is None:
-            kernels()[loop][launch](*game[:3], argument, self._scratch)
+        worlds, tables, output, law, decisions, payments = game
+        if law is None:
+            kernels()[loop][launch](worlds, tables, output, argument, self._scratch)
         else:
-            law = game.law._replace(decisions=game.decisions, payments=game.payments)
-            kernels()[f"governed {loop}"][launch](*game[:3], law, argument, self._scratch)
+            law = law._replace(decisions=decisions, payments=payments)
+            kernels()[f"governed {loop}"][launch](worlds, tables, output, law, argument, self._scratch)
 
 
 @cache

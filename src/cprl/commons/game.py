@@ -128,16 +128,6 @@ class Game(Value):
         return len(self.channels), *self._seen
 
     @property
-    def scoreboard_size(self) -> int:
-        """The number of entries in each agent's scoreboard: N, or 0 without a scoreboard."""
-        return self.agents if self.observation.scoreboard else 0
-
-    @property
-    def stock_gauge_size(self) -> int:
-        """The number of entries in each agent's stock gauge: 1, or 0 without a stock gauge."""
-        return 1 if self.observation.stock_gauge else 0
-
-    @property
     def ballots(self) -> tuple[Ballot, ...]:
         """What agents decide on at an episode's first turn."""
         return ballots_of(self)
@@ -150,13 +140,13 @@ class Game(Value):
     @property
     def spaces(self) -> Spaces:
         """What each agent observes and may do."""
-        vectors = {"stock_gauge": self.stock_gauge_size, "scoreboard": self.scoreboard_size}
+        vectors = {"stock_gauge": 1, "scoreboard": self.agents}
         return Spaces(
             agents=self.agents,
             observation_shape=self.observation_shape,
             observation_scale=float(self.observation_highest),
             actions=len(self.actions),
-            vectors=tuple((name, size) for name, size in vectors.items() if size),
+            vectors=tuple((name, size) for name, size in vectors.items() if getattr(self.observation, name)),
         )
 
     def make(self, worlds: int, seed: int, device: Any = "cpu") -> Any:
@@ -199,7 +189,9 @@ def output_forms(game: Game, worlds: int) -> dict[str, Form]:
     has institutions."""
     channels, rows, columns = game.observation_shape
     sizes = {"B": worlds, "N": game.agents}
-    turn = {"C": channels, "X": rows, "Y": columns, "S": game.scoreboard_size, "G": game.stock_gauge_size}
+    vectors = dict(game.spaces.vectors)
+    turn = {"C": channels, "X": rows, "Y": columns}
+    turn |= {"S": vectors.get("scoreboard", 0), "G": vectors.get("stock_gauge", 0)}
     forms = forms_of(StepOutput, **sizes, **turn)
     if game.institutions:
         forms |= forms_of(Payments, **sizes, C=len(COUNTS), V=len(game.ballots))

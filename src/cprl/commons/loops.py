@@ -6,6 +6,7 @@ from cprl.commons.tables import Tables
 from cprl.commons.turn import begin_episode, play_turn, refresh_output
 from cprl.commons.views import draw_board
 from cprl.commons.world import Actions, Bools, Bytes, Scratch, StepOutput, Worlds
+from cprl.institutions import Law
 from cprl.institutions.arrays import slicer
 from cprl.institutions.law import one_law
 from cprl.institutions.ledger import Payments
@@ -20,8 +21,8 @@ class Played(NamedTuple):
     worlds: Worlds
     tables: Tables
     output: StepOutput
-    law: Any
-    """The `Law` of the worlds; None without institutions, as are all that follow."""
+    law: Law | None
+    """None without institutions, as are all that follow."""
     decisions: Actions | None
     payments: Payments | None
 

@@ -5,11 +5,9 @@ heading. Everything outside the board is wall.
 """
 
 from bisect import bisect_left, insort
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from inspect import cleandoc
-from itertools import chain
-from math import isqrt
 from typing import Annotated, Final, Literal
 
 import numpy as np
@@ -78,7 +76,6 @@ class Map(Value):
 
 
 def check_cells(name: str, height: int, width: int) -> None:
-    """Checks the number of cells of a board."""
     if height * width > LARGEST_BOARD_CELLS:
         raise ValueError(
             f"{name} has {height:,} x {width:,} = {height * width:,} cells; allowed: at most "
@@ -224,33 +221,42 @@ def with_agents(board: Map, agents: int) -> Map:
 
 Entrances = Literal["single", "multiple", "none", "unequal"]
 
-ROOMS_HEIGHT: Final = 19
-ROOMS_WIDTH: Final = 53
+_ROOMS: Final = """
+    ..A....A....A....A....A.#...#.A....A....A....A....A..
+    .AAA..AAA..AAA..AAA..AAAo...#AAA..AAA..AAA..AAA..AAA.
+    ..A....A....A....A....A.#...#.A....A....A....A....A..
+    ......v...v...v.........#...o.........v...v...v......
+    .....A....A....A....A...#...#...A....A....A....A.....
+    ....AAA..AAA..AAA..AAA#.#...###AAA..AAA..AAA..AAA....
+    .....A....A....A....A.#.#.......A....A....A....A.....
+    #o######o##############.#...############o#######o####
+    .....................................................
+    .....................................................
+    .....................................................
+    ####o#######o############...#.##############o######o#
+    .....A....A....A....A.......#.#.A....A....A....A.....
+    ....AAA..AAA..AAA..AAA###...#.#AAA..AAA..AAA..AAA....
+    .....A....A....A....A...#...#...A....A....A....A.....
+    ......^...^...^.........o...#.........^...^...^......
+    ..A....A....A....A....A.#...#.A....A....A....A....A..
+    .AAA..AAA..AAA..AAA..AAA#...oAAA..AAA..AAA..AAA..AAA.
+    ..A....A....A....A....A.#...#.A....A....A....A....A..
+"""
+"""The board of `rooms`; "o" is a wall, but open under "multiple"."""
 
-_FAR_CENTRES: Final = (2, 7, 12, 17, 22, 30, 35, 40, 45, 50)
-_NEAR_CENTRES: Final = (5, 10, 15, 20, 32, 37, 42, 47)
-_CENTRES: Final = (
-    *((row, col) for row in (1, 17) for col in _FAR_CENTRES),
-    *((row, col) for row in (5, 13) for col in _NEAR_CENTRES),
-)
-_CLOSE_CENTRES: Final = (*((1, col) for col in (2, 6, 10, 14, 18)), *((3, col) for col in (4, 8, 12, 16)))
-"""Centres of the crosses in the north-west room of the unequal board."""
-
-_NORTH_WALLS: Final[dict[Sequence[int], tuple[Sequence[int], ...]]] = {
-    range(5): ((24, 28),),
-    (5,): ((22, 24), range(28, 31)),
-    (6,): ((22, 24),),
-    (7,): (range(23), (24,), range(28, 53)),
-}
-"""Columns of wall by rows of the upper half; the lower half is the upper one rotated by 180 degrees."""
-
-_OPENINGS: Final = ((1, 24), (3, 28), (7, 1), (7, 8), (7, 40), (7, 48))
-"""Openings in the walls of the upper half under "multiple"; the lower half likewise."""
-
-_NORTH_STARTS: Final = ((3, 6), (3, 46), (3, 10), (3, 42), (3, 14), (3, 38))
+_CLOSE_ROOM: Final = """
+    ..A...A...A...A...A.....
+    .AAA.AAA.AAA.AAA.AAA....
+    ..A.A.A.A.A.A.A.A.A.....
+    ...AAAvAAAvAAAvAAA......
+    ....A...A...A...A.......
+    ......................#.
+    ......................#.
+"""
+"""The north-west room under "unequal"."""
 
 ROOM_NAMES: Final = ("north-west", "north-east", "south-east", "south-west")
-_ROOMS: Final = tuple(
+_ROOM_SLICES: Final = tuple(
     (slice(*rows), slice(*columns))
     for rows, columns in (((0, 7), (0, 24)), ((0, 7), (29, 53)), ((12, 19), (29, 53)), ((12, 19), (0, 24)))
 )
@@ -285,18 +291,16 @@ def rooms(entrances: Entrances = "single", *, agents: int = 12) -> Map:
     south-east and south-west room.
     """
     checked("entrances", entrances, Entrances)
-    agents = checked("agents", agents, Annotated[int, Range(1, 2 * len(_NORTH_STARTS))])
-    centres: tuple[Cell, ...] = _CENTRES
+    agents = checked("agents", agents, Annotated[int, Range(1, 12)])
+    rows = _ROOMS.split()
     if entrances == "unequal":
-        in_corner = {(row, col) for row, col in _CENTRES if row < 7 and col < 24}
-        centres = (*_CLOSE_CENTRES, *(cell for cell in _CENTRES if cell not in in_corner))
-    return crosses(
-        height=ROOMS_HEIGHT,
-        width=ROOMS_WIDTH,
-        centres=centres,
-        starts=_room_starts()[:agents],
-        walls=_room_walls(entrances),
-    )
+        close = _CLOSE_ROOM.split()
+        rows[: len(close)] = [west + row[len(west) :] for west, row in zip(close, rows, strict=False)]
+    board = parse("\n".join(rows).replace("o", GROUND if entrances == "multiple" else WALL))
+    north, south = board.starts[:6], board.starts[6:]
+    starts = [start for n in range(3) for start in (north[n], north[-1 - n], south[-1 - n], south[n])]
+    walls = () if entrances == "none" else board.walls
+    return replace(board, starts=tuple(starts[:agents]), walls=walls)
 
 
 def room_cells() -> NDArray[np.bool_]:
@@ -304,39 +308,10 @@ def room_cells() -> NDArray[np.bool_]:
 
     Those of the corridor are in no room. They are the same without walls. Agent i begins in room i % 4.
     """
-    cells = np.zeros((len(_ROOMS), ROOMS_HEIGHT, ROOMS_WIDTH), np.bool_)
-    for room, (rows, columns) in enumerate(_ROOMS):
+    cells = np.zeros((len(_ROOM_SLICES), 19, 53), np.bool_)
+    for room, (rows, columns) in enumerate(_ROOM_SLICES):
         cells[room, rows, columns] = True
     return cells
-
-
-def _turned(cell: Cell) -> Cell:
-    """The position of a cell after the board is rotated by 180 degrees."""
-    return ROOMS_HEIGHT - 1 - cell[0], ROOMS_WIDTH - 1 - cell[1]
-
-
-def _room_walls(entrances: Entrances) -> list[Cell]:
-    if entrances == "none":
-        return []
-    north = {
-        (row, col)
-        for rows, columns in _NORTH_WALLS.items()
-        for row in rows
-        for some in columns
-        for col in some
-    }
-    if entrances == "multiple":
-        north -= set(_OPENINGS)
-    return sorted(north | set(map(_turned, north)))
-
-
-def _room_starts() -> list[Start]:
-    """The starts of all 12 agents, facing the corridor."""
-    starts: list[Start] = []
-    for west, east in zip(_NORTH_STARTS[::2], _NORTH_STARTS[1::2], strict=True):
-        north = [(*cell, DOWN) for cell in (west, east)]
-        starts += [*north, *((*_turned(cell), UP) for cell in (west, east))]
-    return starts
 
 
 def random(
@@ -365,72 +340,26 @@ def random(
             f"{count} sites and {agents} agents do not fit on {cells} cells; allowed: a lower density, or "
             "fewer agents"
         )
-    free, beside = _Cells(cells, full=True), _Cells(cells)
-    while cells - free.count < count:
-        near = beside.count and rng.random() < clustering
+    free = list(range(cells))
+    beside: list[int] = []  # free cells next to a site; both lists stay in ascending order
+    is_free, is_beside = [True] * cells, [False] * cells
+    for _ in range(count):
+        near = beside and rng.random() < clustering
         choices = beside if near else free
-        cell = choices.at(int(rng.integers(choices.count)))
-        free.discard(cell)
-        beside.discard(cell)
+        cell = choices[int(rng.integers(len(choices)))]
+        del free[bisect_left(free, cell)]
+        is_free[cell] = False
+        if is_beside[cell]:
+            del beside[bisect_left(beside, cell)]
+            is_beside[cell] = False
         row, col = divmod(cell, width)
-        for inside, neighbour in (
-            (row > 0, cell - width),
-            (row < height - 1, cell + width),
-            (col > 0, cell - 1),
-            (col < width - 1, cell + 1),
-        ):
-            if inside and neighbour in free:
-                beside.add(neighbour)
-    places = np.fromiter(free, np.int64)
-    chosen = places[rng.choice(len(places), agents, replace=False)].tolist()
-    starts = [(*divmod(cell, width), int(rng.integers(4))) for cell in chosen]
-    sites = np.setdiff1d(np.arange(cells), places).tolist()
-    return Map(
-        height=height, width=width, sites=tuple(divmod(cell, width) for cell in sites), starts=tuple(starts)
-    )
-
-
-class _Cells:
-    """A set of cells, 0 .. cells - 1, that knows the n-th smallest in about 10 microseconds: ascending cells
-    in blocks of about the square root of their largest number."""
-
-    def __init__(self, cells: int, *, full: bool = False) -> None:
-        self.count = cells if full else 0
-        self._size = isqrt(cells) + 1
-        self._is_in = bytearray([full]) * cells
-        firsts = range(0, cells, self._size)
-        self._blocks = [
-            list(range(first, min(first + self._size, cells))) if full else [] for first in firsts
-        ]
-        self._lengths = np.array(list(map(len, self._blocks)))
-
-    def __contains__(self, cell: int) -> bool:
-        return bool(self._is_in[cell])
-
-    def __iter__(self) -> Iterator[int]:
-        return chain.from_iterable(self._blocks)
-
-    def at(self, place: int) -> int:
-        """The cell at a place in ascending order."""
-        ends = self._lengths.cumsum()
-        block = int(ends.searchsorted(place, side="right"))
-        return self._blocks[block][place - int(ends[block])]
-
-    def add(self, cell: int) -> None:
-        """Adds a cell, if it is not there."""
-        if not self._is_in[cell]:
-            self._is_in[cell] = True
-            block = cell // self._size
-            insort(self._blocks[block], cell)
-            self._lengths[block] += 1
-            self.count += 1
-
-    def discard(self, cell: int) -> None:
-        """Removes a cell, if it is there."""
-        if self._is_in[cell]:
-            self._is_in[cell] = False
-            block = cell // self._size
-            cells = self._blocks[block]
-            del cells[bisect_left(cells, cell)]
-            self._lengths[block] -= 1
-            self.count -= 1
+        for neighbour_row, neighbour_col in ((row - 1, col), (row + 1, col), (row, col - 1), (row, col + 1)):
+            neighbour = neighbour_row * width + neighbour_col
+            is_on_board = 0 <= neighbour_row < height and 0 <= neighbour_col < width
+            if is_on_board and is_free[neighbour] and not is_beside[neighbour]:
+                insort(beside, neighbour)
+                is_beside[neighbour] = True
+    chosen = np.array(free)[rng.choice(len(free), agents, replace=False)].tolist()
+    starts = tuple((*divmod(cell, width), int(rng.integers(4))) for cell in chosen)
+    sites = tuple(divmod(cell, width) for cell in range(cells) if not is_free[cell])
+    return Map(height=height, width=width, sites=sites, starts=starts)

@@ -110,12 +110,10 @@ def check_sizes(board: Map, rules: Rules) -> None:
 
 
 def _beam_half_width(board: Map, rules: Rules) -> int:
-    """Half the width of a beam, as far as the board extends."""
     return min(rules.beam_width_cells // 2, max(board.height, board.width) - 1)
 
 
 def _rim(board: Map, rules: Rules, *, sees_all: bool = False) -> int:
-    """`Tables.rim`."""
     window_reach = (0,) if sees_all else (rules.window_rows - 1, rules.window_columns // 2)
     return max(1, *window_reach, _beam_half_width(board, rules))
 
@@ -134,14 +132,6 @@ def _offset(ahead: int, side: int, heading: int, stride: int) -> int:
     rows = ahead * ROW_STEP[heading] + side * ROW_STEP[right]
     cols = ahead * COL_STEP[heading] + side * COL_STEP[right]
     return rows * stride + cols
-
-
-def _window_cells(rules: Rules, stride: int) -> Ints:
-    """`Tables.window_cells` for windows: [4, X * Y]."""
-    places = _window_places(rules)
-    return np.array(
-        [[_offset(*place, heading, stride) for place in places] for heading in range(4)], np.int32
-    )
 
 
 def _paint(kind: int) -> int:
@@ -209,6 +199,8 @@ def build_tables(board: Map, rules: Rules, observation: Observation, *, highest:
     site_at = np.full(background.size, -1, np.int32)
     site_at[cells(board.sites)] = range(len(board.sites))
     near_first, near_sites = neighbours(board, rules)
+    places = _window_places(rules)
+    window_cells = [[_offset(*place, heading, stride) for place in places] for heading in range(4)]
     max_near = int(np.diff(near_first).max())
     probs = [rules.regrow_prob[min(n, len(rules.regrow_prob) - 1)] for n in range(max_near + 1)]
     below = np.array([threshold(p) for p in probs], np.int64)
@@ -225,7 +217,7 @@ def build_tables(board: Map, rules: Rules, observation: Observation, *, highest:
         beam_length=np.array(rules.beam_lengths_cells, np.int32),
         paints=paints,
         channel_of=channel_of,
-        window_cells=_board_cells(board, rim, stride) if sees_all else _window_cells(rules, stride),
+        window_cells=_board_cells(board, rim, stride) if sees_all else np.array(window_cells, np.int32),
         in_sight=_in_sight(board, rules, background.reshape(-1) == paints[WALL], rim, stride),
         rim=rim,
         stride=stride,

@@ -1,7 +1,5 @@
 """The order of a turn and of an episode, and what institutions do in them, on one world."""
 
-from typing import Any
-
 import numpy as np
 
 from cprl.commons.apples import bite, draw, fill, find_sprouts, grow, recount
@@ -19,6 +17,7 @@ from cprl.commons.moves import (
 from cprl.commons.tables import Tables
 from cprl.commons.views import draw_institutions, draw_windows
 from cprl.commons.world import PLAYING, TERMINATED, TRUNCATED, Actions, Scratch, StepOutput, Worlds
+from cprl.institutions import Law
 from cprl.institutions.law import begin, note_growth, open_turn, refresh, settle
 from cprl.institutions.ledger import charge, count_violation, forget_episode, forget_turn
 from cprl.institutions.sanctioner import appoint
@@ -27,7 +26,7 @@ from cprl.institutions.votes import hold_ballot, is_due
 
 
 def play_turn(
-    world: Worlds, tables: Tables, actions: Actions, output: StepOutput, law: Any, scratch: Scratch
+    world: Worlds, tables: Tables, actions: Actions, output: StepOutput, law: Law | None, scratch: Scratch
 ) -> None:
     """Plays one turn; `actions`: int64 [N]. A world that has ended does not change and pays nothing.
 
@@ -90,7 +89,9 @@ def shuffle_starts(world: Worlds) -> None:
         world.heading[i], world.heading[j] = world.heading[j], world.heading[i]
 
 
-def begin_episode(world: Worlds, tables: Tables, output: StepOutput, law: Any, scratch: Scratch) -> None:
+def begin_episode(
+    world: Worlds, tables: Tables, output: StepOutput, law: Law | None, scratch: Scratch
+) -> None:
     """Starts the next episode: all sites hold an apple, all agents are at their starts; institutions forget
     the last one, but for what votes put in force."""
     world.episode[0] += 1
@@ -107,7 +108,9 @@ def begin_episode(world: Worlds, tables: Tables, output: StepOutput, law: Any, s
         write_payments(world, tables, law, output)
 
 
-def refresh_output(world: Worlds, tables: Tables, output: StepOutput, law: Any, scratch: Scratch) -> None:
+def refresh_output(
+    world: Worlds, tables: Tables, output: StepOutput, law: Law | None, scratch: Scratch
+) -> None:
     """Writes the output for a state that was set from outside, with no harvest, shots, hits, growth or
     payments."""
     recount(world, tables)
@@ -161,7 +164,7 @@ def write_state(world: Worlds, tables: Tables, output: StepOutput, scratch: Scra
     draw_windows(world, tables, scratch, output.observation)
 
 
-def begin_turn(world: Worlds, law: Any) -> None:
+def begin_turn(world: Worlds, law: Law) -> None:
     """Clears the notes of the last turn; in the first one of an episode agents decide, and windows open."""
     forget_turn(law.ledger)
     if world.step[0] == 1:
@@ -173,20 +176,20 @@ def begin_turn(world: Worlds, law: Any) -> None:
         open_turn(law, 1, stock_share(world))
 
 
-def hold_fire(world: Worlds, law: Any) -> None:
+def hold_fire(world: Worlds, law: Law) -> None:
     """Takes back the shots of agents that may not fire."""
     for i in range(world.row.shape[0]):
         world.fired[i] = world.fired[i] and law.sanctioner.may_fire[i]
 
 
-def end_turn(world: Worlds, law: Any, scratch: Scratch, sprouts: int) -> None:
+def end_turn(world: Worlds, law: Law, scratch: Scratch, sprouts: int) -> None:
     """Begins what begins with the coming turn; `sprouts`: apples grown."""
     for s in range(sprouts):
         note_growth(law, scratch.sprouts[s])
     open_turn(law, world.step[0] + 1, stock_share(world))
 
 
-def begin_institutions(world: Worlds, law: Any) -> None:
+def begin_institutions(world: Worlds, law: Law) -> None:
     """Begins an episode: all is forgotten but what votes put in force. Before the first vote of a world, that
     is the first choice of each ballot."""
     forget_episode(law.ledger)
@@ -198,7 +201,7 @@ def begin_institutions(world: Worlds, law: Any) -> None:
     open_turn(law, 1, stock_share(world))
 
 
-def refresh_institutions(world: Worlds, law: Any) -> None:
+def refresh_institutions(world: Worlds, law: Law) -> None:
     """Writes what follows from the rest of the memory and from the stock, without events."""
     refresh(law, world.stock)
     forget_turn(law.ledger)
@@ -209,7 +212,7 @@ def stock_share(world: Worlds) -> float:
     return world.stock_left[0] / world.stock.shape[0]
 
 
-def pursue_violations(world: Worlds, tables: Tables, law: Any) -> None:
+def pursue_violations(world: Worlds, tables: Tables, law: Law) -> None:
     """Detects violations of this turn, or not, and lets those who are found out pay and miss turns."""
     for i in range(world.row.shape[0]):
         law.ledger.detected[i] = False
@@ -222,10 +225,11 @@ def pursue_violations(world: Worlds, tables: Tables, law: Any) -> None:
                     take_out(world, tables, i, steps)
 
 
-def write_payments(world: Worlds, tables: Tables, law: Any, output: StepOutput) -> None:
+def write_payments(world: Worlds, tables: Tables, law: Law, output: StepOutput) -> None:
     """Writes what institutions took, gave and counted in this turn, the reward, and what agents are shown."""
     ledger, payments = law.ledger, law.payments
-    draw_institutions(world, tables, law, output.observation)
+    if law.entries.places or law.entries.what.shape[0] > 0:
+        draw_institutions(world, tables, law, output.observation)
     for i in range(world.row.shape[0]):
         payments.fines[i] = ledger.fines[i]
         payments.transfers[i] = ledger.transfers[i]

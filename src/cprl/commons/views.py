@@ -9,8 +9,6 @@ entry n modulo S. So a single entry fills a plane evenly, as is usual for number
 beside a board.
 """
 
-from typing import Any
-
 import numpy as np
 
 from cprl.commons.beam import beam_cell, beam_reach
@@ -18,6 +16,7 @@ from cprl.commons.colours import APPLE, BEAM, FIRST_AGENT, GROUND, HIDDEN, MARK,
 from cprl.commons.moves import cell_of
 from cprl.commons.tables import CLASS_SHIFT, Tables
 from cprl.commons.world import COL_STEP, DOWN, ROW_STEP, UP, Bytes, Ints, Scratch, Worlds
+from cprl.institutions import Law
 from cprl.institutions.law import forbids, shown
 
 
@@ -163,7 +162,7 @@ def draw_board(world: Worlds, tables: Tables, scratch: Scratch, board: Bytes) ->
 HIGHEST = 255
 
 
-def draw_institutions(world: Worlds, tables: Tables, law: Any, observation: Bytes) -> None:
+def draw_institutions(world: Worlds, tables: Tables, law: Law, observation: Bytes) -> None:
     """Writes what institutions show each agent; `observation`: uint8 [N, C, X, Y]."""
     cells = tables.window_cells.shape[1]
     for i in range(world.row.shape[0]):
@@ -176,7 +175,7 @@ def draw_institutions(world: Worlds, tables: Tables, law: Any, observation: Byte
             draw_entries(law, i, world.step[0], planes[first:])
 
 
-def draw_forbidden(world: Worlds, tables: Tables, law: Any, i: int, plane: Bytes) -> None:
+def draw_forbidden(world: Worlds, tables: Tables, law: Law, i: int, plane: Bytes) -> None:
     """Draws where agent i sees that its bites would break a rule about places; `plane`: uint8 [X * Y]."""
     origin = 0 if tables.sees_all else cell_of(world.row[i], world.col[i], tables)
     heading = world.heading[i]
@@ -188,7 +187,7 @@ def draw_forbidden(world: Worlds, tables: Tables, law: Any, i: int, plane: Bytes
                 plane[n] = HIGHEST
 
 
-def draw_entries(law: Any, i: int, turn: int, planes: Bytes) -> None:
+def draw_entries(law: Law, i: int, turn: int, planes: Bytes) -> None:
     """Writes the entries shown to agent i, each into every S-th cell; `planes`: uint8 [cells]."""
     entries = law.entries.what.shape[0]
     for entry in range(entries):

@@ -21,7 +21,7 @@ at which it acts, see `cprl.institutions.law`. In reading order:
     law         all of them together, compiled by `cprl.commons` for every target
 """
 
-from typing import Final
+from typing import Annotated, NamedTuple
 
 from cprl.institutions import (
     boundaries,
@@ -36,9 +36,10 @@ from cprl.institutions import (
     taxes,
     votes,
 )
+from cprl.institutions.arrays import Longs
 from cprl.institutions.base import Institution
 from cprl.institutions.boundaries import Boundaries
-from cprl.institutions.ledger import COUNTS
+from cprl.institutions.ledger import COUNTS, Entries, Ledger, Payments
 from cprl.institutions.mediation import Mediation
 from cprl.institutions.monitoring import Monitoring
 from cprl.institutions.patches import ClosedPatches
@@ -50,11 +51,28 @@ from cprl.institutions.seasons import ClosedSeason
 from cprl.institutions.taxes import Levies, Tax
 from cprl.institutions.votes import Vote
 
-MODULES: Final = (
-    *(boundaries, seasons, quotas, patches, rotation),
-    *(monitoring, taxes, votes, sanctions, mediation, sanctioner),
-)
-"""The module of each kind, in the order in which their rules are called within a turn."""
+
+class Law(NamedTuple):
+    """What institutions need in a turn of B worlds: the `Arrays` of each module, in the order in which their
+    rules are called, and more."""
+
+    decisions: Annotated[Longs, "B N"]
+    """Read in the first turn of an episode."""
+    payments: Payments
+    ledger: Ledger
+    entries: Entries
+    boundaries: boundaries.Arrays
+    seasons: seasons.Arrays
+    quotas: quotas.Arrays
+    patches: patches.Arrays
+    rotation: rotation.Arrays
+    monitoring: monitoring.Arrays
+    taxes: taxes.Arrays
+    votes: votes.Arrays
+    sanctions: sanctions.Arrays
+    mediation: mediation.Arrays
+    sanctioner: sanctioner.Arrays
+
 
 __all__ = [
     "COUNTS",
@@ -63,6 +81,7 @@ __all__ = [
     "ClosedSeason",
     "GraduatedSanctions",
     "Institution",
+    "Law",
     "Levies",
     "Mediation",
     "Monitoring",

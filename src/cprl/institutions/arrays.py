@@ -57,17 +57,11 @@ class Field(NamedTuple):
 def _fields(kind: Any) -> Mapping[str, Any]:
     """The `Field` of each array of a tuple; of whatever else it holds the annotation."""
     hints = get_type_hints(kind, include_extras=True)
-    return {name: _field(hint) if get_origin(hint) is Annotated else hint for name, hint in hints.items()}
-
-
-def _field(hint: Any) -> Field:
-    array, axes, *lasts = get_args(hint)
-    return Field(tuple(axes.split()), get_args(get_args(array)[1])[0], *lasts)
-
-
-def fields_of(kind: Any) -> list[Field]:
-    """The arrays of a tuple."""
-    return [field for field in _fields(kind).values() if isinstance(field, Field)]
+    for name, hint in hints.items():
+        if get_origin(hint) is Annotated:
+            array, axes, *lasts = get_args(hint)
+            hints[name] = Field(tuple(axes.split()), get_args(get_args(array)[1])[0], *lasts)
+    return hints
 
 
 def forms_of(kind: Any, **sizes: int) -> dict[str, Form]:

@@ -39,8 +39,6 @@ class Institution(Value, stored=False):
     observed: bool = True
     """Whether agents observe what this institution shows them, see `cprl.commons.views`."""
 
-    principle: ClassVar[str] = ""
-    """Of the eight design principles of Ostrom, "Governing the Commons" (1990), table 3.1."""
     at_most: ClassVar[int | None] = None
     """How many of this kind a game can have; None for any number."""
     needs: ClassVar[tuple[str, ...]] = ()

@@ -59,7 +59,6 @@ class Boundaries(Institution):
     """None: everybody may stand anywhere. A number: each turn that ends in the region of others
     is a violation, and costs so many apples if it is detected."""
 
-    principle: ClassVar[str] = "1 clearly defined boundaries"
     shows_places: ClassVar[bool] = True
     counts: ClassVar[tuple[str, ...]] = ("own_bites", "foreign_bites", "trespasses")
 

@@ -21,87 +21,56 @@ institutions in a game. What a tag costs and who is detected is asked of `sancti
 compiles anything.
 """
 
+from importlib import import_module
 from types import FunctionType
-from typing import Annotated, Any, Final, NamedTuple, cast
+from typing import Any, Final, cast
 
-from cprl.institutions import MODULES
-from cprl.institutions.arrays import Ints, Longs, fields_of, filled, slicer
+from cprl.institutions import Law
+from cprl.institutions.arrays import filled, slicer
 from cprl.institutions.base import Institution, numbered
-from cprl.institutions.ledger import COUNTS, Ledger, Payments, violate
+from cprl.institutions.ledger import COUNTS, Ledger, violate
 from cprl.institutions.votes import MOST_DECISIONS, decision_options
 
-MOST_INSTITUTIONS: Final = 64
-"""The largest number of institutions of a game."""
+MODULES: Final = {
+    name: import_module(kind.__module__)
+    for name, kind in Law.__annotations__.items()
+    if getattr(kind, "__name__", "") == "Arrays"
+}
+"""The modules of kinds, in the order in which their rules are called within a turn."""
 
 KINDS: Final[tuple[type[Institution], ...]] = tuple(
     kind
-    for module in MODULES
+    for module in MODULES.values()
     for kind in vars(module).values()
     if isinstance(kind, type) and issubclass(kind, Institution) and kind.__module__ == module.__name__
 )
 """All kinds of institutions that a game can have."""
 
-
-class Entries(NamedTuple):
-    """What agents are shown of institutions, one entry per index of axis E."""
-
-    module: Annotated[Ints, "E"]
-    """The index in `MODULES`."""
-    what: Annotated[Ints, "E"]
-    """The index in the `entries` of its kind."""
-    argument: Annotated[Ints, "E"]
-    """Which one of its kind."""
-    places: bool
-    """Whether agents see where bites are forbidden."""
-    first_plane: int
-    """The channel of observations that is the first one of institutions."""
-
-
-_NAMES: Final = tuple(module.__name__.rpartition(".")[2] for module in MODULES)
-
-Law: Final[Any] = cast(Any, NamedTuple)(
-    "Law",
-    [
-        ("decisions", Annotated[Longs, "B N"]),
-        ("payments", Payments),
-        ("ledger", Ledger),
-        ("entries", Entries),
-        *((name, module.Arrays) for name, module in zip(_NAMES, MODULES, strict=True)),
-    ],
-)
-"""All that institutions need in a turn, beside the world: int64 `decisions`, [N] of one world, read in the
-first turn of an episode, and the `Arrays` of each module by its name."""
-
-
-_FUNCTIONS: Final = {
-    f"{name}_{hook}": function
-    for name, module in zip(_NAMES, MODULES, strict=True)
-    for hook, function in vars(module).items()
-    if isinstance(function, FunctionType) and function.__module__ == module.__name__
+_RULES: Final = {
+    f"{name}_{word}": rule
+    for name, module in MODULES.items()
+    for word, rule in vars(module).items()
+    if word == "COUNT" or (isinstance(rule, FunctionType) and rule.__module__ == module.__name__)
 }
-_COUNTS: Final = {
-    f"{name}_COUNT": module.COUNT
-    for name, module in zip(_NAMES, MODULES, strict=True)
-    if hasattr(module, "COUNT")
-}
+"""The functions and `COUNT` of modules, under names of their own."""
 
 _SLICERS: Final = {
-    f"one_{name}": slicer(kind)
-    for name, kind in Law.__annotations__.items()
-    if name != "decisions" and any(field.is_of_worlds for field in fields_of(kind))
+    f"one_{name}": slicer(kind) for name, kind in Law.__annotations__.items() if name != "decisions"
 }
 
 
 def _calls(hook: str, arguments: str) -> list[str]:
     """The calls of a hook in every module that has it."""
-    names = [name for name in _NAMES if f"{name}_{hook}" in _FUNCTIONS]
-    return [f"{name}_{hook}(law.{name}, law.ledger, {arguments})" for name in names]
+    return [
+        f"{name}_{hook}(law.{name}, law.ledger, {arguments})"
+        for name in MODULES
+        if f"{name}_{hook}" in _RULES
+    ]
 
 
 def _written(head: str, lines: list[str]) -> Any:
     """Return a function of these lines, in which hooks are called one by one: rules cannot loop over them."""
-    names: dict[str, Any] = {"__name__": __name__, "violate": violate, "Law": Law}
-    names |= {**_COUNTS, **_FUNCTIONS, **_SLICERS}
+    names: dict[str, Any] = {"__name__": __name__, "violate": violate, "Law": Law, **_RULES, **_SLICERS}
     exec(f"def {head}:\n    " + "\n    ".join(lines), names)
     return names[head.partition("(")[0]]
 
@@ -125,10 +94,7 @@ one_law = _written(
     [
         "if law is None: return None",
         "return Law(decisions[b], one_payments(payments, b), "
-        + ", ".join(
-            f"one_{name}(law.{name}, b)" if f"one_{name}" in _SLICERS else f"law.{name}"
-            for name in Law._fields[2:]
-        )
+        + ", ".join(f"one_{name}(law.{name}, b)" for name in Law._fields[2:])
         + ")",
     ],
 )
@@ -159,7 +125,7 @@ shown = _written(
         "module, what, argument = law.entries.module[entry], law.entries.what[entry], "
         "law.entries.argument[entry]",
         *(
-            f"if module == {_NAMES.index(call.partition('_shown')[0])}: return {call}"
+            f"if module == {list(MODULES).index(call.partition('_shown')[0])}: return {call}"
             for call in _calls("shown", "what, argument, i, turn")
         ),
         "return 0.0",
@@ -181,8 +147,9 @@ def entries_shown(game: Any) -> list[tuple[str, int]]:
 
 def parameters(game: Any) -> dict[str, dict[str, Any]]:
     """The parameters of a game's institutions, by the fields of `Law`."""
+    modules = [module.__name__ for module in MODULES.values()]
     places = {
-        entry: (_NAMES.index(kind.__module__.rpartition(".")[2]), what)
+        entry: (modules.index(kind.__module__), what)
         for kind in KINDS
         for what, entry in enumerate(kind.entries)
     }
@@ -194,11 +161,11 @@ def parameters(game: Any) -> dict[str, dict[str, Any]]:
         "places": shows_places(game),
         "first_plane": len(game.cell_channels),
     }
-    of_modules = {name: module.parameters(game) for name, module in zip(_NAMES, MODULES, strict=True)}
+    of_modules = {name: module.parameters(game) for name, module in MODULES.items()}
     return {"entries": entries, **of_modules}
 
 
-def new_law(game: Any, worlds: int) -> Any:
+def new_law(game: Any, worlds: int) -> Law:
     """The law of B worlds of a game, in which nothing has happened and the first choice of each ballot is in
     force; without `decisions` and `payments`, which come with each turn."""
     given = game.law_parameters
@@ -207,17 +174,12 @@ def new_law(game: Any, worlds: int) -> Any:
     parts = {name: filled(kinds[name], values, **sizes) for name, values in given.items()}
     ledger = filled(Ledger, {}, **sizes)
     ledger.in_force[:] = parts["votes"].choices[:, 0]
-    return Law(decisions=None, payments=None, ledger=ledger, **parts)
+    return cast(Any, Law)(decisions=None, payments=None, ledger=ledger, **parts)
 
 
 def check_institutions(game: Any) -> None:
     """Checks that the institutions of a game fit each other, its map, rules and observation."""
-    institutions = game.institutions
-    if len(institutions) > MOST_INSTITUTIONS:
-        raise ValueError(
-            f"Game.institutions has {len(institutions)} entries; allowed: at most {MOST_INSTITUTIONS}"
-        )
-    for institution in institutions:
+    for institution in game.institutions:
         kind = type(institution)
         if kind not in KINDS:
             raise ValueError(
@@ -225,19 +187,17 @@ def check_institutions(game: Any) -> None:
                 f"{', '.join(known.__name__ for known in KINDS)}; an institution of your own is a "
                 "TorchRL transform, see docs/institutions.md"
             )
-        of_kind = sum(type(other) is kind for other in institutions)
+        of_kind = sum(type(other) is kind for other in game.institutions)
         if kind.at_most is not None and of_kind > kind.at_most:
             raise ValueError(
                 f"Game.institutions has {of_kind} of {kind.__name__}; allowed: at most {kind.at_most}"
             )
-        lacking = [
-            name for name in kind.needs if institution.observed and not getattr(game.observation, name)
-        ]
-        if lacking:
-            raise ValueError(
-                f"{kind.__name__}.observed is True and Observation.{lacking[0]} is False; allowed: "
-                f"Observation({lacking[0]}=True), or {kind.__name__}(observed=False)"
-            )
+        for switch in kind.needs:
+            if institution.observed and not getattr(game.observation, switch):
+                raise ValueError(
+                    f"{kind.__name__}.observed is True and Observation.{switch} is False; allowed: "
+                    f"Observation({switch}=True), or {kind.__name__}(observed=False)"
+                )
         if institution.needs_tags and not game.rules.may_fire:
             raise ValueError(
                 f"Game.institutions has a {kind.__name__} and Rules.may_fire is False; allowed: a game in "

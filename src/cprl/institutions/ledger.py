@@ -44,6 +44,21 @@ class Ledger(NamedTuple):
     """Apples given in this turn."""
 
 
+class Entries(NamedTuple):
+    """What agents are shown of institutions, one entry per index of axis E."""
+
+    module: Annotated[Ints, "E"]
+    """The index in `cprl.institutions.law.MODULES`."""
+    what: Annotated[Ints, "E"]
+    """The index in the `entries` of its kind."""
+    argument: Annotated[Ints, "E"]
+    """Which one of its kind."""
+    places: bool
+    """Whether agents see where bites are forbidden."""
+    first_plane: int
+    """The channel of observations that is the first one of institutions."""
+
+
 class Payments(NamedTuple):
     """What institutions output in a turn, written into arrays that the caller provides."""
 

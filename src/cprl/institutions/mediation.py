@@ -26,7 +26,6 @@ class Mediation(Institution):
     refund: Amount = 1.0
     """The apples that the tagged agent is paid."""
 
-    principle: ClassVar[str] = "6 conflict resolution"
     entries: ClassVar[tuple[str, ...]] = ("violator",)
     at_most: ClassVar[int | None] = 1
     needs: ClassVar[tuple[str, ...]] = ("agents_apart",)

@@ -41,7 +41,6 @@ class Monitoring(Institution):
     period_episodes: Positive = 1
     """An election is held in every such number of episodes, from the first one."""
 
-    principle: ClassVar[str] = "4 monitoring"
     entries: ClassVar[tuple[str, ...]] = ("detected", "elected")
     at_most: ClassVar[int | None] = 1
     counts: ClassVar[tuple[str, ...]] = ("detections",)

@@ -29,7 +29,6 @@ class ClosedPatches(Limit):
     """None: nobody can harvest in a closed patch. A number: it can be done, is a violation, and each bite
     costs so many apples if it is detected."""
 
-    principle: ClassVar[str] = "2 rules that fit local conditions"
     at_most: ClassVar[int | None] = 1
     shows_places: ClassVar[bool] = True
     counts: ClassVar[tuple[str, ...]] = ("closed_bites",)

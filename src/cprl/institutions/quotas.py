@@ -39,7 +39,6 @@ class Quota(Limit):
     """None: nobody can harvest more. A number: it can be done, is a violation, and each bite above the quota
     costs so many apples if it is detected."""
 
-    principle: ClassVar[str] = "2 rules that fit local conditions"
     counts: ClassVar[tuple[str, ...]] = ("excess_bites",)
     entries: ClassVar[tuple[str, ...]] = ("quota left", "quota time")
     voted_on: ClassVar[str] = "the quota's share"

@@ -28,7 +28,6 @@ class Rotation(Limit):
     """None: nobody else can harvest. A number: it can be done, is a violation, and each bite costs so many
     apples if it is detected."""
 
-    principle: ClassVar[str] = "2 rules that fit local conditions"
     counts: ClassVar[tuple[str, ...]] = ("closed_bites",)
     entries: ClassVar[tuple[str, ...]] = ("may harvest", "window time")
 

@@ -28,7 +28,6 @@ class Sanctioner(Institution):
     """The probability that an authority from outside appoints an agent by chance, all equally likely, in
     place of the elected one."""
 
-    principle: ClassVar[str] = "7 the right to organise"
     entries: ClassVar[tuple[str, ...]] = ("may fire",)
     at_most: ClassVar[int | None] = 1
 

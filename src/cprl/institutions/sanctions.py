@@ -48,7 +48,6 @@ class GraduatedSanctions(Institution):
     """What is an offence: "tags", to be tagged by another agent; "violations" of rules of other institutions,
     if they are detected; "both"."""
 
-    principle: ClassVar[str] = "5 graduated sanctions"
     entries: ClassVar[tuple[str, ...]] = ("sanction level",)
     at_most: ClassVar[int | None] = 1
     counts: ClassVar[tuple[str, ...]] = ("sanctions", "returns_to_violation")

@@ -29,7 +29,6 @@ class ClosedSeason(Limit):
     """None: nobody can harvest in a closed season. A number: it can be done, is a violation, and each bite
     costs so many apples if it is detected."""
 
-    principle: ClassVar[str] = "2 rules that fit local conditions"
     counts: ClassVar[tuple[str, ...]] = ("closed_bites",)
     entries: ClassVar[tuple[str, ...]] = ("season closed", "season time")
 

@@ -46,7 +46,6 @@ class Tax(Institution):
     """(apples, rate) pairs in ascending order, the first from 0: of the apples of a period, those from here
     up to the next bracket are taxed at this rate. Empty for `rate` alone."""
 
-    principle: ClassVar[str] = "2 rules that fit local conditions"
     voted_on: ClassVar[str] = "the tax rate"
 
 
@@ -67,8 +66,6 @@ class Levies(Institution):
 
     joint_rate: Share = 0.1
     """The share of the harvest that goes to all; both rates together are at most 1."""
-
-    principle: ClassVar[str] = "8 nested enterprises"
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -47,7 +47,6 @@ class Vote(Institution):
     """The probability that an authority from outside puts a choice in force by chance, all equally likely, in
     place of the result of a vote (the opposite of Ostrom's principle 7, the right to organise)."""
 
-    principle: ClassVar[str] = "3 collective choice"
     entries: ClassVar[tuple[str, ...]] = ("in force",)
 
     def __post_init__(self) -> None:
