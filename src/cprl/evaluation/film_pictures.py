@@ -1,6 +1,5 @@
 """The pictures of a film: one population's board, stock and harvests so far; and its files."""
 
-import shutil
 from collections.abc import Iterable, Sequence
 from contextlib import closing
 from functools import cache
@@ -8,7 +7,7 @@ from importlib.util import find_spec
 from math import ceil
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 import matplotlib
 import numpy as np
@@ -280,9 +279,4 @@ def write_mp4(path: Path, pictures: Iterable[Bytes], size: tuple[int, int], *, f
                 video.send(np.ascontiguousarray(last))
             for _ in range(round(HOLD_S * fps) - 1):
                 video.send(np.ascontiguousarray(last))
-
-        def write(file: BinaryIO) -> None:
-            with open(partial, "rb") as written:
-                shutil.copyfileobj(written, file)
-
-        write_atomically(path, write)
+        write_atomically(path, lambda file: file.write(partial.read_bytes()))
