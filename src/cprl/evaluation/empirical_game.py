@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import permutations, product
+from itertools import permutations
 from math import isnan, nan
 from pathlib import Path
 from typing import Annotated, Final
@@ -280,8 +280,11 @@ def _payoff_table(game: EmpiricalGame) -> Table:
     if game.agents == 2:
         others = "the other" if game.of_agents == 2 else f"all other {game.of_agents - 1}"
         title = f"return of an agent, by its run and that of {others}"
-        of_pairs = map(estimate, game.pairs.reshape(len(game.payoffs), -1).T)
-        cells = dict(zip(product(game.names, repeat=2), of_pairs, strict=True))
+        cells = {
+            (name, other): estimate(game.pairs[:, row, column])
+            for row, name in enumerate(game.names)
+            for column, other in enumerate(game.names)
+        }
         return matrix_table(title, "an agent \\ others", game.names, cells)
     rows = []
     for place, counts in enumerate(compositions(game.agents, len(game.names)).tolist()):

@@ -168,8 +168,9 @@ def draw_visits(
         owned = np.where(owner == agent, shares[agent], 0.0)
         if owned.any():
             row, col = divmod(int(owned.argmax()), board.width)
-            look = {"color": "white", "fontsize": 7, "ha": "center", "va": "center_baseline"}
-            panels[-1].text(col, row, str(agent), **look)
+            panels[-1].text(
+                col, row, str(agent), color="white", fontsize=7, ha="center", va="center_baseline"
+            )
     alone = np.divide(longest, total, out=np.zeros_like(total), where=total > 0)
     light = DARKEST + (1 - DARKEST) * np.sqrt(longest / max(longest.max(), 1e-12)) * alone
     owned_light = np.where(owner >= 0, light, 0.0)
