@@ -113,25 +113,19 @@ def run(
     prepare_process(experiment.seed)
     out = None if out is None else Path(out)
     is_new = out is None or not out.exists()
-    is_begun = resume and out is not None and bool(checkpoints_in(out / FOLDER))
-    weights = _weights_of_partners(experiment, out) if resume and out is not None else {}
+    resumed = out if resume else None
+    is_begun = resumed is not None and bool(checkpoints_in(resumed / FOLDER))
+    weights = {} if resumed is None else _weights_of_partners(experiment, resumed)
     env, population = make_agents(experiment, starts=not is_begun, weights=weights)
     observers: list[Any] = [*(made(callback) for callback in experiment.callbacks), *callbacks]
     check_callbacks(observers)
-
-    def recipe_in(directory: Path) -> dict[str, Any]:
-        return {**experiment.to_recipe(directory), **partners_of(directory, _partners(experiment))}
-
     episodes = refuse_another_run(out, experiment.to_recipe, Experiment) if resume else experiment.episodes
-    if not resume or out is None:
-        directory = start_run(out, experiment.name, recipe_in)
-    elif episodes < experiment.episodes or not (out / REPORT).exists():
-        directory = out
-        if episodes < experiment.episodes:
-            refuse_to_extend(out, episodes, observers)
-    else:
-        _tidy_up(out, keep_checkpoint=keep_checkpoint, take_over=take_over)
-        return out
+    if resumed is not None and episodes >= experiment.episodes and (resumed / REPORT).exists():
+        _tidy_up(resumed, keep_checkpoint=keep_checkpoint, take_over=take_over)
+        return resumed
+    directory = _start(experiment, out) if resumed is None else resumed
+    if episodes < experiment.episodes:
+        refuse_to_extend(directory, episodes, observers)
     checkpointer = Checkpointer(directory, keep_ending=keep_checkpoint, take_over=take_over)
     closing = ExitStack()  # of the viewer, which outlives the rest
     try:
@@ -140,16 +134,7 @@ def run(
                 _begin_again(directory, experiment, is_begun=is_begun, episodes=episodes)
             viewer = closing.enter_context(_make_viewer(watch, directory, experiment, env, population))
             work = _Work(directory, experiment, env, population, viewer)
-            random = None if viewer is None else random_play(experiment, population)
-            if viewer is not None and random is not None:
-                viewer.random_play(random)
-            training = _train(work, observers, checkpointer)
-            played = _evaluate(work, random)
-            figure = _draw(experiment, directory, played["random"]) if figures else None
-            _write_report(directory, training, times)
-            _summarise(work, training, played, figure)
-            checkpointer.done()
-            _say_what_is_kept(directory)
+            _carry_out(work, observers, checkpointer, times, figures=figures)
     except BaseException as error:
         closing.close()
         if checkpointer.has_begun or (resume and isinstance(error, OSError)):
@@ -172,6 +157,29 @@ class _Work(NamedTuple):
     env: EnvBase
     population: Population
     viewer: "ViewerCallback | None"
+
+
+def _start(experiment: Experiment, out: Path | None) -> Path:
+    def recipe_in(directory: Path) -> dict[str, Any]:
+        return {**experiment.to_recipe(directory), **partners_of(directory, _partners(experiment))}
+
+    return start_run(out, experiment.name, recipe_in)
+
+
+def _carry_out(
+    work: _Work, observers: Sequence[Any], checkpointer: Checkpointer, times: Times, *, figures: bool
+) -> None:
+    random = None
+    if work.viewer is not None:
+        random = random_play(work.experiment, work.population)
+        work.viewer.random_play(random)
+    training = _train(work, observers, checkpointer)
+    played = _evaluate(work, random)
+    figure = _draw(work.experiment, work.directory, played["random"]) if figures else None
+    _write_report(work.directory, training, times)
+    _summarise(work, training, played, figure)
+    checkpointer.done()
+    _say_what_is_kept(work.directory)
 
 
 def _train(work: _Work, observers: Sequence[Any], checkpointer: Checkpointer) -> Training:
