@@ -38,7 +38,7 @@ class ValueFlags(ConstructorRegistry):
 
     def __init__(self, listed: Collection[str] | None = None, *, is_help: bool = False) -> None:
         super().__init__()
-        self._listed, self._is_help = listed, is_help
+        self._listed, self._is_help = listed if is_help else None, is_help
         self._places: dict[int, str] = {}
         self._is_inside = False
         self.struct_rule(self._changes)
@@ -89,13 +89,9 @@ class ValueFlags(ConstructorRegistry):
             kind = _sayable(field.type, value)
         if kind is None:
             return None
-        if self._is_help and self._listed is not None and not self._is_listed(place):
+        if self._listed is not None and not any(f"{path}.".startswith(f"{place}.") for path in self._listed):
             kind = Annotated[kind, tyro.conf.Suppress]
         return replace(field, type=kind)
-
-    def _is_listed(self, place: str) -> bool:
-        assert self._listed is not None
-        return any(f"{path}.".startswith(f"{place}.") for path in self._listed)
 
 
 def _is_code(value: Any) -> bool:

@@ -53,6 +53,7 @@ _NOTE: Final = (
 _HELP: Final = {"-h", "--help", "--help-all", "--help_all"}
 _CONFIG: Final = (tyro.conf.HelptextFromCommentsOff,)
 _LONGEST: Final = 1500
+_UNSHAPED: Final = Shape()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,13 +186,9 @@ def parse_with(
     _refuse_names(make_experiment, {*Experiment.__dataclass_fields__, *vars(options)})
     is_help, is_short = bool(_HELP & {*words}), bool({"-h", "--help"} & {*words})
     given = [word for word in words if word not in _HELP]
+    recipe: Any = Annotated[Any, tyro.conf.arg(name="", constructor=make_experiment)]
 
-    unshaped = Shape()
-
-    def first(
-        made: Annotated[Any, tyro.conf.arg(name="", constructor=make_experiment)],
-        shape: Annotated[Shape, tyro.conf.arg(name="")] = unshaped,
-    ) -> tuple[Any, Shape]:
+    def first(made: recipe, shape: Annotated[Shape, tyro.conf.arg(name="")] = _UNSHAPED) -> tuple[Any, Shape]:
         return made, shape
 
     (made, shape), _ = tyro.cli(
@@ -203,7 +200,7 @@ def parse_with(
     shaped = shape_of(start)
 
     def read(
-        made: Annotated[Any, tyro.conf.arg(name="", constructor=make_experiment)],
+        made: recipe,
         options: Annotated[Any, tyro.conf.arg(name="")] = options,
         shape: Annotated[Shape, tyro.conf.arg(name="")] = shaped,
         experiment: Annotated[Experiment, tyro.conf.arg(name="")] = start,
