@@ -81,7 +81,6 @@ class Block:
 
 
 Replicas: TypeAlias = Annotated[int, Range(1, 2**20)]
-"""How many replicas something has."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -80,19 +80,14 @@ class Where(NamedTuple):
 
 
 Natural = Annotated[int, Range(0, MOST_INT32)]
-"""An integer from 0."""
 Positive = Annotated[int, Range(1, MOST_INT32)]
-"""An integer from 1."""
 Steps = Annotated[int, Range(1, MOST_INT64)]
 """An integer from 1, as large as a count of steps can get."""
 Share = Annotated[float, Range(0, 1)]
-"""A share or a probability."""
 Seed = Annotated[int, Range(0, 2**64 - 1)]
 """The seed of a random generator."""
 PositiveShare = Annotated[float, Where(lambda value: 0 < value <= 1, "a number above 0, at most 1")]
-"""A share or a probability that is not zero."""
 Odd = Annotated[int, Where(lambda value: 1 <= value <= MOST_INT32 and value % 2 == 1, "an odd integer >= 1")]
-"""1, 3, 5 and so on."""
 
 
 _MOST_NAME: Final = 200
