@@ -149,13 +149,18 @@ class Fresh(Value, stored=False):
 
 
 def fresh_of(
-    runs: Iterable[LoadedRun], *, replicas: Sequence[int] = (), among: Iterable[LoadedRun] = (), **which: Any
+    runs: Iterable[LoadedRun],
+    *,
+    episodes: int,
+    greedy: bool,
+    seed: int,
+    replicas: Sequence[int],
+    among: Iterable[LoadedRun] = (),
 ) -> Fresh:
     """Fresh episodes of the chosen replicas, or of all that every run has.
 
     Args:
         among: more runs of which no agent may have been trained in the worlds.
-        which: episodes, seed and greedy, see `Fresh`.
     """
     runs, chosen = list(runs), set(replicas)
     common = set.intersection(*(set(run.replicas) for run in runs))
@@ -166,7 +171,7 @@ def fresh_of(
     if not common:
         has = {str(run.path): run.replicas for run in runs}
         raise ValueError(f"the replicas of the runs are {has}; allowed: runs with a replica in common")
-    fresh = Fresh(replicas=tuple(sorted(chosen or common)), **which)
+    fresh = Fresh(replicas=tuple(sorted(chosen or common)), episodes=episodes, seed=seed, greedy=greedy)
     refuse_trained_in(fresh.seed, [*runs, *among])
     return fresh
 

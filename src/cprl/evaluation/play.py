@@ -45,7 +45,6 @@ KEYS: Final = {
 }
 """The action of each key, and what it is called."""
 QUIT: Final = "quit"
-_LONGEST_DRAWING_BYTES: Final = 10_000_000
 _PROMPT: Final = "keys> "
 
 
@@ -244,8 +243,6 @@ def board_named(
     if path.is_dir():
         run = load(path, allow=allow)
         return commons_game(run), run
-    if path.stat().st_size > _LONGEST_DRAWING_BYTES:
-        raise ValueError(f"{path} has more than {_LONGEST_DRAWING_BYTES:,} bytes; allowed: a drawing")
     try:
         return Game(map=maps.parse(path.read_text(encoding="utf-8")), rules=Rules()), None
     except ValueError as error:
