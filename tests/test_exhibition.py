@@ -1,6 +1,5 @@
 """The present policy plays a world of its own for viewers; the training and its file do not notice."""
 
-import threading
 import warnings
 from dataclasses import replace
 from types import SimpleNamespace
@@ -279,18 +278,17 @@ def test_viewers_that_do_not_keep_up_miss_frames_and_nothing_waits(kept, monkeyp
     assert len(kept.rows("SegmentationImage:buffer")) == 1, "the first, which the constructor sent"
 
 
-def test_after_the_training_the_trained_policy_plays_on_until_it_is_stopped(kept, monkeypatch):
-    monkeypatch.setattr(exhibition, "BATCH_S", 0.01)
-    stop = threading.Event()
-    thread = threading.Thread(target=kept.exhibition.play_on, args=(stop,), kwargs={"episode": 4})
-    thread.start()
-    while kept.exhibition.steps < 25:
-        assert thread.is_alive()
-    stop.set()
-    thread.join(10)
-    assert not thread.is_alive()
-    assert len(kept.rows("SegmentationImage:buffer")) >= 24
-    assert kept.rows("Points2D:labels", "caption")[-1] == ["trained policy, episode 4, epsilon 0.05"]
+def test_after_the_training_the_trained_policy_plays_on_and_rests_on_the_last_board_of_an_episode(kept):
+    waits = []
+    stop = SimpleNamespace(wait=waits.append, is_set=lambda: waits.count(exhibition.REST_S) == 2)
+    kept.exhibition.play_on(stop, episode=4)
+    boards, captions = kept.rows("SegmentationImage:buffer"), kept.rows("Points2D:labels", "caption")
+    plays = "trained policy, episode 4, epsilon 0.05"
+    assert captions[1:] == 2 * [[plays], [f"{plays}: the end, turn 20"]]
+    assert waits == 2 * [exhibition.REST_S]
+    assert len(boards) == 1 + 2 * (1 + 20)
+    assert boards[0] == boards[1] == boards[22], "an episode begins"
+    assert boards[21] != boards[1], "its last board is seen"
 
 
 def test_a_game_without_a_board_has_no_exhibition_and_one_event_says_so(tmp_path):
@@ -298,7 +296,7 @@ def test_a_game_without_a_board_has_no_exhibition_and_one_event_says_so(tmp_path
     assert exhibited(ALONE, env, None) is None
     with ViewerCallback(tmp_path, env, title="run", episodes=1, live="serve") as viewer:
         assert viewer.exhibition is None
-        viewer.play_on(threading.Event())
+        viewer.play_on(SimpleNamespace())
     texts = column(tmp_path / "run.rrd", "log", "TextLog:text")[1]
     assert ["no exhibition: the game has no board"] in texts
 

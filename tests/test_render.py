@@ -1,11 +1,12 @@
 """`CommonsEnv.render` gives the pictures that TorchRL's recorders write."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 from torchrl.envs import TransformedEnv
 from torchrl.record import PixelRenderTransform, VideoRecorder
-from torchrl.record.loggers import Logger
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.commons.picture import world_image
@@ -52,37 +53,16 @@ def test_it_is_the_picture_that_pettingzoo_gets():
     assert np.array_equal(env.render()[0], theirs.render())
 
 
-class Videos(Logger):
-    """Keeps the videos that it is given."""
-
-    def __init__(self):
-        self.videos = []
-        super().__init__("videos", "")
-
-    def _create_experiment(self):
-        return None
-
-    def log_video(self, name, video, step=None, **how):
-        self.videos.append((name, video))
-
-    def log_scalar(self, name, value, step=None): ...
-    def log_hparams(self, cfg): ...
-    def log_histogram(self, name, data, **how): ...
-    def __repr__(self):
-        return "Videos()"
-
-
 @pytest.mark.parametrize("world", [None, 0])
 def test_torchrls_video_recorder_takes_the_worlds_as_a_grid_or_one_of_them(world):
-    logger = Videos()
+    videos = {}
+    logger = SimpleNamespace(log_video=lambda name, video, **named: videos.update({name: video}))
     env = TransformedEnv(CommonsEnv(MEADOW, 2, seed=1), PixelRenderTransform(cell_pixels=8, world=world))
     env.append_transform(VideoRecorder(logger, "boards"))
     env.rollout(4)
     env.transform.dump()
-    ((name, video),) = logger.videos
-    assert name == "boards"
-    assert video.shape[2] == 3
-    frames = video[0].permute(0, 2, 3, 1)
+    assert videos["boards"].shape[2] == 3
+    frames = videos["boards"][0].permute(0, 2, 3, 1)
     apple, ground = env.base_env.render(world=0)[4, 12], env.base_env.render(world=0)[4, 4]
     assert (frames == apple).all(-1).any()
     assert (frames == ground).all(-1).any()

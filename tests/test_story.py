@@ -161,6 +161,8 @@ def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_g
         for path in (complete, resumed)
     ]
     assert titles[1] == {episode: title for episode, title in titles[0].items() if episode > 48}
+    episodes, labels = column(resumed, "visits/labels", "Points2D:labels", "episode")
+    assert (episodes[0], labels[0][0]) == (50, "0: episodes 50 to 51"), "who went where before was not kept"
     states = dict(zip(*column(complete, "now", "StateChange:state", "episode"), strict=True))
     later = {episode: state for episode, state in states.items() if episode > 48}
     goes_on = dict(zip(*column(resumed, "now", "StateChange:state", "episode"), strict=True))

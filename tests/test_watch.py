@@ -16,6 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from subprocess import PIPE
 from types import SimpleNamespace
+from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import urlopen
 
@@ -464,19 +465,31 @@ def wait(is_so):
         time.sleep(0.05)
 
 
-def test_the_page_is_on_this_machine_alone_until_it_is_closed():
-    served = WebViewer()
+def ports_of(process):
+    """The (address, port) at which a process and its children listen."""
+    every = [process, *process.children(recursive=True)]
+    connections = [each for one in every for each in one.net_connections()]
+    return {tuple(each.laddr) for each in connections if each.status == psutil.CONN_LISTEN}
+
+
+def test_a_page_with_a_short_address_is_on_this_machine_alone_until_it_is_closed():
+    before = ports_of(psutil.Process())
+    page, source = WebViewer("rerun+http://127.0.0.1:9/proxy"), "rerun%2Bhttp%3A%2F%2F127.0.0.1%3A9%2Fproxy"
     try:
-        ports = served.port, urlsplit(served.data).port
-        wait(lambda: all(map(listens, ports)))
-        assert b"re_viewer_bg.wasm" in urlopen(served.address("rerun+http://127.0.0.1:9/proxy")).read()
-        own = [one.address for all_ in psutil.net_if_addrs().values() for one in all_ if one.family == 2]
-        for address in set(own) - {LOCALHOST}:
-            assert not any(listens(port, address) for port in ports)
+        wait(lambda: len(ports_of(psutil.Process()) - before) == 3)  # the page's, Rerun's own, and its data
+        answer = urlopen(page.addresses["browser"])
+        assert b"re_viewer_bg.wasm" in answer.read()
+        assert f"url={source}&" in answer.url
+        assert len(page.addresses["browser"]) <= len("http://127.0.0.1:65535/")
+        assert "connect-src 'self' http://127.0.0.1:*" in answer.headers["Content-Security-Policy"]
+        with pytest.raises(HTTPError, match="404"):
+            urlopen(page.addresses["browser"] + "nothing")
+        opened = ports_of(psutil.Process()) - before
+        assert {address for address, _ in opened} == {LOCALHOST}
     finally:
-        served.close()
-    wait(lambda: not any(map(listens, ports)))
-    served.close()
+        page.close()
+    wait(lambda: ports_of(psutil.Process()) == before)
+    page.close()
 
 
 def test_a_process_that_is_killed_leaves_no_page():
@@ -525,7 +538,11 @@ def test_without_a_display_or_on_request_a_run_is_served_until_it_is_interrupted
     served, whole = (RrdReader(path) for path in (got / "got.rrd", tmp_path / "run.rrd"))
     ids = [[store.recording_id for store in reader.recordings()] for reader in (served, whole)]
     assert ids[0] == ids[1], "header and history are of one recording"
-    assert served.blueprints()
+    layouts = [
+        {chunk.entity_path for chunk in reader.stream(store=reader.blueprints()[0])}
+        for reader in (served, whole)
+    ]
+    assert layouts[0] == layouts[1], "views have names of their own"
 
 
 def test_a_run_without_a_recording_is_refused(tmp_path):

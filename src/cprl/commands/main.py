@@ -5,13 +5,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import suppress
 from contextvars import ContextVar
 from dataclasses import replace
 from importlib import import_module
 from inspect import getdoc
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Final
 
 import tyro
@@ -216,15 +215,11 @@ def watch(run: Path, /, *, serve: bool = False) -> None:
 
 
 def _serve(files: Sequence[Path], *, why: str) -> None:
-    from cprl.viewer.live import newest_header
-    from cprl.viewer.page import WebViewer, viewer
+    from cprl.viewer.live import served
 
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(TemporaryDirectory()))
-        stack.enter_context(suppress(KeyboardInterrupt))
-        page = stack.enter_context(closing(WebViewer([*newest_header(files, folder), *files])))
-        say(f"Watch (browser): {page.address()}")
-        say(f"Watch (native): {printed([viewer(), '--connect', page.data])}")
+    with suppress(KeyboardInterrupt), served(files) as page:
+        say(f"Watch (browser): {page.addresses['browser']}")
+        say(f"Watch (native): {page.addresses['native']}")
         say(f"{why}served on 127.0.0.1 until Ctrl-C")
         while True:
             time.sleep(1)

@@ -16,7 +16,7 @@ from cprl.measuring.metrics import title as metric_title
 from cprl.measuring.statistics import institution_metrics, social_metrics
 from cprl.system.output import console as safe_console
 from cprl.system.output import printed
-from cprl.viewer.page import to_watch
+from cprl.system.shipped import cprl_here
 
 _OF_AGENTS: Final = {"fines": "fined", "transfers": "given", "violations": "violations"}
 _FILES: Final = ("recipe.json", "episodes.parquet", "run.rrd", "checkpoints", "figures")
@@ -54,8 +54,8 @@ def summarise(
     console.print(f"Saved in {run}: {', '.join(files)}", soft_wrap=True)
     if figure:
         console.print(f"Training curve: {figure}", soft_wrap=True)
-    if recordings := sorted(run.glob("run*.rrd")):  # a run that was resumed has several
-        console.print(f"Watch again: {printed(to_watch(*recordings))}", soft_wrap=True)
+    if any(run.glob("run*.rrd")):
+        console.print(f"Watch again: {printed([*cprl_here(), 'watch', str(run)])}", soft_wrap=True)
 
 
 def _new_table(title: str, caption: str, heads: Sequence[str], *, folds_heads: bool) -> Table:

@@ -169,6 +169,8 @@ class ViewerCallback:
         with self.logger.silent():
             for episode in _stored_episodes(self._run):
                 self.on_episode(episode, {})
+        for view in self._views:
+            view.resumed()
         for recording in self._earlier:
             self.logger.do(methodcaller("log_file_from_path", recording), live_only=True)
         self.logger.at(step=step, episode=self._episode)

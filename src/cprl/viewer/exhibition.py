@@ -12,6 +12,7 @@ import rerun as rr
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv
 
+from cprl import keys
 from cprl.commons.game import Game
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.envs.stepping import begin_states
@@ -38,6 +39,8 @@ BATCH_STEPS: Final = 21
 MOST_SHARE: Final = 0.01
 """The share of the training's wall time that its thread may spend on the exhibition: where a step of it takes
 longer than 0.95 ms, it plays fewer."""
+REST_S: Final = 10.0
+"""Seconds for which the last board of an episode of the trained policy stays: of a tragedy the empty one."""
 LONGEST_S: Final = 10.0
 """The longest time that a viewer sees the same board, if a step took exceptionally long."""
 
@@ -79,6 +82,7 @@ class Exhibition(View):
         self._recorder = FrameRecorder(commons, scene, has_windows=False)
         self._carried: TensorDictBase | None = None
         self._due, self._count = clock(), BATCH_STEPS
+        self._turn = 0
         self.steps = 0
         """Steps played so far."""
         self.is_over = False
@@ -95,11 +99,14 @@ class Exhibition(View):
             self._play(episode)
 
     def play_on(self, stop: Event, *, episode: int) -> None:
-        """Plays the trained policy until the event is set; returns at once where it has ended."""
+        """Plays the trained policy until the event is set; returns at once where it has ended.
+
+        It rests when an episode ends.
+        """
         self._policy.is_trained = True
         while not (self.is_over or stop.is_set()):
             self._play(episode)
-            stop.wait(BATCH_S)
+            stop.wait(BATCH_S if self._carried is not None else REST_S)
 
     def close(self) -> None:
         """Leaves out frames that have not been sent."""
@@ -115,11 +122,12 @@ class Exhibition(View):
         """Plays some steps, and has them sent; fewer the next time if they took long."""
         if self._stream.is_behind:
             return
-        began = self._clock()
+        began, end = self._clock(), None
         try:
             with self._policy.apart():
                 for _ in range(self._count):
-                    self._step()
+                    if end := self._step():
+                        break
         except Exception as error:
             self.is_over = True
             warnings.warn(
@@ -135,20 +143,43 @@ class Exhibition(View):
         self._count = max(1, min(BATCH_STEPS, affordable))
         frames = self._recorder.take()
         if frames is not None:
-            self._send(frames, caption_of(self._policy, episode))
+            caption = caption_of(self._policy, episode)
+            self._send(frames, caption)
+            if end is not None:
+                self._stream.do(partial(_send_caption, caption=f"{caption}: {end}"))
 
-    def _step(self) -> None:
-        """One step of the world, of which the recorder then has a frame; the first only begins an episode."""
+    def _step(self) -> str | None:
+        """One step of the world, of which the recorder then has a frame; the first only begins an episode.
+
+        The last board of the trained policy's episodes stays until the next step.
+
+        Returns:
+            In words how such an episode has ended; None while it goes on.
+        """
         self.steps += 1
+        self._turn += 1
         if self._carried is None:
-            self._carried = self._env.reset()
+            self._turn, self._carried = 0, self._env.reset()
             self._recorder.add_board()
-            return
-        batch, self._carried = self._env.step_and_maybe_reset(self._policy(self._carried))
+            return None
+        moment = self._policy(self._carried)
+        if self._policy.is_trained:
+            batch = self._env.step(moment)
+            self._carried = self._env.step_mdp(batch)
+        else:
+            batch, self._carried = self._env.step_and_maybe_reset(moment)
         begin_states(self._carried, self._carried, batch)
         self._recorder.add(batch)
         if isinstance(self._env, TransformedEnv) and self.steps % BATCH_STEPS == 0:
             load_transforms_state(self._env, transforms_state(self._trained))
+        if not batch["next"][keys.DONE][0, 0]:
+            return None
+        end = f"{'no apple is left' if batch['next', 'terminated'][0, 0] else 'the end'}, turn {self._turn:,}"
+        self._turn = 0
+        if not self._policy.is_trained:
+            return None
+        self._carried = None
+        return end
 
     def _send(self, frames: Frames, caption: str) -> None:
         send = partial(_send_frames, scene=self._scene, frames=frames, caption=caption, wait=self._wait)
@@ -188,13 +219,17 @@ def _send_frames(
     recording: Any, *, scene: Scene, frames: Frames, caption: str, wait: Callable[[float], bool]
 ) -> None:
     """Sends frames one by one, over the time of a batch, until `wait` says to leave out the rest."""
-    recording.send_columns("exhibition/caption", [], rr.Points2D.columns(labels=[caption]))
+    _send_caption(recording, caption=caption)
     rows = _rows(scene, frames)
     for sent, row in enumerate(rows, 1):
         for entity, columns in row:
             recording.send_columns(f"exhibition/{entity}", [], columns)
         if sent < len(rows) and wait(BATCH_S / len(rows)):
             return
+
+
+def _send_caption(recording: Any, *, caption: str) -> None:
+    recording.send_columns("exhibition/caption", [], rr.Points2D.columns(labels=[caption]))
 
 
 class _Values(NamedTuple):

@@ -6,8 +6,8 @@ import shutil
 import subprocess
 import time
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
 from queue import Full, Queue
@@ -17,8 +17,8 @@ from typing import Any, Final, TypeAlias
 import rerun as rr
 from rerun.chunk import RrdReader
 
-from cprl.system.compat import keep_native
-from cprl.system.output import legible, printed
+from cprl.system.compat import StoredLayout, keep_native
+from cprl.system.output import legible
 from cprl.values import checked
 from cprl.viewer.page import LOCALHOST, Served, WebViewer, free_port, has_display, viewer
 
@@ -37,6 +37,8 @@ SERVER_MEMORY: Final = "512MB"
 """The memory limit of the served recording; beyond it viewers lose the oldest rows, the file does not."""
 EXHIBITION_MEMORY: Final = "1MB"
 """The same of the exhibition, of which viewers need the newest frame alone."""
+FILES_MEMORY: Final = "75%"
+"""The same of recordings that are served from their files: all of them, while memory lasts."""
 NEEDED_BYTES: Final = 2_000_000
 """The free disk space needed to start a recording; its layout and static parts take a tenth."""
 
@@ -188,11 +190,8 @@ class Live:
 
         def serve(name: str, memory: str, *, send_properties: bool) -> LiveStream:
             recording = _recording(application, recording_id, send_properties=send_properties)
-            port = free_port()
-            sink = rr.GrpcServerSink(LOCALHOST, port, server_memory_limit=memory)
             # The layout is in both: a viewer may hear of the recording from either first.
-            recording.set_sinks(sink, default_blueprint=blueprint)
-            sources.append(f"rerun+http://{LOCALHOST}:{port}/proxy")
+            sources.append(_serve(recording, memory, blueprint))
             return LiveStream(name, recording, period_s=period_s)
 
         sources: list[str] = []
@@ -202,12 +201,8 @@ class Live:
             self.exhibition = serve("exhibition", EXHIBITION_MEMORY, send_properties=False)
         if how == "spawn":
             _spawn(sources)
-        self._page = WebViewer()
-        self.addresses = {
-            "browser": self._page.address(*sources),
-            "native": printed([viewer(), "--connect", *sources]),
-        }
-        """How to watch."""
+        self._page = WebViewer(*sources)
+        self.addresses = self._page.addresses
 
     def close(self) -> None:
         self.stream.close()
@@ -245,34 +240,56 @@ def send_text(recording: Any, name: str, text: str) -> None:
     recording.send_columns(name, [], rr.TextDocument.columns(text=[text]))
 
 
-def newest_header(recordings: Sequence[Path], folder: Path) -> list[Path]:
-    """Write the newest header of recordings as static data, to be served with them: while a viewer loads
-    their history it would show old headers as the present.
+def _serve(recording: Any, memory: str, blueprint: Any = None) -> str:
+    """Serves a recording on a free port of this machine alone; returns its address."""
+    port = free_port()
+    sink = rr.GrpcServerSink(LOCALHOST, port, server_memory_limit=memory)
+    recording.set_sinks(sink, default_blueprint=blueprint)
+    return f"rerun+http://{LOCALHOST}:{port}/proxy"
 
-    Returns:
-        The file; none where no recording that can be read has a header.
+
+@contextmanager
+def served(files: Sequence[Path]) -> Iterator[WebViewer]:
+    """Serve recordings within the block. (Rerun's own command keeps a core busy as long as it serves a file.)
+
+    Viewers get the layout first, else they make one of their own; then the newest header as static data:
+    while they load the history they would show old ones as the present.
     """
-    headers = []
+    exit_in_time()
+    readers: dict[Path, RrdReader] = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the recording of a run that was killed has no footer
-        for path in recordings:
-            with suppress(RuntimeError):
-                reader = RrdReader(path)
-                store = reader.recordings()[0]
-                batches = [chunk.to_record_batch() for chunk in reader.stream().filter(content="/header")]
-                headers += [
-                    (batch["step"][-1].as_py(), batch["TextDocument:text"][-1].as_py()[0], store)
-                    for batch in batches
-                    if "step" in batch.schema.names
-                ]
-    if not headers:
-        return []
-    _, text, store = max(reversed(headers), key=lambda header: header[0])
+        for path in files:
+            with suppress(RuntimeError):  # it is none, or cut
+                readers[path] = RrdReader(path)
+        if not readers:
+            raise ValueError(f"no recording can be read of {', '.join(map(str, files))}")
+        reader, header = _newest_header(list(readers.values()))
+        store = reader.recordings()[0]
+        layout = next((StoredLayout(reader.stream(store=stored)) for stored in reader.blueprints()), None)
     recording = _recording(store.application_id, store.recording_id, send_properties=False)
-    recording.save(folder / "header.rrd")
-    send_text(recording, "header", text)
-    recording.disconnect()
-    return [folder / "header.rrd"]
+    page = WebViewer(_serve(recording, FILES_MEMORY, layout))
+    try:
+        if header is not None:
+            send_text(recording, "header", header)
+        for path in readers:
+            recording.log_file_from_path(path)
+        yield page
+    finally:
+        page.close()
+        recording.disconnect()
+
+
+def _newest_header(readers: Sequence[RrdReader]) -> tuple[RrdReader, str | None]:
+    """The recording that has the newest header, and the header; None if none has one."""
+    step, header, newest = -1, None, readers[0]
+    for reader in readers:
+        for chunk in reader.stream().filter(content="/header"):
+            batch = chunk.to_record_batch()
+            if "step" in batch.schema.names and batch["step"][-1].as_py() >= step:
+                step, header = batch["step"][-1].as_py(), batch["TextDocument:text"][-1].as_py()[0]
+                newest = reader
+    return newest, header
 
 
 def _spawn(sources: list[str]) -> None:

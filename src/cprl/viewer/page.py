@@ -5,13 +5,17 @@ import shutil
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from functools import partial
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Event, current_thread, main_thread
-from typing import TYPE_CHECKING, Final, Literal, get_args
+from threading import Event, Thread, current_thread, main_thread
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 from urllib.parse import quote
+from urllib.request import urlopen
 
-from cprl.system.output import console
+from cprl.system.output import console, printed
 from cprl.system.process import at_signals
 from cprl.values import checked
 
@@ -22,25 +26,25 @@ LOCALHOST: Final = "127.0.0.1"
 Served = Literal["serve", "spawn"]
 
 _QUERY: Final = "renderer=webgl&persist=0&hide_welcome_screen=1&theme=dark"
+_THIS_MACHINE: Final = (
+    f"default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' http://{LOCALHOST}:*"
+)
+"""Rerun's page would ask other machines for fonts, and tell one of its use."""
 _UNTIL_THE_PIPE_CLOSES: Final = '"$@" & read -r _; kill $!'
 """A shell ends Rerun's server when this process ends, even when it is killed."""
 
 
 class WebViewer:
-    """Rerun's own server of its web viewer, and of recordings, on 127.0.0.1 alone.
+    """The page at which a browser shows what is served at some addresses, on 127.0.0.1 alone.
 
-    It is a process of its own, which ends with this one.
-
-    Args:
-        recordings: files that it serves; a page of it can show what others serve too.
+    Rerun's own server of its web viewer is a process of its own, which ends with this one. The address of its
+    page names all others, so a server with a short one leads there and hands out what it serves.
     """
 
-    def __init__(self, recordings: Sequence[Path] = ()) -> None:
-        self.port, data_port = free_port(), free_port()
-        self.data = f"rerun+http://{LOCALHOST}:{data_port}/proxy"
-        """The address at which it serves the recordings."""
-        command = [str(viewer_binary()), "--serve-web", "--bind", LOCALHOST, "--port", str(data_port)]
-        command += ["--web-viewer-port", str(self.port), *(str(path.absolute()) for path in recordings)]
+    def __init__(self, *sources: str) -> None:
+        port = free_port()
+        command = [str(viewer_binary()), "--serve-web", "--bind", LOCALHOST, "--port", str(free_port())]
+        command += ["--web-viewer-port", str(port)]
         if os.name == "posix":
             command = ["sh", "-c", _UNTIL_THE_PIPE_CLOSES, "sh", *command]
         self._process = subprocess.Popen(
@@ -51,19 +55,56 @@ class WebViewer:
             env={**os.environ, "CI": "1"},  # without usage data
             start_new_session=True,  # Ctrl-C is for this process alone
         )
-
-    def address(self, *sources: str) -> str:
-        """The address of the page that shows these sources in one viewer, by default the recordings."""
-        urls = [f"url={quote(source, safe='')}" for source in sources or (self.data,)]
-        return f"http://{LOCALHOST}:{self.port}/?{'&'.join([*urls, _QUERY])}"
+        page = "/?" + "&".join([*(f"url={quote(source, safe='')}" for source in sources), _QUERY])
+        handler = partial(_Page, f"http://{LOCALHOST}:{port}", page)
+        self._server = ThreadingHTTPServer((LOCALHOST, 0), handler)
+        Thread(target=self._server.serve_forever, daemon=True).start()
+        self.port = self._server.server_port
+        self.addresses = {
+            "browser": f"http://{LOCALHOST}:{self.port}/",
+            "native": printed([viewer(), "--connect", *sources]),
+        }
+        """How to watch, in a browser and in Rerun's native viewer."""
 
     def close(self) -> None:
         """Stop serving. A second call does nothing."""
+        self._server.shutdown()
+        self._server.server_close()
         if os.name != "posix":
             self._process.kill()
         if self._process.stdin is not None:
             self._process.stdin.close()
         self._process.wait()
+
+
+class _Page(BaseHTTPRequestHandler):
+    """Leads to a page of another server, and hands out what that one serves."""
+
+    def __init__(self, origin: str, page: str, *arguments: Any) -> None:
+        self._origin, self._page = origin, page
+        super().__init__(*arguments)
+
+    def do_GET(self) -> None:
+        if self.path == "/":
+            self.send_response(HTTPStatus.FOUND)
+            self.send_header("Location", self._page)
+            self.end_headers()
+            return
+        try:
+            with urlopen(self._origin + self.path) as answer:
+                content = answer.read()
+        except OSError as error:
+            self.send_error(getattr(error, "code", HTTPStatus.SERVICE_UNAVAILABLE))
+            return
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Type", answer.headers["Content-Type"])
+        self.send_header("Content-Length", str(len(content)))
+        self.send_header("Content-Security-Policy", _THIS_MACHINE)
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, *arguments: Any) -> None:
+        """Say nothing."""
 
 
 def viewer_binary() -> Path:

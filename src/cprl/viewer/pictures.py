@@ -68,6 +68,9 @@ class View:
     def finished(self, played: Mapping[str, Sequence[Episode]]) -> None:
         """Show the evaluation of a run that is over: the episodes of "trained" and "random"."""
 
+    def resumed(self) -> None:
+        """The episodes so far have been added again, but not their steps."""
+
     def close(self) -> None:
         """Log what is left; a second call does nothing."""
 
@@ -276,8 +279,11 @@ class Picture(View):
             self.log(f"episode{'' if is_one else f's {self._logged + 1} to'} {self._ended}")
             self._logged = self._ended
 
+    def resumed(self) -> None:
+        self._logged = self._ended
+
     def log(self, episodes: str) -> None:
-        """Log what came since the last time, "episodes 51 to 100"."""
+        """Log what came since the last time, "episodes 51 to 100"; since a resume where that is later."""
 
 
 _DARKEST: Final = 0.35
@@ -466,6 +472,9 @@ class Lorenz(Picture):
     def on_episode(self, episode: Episode) -> None:
         if episode.harvest is not None and episode.harvest.sum() > 0:
             self._curves.setdefault(episode.episode, []).append(lorenz_curve(episode.harvest))
+
+    def resumed(self) -> None:
+        """Its curves follow from the episodes."""
 
     def log(self, episodes: str) -> None:
         ended = [number for number in self._curves if number < self._ended]

@@ -37,6 +37,7 @@ from cprl.system.compat.losses import forget_cached_weights as forget_cached_wei
 from cprl.system.compat.losses import promise_targets as promise_targets
 from cprl.system.compat.losses import refuse_updaters as refuse_updaters
 from cprl.system.compat.losses import updated_weights as updated_weights
+from cprl.system.compat.recordings import StoredLayout as StoredLayout
 from cprl.system.compat.recordings import end_recordings as end_recordings
 from cprl.system.compat.recordings import keep_native as keep_native
 from cprl.system.compat.tensordicts import entry as entry

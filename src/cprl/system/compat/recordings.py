@@ -3,7 +3,7 @@
 import ctypes
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any
+from typing import Any, Self
 
 from cprl.system.libraries import relying_on
 
@@ -25,3 +25,18 @@ def keep_native(recording: Any, keep: Callable[..., object] = ctypes.pythonapi.P
         keep: bound here, because the interpreter clears modules before it deletes the last recordings.
     """
     keep(ctypes.py_object(recording.inner))
+
+
+class StoredLayout:
+    """The layout of a recording that is read, for another one that takes it over: Rerun has layouts log
+    themselves, by the private `_log_to_stream`.
+    """
+
+    def __init__(self, chunks: Any) -> None:
+        self._chunks = chunks
+
+    def to_blueprint(self) -> Self:
+        return self
+
+    def _log_to_stream(self, stream: Any) -> None:
+        stream.send_chunks(self._chunks)
