@@ -28,6 +28,23 @@ class Fatigue(Transform):
         return next_tensordict
 
 
+def largest_share(episode):
+    """Of all apples that were harvested, those of the agent with most."""
+    return episode.harvest.max() / episode.harvest.sum()
+
+
+def no_number(episode):
+    return episode.harvest
+
+
+def fails(episode):
+    return int(episode.harvest.sum() / episode.harvest.sum())
+
+
+def of_another_game(episode):
+    return episode.fines.sum()
+
+
 class Bored:
     """Explores less from some episode on, and counts episodes; stops at the step in STOP_AT_STEP."""
 

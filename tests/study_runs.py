@@ -1,6 +1,7 @@
 """Small runs of a study whose numbers are known, written as a training writes them."""
 
 import json
+from itertools import product
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from cprl.population import Learning
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.recipe import start_run
 from cprl.studies.trials import trials_of
+from cprl.training.outcome import write_evaluation
 
 EXPERIMENT = cprl.Experiment(
     name="tiny",
@@ -67,13 +69,11 @@ def write_run(run, experiment, apples, *, random=4.0, equality=None, is_finished
             for replica in range(experiment.replicas):
                 more = {} if equality is None else {"equality": equality(replica, number)}
                 table.add(an_episode(number, replica, float(apples(replica, number)), **more))
-    (run / "evaluation").mkdir()
-    for name in ("trained", "random"):
-        with EpisodeTable(run / "evaluation" / f"{name}.parquet", run=run) as table:
-            for replica in range(experiment.replicas):
-                for number in range(experiment.evaluation_episodes):
-                    harvest = random if name == "random" else apples(replica, -1)
-                    table.add(an_episode(number, replica, float(harvest)))
+    places = list(product(range(experiment.replicas), range(experiment.evaluation_episodes)))
+    trained = [an_episode(number, replica, float(apples(replica, -1))) for replica, number in places]
+    by_chance = [an_episode(number, replica, float(random)) for replica, number in places]
+    played = {"trained": trained, "random": by_chance}
+    write_evaluation(run, played, of_replica=experiment.evaluation_episodes)
     if is_finished:
         (run / "report.json").write_text("{}")
     return run

@@ -2,7 +2,6 @@
 
 import io
 import re
-from itertools import chain, combinations
 from pathlib import Path
 
 import pyarrow as pa
@@ -82,23 +81,10 @@ def test_what_a_game_of_torchrl_reports_is_read_from_its_specs():
     assert reported_by(TransformedEnv(CommonsEnv(GAME, 1), StepCounter())) == OPTIONAL
 
 
-def test_each_metric_needs_what_is_said_and_nothing_else():
-    entries = {"harvest": torch.rand(4, 9, 2), "in_play": torch.ones(4, 9, 2, dtype=torch.bool)}
-    played = torch.ones(4, 9, dtype=torch.bool)
-    whole = social.summary(entries["harvest"], entries["in_play"], played=played)
-    assert tuple(whole) == social.METRICS == tuple(METRICS)
-    for given in chain.from_iterable(combinations(entries, count) for count in range(3)):
-        part = social.summary(
-            *(entries[name] if name in given else None for name in ("harvest", "in_play")), played=played
-        )
-        assert tuple(part) == available(METRICS, given)
-        assert all(torch.equal(part[name], whole[name]) for name in part)
-
-
 def test_what_the_docs_say_is_left_out_is_what_needs_the_entry():
     text = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
     rows = dict(re.findall(r'^\| "(\w+)" \| (.*) \|$', text, re.MULTILINE))
-    needs = {**social.NEEDS, **FIELDS}
+    needs = {**{name: metric.needs for name, metric in social.SOCIAL.items()}, **FIELDS}
     words = {name: set(re.findall(r"\w+", row)) for name, row in rows.items()}
     assert {entry: words[entry] & set(needs) for entry in rows} == {
         entry: {name for name, entries in needs.items() if entry in entries} - {"tagged_by"}
@@ -156,7 +142,6 @@ def test_a_batch_that_lacks_what_all_have_or_the_first_had_is_refused():
         (tracker, bare, r"the batch lacks \(next, agents, harvest\)"),
         (EpisodeTracker(1, 2), bare.exclude(("next", "agents", "reward")), r"\(next, agents, reward\)"),
         (EpisodeTracker(1, 2), bare.exclude("done"), r"lacks \(done\)"),
-        (EpisodeTracker(1, 2, sustainable_yield=1.0, first_stock=1.0), bare, "yield_share needs a harvest"),
     ):
         with pytest.raises(ValueError, match=message):
             each.add(batch)

@@ -49,9 +49,13 @@ MEADOW = Experiment(
         Custom("one_road_parts:Fatigue", arguments={"per_step": 0.01}),
     ],
     callbacks=[Custom("one_road_parts:Bored", arguments={"from_episode": 7, "epsilon": 0.4})],
+    metrics=[Custom("one_road_parts:largest_share")],
     engine="eager",
 )
-ALLOW = ("one_road_parts:Bored", "one_road_parts:Fatigue", "torchrl.envs.transforms:RewardScaling")
+ALLOW = (
+    *(f"one_road_parts:{name}" for name in ("Bored", "Fatigue", "largest_share")),
+    "torchrl.envs.transforms:RewardScaling",
+)
 
 
 def assert_same_training(run, other, names=("final",)):
@@ -187,7 +191,7 @@ def test_a_transform_that_changes_the_shape_of_observations_is_learned_from(tmp_
     agents = [Learning(DQN(settings=REPLAY))] * 2
     experiment = replace(MEADOW, agents=agents, transforms=[FLAT], callbacks=(), loggers=(), episodes=2)
     run = cprl.run(experiment, tmp_path / "run", watch="off")
-    loaded = cprl.load(run, allow=["torchrl.envs.transforms:FlattenObservation"])
+    loaded = cprl.load(run, allow=["torchrl.envs.transforms:FlattenObservation", *ALLOW])
     assert loaded.spaces.observation_shape == (45,)
     wrong = replace(experiment, agents=MEADOW.agents)
     with pytest.raises(ValueError, match="Conv"):
@@ -211,7 +215,7 @@ def test_normalised_observations_are_floats_from_the_environment_to_the_stored_p
             MEADOW, agents=[agent] * 2, transforms=[norm], callbacks=(), loggers=(), episodes=2
         )
         run = cprl.run(experiment, tmp_path / type(agent.algorithm).__name__, watch="off")
-        loaded = cprl.load(run, allow=["torchrl.envs.transforms:ObservationNorm"])
+        loaded = cprl.load(run, allow=["torchrl.envs.transforms:ObservationNorm", *ALLOW])
         assert loaded.spaces.observation_dtype == "float32"
         assert loaded.spaces.observation_scale == 1.0
         assert cprl.evaluate_run(loaded, episodes=1).trained

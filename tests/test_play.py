@@ -12,7 +12,6 @@ from cprl import Game, Rules, maps, presets
 from cprl.commands import main as cli
 from cprl.evaluation.play import Session, board_text, help_of, open_session, play_in_terminal
 from cprl.measuring.episodes import EpisodeTracker
-from cprl.measuring.statistics import social_metrics
 
 DRAWING = """
 .A>.A.
@@ -72,7 +71,7 @@ def test_the_metrics_are_those_of_an_episode(run):
         if not session.has_ended:
             session.act(action)
     (episode,) = ended
-    assert session.metrics() == pytest.approx(social_metrics(episode), nan_ok=True)
+    assert session.metrics() == pytest.approx(episode.social, nan_ok=True)
     with pytest.raises(ValueError, match="the episode has ended"):
         session.act("stay")
 

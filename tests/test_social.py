@@ -28,61 +28,60 @@ BY_HAND = {
 EMPTY = torch.zeros(4, 2)
 
 
+def summary(harvest, in_play=None):
+    return social.summary(harvest, harvest >= 0 if in_play is None else in_play)
+
+
 def values(metrics):
     return {name: value.item() for name, value in metrics.items()}
 
 
-def share(harvest, **board):
-    return social.summary(harvest, None, **board)["yield_share"]
-
-
 def test_each_metric_is_what_we_work_out_by_hand():
-    metrics = social.summary(HARVEST, IN_PLAY)
+    metrics = summary(HARVEST, IN_PLAY)
     assert values(metrics) == pytest.approx(BY_HAND, rel=1e-15)
     assert tuple(metrics) == social.METRICS
     assert {(metric.dtype, metric.shape) for metric in metrics.values()} == {(torch.float64, ())}
 
 
-def test_the_yield_share_sets_the_harvest_against_what_the_map_bears():
-    # 4 apples of 0.5 per step * 4 steps + 6 at first = 8
-    assert share(HARVEST, sustainable_yield=0.5, first_stock=6).item() == 0.5
-    assert share(HARVEST, sustainable_yield=0.1, first_stock=0).item() == 4 / (0.1 * 4), "not of float32"
-    assert share(HARVEST, sustainable_yield=0, first_stock=0).isnan(), "a share of nothing"
-    yields, stocks = torch.tensor([0.0, 0.5, 1.0]), torch.tensor([4, 6, 0])
-    shares = share(HARVEST.expand(3, 4, 2), sustainable_yield=yields, first_stock=stocks)
-    assert shares.tolist() == [1.0, 0.5, 1.0], "a yield for each episode"
+@pytest.mark.parametrize(
+    ("sustainable_yield", "first_stock", "share"),
+    [
+        (0.5, 6, 0.5),  # 4 apples of 0.5 per step * 4 steps + 6 at first = 8
+        (0.1, 0, 4 / (0.1 * 4)),  # and not that of float32
+        (0, 0, math.nan),  # a share of nothing
+    ],
+)
+def test_the_yield_share_sets_the_harvest_against_what_the_map_bears(sustainable_yield, first_stock, share):
+    totals = social.Totals(
+        steps=torch.tensor(4.0, dtype=torch.float64),
+        harvest=HARVEST.sum(0, dtype=torch.float64),
+        sustainable_yield=sustainable_yield,
+        first_stock=first_stock,
+    )
+    (measured,) = social.measured({"yield_share": social.SOCIAL["yield_share"]}, totals).values()
+    assert measured.item() == pytest.approx(share, rel=1e-15, nan_ok=True)
 
 
-def test_agents_without_a_harvest_leave_equality_and_sustainability_undefined_or_are_left_out():
-    metrics = social.summary(torch.stack([HARVEST, EMPTY]), None)
+def test_episodes_of_a_batch_are_measured_apart_and_those_without_a_harvest_have_no_equality():
+    metrics = summary(torch.stack([HARVEST, EMPTY]), torch.stack([IN_PLAY, IN_PLAY]))
+    assert {name: value[0].item() for name, value in metrics.items()} == pytest.approx(BY_HAND)
     assert metrics["equality"].isnan().tolist() == [False, True]
     assert metrics["sustainability"].isnan().tolist() == [False, True]
-    alone = social.summary(HARVEST * torch.tensor([1, 0]), None)
-    assert alone["sustainability"].item() == pytest.approx(7 / 3)
+    alone = summary(HARVEST * torch.tensor([1, 0]))
+    assert alone["sustainability"].item() == pytest.approx(7 / 3), "of those who harvested"
 
 
 def test_an_episode_without_steps_has_no_value_per_step():
-    none = torch.zeros(0, 2)
-    metrics = values(social.summary(none, none.bool()))
+    metrics = values(summary(torch.zeros(0, 2)))
     undefined = {name for name, value in metrics.items() if math.isnan(value)}
     assert undefined == {"efficiency", "equality", "sustainability", "peace"}
     assert metrics["survival_steps"] == metrics["peacefulness"] == 0
 
 
-def test_episodes_of_unlike_length_are_measured_in_one_batch_and_padding_is_never_read():
-    played = torch.arange(7) < torch.tensor([[4], [2]])
-    harvest = torch.cat([HARVEST, torch.full((3, 2), torch.nan)])
-    in_play = torch.cat([IN_PLAY, torch.ones(3, 2, dtype=torch.bool)])
-    both = social.summary(harvest.expand(2, 7, 2), in_play.expand(2, 7, 2), played=played)
-    short = social.summary(HARVEST[:2], IN_PLAY[:2])
-    assert {name: value[0].item() for name, value in both.items()} == pytest.approx(BY_HAND)
-    assert {name: value[1].item() for name, value in both.items()} == values(short)
-
-
 def test_a_long_sum_of_float32_loses_no_apple():
     harvest = torch.full((3, 1), 2.0**24)
     harvest[1:] = 1  # a float32 sum would stay at 2**24
-    assert social.summary(harvest, None)["collective_return"].item() == 2**24 + 2
+    assert summary(harvest)["collective_return"].item() == 2**24 + 2
 
 
 episodes = st.tuples(st.integers(1, 12), st.integers(1, 5), st.integers(0, 2**32 - 1))
@@ -95,7 +94,7 @@ def test_metrics_stay_in_their_ranges(episode):
     chance = torch.Generator().manual_seed(seed)
     harvest = (torch.rand(steps, agents, generator=chance) < 0.2).float()
     in_play = torch.rand(steps, agents, generator=chance) < 0.7
-    metrics = values(social.summary(harvest, in_play))
+    metrics = values(summary(harvest, in_play))
     assert 0 <= metrics["peace"] <= agents
     assert 0 <= metrics["peacefulness"] <= steps
     assert metrics["efficiency"] * steps == pytest.approx(harvest.sum().item())
@@ -111,26 +110,16 @@ def test_metrics_stay_in_their_ranges(episode):
 def test_agents_numbers_do_not_matter(order):
     harvest = torch.tensor([[1.0, 0, 0, 1], [1, 1, 0, 0], [1, 0, 0, 1]])
     in_play = harvest > 0
-    shuffled = social.summary(harvest[:, order], in_play[:, order])
-    assert values(shuffled) == pytest.approx(values(social.summary(harvest, in_play)))
+    shuffled = summary(harvest[:, order], in_play[:, order])
+    assert values(shuffled) == pytest.approx(values(summary(harvest, in_play)))
 
 
 def test_equality_is_one_when_all_have_the_same_and_one_nth_when_one_has_all():
-    assert social.summary(torch.ones(5, 3), None)["equality"].item() == 1
-    one_has_all = torch.tensor([[1.0, 0, 0, 0]])
-    assert social.summary(one_has_all, None)["equality"].item() == pytest.approx(1 / 4)
+    assert summary(torch.ones(5, 3))["equality"].item() == 1
+    assert summary(torch.tensor([[1.0, 0, 0, 0]]))["equality"].item() == pytest.approx(1 / 4)
 
 
-@pytest.mark.parametrize(
-    ("harvest", "in_play", "board", "field"),
-    [
-        (-HARVEST, IN_PLAY, {}, "harvest"),
-        (HARVEST / 0, IN_PLAY, {}, "harvest"),
-        (HARVEST, IN_PLAY, {"first_stock": 3}, "first_stock"),
-        (None, IN_PLAY, {"sustainable_yield": 1, "first_stock": 3}, "harvest"),
-        (None, None, {}, "played"),
-    ],
-)
-def test_what_cannot_be_measured_is_refused(harvest, in_play, board, field):
-    with pytest.raises(ValueError, match=field):
-        social.summary(harvest, in_play, **board)
+@pytest.mark.parametrize("harvest", [-HARVEST, HARVEST / 0])
+def test_what_is_no_harvest_is_refused(harvest):
+    with pytest.raises(ValueError, match="harvest"):
+        social.summary(harvest, IN_PLAY)

@@ -15,7 +15,7 @@ from study_runs import EXPERIMENT, TIME_OUT, write_run, write_study
 from cprl import Study
 from cprl.commands import main as cli
 from cprl.measuring.statistics import difference
-from cprl.runs.recipe import runs_in, write_changed_circumstances
+from cprl.runs.recipe import runs_in, write_circumstances
 from cprl.studies import figures, results
 from cprl.studies.factors import Uniform
 from cprl.studies.status import Status
@@ -220,7 +220,7 @@ def test_a_recipe_records_each_time_it_is_resumed_under_other_circumstances(tmp_
     for version in ("2.1", "2.1", "2.2"):
         now = {**made, "versions": {"torch": version}}
         monkeypatch.setattr("cprl.runs.recipe._circumstances", lambda recipe, now=now: now)
-        write_changed_circumstances(run)
+        write_circumstances(run)
     resumed = json.loads((run / "recipe.json").read_text())["resumed"]
     assert [now["versions"]["torch"] for now in resumed] == ["2.1", "2.2"]
     assert circumstances_of(run) == {"torch": "2.0 then 2.1 then 2.2", "cpu": "Xeon"}

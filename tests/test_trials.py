@@ -28,7 +28,7 @@ from cprl import Custom, Study, run_study
 from cprl.runs.checkpoints import FOLDER as CHECKPOINTS
 from cprl.runs.episodes import read_episodes, read_table
 from cprl.runs.files import LOCK_FILE, RunLock, RunLockedError, write_json
-from cprl.runs.recipe import changed_circumstances, start_run
+from cprl.runs.recipe import start_run, write_circumstances
 from cprl.studies import InProcess, Processes, Ray, executors, progress, read_study, run
 from cprl.studies.progress import Overview, Progress, table_of
 from cprl.studies.results import write_results
@@ -321,7 +321,7 @@ def test_other_code_is_refused_where_another_process_makes_the_trial_and_unknown
     with RunLock(run), pytest.raises(RunLockedError, match=name):
         run_study(study, tmp_path / "a", progress=False)
     run = write_run(tmp_path / "b/runs" / name, study.experiment, lambda *_: 1.0, code=None)
-    assert changed_circumstances(run) == []
+    assert write_circumstances(run) == []
     run_study(study, tmp_path / "b", on=executor, progress=False, results=False)
     assert executor.names == []
 

@@ -332,7 +332,7 @@ def _play(fresh: FreshEpisode) -> tuple[list[Shown], list[set[int]], Episode]:
     a rule in the turn that led to each; and the episode."""
     commons = commons_of(fresh.env)
     assert commons is not None
-    tracker, turns = tracker_of(fresh.env), Turns(fresh.env, fresh.policies)
+    tracker, turns = tracker_of(fresh.env, fresh.run.metrics), Turns(fresh.env, fresh.policies)
     ended: list[Episode] = []
     moments, violators = [board_now(commons)], [set[int]()]
     while not ended:

@@ -40,7 +40,7 @@ from cprl.runs.episodes import Label, labelled
 from cprl.system.defaults import SEED
 from cprl.system.process import one_thread
 from cprl.training.agents import LoadedRun, Population, StoredAgent, load, stored_policies
-from cprl.values import Positive, Seed, Value, Where, made, refusal, trust
+from cprl.values import Custom, Positive, Seed, Value, Where, made, refusal, trust
 
 Values = NDArray[np.float64]
 
@@ -80,6 +80,7 @@ class FreshGame:
     """A game of which fresh worlds are made, like those of a `LoadedRun`."""
 
     game: Any
+    metrics: tuple[Custom, ...] = ()
 
     @property
     def playing(self) -> Game | Spaces:
@@ -129,7 +130,8 @@ class Fresh(Value, stored=False):
         """The episodes by replica."""
         played: Played = {}
         for group, env in self.worlds(where):
-            ended = evaluate(env, self.policies(where, agents, group), explore=not self.greedy)
+            policies = self.policies(where, agents, group)
+            ended = evaluate(env, policies, explore=not self.greedy, metrics=where.metrics)
             for place, replica in enumerate(group):
                 played[replica] = ended[place * self.episodes : (place + 1) * self.episodes]
         return played

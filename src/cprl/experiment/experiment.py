@@ -10,6 +10,7 @@ from cprl.algorithms.base import TeamAlgorithm, TrainingEngine
 from cprl.commons.game import Game
 from cprl.envs.make_env import PlayableGame, game_of, stored_game
 from cprl.learners.preferences import check_preference
+from cprl.measuring.episodes import check_own_metrics
 from cprl.population import AgentSpec, Frozen, Learning, Team, refuse_undecided, specs_by_agent, stored_of
 from cprl.runs.files import RECIPE_FORMAT, written_by_another
 from cprl.runs.recipe import recipe_config, with_runs_moved
@@ -67,6 +68,8 @@ class Experiment(Value, stored=False, called="experiment"):
     """TorchRL transforms of the environment, the first one nearest to it."""
     callbacks: tuple[Custom, ...] = ()
     """Callbacks of the training; see `cprl.training`."""
+    metrics: tuple[Custom, ...] = ()
+    """Metrics of your own: functions of an episode that return a number; see docs/metrics.md."""
     loggers: tuple[LoggerName | Custom, ...] = ()
     """TorchRL's loggers that get every series: "tensorboard", "wandb", or one of your own."""
     device: Device = "cpu"
@@ -89,6 +92,7 @@ class Experiment(Value, stored=False, called="experiment"):
         if isinstance(self.game, PlayableGame):
             checked("experiment.game.agents", self.game.agents, Positive)
         self.to_config()
+        check_own_metrics(self.metrics)
         _check_numbers(self)
         _check_agents(self)
         _check_engine(self)

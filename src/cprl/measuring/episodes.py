@@ -1,7 +1,10 @@
 """Episode, the record of one that has ended, and EpisodeTracker, which makes them of batches of turns."""
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from functools import partial
+from math import isfinite, nan
 from typing import Any, Final
 
 import numpy as np
@@ -17,8 +20,17 @@ from cprl.commons.yields import sustainable_yield
 from cprl.envs.unwrap import agent_count, commons_of
 from cprl.institutions import COUNTS, Institution
 from cprl.measuring import institutions, social
-from cprl.measuring.metrics import FIELDS, INSTITUTIONAL, OF_INSTITUTIONS, OPTIONAL, reported_by, reported_in
-from cprl.values import Positive, checked
+from cprl.measuring.metrics import (
+    FIELDS,
+    INSTITUTIONAL,
+    NAMES,
+    OF_INSTITUTIONS,
+    OPTIONAL,
+    PLACES,
+    entry_in,
+    reported_in,
+)
+from cprl.values import Custom, Positive, checked
 
 Array = NDArray[Any]
 Turns = dict[str, Array]
@@ -41,8 +53,8 @@ class Episode:
     return_: NDArray[np.float64]
     """[N], the undiscounted sum of rewards of each agent."""
     metrics: dict[str, float]
-    """`social.summary` of the episode; NaN where undefined. Metrics that need entries that the game does not
-    report are missing."""
+    """`social.SOCIAL` of the episode, then those of the user's own; NaN where undefined. Metrics that need
+    entries that the game does not report are missing."""
     harvest: NDArray[np.float64] | None = None
     """[N], apples harvested. This field and all below are None if the game does not report the entries that
     they need, see `cprl.measuring.metrics.FIELDS`."""
@@ -78,13 +90,28 @@ class Episode:
     in_force: NDArray[np.float64] | None = None
     """[V], what was decided for this episode: tax rates, quotas, the agent elected."""
     institutions: Mapping[str, float] = field(default_factory=dict)
-    """`cprl.measuring.institutions.summary` of the episode; NaN where undefined, empty without
+    """`cprl.measuring.institutions.METRICS` of the episode; NaN where undefined, empty without
     institutions."""
 
     def __repr__(self) -> str:
         returns = [round(value, 2) for value in self.return_.tolist()]
         ended = f"{self.steps} steps, terminated={self.terminated}"
         return f"Episode(world={self.world}, episode={self.episode}, {ended}, returns={returns})"
+
+    @property
+    def social(self) -> dict[str, float]:
+        """Each of "Social metrics" in docs/metrics.md that the game reports, and the user's own, by name; NaN
+        where undefined."""
+        stock = {} if self.stock_left is None else {"stock_left": float(self.stock_left)}
+        return self.metrics | stock
+
+    @property
+    def of_institutions(self) -> dict[str, float]:
+        """Each of "Institutions" in docs/metrics.md, as `institutions/fines`, and what was decided, as
+        `institutions/in_force_0`; NaN where undefined, none of a game without institutions."""
+        in_force = () if self.in_force is None else enumerate(self.in_force.tolist())
+        values = {**self.institutions, **{f"in_force_{place}": value for place, value in in_force}}
+        return {f"institutions/{name}": value for name, value in values.items()}
 
     @property
     def outcome(self) -> str:
@@ -100,6 +127,60 @@ class Episode:
         missing = {entry for name, needs in FIELDS.items() if getattr(self, name) is None for entry in needs}
         more = (entry for name, entry in INSTITUTIONAL.items() if getattr(self, name) is not None)
         return (*(entry for entry in OPTIONAL if entry not in missing), *more)
+
+
+_TAKEN: Final = {
+    *(entry.name for entry in fields(Episode)),
+    *NAMES,
+    *COUNTS,
+    "return",
+    "replica",
+    "agent",
+    "net",
+}
+"""What columns of a table and other metrics are called."""
+
+
+def own_name(metric: Custom) -> str:
+    """Return what a metric of the user's own is called: as its function."""
+    return re.split("[:.]", metric.target)[-1]
+
+
+def check_own_metrics(metrics: Sequence[Custom]) -> None:
+    """Refuse metrics of the user's own with the name of another number of an episode."""
+    names = [own_name(metric) for metric in metrics]
+    for name, metric in zip(names, metrics, strict=True):
+        if name in _TAKEN or name.startswith(("return_", "in_force_")) or names.count(name) > 1:
+            raise ValueError(f"{metric.target}: another number of an episode is called {name}; rename it")
+
+
+def own_metrics(metrics: Sequence[Custom], episode: Episode) -> dict[str, float]:
+    """Return the metrics of the user's own of an episode by name; NaN where one is NaN or infinite.
+
+    Raises:
+        ValueError: if one fails, or returns no number; with its name.
+    """
+    values = {}
+    for metric in metrics:
+        try:
+            with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0: undefined
+                value = metric.make(episode)
+                number = float(value)
+        except Exception as error:
+            raise ValueError(
+                f"the metric {metric.target} gives no number of {episode!r}: {error!r}"
+            ) from error
+        values[own_name(metric)] = number if isfinite(number) else nan
+    return values
+
+
+def try_own_metrics(metrics: Sequence[Custom], env: EnvBase) -> None:
+    """Refuse metrics of the user's own that fail on an episode of one turn of an environment: one in which
+    nothing happens, and one in which each entry that the game reports is 1."""
+    for entry in (0, 1) if metrics else ():
+        batch = env.fake_tensordict().apply(partial(torch.full_like, fill_value=entry))
+        batch["done"], batch["next", "done"] = batch["done"] & False, batch["next", "done"] | True
+        tracker_of(env, metrics).add(batch)
 
 
 _RUNNING: Final[Mapping[str, tuple[str, str, type]]] = {
@@ -129,6 +210,14 @@ _COPIED: Final = {entry.name for entry in fields(Episode)} & ({*_RUNNING} - {"de
 _TOTALS: Final = {entry.name for entry in fields(social.Totals)} & ({"steps", *_RUNNING} - {"counts"})
 
 
+_ALWAYS: Final = {
+    "reward": ("next agents", "reward"),
+    "terminated": ("next", keys.TERMINATED),
+    "done": ("next", keys.DONE),
+}
+"""Where a batch has the entries that every game reports, as `PLACES`."""
+
+
 class EpisodeTracker:
     """Tracks the running episode of each world and returns it when it ends.
 
@@ -140,6 +229,7 @@ class EpisodeTracker:
         first_stock: apples on the board at the start of an episode.
         institutions: those of the game, which say what is measured of them, see
             `cprl.measuring.institutions.metrics_for`.
+        metrics: the user's own: each names a function of an `Episode` that returns a number.
 
     Raises:
         ValueError: if a number is below 1; in `add`, if a batch has a wrong shape or lacks an entry.
@@ -153,16 +243,18 @@ class EpisodeTracker:
         sustainable_yield: float | None = None,
         first_stock: float | None = None,
         institutions: Sequence[Institution] = (),
+        metrics: Sequence[Custom] = (),
     ) -> None:
         self.worlds = checked("worlds", worlds, Positive)
         self.agents = checked("agents", agents, Positive)
         self.reported: tuple[str, ...] | None = None
         """The optional entries of this game; None before the first batch."""
         self._yield: dict[str, Any] = {"sustainable_yield": sustainable_yield, "first_stock": first_stock}
-        self._institutions = tuple(institutions)
+        self._institutions, self._metrics = tuple(institutions), tuple(metrics)
         self._episode = np.zeros(worlds, np.int64)
-        self._reader = _TurnReader((), worlds=worlds, agents=agents, widths={})
         self._running: dict[str, Array] = {}
+        self._places = _ALWAYS
+        self._checked: torch.Size | None = None
 
     def add(self, tensordict: TensorDictBase) -> list[Episode]:
         """Adds the next turns of all worlds, batch size [B] or [B, T], with the entries of `cprl.keys`.
@@ -171,8 +263,9 @@ class EpisodeTracker:
             The episodes that ended, ordered by turn, then by world.
         """
         if self.reported is None:
-            self._begin(reported_in(tensordict), _widths_in(tensordict))
-        turns, size = self._reader.read(tensordict), tensordict.batch_size
+            reported = reported_in(tensordict)
+            self._begin(reported, self._zeros(reported, _widths_in(tensordict)))
+        turns, size = self._read(tensordict), tensordict.batch_size
         if len(size) == 1:
             return self._add_turn(turns)
         return [
@@ -188,7 +281,8 @@ class EpisodeTracker:
         return np.zeros((self.worlds, self.agents)) if returns is None else returns.copy()
 
     def state_dict(self) -> dict[str, Tensor]:
-        return {name: torch.tensor(array) for name, array in self._arrays().items()}
+        arrays = {"episode": self._episode, **self._running}
+        return {name: torch.tensor(array) for name, array in arrays.items()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Continues exactly from a state that `state_dict` returned.
@@ -197,7 +291,7 @@ class EpisodeTracker:
             ValueError: if the state has other shapes, or is from a game that reports other entries; the
                 tracker is then unchanged.
         """
-        other = EpisodeTracker(self.worlds, self.agents, **self._yield, institutions=self._institutions)
+        reported, running = self.reported, self._running
         if "steps" in state:  # else the tracker had seen no batch
             entries = {entry for name, (entry, _, _) in _RUNNING.items() if name in state}
             reported = tuple(entry for entry in (*OPTIONAL, *OF_INSTITUTIONS) if entry in entries)
@@ -206,30 +300,30 @@ class EpisodeTracker:
                     f"the state is from a game that reports {list(reported)}; allowed: "
                     f"{list(self.reported or ())}, as this game reports"
                 )
-            widths = {name: state[name].shape[-1] for name in ("counts", "in_force") if name in state}
-            other._begin(reported, widths if self.reported is None else self._reader.widths)
-        arrays = other._arrays()
+            if self.reported is None:
+                widths = {name: state[name].shape[-1] for name in ("counts", "in_force") if name in state}
+                running = self._zeros(reported, widths)
+        arrays = {"episode": self._episode, **running}
         if not set(arrays) <= set(state):
             raise ValueError(f"the state has {sorted(state)}; allowed: at least {sorted(arrays)}")
         for name, array in arrays.items():
             if state[name].shape != array.shape:
                 allowed = list(array.shape)
                 raise ValueError(f'"{name}" of the state is {list(state[name].shape)}; allowed: {allowed}')
-            array[:] = state[name].numpy(force=True)
-        vars(self).update(vars(other))
+        arrays = {name: state[name].numpy(force=True).copy() for name in arrays}
+        self._episode = arrays.pop("episode")
+        if reported is not None:
+            self._begin(reported, arrays)
 
-    def _arrays(self) -> dict[str, Array]:
-        return {"episode": self._episode, **self._running}
+    def _begin(self, reported: tuple[str, ...], running: dict[str, Array]) -> None:
+        """Reads these entries from now on."""
+        self.reported, self._running = reported, running
+        self._places = _ALWAYS | {name: PLACES[name] for name in reported}
 
-    def _begin(self, reported: tuple[str, ...], widths: Mapping[str, int]) -> None:
-        if "harvest" not in reported and self._yield["sustainable_yield"] is not None:
-            raise ValueError(
-                "sustainable_yield is given; allowed: None, because yield_share needs a harvest, which the "
-                "game does not report"
-            )
-        self.reported = reported
+    def _zeros(self, reported: Collection[str], widths: Mapping[str, int]) -> dict[str, Array]:
+        """The totals of episodes that begin, of a game that reports these entries."""
         sizes = {"N": self.agents, "C": widths.get("counts", 0), "V": widths.get("in_force", 0)}
-        self._running = {
+        return {
             "steps": np.zeros(self.worlds, np.int64),
             "return": np.zeros((self.worlds, self.agents), np.float64),
             **{
@@ -238,7 +332,50 @@ class EpisodeTracker:
                 if entry in reported
             },
         }
-        self._reader = _TurnReader(reported, worlds=self.worlds, agents=self.agents, widths=widths)
+
+    def _read(self, tensordict: TensorDictBase) -> Turns:
+        """All entries as arrays, [B, ...] or [B, T, ...], without a copy if the batch is on the CPU.
+
+        "had_ended", the worlds that had ended before the turn, and the agents' decisions are included only
+        if a world has ended now.
+        """
+        entry = keys.entry
+        try:
+            agents, following = entry(tensordict, keys.AGENTS), entry(tensordict, "next")
+            folders = {"": tensordict, "agents": agents, "next": following}
+            folders["next agents"], had_ended = entry(following, keys.AGENTS), entry(tensordict, keys.DONE)
+            turns = {
+                name: entry(folders[folder], key).numpy(force=True)
+                for name, (folder, key) in self._places.items()
+            }
+            if np.count_nonzero(turns["done"]):  # a tenth of the time that `any` takes on so few
+                turns["had_ended"] = had_ended.numpy(force=True)
+                if tensordict.get(keys.BALLOTS_DUE, None) is not None:
+                    turns["decision"] = entry(agents, "decision").numpy(force=True)
+        except KeyError as error:
+            places = [(*folder.split(), key) for folder, key in (*self._places.values(), ("", keys.DONE))]
+            missing = [f"({', '.join(place)})" for place in places if tensordict.get(place, None) is None]
+            raise ValueError(
+                f"the batch lacks {', '.join(missing)}; allowed: batches with rewards, done and terminated, "
+                "and the optional entries of the first batch"
+            ) from error
+        if tensordict.batch_size != self._checked:
+            self._check(turns, tensordict.batch_size)
+        return turns
+
+    def _check(self, turns: Turns, size: torch.Size) -> None:
+        """Checks the shapes of a batch, once per batch size, because checking takes longer than counting."""
+        if len(size) not in (1, 2) or size[0] != self.worlds:
+            raise ValueError(f"the batch is {list(size)}; allowed: [{self.worlds}] or [{self.worlds}, T]")
+        shapes: dict[str, tuple[int, ...]] = {"reward": (self.agents, 1), "decision": (self.agents,)}
+        for name, (entry, _, _) in _RUNNING.items():
+            if name in self._running:
+                shapes[entry] = self._running[name].shape[1:] or (1,)
+        for name, array in turns.items():
+            allowed = (*size, *shapes.get(name, (1,)))
+            if array.shape != allowed:
+                raise ValueError(f'"{name}" of the batch is {list(array.shape)}; allowed: {list(allowed)}')
+        self._checked = size
 
     def _add_turn(self, turn: Turns) -> list[Episode]:
         self._count(turn)
@@ -288,10 +425,10 @@ class EpisodeTracker:
         if "counts" in ended:
             given["counts"] = dict(zip(COUNTS, torch.from_numpy(ended["counts"]).unbind(-1), strict=True))
         totals = social.Totals(**given, **self._yield, groups=institutions.groups_of(self._institutions))
-        metrics, of_institutions = social.of_totals(totals), {}
+        metrics, of_institutions = social.measured(social.SOCIAL, totals), {}
         if any(name in ended for name in INSTITUTIONAL):
-            summary, wanted = institutions.summary(totals), institutions.metrics_for(self._institutions)
-            of_institutions = {name: values for name, values in summary.items() if name in wanted}
+            wanted = institutions.metrics_for(self._institutions)
+            of_institutions = social.measured({name: institutions.METRICS[name] for name in wanted}, totals)
         counted = institutions.counts_for(self._institutions) if "counts" in ended else ()
         episodes = []
         for index, world in enumerate(worlds):
@@ -305,26 +442,30 @@ class EpisodeTracker:
                 more["depletion_step"] = int(ended["depletion_step"][index]) or -1
             if "counts" in ended:
                 more["counts"] = {name: ended["counts"][index][:, COUNTS.index(name)] for name in counted}
-            episodes.append(
-                Episode(
-                    world=int(world),
-                    episode=int(self._episode[world]),
-                    steps=int(ended["steps"][index]),
-                    terminated=bool(turn["terminated"][world, 0]),
-                    return_=ended["return"][index],
-                    metrics={name: float(values[index]) for name, values in metrics.items()},
-                    institutions={name: float(values[index]) for name, values in of_institutions.items()},
-                    **more,
-                )
+            episode = Episode(
+                world=int(world),
+                episode=int(self._episode[world]),
+                steps=int(ended["steps"][index]),
+                terminated=bool(turn["terminated"][world, 0]),
+                return_=ended["return"][index],
+                metrics={name: float(values[index]) for name, values in metrics.items()},
+                institutions={name: float(values[index]) for name, values in of_institutions.items()},
+                **more,
             )
+            episode.metrics.update(own_metrics(self._metrics, episode))
+            episodes.append(episode)
         return episodes
 
 
-def tracker_of(env: EnvBase) -> EpisodeTracker:
+def tracker_of(env: EnvBase, metrics: Sequence[Custom] = ()) -> EpisodeTracker:
     """Return an `EpisodeTracker` for all worlds of an environment, with its institutions and what its board
-    bears."""
+    bears, and metrics of the user's own."""
     return EpisodeTracker(
-        env.batch_size.numel(), agent_count(env), institutions=institutions_of(env), **yield_of(env)
+        env.batch_size.numel(),
+        agent_count(env),
+        institutions=institutions_of(env),
+        metrics=metrics,
+        **yield_of(env),
     )
 
 
@@ -336,13 +477,10 @@ def yield_of_game(game: Game) -> dict[str, float]:
     }
 
 
-def yield_of(env: EnvBase) -> Mapping[str, float | None]:
-    """Return the arguments of an `EpisodeTracker` for yield_share; None in a game that has no board of cprl,
-    or does not report the harvest."""
+def yield_of(env: EnvBase) -> dict[str, float]:
+    """Return the arguments of an `EpisodeTracker` for yield_share; none of a game without a board of cprl."""
     commons = commons_of(env)
-    if commons is None or "harvest" not in reported_by(env):
-        return {"sustainable_yield": None, "first_stock": None}
-    return yield_of_game(commons.game)
+    return {} if commons is None else yield_of_game(commons.game)
 
 
 def institutions_of(env: EnvBase) -> tuple[Institution, ...]:
@@ -373,8 +511,7 @@ def decisions_of(env: EnvBase) -> tuple[str, ...]:
 
 def _widths_in(tensordict: TensorDictBase) -> dict[str, int]:
     """The last axes of "counts" and "in_force" of a batch."""
-    places: dict[str, Any] = {"counts": ("next", *keys.COUNTS), "in_force": ("next", keys.IN_FORCE)}
-    entries = {name: tensordict.get(place, None) for name, place in places.items()}
+    entries = {name: entry_in(tensordict, name) for name in ("counts", "in_force")}
     widths = {name: values.shape[-1] for name, values in entries.items() if values is not None}
     if widths.get("counts", len(COUNTS)) != len(COUNTS):
         raise ValueError(
@@ -382,70 +519,3 @@ def _widths_in(tensordict: TensorDictBase) -> dict[str, int]:
             f"{', '.join(COUNTS)}"
         )
     return widths
-
-
-class _TurnReader:
-    """Reads the turns of batches that have the same entries, worlds and agents."""
-
-    def __init__(
-        self, reported: Collection[str], *, worlds: int, agents: int, widths: Mapping[str, int]
-    ) -> None:
-        self._worlds, self._agents, self.widths = worlds, agents, widths
-        of_worlds = tuple(name for name in reported if name in ("stock", "in_force"))
-        self._of_agents = ("reward", *(name for name in reported if name not in ("in_play", *of_worlds)))
-        self._of_worlds = (*of_worlds, keys.TERMINATED, keys.DONE)
-        self._has_in_play = "in_play" in reported
-        self._checked: torch.Size | None = None
-
-    def read(self, tensordict: TensorDictBase) -> Turns:
-        """All entries as arrays, [B, ...] or [B, T, ...], without a copy if the batch is on the CPU.
-
-        "had_ended", the worlds that had ended before the turn, is included only if a world has ended now.
-        """
-        try:
-            turns = self._arrays(tensordict)
-        except KeyError as error:
-            raise self._missing(tensordict) from error
-        if tensordict.batch_size != self._checked:
-            self._check(turns, tensordict.batch_size)
-        return turns
-
-    def _arrays(self, tensordict: TensorDictBase) -> Turns:
-        following, entry = keys.entry(tensordict, "next"), keys.entry
-        agents = entry(following, keys.AGENTS)
-        tensors = {name: entry(agents, name) for name in self._of_agents}
-        tensors |= {name: entry(following, name) for name in self._of_worlds}
-        if self._has_in_play:
-            tensors["in_play"] = entry(entry(tensordict, keys.AGENTS), "in_play")
-        had_ended = entry(tensordict, keys.DONE)
-        turns = {name: tensor.numpy(force=True) for name, tensor in tensors.items()}
-        if np.count_nonzero(turns["done"]):  # a tenth of the time that `any` takes on so few
-            turns["had_ended"] = had_ended.numpy(force=True)
-            if tensordict.get(keys.BALLOTS_DUE, None) is not None:
-                turns["decision"] = entry(entry(tensordict, keys.AGENTS), "decision").numpy(force=True)
-        return turns
-
-    def _missing(self, tensordict: TensorDictBase) -> ValueError:
-        needed: dict[Any, str] = {keys.DONE: "done"}
-        needed |= {("next", name): f"next, {name}" for name in self._of_worlds}
-        needed |= {("next", keys.AGENTS, name): f"next, agents, {name}" for name in self._of_agents}
-        if self._has_in_play:
-            needed[keys.IN_PLAY] = "agents, in_play"
-        missing = [f"({name})" for key, name in needed.items() if tensordict.get(key, None) is None]
-        return ValueError(
-            f"the batch lacks {', '.join(missing)}; allowed: batches with rewards, done and terminated, "
-            "and the optional entries of the first batch"
-        )
-
-    def _check(self, turns: Turns, size: torch.Size) -> None:
-        """Checks the shapes of a batch, once per batch size, because checking takes longer than counting."""
-        if len(size) not in (1, 2) or size[0] != self._worlds:
-            raise ValueError(f"the batch is {list(size)}; allowed: [{self._worlds}] or [{self._worlds}, T]")
-        sizes = {"N": self._agents, "C": self.widths.get("counts"), "V": self.widths.get("in_force"), "1": 1}
-        axes = {entry: axes or "1" for entry, axes, _ in _RUNNING.values()}
-        axes |= {"reward": "N1", "decision": "N"}
-        for name, array in turns.items():
-            allowed = (*size, *(sizes[axis] for axis in axes.get(name, "1")))
-            if array.shape != allowed:
-                raise ValueError(f'"{name}" of the batch is {list(array.shape)}; allowed: {list(allowed)}')
-        self._checked = size

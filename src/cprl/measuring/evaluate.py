@@ -1,6 +1,6 @@
 """Evaluates a policy without learning: one fresh episode in every world of an environment."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from statistics import fmean, stdev
 
 import torch
@@ -11,24 +11,28 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode, tracker_of
 from cprl.system.process import one_thread
+from cprl.values import Custom
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
-def evaluate(env: EnvBase, policy: Policy, *, explore: bool = False) -> list[Episode]:
+def evaluate(
+    env: EnvBase, policy: Policy, *, explore: bool = False, metrics: Sequence[Custom] = ()
+) -> list[Episode]:
     """Plays the next episode of each world to its end; torch computes in one thread.
 
     Args:
         env: B worlds, batch size [B]; all are reset. A world of a `CommonsEnv` that has ended does not change
             until all have ended. In any other environment, including one with transforms, it is reset and
             plays on, and only its first episode counts.
+        metrics: the user's own, see `EpisodeTracker`.
 
     Returns:
         B episodes, in the order of worlds.
     """
     worlds = env.batch_size.numel()
     is_commons = isinstance(env, CommonsEnv)
-    tracker = tracker_of(env)
+    tracker = tracker_of(env, metrics)
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     episodes: dict[int, Episode] = {}
     with torch.no_grad(), one_thread(), set_exploration_type(exploration):

@@ -5,7 +5,7 @@ a metric is undefined; `cprl.measuring.statistics` counts these cases. None is c
 and the social metrics stay those of the harvest.
 
 Sources: Ostrom, "Governing the Commons" (1990), whose principles each metric belongs to; inequality as in
-`cprl.measuring.social.equality`, 1 - Gini.
+`cprl.measuring.social`, 1 - Gini.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from cprl.institutions import COUNTS, Institution, Levies
 from cprl.measuring import social
-from cprl.measuring.social import SHARE, Metric, Totals, measured
+from cprl.measuring.social import SHARE, Metric, Totals
 
 Groups = Sequence[Sequence[int]]
 """The indices of the agents of each group; each agent belongs to one group."""
@@ -38,11 +38,8 @@ def net_income(harvest: Tensor, fines: Tensor, transfers: Tensor) -> Tensor:
 
 
 def equality(income: Tensor) -> Tensor:
-    """1 - Gini of incomes [..., N], see `cprl.measuring.social.equality`, e.g. of `net_income`.
-
-    From 1/N (one agent has everything) to 1 (all have the same). Undefined where nobody has anything, and
-    where somebody has less than nothing, since the Gini coefficient then has no bounds.
-    """
+    """`cprl.measuring.social.equality_of` incomes [..., N], e.g. of `net_income`; undefined also where
+    somebody has less than nothing, since the Gini coefficient then has no bounds."""
     income = income.to(torch.float64)
     value = social.equality_of(income.clamp(min=0.0))
     return torch.where((income < 0).any(-1), torch.nan, value)
@@ -66,7 +63,7 @@ def _total(values: Tensor) -> Tensor:
 
 def _ratio(part: Tensor, whole: Tensor) -> Tensor:
     """sum_i x_i / sum_i y_i; undefined where nothing is in the whole."""
-    return torch.where(_total(whole) > 0, _total(part) / _total(whole), torch.nan)
+    return social.share_of(_total(part), _total(whole))
 
 
 def _net(totals: Totals) -> Tensor:
@@ -83,21 +80,26 @@ def _sum(words: str, unit: str, entry: str, total: str) -> Metric:
 
 def _count(words: str, unit: str, name: str) -> Metric:
     """The sum of one of `COUNTS`."""
-    metric = Metric(words, unit, ("counts",), lambda sums: _total(sums.counts[name]))
-    return metric._replace(counted=(name,))
+    return Metric(words, unit, ("counts",), lambda sums: _total(sums.counts[name]), counted=(name,))
 
 
 def _per_violation(words: str, name: str, *, unit: str = SHARE) -> Metric:
     """The sum of one of `COUNTS` for each violation; undefined without one."""
-    of = Metric(words, unit, ("counts",), lambda sums: _ratio(sums.counts[name], sums.counts["violations"]))
-    return of._replace(counted=(name, "violations"))
+    names = (name, "violations")
+    return Metric(
+        words, unit, ("counts",), lambda sums: _ratio(*(sums.counts[one] for one in names)), counted=names
+    )
 
 
 def _of_groups(words: str, of: Callable[[Tensor, Groups], Tensor], *, is_net: bool = False) -> Metric:
     """Principle 8, nested enterprises: of the harvest or of net incomes."""
-    needs = _INCOMES if is_net else ("harvest",)
-    metric = Metric(words, SHARE, needs, lambda sums: of(_net(sums) if is_net else sums.harvest, sums.groups))
-    return metric._replace(of_totals=("groups",))
+    return Metric(
+        words,
+        SHARE,
+        _INCOMES if is_net else ("harvest",),
+        lambda sums: of(_net(sums) if is_net else sums.harvest, sums.groups),
+        of_totals=("groups",),
+    )
 
 
 METRICS: Final[Mapping[str, Metric]] = MappingProxyType(
@@ -147,11 +149,6 @@ METRICS: Final[Mapping[str, Metric]] = MappingProxyType(
         ),
     }
 )
-
-
-def summary(totals: Totals) -> dict[str, Tensor]:
-    """Return those of `METRICS` by name for which all totals are given, each float64 [...]."""
-    return measured(METRICS, totals)
 
 
 def metrics_for(institutions: Sequence[Institution]) -> tuple[str, ...]:

@@ -1,15 +1,16 @@
 """The names, words and units of metrics, and what is left out where a game does not report an entry.
 
 Every game reports rewards and how episodes end. It may lack the entries of `OPTIONAL`. The entries that each
-number needs are named in `cprl.measuring.social.NEEDS` for metrics, and here for the other fields of an
+number needs are named in `cprl.measuring.social.SOCIAL` for metrics, and here for the other fields of an
 `Episode`. A number whose entries a game lacks is left out; it is never zero or NaN instead.
 """
 
 from collections.abc import Collection, Mapping
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Final
 
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.envs import EnvBase
 
 from cprl import keys
@@ -26,6 +27,11 @@ DIGITS: Final = {
     "stock_left": 1,
 }
 """The digits behind the point of each metric in the summary of a run."""
+
+
+def is_own(name: str) -> bool:
+    """Whether a number of an episode is a metric of the user's own."""
+    return not (name in NAMES or "/" in name or name == "net" or name.startswith("return_"))
 
 
 def title(name: str) -> str:
@@ -55,7 +61,7 @@ OPTIONAL: Final = ("harvest", "in_play", "fired", "hit_by", "tagged_by", "stock"
 """The optional entries, by the last part of their keys in `cprl.keys`; all but "stock" are in "agents"."""
 
 METRICS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
-    {name: social.NEEDS[name] for name in social.METRICS}
+    {name: social.SOCIAL[name].needs for name in social.METRICS}
 )
 """The entries that each metric of an episode needs."""
 
@@ -89,12 +95,23 @@ def reported_by(env: EnvBase) -> tuple[str, ...]:
     return tuple(name for name in (*OPTIONAL, *OF_INSTITUTIONS) if {name, (keys.AGENTS, name)} & entries)
 
 
+PLACES: Final = {name: ("next agents", name) for name in (*OPTIONAL, *OF_INSTITUTIONS)} | {
+    "in_play": (keys.AGENTS, "in_play"),
+    "stock": ("next", keys.STOCK),
+    "in_force": ("next", keys.IN_FORCE),
+}
+"""Where a batch has these entries: the names of the groups, and the last part of the key."""
+
+
+def entry_in(tensordict: TensorDictBase, name: str) -> Tensor | None:
+    """The entry of `PLACES` in a batch; None if it has none."""
+    groups, key = PLACES[name]
+    return tensordict.get((*groups.split(), key), None)
+
+
 def reported_in(tensordict: TensorDictBase) -> tuple[str, ...]:
-    """The entries of `OPTIONAL` and `OF_INSTITUTIONS` in a batch: in_play at the root, the others under
-    "next"."""
-    places: dict[str, Any] = {name: ("next", keys.AGENTS, name) for name in (*OPTIONAL, *OF_INSTITUTIONS)}
-    places |= {"in_play": keys.IN_PLAY, "stock": ("next", keys.STOCK), "in_force": ("next", keys.IN_FORCE)}
-    return tuple(name for name, place in places.items() if tensordict.get(place, None) is not None)
+    """The entries of `OPTIONAL` and `OF_INSTITUTIONS` in a batch."""
+    return tuple(name for name in PLACES if entry_in(tensordict, name) is not None)
 
 
 def available(needs: Mapping[str, tuple[str, ...]], reported: Collection[str]) -> tuple[str, ...]:

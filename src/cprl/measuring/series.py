@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.measuring.episodes import Episode
-from cprl.measuring.statistics import institution_metrics, social_metrics
 
 Values = NDArray[np.float64]
 
@@ -25,10 +24,10 @@ def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence
         learning: the numbers of learning in it, by agent index: `agent_0/loss` and so on.
         agents: the agents' names, which replace `agent_0` and so on.
     """
-    numbers = {f"social/{name}": value for name, value in social_metrics(episode).items()}
+    numbers = {f"social/{name}": value for name, value in episode.social.items()}
     for agent, value in zip(agents, episode.return_, strict=True):
         numbers[f"{agent}/return"] = float(value)
-    numbers |= {f"institutions/{name}": value for name, value in institution_metrics(episode).items()}
+    numbers |= episode.of_institutions
     for name in OF_AGENTS:
         if (values := getattr(episode, name)) is not None:
             numbers |= {f"{agent}/{name}": float(value) for agent, value in zip(agents, values, strict=True)}

@@ -9,6 +9,7 @@ different population variances are involved" (1947).
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isnan
+from operator import attrgetter
 from statistics import fmean
 from typing import Final
 
@@ -204,46 +205,23 @@ def over_replicas(values: Mapping[int, Sequence[float]]) -> Measured:
     )
 
 
-def social_metrics(episode: Episode) -> dict[str, float]:
-    """Each of "Social metrics" in docs/metrics.md by name, NaN where undefined.
-
-    Metrics that need entries that the game does not report are left out.
-    """
-    if episode.stock_left is None:
-        return dict(episode.metrics)
-    return {**episode.metrics, "stock_left": float(episode.stock_left)}
-
-
-def institution_metrics(episode: Episode) -> dict[str, float]:
-    """Each of "Institutions" in docs/metrics.md by name, NaN where undefined: `Episode.institutions`, and
-    what was decided, `in_force_0` and so on. Empty for a game without institutions."""
-    in_force: list[float] = [] if episode.in_force is None else episode.in_force.tolist()
-    return {**episode.institutions, **{f"in_force_{place}": value for place, value in enumerate(in_force)}}
-
-
 def institution_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measured]:
-    """Return `institution_metrics` over replicas, by name, as `institutions/fines` and so on; empty of a game
-    without institutions."""
-    measures = _measures(played, institution_metrics)
-    return {f"institutions/{name}": measured for name, measured in measures.items()}
+    """Return the metrics of institutions over replicas, by name, of episodes by replica."""
+    return _measures(played, attrgetter("of_institutions"))
 
 
 def social_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measured]:
-    """Return `social_metrics` over replicas, by name, of episodes by replica."""
-    return _measures(played, social_metrics)
+    """Return the social metrics over replicas, by name, of episodes by replica."""
+    return _measures(played, attrgetter("social"))
 
 
 def _measures(
     played: Mapping[int, Sequence[Episode]], metrics_of: Callable[[Episode], dict[str, float]]
 ) -> dict[str, Measured]:
-    by_replica = {
-        replica: [metrics_of(episode) for episode in episodes] for replica, episodes in played.items()
-    }
+    by_replica = {replica: list(map(metrics_of, episodes)) for replica, episodes in played.items()}
     names = next(iter(by_replica.values()))[0]
     return {
-        name: over_replicas(
-            {replica: [metrics[name] for metrics in episodes] for replica, episodes in by_replica.items()}
-        )
+        name: over_replicas({replica: [one[name] for one in by_replica[replica]] for replica in by_replica})
         for name in names
     }
 

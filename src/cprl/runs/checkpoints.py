@@ -5,9 +5,9 @@ import os
 import re
 import signal
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Final, NoReturn, Protocol, Self
+from typing import Any, Final, NoReturn, Self
 
 import torch
 
@@ -36,22 +36,9 @@ KEPT: Final = 2
 _NAME: Final = re.compile(r"(training|ending)-(\d{12})-[0-9a-f]{32}\.pt")
 
 
-class HasState(Protocol):
-    """What a checkpoint saves: `cprl.training.Training`."""
-
-    steps: int
-
-    @property
-    def is_ending(self) -> bool: ...
-    @property
-    def is_over(self) -> bool: ...
-
-    def state_dict(self) -> dict[str, Any]: ...
-    def load_state_dict(self, state: Mapping[str, Any]) -> None: ...
-
-
 class Checkpointer:
-    """Saves the state of a training every `every_s` seconds, and when it is stopped; a context manager.
+    """Saves the state of a `Training` every `every_s` seconds, and when it is stopped; a context
+    manager.
 
     Within its block the run is locked, see `RunLock`. On the first SIGINT or SIGTERM the checkpointer
     finishes the step, saves the state, prints the command that resumes and raises what `interruption` makes
@@ -89,7 +76,7 @@ class Checkpointer:
         self._lock = RunLock(run, take_over=take_over)
         self._sound: Path | None = None
 
-    def restore(self, training: HasState) -> None:
+    def restore(self, training: Any) -> None:
         """Restore the newest readable checkpoint, if there is one."""
         reasons: list[str] = []
         cause: Exception | None = None
@@ -113,7 +100,7 @@ class Checkpointer:
             raise ValueError("no checkpoint can be read: " + "; ".join(reasons)) from cause
         self.has_begun = True
 
-    def after_step(self, training: HasState) -> None:
+    def after_step(self, training: Any) -> None:
         """Saves a checkpoint if one is due, or if the process was asked to stop; then stops it."""
         ends = training.is_ending and not self._has_ending
         if self._asked_to_stop is not None:
@@ -127,7 +114,7 @@ class Checkpointer:
         elif time.monotonic() - self._saved >= self.every_s:
             self.save(training)
 
-    def save(self, training: HasState, *, kind: str = "training") -> Path:
+    def save(self, training: Any, *, kind: str = "training") -> Path:
         """Writes a checkpoint atomically, and deletes all of its kind but the newest two, or the newest
         "ending". Of a training that goes on with agents whose weights are not finite, the last
         checkpoint before is kept as "sound-<its name>" too.
@@ -205,7 +192,7 @@ def interruption(number: int) -> BaseException:
     return KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
 
 
-def _is_sound(training: HasState) -> bool:
+def _is_sound(training: Any) -> bool:
     return bool(getattr(training, "is_sound", True))
 
 

@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 
 from cprl.institutions import COUNTS
-from cprl.measuring import phases, social
-from cprl.measuring.institutions import summary
-from cprl.measuring.social import Totals
-from cprl.runs.episodes import OF_INSTITUTIONS, read_episodes
+from cprl.measuring import phases
+from cprl.measuring.institutions import METRICS
+from cprl.measuring.social import Totals, measured
+from cprl.runs.episodes import OF_INSTITUTIONS, metrics_in, read_episodes
 
 Values = NDArray[np.float64]
 
@@ -48,8 +48,7 @@ def as_curves(table: pa.Table) -> dict[str, Values]:
         column[cells] = table[name].to_numpy()[ended]
         return column
 
-    metrics = [name for name in table.column_names if name in social.METRICS or name == "yield_share"]
-    curves = {name: values(name)[..., 0].copy() for name in metrics}
+    curves = {name: values(name)[..., 0].copy() for name in metrics_in(table.schema)}
     returns = values("return")
     curves |= {f"return_{number}": returns[..., number].copy() for number in np.unique(agent)}
     return curves | _of_institutions(table.column_names, values)
@@ -66,7 +65,7 @@ def _of_institutions(names: Sequence[str], values: Callable[[str], Values]) -> d
     given = tensors(("harvest", "in_play_steps", "fines", "transfers", "violations"))
     if "violations" in given:
         given["counts"] = tensors(COUNTS)
-    curves = {name: curve.numpy() for name, curve in summary(Totals(**given)).items()}
+    curves = {name: curve.numpy() for name, curve in measured(METRICS, Totals(**given)).items()}
     curves |= {name: values(name)[..., 0] for name in names if name.startswith("in_force_")}
     return {f"institutions/{name}": curve for name, curve in curves.items()}
 

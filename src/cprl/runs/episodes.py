@@ -40,53 +40,6 @@ _ROWS_PER_GROUP: Final = 2**16
 """Parquet files with row groups of a few rows are slow to read."""
 
 
-class Journal:
-    """Appends batches to a journal.
-
-    Args:
-        path: the file; it is created where it does not exist.
-        rows: how many of its rows are kept; what follows them is dropped.
-    """
-
-    def __init__(self, path: Path, *, rows: int = 0) -> None:
-        self.rows, bytes_kept = 0, 0
-        self.schema: pa.Schema | None = None
-        """Of all batches; None before the first."""
-        for batch, end in batches_in(path) if rows else ():
-            self.schema, self.rows, bytes_kept = batch.schema, self.rows + batch.num_rows, end
-            if self.rows >= rows:
-                break
-        if self.rows != rows:
-            raise ValueError(f"{path} holds {self.rows} rows up to there; the checkpoint has {rows}")
-        exists = path.exists()
-        self._file = FileIO(path, "r+" if exists else "x")  # unbuffered: what is written survives the process
-        self._file.truncate(bytes_kept)
-        self._file.seek(bytes_kept)
-        if not exists:
-            sync_folder(path.parent)
-
-    def append(self, batch: pa.RecordBatch) -> None:
-        """Append all of a batch or nothing: behind half of one later ones would be unreadable."""
-        end = self._file.tell()
-        left = memoryview(_message(batch, is_first=self.schema is None))
-        try:
-            while left:
-                left = left[self._file.write(left) :]
-        except BaseException:
-            self._file.seek(end)
-            self._file.truncate()
-            raise
-        self.schema, self.rows = batch.schema, self.rows + batch.num_rows
-
-    def sync(self) -> None:
-        """Wait until all that was appended is on the disk."""
-        os.fsync(self._file.fileno())
-
-    def close(self) -> None:
-        """Close the file. A second call does nothing."""
-        self._file.close()
-
-
 def batches_in(path: Path) -> Iterator[tuple[pa.RecordBatch, int]]:
     """The whole batches of a journal, each with the byte at which it ends.
 
@@ -124,48 +77,57 @@ class EpisodeTable:
     earlier episodes are intact, and the same `add` or `close` can be repeated.
 
     Args:
-        path: the parquet file to write, `episodes.parquet` in a run's directory.
+        path: the parquet file to write, `episodes.parquet` in a run's directory, whose manifest lists it.
         resumable: whether to continue an existing journal or table, see `load_state_dict`, and to leave the
             journal in place if the block ends with an error.
-        run: the run whose manifest lists the table; by default the directory of the table.
 
     Raises:
         FileExistsError: if the table exists and is not to be resumed; nothing is ever overwritten.
     """
 
-    def __init__(
-        self, path: str | os.PathLike[str], *, resumable: bool = False, run: Path | None = None
-    ) -> None:
+    def __init__(self, path: str | os.PathLike[str], *, resumable: bool = False) -> None:
         self.path = Path(path)
         self.journal = self.path.with_suffix(".arrows")
-        self._run = self.path.parent if run is None else Path(run)
         self._resumable, self._is_closed = resumable, False
+        self._file: FileIO | None = None
+        self._rows, self._schema = 0, None
         for table in () if resumable else (self.path, self.journal):
             if table.exists():
                 raise FileExistsError(f"{table} exists and is not overwritten; use another directory")
         if self.path.exists() and not self.journal.exists():
             _reopen(self.path, self.journal)
-        self._file = None if self.journal.exists() else Journal(self.journal)
+        elif not self.journal.exists():
+            self._open()
+
+    def _open(self, rows: int = 0) -> FileIO:
+        """Open the journal behind so many of its rows; what follows them is dropped."""
+        count, bytes_kept, schema = 0, 0, None
+        for batch, end in batches_in(self.journal) if rows else ():
+            count, bytes_kept, schema = count + batch.num_rows, end, batch.schema
+            if count >= rows:
+                break
+        if count != rows:
+            raise ValueError(f"{self.journal} holds {count} rows up to there; the checkpoint has {rows}")
+        is_new = not self.journal.exists()
+        if self._file is not None:
+            self._file.close()
+        self._file = FileIO(self.journal, "x" if is_new else "r+")  # unbuffered: it survives the process
+        self._file.truncate(bytes_kept)
+        self._file.seek(bytes_kept)
+        self._rows, self._schema = count, schema
+        if is_new:
+            sync_folder(self.journal.parent)
+        return self._file
 
     def state_dict(self) -> dict[str, int]:
         """The number of rows, which are on the disk once it returns."""
-        if self._file is None:
-            return {"rows": 0}
-        self._file.sync()
-        return {"rows": self._file.rows}
+        if self._file is not None:
+            os.fsync(self._file.fileno())
+        return {"rows": self._rows}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
         """Continue after the given number of rows of its journal; later rows are dropped."""
-        file = Journal(self.journal, rows=int(state["rows"]))
-        if self._file is not None:
-            self._file.close()
-        self._file = file
-
-    def _placed(self) -> Journal:
-        """The journal; without a checkpoint of the last attempt it starts over."""
-        if self._file is None:
-            self._file = Journal(self.journal)
-        return self._file
+        self._open(int(state["rows"]))
 
     def add(self, *episodes: Episode, replica: int | None = None) -> None:
         """Append episodes; the first one of a table determines the columns and metrics of all.
@@ -175,15 +137,20 @@ class EpisodeTable:
         """
         if not episodes:
             return
-        file = self._placed()
+        file = self._file or self._open()  # without a checkpoint of the last attempt it starts over
+        batch = rows_of(episodes, replica, self._schema or schema_of(episodes[0]))
+        end, left = file.tell(), memoryview(_message(batch, is_first=self._schema is None))
         try:
-            file.append(rows_of(episodes, replica, file.schema or schema_of(episodes[0])))
-        except OSError as error:
-            raise OSError(
-                error.errno,
-                f"{error.strerror or error}: could not add episodes; the {file.rows} earlier rows are in "
-                f"{self.journal}",
-            ) from error
+            while left:
+                left = left[file.write(left) :]
+        except BaseException as error:
+            file.seek(end)  # behind half of a batch later ones would be unreadable
+            file.truncate()
+            if isinstance(error, OSError):
+                what = f"could not add episodes; the {self._rows} earlier rows are in {self.journal}"
+                raise OSError(error.errno, f"{error.strerror or error}: {what}") from error
+            raise
+        self._schema, self._rows = batch.schema, self._rows + batch.num_rows
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Do nothing: a table stores whole episodes."""
@@ -200,20 +167,24 @@ class EpisodeTable:
         """
         if self._is_closed:
             return
-        file = self._placed()
-        file.close()
+        (self._file or self._open()).close()
         try:
-            name = self.path.relative_to(self._run).as_posix()
-            write_listed(self._run, name, partial(_merge, self.journal, rows=file.rows))
+            write_listed(self.path.parent, self.path.name, self._merge)
         except FileNotFoundError as error:
             raise FileNotFoundError(ENOENT, f"{error.strerror}: was {self.journal} deleted?") from error
         except OSError as error:
-            raise OSError(
-                error.errno,
-                f"{error.strerror or error}: could not write {self.path}; all episodes are in {self.journal}",
-            ) from error
+            what = f"could not write {self.path}; all episodes are in {self.journal}"
+            raise OSError(error.errno, f"{error.strerror or error}: {what}") from error
         self.journal.unlink()
         self._is_closed = True
+
+    def _merge(self, target: BinaryIO) -> None:
+        table = read_journal(self.journal)
+        if table.num_rows != self._rows:
+            raise OSError(
+                EIO, f"{self.journal} holds {table.num_rows} rows of the {self._rows} that were added"
+            )
+        pq.write_table(table, target, row_group_size=_ROWS_PER_GROUP)
 
     def __enter__(self) -> Self:
         return self
@@ -284,13 +255,6 @@ def _reopen(path: Path, journal: Path) -> None:
     write_atomically(journal, lambda file: file.writelines(messages))
 
 
-def _merge(journal: Path, target: BinaryIO, *, rows: int) -> None:
-    table = read_journal(journal)
-    if table.num_rows != rows:
-        raise OSError(EIO, f"{journal} holds {table.num_rows} rows of the {rows} that were added")
-    pq.write_table(table, target, row_group_size=_ROWS_PER_GROUP)
-
-
 COLUMNS: Final = {
     "replica": pa.int32(),
     "episode": pa.int32(),
@@ -323,6 +287,18 @@ OF_INSTITUTIONS: Final = {
 where `cprl.measuring.institutions.counts_for` has them. One for each decision in force follows, `in_force_0`
 and so on, float64."""
 
+
+def metrics_in(schema: pa.Schema) -> list[str]:
+    """Return the metrics among the columns of a table, those of the user's own included."""
+    return [
+        field.name
+        for field in schema
+        if pa.types.is_floating(field.type)
+        and field.name not in {**COLUMNS, **OF_INSTITUTIONS}
+        and not field.name.startswith("in_force_")
+    ]
+
+
 LEFT_OUT: Final = b"left_out"
 """The key of the schema's metadata whose value says which columns are left out, and why, if any are."""
 
@@ -339,26 +315,8 @@ def _schema(names: Iterable[str]) -> pa.Schema:
 
 def schema_of(episode: Episode) -> pa.Schema:
     """The columns that an episode has; the schema's metadata names those that it lacks."""
-    schema = _schema([*_columns_of(episode), *_of_institutions(episode), *episode.metrics])
-    missing = left_out(episode.reported)
+    schema, missing = _schema(_columns(episode, 0)), left_out(episode.reported)
     return schema.with_metadata({LEFT_OUT: missing}) if missing else schema
-
-
-def _columns_of(episode: Episode) -> list[str]:
-    return [name for name in COLUMNS if getattr(episode, name, "") is not None]
-
-
-def _of_institutions(episode: Episode) -> dict[str, Any]:
-    """The values of the columns of institutions, [N] or a number; none for a game without them."""
-    values: dict[str, Any] = {**(episode.counts or {})}
-    for name in ("fines", "transfers", "violations", "decision"):
-        if getattr(episode, name) is not None:
-            values[name] = getattr(episode, name)
-    in_force: list[float] = [] if episode.in_force is None else episode.in_force.tolist()
-    return {
-        **{name: values[name] for name in OF_INSTITUTIONS if name in values},
-        **{f"in_force_{place}": value for place, value in enumerate(in_force)},
-    }
 
 
 def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema) -> pa.RecordBatch:
@@ -369,37 +327,35 @@ def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema)
         replica: the index of their replica; None for each episode's world.
         schema: what `schema_of` gave for the first episode of the table.
     """
-    values = [_values(episode, episode.world if replica is None else replica) for episode in episodes]
-    for columns in values:
+    parts = [_columns(episode, episode.world if replica is None else replica) for episode in episodes]
+    for columns in parts:
         if columns.keys() != set(schema.names):
             more, lacks = columns.keys() - set(schema.names), set(schema.names) - columns.keys()
             raise ValueError(
                 f"the episode has the extra columns {sorted(more)} and lacks {sorted(lacks)}; allowed: the "
                 "columns of the table's first episode"
             )
-    return pa.record_batch(
-        [
-            pa.array(
-                np.concatenate([columns[field.name] for columns in values]),
-                field.type,
-                from_pandas=field.name == "wanted_return",  # NaN, of agents that do not learn, is null
-            )
-            for field in schema
-        ],
-        schema=schema,
-    )
+    arrays = [
+        pa.array(
+            np.concatenate([columns[field.name] for columns in parts]),
+            field.type,
+            from_pandas=field.name == "wanted_return",  # NaN, of agents that do not learn, is null
+        )
+        for field in schema
+    ]
+    return pa.record_batch(arrays, schema=schema)
 
 
-def _values(episode: Episode, replica: int) -> dict[str, Any]:
+def _columns(episode: Episode, replica: int) -> dict[str, Any]:
+    """The columns of an episode in order, [N] each."""
     agents = np.arange(len(episode.return_))
-    values: dict[str, Any] = {
-        **{name: getattr(episode, name, None) for name in _columns_of(episode)},
-        "replica": replica,
-        "agent": agents,
-        "return": episode.return_,
-        **_of_institutions(episode),
-        **episode.metrics,
-    }
+    entries = dict(episode.counts or {})
+    entries |= {name: value for name, value in vars(episode).items() if value is not None}
+    entries |= {"replica": replica, "agent": agents, "return": episode.return_}
+    values = {name: entries[name] for name in (*COLUMNS, *OF_INSTITUTIONS) if name in entries}
+    if episode.in_force is not None:
+        values |= {f"in_force_{place}": value for place, value in enumerate(episode.in_force.tolist())}
+    values |= episode.metrics
     return {name: np.broadcast_to(value, agents.shape) for name, value in values.items()}
 
 

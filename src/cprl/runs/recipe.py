@@ -225,27 +225,23 @@ def write_on_nan(run: Path, on_nan: str) -> None:
         write_json(run / RECIPE_FILE, recipe)
 
 
-def changed_circumstances(run: Path) -> list[str]:
-    """Return what differs now from when a run was started, so that its numbers may differ from those of an
-    undisturbed run: versions, git commit, processor, the user's own code; a sentence for each."""
-    recipe = read_recipe(run)
-    return [
-        difference
-        for name, now in _circumstances(recipe).items()
-        if recipe.get(name) is not None
-        for difference in differences(recipe[name], now, name)
-    ]
-
-
-def write_changed_circumstances(run: Path) -> None:
+def write_circumstances(run: Path) -> list[str]:
     """Write into a run's recipe under which versions, git commit, processor and code of the user's own it is
-    resumed, if they are not those of its last process."""
+    resumed, if they are not those of its last process.
+
+    Returns:
+        What differs now from when the run was started, a sentence for each, so that its numbers may differ
+        from those of an undisturbed run.
+    """
     recipe = read_recipe(run)
     now = _circumstances(recipe)
-    before = (recipe.get("resumed") or [recipe])[-1]
-    if any(before.get(name) != now[name] for name in now):
+    before = {name: recipe[name] for name in now if recipe.get(name) is not None}
+    last = (recipe.get("resumed") or [before])[-1]
+    changed = [line for name in before for line in differences(before[name], now[name], name)]
+    if any(last[name] != now[name] for name in last if name in now):
         recipe |= {**_code_text(recipe), "resumed": [*recipe.get("resumed", []), now]}
         write_json(run / RECIPE_FILE, recipe)
+    return changed
 
 
 def say_changes(run: Path, changes: Sequence[str]) -> None:

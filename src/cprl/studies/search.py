@@ -21,6 +21,7 @@ import numpy as np
 from cprl.commons.game import Game
 from cprl.experiment import Experiment
 from cprl.measuring import social
+from cprl.measuring.episodes import own_name
 from cprl.runs.curves import as_curves, curves_of
 from cprl.runs.episodes import read_table
 from cprl.runs.files import RunLock
@@ -98,7 +99,11 @@ class Search(Value, stored=False):
         super().__post_init__()
         game = self.experiment.game
         if isinstance(game, Game) and not (game.institutions and self.metric.startswith("institutions/")):
-            metrics = [*social.METRICS, *(f"return_{agent}" for agent in range(game.agents))]
+            metrics = [
+                *social.METRICS,
+                *map(own_name, self.experiment.metrics),
+                *(f"return_{agent}" for agent in range(game.agents)),
+            ]
             if self.metric not in metrics:
                 raise refusal("metric", self.metric, ", ".join(metrics))
         one = self._one_point()

@@ -16,7 +16,6 @@ from cprl.measuring.metrics import title as metric_title
 from cprl.measuring.metrics import unit
 from cprl.measuring.phases import UNNAMED as UNNAMED
 from cprl.measuring.phases import Phase
-from cprl.measuring.statistics import institution_metrics
 from cprl.runs.curves import SMOOTHED_EPISODES, centres, curves_of, episode_of_step, phases_of, running_mean
 from cprl.runs.episodes import read_evaluations
 from cprl.terminal import style
@@ -173,9 +172,7 @@ def _panels(run: Path, curves: dict[str, Values], random: Sequence[Episode]) -> 
     """Collective return and survival, or the return of all agents of a game without a harvest; violations and
     fines of a game with institutions."""
     played: list[dict[str, float]] = [
-        {"return": float(one.return_.sum()), **one.metrics}
-        | {f"institutions/{name}": value for name, value in institution_metrics(one).items()}
-        for one in random
+        {"return": float(one.return_.sum()), **one.social, **one.of_institutions} for one in random
     ]
     if "collective_return" in curves:
         names = ["collective_return", "survival_steps"]

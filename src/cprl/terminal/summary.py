@@ -11,9 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from cprl.measuring.episodes import Episode
-from cprl.measuring.metrics import DIGITS, INSTITUTIONAL, left_out
+from cprl.measuring.metrics import DIGITS, INSTITUTIONAL, is_own, left_out
 from cprl.measuring.metrics import title as metric_title
-from cprl.measuring.statistics import institution_metrics, social_metrics
 from cprl.system.output import console as safe_console
 from cprl.system.output import printed
 from cprl.system.shipped import cprl_here
@@ -80,10 +79,12 @@ def _table(title: str, played: Mapping[str, list[Episode]]) -> Table:
         pairs = zip(chain(*harvests), chain(*returns), strict=True)
         if any(abs(harvest - reward) > 1e-3 for harvest, reward in pairs):  # as under fines
             _add_returns(table, f"{RETURN}, rewards", played, returns)
-    measured = [[social_metrics(episode) for episode in episodes] for episodes in played.values()]
-    for metric, digits in DIGITS.items():
+    measured = [[episode.social for episode in episodes] for episodes in played.values()]
+    forms = {metric: f".{digits}f" for metric, digits in DIGITS.items()}
+    forms |= {metric: ".3g" for metric in measured[0][0] if is_own(metric)}
+    for metric, form in forms.items():
         if metric in measured[0][0]:
-            table.add_row(metric_title(metric), *(_mean(episodes, metric, digits) for episodes in measured))
+            table.add_row(metric_title(metric), *(_mean(episodes, metric, form) for episodes in measured))
     table.add_row("episodes", *(str(len(episodes)) for episodes in played.values()))
     return table
 
@@ -110,13 +111,13 @@ def _baseline(played: Mapping[str, list[Episode]]) -> str:
     return "random play" if name == "random" else name
 
 
-def _mean(measured: list[dict[str, float]], name: str, digits: int) -> str:
+def _mean(measured: list[dict[str, float]], name: str, form: str) -> str:
     """The mean of a metric over the episodes in which it is defined, and the number of the others."""
     defined = [metrics[name] for metrics in measured if not isnan(metrics[name])]
     if not defined:
         return UNDEFINED
     others = len(measured) - len(defined)
-    return f"{fmean(defined):.{digits}f}" + f", {UNDEFINED} in {others} of {len(measured)}" * (others > 0)
+    return f"{fmean(defined):{form}}" + f", {UNDEFINED} in {others} of {len(measured)}" * (others > 0)
 
 
 def _notes(played: Mapping[str, list[Episode]]) -> Iterator[str]:
@@ -139,14 +140,13 @@ def institutions_table(played: Mapping[str, Sequence[Episode]]) -> Table | None:
     if all(getattr(first, name) is None for name in INSTITUTIONAL):
         return None
     table = _new_table("institutions", "means over episodes", list(played), folds_heads=False)
-    measured = [[institution_metrics(episode) for episode in episodes] for episodes in played.values()]
-    for metric in institution_metrics(first):
+    measured = [[episode.of_institutions for episode in episodes] for episodes in played.values()]
+    for metric in first.of_institutions:
         values = [metrics[metric] for episodes in measured for metrics in episodes]
         if "equality" in metric or not all(map(isnan, values)):
-            is_decision = metric.startswith("in_force_")
-            decision = f"in force: decision {metric.removeprefix('in_force_')}"
-            title = decision if is_decision else metric_title(f"institutions/{metric}")
-            table.add_row(title, *(_mean(episodes, metric, 2) for episodes in measured))
+            _, is_decision, number = metric.partition("in_force_")
+            title = f"in force: decision {number}" if is_decision else metric_title(metric)
+            table.add_row(title, *(_mean(episodes, metric, ".2f") for episodes in measured))
     fields = {name: word for name, word in _OF_AGENTS.items() if getattr(first, name) is not None}
     if fields:
         table.add_section()

@@ -106,6 +106,11 @@ class LoadedRun:
         return made(self.experiment.game)
 
     @property
+    def metrics(self) -> tuple[Custom, ...]:
+        """The user's own."""
+        return self.experiment.metrics
+
+    @property
     def specs(self) -> list[AgentSpec]:
         return specs_by_agent(self.experiment.agents, self.game.agents)
 

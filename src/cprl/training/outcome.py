@@ -3,7 +3,7 @@
 import random as random_of_python
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from statistics import fmean
@@ -21,9 +21,8 @@ from cprl.envs.unwrap import commons_of
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import evaluate
-from cprl.measuring.statistics import social_metrics
 from cprl.policies.present import PresentPolicy
-from cprl.runs.episodes import EVALUATIONS, EpisodeTable, labelled
+from cprl.runs.episodes import EVALUATIONS, labelled
 from cprl.runs.files import write_listed
 from cprl.training.agents import Population, stored_policies
 
@@ -86,7 +85,8 @@ def random_play(experiment: Experiment, population: Population) -> list[Episode]
     """Let agents who take every action with equal probability play the worlds of the evaluation, before the
     training: what it is compared with while it runs. No generator moves."""
     with _generators_kept(experiment.device):
-        return evaluate(fresh_env(experiment), population.random_policy(experiment.evaluation_episodes))
+        policy = population.random_policy(experiment.evaluation_episodes)
+        return evaluate(fresh_env(experiment), policy, metrics=experiment.metrics)
 
 
 @contextmanager
@@ -148,7 +148,7 @@ class Evaluations:
             load_transforms_state(env, transforms_state(self._env))
             agents, playing = self._population.as_stored(group), self._population.playing
             policies = stored_policies(agents, playing, replicas=group, worlds=worlds, seed=seed)
-            episodes = evaluate(env, policies)
+            episodes = evaluate(env, policies, metrics=experiment.metrics)
             for place, replica in enumerate(group):
                 played[replica] = episodes[place * worlds : (place + 1) * worlds]
         return played
@@ -168,8 +168,8 @@ class Evaluations:
 
 def _means(episodes: Sequence[Episode]) -> dict[str, float]:
     means = {"return": fmean(float(episode.return_.sum()) for episode in episodes)}
-    for name in social_metrics(episodes[0]):
-        values = [social_metrics(episode)[name] for episode in episodes]
+    for name in episodes[0].social:
+        values = [episode.social[name] for episode in episodes]
         means[name] = float(np.nanmean(values)) if not np.isnan(values).all() else float("nan")
     return means
 
@@ -200,24 +200,20 @@ def evaluate_population(
     fresh, worlds = fresh_env(experiment), experiment.evaluation_episodes
     load_transforms_state(fresh, transforms_state(trained))
     if random is None or not is_same_later(experiment):
-        random = evaluate(fresh, population.random_policy(worlds))
+        random = evaluate(fresh, population.random_policy(worlds), metrics=experiment.metrics)
     elif not _keeps_decisions(trained):
         fresh.reset()  # the trained agents play the second episode of each world
     if _keeps_decisions(trained):
         fresh = fresh_env(experiment)  # or its first one, where what others decided would stay in force
     load_transforms_state(fresh, transforms_state(trained))  # which random play may have changed
-    return {"random": random, "trained": evaluate(fresh, population.policy(worlds), explore=True)}
+    policy = population.policy(worlds)
+    return {"random": random, "trained": evaluate(fresh, policy, explore=True, metrics=experiment.metrics)}
 
 
 def write_evaluation(run: Path, played: Mapping[str, Sequence[Episode]], *, of_replica: int) -> None:
     """Write `evaluation/<policy>.parquet` of a run, so many episodes of each replica; again where one is
     there."""
     for name, episodes in played.items():
-        path = run / "evaluation" / f"{name}.parquet"
-        path.parent.mkdir(exist_ok=True)
-        for before in (path, path.with_suffix(".arrows")):
-            before.unlink(missing_ok=True)
-        with EpisodeTable(path, run=run) as table:
-            for place, episode in enumerate(episodes):
-                replica, number = divmod(place, of_replica)
-                table.add(replace(episode, world=replica, episode=number))
+        starts = enumerate(range(0, len(episodes), of_replica))
+        table = labelled(({}, replica, episodes[start : start + of_replica]) for replica, start in starts)
+        write_listed(run, f"evaluation/{name}.parquet", partial(pq.write_table, table))

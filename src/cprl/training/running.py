@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from cprl.envs.state import transforms_state
 from cprl.envs.unwrap import agent_names
 from cprl.experiment import Experiment
-from cprl.measuring.episodes import Episode
+from cprl.measuring.episodes import Episode, own_name, try_own_metrics
 from cprl.population import Frozen, exploration_steps
 from cprl.runs.checkpoints import FOLDER, REPORT, Checkpointer, checkpoints_in, extend, refuse_to_extend
 from cprl.runs.episodes import EpisodeTable
@@ -21,12 +21,11 @@ from cprl.runs.files import LOCK_FILE, RunLockedError, refuse_missing, write_jso
 from cprl.runs.loggers import LoggerCallback, check_logger, make_logger
 from cprl.runs.recipe import (
     RECIPE_FILE,
-    changed_circumstances,
     read_recipe,
     refuse_another_run,
     say_changes,
     start_run,
-    write_changed_circumstances,
+    write_circumstances,
     write_on_nan,
 )
 from cprl.runs.weights import partners_of, save_decisions, save_transforms, save_weights, weights_of
@@ -119,6 +118,7 @@ def run(
     env, population = make_agents(experiment, starts=not is_begun, weights=weights)
     observers: list[Any] = [*(made(callback) for callback in experiment.callbacks), *callbacks]
     check_callbacks(observers)
+    try_own_metrics(experiment.metrics, env)
     episodes = refuse_another_run(out, experiment.to_recipe, Experiment) if resume else experiment.episodes
     if resumed is not None and episodes >= experiment.episodes and (resumed / REPORT).exists():
         _tidy_up(resumed, keep_checkpoint=keep_checkpoint, take_over=take_over)
@@ -204,6 +204,7 @@ def _train(work: _Work, observers: Sequence[Any], checkpointer: Checkpointer) ->
             checkpointer=checkpointer,
             update_every=experiment.update_every,
             on_nan=experiment.on_nan,
+            metrics=experiment.metrics,
         )
         save_weights(directory, population.networks())
         save_transforms(directory, transforms_state(env))
@@ -271,10 +272,7 @@ def _weights_of_partners(experiment: Experiment, run: Path) -> dict[str, str]:
 
 def _begin_again(directory: Path, experiment: Experiment, *, is_begun: bool, episodes: int) -> None:
     """Says what is new since a run was begun, of so many episodes, and writes it into its recipe."""
-    changed = changed_circumstances(directory)
-    say_changes(directory, changed)
-    if changed:
-        write_changed_circumstances(directory)
+    say_changes(directory, write_circumstances(directory))
     if not is_begun:
         say("No checkpoint yet: begins with the first episode")
     write_on_nan(directory, experiment.on_nan)
@@ -296,6 +294,7 @@ def _make_viewer(
         env,
         title=_title(experiment),
         episodes=experiment.episodes,
+        metrics=[own_name(metric) for metric in experiment.metrics],
         recipe={**circumstances, **recipe["experiment"]},
         live=None if watch == "file" else watch,
         exhibited=None if watch == "file" else exhibited(experiment, env, population),

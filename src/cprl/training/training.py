@@ -36,7 +36,7 @@ from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.files import TRAINING_STATE_FORMAT
 from cprl.system.times import Times
 from cprl.training.finite import EVERY_STEPS, FiniteCheck
-from cprl.values import shown
+from cprl.values import Custom, shown
 
 
 class StepCollector(BaseCollector):
@@ -103,6 +103,7 @@ class Training:
         make_collector: what plays; one of TorchRL's own is several times slower, and cannot be resumed.
         on_nan: whether the training stops where a loss, weight, reward or observation is not finite, see
             `cprl.training.finite`.
+        metrics: the user's own, see `cprl.measuring.EpisodeTracker`.
     """
 
     def __init__(
@@ -117,6 +118,7 @@ class Training:
         update_every: int = 1,
         make_collector: MakeCollector = StepCollector,
         on_nan: OnNan = "stop",
+        metrics: Sequence[Custom] = (),
     ) -> None:
         spaces = spaces_of(env)
         replicas = env.batch_size.numel()
@@ -135,7 +137,7 @@ class Training:
         self.decisions = decisions
         self._collector = make_collector(env, AgentPolicies({**actors, **self.others}, decisions=decisions))
         self._turns = iter(self._collector)
-        self._tracker = tracker_of(env)
+        self._tracker = tracker_of(env, metrics)
         self._losses = {agents: LaneLosses(replicas, agents) for agents in self.learners}
         self._wanted = WantedReturns(replicas, spaces.agents, self.learners)
         for learner in self.learners.values():
@@ -340,6 +342,7 @@ def train(
     update_every: int = 1,
     make_collector: MakeCollector = StepCollector,
     on_nan: OnNan = "stop",
+    metrics: Sequence[Custom] = (),
 ) -> Training:
     """Plays so many episodes of every replica; each learner stores every turn and then updates.
 
@@ -359,6 +362,7 @@ def train(
         update_every=update_every,
         make_collector=make_collector,
         on_nan=on_nan,
+        metrics=metrics,
     )
     training.run(checkpointer)
     return training

@@ -15,11 +15,11 @@ from torchrl.envs import EnvBase
 
 from cprl.envs.unwrap import agent_names, commons_of
 from cprl.measuring.episodes import Episode
-from cprl.measuring.metrics import METRICS, reported_by
+from cprl.measuring.metrics import reported_by
 from cprl.measuring.series import OF_AGENTS, Series, numbers_of
 from cprl.policies.present import PresentPolicy
 from cprl.runs.curves import as_curves
-from cprl.runs.episodes import read_episodes
+from cprl.runs.episodes import metrics_in, read_episodes
 from cprl.viewer.board import Filming
 from cprl.viewer.exhibition import Exhibition
 from cprl.viewer.layout import curves_of, missing_in, scene_of
@@ -63,6 +63,7 @@ class ViewerCallback:
         run: the run's directory, where the recording is written. If there is one already, the new file is
             `run-2.rrd` and so on; the viewer shows them as one recording.
         env: a world for each replica, with transforms or without; the first is shown.
+        metrics: the names of the user's own.
         live: "serve" or "spawn", see `cprl.viewer.live`; None for the file alone.
         exhibited: what is exhibited live: the present policy and one world for it, see
             `cprl.viewer.exhibition`.
@@ -79,6 +80,7 @@ class ViewerCallback:
         *,
         title: str,
         episodes: int,
+        metrics: Sequence[str] = (),
         recipe: Mapping[str, object] | None = None,
         live: str | None = None,
         exhibited: tuple[PresentPolicy, EnvBase] | None = None,
@@ -87,7 +89,7 @@ class ViewerCallback:
     ) -> None:
         self.env, self._run, self._agents = env, run, agent_names(env)
         reported, commons = reported_by(env), commons_of(env)
-        curves = curves_of(env, self._agents, reported, episodes=episodes)
+        curves = curves_of(env, self._agents, reported, episodes=episodes, own=metrics)
         scene = None if commons is None else scene_of(commons, curves, is_replay=is_replay)
         self._earlier = [] if file_name else recordings_of(run)
         self.logger = RerunLogger(
@@ -272,7 +274,7 @@ def _stored_episodes(run: Path) -> Iterator[Episode]:
     columns = {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
     curves = as_curves(table)
     agents = int(columns["agent"].max()) + 1
-    metrics = [name for name in columns if name in METRICS or name == "yield_share"]
+    metrics = metrics_in(table.schema)
     in_force = [name for name in columns if name.startswith("in_force_")]
     for row in range(0, table.num_rows, agents):
         replica, number = int(columns["replica"][row]), int(columns["episode"][row])

@@ -35,7 +35,7 @@ from cprl.commons.decoding import UNSEEN
 from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring import institutions, now, phases
 from cprl.measuring.episodes import decisions_of, metrics_of, yield_of
-from cprl.measuring.metrics import FIELDS, METRICS, available, left_out
+from cprl.measuring.metrics import FIELDS, METRICS, available, is_own, left_out
 from cprl.measuring.series import OF_AGENTS
 
 ORANGE, BLUE, GREEN = (230, 160, 0), (86, 180, 233), (0, 158, 115)
@@ -165,10 +165,18 @@ class Scene(Curves):
     there are no curves over episodes."""
 
 
-def curves_of(env: EnvBase, agents: tuple[str, ...], reported: Sequence[str], *, episodes: int) -> Curves:
-    """The numbers of an environment that are plotted."""
+def curves_of(
+    env: EnvBase,
+    agents: tuple[str, ...],
+    reported: Sequence[str],
+    *,
+    episodes: int,
+    own: Sequence[str] = (),
+) -> Curves:
+    """The numbers of an environment that are plotted, and metrics of the user's own by their names."""
     metrics = available({**METRICS, "stock_left": FIELDS["stock_left"]}, reported)
-    metrics += () if yield_of(env)["sustainable_yield"] is None else ("yield_share",)
+    metrics += ("yield_share",) if yield_of(env) and "harvest" in reported else ()
+    metrics += tuple(own)
     return Curves(
         agents=agents,
         replicas=env.batch_size.numel(),
@@ -225,10 +233,9 @@ def styles(curves: Curves) -> dict[str, Any]:
     """The names, colours and widths of each plot's lines, and the colours of states, by entity."""
     replicas = curves.replicas
     lines = {entity: line(name, colour, width=None) for entity, (name, colour) in OTHERS.items()}
-    for entity, (name, colour) in SOCIAL.items():
-        if entity.removeprefix("social/") in curves.metrics:
-            lines[entity] = running(name, colour, replicas)
     for metric in curves.metrics:
+        name, colour = SOCIAL.get(f"social/{metric}", (metric, ORANGE))
+        lines[f"social/{metric}"] = running(name, colour, replicas)
         lines[f"{RANDOM_PLAY}/{metric}"] = line("random play", GREY)
         lines[f"{EVALUATION}/{metric}"] = line("greedy, evaluated", ORANGE)
     for name in curves.institutions:
@@ -521,6 +528,7 @@ def _tabs(curves: Curves) -> list[Any]:
             social("Apples left at the end", "stock_left"),
             social("Yield share of the steps played", "yield_share"),
         ],
+        "Your metrics": [social(name, name) for name in filter(is_own, curves.metrics)],
     }
     rows = [rrb.Horizontal(*views, name=name) for name, tab in tabs.items() if (views := _present(tab))]
     return [*rows, _plot("Steps per second", ["time/env_steps_per_s"]), _recipe()]

@@ -20,7 +20,6 @@ from cprl.envs.commons_env import CommonsEnv
 from cprl.institutions import Boundaries
 from cprl.measuring.episodes import Episode
 from cprl.measuring.series import OF_AGENTS, Recent, Values, mean_of
-from cprl.measuring.statistics import social_metrics
 from cprl.viewer.board import RIM_CELLS, boards, image_form
 from cprl.viewer.layout import (
     BACKGROUND,
@@ -101,8 +100,9 @@ class Plots(View):
     def random_play(self, episodes: Sequence[Episode]) -> None:
         """Sets the lines of random play: the mean of each metric in these episodes, where it is defined."""
         curves = self._logger.curves
+        played = [{**episode.social, **episode.of_institutions} for episode in episodes]
         for name in (*curves.metrics, *(f"institutions/{metric}" for metric in curves.institutions)):
-            values = [_metrics_of(episode).get(name, float("nan")) for episode in episodes]
+            values = [metrics.get(name, float("nan")) for metrics in played]
             defined = [value for value in values if value == value]
             if defined:
                 self._random[name] = fmean(defined)
@@ -117,11 +117,6 @@ class Plots(View):
             self._logger.log_lines(name, lines)
         for name, mean in self._random.items():
             self._logger.log_scalar(f"{RANDOM_PLAY}/{name}", mean)
-
-
-def _metrics_of(episode: Episode) -> dict[str, float]:
-    of_institutions = {f"institutions/{name}": value for name, value in episode.institutions.items()}
-    return {**social_metrics(episode), **of_institutions}
 
 
 class Tags(View):

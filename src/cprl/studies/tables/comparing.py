@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 
-from cprl.measuring.metrics import title
+from cprl.measuring.metrics import is_own, title
 from cprl.measuring.statistics import CONFIDENCE, Estimate, difference, estimate, holm
 from cprl.studies.tables.table import NET, PARTS, RANDOM, TRAINING, StudyTable
 from cprl.system.defaults import LAST as LAST
@@ -110,12 +110,14 @@ def compare(table: StudyTable, metric: str, *, part: str = TRAINING, last: int =
 
 
 def metrics_of(table: StudyTable, metrics: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the metrics asked for, by default those of `METRICS` that a table has."""
+    """Return the metrics asked for, by default those of `METRICS` and of the user's own that a
+    table has."""
     for metric in metrics:
         if metric not in table.metrics:
             allowed = ", ".join(table.metrics) or "none, as the table has no finished run"
             raise refusal("metric", metric, allowed)
-    return tuple(metrics) or tuple(metric for metric in METRICS if metric in table.metrics)
+    usual = [metric for metric in METRICS if metric in table.metrics]
+    return tuple(metrics) or (*usual, *filter(is_own, table.metrics))
 
 
 @lru_cache(maxsize=128)  # figures and texts of a table share what it says

@@ -1,0 +1,107 @@
+"""A metric of the user's own, one function of an episode, appears wherever those of the library do."""
+
+from dataclasses import replace
+
+import pytest
+from recordings import column
+from tiny_study import TINY
+
+import cprl
+from cprl import Custom, Study
+from cprl.commands import main as cli
+from cprl.runs.curves import curves_of
+from cprl.runs.episodes import read_episodes, read_evaluations
+from cprl.studies import Search, StudyTable
+
+KEYS = ("policy", "trained_episodes", "replica", "episode")
+SHARE, LOGGER = "one_road_parts:largest_share", "torchrl.record.loggers:CSVLogger"
+ALLOW = [SHARE, LOGGER]
+
+
+def experiment(*targets, **changes):
+    return replace(TINY, metrics=[Custom(f"one_road_parts:{target}") for target in targets], **changes)
+
+
+def train(measured, out, **options):
+    return cprl.run(measured, out, figures=False, **options)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run and the folder of its logger."""
+    folder = tmp_path_factory.mktemp("own")
+    log = Custom(LOGGER, arguments={"exp_name": "own", "log_dir": str(folder)})
+    return train(experiment("largest_share", episodes=3, evaluate_every=2, loggers=(log,)), folder / "run")
+
+
+@pytest.mark.integration
+def test_it_is_a_column_of_every_table_of_episodes(run):
+    evaluated = cprl.evaluate_run(run, episodes=2, allow=ALLOW)
+    for table in (read_episodes(run), read_evaluations(run), evaluated.table()):
+        by_episode = table.group_by([name for name in table.column_names if name in KEYS]).aggregate(
+            [("harvest", "max"), ("harvest", "sum"), ("largest_share", "min"), ("largest_share", "max")]
+        )
+        for row in by_episode.to_pylist():
+            share = row["harvest_max"] / row["harvest_sum"] if row["harvest_sum"] else float("nan")
+            assert row["largest_share_min"] == pytest.approx(share, nan_ok=True)
+            assert row["largest_share_max"] == pytest.approx(share, nan_ok=True)
+
+
+@pytest.mark.integration
+def test_it_is_a_curve_of_the_recording_and_of_a_logger_and_a_row_of_what_is_evaluated(
+    run, monkeypatch, capsys
+):
+    curve = curves_of(run)["largest_share"]
+    defined = [(episode, pytest.approx(value)) for episode, value in enumerate(curve[0]) if value == value]
+    episodes, values = column(run / "run.rrd", "social/largest_share", "Scalars:scalars", "episode")
+    assert [(episode, value[0]) for episode, value in zip(episodes, values, strict=True)] == defined
+    lines = (run.parent / "own/scalars/social/largest_share.csv").read_text().split()
+    assert len(lines) == len(defined)
+    assert column(run / "run.rrd", "random_play/largest_share", "Scalars:scalars")[1]
+    monkeypatch.setattr(
+        "sys.argv", ["cprl", "evaluate", str(run), "--episodes", "2", "--allow", SHARE, "--allow", LOGGER]
+    )
+    cli.main()
+    assert "largest_share" in capsys.readouterr().out
+
+
+@pytest.mark.integration
+def test_it_is_compared_in_a_study_and_what_a_search_looks_for(tmp_path):
+    measured = experiment("largest_share")
+    study = Study(measured, {"game.rules.freeze_steps": [2, 5]}, replicas=1)
+    result = cprl.run_study(study, tmp_path / "study")
+    assert "largest_share" in (result.out / "summary.md").read_text()
+    for part in ("training", "evaluation", "random"):
+        assert StudyTable.read(result.out / "table.parquet").values("freeze_steps=5", "largest_share", part)
+    factors = {"game.rules.freeze_steps": [2, 5]}
+    assert Search(measured, factors, points=2, metric="largest_share").metric == "largest_share"
+    with pytest.raises(ValueError, match="metric"):
+        Search(TINY, factors, points=2, metric="largest_share")
+
+
+@pytest.mark.integration
+def test_nothing_else_of_a_run_changes(tmp_path):
+    measured = train(experiment("largest_share"), tmp_path / "run", watch="off")
+    plain = train(TINY, tmp_path / "plain", watch="off")
+    tables = [read_episodes(measured).drop(["largest_share"]), read_episodes(plain)]
+    assert repr(tables[0].to_pydict()) == repr(tables[1].to_pydict())
+
+
+@pytest.mark.parametrize("target", ["no_number", "fails", "of_another_game", "missing"])
+def test_one_that_gives_no_number_is_refused_before_anything_is_written(target, tmp_path):
+    with pytest.raises(ValueError, match=f"one_road_parts:{target}"):
+        train(experiment(target), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("targets", [["equality"], ["steps"], ["return_1"], ["largest_share"] * 2])
+def test_one_with_the_name_of_another_number_is_refused(targets):
+    with pytest.raises(ValueError, match=f"another number of an episode is called {targets[0]}"):
+        experiment(*targets)
+
+
+def test_a_recipe_with_one_is_read_where_it_is_allowed():
+    recipe = experiment("largest_share").to_recipe()
+    with pytest.raises(ValueError, match=f"--allow {SHARE}"):
+        cprl.Experiment.from_recipe(recipe)
+    assert cprl.Experiment.from_recipe(recipe, allow=[SHARE]) == experiment("largest_share")
