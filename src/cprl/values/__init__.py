@@ -30,7 +30,7 @@ from typing import (
     get_type_hints,
 )
 
-from cprl.values import Custom as Custom
+from cprl.values.custom import Custom as Custom
 from cprl.values.custom import allowed as allowed
 from cprl.values.custom import allowing as allowing
 from cprl.values.custom import custom_targets as custom_targets
