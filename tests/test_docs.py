@@ -13,7 +13,7 @@ from recordings import watched_training
 from rerun.chunk import RrdReader
 
 from cprl.commands import main as cli
-from cprl.measuring import institutions
+from cprl.measuring import institutions, social
 from cprl.measuring.series import OF_AGENTS
 from cprl.runs.episodes import OF_INSTITUTIONS
 
@@ -58,12 +58,27 @@ def rows_under(heading):
     return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines[1:]]
 
 
-def test_the_docs_name_what_is_logged_and_kept_of_institutions():
-    rows = rows_under("Institutions, one value per episode")
+@pytest.mark.parametrize(
+    ("heading", "prefix", "metrics", "others"),
+    [
+        ("Social metrics", "social", social.SOCIAL, ["social/stock_left"]),
+        (
+            "Institutions",
+            "institutions",
+            institutions.METRICS,
+            ["institutions/in_force_<v>", *(f"agent_<i>/{name}" for name in OF_AGENTS)],
+        ),
+    ],
+)
+def test_the_docs_have_each_metric_with_its_unit(heading, prefix, metrics, others):
+    rows = rows_under(f"{heading}, one value per episode")
     units = {name: row[1] for row in rows for name in re.findall(r"`([^`]+)`", row[0])}
-    words = {f"institutions/{name}": metric.unit for name, metric in institutions.METRICS.items()}
-    assert set(units) == {*words, "institutions/in_force_<v>", *(f"agent_<i>/{name}" for name in OF_AGENTS)}
+    words = {f"{prefix}/{name}": metric.unit for name, metric in metrics.items()}
+    assert set(units) == {*words, *others}
     assert all(words[name] == units[name].replace("0..1", "0 to 1") for name in words)
+
+
+def test_the_docs_have_each_column_of_games_with_institutions():
     columns = [row[0] for row in rows_under("The table of a run")]
     assert columns == [*OF_INSTITUTIONS, "in_force_<v>"]
 

@@ -17,7 +17,6 @@ import torch
 from matrix_game import MatrixGame, tit_for_tat
 from recordings import column
 from rerun.chunk import RrdReader
-from study_runs import an_episode
 from test_any_game import play
 from tiny_study import TINY
 from torchrl.record.loggers import CSVLogger
@@ -32,9 +31,8 @@ from cprl.measuring import EpisodeTracker
 from cprl.population import Frozen, Learning
 from cprl.runs import loggers
 from cprl.runs.curves import as_curves, running_mean
-from cprl.runs.episodes import EpisodeTable, read_episodes, read_journal, read_table
+from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
-from cprl.runs.files import remove_listed, rename_listed, verify, write_listed
 from cprl.runs.recipe import read_recipe, refuse_another_run, resume_command, runs_in, start_run
 from cprl.studies.factors import changed
 from cprl.system.shipped import cprl_here
@@ -202,108 +200,6 @@ def test_a_run_that_python_began_is_resumed_by_the_command_cprl(tmp_path):
     typed = shlex.join(cprl_here())
     assert resume_command(run) == f"{typed} run {run} --resume --allow my:Callback --allow my:Other"
     assert resume_command(tmp_path) == f"{typed} run {tmp_path} --resume"
-
-
-# The journal, and the files of a manifest
-
-
-def add(table, numbers):
-    for number in numbers:
-        table.add(an_episode(number, 0, 3.0))
-
-
-@pytest.fixture
-def journal(tmp_path):
-    """The journal of four episodes of two agents."""
-    table = EpisodeTable(tmp_path / "episodes.parquet")
-    add(table, range(4))
-    return table.journal
-
-
-def continued(journal, rows):
-    table = EpisodeTable(journal.with_suffix(".parquet"), resumable=True)
-    table.load_state_dict({"rows": rows})
-    return table
-
-
-def test_a_journal_continues_behind_as_many_rows_as_a_checkpoint_has(journal):
-    whole = journal.read_bytes()
-    for rows, message in ((5, "holds 6 rows up to there; the checkpoint has 5"), (9, "holds 8 rows")):
-        with pytest.raises(ValueError, match=message):
-            continued(journal, rows)
-    assert journal.read_bytes() == whole, "one that cannot be continued is left as it is"
-    add(continued(journal, 4), (2, 3))
-    assert journal.read_bytes() == whole
-    continued(journal, 0)
-    assert journal.read_bytes() == b""
-
-
-@pytest.mark.integration
-def test_damage_hides_a_batch_with_those_behind_it_or_changes_values_but_nothing_else(journal):
-    data, whole = journal.read_bytes(), read_journal(journal)
-    for place in range(0, len(data), 3):
-        flipped = bytearray(data)
-        flipped[place] ^= 64
-        journal.write_bytes(flipped)
-        assert read_journal(journal).num_rows <= whole.num_rows
-
-
-def test_a_stream_that_pyarrow_writes_is_a_journal(tmp_path):
-    path, rows = tmp_path / "episodes.arrows", pa.record_batch({"replica": [1, 1], "equality": [0.5, -1.25]})
-    with pa.OSFile(str(path), "wb") as file, pa.ipc.new_stream(file, rows.schema) as stream:
-        stream.write_batch(rows, custom_metadata={"crc32": "0"})
-    assert read_journal(path).to_batches() == [rows]
-
-
-def test_a_finished_table_that_is_resumed_continues_behind_any_episode(tmp_path):
-    path = tmp_path / "episodes.parquet"
-    with EpisodeTable(path) as table:
-        add(table, range(5))
-    rows = read_episodes(tmp_path)
-    with EpisodeTable(path, resumable=True) as table:
-        table.load_state_dict({"rows": 4})
-        add(table, range(2, 5))
-    assert str(read_episodes(tmp_path).to_pylist()) == str(rows.to_pylist())
-    assert read_episodes(tmp_path).schema.equals(rows.schema, check_metadata=True)
-    assert not table.journal.exists()
-
-
-def test_a_table_syncs_its_journal_before_a_checkpoint_counts_its_rows_and_misses_a_deleted_one(
-    tmp_path, monkeypatch
-):
-    table = EpisodeTable(tmp_path / "episodes.parquet")
-    add(table, [0])
-    synced = []
-    monkeypatch.setattr(os, "fsync", lambda file: synced.append(os.fstat(file).st_ino))
-    assert table.state_dict() == {"rows": 2}
-    assert synced == [table.journal.stat().st_ino]
-    table.journal.unlink()
-    with pytest.raises(FileNotFoundError, match=r"was .*episodes\.arrows deleted\?"):
-        table.close()
-
-
-def test_a_listed_file_is_checked_by_its_path_wherever_it_is_moved_to(tmp_path):
-    write_listed(tmp_path, "evaluation/random.bin", lambda file: file.write(b"one"))
-    rename_listed(tmp_path, "evaluation", "evaluation-5")
-    path = tmp_path / "evaluation-5" / "random.bin"
-    verify(path)
-    path.write_bytes(b"two")
-    with pytest.raises(ValueError, match=r"random\.bin is damaged or was changed: its checksum is"):
-        verify(path)
-    remove_listed(tmp_path, "evaluation-5/random.bin")
-    path.write_bytes(b"two")
-    verify(path)  # what no manifest lists is not checked
-    (tmp_path / "manifest.json").write_text("{}")
-    with pytest.raises(ValueError, match=r"manifest\.json is not the manifest of a run"):
-        verify(path)
-
-
-def test_what_is_no_table_is_refused_by_name(tmp_path):
-    (tmp_path / "a.parquet").write_bytes(b"PAR1 and no more")
-    os.mkfifo(tmp_path / "b.parquet")
-    for name, message in (("a", r"a\.parquet is not a table"), ("b", r"b\.parquet is not a file")):
-        with pytest.raises(ValueError, match=message):
-            read_table(tmp_path / f"{name}.parquet")
 
 
 def test_curves_are_those_of_each_replica_and_agent():

@@ -1,6 +1,6 @@
 """Evaluates a policy without learning: one fresh episode in every world of an environment."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from statistics import fmean, stdev
 
 import torch
@@ -30,33 +30,19 @@ def evaluate(
     Returns:
         B episodes, in the order of worlds.
     """
-    worlds = env.batch_size.numel()
-    is_commons = isinstance(env, CommonsEnv)
-    tracker = tracker_of(env, metrics)
+    tracker, episodes = tracker_of(env, metrics), dict[int, Episode]()
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
-    episodes: dict[int, Episode] = {}
     with torch.no_grad(), one_thread(), set_exploration_type(exploration):
-        for batch in _until_ended(env, policy) if is_commons else _again_and_again(env, policy):
+        moment = env.reset()
+        while len(episodes) < tracker.worlds:
+            acted = policy(moment)
+            if isinstance(env, CommonsEnv):
+                batch, moment = env.lean_step(acted, resets=False)
+            else:
+                batch, moment = env.step_and_maybe_reset(acted)
             for episode in tracker.add(batch):
                 episodes.setdefault(episode.world, episode)
-            if len(episodes) == worlds:
-                break
-    return [episodes[world] for world in range(worlds)]
-
-
-def _until_ended(env: CommonsEnv, policy: Policy) -> Iterator[TensorDictBase]:
-    """Steps all worlds until all have ended; worlds that have ended do not change."""
-    moment: TensorDictBase = env.reset()
-    while True:
-        batch, moment = env.lean_step(policy(moment), resets=False)
-        yield batch
-
-
-def _again_and_again(env: EnvBase, policy: Policy) -> Iterator[TensorDictBase]:
-    moment = env.reset()
-    while True:
-        batch, moment = env.step_and_maybe_reset(policy(moment))
-        yield batch
+    return [episodes[world] for world in range(tracker.worlds)]
 
 
 def mean_return(episodes: list[Episode]) -> tuple[float, float]:

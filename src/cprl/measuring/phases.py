@@ -57,19 +57,18 @@ class Phase:
 
 
 def change_points(episodes: ArrayLike, metrics: Mapping[str, ArrayLike], *, number: int = 3) -> list[float]:
-    """Return the episodes at which a phase ends and the next begins.
+    """Return the episodes at which a phase ends and the next begins, of which each `GRID`-th is a candidate.
 
     Args:
         episodes: The index of each episode, [E], increasing.
-        metrics: float [E] or [R, E] by name, the same R replicas for all; running means work well. Means
-            over replicas ignore NaN.
+        metrics: float [E] or [R, E] by name; running means work well. Means over replicas ignore NaN.
         number: The number of change points.
 
     Raises:
         ValueError: If there are too few or too many episodes, or a metric is NaN in some episode of all
             replicas.
     """
-    at, curves = np.asarray(episodes, np.float64), np.stack(list(_curves(metrics).values()))
+    at = np.asarray(episodes, np.float64)
     if at[-1] - at[0] > LONGEST:
         raise ValueError(f"episodes are {at[0]:g} to {at[-1]:g}; allowed: at most {LONGEST:,} episodes")
     grid = np.arange(at[0], at[-1] + 1e-9, GRID / _JUMP)
@@ -77,7 +76,29 @@ def change_points(episodes: ArrayLike, metrics: Mapping[str, ArrayLike], *, numb
         raise ValueError(
             f"episodes {at[0]:g} to {at[-1]:g} are too few for {number + 1} phases of at least {SHORTEST}"
         )
-    return _change_points(grid, at, _over_replicas(curves), number)
+    on_grid = np.stack([np.interp(grid, at, _over_replicas(curve)) for curve in metrics.values()], axis=1)
+    if not np.isfinite(on_grid).all():
+        raise ValueError(
+            "a metric is NaN in some episode of all replicas; allowed: finite means over replicas "
+            "(omit the metric or fill the gap)"
+        )
+    spread = on_grid.std(0)
+    signal = (on_grid - on_grid.mean(0)) / np.where(spread > 0, spread, 1.0)
+    ends = np.array([*range(0, len(signal), _JUMP), len(signal)])
+    if ends[-1] == ends[-2]:
+        ends = ends[:-1]
+    costs = _costs_of_lines(signal, ends)
+    # best[e]: the least cost of k + 1 segments up to ends[e]; before[k][e]: where the last of them begins.
+    best, before = costs[0], []
+    for _ in range(number):
+        totals = best[:, None] + costs
+        before.append(totals.argmin(0))
+        best = totals.min(0)
+    place, changes = len(ends) - 1, []
+    for of_last in reversed(before):
+        place = of_last[place]
+        changes.append(float(grid[ends[place] - 1]))
+    return changes[::-1]
 
 
 def find_phases(episodes: ArrayLike, metrics: Mapping[str, ArrayLike], *, number: int = 3) -> list[Phase]:
@@ -103,8 +124,8 @@ def phases(episodes: ArrayLike, metrics: Mapping[str, ArrayLike], changes: Seque
     Raises:
         ValueError: If a phase has fewer than two episodes.
     """
-    at, by_name = np.asarray(episodes, np.float64), _curves(metrics)
-    means = {name: _over_replicas(by_name[name]) for name in METRICS}
+    at = np.asarray(episodes, np.float64)
+    means = {name: _over_replicas(metrics[name]) for name in METRICS}
     bounds = [at[0], *changes, at[-1]]
     divided: list[Phase] = []
     for first, last in pairwise(bounds):
@@ -125,10 +146,6 @@ def phases(episodes: ArrayLike, metrics: Mapping[str, ArrayLike], changes: Seque
     return divided
 
 
-def _curves(metrics: Mapping[str, ArrayLike]) -> dict[str, Values]:
-    return {name: np.atleast_2d(np.asarray(curve, np.float64)) for name, curve in metrics.items()}
-
-
 def _label(change: Mapping[str, float], before: Sequence[str | None]) -> str | None:
     rises = change["collective_return"] > CHANGE
     if not before:
@@ -142,43 +159,13 @@ def _label(change: Mapping[str, float], before: Sequence[str | None]) -> str | N
     return None
 
 
-def _over_replicas(curves: Values) -> Values:
-    """Means over replicas that ignore NaN, [..., R, E] to [..., E]; NaN if all replicas are NaN."""
+def _over_replicas(curve: ArrayLike) -> Values:
+    """Means over replicas that ignore NaN, [R, E] or [E] to [E]; NaN if all replicas are NaN."""
+    curves = np.atleast_2d(np.asarray(curve, np.float64))
     defined = ~np.isnan(curves)
     with np.errstate(invalid="ignore"):
-        means: Values = np.where(defined, curves, 0.0).sum(-2) / defined.sum(-2)
+        means: Values = np.where(defined, curves, 0.0).sum(0) / defined.sum(0)
     return means
-
-
-def _change_points(grid: Values, at: Values, means: Values, number: int) -> list[float]:
-    """The change points of one set of curves, [M, E] for M metrics.
-
-    Points of the grid are candidates at every `GRID` episodes, and the cost of a segment is the squared error
-    of its best straight lines.
-    """
-    on_grid = np.stack([np.interp(grid, at, curve) for curve in means], axis=1)
-    if not np.isfinite(on_grid).all():
-        raise ValueError(
-            "a metric is NaN in some episode of all replicas; allowed: finite means over replicas "
-            "(omit the metric or fill the gap)"
-        )
-    spread = on_grid.std(0)
-    signal = (on_grid - on_grid.mean(0)) / np.where(spread > 0, spread, 1.0)
-    ends = np.array([*range(0, len(signal), _JUMP), len(signal)])
-    if ends[-1] == ends[-2]:
-        ends = ends[:-1]
-    costs = _costs_of_lines(signal, ends)
-    # best[e]: the least cost of k + 1 segments up to ends[e]; before[k][e]: where the last of them begins.
-    best, before = costs[0], []
-    for _ in range(number):
-        totals = best[:, None] + costs
-        before.append(totals.argmin(0))
-        best = totals.min(0)
-    place, changes = len(ends) - 1, []
-    for of_last in reversed(before):
-        place = of_last[place]
-        changes.append(float(grid[ends[place] - 1]))
-    return changes[::-1]
 
 
 def _costs_of_lines(signal: Values, ends: NDArray[np.int64]) -> Values:

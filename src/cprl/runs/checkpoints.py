@@ -92,7 +92,7 @@ class Checkpointer:
                 say(f"Passed over: {reason}")
             say(f"Resuming from step {training.steps:,}: {path}")
             self._saved = time.monotonic()
-            self._sound = path if _is_sound(training) else None
+            self._sound = path if training.is_sound else None
             self._has_ending |= training.is_ending
             self.has_begun = True
             return
@@ -129,7 +129,7 @@ class Checkpointer:
             lambda file: torch.save(training.state_dict(), file),
             name=lambda partial: f"{kind}-{training.steps:012d}-{checksum(partial)}.pt",
         )
-        if _is_sound(training):
+        if training.is_sound:
             self._sound = path
         elif self._sound is not None and self._sound.exists():
             last_sound = self._sound.with_name(f"sound-{self._sound.name}")
@@ -190,10 +190,6 @@ def interruption(number: int) -> BaseException:
     """Return what ends a process that saved everything after a signal: `KeyboardInterrupt` for SIGINT, which
     Python turns into exit code 130, and `SystemExit` with code 143 for SIGTERM, as shells count."""
     return KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
-
-
-def _is_sound(training: Any) -> bool:
-    return bool(getattr(training, "is_sound", True))
 
 
 def _place_of(folder: Path) -> tuple[int, int] | None:

@@ -125,7 +125,7 @@ def refuse_another_run(
     """
     if out is None:
         raise ValueError("resume requires the directory of the run as out")
-    before, now = recipe_config(read_recipe(out), where=out), to_recipe(out)["experiment"]
+    before, now = read_recipe(out)["experiment"], to_recipe(out)["experiment"]
     free = {"episodes": 0, "on_nan": ""}
     differ = differences({**before, **free}, {**now, **free}, "experiment", kind)
     if differ:
@@ -151,9 +151,7 @@ def read_recipe(run: Path) -> dict[str, Any]:
         recipe = read_json(path)
     except (OSError, ValueError) as error:
         raise ValueError(f"{path} is not the recipe of a run: {error!r}") from error
-    refuse_newer(path, recipe, RECIPE_FORMAT)
-    if not isinstance(recipe.get("experiment"), dict):
-        raise ValueError(f'{path} is not the recipe of a run: it has no table "experiment"')
+    recipe_config(recipe, where=path)
     return recipe
 
 
@@ -166,8 +164,8 @@ def recipe_config(recipe: Mapping[str, Any], *, where: object = "the recipe") ->
     refuse_newer(where, recipe, RECIPE_FORMAT)
     if recipe.get("format") != RECIPE_FORMAT or not isinstance(recipe.get("experiment"), Mapping):
         raise ValueError(
-            f"{where} has the format {shown(recipe.get('format'))}; allowed: {RECIPE_FORMAT}, with a table "
-            '"experiment"'
+            f"{where} is not the recipe of a run: it has the format {shown(recipe.get('format'))}; allowed: "
+            f'{RECIPE_FORMAT}, with a table "experiment"'
         )
     return dict(recipe["experiment"])
 
