@@ -42,6 +42,7 @@ FIELD = replace(
     agents=[LEARNING, Scripted("random")],
     transforms=(),
     callbacks=(),
+    metrics=(),
     episodes=5,
 )
 """Its episodes have between ten and forty steps, so that one replica plays on while the other ends."""

@@ -4,7 +4,7 @@ Modules, in the order in which one reads them:
     social        the social metrics, from the totals of an episode
     institutions  metrics of institutions, likewise
     metrics       their names, words and units, and what is left out where a game does not report an entry
-    episodes      Episode, and EpisodeTracker, which makes them of batches of turns
+    episodes      Episode, and EpisodeTracker, which makes them of batches of turns; metrics of the user's own
     evaluate      one fresh episode in every world, without learning
     statistics    estimates over replicas, with intervals by Student's t
     series, now   numbers while a training runs, and what a group is doing at the moment

@@ -425,23 +425,26 @@ class EpisodeTracker:
         if "counts" in ended:
             given["counts"] = dict(zip(COUNTS, torch.from_numpy(ended["counts"]).unbind(-1), strict=True))
         totals = social.Totals(**given, **self._yield, groups=institutions.groups_of(self._institutions))
-        metrics, of_institutions = social.measured(social.SOCIAL, totals), {}
-        if any(name in ended for name in INSTITUTIONAL):
-            wanted = institutions.metrics_for(self._institutions)
-            of_institutions = social.measured({name: institutions.METRICS[name] for name in wanted}, totals)
-        counted = institutions.counts_for(self._institutions) if "counts" in ended else ()
+        metrics = social.measured(social.SOCIAL, totals)
+        wanted = institutions.metrics_for(self._institutions)
+        of_institutions = social.measured({name: institutions.METRICS[name] for name in wanted}, totals)
+        columns: dict[str, Any] = {name: ended[name] for name in _COPIED if name in ended}
+        if "hit_by" in ended:
+            columns["hits"] = ended["hit_by"].sum(1)
+        if "decision" in turn:
+            columns["decision"] = turn["decision"][worlds]
+        if "stock" in turn:
+            steps = ended["depletion_step"]
+            columns["stock_left"] = turn["stock"][worlds, 0].tolist()
+            columns["depletion_step"] = np.where(steps > 0, steps, -1).tolist()
+        if "counts" in ended:
+            counted = institutions.counts_for(self._institutions)
+            counts = {name: ended["counts"][..., COUNTS.index(name)] for name in counted}
+            columns["counts"] = [
+                {name: counts[name][index] for name in counts} for index in range(len(worlds))
+            ]
         episodes = []
         for index, world in enumerate(worlds):
-            more: dict[str, Any] = {name: ended[name][index] for name in _COPIED if name in ended}
-            if "hit_by" in ended:
-                more["hits"] = ended["hit_by"][index].sum(0)
-            if "decision" in turn:
-                more["decision"] = turn["decision"][world].copy()
-            if "stock" in turn:
-                more["stock_left"] = int(turn["stock"][world, 0])
-                more["depletion_step"] = int(ended["depletion_step"][index]) or -1
-            if "counts" in ended:
-                more["counts"] = {name: ended["counts"][index][:, COUNTS.index(name)] for name in counted}
             episode = Episode(
                 world=int(world),
                 episode=int(self._episode[world]),
@@ -450,7 +453,7 @@ class EpisodeTracker:
                 return_=ended["return"][index],
                 metrics={name: float(values[index]) for name, values in metrics.items()},
                 institutions={name: float(values[index]) for name, values in of_institutions.items()},
-                **more,
+                **{name: values[index] for name, values in columns.items()},
             )
             episode.metrics.update(own_metrics(self._metrics, episode))
             episodes.append(episode)

@@ -41,11 +41,7 @@ _ROWS_PER_GROUP: Final = 2**16
 
 
 def batches_in(path: Path) -> Iterator[tuple[pa.RecordBatch, int]]:
-    """The whole batches of a journal, each with the byte at which it ends.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-    """
+    """The whole batches of a journal, each with the byte at which it ends."""
     refuse_special(path)
     source = pa.BufferReader(path.read_bytes())
     try:
@@ -197,11 +193,8 @@ class EpisodeTable:
 
 
 def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
-    """The episodes of a finished, running or killed run, in the order in which they ended.
-
-    Raises:
-        FileNotFoundError: if there are none.
-    """
+    """The episodes of a finished, running or killed run, in the order in which they ended; those of what is
+    no run are a FileNotFoundError."""
     path = Path(run_directory) / FILE_NAME
     recipe = path.with_name("recipe.json")  # with the format of the journal, which has none of its own
     if recipe.is_file():
@@ -216,11 +209,7 @@ def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
 
 
 def read_table(path: str | os.PathLike[str]) -> pa.Table:
-    """A parquet file of a run, checked for damage.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-    """
+    """A parquet file of a run, checked for damage; one that is missing is a FileNotFoundError."""
     path = Path(path)
     verify(path)
     try:
@@ -320,13 +309,8 @@ def schema_of(episode: Episode) -> pa.Schema:
 
 
 def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema) -> pa.RecordBatch:
-    """A row for each episode and agent.
-
-    Args:
-        episodes: at least one.
-        replica: the index of their replica; None for each episode's world.
-        schema: what `schema_of` gave for the first episode of the table.
-    """
+    """A row for each episode and agent, with the schema of the table's first episode; None as the replica for
+    each episode's world."""
     parts = [_columns(episode, episode.world if replica is None else replica) for episode in episodes]
     for columns in parts:
         if columns.keys() != set(schema.names):
@@ -382,11 +366,8 @@ def labelled(parts: Iterable[tuple[Label, int, Sequence[Episode]]]) -> pa.Table:
 
 
 def write_table(path: Path, table: pa.Table, *, over: bool = False) -> None:
-    """Write a parquet file atomically, in little room.
-
-    Raises:
-        FileExistsError: if the file exists and is not to be replaced.
-    """
+    """Write a parquet file atomically, in little room; one that exists is refused by a FileExistsError, or
+    replaced."""
     if not over:
         refuse_to_write_over(path)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -40,9 +40,6 @@ def export_results(run: Path, folder: Path, *, weights: bool = True) -> Path:
     Returns:
         The folder, which `cprl.load`, `read_episodes` and a report accept like the run itself. Metrics and
         returns are float32, and rows are sorted by replica, episode and agent.
-
-    Raises:
-        FileNotFoundError: if the run has not ended.
     """
     run, folder = Path(run), Path(folder)
     recipe = read_recipe(run)

@@ -44,11 +44,7 @@ _PARTIAL: Final = f"*.{8 * '[0-9a-f]'}.partial"
 
 
 def refuse_to_write_over(path: Path) -> None:
-    """Check before hours of work that its output file does not exist.
-
-    Raises:
-        FileExistsError: if the file exists.
-    """
+    """Refuse a file that exists by a FileExistsError, before hours of work."""
     if os.path.lexists(path):  # a link to a file that is not there would be written through
         raise FileExistsError(f"{path} exists and is not overwritten; use another name")
 
@@ -56,14 +52,11 @@ def refuse_to_write_over(path: Path) -> None:
 def write_atomically(
     path: Path, write: Callable[[BinaryIO], object], *, name: Callable[[Path], str] | None = None
 ) -> Path:
-    """Write a temporary file, sync it to disk and rename it; a file that is there is replaced.
+    """Write a temporary file, whose name has letters of its own, sync it to disk and rename it; a file that
+    is there is replaced.
 
     Args:
-        path: the file. Each writer adds letters of its own to the name of the temporary one.
         name: returns the final name, given the complete temporary file, where it depends on the content.
-
-    Returns:
-        The file.
     """
     partial = path.with_name(f"{path.name}.{secrets.token_hex(4)}.partial")
     try:
@@ -108,11 +101,7 @@ def write_json(path: Path, value: object) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-    """
+    """Read a JSON object; a file that is missing is a FileNotFoundError, all else a ValueError."""
     refuse_special(path)
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
@@ -216,8 +205,7 @@ def write_listed(run: Path, name: str, write: Callable[[BinaryIO], object]) -> N
     """Write a file of a run atomically, and its checksum into the manifest.
 
     Args:
-        run: the run's directory, which exists.
-        name: the file's path in it, e.g. "checkpoints/final.pt"; its folder is made.
+        name: the file's path in the run, e.g. "checkpoints/final.pt"; its folder is made.
     """
     path = run / name
     _list(run, {name: None})
@@ -288,7 +276,6 @@ class RunLock:
     last removes the file. On Windows, which has no `flock`, nothing is locked.
 
     Args:
-        directory: the directory, which exists.
         take_over: whether to take the lock of a run that a process on another host left behind. A lock that a
             living process on this host holds is never taken.
         study: tells a study from others: its directory is locked together with all who run the same one.

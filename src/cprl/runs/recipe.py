@@ -116,7 +116,6 @@ def refuse_another_run(
     `on_nan` be another.
 
     Args:
-        out: the directory of the stopped run.
         kind: the dataclass of what the recipe holds, `cprl.Experiment`; fields that an earlier version did
             not know are then no differences while they have their defaults.
 
@@ -144,7 +143,7 @@ def read_recipe(run: Path) -> dict[str, Any]:
     """Read the recipe that `start_run` wrote.
 
     Args:
-        run: the run's directory, or the file itself.
+        run: its directory, or the file itself.
     """
     path = Path(run) if Path(run).is_file() else Path(run) / RECIPE_FILE
     try:
@@ -351,14 +350,9 @@ _OF_ANOTHER: Final = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
 
 
 def git_state(package: Path = _PACKAGE) -> dict[str, str | bool] | None:
-    """Return the commit of the code of cprl, and whether a tracked file differed from it.
-
-    Where this process stands does not count: the git folder of somebody's own project says nothing of cprl.
-
-    Returns:
-        {"commit": 40 hexadecimal digits, "dirty": whether a tracked file was changed}; None where no commit
-        is known: of a wheel that was built outside a checkout, or of files that git does not track.
-    """
+    """Return the commit of the code of cprl, wherever this process stands, and whether a tracked file was
+    changed since, as {"commit": 40 hexadecimal digits, "dirty": bool}; None where no commit is known: of a
+    wheel that was built outside a checkout, or of files that git does not track."""
     written = package / BUILT_FROM
     if written.is_file():
         built = read_json(written)

@@ -19,15 +19,8 @@ DECISIONS: Final = "decisions.pt"
 
 
 def save_weights(run: Path, networks: Mapping[str, nn.Module], *, name: str = "final") -> Path:
-    """Write the weights of each agent's network atomically, and list them in the run's manifest.
-
-    Args:
-        networks: the networks by the agent's name.
-        name: the name of the file, without suffix.
-
-    Returns:
-        `checkpoints/<name>.pt` of the run, which `load_weights` reads.
-    """
+    """Write the weights of each agent's network, by the agent's name, atomically into
+    `checkpoints/<name>.pt` of a run, which `load_weights` reads."""
     if not name or Path(name).name != name or "\0" in name:
         raise refusal("name", name, "the name of a file, without slashes and suffix")
     weights = {agent: network.state_dict() for agent, network in networks.items()}
