@@ -27,7 +27,6 @@ from cprl.measuring.metrics import (
     OF_INSTITUTIONS,
     OPTIONAL,
     PLACES,
-    entry_in,
     reported_in,
 )
 from cprl.values import Custom, Positive, checked
@@ -210,8 +209,8 @@ _COPIED: Final = {entry.name for entry in fields(Episode)} & ({*_RUNNING} - {"de
 _TOTALS: Final = {entry.name for entry in fields(social.Totals)} & ({"steps", *_RUNNING} - {"counts"})
 
 
-_ALWAYS: Final = {
-    "reward": ("next agents", "reward"),
+_ALWAYS: Final[Mapping[str, Any]] = {
+    "reward": ("next", *keys.REWARD),
     "terminated": ("next", keys.TERMINATED),
     "done": ("next", keys.DONE),
 }
@@ -253,7 +252,7 @@ class EpisodeTracker:
         self._institutions, self._metrics = tuple(institutions), tuple(metrics)
         self._episode = np.zeros(worlds, np.int64)
         self._running: dict[str, Array] = {}
-        self._places = _ALWAYS
+        self._places: list[tuple[str, Any, str]] = []
         self._checked: torch.Size | None = None
 
     def add(self, tensordict: TensorDictBase) -> list[Episode]:
@@ -318,7 +317,8 @@ class EpisodeTracker:
     def _begin(self, reported: tuple[str, ...], running: dict[str, Array]) -> None:
         """Reads these entries from now on."""
         self.reported, self._running = reported, running
-        self._places = _ALWAYS | {name: PLACES[name] for name in reported}
+        places = {**_ALWAYS, **{name: PLACES[name] for name in reported}}
+        self._places = [(name, key[:-1], key[-1]) for name, key in places.items()]
 
     def _zeros(self, reported: Collection[str], widths: Mapping[str, int]) -> dict[str, Array]:
         """The totals of episodes that begin, of a game that reports these entries."""
@@ -342,19 +342,18 @@ class EpisodeTracker:
         entry = keys.entry
         try:
             agents, following = entry(tensordict, keys.AGENTS), entry(tensordict, "next")
-            folders = {"": tensordict, "agents": agents, "next": following}
-            folders["next agents"], had_ended = entry(following, keys.AGENTS), entry(tensordict, keys.DONE)
-            turns = {
-                name: entry(folders[folder], key).numpy(force=True)
-                for name, (folder, key) in self._places.items()
+            groups: dict[Any, Any] = {("agents",): agents, ("next",): following}
+            groups["next", "agents"], had_ended = entry(following, keys.AGENTS), entry(tensordict, keys.DONE)
+            turns: Turns = {
+                name: entry(groups[group], key).numpy(force=True) for name, group, key in self._places
             }
             if np.count_nonzero(turns["done"]):  # a tenth of the time that `any` takes on so few
                 turns["had_ended"] = had_ended.numpy(force=True)
                 if tensordict.get(keys.BALLOTS_DUE, None) is not None:
                     turns["decision"] = entry(agents, "decision").numpy(force=True)
         except KeyError as error:
-            places = [(*folder.split(), key) for folder, key in (*self._places.values(), ("", keys.DONE))]
-            missing = [f"({', '.join(place)})" for place in places if tensordict.get(place, None) is None]
+            places = [(*group, key) for _, group, key in (*self._places, ("", (), keys.DONE))]
+            missing = [f"({', '.join(key)})" for key in places if tensordict.get(key, None) is None]
             raise ValueError(
                 f"the batch lacks {', '.join(missing)}; allowed: batches with rewards, done and terminated, "
                 "and the optional entries of the first batch"
@@ -514,7 +513,7 @@ def decisions_of(env: EnvBase) -> tuple[str, ...]:
 
 def _widths_in(tensordict: TensorDictBase) -> dict[str, int]:
     """The last axes of "counts" and "in_force" of a batch."""
-    entries = {name: entry_in(tensordict, name) for name in ("counts", "in_force")}
+    entries = {name: tensordict.get(PLACES[name], None) for name in ("counts", "in_force")}
     widths = {name: values.shape[-1] for name, values in entries.items() if values is not None}
     if widths.get("counts", len(COUNTS)) != len(COUNTS):
         raise ValueError(

@@ -7,10 +7,9 @@ number needs are named in `cprl.measuring.social.SOCIAL` for metrics, and here f
 
 from collections.abc import Collection, Mapping
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.envs import EnvBase
 
 from cprl import keys
@@ -95,23 +94,18 @@ def reported_by(env: EnvBase) -> tuple[str, ...]:
     return tuple(name for name in (*OPTIONAL, *OF_INSTITUTIONS) if {name, (keys.AGENTS, name)} & entries)
 
 
-PLACES: Final = {name: ("next agents", name) for name in (*OPTIONAL, *OF_INSTITUTIONS)} | {
-    "in_play": (keys.AGENTS, "in_play"),
+PLACES: Final[Mapping[str, Any]] = {
+    **{name: ("next", keys.AGENTS, name) for name in (*OPTIONAL, *OF_INSTITUTIONS)},
+    "in_play": keys.IN_PLAY,
     "stock": ("next", keys.STOCK),
     "in_force": ("next", keys.IN_FORCE),
 }
-"""Where a batch has these entries: the names of the groups, and the last part of the key."""
-
-
-def entry_in(tensordict: TensorDictBase, name: str) -> Tensor | None:
-    """The entry of `PLACES` in a batch; None if it has none."""
-    groups, key = PLACES[name]
-    return tensordict.get((*groups.split(), key), None)
+"""The keys of these entries in a batch."""
 
 
 def reported_in(tensordict: TensorDictBase) -> tuple[str, ...]:
     """The entries of `OPTIONAL` and `OF_INSTITUTIONS` in a batch."""
-    return tuple(name for name in PLACES if entry_in(tensordict, name) is not None)
+    return tuple(name for name, key in PLACES.items() if tensordict.get(key, None) is not None)
 
 
 def available(needs: Mapping[str, tuple[str, ...]], reported: Collection[str]) -> tuple[str, ...]:

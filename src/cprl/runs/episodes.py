@@ -333,7 +333,7 @@ def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema)
 def _columns(episode: Episode, replica: int) -> dict[str, Any]:
     """The columns of an episode in order, [N] each."""
     agents = np.arange(len(episode.return_))
-    entries = dict(episode.counts or {})
+    entries: dict[str, Any] = dict(episode.counts or {})
     entries |= {name: value for name, value in vars(episode).items() if value is not None}
     entries |= {"replica": replica, "agent": agents, "return": episode.return_}
     values = {name: entries[name] for name in (*COLUMNS, *OF_INSTITUTIONS) if name in entries}
