@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from recordings import column
+from recordings import column, names
 from tiny_study import TINY
 
 import cprl
@@ -12,6 +12,7 @@ from cprl.commands import main as cli
 from cprl.runs.curves import curves_of
 from cprl.runs.episodes import read_episodes, read_evaluations
 from cprl.studies import Search, StudyTable
+from cprl.viewer.layout import Curves, layout, styles
 
 KEYS = ("policy", "trained_episodes", "replica", "episode")
 SHARE, LOGGER = "one_road_parts:largest_share", "torchrl.record.loggers:CSVLogger"
@@ -63,6 +64,12 @@ def test_it_is_a_curve_of_the_recording_and_of_a_logger_and_a_row_of_what_is_eva
     )
     cli.main()
     assert "largest_share" in capsys.readouterr().out
+
+
+def test_it_has_a_plot_and_a_line_of_its_own_in_the_viewer():
+    curves = Curves(agents=("a", "b"), metrics=("equality", "largest_share"))
+    assert "largest_share" in names(layout(curves).root_container)
+    assert "social/largest_share" in styles(curves)
 
 
 @pytest.mark.integration

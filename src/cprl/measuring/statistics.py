@@ -184,14 +184,7 @@ class Measured:
 
 
 def over_replicas(values: Mapping[int, Sequence[float]]) -> Measured:
-    """Estimates a metric from its values by replica, one per episode, NaN where undefined.
-
-    Args:
-        values: the values by replica.
-
-    Raises:
-        ValueError: if there are no replicas, or a replica has no episodes.
-    """
+    """Estimates a metric from its values by replica, at least one per episode, NaN where undefined."""
     if not values or not all(map(len, values.values())):
         counts = {replica: len(episodes) for replica, episodes in values.items()}
         raise ValueError(f"episodes by replica are {counts}; allowed: at least one replica, each at least 1")
@@ -227,13 +220,8 @@ def _measures(
 
 
 def agents_without_harvest(played: Mapping[int, Sequence[Episode]]) -> tuple[int, int] | None:
-    """Counts the agents of all episodes without a harvest, which sustainability leaves out, and all agents.
-
-    None if the game reports no harvest.
-    """
-    harvests: list[float] = []
-    for episode in (episode for episodes in played.values() for episode in episodes):
-        if episode.harvest is None:
-            return None
-        harvests += episode.harvest.tolist()
-    return sum(apples == 0 for apples in harvests), len(harvests)
+    """Count the agents of all episodes without a harvest, which sustainability leaves out, and all agents;
+    None if the game reports no harvest."""
+    harvests = [episode.harvest for episodes in played.values() for episode in episodes]
+    apples = [apples for harvest in harvests if harvest is not None for apples in harvest.tolist()]
+    return (apples.count(0), len(apples)) if apples else None
