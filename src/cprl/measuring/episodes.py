@@ -290,7 +290,7 @@ class EpisodeTracker:
             ValueError: if the state has other shapes, or is from a game that reports other entries; the
                 tracker is then unchanged.
         """
-        reported, running = self.reported, self._running
+        reported, running = None, dict[str, Array]()
         if "steps" in state:  # else the tracker had seen no batch
             entries = {entry for name, (entry, _, _) in _RUNNING.items() if name in state}
             reported = tuple(entry for entry in (*OPTIONAL, *OF_INSTITUTIONS) if entry in entries)
@@ -299,9 +299,8 @@ class EpisodeTracker:
                     f"the state is from a game that reports {list(reported)}; allowed: "
                     f"{list(self.reported or ())}, as this game reports"
                 )
-            if self.reported is None:
-                widths = {name: state[name].shape[-1] for name in ("counts", "in_force") if name in state}
-                running = self._zeros(reported, widths)
+            widths = {name: state[name].shape[-1] for name in ("counts", "in_force") if name in state}
+            running = self._running or self._zeros(reported, widths)
         arrays = {"episode": self._episode, **running}
         if not set(arrays) <= set(state):
             raise ValueError(f"the state has {sorted(state)}; allowed: at least {sorted(arrays)}")
@@ -311,13 +310,12 @@ class EpisodeTracker:
                 raise ValueError(f'"{name}" of the state is {list(state[name].shape)}; allowed: {allowed}')
         arrays = {name: state[name].numpy(force=True).copy() for name in arrays}
         self._episode = arrays.pop("episode")
-        if reported is not None:
-            self._begin(reported, arrays)
+        self._begin(reported, arrays)
 
-    def _begin(self, reported: tuple[str, ...], running: dict[str, Array]) -> None:
+    def _begin(self, reported: tuple[str, ...] | None, running: dict[str, Array]) -> None:
         """Reads these entries from now on."""
         self.reported, self._running = reported, running
-        places = {**_ALWAYS, **{name: PLACES[name] for name in reported}}
+        places = {**_ALWAYS, **{name: PLACES[name] for name in reported or ()}}
         self._places = [(name, key[:-1], key[-1]) for name, key in places.items()]
 
     def _zeros(self, reported: Collection[str], widths: Mapping[str, int]) -> dict[str, Array]:
