@@ -63,15 +63,12 @@ class PowerWorth(Value):
 
     @property
     def most(self) -> float:
-        """The total from which on a unit is worth nothing."""
         return float((self.top / self.factor) ** (1 / self.power))
 
     def at(self, total: float) -> float:
-        """v(A)."""
         return float(max(self.top - self.factor * total**self.power, 0.0))
 
     def slope(self, total: float) -> float:
-        """v'(A), below `most`."""
         return float(-self.factor * self.power * total ** (self.power - 1))
 
     def balance(self, cost: float, share: float) -> float:
@@ -105,11 +102,9 @@ class CallableWorth(Value, stored=False):
             raise ValueError(f"CallableWorth.function is {values[:2]} .. {values[-2:]}; allowed: {allowed}")
 
     def at(self, total: float) -> float:
-        """v(A)."""
         return float(self.function(total)) if total < self.most else 0.0
 
     def slope(self, total: float) -> float:
-        """v'(A), below `most`, from differences of the function."""
         step = _STEP * self.most
         low, high = max(total - step, 0.0), min(total + step, self.most)
         return (float(self.function(high)) - float(self.function(low))) / (high - low)
