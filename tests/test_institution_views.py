@@ -103,14 +103,14 @@ def test_the_lines_of_institutions_are_each_replica_their_mean_and_its_running_m
         assert line[:3] == [*each, np.mean(each)]
     assert len(logged[0]) == 4
     names = static(path, "institutions/violations", "SeriesLines:names")
-    assert list(names) == ["replica 0", "replica 1", "violations, mean", "violations, running mean"]
+    assert list(names) == ["replicas", "replicas", "episodes", "violations"]
     _, in_force = column(path, "institutions/in_force_0", "Scalars:scalars", "episode")
     assert [line[0] for line in in_force] == [0.5] * 4
     _, texts = column(path, "log", "TextLog:text", "episode")
     said = next(text for (text,) in texts if text.startswith("episode 0: decision 0: 0.5; "))
     first = next(one for one in seen.episodes if (one.world, one.episode) == (0, 0))
     assert said == f"episode 0: {in_words(first, viewer.logger.curves)}"
-    assert f"{first.violations.sum()} violations; agent 0 fined {first.fines[0]:.4g}, " in said
+    assert f"{first.violations.sum()} violations; fined {first.fines[0]:.4g}, " in said
 
 
 def test_each_agent_has_lines_of_what_it_paid_got_and_broke(run):
@@ -131,7 +131,7 @@ def test_events_are_in_words():
     class Episode:
         violations, fines, in_force = np.array([0, 1]), np.array([0.0, 1.5]), np.array([0.25])
 
-    assert in_words(Episode(), curves) == "the tax rate: 0.25; 1 violation; agent 1 fined 1.5"
+    assert in_words(Episode(), curves) == "the tax rate: 0.25; 1 violation; fined 0, 1.5"
     Episode.violations, Episode.fines, Episode.in_force = None, None, None
     assert in_words(Episode(), curves) == ""
 
@@ -144,8 +144,7 @@ def test_only_games_with_institutions_have_their_tabs(run):
         "Violations of each, turns",
         "Fines of each, apples",
         "Transfers to each, apples",
-        "Rules kept",
-        "Shares of violations, bites, tags",
+        "Shares of turns, bites, violations, tags",
         "Equality of net incomes",
         "In force: decision 0",
     }

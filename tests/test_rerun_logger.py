@@ -107,10 +107,7 @@ def test_colours_and_names_of_classes_are_in_the_recording(tmp_path):
         assert told[APPLE]["label"] == "apple"
         red, green, blue = apple
         assert told[APPLE]["color"] >> 8 == red << 16 | green << 8 | blue, "windows keep the study's colours"
-    assert static(tmp_path / "run.rrd", "agent_1/return", "SeriesLines:names") == [
-        "agent_1",
-        "agent_1, running mean",
-    ]
+    assert static(tmp_path / "run.rrd", "agent_1/return", "SeriesLines:names") == ["episodes", "agent_1"]
     assert RrdReader(tmp_path / "run.rrd").blueprints()
 
 

@@ -3,6 +3,7 @@ boards of all replicas, where agents go, the stock over the turn, and the Lorenz
 """
 
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,10 +12,14 @@ import rerun as rr
 import torch
 from recordings import GAME, SCENE, column, names, static, strict_rerun
 from rerun.chunk import RrdReader
+from tensordict import TensorDict
 from test_watch import connected, fake
 
 from cprl import CommonsEnv, Game, Rules, maps, presets
 from cprl.commons.colours import GROUND, PALETTE, WALL, agent_colour
+from cprl.envs import make_env
+from cprl.envs.matrix import MatrixGame, chicken, matching_pennies, prisoners_dilemma
+from cprl.institutions import Quota, Tax, Vote
 from cprl.measuring import social
 from cprl.measuring.metrics import reported_by
 from cprl.measuring.phases import LONGEST, PHASES_BEGIN
@@ -22,11 +27,11 @@ from cprl.policies.lanes import random_agents
 from cprl.runs.episodes import EpisodeTable
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.layout import Curves, Panels, curves_of, layout
+from cprl.viewer.layout import Curves, Panels, curves_of, joint_actions, layout
 from cprl.viewer.live import LiveStream, Stream
 from cprl.viewer.logger import RerunLogger, as_table, send_waiting
 from cprl.viewer.pictures import Turns, Visits, Wall, gini, lorenz_curve
-from cprl.viewer.story import CLOCK, CompilingNotice, Header, played, published_phases
+from cprl.viewer.story import CLOCK, CompilingNotice, Header, played, published_phases, rules_of
 
 __all__ = ["strict_rerun"]
 
@@ -71,21 +76,21 @@ def test_the_header_goes_from_the_beginning_to_the_end(tmp_path):
         },
     )
     said = headers(path)
-    assert said[0][1] == "# Episode 1 of 6 · begins"
-    line = "# Episode 1 of 6 · exploring · 50 apples (random play 282) · 0 of 2 boards died early"
-    assert said[1] == (0, line)
+    assert said[0][1] == "#### Episode 1 of 6 · begins"
+    line = "Episode 1 of 6 · begins, exploring · 50 apples, random play 282 · 0 of 2 boards died early"
+    assert said[1] == (0, f"#### {line}")
     assert said[-2][1].endswith("· 2 of 2 boards died early")
-    line = "# Finished, 6 episodes · trained 100 apples, random play 282 · 4 of 4 boards died early"
-    assert said[-1] == (5, line)
-    words = next(text for text in texts(path) if text.startswith("random play"))
-    assert words == "random play 282.0 ± 2 apples in 2 fresh episodes, 0 boards died early"
+    line = "Finished, 6 episodes · trained 100 apples, random play 282 · 4 of 4 boards died early"
+    assert said[-1] == (5, f"#### {line}")
+    words = [text for text in texts(path) if "random play" in text]
+    assert words == ["random play 282.0 ± 2 apples; 0 of 2 boards died early"]
     assert column(path, "phase/found", "StateChange:state") == ([], []), "too few episodes"
 
 
 def test_a_training_without_an_evaluation_or_that_was_stopped_ends_with_a_header_of_its_own(tmp_path):
     for episodes, line in (
-        (2, "# Finished, 2 episodes · 30 apples at the end"),
-        (9, "# Stopped after 2 of 9 episodes · 30 apples"),
+        (2, "#### Finished, 2 episodes · 30 apples at the end"),
+        (9, "#### Stopped after 2 of 9 episodes · 30 apples"),
     ):
         run = tmp_path / str(episodes)
         assert headers(recorded(run, range(2), episodes=episodes))[-1] == (1, line)
@@ -105,7 +110,7 @@ def test_viewers_get_the_newest_header_at_all_times_and_files_each_at_its_own(ki
     assert chunk.to_record_batch().column("TextDocument:text").to_pylist() == expected
 
 
-def test_where_exploration_ends_the_strip_changes_and_an_event_says_so(tmp_path):
+def test_strips_and_events_say_what_the_group_does_and_where_exploration_ends(tmp_path):
     path = recorded(
         tmp_path,
         range(30),
@@ -113,9 +118,12 @@ def test_where_exploration_ends_the_strip_changes_and_an_event_says_so(tmp_path)
         learning=lambda number: {"agent_0/epsilon": max(0.1, 1 - number / 20)},
     )
     said = texts(path)
-    assert said["episode 19: exploration ends: no epsilon falls any more; now harvesting"] == 19
+    assert said["episode 19: exploration ends: no epsilon falls any more"] == 19
+    assert said["episode 9: now steady"] == 9
     states = column(path, "now", "StateChange:state", "episode")
-    assert states == ([0, 19], [["exploring"], ["harvesting"]])
+    assert states == ([0, 9], [["begins"], ["steady"]])
+    states = column(path, "now_exploring", "StateChange:state", "episode")
+    assert states == ([0, 19], [["exploring"], ["settled"]])
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
@@ -139,7 +147,7 @@ def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_g
             play(range(49), first, table)
             play([49], first, table, worlds=[0])
         state = first.state_dict()
-    assert headers(tmp_path / "run.rrd")[-1][1].startswith("# Stopped after 49 of 70 episodes")
+    assert headers(tmp_path / "run.rrd")[-1][1].startswith("#### Stopped after 49 of 70 episodes")
     with ViewerCallback(tmp_path, env, live="serve", **common) as second:
         second.load_state_dict(state)
         second.on_start(SimpleNamespace(steps=1000))
@@ -150,8 +158,8 @@ def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_g
     files = [tmp_path / name for name in ("run.rrd", "run-2.rrd")]
     assert len({RrdReader(file).recordings()[0].recording_id for file in files}) == 1
     complete, resumed = tmp_path / "whole.rrd", files[1]
-    assert headers(resumed)[1][1].startswith("# Episode 49 of 70 · exploring · ")
-    assert headers(resumed)[-21:] == headers(complete)[-21:]
+    assert headers(resumed)[1][1].startswith("#### Episode 49 of 70 · falling · ")
+    assert headers(resumed)[-20:] == headers(complete)[-20:]
     for name in ("social/collective_return", "agent_0/return"):
         episodes, values = column(resumed, name, "Scalars:scalars", "episode")
         assert episodes == list(range(49, 70))
@@ -163,11 +171,12 @@ def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_g
     assert titles[1] == {episode: title for episode, title in titles[0].items() if episode > 48}
     episodes, labels = column(resumed, "visits/labels", "Points2D:labels", "episode")
     assert (episodes[0], labels[0][0]) == (50, "0: episodes 50 to 51"), "who went where before was not kept"
-    states = dict(zip(*column(complete, "now", "StateChange:state", "episode"), strict=True))
-    later = {episode: state for episode, state in states.items() if episode > 48}
-    goes_on = dict(zip(*column(resumed, "now", "StateChange:state", "episode"), strict=True))
-    assert goes_on == {48: ["exploring"], **later}
-    assert later, "the label changes once more"
+    for entity, present in (("now", {48: ["falling"]}), ("now_exploring", {50: ["exploring"]})):
+        states = dict(zip(*column(complete, entity, "StateChange:state", "episode"), strict=True))
+        later = {episode: state for episode, state in states.items() if episode > 48}
+        goes_on = dict(zip(*column(resumed, entity, "StateChange:state", "episode"), strict=True))
+        assert goes_on == {**present, **later}
+        assert later, "it changes once more"
 
 
 def seen_by_viewers(logger, folder, entity, episodes):
@@ -236,19 +245,53 @@ def test_the_recipe_is_a_table_of_places():
 
 
 def test_a_layout_has_the_views_of_what_a_game_reports_and_the_live_one_the_present_policy():
-    live, file, bare = (
+    alone = replace(SCENE, agents=("a",))
+    bare = Curves(agents=("a", "b"), metrics=(), has_tags=False)
+    live, file, several, single, matrix, stage = (
         set(names(view.root_container))
         for view in (
             layout(SCENE, live=True),
             layout(SCENE),
-            layout(Curves(agents=("a",), metrics=(), has_tags=False)),
+            layout(replace(SCENE, replicas=2)),
+            layout(alone),
+            layout(replace(bare, joint=("CC", "CD", "DC", "DD"))),
+            layout(bare),
         )
     )
-    assert {"Present policy", "Recorded episodes", "Outcome"} <= live
-    assert "Board" in file
-    assert "Present policy" not in file
-    assert {"Agents", "Learning", "Events", "Recipe"} <= bare
-    assert not {"Outcome", "Board", "Who tagged whom"} & bare
+    assert {"Present policy", "Recorded episodes", "Overview", "Stock left at the end, apples"} <= live
+    assert live - file == {"Present policy", "Recorded episodes"}
+    assert file - live == {"Board"}
+    wall = "All replicas; orange: the board of its last episode died"
+    assert wall in several - file
+    tags = next(name for name in file if name.startswith("Tags in"))
+    assert {tags, "Equality (1 - Gini), 0 to 1"} <= file - single
+    joint = "Joint actions, share of turns; agent 0 first"
+    assert joint in matrix - stage
+    assert {"Return of each, rewards", "Learning", "Events", "Recipe"} <= stage
+    assert not {"Board", tags, "More metrics"} & stage
+
+
+def test_joint_actions_are_named_by_letters_c_and_d_in_social_dilemmas():
+    assert joint_actions(prisoners_dilemma()) == joint_actions(chicken()) == ("CC", "CD", "DC", "DD")
+    assert joint_actions(matching_pennies()) == ("AA", "AB", "BA", "BB")
+    three = joint_actions(MatrixGame(np.zeros((2, 2, 2, 3))))
+    assert three[:3] == ("AAA", "AAB", "ABA")
+    assert joint_actions(MatrixGame(np.zeros((5, 5, 2)))) == (), "too many for lines"
+
+
+def test_a_recording_of_a_matrix_game_has_the_sum_of_returns_and_shares_of_joint_actions(tmp_path):
+    """Two replicas of a dilemma of two turns: CC and CD in the first, DD twice in the second."""
+    env = make_env(prisoners_dilemma(turns=2), worlds=2)
+    with ViewerCallback(tmp_path, env, title="run", episodes=2) as viewer:
+        viewer.random_play([fake(0, 0, returned=-7.0, tagged=0)])
+        for action in ([[0, 0], [1, 1]], [[0, 1], [1, 1]]):
+            viewer.on_step(TensorDict({("agents", "action"): torch.tensor(action)}, [2]))
+        for world, returned in ((0, -5.0), (1, -8.0)):
+            viewer.on_episode(fake(0, world, returned=returned, tagged=0), {})
+    path = tmp_path / "run.rrd"
+    assert column(path, "joint_actions", "Scalars:scalars")[1] == [[0.25, 0.25, 0, 0.5]]
+    assert column(path, "return_of_all", "Scalars:scalars")[1] == [[-5, -8, -6.5, -6.5]]
+    assert column(path, "random_play/return_of_all", "Scalars:scalars")[1] == [[-7]]
 
 
 def test_the_file_closes_while_the_live_view_goes_on(tmp_path):
@@ -270,20 +313,21 @@ def test_the_numbers_of_an_evaluation_are_means_with_their_error():
     assert np.isnan(played(episodes[:1]).error)
 
 
-def test_the_header_says_where_a_run_is_and_how_to_read_its_plots():
-    header = Header(episodes=4800, replicas=8, unit="apples")
-    assert header.begins("compiling, 3 s so far").splitlines()[0] == (
-        "# Episode 1 of 4,800 · compiling, 3 s so far"
+def test_the_header_says_where_a_run_is_and_which_institutions_are_in_force():
+    institutions = (Quota(share=0.25, window_steps=50, fine=2.0), Vote(on=Tax(), choices=(0.0, 0.5)))
+    rules = rules_of(replace(GAME, institutions=institutions))
+    assert rules == "quota (share 0.25, fine 2), vote (on tax (rate 0.1))"
+    header = Header(episodes=4800, replicas=8, unit="apples", rules=rules)
+    assert header.begins("compiling, 3 s so far") == (
+        f"#### Episode 1 of 4,800 · compiling, 3 s so far · {rules}"
     )
-    line = header.line(episode=640, label="tragedy", mean=436.4, random_play=282.1, died=2.0, over=64)
-    words = ("640", "4,800", "tragedy", "436", "282", "2 of 8", "64 episodes", "96 episodes", "8 replicas")
-    assert all(word in line for word in words)
+    line = header.line(episode=640, label="falling", mean=436.4, random_play=282.1, died=2.0)
+    said = "Episode 640 of 4,800 · falling · 436 apples, random play 282 · 2 of 8 boards died early"
+    assert line == f"#### {said} · {rules}"
     alone = Header(episodes=200, replicas=1, unit="return")
     for died in (None, float("nan"), 0.0):
-        line = alone.line(episode=1, label="harvesting", mean=4.25, random_play=None, died=died, over=1)
-        assert "return 4.25" in line
-        assert "replicas" not in line
-        assert "died" not in line
+        line = alone.line(episode=1, label="steady", mean=4.25, random_play=None, died=died)
+        assert line == "#### Episode 1 of 200 · steady · return 4.25"
 
 
 SMALL = Game(
@@ -392,15 +436,18 @@ def test_any_number_of_agents_and_replicas_is_shown(drawing, replicas, tmp_path)
     assert len(column(path, "turn/lines", "LineStrips2D:strips")[1][-1]) == replicas
 
 
-def test_the_wall_marks_a_board_that_has_died(run):
+def test_the_text_of_a_board_is_orange_after_an_episode_in_which_it_died(run):
     path, _, seen = run
-    frames, colours = column(path, "wall/died", "Boxes2D:colors", "step")
-    assert 0 < sum(own.terminated for own in seen.episodes) < len(seen.episodes), "some die, some live"
+    steps, colours = column(path, "wall/labels", "Points2D:colors", "step")
+    assert 0 < sum(episode.terminated for episode in seen.episodes) < len(seen.episodes), (
+        "some die, some live"
+    )
     ended, died = 0, False
-    for own in (own for own in seen.episodes if own.world == 0):
-        rows = [row for step, row in zip(frames, colours, strict=True) if ended < step <= ended + own.steps]
+    for episode in (episode for episode in seen.episodes if episode.world == 0):
+        until = ended + episode.steps
+        rows = [row for step, row in zip(steps, colours, strict=True) if ended < step <= until]
         assert all((row[0] >> 8 == 0xD55E00) == died for row in rows)
-        ended, died = ended + own.steps, own.terminated
+        ended, died = until, episode.terminated
 
 
 class Listener:

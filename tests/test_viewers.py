@@ -19,24 +19,18 @@ from test_story import headers
 from viewers import browser, native_viewer, wait_until
 
 from cprl.commons.colours import APPLE, PALETTE, agent_colour
+from cprl.measuring.metrics import colour
 from cprl.training.outcome import exhibited
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.layout import SOCIAL
-from cprl.viewer.live import served
-from cprl.viewer.logger import RerunLogger
 
 pytestmark = pytest.mark.viewer
 
 SCRIPT = Path(__file__).with_name("train_and_watch.py")
 AGENTS = 4
-BOARD = (0.0, 0.2, 0.45, 0.46)
+BOARD = (0.0, 0.17, 0.6, 0.8)
 """Where the layout puts what is looked for, as shares of the picture: left, top, right, bottom."""
-HEADER = (0.0, 0.04, 1.0, 0.17)
-PLACES = {
-    "social/collective_return": (0.0, 0.64, 0.333, 0.96),
-    "social/survival_steps": (0.34, 0.64, 0.666, 0.96),
-    "social/equality": (0.67, 0.64, 1.0, 0.96),
-}
+HEADER = (0.0, 0.04, 1.0, 0.12)
+PLACES = {"collective_return": (0.62, 0.17, 1.0, 0.36), "stock_left": (0.62, 0.39, 1.0, 0.58)}
 LIMIT_S = 900.0
 """The longest wait, on a machine with much other work; as a rule it takes seconds."""
 
@@ -67,7 +61,7 @@ def missing(picture):
         if len(spots(picture, BOARD, agent_colour(agent), within=4)) < 60:
             lacking.append(f"agent_{agent} on the board")
     for name, place in PLACES.items():
-        if len(np.unique(spots(picture, place, SOCIAL[name][1])[:, 1])) < 100:
+        if len(np.unique(spots(picture, place, colour(name))[:, 1])) < 100:
             lacking.append(f"line of {name}")
     return lacking
 

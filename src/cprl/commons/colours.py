@@ -32,8 +32,9 @@ COLOURS: Final[tuple[Colour, ...]] = (
 )
 """Red, green and blue of each class in windows [W, run]; HIDDEN is ours."""
 
-WINDOW_CAPTION: Final = "in the study's colours: self blue, others red"
-"""The caption of windows wherever they are shown."""
+ORANGE, BLUE, GREEN = (230, 160, 0), (86, 180, 233), (0, 158, 115)
+VERMILION, PURPLE, GREY = (213, 94, 0), (204, 121, 167), (150, 150, 150)
+"""Of lines and states: M. Okabe and K. Ito's colours, apart for the colour-blind too, and a grey."""
 
 PALETTE: Final[dict[int, Colour]] = {
     GROUND: (16, 18, 22),
@@ -66,6 +67,15 @@ _APART_COLOURS: Final[tuple[Colour, ...]] = (
 def agent_colour(agent: int) -> Colour:
     """An agent's hue (red, green, blue), 0..255, in pictures for people; agents 0 and 4 have the same."""
     return AGENT_COLOURS[agent % len(AGENT_COLOURS)]
+
+
+def line_colour(agent: int) -> Colour:
+    """An agent's colour in plots over time, where no mark can stand: the hue, lighter for agents 4 to 7 and
+    darker for 8 to 11."""
+    tints = ((0, 1.0), (255, 0.4), (0, 0.5))
+    towards, share = tints[agent // len(AGENT_COLOURS) % len(tints)]
+    red, green, blue = (round(towards + share * (part - towards)) for part in agent_colour(agent))
+    return red, green, blue
 
 
 def agent_mark(agent: int) -> str:

@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import keys
+from cprl.commons.colours import APPLE, BLUE, GREEN, GREY, ORANGE, PALETTE, PURPLE, VERMILION, Colour
 from cprl.measuring import institutions, social
 
 NAMES: Final[Mapping[str, tuple[str, str]]] = {
@@ -21,6 +22,27 @@ NAMES: Final[Mapping[str, tuple[str, str]]] = {
     **{f"institutions/{name}": metric[:2] for name, metric in institutions.METRICS.items()},
 }
 """The words and the unit of each number of an episode."""
+COLOURS: Final[Mapping[str, Colour]] = {
+    "collective_return": ORANGE,
+    "efficiency": ORANGE,
+    "equality": BLUE,
+    "sustainability": GREEN,
+    "survival_steps": (230, 120, 0),
+    "peace": PURPLE,
+    "peacefulness": PURPLE,
+    "yield_share": GREEN,
+    "stock_left": PALETTE[APPLE],
+    "institutions/violations": VERMILION,
+    "institutions/violations_per_step": VERMILION,
+    "institutions/own_share_of_bites": GREEN,
+    "institutions/detection_rate": ORANGE,
+    "institutions/recidivism": PURPLE,
+    "institutions/unjust_share_of_tags": BLUE,
+    "institutions/net_equality": BLUE,
+    "institutions/net_equality_within": GREEN,
+    "institutions/net_equality_between": ORANGE,
+}
+"""The colours of lines, of which those that share a plot differ; all others have a grey."""
 DIGITS: Final = {
     **{name: metric.digits for name, metric in social.SOCIAL.items() if metric.digits is not None},
     "stock_left": 1,
@@ -36,6 +58,11 @@ def is_own(name: str) -> bool:
 def title(name: str) -> str:
     """Words and unit of a metric, e.g. "survival, steps"; the name itself if it is none."""
     return ", ".join(NAMES[name]) if name in NAMES else name
+
+
+def colour(name: str) -> Colour:
+    """The colour of a metric's lines."""
+    return COLOURS.get(name, GREY)
 
 
 def unit(name: str) -> str:

@@ -105,10 +105,3 @@ class Recent:
             self._last.popleft()
         defined = [value for value in self._last if not isnan(value)]
         return fmean(defined) if defined else float("nan")
-
-    def state_dict(self) -> dict[str, Any]:
-        return {"last": list(self._last), "count": self.count}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        last: Sequence[float] = state["last"]
-        self._last, self.count = deque(last), int(state["count"])

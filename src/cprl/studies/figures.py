@@ -21,7 +21,6 @@ from matplotlib.colors import Normalize, to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from cprl.measuring.now import DECLINE, HARVESTING, RECOVERY
 from cprl.measuring.statistics import Estimate, curve_interval
 from cprl.runs.curves import SMOOTHED_EPISODES, running_mean
 from cprl.studies.tables.comparing import (
@@ -35,7 +34,7 @@ from cprl.studies.tables.comparing import (
     metric_title,
     metrics_of,
 )
-from cprl.studies.tables.sources import NO_BETTER
+from cprl.studies.tables.sources import DECLINE, HARVESTING, NO_BETTER, RECOVERY
 from cprl.studies.tables.table import RANDOM, TRAINING, Design, StudyTable
 from cprl.system.defaults import LAST
 from cprl.terminal.figures import COLOURS as PHASE_COLOURS

@@ -295,7 +295,7 @@ def _make_viewer(
         title=_title(experiment),
         episodes=experiment.episodes,
         metrics=[own_name(metric) for metric in experiment.metrics],
-        recipe={**circumstances, **recipe["experiment"]},
+        recipe={**recipe["experiment"], **circumstances},
         live=None if watch == "file" else watch,
         exhibited=None if watch == "file" else exhibited(experiment, env, population),
     )

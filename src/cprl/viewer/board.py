@@ -17,6 +17,7 @@ from cprl.commons.colours import (
     BEAM,
     FIRST_AGENT,
     GROUND,
+    PALETTE,
     WALL,
     agent_colour,
     agent_mark,
@@ -261,6 +262,8 @@ def _mark(mark: str) -> list[Floats]:
 
 
 RIM_CELLS: Final = 1
+BAR_CELLS: Final = 0.3
+"""Half the height of the bar of apples below the board."""
 """The width of the wall shown around the board, in cells."""
 BEAM_OPACITY: Final = 0.7
 IMAGES: Final = ("board", "beams")
@@ -319,6 +322,7 @@ def board_styles() -> dict[str, list[Any]]:
         "marks": [lines(colors=[MARK_COLOUR], radii=[RADIUS_CELLS])],
         "out": [rr.Boxes2D.from_fields(radii=[OUT_STROKE_CELLS], show_labels=False)],
         "out/numbers": [lines(radii=[RADIUS_CELLS])],
+        "stock": [lines(colors=[PALETTE[WALL], PALETTE[APPLE]], radii=[BAR_CELLS], show_labels=True)],
     }
 
 
@@ -352,7 +356,21 @@ def board_columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.in
     covered = _with_rim(np.where(frames["beams"], BEAM, UNSEEN).astype(np.uint8), UNSEEN)
     changed = _changes(covered)
     contents["beams"] = changed, _pictures(covered[changed])
-    return contents | _out(frames)
+    return contents | {"stock": _stock(scene, frames)} | _out(frames)
+
+
+def _stock(scene: Scene, frames: Frames) -> tuple[NDArray[np.intp], Any]:
+    """A bar below the board, as wide as it with all apples, filled as far as they are there."""
+    apples = (frames["stock"] > 0).sum(1)
+    changed = _changes(apples)
+    apples, sites = apples[changed], max(1, len(scene.sites))
+    left, low = RIM_CELLS, scene.height + 2 * RIM_CELLS + 2 * BAR_CELLS
+    bars = np.full((len(apples), 2, 2, 2), (left, low), np.float32)
+    bars[:, 0, 1, 0] += scene.width
+    bars[:, 1, 1, 0] += scene.width * apples / sites
+    words = [text for count in apples for text in ("", f"{count} of {len(scene.sites)} apples")]
+    columns = rr.LineStrips2D.columns(strips=bars.reshape(-1, 2, 2), labels=words)
+    return changed, columns.partition([2] * len(apples))
 
 
 def _pictures(images: Bytes) -> Any:

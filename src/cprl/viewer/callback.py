@@ -13,7 +13,7 @@ import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from cprl.envs.unwrap import agent_names, commons_of
+from cprl.envs.unwrap import agent_names, base_env, commons_of
 from cprl.measuring.episodes import Episode
 from cprl.measuring.metrics import reported_by
 from cprl.measuring.series import OF_AGENTS, Series, numbers_of
@@ -25,6 +25,7 @@ from cprl.viewer.exhibition import Exhibition
 from cprl.viewer.layout import curves_of, missing_in, scene_of
 from cprl.viewer.logger import FILE_NAME, RerunLogger, recording_id, recordings_of
 from cprl.viewer.pictures import (
+    JointActions,
     Lorenz,
     Plots,
     Tags,
@@ -106,10 +107,9 @@ class ViewerCallback:
         self._series = Series(curves.replicas)
         self._step = self._episode = 0
         self._rate_at, self._rate_step = time.perf_counter(), 0
-        self._now: Mapping[str, Any] | None = None
         self.logger.log_hparams({"run": run.name, **(recipe or {})})
         self.logger.log_text(f"{title} begins")
-        if missing := missing_in(reported, has_board=scene is not None):
+        for missing in missing_in(reported, has_board=scene is not None):
             self.logger.log_text(missing)
         if live and scene is None:
             self.logger.log_text("no exhibition: the game has no board")
@@ -128,7 +128,9 @@ class ViewerCallback:
         logger, commons = self.logger, commons_of(self.env)
         curves, scene, live = logger.curves, logger.scene, logger.live
         every = max(1, min(LONGEST, episodes // _IMAGES))
-        views: list[View] = [Plots(logger, episodes=episodes), Events(logger, self.filming, every=every)]
+        views: list[View] = [Plots(logger), Events(logger, self.filming, every=every)]
+        if curves.joint:
+            views.append(JointActions(logger, actions=base_env(self.env).game.actions))
         if curves.has_tags_between:
             views.append(Tags(logger))
         if commons is not None and scene is not None:
@@ -177,7 +179,7 @@ class ViewerCallback:
             self.logger.do(methodcaller("log_file_from_path", recording), live_only=True)
         self.logger.at(step=step, episode=self._episode)
         if self.story is not None:
-            self.story.resume(self._now)
+            self.story.resume()
         self.logger.log_text(f"resumed from step {step:,}")
 
     def on_step(self, batch: TensorDictBase) -> None:
@@ -192,6 +194,7 @@ class ViewerCallback:
         frame = self.filming.add(batch, step=self._step, episode=self._episode)
         for view in self._views:
             view.on_step(self._step, self._episode, frame)
+            view.on_batch(batch)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Logs the numbers of an episode, and its events, once all replicas have ended it."""
@@ -242,13 +245,10 @@ class ViewerCallback:
     def state_dict(self) -> dict[str, Any]:
         """What does not follow from the run's table; the recording is complete up to here."""
         self.flush()
-        return {
-            "frames": self.logger.frames,
-            "now": None if self.story is None else self.story.now.state_dict(),
-        }
+        return {"frames": self.logger.frames}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self.logger.frames, self._now = int(state["frames"]), state["now"]
+        self.logger.frames = int(state["frames"])
 
     def __enter__(self) -> Self:
         return self

@@ -27,7 +27,7 @@ from cprl.viewer.board import (
     board_form,
     board_styles,
 )
-from cprl.viewer.layout import BACKGROUND, Scene
+from cprl.viewer.layout import Scene
 from cprl.viewer.live import LiveStream
 from cprl.viewer.pictures import View
 
@@ -195,8 +195,8 @@ def caption_of(policy: PresentPolicy, episode: int) -> str:
     return f"{'trained' if policy.is_trained else 'present'} policy, episode {episode:,}{chance}"
 
 
-_CAPTION_CELLS, _ROOM_CELLS = 0.4, 2.4
-"""The distances from the board to the caption and to the line that gives it room, in cells."""
+_CAPTION_CELLS = 2.3
+"""The distance from the board to the caption, in cells."""
 _THIN: Final = 0.01
 
 
@@ -207,9 +207,6 @@ def _send_fixed(recording: Any, *, scene: Scene) -> None:
     for entity, parts in board_styles().items():
         recording.log(f"exhibition/{entity}", *parts, static=True)
     low, wide = scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS
-    line = [(0.0, low + _ROOM_CELLS), (wide, low + _ROOM_CELLS)]  # hidden; the view makes room for it
-    room = rr.LineStrips2D([line], radii=_THIN, colors=[BACKGROUND])
-    recording.log("exhibition/room", room, static=True)
     place = wide / 2, low + _CAPTION_CELLS
     caption = rr.Points2D([place], show_labels=True, radii=_THIN, colors=[(255, 255, 255)])
     recording.log("exhibition/caption", caption, static=True)

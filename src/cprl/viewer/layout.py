@@ -1,16 +1,16 @@
 """What a recording shows: the numbers and boards, their names and colours, and the layout of the viewer.
 
-    header: one line in large type, and how to read the lines of plots
-    board (live: "Present policy" first) | windows of the agents | events
-    the live label and, at the end, the phases, as strips
-    plots in tabs, three to a tab
+    header: one line in large type
+    tabs, of which the first has the board (live: the present policy's) beside the harvest, the apples left
+    and the boards of all replicas
+    the live label, whether agents explore and, at the end, the phases, as strips
 
 A new tab is a line of `_tabs`.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from itertools import product
 from math import ceil
 from typing import Any, Final, Literal
 
@@ -23,54 +23,29 @@ from torchrl.envs import EnvBase
 
 from cprl.commons.colours import (
     APPLE,
+    BLUE,
     FIRST_AGENT,
+    GREEN,
+    GREY,
+    ORANGE,
     PALETTE,
-    WINDOW_CAPTION,
+    PURPLE,
+    VERMILION,
     Colour,
-    agent_colour,
     class_name,
+    line_colour,
     picture_colour,
 )
 from cprl.commons.decoding import UNSEEN
+from cprl.commons.game import Game
 from cprl.envs.commons_env import CommonsEnv
-from cprl.measuring import institutions, now, phases
+from cprl.envs.matrix import MatrixGame
+from cprl.envs.unwrap import base_env
+from cprl.measuring import now, phases
 from cprl.measuring.episodes import decisions_of, metrics_of, yield_of
-from cprl.measuring.metrics import FIELDS, METRICS, available, is_own, left_out
+from cprl.measuring.metrics import FIELDS, METRICS, NAMES, available, colour, is_own, left_out, title
 from cprl.measuring.series import OF_AGENTS
 
-ORANGE, BLUE, GREEN = (230, 160, 0), (86, 180, 233), (0, 158, 115)
-VERMILION, PURPLE, GREY = (213, 94, 0), (204, 121, 167), (150, 150, 150)
-"""M. Okabe and K. Ito's colours, which are apart for the colour-blind too, and a grey."""
-
-SOCIAL: Final = {
-    "social/collective_return": ("collective return", ORANGE),
-    "social/efficiency": ("apples per step", ORANGE),
-    "social/equality": ("equality", BLUE),
-    "social/sustainability": ("sustainability", GREEN),
-    "social/survival_steps": ("survival", (230, 120, 0)),
-    "social/peace": ("peace", PURPLE),
-    "social/peacefulness": ("peacefulness", PURPLE),
-    "social/stock_left": ("apples left", PALETTE[APPLE]),
-    "social/yield_share": ("yield share of the steps played", GREEN),
-}
-"""The name and colour of each line, because viewers assign different colours; agents have their own."""
-OTHERS: Final = {
-    "time/env_steps_per_s": ("steps per second", GREY),
-    "evaluation/greedy_return": ("greedy, evaluated", ORANGE),
-    "turn/stock": ("apples", PALETTE[APPLE]),
-}
-INSTITUTIONAL: Final = {
-    "violations": VERMILION,
-    "violations_per_step": VERMILION,
-    "own_share_of_bites": GREEN,
-    "detection_rate": ORANGE,
-    "recidivism": PURPLE,
-    "unjust_share_of_tags": BLUE,
-    "net_equality": BLUE,
-    "net_equality_within": GREEN,
-    "net_equality_between": ORANGE,
-}
-"""The colours of the lines of institutions; those that no tab shows have a grey."""
 SHARES: Final = (
     "violations_per_step",
     "own_share_of_bites",
@@ -78,7 +53,9 @@ SHARES: Final = (
     "recidivism",
     "unjust_share_of_tags",
 )
-"""The metrics of institutions that share a plot; only their running means are shown there."""
+"""The metrics of institutions that share a plot; only their running means are shown there, as of those of
+net incomes."""
+INCOMES: Final = ("net_equality", "net_equality_within", "net_equality_between")
 PAYMENTS: Final = {
     "violations": "Violations of each, turns",
     "fines": "Fines of each, apples",
@@ -87,12 +64,21 @@ PAYMENTS: Final = {
 """The plots of what each agent breaks, pays and gets, by the name of their lines."""
 PAID, GIVEN = "paid", "given"
 """The lines of each agent in a replay: what institutions take in a turn, downwards, and give, upwards."""
+RETURN: Final = "return_of_all"
+"""The line of the summed return, in games that report no harvest."""
+JOINT: Final = "joint_actions"
+"""The lines of the shares of joint actions, in small matrix games."""
+MOST_JOINT: Final = 16
+"""Joint actions that have a line each."""
 RANDOM_PLAY: Final = "random_play"
 """The folder of the lines of random play; each has the name of its metric."""
 EVALUATION: Final = "evaluation"
 """The folder of the lines of evaluations while agents are trained, likewise."""
 ANOTHER: Final = "another"
 """The name of a phase that matches no pattern of the study."""
+SETTLED: Final = "settled"
+"""The state of agents who explore no more, which is not drawn."""
+TEXT: Final = (200, 200, 200)
 BACKGROUND: Final = (24, 26, 32)
 """The background of boards and windows, which sets their dark cells apart from the viewer's own colour."""
 STATES: Final = {
@@ -102,14 +88,23 @@ STATES: Final = {
     "cultivation": GREEN,
     ANOTHER: (120, 120, 120),
     now.BEGINS: (80, 80, 80),
-    now.EXPLORING: BLUE,
-    now.HARVESTING: GREY,
-    now.DECLINE: VERMILION,
-    now.RECOVERY: GREEN,
+    now.RISING: GREEN,
+    now.RECOVERING: GREEN,
+    now.STEADY: GREY,
+    now.FALLING: ORANGE,
+    now.BELOW: VERMILION,
+    now.EXPLORING: (60, 90, 130),
+    SETTLED: BACKGROUND,
 }
 """The colours of phases and live labels, which share one where they mean the same."""
-STRIPS: Final = ("now", "phase/found", "phase/as_published")
-"""The entities of states: the live label, and the phases that are logged when a long run ends."""
+STRIPS: Final = ("now", "now_exploring", "phase/found", "phase/as_published")
+"""The entities of states: the live label, whether agents explore, and the phases that are logged when a long
+run ends."""
+
+
+def window_of(episodes: int) -> int:
+    """The episodes whose mean is the bold line of a run of so many."""
+    return max(10, round(0.02 * episodes))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +115,9 @@ class Curves:
     """The names of the agents, agent 0 first."""
     replicas: int = 1
     """The number of replicas: each is a thin line, and their mean a thick one."""
-    metrics: tuple[str, ...] = tuple(name.removeprefix("social/") for name in SOCIAL)
+    mean_over: int = 10
+    """The episodes whose mean is the bold line."""
+    metrics: tuple[str, ...] = (*METRICS, "stock_left", "yield_share")
     """The metrics that the game reports, without the prefix `social/`."""
     has_phases: bool = True
     """Whether phases are found when the run ends: it is long enough, and these metrics tell."""
@@ -130,6 +127,8 @@ class Curves:
     """The metrics of institutions that the game reports, without the prefix `institutions/`."""
     in_force: tuple[str, ...] = ()
     """What is decided in an episode, in words, e.g. "the tax rate"."""
+    joint: tuple[str, ...] = ()
+    """The joint actions whose shares are plotted, e.g. "CC" and so on."""
 
     @property
     def has_lorenz(self) -> bool:
@@ -145,6 +144,11 @@ class Curves:
     def has_institutions(self) -> bool:
         return bool(self.institutions or self.in_force)
 
+    @property
+    def unit(self) -> str:
+        """Apples, or "return" for the sum of rewards in a game that reports no harvest."""
+        return "apples" if "collective_return" in self.metrics else "return"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Scene(Curves):
@@ -158,6 +162,8 @@ class Scene(Curves):
     """(row, col) of each of the K sites, the cells where apples grow."""
     window: tuple[int, int]
     """(X, Y) of a window."""
+    caption: str = "itself blue at the bottom; others red"
+    """How to read windows."""
     actions: int = 8
     """The number of actions A."""
     is_replay: bool = False
@@ -177,15 +183,31 @@ def curves_of(
     metrics = available({**METRICS, "stock_left": FIELDS["stock_left"]}, reported)
     metrics += ("yield_share",) if yield_of(env) and "harvest" in reported else ()
     metrics += tuple(own)
+    game = getattr(base_env(env), "game", None)
     return Curves(
         agents=agents,
         replicas=env.batch_size.numel(),
+        mean_over=window_of(episodes),
         metrics=metrics,
         has_phases=episodes in phases.EPISODES and set(phases.METRICS) <= set(metrics),
         has_tags="tagged_by" in reported,
         institutions=metrics_of(env, reported),
         in_force=decisions_of(env) if "in_force" in reported else (),
+        joint=joint_actions(game) if isinstance(game, MatrixGame) else (),
     )
+
+
+def joint_actions(game: MatrixGame) -> tuple[str, ...]:
+    """The joint actions of a small game in letters, that of agent 0 first: C and D in a social dilemma of
+    two, where both are paid more if both choose action 0, else A and so on. None of a large game."""
+    if game.actions**game.agents > MOST_JOINT:
+        return ()
+    letters, payoffs = "ABCDEFGHIJKLMNOP"[: game.actions], np.array(game.payoffs)
+    if payoffs.shape == (2, 2, 2) and (payoffs[..., 0] == payoffs[..., 1].T).all():
+        (reward, sucker), (temptation, punishment) = payoffs[..., 0]
+        if reward > max(punishment, sucker) and (temptation > reward or punishment > sucker):
+            letters = "CD"
+    return tuple(map("".join, product(letters, repeat=game.agents)))
 
 
 def scene_of(env: CommonsEnv, curves: Curves, *, is_replay: bool = False) -> Scene:
@@ -198,9 +220,17 @@ def scene_of(env: CommonsEnv, curves: Curves, *, is_replay: bool = False) -> Sce
         walls=board.walls,
         sites=board.sites,
         window=env.game.observation_shape[1:],
+        caption=_caption(env.game),
         actions=len(env.game.actions),
         is_replay=is_replay,
     )
+
+
+def _caption(game: Game) -> str:
+    if game.observation.agents_apart:
+        return "each agent in a colour of its own"
+    also = "; as run also agents of lower number" if game.rules.self_paint_stays else ""
+    return "itself blue at the bottom" + (f"{also}; others red" if game.agents > 1 else "")
 
 
 _SHOWN: Final[Mapping[str, tuple[str, ...]]] = {
@@ -215,9 +245,10 @@ _SHOWN: Final[Mapping[str, tuple[str, ...]]] = {
 """The views of a recording besides metrics, and the entries that each needs."""
 
 
-def missing_in(reported: Sequence[str], *, has_board: bool) -> str:
-    """One line that names what the recording lacks, and why; "" if it lacks nothing."""
-    return left_out([*reported, *(["board"] if has_board else [])], more=_SHOWN)
+def missing_in(reported: Sequence[str], *, has_board: bool) -> list[str]:
+    """Lines that name what the recording lacks, and why."""
+    lines = left_out([*reported, *(["board"] if has_board else [])], more=_SHOWN).split("; ")
+    return [line for line in lines if line]
 
 
 def classes(curves: Curves, colour_of: Callable[[int], Colour] = picture_colour) -> Any:
@@ -231,51 +262,62 @@ def classes(curves: Curves, colour_of: Callable[[int], Colour] = picture_colour)
 
 def styles(curves: Curves) -> dict[str, Any]:
     """The names, colours and widths of each plot's lines, and the colours of states, by entity."""
-    replicas = curves.replicas
-    lines = {entity: line(name, colour, width=None) for entity, (name, colour) in OTHERS.items()}
+    replicas, mean = curves.replicas, f"mean of {curves.mean_over}"
+    lines = {
+        "time/env_steps_per_s": line("steps per second", GREY),
+        f"{EVALUATION}/greedy_return": line("greedy, evaluated", ORANGE),
+        "turn/stock": line("apples", PALETTE[APPLE]),
+    }
+    if curves.unit == "return":
+        lines[RETURN] = running(mean, ORANGE, replicas)
+        lines[f"{RANDOM_PLAY}/{RETURN}"] = line("random play", GREY)
     for metric in curves.metrics:
-        name, colour = SOCIAL.get(f"social/{metric}", (metric, ORANGE))
-        lines[f"social/{metric}"] = running(name, colour, replicas)
+        lines[f"social/{metric}"] = running(mean, colour(metric), replicas)
         lines[f"{RANDOM_PLAY}/{metric}"] = line("random play", GREY)
         lines[f"{EVALUATION}/{metric}"] = line("greedy, evaluated", ORANGE)
-    for name in curves.institutions:
-        lines[f"{RANDOM_PLAY}/institutions/{name}"] = line("random play", GREY)
-        lines[f"institutions/{name}"] = running(
-            institutions.METRICS[name].words,
-            INSTITUTIONAL.get(name, GREY),
-            replicas,
-            alone=name in SHARES,
-        )
-    for ballot, title in enumerate(curves.in_force):
-        colour = (ORANGE, BLUE, GREEN, PURPLE)[ballot % 4]
-        lines[f"institutions/in_force_{ballot}"] = running(title, colour, replicas)
+    for name in (f"institutions/{metric}" for metric in curves.institutions):
+        lines[f"{RANDOM_PLAY}/{name}"] = line("random play", GREY)
+        is_alone = name.removeprefix("institutions/") in (*SHARES, *INCOMES)
+        lines[name] = running(NAMES[name][0], colour(name), replicas, is_alone=is_alone)
+    for ballot, decided in enumerate(curves.in_force):
+        hue = (ORANGE, BLUE, GREEN, PURPLE)[ballot % 4]
+        lines[f"institutions/in_force_{ballot}"] = running(decided, hue, replicas)
     for agent, name in enumerate(curves.agents):
-        colour = agent_colour(agent)
-        for entity in ("loss", "epsilon", "q", "harvested"):
-            lines[f"{name}/{entity}"] = line(name, colour)
+        hue = line_colour(agent)
+        for entity in ("loss", "q", "harvested"):
+            lines[f"{name}/{entity}"] = line(name, hue)
+        # Equal ones are seen as stripes.
+        lines[f"{name}/epsilon"] = line(name, hue, width=1.0 + 2.0 * ((len(curves.agents) - 1 - agent) % 4))
         for entity in ("return", *(kind for kind in OF_AGENTS if kind in curves.institutions)):
-            lines[f"{name}/{entity}"] = running(name, colour, replicas=1)
+            lines[f"{name}/{entity}"] = running(name, hue, replicas=1, is_alone=len(curves.agents) > 4)
+    if curves.joint:
+        count = len(curves.joint)
+        hues = (GREEN, BLUE, ORANGE, VERMILION) if count == 4 else tuple(map(line_colour, range(count)))
+        lines[JOINT] = rr.SeriesLines(names=list(curves.joint), colors=list(hues), widths=[2.5] * count)
     packed = [red << 24 | green << 16 | blue << 8 | 255 for red, green, blue in STATES.values()]
-    names, colours = list(STATES), np.array(packed, np.uint32)  # 0xRRGGBBAA
-    states = rr.StateConfiguration(values=names, labels=names, colors=colours)
-    return lines | dict.fromkeys(STRIPS if curves.has_phases else STRIPS[:1], states)
+    states = rr.StateConfiguration(
+        values=list(STATES),
+        labels=list(STATES),
+        colors=np.array(packed, np.uint32),  # 0xRRGGBBAA
+        visible=[state != SETTLED for state in STATES],
+    )
+    return lines | dict.fromkeys(STRIPS if curves.has_phases else STRIPS[:2], states)
 
 
-def line(name: str, colour: Colour, *, width: float | None = 1.0) -> Any:
-    return rr.SeriesLines(names=[name], colors=[colour], widths=None if width is None else [width])
+def line(name: str, colour: Colour, *, width: float = 1.0) -> Any:
+    return rr.SeriesLines(names=[name], colors=[colour], widths=[width])
 
 
-def running(name: str, colour: Colour, replicas: int, *, alone: bool = False) -> Any:
+def running(name: str, colour: Colour, replicas: int, *, is_alone: bool = False) -> Any:
     """Thin, dark lines for each of several replicas, a faint one for their mean, and on top a bold one for
-    its running mean; `alone` shows that one alone, where others share the plot."""
+    its running mean; `is_alone` shows that one alone, where others share the plot."""
     singles = replicas if replicas > 1 else 0
-    raw = name if replicas == 1 else f"{name}, mean"
     dark, faint = (tuple(round(share * part) for part in colour) for share in (0.35, 0.6))
     return rr.SeriesLines(
-        names=[*(f"replica {replica}" for replica in range(singles)), raw, f"{name}, running mean"],
+        names=[*["replicas"] * singles, "episodes", name],
         colors=[*[dark] * singles, faint, colour],
         widths=[*[0.7] * singles, 1.0, 2.5],
-        visible_series=[*[False] * (singles + 1), True] if alone else None,
+        visible_series=[*[False] * (singles + 1), True] if is_alone else None,
     )
 
 
@@ -327,20 +369,12 @@ class Panels:
             image[top : top + self.size[0], left : left + self.size[1]] = board
         return image
 
-    def labels(self) -> Any:
-        """The points at which texts stand, as Rerun's static part of `Points2D`; their labels vary."""
+    def labels(self, colours: Sequence[Colour] | None = (TEXT,)) -> Any:
+        """The points at which texts stand, as Rerun's static part of `Points2D`; labels vary, and colours for
+        None: what is static hides what is not."""
         tops = self.corners[:, ::-1] + (self.size[1] / 2, 0.1 - self._label)
         return rr.Points2D.from_fields(
-            positions=tops.astype(np.float32), radii=[0.0], colors=[(220, 220, 220)], show_labels=True
-        )
-
-    def frames(self) -> Any:
-        """A frame around each board, as Rerun's static part of `Boxes2D`; colours vary."""
-        return rr.Boxes2D.from_fields(
-            centers=(self.corners[:, ::-1] + np.array(self.size[::-1]) / 2).astype(np.float32),
-            half_sizes=np.tile(np.array(self.size[::-1], np.float32) / 2, (len(self.corners), 1)),
-            radii=[0.25],
-            show_labels=False,
+            positions=tops.astype(np.float32), radii=[0.0], colors=colours, show_labels=True
         )
 
     def view(self, name: str, origin: str) -> Any:
@@ -378,14 +412,16 @@ def _drawn_plot(name: str, origin: str) -> Any:
     return flat(name, origin, x=(-24.0, PLOT_WIDE + 16.0), y=(TITLE[1], PLOT_HIGH + 26.0))
 
 
-def flat(name: str, origin: str, *, x: tuple[float, float], y: tuple[float, float]) -> Any:
-    bounds = rrb.VisualBounds2D(x_range=x, y_range=y)
+def flat(
+    name: str, origin: str, *, x: tuple[float, float] | None = None, y: tuple[float, float] | None = None
+) -> Any:
+    bounds = rrb.VisualBounds2D(x_range=x, y_range=y) if x and y else None
     return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=BACKGROUND, visual_bounds=bounds)
 
 
-_HEADER, _STRIP, _VIEW = 97, 40, 207
-"""Heights in a window of 1280 x 720, in pixels: the header, a strip, boards or plots. The rows share out any
-other height as they do this one."""
+_HEADER, _RULER, _STRIP, _VIEWS = 64, 24, 43, 480
+"""Heights in a window of 1280 x 720, in pixels: the header, the ruler above strips, a strip, and all else.
+Rows share out any other height as they do this one."""
 
 
 def layout(curves: Curves, *, live: bool = False, ended: bool = False) -> Any:
@@ -400,16 +436,15 @@ def layout(curves: Curves, *, live: bool = False, ended: bool = False) -> Any:
             (`/exhibition`, in the live stream alone), and no room for phases before they are there.
     """
     is_replay = isinstance(curves, Scene) and curves.is_replay
-    strips = 3 if curves.has_phases and (ended or not live) else 1
+    strips = 4 if curves.has_phases and (ended or not live) else 2
     views = (
         _replay(curves)
         if isinstance(curves, Scene) and is_replay
         else rrb.Vertical(
             rrb.TextDocumentView(name="Now", origin="/header", titlebar=False),
-            _top(curves, live=live),
-            _strip(),
-            rrb.Tabs(*_tabs(curves), active_tab=0),
-            row_shares=[_HEADER, _VIEW, (0.5 + strips) * _STRIP, _VIEW],
+            rrb.Tabs(*_tabs(curves, live=live), active_tab=0),
+            _strips(),
+            row_shares=[_HEADER, _VIEWS, _RULER + strips * _STRIP],
         )
     )
     play_state: Literal["playing", "following"] = "playing" if is_replay else "following"
@@ -430,14 +465,14 @@ def _replay(scene: Scene) -> Any:
     paid = [*_of(scene.agents, PAID), *_of(scene.agents, GIVEN)] if scene.has_institutions else []
     right = _present(
         [
-            _board(f"What agents see, {WINDOW_CAPTION}", "windows"),
+            flat(f"What agents see: {scene.caption}", "windows"),
             bars.view("What policies say (L, R turn, B beam, S stay), taken: white", "decisions"),
             _plot("Harvest so far, apples", _of(scene.agents, "harvested")),
             _plot("Apples on the board", ["turn/stock"]),
             _plot("Fined (down) and given (up) in the turn, apples", paid),
         ]
     )
-    left = [_board("Board", "world"), rrb.Tabs(_events(), _recipe(), active_tab=0)]
+    left = [_board("Board", scene), rrb.Tabs(_events(), _recipe(), active_tab=0)]
     return rrb.Horizontal(
         rrb.Vertical(*left, row_shares=[7, 2]),
         rrb.Vertical(*right, row_shares=[4, 4, 2, 2, 2][: len(right)]),
@@ -445,20 +480,9 @@ def _replay(scene: Scene) -> Any:
     )
 
 
-def _top(curves: Curves, *, live: bool) -> Any:
-    """The board, the agents' windows and the events side by side; without a board the events alone."""
-    if not isinstance(curves, Scene):
-        return _events()
-    boards, windows = _board("Board", "world"), _board("Windows: self blue, others red", "windows")
-    if live:
-        present = _board("Present policy", "exhibition")
-        boards = rrb.Tabs(present, _board("Recorded episodes", "world"), active_tab=0)
-        windows = _board("Recorded: self blue, others red", "windows")
-    return rrb.Horizontal(boards, windows, _events(), column_shares=[5, 3, 3])
-
-
-def _board(name: str, origin: str) -> Any:
-    return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=BACKGROUND)
+def _board(name: str, scene: Scene, *, origin: str = "world", below: float = 2.6) -> Any:
+    """The view of a board with room for what stands below it, in cells."""
+    return flat(name, origin, x=(-0.2, scene.width + 2.2), y=(-0.2, scene.height + 2.0 + below))
 
 
 def _events() -> Any:
@@ -468,70 +492,92 @@ def _events() -> Any:
     return rrb.TextLogView(name="Events", origin="/log", columns=columns)
 
 
-def _strip() -> Any:
-    """The live label, below it the phases found at the end and the published ones, as bands over episodes."""
-    contents = ["+ /now", "+ /phase/**"]
+def _strips() -> Any:
+    """The live label, below it whether agents explore, and the phases found at the end and the published
+    ones, as bands over episodes."""
+    contents = ["+ /now", "+ /now_exploring", "+ /phase/**"]
     return rrb.StateTimelineView(name="Phases", contents=contents, time_view=_whole(), titlebar=False)
 
 
-def _tabs(curves: Curves) -> list[Any]:
-    """The tabs, with up to three views each; those of which the game has nothing are left out."""
-    agents, social = curves.agents, partial(_social, curves)
-    unit = "apples" if "collective_return" in curves.metrics else "sum of rewards"
+def _overview(curves: Curves, *, live: bool) -> Any:
+    """What a newcomer sees: the board large, and beside it what the group gets and leaves."""
+    if curves.unit == "apples":
+        gets = _social(curves, "collective_return", is_explained=True)
+    else:
+        gets = _plot(
+            f"Sum of all returns; {_lines(curves)}", [RETURN, f"{RANDOM_PLAY}/{RETURN}"], has_legend=False
+        )
+    if not isinstance(curves, Scene):
+        joint = (
+            _plot("Joint actions, share of turns; agent 0 first", [JOINT], share=True)
+            if curves.joint
+            else None
+        )
+        return rrb.Horizontal(rrb.Vertical(gets, _returns(curves)), *_present([joint]), name="Overview")
+    board = (
+        _board("Present policy", curves, origin="exhibition", below=4.2) if live else _board("Board", curves)
+    )
+    boards = _wall(curves) if curves.replicas > 1 else _social(curves, "survival_steps")
+    beside = _present([gets, _social(curves, "stock_left"), boards])
+    return rrb.Horizontal(board, rrb.Vertical(*beside), column_shares=[3, 2], name="Overview")
+
+
+def _tabs(curves: Curves, *, live: bool) -> list[Any]:
+    """The tabs, with up to six views each; those of which the game has nothing are left out."""
+    agents, several = curves.agents, len(curves.agents) > 1
+    decided = [f"institutions/in_force_{ballot}" for ballot in range(len(curves.in_force))]
     shares, equalities = (
         [f"institutions/{name}" for name in names if name in curves.institutions]
-        for names in (SHARES, [name for name in INSTITUTIONAL if "equality" in name])
+        for names in (SHARES, INCOMES)
     )
-    equalities += [f"{RANDOM_PLAY}/institutions/net_equality"] if equalities else []
-    decided = [f"institutions/in_force_{ballot}" for ballot in range(len(curves.in_force))]
-    lorenz = _drawn_plot("Lorenz curve: harvest in %", "lorenz") if curves.has_lorenz else None
-    tags = rrb.TensorView(name="Who tagged whom", origin="/tags") if curves.has_tags_between else None
-    wall, visits, stock = None, None, None
+    recorded, windows, visits, stock = None, None, None, None
     if isinstance(curves, Scene):
+        recorded = _board("Recorded episodes", curves) if live else None
+        windows = flat(f"Recorded windows: {curves.caption}", "windows")
         stock = _drawn_plot("Apples on the board, over the turn", "turn")
-        visits = boards_of(curves, len(agents)).view(
-            "Where agents go in the first replica, by episodes", "visits"
-        )
-        if curves.replicas > 1:
-            wall = boards_of(curves, curves.replicas).view(
-                "All replicas; framed: died in its last episode", "wall"
-            )
+        places = boards_of(curves, len(agents))
+        visits = places.view("Where agents go in the first replica, by episodes", "visits")
     tabs = {
-        "Outcome": [
-            social("Harvest of all, apples", "collective_return"),
-            social("Survival, steps", "survival_steps"),
-            social("Equality, 0 to 1", "equality", share=True),
-        ],
+        "Windows and events" if windows else "Events": [recorded, windows, _events()],
         "Agents": [
-            _plot(f"Return of each, {unit}", [*_of(agents, "return"), "evaluation/greedy_return"]),
-            social("Peacefulness, steps in play", "peacefulness"),
-            tags,
+            _returns(curves) if windows else None,
+            _drawn_plot("Lorenz curve: harvest in %", "lorenz") if curves.has_lorenz else None,
+            visits,
+            _tags(len(agents)) if curves.has_tags_between else None,
         ],
         "Institutions": [
-            _plot(title, _of(agents, name)) for name, title in PAYMENTS.items() if name in curves.institutions
-        ],
-        "Rules kept": [
-            _plot("Shares of violations, bites, tags", shares, share=True),
+            *(
+                _plot(words, _of(agents, name))
+                for name, words in PAYMENTS.items()
+                if name in curves.institutions
+            ),
+            _plot("Shares of turns, bites, violations, tags", shares, share=True),
             _plot("Equality of net incomes", equalities, share=True),
             _plot(f"In force: {', '.join(curves.in_force)}", decided),
         ],
-        "Replicas": [wall, stock],
-        "Places and shares": [visits, lorenz],
         "Learning": [
             _plot("Loss", _of(agents, "loss")),
-            _plot("Highest Q value, apples", _of(agents, "q")),
+            _plot(f"Highest Q value, {_rewards(curves)}", _of(agents, "q")),
             _plot("Epsilon, 0 to 1", _of(agents, "epsilon"), share=True),
+            _plot("Steps per second", ["time/env_steps_per_s"]),
         ],
         "More metrics": [
-            social("Apples per step", "efficiency"),
-            social("Mean time of harvest, steps", "sustainability"),
-            social("Apples left at the end", "stock_left"),
-            social("Yield share of the steps played", "yield_share"),
+            _social(curves, "survival_steps"),
+            _social(curves, "equality", share=True) if several else None,
+            stock,
+            *(
+                _social(curves, name)
+                for name in ("peacefulness", "efficiency", "sustainability", "yield_share")
+            ),
         ],
-        "Your metrics": [social(name, name) for name in filter(is_own, curves.metrics)],
+        "Your metrics": [_social(curves, name) for name in filter(is_own, curves.metrics)],
     }
-    rows = [rrb.Horizontal(*views, name=name) for name, tab in tabs.items() if (views := _present(tab))]
-    return [*rows, _plot("Steps per second", ["time/env_steps_per_s"]), _recipe()]
+    grids = [
+        rrb.Grid(*views, grid_columns=len(views) if len(views) < 4 else ceil(len(views) / 2), name=name)
+        for name, tab in tabs.items()
+        if (views := _present(tab))
+    ]
+    return [_overview(curves, live=live), *grids, _recipe()]
 
 
 def _recipe() -> Any:
@@ -542,16 +588,40 @@ def _present(views: Iterable[Any]) -> list[Any]:
     return [view for view in views if view is not None]
 
 
-def _social(curves: Curves, name: str, metric: str, *, share: bool = False) -> Any:
-    """The plot of a metric with the lines of random play and of evaluations; None if the game does not report
-    it."""
+def _wall(scene: Scene) -> Any:
+    wall = boards_of(scene, scene.replicas)
+    return wall.view("All replicas; orange: the board of its last episode died", "wall")
+
+
+def _tags(agents: int) -> Any:
+    bounds = (-1.0, agents + 0.5)
+    return flat("Tags in 50 episodes: who (row) was tagged by whom (column)", "tags", x=bounds, y=bounds)
+
+
+def _rewards(curves: Curves) -> str:
+    return "apples" if curves.unit == "apples" else "rewards"
+
+
+def _returns(curves: Curves) -> Any:
+    entities = [*_of(curves.agents, "return"), f"{EVALUATION}/greedy_return"]
+    return _plot(f"Return of each, {_rewards(curves)}", entities)
+
+
+def _social(curves: Curves, metric: str, *, share: bool = False, is_explained: bool = False) -> Any:
+    """The plot of a metric with the lines of random play and of evaluations, of which its name says which is
+    which if it is explained; None if the game does not report it."""
     folders = ("social", RANDOM_PLAY, EVALUATION) if metric in curves.metrics else ()
-    return _plot(name, [f"{folder}/{metric}" for folder in folders], share=share)
+    name = title(metric)[0].upper() + title(metric)[1:]
+    name += f"; {_lines(curves)}" if is_explained else ""
+    return _plot(name, [f"{folder}/{metric}" for folder in folders], share=share, has_legend=False)
 
 
-def _plot(name: str, entities: Sequence[str], *, share: bool = False) -> Any:
-    """A plot over the whole run, without a legend, which would hide its lines: they are named where the
-    pointer is, and `header` says which is which. The axis of a share is 0..1. None for no lines."""
+def _lines(curves: Curves) -> str:
+    return f"bold: mean of {curves.mean_over}, grey: random play"
+
+
+def _plot(name: str, entities: Sequence[str], *, share: bool = False, has_legend: bool = True) -> Any:
+    """A plot over the whole run; None for no lines. The axis of a share is 0..1."""
     if not entities:
         return None
     return rrb.TimeSeriesView(
@@ -559,7 +629,7 @@ def _plot(name: str, entities: Sequence[str], *, share: bool = False) -> Any:
         contents=[f"+ /{entity}" for entity in entities],
         axis_x=_whole(),
         axis_y=rrb.ScalarAxis(range=(0.0, 1.05)) if share else None,
-        plot_legend=rrb.PlotLegend(visible=False),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=has_legend),
     )
 
 

@@ -1,5 +1,5 @@
-"""What a recording shows of a training beside its frames: lines over episodes, who tagged whom, the boards of
-all replicas, where agents go, the stock over the turn, the Lorenz curve, and the borders of regions.
+"""What a recording shows of a training beside its frames: lines over episodes, joint actions, tags, the
+boards of all replicas, where agents go, the stock over the turn, the Lorenz curve, and borders of regions.
 """
 
 import time
@@ -13,8 +13,10 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
+from tensordict import TensorDictBase
 
-from cprl.commons.colours import GROUND, PALETTE, WALL, agent_colour
+from cprl import keys
+from cprl.commons.colours import GREEN, GREY, GROUND, ORANGE, PALETTE, WALL, agent_colour
 from cprl.commons.decoding import UNSEEN
 from cprl.envs.commons_env import CommonsEnv
 from cprl.institutions import Boundaries
@@ -22,14 +24,13 @@ from cprl.measuring.episodes import Episode
 from cprl.measuring.series import OF_AGENTS, Recent, Values, mean_of
 from cprl.viewer.board import RIM_CELLS, boards, image_form
 from cprl.viewer.layout import (
-    BACKGROUND,
-    GREEN,
-    GREY,
-    ORANGE,
+    JOINT,
     PLOT_HIGH,
     PLOT_WIDE,
     RANDOM_PLAY,
+    RETURN,
     STATES,
+    TEXT,
     TITLE,
     Scene,
     boards_of,
@@ -49,6 +50,9 @@ class View:
 
     def on_step(self, step: int, episode: int, frame: int | None) -> None:
         """Look at the worlds after a step of the run; `frame` is the number of the recorded one, if any."""
+
+    def on_batch(self, batch: TensorDictBase) -> None:
+        """Look at a turn of all worlds, after `on_step`."""
 
     def on_episode(self, episode: Episode) -> None:
         """Add an episode of a replica."""
@@ -82,51 +86,90 @@ def has_died(episode: Episode) -> bool | None:
 _WITH_MEAN: Final = tuple(f"/{name}" for name in ("return", *OF_AGENTS))
 
 
-def window_of(episodes: int) -> int:
-    """The episodes whose mean is the bold line of a run of so many."""
-    return max(10, round(0.02 * episodes))
-
-
 class Plots(View):
     """Logs the lines of each episode: social metrics, those of institutions and what agents get and pay
     with a running mean, all else as it is.
     """
 
-    def __init__(self, logger: RerunLogger, *, episodes: int) -> None:
-        self._logger, self._window = logger, window_of(episodes)
+    def __init__(self, logger: RerunLogger) -> None:
+        self._logger = logger
         self._recent: dict[str, Recent] = {}
         self._random: dict[str, float] = {}
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
         """Sets the lines of random play: the mean of each metric in these episodes, where it is defined."""
         curves = self._logger.curves
-        played = [{**episode.social, **episode.of_institutions} for episode in episodes]
-        for name in (*curves.metrics, *(f"institutions/{metric}" for metric in curves.institutions)):
+        played = [
+            {**episode.social, **episode.of_institutions, RETURN: float(episode.return_.sum())}
+            for episode in episodes
+        ]
+        of_institutions = (f"institutions/{metric}" for metric in curves.institutions)
+        for name in (*curves.metrics, *of_institutions, *([RETURN] if curves.unit == "return" else [])):
             values = [metrics.get(name, float("nan")) for metrics in played]
             defined = [value for value in values if value == value]
             if defined:
                 self._random[name] = fmean(defined)
 
     def on_all(self, episode: int, numbers: Mapping[str, Values], died: float | None) -> None:
+        curves = self._logger.curves
+        if curves.unit == "return":
+            numbers = {**numbers, RETURN: np.sum([numbers[f"{name}/return"] for name in curves.agents], 0)}
         for name, values in numbers.items():
-            is_social = name.startswith(("social/", "institutions/"))
+            is_social = name.startswith(("social/", "institutions/", RETURN))
             singles = values.tolist() if is_social and len(values) > 1 else []
             lines = [*singles, mean := mean_of(values)]
             if is_social or name.endswith(_WITH_MEAN):
-                lines.append(self._recent.setdefault(name, Recent(self._window)).add(mean))
+                lines.append(self._recent.setdefault(name, Recent(curves.mean_over)).add(mean))
             self._logger.log_lines(name, lines)
         for name, mean in self._random.items():
             self._logger.log_scalar(f"{RANDOM_PLAY}/{name}", mean)
 
 
+class JointActions(View):
+    """Logs the share of turns in which agents of a small matrix game chose each joint action: the mean over
+    replicas and over the last episodes."""
+
+    stride = 1
+
+    def __init__(self, logger: RerunLogger, *, actions: int) -> None:
+        curves = logger.curves
+        self._logger, self._worlds = logger, np.arange(curves.replicas)
+        self._places = actions ** np.arange(len(curves.agents))[::-1]
+        self._counts = np.zeros((curves.replicas, len(curves.joint)))
+        self._shares: dict[int, list[NDArray[np.float64]]] = {}
+        self._recent = [Recent(curves.mean_over) for _ in curves.joint]
+
+    def on_batch(self, batch: TensorDictBase) -> None:
+        action = batch[keys.ACTION].cpu().numpy()
+        self._counts[self._worlds, action @ self._places] += 1
+
+    def on_episode(self, episode: Episode) -> None:
+        counts = self._counts[episode.world]
+        if counts.any():
+            self._shares.setdefault(episode.episode, []).append(counts / counts.sum())
+        counts[:] = 0
+
+    def on_all(self, episode: int, numbers: Mapping[str, Values], died: float | None) -> None:
+        if shares := self._shares.pop(episode, None):
+            means = zip(self._recent, np.mean(shares, 0), strict=True)
+            self._logger.log_lines(JOINT, [recent.add(share) for recent, share in means])
+
+
 class Tags(View):
-    """Logs a matrix of who tagged whom every ten episodes: the sum over the last fifty, of all replicas."""
+    """Draws a matrix of who tagged whom every ten episodes: the sum over the last fifty, of all replicas."""
 
     EVERY, OVER = 10, 5
 
     def __init__(self, logger: RerunLogger) -> None:
         self._logger = logger
-        self._last = [np.zeros((len(logger.curves.agents),) * 2)]
+        agents = range(len(logger.curves.agents))
+        self._last = [np.zeros((len(agents),) * 2)]
+        cells = [(col + 0.5, row + 0.3) for row in agents for col in agents]
+        edges = [(-0.5, agent + 0.3) for agent in agents] + [(agent + 0.5, -0.7) for agent in agents]
+        places = rr.Points2D.from_fields(
+            positions=[*cells, *edges], radii=[0.0], colors=[TEXT], show_labels=True
+        )
+        logger.log_static("tags/counts", places)
 
     def on_episode(self, episode: Episode) -> None:
         if episode.tagged_by is not None:
@@ -134,8 +177,15 @@ class Tags(View):
 
     def on_all(self, episode: int, numbers: Mapping[str, Values], died: float | None) -> None:
         if (episode + 1) % self.EVERY == 0:
-            tags = np.sum(self._last, 0).astype(np.float32)
-            self._logger.log_row("tags", rr.Tensor(tags, dim_names=["tagged", "by whom"]))
+            tags = np.sum(self._last, 0)
+            light = (tags / max(1.0, tags.max()))[..., None]
+            image = np.array(PALETTE[GROUND]) * (1 - light) + np.array(STATES["combat"]) * light
+            self._logger.log_row("tags", rr.Image(image.round().astype(np.uint8)))
+            texts = [
+                *(f"{count:.0f}" for count in tags.ravel()),
+                *2 * [f"{agent}" for agent in range(len(tags))],
+            ]
+            self._logger.log_row("tags/counts", rr.Points2D.from_fields(labels=texts))
             self._last = [*self._last[1 - self.OVER :], np.zeros_like(self._last[0])]
 
 
@@ -185,15 +235,15 @@ _FEWEST_STEPS: Final = 10
 """Steps from one row of the file to the next, at least."""
 _DIED: Final = STATES["tragedy"]
 _Row: TypeAlias = tuple[int, int, int, NDArray[np.uint8], list[str], NDArray[np.uint8]]
-"""A step, episode and frame, the image, and the label and outline of each board."""
+"""A step, episode and frame, the image, and the text of each board and its colour."""
 
 
 class Wall(View):
     """Logs the boards of all replicas: same rules, as many fates.
 
     Viewers get them every two seconds, after hours more rarely; the file gets every `stride_in_file`-th step
-    of the episodes whose frames are recorded. A board is outlined while the last episode of its replica has
-    ended because no apple was left.
+    of the episodes whose frames are recorded. The text of a board says its turn, in orange if the episode of
+    its replica before this one ended because no apple was left.
 
     Args:
         recorded_steps: the steps of the run whose frames are recorded, about; determines the stride.
@@ -210,8 +260,7 @@ class Wall(View):
         self._began = self._due = time.perf_counter()
         form = rr.SegmentationImage.from_fields(format=image_form(self._panels.shape), opacity=1.0)
         logger.log_static("wall/boards", form)
-        logger.log_static("wall/labels", self._panels.labels())
-        logger.log_static("wall/died", self._panels.frames())
+        logger.log_static("wall/labels", self._panels.labels(colours=None))
 
     def on_step(self, step: int, episode: int, frame: int | None) -> None:
         if frame is not None and step % self._stride == 0:
@@ -239,18 +288,18 @@ class Wall(View):
         image = self._panels.joined(boards(self._scene, {"step": state["stock"], **state}), UNSEEN)
         turns = read(now.step)[:, 0].tolist()
         labels = [f"{replica}: turn {turn}" for replica, turn in enumerate(turns)]
-        outlines = np.where(self._died[:, None], _DIED, BACKGROUND).astype(np.uint8)
-        return step, episode, frame, image, labels, outlines
+        colours = np.where(self._died[:, None], _DIED, TEXT).astype(np.uint8)
+        return step, episode, frame, image, labels, colours
 
 
 def _send_rows(recording: Any, *, rows: list[_Row]) -> None:
     """Sends rows, for viewers in the thread that sends."""
-    steps, episodes, frames, images, labels, outlines = zip(*rows, strict=True)
+    steps, episodes, frames, images, labels, colours = zip(*rows, strict=True)
     at, replicas = times(steps, episodes, frames), [len(labels[0])] * len(rows)
+    texts = rr.Points2D.columns(labels=list(chain(*labels)), colors=np.concatenate(colours))
     parts = {
         "wall/boards": rr.SegmentationImage.columns(buffer=np.stack(images).reshape(len(rows), -1)),
-        "wall/labels": rr.Points2D.columns(labels=list(chain(*labels))).partition(replicas),
-        "wall/died": rr.Boxes2D.columns(colors=np.concatenate(outlines)).partition(replicas),
+        "wall/labels": texts.partition(replicas),
     }
     for entity, columns in parts.items():
         recording.send_columns(entity, at, columns)
@@ -281,22 +330,38 @@ class Picture(View):
         """Log what came since the last time, "episodes 51 to 100"; since a resume where that is later."""
 
 
+class Sampled(Picture):
+    """A picture of some arrays of the worlds every `stride` steps."""
+
+    def __init__(self, env: CommonsEnv, names: Sequence[str], *, every: int, stride: int) -> None:
+        super().__init__(every)
+        self.stride, self._looks = stride, Looks(env, names)
+
+    def on_step(self, step: int, episode: int, frame: int | None) -> None:
+        if step % self.stride == 0:
+            self._looks.add()
+            if self._looks.is_full:
+                self._add(*self._looks.take())
+
+    def _add(self, *arrays: NDArray[Any]) -> None:
+        """Add the arrays [T, R, ...] at T steps."""
+        raise NotImplementedError
+
+
 _DARKEST: Final = 0.35
 """The brightness of a cell that was visited once; 1 is the cell with the longest stay."""
 
 
-class Visits(Picture):
+class Visits(Sampled):
     """Counts the agents' cells in the first replica, the one that is shown, every ten steps.
 
     The image has a map for each agent: hue the agent, brightness the time it spent on the cell while in play,
     by its square root, as a share of the longest time that any agent spent on one cell.
     """
 
-    stride = 10
-
     def __init__(self, env: CommonsEnv, logger: RerunLogger, scene: Scene, *, every: int) -> None:
-        super().__init__(every)
-        self._logger, self._looks = logger, Looks(env, ("row", "col", "in_play"))
+        super().__init__(env, ("row", "col", "in_play"), every=every, stride=10)
+        self._logger = logger
         self.counts = np.zeros((len(scene.agents), scene.height, scene.width), np.int64)
         """Of the time since the last image."""
         self._panels = boards_of(scene, len(scene.agents))
@@ -306,20 +371,13 @@ class Visits(Picture):
             self._walls[row + 1, col + 1] = True
         logger.log_static("visits/labels", self._panels.labels())
 
-    def on_step(self, step: int, episode: int, frame: int | None) -> None:
-        if step % self.stride == 0:
-            self._looks.add()
-            if self._looks.is_full:
-                self._count()
-
-    def _count(self) -> None:
-        """Counts where the agents in play were."""
-        row, col, in_play = (copies[:, 0] for copies in self._looks.take())
+    def _add(self, *arrays: NDArray[Any]) -> None:
+        row, col, in_play = (copies[:, 0] for copies in arrays)
         agent = np.broadcast_to(np.arange(len(self.counts)), row.shape)
         np.add.at(self.counts, (agent[in_play], row[in_play], col[in_play]), 1)
 
     def log(self, episodes: str) -> None:
-        self._count()
+        self._add(*self._looks.take())
         self._logger.log_row("visits", rr.Image(self._panels.joined(self.maps(), PALETTE[GROUND])))
         texts = [f"{agent}: {episodes}" for agent in range(len(self.counts))]
         self._logger.log_row("visits/labels", rr.Points2D.from_fields(labels=texts))
@@ -371,7 +429,7 @@ class DrawnPlot:
 
 
 def _texts(places: Sequence[Any], texts: Sequence[str]) -> Any:
-    return rr.Points2D(places, labels=texts, colors=(200, 200, 200), radii=0.0, show_labels=True)
+    return rr.Points2D(places, labels=texts, colors=TEXT, radii=0.0, show_labels=True)
 
 
 def _ticks(end: float) -> list[float]:
@@ -381,7 +439,7 @@ def _ticks(end: float) -> list[float]:
     return [step * index for index in range(int(end / step + 1e-9) + 1)]
 
 
-class Turns(Picture):
+class Turns(Sampled):
     """Logs the apples on the board over the turns of each replica's last episode, grey where the board lived
     until the time was up, in the colour of a tragedy where it died.
     """
@@ -390,10 +448,9 @@ class Turns(Picture):
     """The points of a line, at most."""
 
     def __init__(self, env: CommonsEnv, logger: RerunLogger, *, every: int) -> None:
-        super().__init__(every)
         game, replicas = env.game, env.worlds.size
-        self._looks = Looks(env, ("step", "stock_left"))
-        self.stride = ceil(game.rules.episode_steps / self.POINTS)
+        stride = ceil(game.rules.episode_steps / self.POINTS)
+        super().__init__(env, ("step", "stock_left"), every=every, stride=stride)
         self._playing = np.full((replicas, game.rules.episode_steps // self.stride + 1, 2), np.nan)
         """[R, points, 2], turn and stock of the episodes that are being played."""
         self.lines: list[list[tuple[float, float]]] = [[] for _ in range(replicas)]
@@ -402,20 +459,14 @@ class Turns(Picture):
         ends = {"x_end": game.rules.episode_steps, "y_end": max(1, len(game.map.sites))}
         self._plot = DrawnPlot(logger, "turn", "turn of the episode", **ends)
 
-    def on_step(self, step: int, episode: int, frame: int | None) -> None:
-        if step % self.stride == 0:
-            self._looks.add()
-            if self._looks.is_full:
-                self._place()
-
-    def _place(self) -> None:
-        """Places the points that were noted, the latest last: it stays where two have the same place."""
-        turn, stock = (copies[..., 0] for copies in self._looks.take())
+    def _add(self, *arrays: NDArray[Any]) -> None:
+        """Places the points, the latest last: it stays where two have the same place."""
+        turn, stock = (copies[..., 0] for copies in arrays)
         point = np.arange(len(self.lines)), turn // self.stride
         self._playing[(*point, 0)], self._playing[(*point, 1)] = turn, stock
 
     def on_episode(self, episode: Episode) -> None:
-        self._place()
+        self._add(*self._looks.take())
         playing = self._playing[episode.world]
         points = playing[playing[:, 0] < episode.steps]
         end = [] if episode.stock_left is None else [(float(episode.steps), float(episode.stock_left))]

@@ -1,17 +1,19 @@
 """Story: the header, the live label, events, and at the end the phases of a training."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from math import isfinite, isnan
 from statistics import fmean, stdev
 from threading import Event, Thread
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from cprl.commons.game import Game
 from cprl.commons.published import GAMES
 from cprl.commons.published import game as published_game
+from cprl.institutions import Institution
 from cprl.measuring import phases
 from cprl.measuring.episodes import Episode
 from cprl.measuring.now import BEGINS, EXPLORING, Now
@@ -19,9 +21,9 @@ from cprl.measuring.series import Values, mean_of
 from cprl.runs.curves import running_mean
 from cprl.system.times import CLOCK
 from cprl.viewer.board import Filming
-from cprl.viewer.layout import ANOTHER, STRIPS, Curves
+from cprl.viewer.layout import ANOTHER, SETTLED, STRIPS, Curves
 from cprl.viewer.logger import RerunLogger
-from cprl.viewer.pictures import View, has_died, window_of
+from cprl.viewer.pictures import View, has_died
 
 
 class Played(NamedTuple):
@@ -50,64 +52,45 @@ def played(episodes: Sequence[Episode]) -> Played:
 
 @dataclass(frozen=True, kw_only=True)
 class Header:
-    """The Markdown texts of one run's header."""
+    """The headers of one run: a line of Markdown each."""
 
     episodes: int
     """Of the run."""
     replicas: int
     unit: str
     """"apples" or "return"."""
+    rules: str = ""
+    """The institutions in force, in words."""
 
     def begins(self, status: str) -> str:
-        return self._text([f"Episode 1 of {self.episodes:,}", status])
+        return self._text(f"Episode 1 of {self.episodes:,}", status)
 
     def line(
-        self,
-        *,
-        episode: int,
-        label: str,
-        mean: float,
-        random_play: float | None,
-        died: float | None,
-        over: int,
+        self, *, episode: int, label: str, mean: float, random_play: float | None, died: float | None
     ) -> str:
-        """After an episode.
-
-        Args:
-            died: boards that died early in the episode; None or NaN for a game that reports no stock.
-            over: episodes of the mean.
-        """
-        beside = "" if random_play is None else f" (random play {_number(random_play)})"
-        parts = [f"Episode {episode:,} of {self.episodes:,}", label, f"{self._amount(mean)}{beside}"]
-        if died is not None and not isnan(died):
-            parts.append(self._died(round(died), self.replicas))
-        return self._text(parts, over=over)
+        """After an episode, in which so many boards died early; None or NaN for a game without stock."""
+        beside = "" if random_play is None else f", random play {_number(random_play)}"
+        deaths = "" if died is None or isnan(died) else self._died(round(died), self.replicas)
+        return self._text(
+            f"Episode {episode:,} of {self.episodes:,}", label, f"{self._amount(mean)}{beside}", deaths
+        )
 
     def finished(self, trained: Played, random: Played) -> str:
         """After the evaluation of a run: the trained policy beside the random one, in fresh worlds."""
         beside = f"trained {self._amount(trained.mean)}, random play {_number(random.mean)}"
         died = "" if trained.died is None else self._died(trained.died, trained.episodes)
-        return self._text([f"Finished, {self.episodes:,} episodes", beside, died])
+        return self._text(f"Finished, {self.episodes:,} episodes", beside, died)
 
     def ended(self, mean: float) -> str:
-        return self._text([f"Finished, {self.episodes:,} episodes", f"{self._amount(mean)} at the end"])
+        return self._text(f"Finished, {self.episodes:,} episodes", f"{self._amount(mean)} at the end")
 
     def stopped(self, episode: int, mean: float) -> str:
         """At the end of a run that was stopped after so many episodes; it can be resumed."""
         amount = "" if isnan(mean) else self._amount(mean)
-        return self._text([f"Stopped after {episode:,} of {self.episodes:,} episodes", amount])
+        return self._text(f"Stopped after {episode:,} of {self.episodes:,} episodes", amount)
 
-    def _text(self, parts: Sequence[str], *, over: int | None = None) -> str:
-        """A line in large type, and below it how to read the lines of plots."""
-        one = "one episode's mean over replicas" if self.replicas > 1 else "one episode"
-        singles = f"; thin, each of {self.replicas} replicas" if self.replicas > 1 else ""
-        above = f"{self.unit.capitalize()} above: mean of the last {over} episodes. " if over else ""
-        window = window_of(self.episodes)
-        return (
-            f"# {' · '.join(filter(None, parts))}\n\n"
-            f"{above}Lines: bold, mean of the last {window} episodes; faint, {one}{singles}; "
-            "grey, random play; agents in their colours."
-        )
+    def _text(self, *parts: str) -> str:
+        return f"#### {' · '.join(part for part in (*parts, self.rules) if part)}"
 
     def _amount(self, value: float) -> str:
         return f"{_number(value)} apples" if self.unit == "apples" else f"{self.unit} {_number(value)}"
@@ -116,6 +99,25 @@ class Header:
         if boards == 1:
             return "the board died early" if died else ""
         return f"{died:,} of {boards:,} boards died early"
+
+
+def rules_of(game: Game | None) -> str:
+    """The institutions of a game, each with its first number and all that are not the defaults, e.g.
+    "quota (share 0.25, fine 2), monitoring (prob 0.5)"."""
+    return ", ".join(_rule(institution) for institution in (game.institutions if game else ()))
+
+
+def _rule(institution: Institution) -> str:
+    words = re.sub("(?<!^)(?=[A-Z])", " ", type(institution).__name__).lower()
+    settings: list[str] = []
+    for field in fields(institution):
+        value = getattr(institution, field.name)
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if isinstance(value, Institution):
+            settings.append(f"on {_rule(value)}")
+        elif is_number and (not settings or value != field.default):
+            settings.append(f"{field.name.replace('_', ' ')} {value:g}")
+    return f"{words} ({', '.join(settings)})" if settings else words
 
 
 def _number(value: float) -> str:
@@ -163,7 +165,7 @@ class Course:
 
 MOST_HEADERS: Final = 5000
 """Rows of the header in a recording, about; in longer runs some episodes have none of their own."""
-_NOW, _FOUND, _PUBLISHED = STRIPS
+_NOW, _EXPLORING, _FOUND, _PUBLISHED = STRIPS
 
 
 class Story(View):
@@ -179,9 +181,10 @@ class Story(View):
     ) -> None:
         self._logger, self._filming, self._curves, self._game = logger, filming, logger.curves, game
         self._episodes = episodes
-        unit = "apples" if "collective_return" in self._curves.metrics else "return"
-        self.header = Header(episodes=episodes, replicas=self._curves.replicas, unit=unit)
-        self.now = Now(agents=max(1, len(self._curves.agents)))
+        self.header = Header(
+            episodes=episodes, replicas=self._curves.replicas, unit=self._curves.unit, rules=rules_of(game)
+        )
+        self.now = Now()
         self._course = Course() if set(phases.METRICS) <= set(self._curves.metrics) else None
         self._random: Played | None = None
         self._ended = 0
@@ -200,19 +203,17 @@ class Story(View):
     def on_all(self, episode: int, numbers: Mapping[str, Values], died: float | None) -> None:
         self._ended = episode + 1
         means = {name: mean_of(values) for name, values in numbers.items()}
-        events = [self._label(episode, means)]
-        if self._course is not None:
-            events.append(best := self._course.new_best(means))
-            self._filming.shows_next |= best is not None
-        for event in filter(None, events):
+        events = self._label(episode, means)
+        if self._course is not None and (best := self._course.new_best(means)):
+            events.append(best)
+            self._filming.shows_next = True
+        for event in events:
             self._logger.log_text(f"episode {episode:,}: {event}")
         if episode % -(-self._episodes // MOST_HEADERS) == 0 or self._ended == self._episodes:
             self._show_episode(died)
 
-    def resume(self, now: Mapping[str, Any] | None) -> None:
-        """Shows where a run is that goes on, with the label of then, which depends on the exploration too."""
-        if now is not None:
-            self.now.load_state_dict(now)
+    def resume(self) -> None:
+        """Shows where a run is that goes on after the episodes so far."""
         if self._ended:
             self._logger.log_states(_NOW, {self._ended - 1: self.now.label})
             self._show_episode(None)
@@ -222,36 +223,36 @@ class Story(View):
         """Says in the header where the run is after an episode."""
         text = self.header.line(
             episode=self._ended,
-            label=self.now.label,
+            label=f"{self.now.label}, {EXPLORING}" if self.now.explores else self.now.label,
             mean=self.now.mean,
             random_play=None if self._random is None else self._random.mean,
             died=died,
-            over=min(self.now.window, self._ended),
         )
         self._logger.log_document("header", text)
 
-    def _label(self, episode: int, means: Mapping[str, float]) -> str | None:
-        """Logs the live label where an episode's means change it; returns that in words."""
+    def _label(self, episode: int, means: Mapping[str, float]) -> list[str]:
+        """Logs the live label where an episode's means change it, and whether agents explore; returns the
+        changes in words."""
         value = means.get("social/collective_return")
         if value is None:
             value = sum(means.get(f"{agent}/return", 0.0) for agent in self._curves.agents)
         if not isfinite(value):
-            return None
-        before = self.now.label
+            return []
+        before, explored, events = self.now.label, self.now.explores, []
         label = self.now.add(value, {name: mean for name, mean in means.items() if name.endswith("/epsilon")})
-        if label != before or (episode == 0 and label == BEGINS):
+        if label != before or episode == 0:
             self._logger.log_states(_NOW, {episode: label})
-        if label in (before, BEGINS):
-            return None
-        ended = "exploration ends: no epsilon falls any more; " if before == EXPLORING else ""
-        return f"{ended}now {label}"
+        if self.now.explores != explored:
+            self._logger.log_states(_EXPLORING, {episode: EXPLORING if self.now.explores else SETTLED})
+            if explored:
+                events.append("exploration ends: no epsilon falls any more")
+        return [*events, f"now {label}"] if label != before else events
 
     def finished(self, played_by: Mapping[str, Sequence[Episode]]) -> None:
         """Logs the evaluation of a run that is over, and its phases."""
         trained, random = played(played_by["trained"]), played(played_by["random"])
         self._end(self.header.finished(trained, random))
         self._logger.log_text(f"finished: trained {self._in_words(trained)}")
-        self._logger.log_text(f"random play {self._in_words(random)}")
 
     def close(self) -> None:
         """Logs the end of a run that is over or was stopped, if `finished` did not."""
@@ -275,8 +276,8 @@ class Story(View):
 
     def _in_words(self, numbers: Played) -> str:
         error = f" ± {numbers.error:.2g}" if isfinite(numbers.error) else ""
-        died = "" if numbers.died is None else f", {numbers.died:,} boards died early"
-        return f"{numbers.mean:.1f}{error} {self.header.unit} in {numbers.episodes:,} fresh episodes{died}"
+        died = "" if numbers.died is None else f"; {numbers.died:,} of {numbers.episodes:,} boards died early"
+        return f"{numbers.mean:.1f}{error} {self.header.unit}{died}"
 
 
 def published_phases(game: Game | None) -> dict[int, str]:
@@ -311,9 +312,12 @@ class Events(View):
             self._has_seen_death = True
 
 
+_FEW: Final = 6
+"""Agents whose fines fit one event."""
+
+
 def in_words(episode: Episode, curves: Curves) -> str:
-    """What was decided, broken and paid in an episode, e.g. "3 violations; agent 2 fined 1.5"; "" if nothing
-    was."""
+    """What was decided, broken and paid in an episode, e.g. "3 violations; fined 0, 1.5"; "" for nothing."""
     parts = []
     if episode.in_force is not None:
         decided = zip(curves.in_force, episode.in_force, strict=False)
@@ -321,8 +325,9 @@ def in_words(episode: Episode, curves: Curves) -> str:
     if episode.violations is not None and episode.violations.any():
         broken = int(episode.violations.sum())
         parts.append(f"{broken:,} violation{'s' * (broken > 1)}")
-    fines = [] if episode.fines is None else episode.fines.tolist()
-    parts.append(", ".join(f"agent {agent} fined {fine:.4g}" for agent, fine in enumerate(fines) if fine > 0))
+    if episode.fines is not None and episode.fines.any():
+        each = [f"{fine:.4g}" for fine in episode.fines.tolist()]
+        parts.append(f"fined {', '.join(each) if len(each) <= _FEW else f'{episode.fines.sum():.4g} in all'}")
     return "; ".join(part for part in parts if part)
 
 

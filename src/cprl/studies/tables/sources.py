@@ -12,7 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from cprl.measuring import social
-from cprl.measuring.now import DECLINE, HARVESTING, LEAST_LOSS, LOST, RECOVERY, REGAINED, TRAGEDY
+from cprl.measuring.now import LEAST_LOSS, LOST, REGAINED
 from cprl.measuring.phases import FEWEST_EPISODES, UNNAMED
 from cprl.runs.checkpoints import REPORT
 from cprl.runs.curves import Values, as_curves, phases_of, running_mean
@@ -373,7 +373,9 @@ def marks(made: Mapping[str, Circumstances]) -> dict[str, str]:
     }
 
 
-NO_BETTER: Final = "no better"
+HARVESTING, TRAGEDY, DECLINE = "harvesting", "tragedy", "decline"
+RECOVERY, NO_BETTER = "recovery", "no better"
+"""How short trainings end, see `ending`."""
 BY_PHASES: Final = f"the last phase that cprl.measuring.phases finds, from {FEWEST_EPISODES:,} episodes on"
 BY_RETURNS: Final = "its last 30 episodes against its peak and random play, see cprl.studies.tables.sources"
 
