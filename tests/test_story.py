@@ -16,7 +16,7 @@ from tensordict import TensorDict
 from test_watch import connected, fake
 
 from cprl import CommonsEnv, Game, Rules, maps, presets
-from cprl.commons.colours import GROUND, PALETTE, WALL, agent_colour
+from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, agent_colour
 from cprl.envs import make_env
 from cprl.envs.matrix import MatrixGame, chicken, matching_pennies, prisoners_dilemma
 from cprl.institutions import Quota, Tax, Vote
@@ -48,7 +48,7 @@ def texts(path):
     return dict(zip([text[0] for text in events], at, strict=True))
 
 
-def recorded(run, numbers, *, replicas=1, episodes=9, learning=lambda number: {}, finished=None):
+def recorded(run, numbers, *, replicas=1, episodes=9, learning=lambda number: {}, finished=None, tagged=0):
     """The recording of a run whose agents harvest thirty apples in each episode of these numbers."""
     with ViewerCallback(run, CommonsEnv(GAME, replicas), title="run", episodes=episodes) as viewer:
         if finished:
@@ -56,7 +56,7 @@ def recorded(run, numbers, *, replicas=1, episodes=9, learning=lambda number: {}
         for number in numbers:
             for world in range(replicas):
                 returned = 100.0 * world if replicas > 1 else 30.0
-                viewer.on_episode(fake(number, world, returned=returned, tagged=0), learning(number))
+                viewer.on_episode(fake(number, world, returned=returned, tagged=tagged), learning(number))
         if finished:
             viewer.finished(finished)
             RrdReader(run / "run.rrd").store()  # closed, with its footer
@@ -133,7 +133,7 @@ def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_g
     def play(numbers, *callbacks, worlds=(0, 1)):
         for number in numbers:
             for world in worlds:
-                returned = (600.0 if number < 30 else 200.0) + number * world
+                returned = (200.0 if 30 <= number < 58 else 600.0) + number * world
                 for callback in callbacks:
                     episode = fake(number, world, returned=returned, tagged=1)
                     callback.on_episode(episode, {"agent_0/epsilon": max(0.1, 1 - number / 60)})
@@ -397,6 +397,30 @@ def test_the_wall_shows_each_replica_with_the_frame_of_the_same_step(run):
         assert np.array_equal(first, np.array(images[frame][0], np.uint8).reshape(5, 7))
     assert len(column(path, "wall/labels", "Points2D:labels")[1][0]) == 2
     assert second[1] > left
+
+
+def test_a_bar_below_the_board_is_as_long_as_its_apples_are_many(run):
+    path, _, _ = run
+    frames, bars = column(path, "world/stock", "LineStrips2D:strips", "frame")
+    _, words = column(path, "world/stock", "LineStrips2D:labels")
+    boards = dict(zip(*column(path, "world/board", "SegmentationImage:buffer", "frame"), strict=True))
+    sites = len(SMALL.map.sites)
+    for frame, (whole, filled), (_, label) in zip(frames, bars, words, strict=True):
+        apples = sum(kind == APPLE for kind in boards[frame][0])
+        covered = int(label.split()[0]) - apples
+        assert 0 <= covered <= SMALL.agents, "an agent may stand where an apple is"
+        assert label.endswith(f" of {sites} apples")
+        lengths = [end[0] - start[0] for start, end in (whole, filled)]
+        assert lengths == [5, pytest.approx(5 * (apples + covered) / sites, abs=1e-6)]
+
+
+def test_who_tagged_whom_is_a_matrix_of_numbers_of_the_last_fifty_episodes(tmp_path):
+    path = recorded(tmp_path, range(60), episodes=60, tagged=1)
+    episodes, labels = column(path, "tags/counts", "Points2D:labels", "episode")
+    assert episodes == [9, 19, 29, 39, 49, 59]
+    assert labels[0] == ["0", "0", "10", "0", "0", "1", "0", "1"], "agent 1 by agent 0"
+    assert labels[-1][2] == "50"
+    assert len(column(path, "tags", "Image:buffer")[0]) == 6
 
 
 def test_the_line_of_a_replica_is_its_stock_turn_by_turn(run):
