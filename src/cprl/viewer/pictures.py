@@ -571,18 +571,12 @@ def borders(regions: Regions) -> Any:
 
 def _borders(cells: NDArray[np.bool_]) -> list[list[tuple[float, float]]]:
     """The sides of cells beyond which the region ends, (x, y), a little inside of it."""
-    around = np.pad(cells, 1)
-    height, width = cells.shape
-    sides = {  # where the neighbour is, and from which to which corner of a cell the side goes
-        (-1, 0): ((0, 0), (1, 0)),
-        (1, 0): ((0, 1), (1, 1)),
-        (0, -1): ((0, 0), (0, 1)),
-        (0, 1): ((1, 0), (1, 1)),
-    }
+    around, (height, width) = np.pad(cells, 1), cells.shape
     strips = []
-    for (down, right), corners in sides.items():
+    for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
         beyond = around[1 + down : 1 + down + height, 1 + right : 1 + right + width]
-        left, top = RIM_CELLS - _INSET_CELLS * right, RIM_CELLS - _INSET_CELLS * down
         for row, col in np.argwhere(cells & ~beyond).tolist():
-            strips.append([(col + x + left, row + y + top) for x, y in corners])
+            x, y = (RIM_CELLS + at + 0.5 for at in (col, row))
+            x, y = x + (0.5 - _INSET_CELLS) * right, y + (0.5 - _INSET_CELLS) * down
+            strips.append([(x + side * abs(down), y + side * abs(right)) for side in (-0.5, 0.5)])
     return strips
