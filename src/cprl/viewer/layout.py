@@ -89,7 +89,7 @@ STATES: Final = {
     ANOTHER: (120, 120, 120),
     now.BEGINS: (80, 80, 80),
     now.RISING: GREEN,
-    now.RECOVERING: GREEN,
+    now.RECOVERING: BLUE,
     now.STEADY: GREY,
     now.FALLING: ORANGE,
     now.BELOW: VERMILION,
