@@ -22,6 +22,8 @@ from cprl.commons.colours import APPLE, PALETTE, agent_colour
 from cprl.measuring.metrics import colour
 from cprl.training.outcome import exhibited
 from cprl.viewer.callback import ViewerCallback
+from cprl.viewer.live import served
+from cprl.viewer.logger import RerunLogger
 
 pytestmark = pytest.mark.viewer
 

@@ -62,7 +62,7 @@ def title(name: str) -> str:
 
 def colour(name: str) -> Colour:
     """The colour of a metric's lines."""
-    return COLOURS.get(name, GREY)
+    return COLOURS.get(name, ORANGE if is_own(name) else GREY)
 
 
 def unit(name: str) -> str:
