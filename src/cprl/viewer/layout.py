@@ -611,7 +611,7 @@ def _social(curves: Curves, metric: str, *, share: bool = False, is_explained: b
     """The plot of a metric with the lines of random play and of evaluations, of which its name says which is
     which if it is explained; None if the game does not report it."""
     folders = ("social", RANDOM_PLAY, EVALUATION) if metric in curves.metrics else ()
-    name = title(metric)[0].upper() + title(metric)[1:]
+    name = metric if is_own(metric) else title(metric)[0].upper() + title(metric)[1:]
     name += f"; {_lines(curves)}" if is_explained else ""
     return _plot(name, [f"{folder}/{metric}" for folder in folders], share=share, has_legend=False)
 
