@@ -24,11 +24,12 @@ from cprl.algorithms.base import Algorithm
 from cprl.algorithms.off_policy import CQL, DQN, IQL, PR2, SAC, DistributionalDQN
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
 from cprl.algorithms.teams import IPPO, MADDPG, MAPPO, QMIX, VDN
-from cprl.learners.base import WEIGHTS, LearningAgents
+from cprl.learners.base import LearningAgents
 from cprl.learners.engine import UpdateRule, make_engine
 from cprl.learners.lanes import Lanes
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.learners.trial import trial_batch, trial_rollout
+from cprl.policies.rng import WEIGHTS
 
 REPLAY, ROLLOUTS = DQNSettings(), RolloutSettings()
 ALGORITHMS = {

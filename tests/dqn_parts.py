@@ -4,10 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 
+from cprl import Game, Rules, maps
 from cprl.algorithms import DQN, DQNSettings
 from cprl.learners.base import LearningAgents
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.transitions import LaneTurn
+
+MEADOW = Game(
+    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
+    rules=Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=12, freeze_steps=2),
+)
+"""A small board for two agents."""
 
 
 def make_learner(algorithm, spaces, *, engine="compiled", **who):
@@ -28,6 +35,22 @@ def dqn_learner(spaces, *, settings, kind=ReplayLearner, make_loss=None, engine=
 
 def dqn_loss(network, *, gamma):
     return DQN(settings=DQNSettings(gamma=gamma)).make_loss(network)
+
+
+def played(learner, env, steps, seen=None):
+    """The losses of a learner of all agents after each step in an environment, None without an update; the
+    turns are added to `seen`."""
+    moment, losses = env.reset(), []
+    for _ in range(steps):
+        moment["agents", "action"] = learner.actor.choose(moment["agents", "observation"])
+        turn, moment = env.step_and_maybe_reset(moment)
+        learner.store(turn)
+        losses.append(learner.update())
+        if turn["next", "done"].any():
+            learner.end_episode(turn["next", "done"].flatten())
+        if seen is not None:
+            seen.append(turn)
+    return losses
 
 
 def write(ring, transitions):

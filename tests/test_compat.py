@@ -27,7 +27,7 @@ from torchrl.objectives import DiscreteCQLLoss, DQNLoss, SoftUpdate, ValueEstima
 
 from cprl import CommonsEnv, Game, Rules, keys, maps
 from cprl.commons import compiled
-from cprl.learners.engine import FunctionalLoss, total, weights_of
+from cprl.objectives.functional import FunctionalLoss, total, weights_of
 from cprl.system import compat
 from cprl.system.compat import losses
 from cprl.system.libraries import fitting_versions, relying_on, require
@@ -117,6 +117,9 @@ def test_entries_are_read_and_written_past_the_checks_of_tensordict():
     tensor, other = torch.arange(3), torch.ones(3)
     moment = TensorDict({"a": tensor}, [3])
     assert compat.entry(moment, "a") is tensor
+    views = compat.Views(moment)
+    assert views["a"] is views["a"]
+    assert torch.equal(torch.from_numpy(views["a"]), tensor)
     with pytest.raises(KeyError):
         compat.entry(moment, "b")
     compat.put(moment, "b", other)

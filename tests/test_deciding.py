@@ -21,10 +21,9 @@ from cprl.evaluation.lanes import Turns
 from cprl.evaluation.play import Session, open_session
 from cprl.institutions import Sanctioner, Tax, Vote
 from cprl.institutions.votes import choice_of
-from cprl.learners.decisions import Bandit, BanditDecider
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.assignment import AgentPolicies
-from cprl.policies.decisions import UNTRIED, Decider, choices_of, decision_of
+from cprl.policies.decisions import UNTRIED, Bandit, BanditDecider, Decider, choices_of, decision_of
 from cprl.policies.lanes import random_agents
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.episodes import read_episodes

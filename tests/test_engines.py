@@ -6,8 +6,10 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
 
+import dqn_parts as parts
 import pytest
 import torch
+from dqn_parts import MEADOW as GAME
 from dqn_parts import dqn_learner, dqn_loss, make_learner
 from test_ring import ACTIONS, SHAPE, filled
 from torch import nn
@@ -16,7 +18,7 @@ from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss, HardUpdate, SoftUpdate
 
 import cprl.algorithms as algorithms
-from cprl import CommonsEnv, Game, Rules, maps
+from cprl import CommonsEnv
 from cprl.algorithms import DQN, IQL, MADDPG, QMIX, SAC, VDN, DistributionalDQN, DQNSettings, RolloutSettings
 from cprl.algorithms.base import OffPolicy, OnPolicy, TeamAlgorithm
 from cprl.learners import lanes
@@ -186,10 +188,6 @@ def test_a_failing_compile_falls_back_with_one_warning(monkeypatch):
 
 # Which way of updating is taken.
 
-GAME = Game(
-    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
-    rules=Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=12, freeze_steps=2),
-)
 SETTINGS = DQNSettings(
     buffer_size=150, batch_size=4, learning_rate=1e-3, hidden_cells=(8,), target_every_episodes=2
 )
@@ -305,17 +303,7 @@ def test_a_trial_finds_the_fastest_way_and_warns_of_the_slow_one_alone(make_netw
 
 
 def played(learner, steps=40):
-    """The losses of a learner that acts in a world of `GAME`."""
-    env = CommonsEnv(GAME, learner.replicas, seed=3)
-    moment, losses = env.reset(), []
-    for _ in range(steps):
-        moment["agents", "action"] = learner.actor.choose(moment["agents", "observation"])
-        now, moment = env.step_and_maybe_reset(moment)
-        learner.store(now)
-        losses.append(learner.update())
-        if now["next", "done"].any():
-            learner.end_episode(now["next", "done"].flatten())
-    return losses
+    return parts.played(learner, CommonsEnv(GAME, 2, seed=3), steps)
 
 
 def learner(engine="eager", algorithm=DQN, **settings):

@@ -16,7 +16,6 @@ from cprl import CommonsEnv, Custom, Experiment, Game, Rules, algorithms, load, 
 from cprl.algorithms import DQN, PPO, PR2, DQNSettings, LOLASettings, RolloutSettings
 from cprl.commands.recipe import parse
 from cprl.envs.make_env import spaces_of
-from cprl.learners.base import LaneLosses
 from cprl.learners.engine import ListEngine
 from cprl.learners.lola import LOLANetworks
 from cprl.learners.replay import ReplayLearner
@@ -25,6 +24,7 @@ from cprl.population import Learning
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in
 from cprl.training import Training, train
 from cprl.training.finite import FiniteCheck, NotFinite, NotFiniteError, places, summary
+from cprl.training.learning import LaneLosses
 
 GAME = Game(
     map=maps.parse(".A>.A.A\nA.A...A\n..<.A.A"),

@@ -19,8 +19,7 @@ from cprl import Custom, maps
 from cprl.algorithms import DQN, PPO, RolloutSettings
 from cprl.commands import main as cli
 from cprl.commons.spaces import Spaces
-from cprl.learners.base import SAMPLING, lane_seeds
-from cprl.policies.rng import DRAWN_AHEAD, LaneRng
+from cprl.policies.rng import DRAWN_AHEAD, SAMPLING, LaneRng, lane_seeds
 from cprl.population import Frozen, Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, is_ending, read_checkpoint
 from cprl.runs.episodes import read_episodes, read_table

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from dqn_parts import make_learner
+from dqn_parts import make_learner, played
 from matrix_game import MatrixGame as SmallGame
 from test_population import GAME, Returns, population, trained, weights
 
@@ -42,17 +42,8 @@ def learner_of(estimator, replicas=2, algorithm=None, **changes):
 
 
 def play(learner, steps, seen=None):
-    """Steps of a dilemma; the losses of updates, and whose weights acted."""
-    env = SmallGame(learner.replicas)
-    moment, losses = env.reset(), []
-    for _ in range(steps):
-        moment["agents", "action"] = learner.actor.choose(moment["agents", "observation"])
-        now, moment = env.step_and_maybe_reset(moment)
-        learner.store(now)
-        if seen is not None:
-            seen.append(now)
-        losses.append(learner.update())
-    return losses
+    """The losses of updates in a dilemma."""
+    return played(learner, SmallGame(learner.replicas), steps, seen)
 
 
 def actor_weights(stacks):

@@ -14,7 +14,6 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import ProbabilisticActor
 
-from cprl.learners.engine import FunctionalLoss, weights_of
 from cprl.objectives import (
     LOLADiCELoss,
     LOLALoss,
@@ -25,6 +24,7 @@ from cprl.objectives import (
     looked_ahead,
     magic_box,
 )
+from cprl.objectives.functional import FunctionalLoss, weights_of
 
 
 def iterated_value(probabilities, payoffs, *, gamma):

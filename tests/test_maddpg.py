@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
-from dqn_parts import make_learner
+from dqn_parts import make_learner, played
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from test_population import GAME, REPLAY, population, trained
@@ -368,12 +368,7 @@ def expected_returns(payoffs, *, turns):
     env = make_env(game, worlds=REPLICAS, seed=1)
     team = Team(MADDPG(settings=SETTINGS), tuple(range(game.agents)), reward="individual")
     (learner,) = Population(env, [team], seed=1, engine="eager").learners.values()
-    moment = env.reset()
-    for _ in range(turns):
-        moment["agents", "action"] = learner.actor.choose(moment["agents", "observation"])
-        now, moment = env.step_and_maybe_reset(moment)
-        learner.store(now)
-        learner.update()
+    played(learner, env, turns)
     probs = learner.evaluation_actor(1).preferences(env.reset()["agents", "observation"]).numpy()
     found = []
     for of_agents in probs:

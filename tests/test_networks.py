@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from dqn_parts import learner_of_parts, make_learner
+from dqn_parts import MEADOW as GAME
+from dqn_parts import learner_of_parts, make_learner, played
 from tensordict import TensorDict
 from torch import nn
 
-from cprl import CommonsEnv, Game, Rules, keys, maps, presets
+from cprl import CommonsEnv, keys, presets
 from cprl.algorithms import (
     A2C,
     CQL,
@@ -30,19 +31,16 @@ from cprl.algorithms import (
 )
 from cprl.commons.spaces import Spaces
 from cprl.learners import lanes
-from cprl.learners.engine import FunctionalEngine, ListEngine, own_targets
+from cprl.learners.engine import FunctionalEngine, ListEngine
 from cprl.learners.replay import ReplayLearner
 from cprl.networks import MLP, Conv, ConvNetwork, MLPNetwork
 from cprl.networks.specification import new_network
 from cprl.networks.stacked import stack_lanes
+from cprl.objectives.functional import own_targets
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
 from cprl.values import Custom
 
-GAME = Game(
-    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
-    rules=Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=12, freeze_steps=2),
-)
 SPACES = GAME.spaces
 VECTORS = Spaces(
     agents=2, observation_shape=(6,), observation_dtype="float32", observation_scale=1.0, actions=3
@@ -138,17 +136,6 @@ def learner_of(kind, network, **how):
     return algorithm, make_learner(algorithm, SPACES, **how)
 
 
-def played(learner, steps=24):
-    env = CommonsEnv(GAME, learner.replicas, seed=3)
-    moment, losses = env.reset(), []
-    for _ in range(steps):
-        moment["agents", "action"] = learner.actor.choose(moment["agents", "observation"])
-        now, moment = env.step_and_maybe_reset(moment)
-        learner.store(now)
-        losses.append(learner.update())
-    return [loss for loss in losses if loss is not None]
-
-
 @pytest.mark.integration
 @pytest.mark.parametrize("network", [CONV, OWN], ids=["conv", "own"])
 @pytest.mark.parametrize("kind", [*OF_REPLAY, *OF_ROLLOUTS])
@@ -156,7 +143,7 @@ def test_every_algorithm_learns_with_every_network(kind, network):
     _, learner = learner_of(kind, network)
     before = {lane: own.state_dict() for lane, own in learner.networks().items()}
     assert isinstance(learner.engine, FunctionalEngine), "all lanes at once"
-    losses = played(learner)
+    losses = [loss for loss in played(learner, CommonsEnv(GAME, 2, seed=3), 24) if loss is not None]
     assert torch.isfinite(torch.stack(losses)).all()
     for lane, own in learner.networks().items():
         for name, value in own.state_dict().items():
@@ -188,7 +175,7 @@ def test_lanes_learn_with_any_network_what_each_would_alone(kind, network, monke
             monkeypatch.setattr(kind, "batching", "list")
         _, learner = learner_of(kind, network)
         assert isinstance(learner.engine, engine)
-        played(learner, 30)
+        played(learner, CommonsEnv(GAME, 2, seed=3), 30)
         ends.append([own.state_dict() for own in learner.networks().values()])
     for fast, plain in zip(*ends, strict=True):
         for name, value in plain.items():
@@ -218,7 +205,7 @@ def test_a_network_whose_buffers_do_not_stack_is_vmapped():
         replicas=1,
     )
     assert learner.engine._vmapped
-    played(learner)
+    played(learner, CommonsEnv(GAME, 1, seed=3), 24)
 
 
 @pytest.mark.parametrize("network", [MLP(), CONV, OWN])

@@ -158,7 +158,7 @@ def test_a_lane_stores_its_own_action_first_then_those_of_the_others_by_their_in
     moment = env.reset()
     moment[keys.ACTION] = torch.tensor([[0, 1, 2], [3, 4, 5]])
     turn = env.step(moment)
-    assert joint_actions((0, 2), turn).tolist() == [[0, 1, 2], [2, 0, 1], [3, 4, 5], [5, 3, 4]]
+    assert joint_actions((0, 2), keys.Turn.of(turn)).tolist() == [[0, 1, 2], [2, 0, 1], [3, 4, 5], [5, 3, 4]]
     learner.store(turn)
     assert learner.buffer.fields["action"][0].tolist() == [[0, 1, 2], [2, 0, 1], [3, 4, 5], [5, 3, 4]]
 

@@ -120,7 +120,7 @@ def test_the_transitions_of_an_agent_are_its_own_under_torchrls_default_keys():
 def test_transitions_of_lanes_are_those_of_the_agents():
     batch = CommonsEnv(GAME, 3).rollout(1)[:, 0]
     for agents in ((0, 1), (1,), (1, 0)):
-        lanes = lane_turn(agents, batch)
+        lanes = lane_turn(agents, keys.Turn.of(batch), batch["next", "agents", "reward"][..., 0].numpy())
         for place, agent in enumerate(agents):
             alone = transitions_of(agent, batch)
             own = lanes._make(entry if entry is None else entry[place :: len(agents)] for entry in lanes)

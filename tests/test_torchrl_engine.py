@@ -189,7 +189,7 @@ def test_every_part_is_torchrls_or_torchs_own(name):
     learner = make_learner(algorithm, SPACES, engine="torchrl", **HOW)
     on_policy = name in ON_POLICY
     assert type(learner) is (TorchRLRolloutLearner if on_policy else TorchRLReplayLearner)
-    buffers = learner.buffers if on_policy else learner.buffer.each
+    buffers = learner.buffer.each
     assert len(buffers) == len(learner.engine.losses) == 4
     for buffer in buffers:
         assert type(buffer) is TensorDictReplayBuffer

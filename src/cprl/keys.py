@@ -4,8 +4,11 @@ Axes have the same letters everywhere: B worlds, N agents, H x W the board, K si
 R replicas, C channels, X rows and Y columns of an agent's window (its own row included, farthest row first).
 """
 
-from typing import Final
+from typing import Final, NamedTuple
 
+from tensordict import TensorDictBase
+
+from cprl.system.compat import Views
 from cprl.system.compat import entry as entry
 from cprl.system.compat import put as put
 
@@ -93,3 +96,26 @@ TERMINATED: Final = "terminated"
 
 TRUNCATED: Final = "truncated"
 """bool [B, 1]: the episode reached its time limit."""
+
+
+class Turn(NamedTuple):
+    """One turn of all worlds, [B], or T of them, [B, T], read once for all who look at it: learners, the
+    tracker of episodes, the search for NaN. All four are views of its entries, by the last part of the key.
+    """
+
+    batch: TensorDictBase
+    """What a collector yielded."""
+    world: Views
+    """Of worlds, before the turn."""
+    agents: Views
+    """Of agents, before the turn, and what they did."""
+    next_world: Views
+    next_agents: Views
+
+    @classmethod
+    def of(cls, batch: "TensorDictBase | Turn") -> "Turn":
+        if isinstance(batch, Turn):
+            return batch
+        following = entry(batch, "next")
+        agents, next_agents = entry(batch, AGENTS), entry(following, AGENTS)
+        return cls(batch, Views(batch), Views(agents), Views(following), Views(next_agents))

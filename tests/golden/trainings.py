@@ -42,8 +42,8 @@ def experiments() -> dict[str, dict[str, object]]:
         Tabular,
         TabularSettings,
     )
+    from cprl.envs.preferences import Exchange, InequityAversion, SocialValueOrientation
     from cprl.institutions import Monitoring, Quota, Sanctioner, Tax, Vote
-    from cprl.learners.preferences import Exchange, InequityAversion, SocialValueOrientation
     from cprl.networks import GRU, LSTM, Conv
     from cprl.population import Learning, Scripted, Team
 

@@ -14,10 +14,10 @@ from torchrl.modules import ProbabilisticActor, QValueActor
 from torchrl.objectives import LossModule, ValueEstimators
 
 from cprl.commons.spaces import Spaces
+from cprl.envs.preferences import Preference, named
 from cprl.learners.base import Learner, LearningAgents
 from cprl.learners.engine import Batching
 from cprl.learners.lanes import Method
-from cprl.learners.preferences import Preference, named
 from cprl.learners.reference import TorchRLReplayLearner, TorchRLRolloutLearner
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.rollouts import RolloutLearner

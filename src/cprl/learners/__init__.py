@@ -2,7 +2,6 @@
 
 Modules, in the order in which one reads them:
     settings     the hyper-parameters, with their units and sources
-    preferences  what agents want: the reward that each learns from
     base         who learns, and what the training loop asks of a learner
     transitions  the turns of some agents, as replay and rollouts store them
     ring         the replay buffer of all lanes
@@ -13,6 +12,5 @@ Modules, in the order in which one reads them:
     rollouts     RolloutLearner: learns from rollouts of the present policy
     reference    both by stock TorchRL parts, one agent after the other
     lola         LOLALearner: learns with the other members' learning in view
-    decisions    Bandit: how agents learn what they decide at an episode's begin
     tabular      TabularLearner: Q-learning in tables
 """

@@ -1,48 +1,24 @@
 """Who learns, and the interface between the training loop and a learner."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
-from math import nan
-from typing import Annotated, Any, Final, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from cprl import keys
 from cprl.commons.spaces import Spaces
-from cprl.learners.preferences import Preference, WantedRewards, check_preference
-from cprl.policies.assignment import AgentIndices, agent_indices
-from cprl.policies.decisions import Decider
+from cprl.envs.preferences import Preference, WantedRewards, check_preference
+from cprl.keys import Turn
+from cprl.policies.rng import lane_names, lane_seeds
 from cprl.system.memory import check_memory
-from cprl.values import Natural, Positive, Range, Value, checked
-
-WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION, EXHIBITION, NOISE = range(7)
-"""The purposes of a lane's random numbers; each has its own seed."""
+from cprl.values import Natural, Range, Value
 
 StartFrom: TypeAlias = Mapping[str, Mapping[str, Tensor]]
 """The state dict of the acting network with which each lane starts, by the lane's name."""
-
-_LEAST_BYTES: Final = 4096
-"""Of a lane, whatever it learns by: its name, seeds and random number generators."""
-
-
-def lane_seeds(
-    seed: int, *, replicas: Sequence[int], agents: Sequence[int], purpose: int
-) -> list[tuple[int, int, int, int]]:
-    """The seed of each lane, replica by replica: (seed of the run, replica, agent, purpose)."""
-    return [(seed, replica, agent, purpose) for replica in replicas for agent in agents]
-
-
-def lane_name(replica: int, agent: int) -> str:
-    return f"replica_{replica}/agent_{agent}"
-
-
-def lane_names(*, replicas: Sequence[int], agents: Sequence[int]) -> list[str]:
-    """The name of each lane, replica by replica: "replica_0/agent_0" and so on."""
-    return [lane_name(replica, agent) for replica in replicas for agent in agents]
 
 
 @dataclass(frozen=True)
@@ -64,7 +40,7 @@ class LearningAgents(Value, stored=False):
     first_replica: int = 0
     """The index of the first replica, so that replica r can be trained alone."""
     reward_kind: Preference = "individual"
-    """What they want, see `cprl.learners.preferences`."""
+    """What they want, see `cprl.envs.preferences`."""
     start_from: StartFrom = field(default_factory=dict)
     """The weights with which acting networks, and their targets, start, by the lane's name; the others, such
     as critics, are new."""
@@ -81,10 +57,8 @@ class LearningAgents(Value, stored=False):
             raise ValueError(
                 f"agents is {agents}; allowed: one or more of the agents 0 to {everyone - 1}, each once"
             )
-        lanes = len(agents) * self.replicas
-        check_memory(
-            f"{self.replicas} replicas of {len(agents)} agents", lanes * _LEAST_BYTES, "fewer replicas"
-        )
+        least_bytes = 4096 * len(agents) * self.replicas  # of names, seeds and generators
+        check_memory(f"{self.replicas} replicas of {len(agents)} agents", least_bytes, "fewer replicas")
 
     @property
     def names(self) -> list[str]:
@@ -116,13 +90,18 @@ class Learner(ABC):
     def __repr__(self) -> str:
         return f"{type(self).__name__}(agents={self.agents}, replicas={self.replicas})"
 
+    def _wanted(self, turn: Turn) -> Any:
+        """The rewards that all agents want in a turn, [R, N]; called once for each turn, in order."""
+        rewards, done = turn.next_agents["reward"], turn.next_world[keys.DONE]
+        return self.wants.add(rewards[..., 0], done[..., 0])
+
     def begin(self) -> None:  # noqa: B027 - most have nothing to do
         """Called before the first turn of a training: whatever is stored of an earlier one, the next turn
         begins new episodes."""
 
     @abstractmethod
-    def store(self, batch: TensorDictBase) -> None:
-        """Stores one step of every replica; the batch size is [R]."""
+    def store(self, batch: TensorDictBase | Turn) -> None:
+        """Stores one turn of every replica, of batch size [R], as collectors yield it."""
 
     @abstractmethod
     def update(self) -> Tensor | None:
@@ -132,7 +111,7 @@ class Learner(ABC):
         """Called after an episode has ended in the marked replicas, bool [R]."""
 
     @abstractmethod
-    def values(self, batch: TensorDictBase) -> Tensor:
+    def values(self, batch: TensorDictBase | Turn) -> Tensor:
         """Each agent's estimate of the value of the state after the turn, [R, S]; for display only."""
 
     @abstractmethod
@@ -156,125 +135,3 @@ class Learner(ABC):
     @abstractmethod
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continues from a state that `state_dict` returned."""
-
-
-class LaneLosses:
-    """Mean losses of S agents since the end of each replica's last episode."""
-
-    def __init__(self, replicas: int, agents: tuple[int, ...]) -> None:
-        self.agents = agents
-        self.total = np.zeros((replicas, len(agents)), np.float64)
-        self.updates = np.zeros(replicas, np.int64)
-
-    def add(self, loss: Tensor | None) -> None:
-        """Adds the losses of an update, [R, S]; None if there was no update."""
-        if loss is not None:
-            self.total += loss.numpy(force=True)
-            self.updates += 1
-
-    def take(self, replica: int) -> dict[int, float]:
-        """Returns the mean loss of each agent of a replica, NaN without an update, and resets the replica."""
-        means = self.total[replica] / (self.updates[replica] or nan)
-        self.total[replica], self.updates[replica] = 0.0, 0
-        return dict(zip(self.agents, means.tolist(), strict=True))
-
-    def state_dict(self) -> dict[str, Tensor]:
-        return {"total": torch.tensor(self.total), "updates": torch.tensor(self.updates)}
-
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        self.total[:], self.updates[:] = state["total"].numpy(), state["updates"].numpy()
-
-
-class WantedReturns:
-    """The sums of the rewards that agents want, over the running episode of each replica.
-
-    Args:
-        agents: the number of agents N; those that do not learn have NaN.
-    """
-
-    def __init__(self, replicas: int, agents: int, learners: Mapping[tuple[int, ...], Learner]) -> None:
-        self._wants: list[tuple[Any, WantedRewards]] = []
-        self._first = np.full(agents, nan)
-        for indices, learner in learners.items():
-            learner.wants.clear()
-            self._wants.append((slice(None) if len(indices) == agents else list(indices), learner.wants))
-            self._first[list(indices)] = 0
-        self.returns = np.tile(self._first, (replicas, 1))
-
-    def add(self) -> None:
-        """Adds the turn that the learners have just stored."""
-        for columns, wants in self._wants:
-            turn: Any = wants.now
-            turn = turn.numpy(force=True) if isinstance(turn, Tensor) else turn
-            self.returns[:, columns] += turn[:, columns]
-
-    def take(self, replica: int) -> NDArray[np.float64]:
-        """The wanted return of each agent of a replica, [N], whose next episode begins at 0."""
-        taken: NDArray[np.float64] = self.returns[replica].copy()
-        self.returns[replica] = self._first
-        return taken
-
-    def state_dict(self) -> dict[str, Tensor]:
-        return {"returns": torch.tensor(self.returns)}
-
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        self.returns[:] = state["returns"].numpy()
-
-
-def learned_in(
-    replica: int,
-    learners: Mapping[tuple[int, ...], Learner],
-    losses: Mapping[tuple[int, ...], LaneLosses],
-    values: Mapping[tuple[int, ...], Tensor],
-) -> dict[str, float]:
-    """What was learned in the episode of a replica that has just ended."""
-    learning = {}
-    for agents, learner in learners.items():
-        for place, (agent, loss) in enumerate(losses[agents].take(replica).items()):
-            learning[f"agent_{agent}/loss"] = loss
-            learning[f"agent_{agent}/epsilon"] = learner.actor.epsilon
-            learning[f"agent_{agent}/q"] = float(values[agents][replica, place])
-    return learning
-
-
-def check_agents(
-    agents: int,
-    replicas: int,
-    learners: Mapping[tuple[int, ...], Learner],
-    others: Mapping[AgentIndices, nn.Module],
-) -> None:
-    """Raises a ValueError unless each of N agents has one learner or actor, with R replicas."""
-    taken = sorted(agent for indices in [*learners, *others] for agent in agent_indices(indices))
-    if taken != (wanted := list(range(agents))):
-        raise ValueError(
-            f"learners and others control the agents {taken}; allowed: each of {wanted} exactly once"
-        )
-    for indices, learner in learners.items():
-        if learner.agents != agent_indices(indices):
-            raise ValueError(f"a learner made for the agents {learner.agents} is given for {indices}")
-        if learner.replicas != replicas:
-            raise ValueError(
-                f"the environment has {replicas} worlds; the learner of {indices} has {learner.replicas} "
-                "replicas; allowed: a world for each replica"
-            )
-
-
-def check_decisions(decisions: Decider | None, options: int) -> None:
-    """Raises a ValueError unless there is a Decider where agents have so many options, and none for 0."""
-    if options and decisions is None:
-        raise ValueError(
-            "decisions is None; allowed for a game whose agents vote or elect: a Decider, e.g. "
-            "Population(...).decisions"
-        )
-    if decisions is not None and not options:
-        raise ValueError("decisions is a Decider; allowed for a game whose agents decide nothing: None")
-
-
-def check_numbers(episodes: int, update_every: int, learners: Mapping[tuple[int, ...], Learner]) -> None:
-    """Raises a ValueError for numbers below 1, and for rollouts that `update_every` does not divide."""
-    for name, number in (("episodes", episodes), ("update_every", update_every)):
-        checked(name, number, Positive)
-    for learner in learners.values():
-        steps = getattr(learner, "rollout_steps", update_every)
-        if steps % update_every:
-            raise ValueError(f"update_every is {update_every}; allowed: a divisor of rollout_steps {steps}")

@@ -6,15 +6,13 @@ lane after the other: what the step is tested against, and the fallback for loss
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
 from math import prod
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import torch
-from tensordict import TensorDict, TensorDictBase, is_tensor_collection
-from tensordict.nn import TensorDictParams
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 from torchrl.objectives.utils import TargetNetUpdater
@@ -24,7 +22,17 @@ from cprl.learners.settings import Optimizer
 from cprl.networks.agent import parts_of
 from cprl.networks.finite import all_finite, finite_lanes
 from cprl.networks.stacked import lane_state, stack_lanes
-from cprl.system.compat import forget_cached_weights, promise_targets, refuse_updaters, updated_weights
+from cprl.objectives.functional import (
+    FunctionalLoss,
+    Weights,
+    groups_of,
+    named_weights,
+    own_targets,
+    single_weights,
+    targets_of,
+    total,
+    weights_of,
+)
 from cprl.system.compiling import Compiled
 
 Batching: TypeAlias = Literal["lane_axis", "lane_axis_flat", "vmapped", "list"]
@@ -41,8 +49,6 @@ WAYS: Final[tuple[Batching, ...]] = ("lane_axis", "lane_axis_flat", "vmapped")
 
 MakeLoss = Callable[[nn.Module], LossModule]
 """Makes one agent's loss from its network."""
-
-Weights = dict[str, Tensor]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,106 +78,6 @@ class UpdateRule:
 
 COMPILED_STEPS: Final = 16
 """The longest sequences whose update is compiled: torch unrolls their turns, and takes seconds for each."""
-
-_NO_UPDATER: Final = (
-    "a SoftUpdate or HardUpdate was built on the {}; the engine has weights of its own, which it would not "
-    "change: leave it out, and set tau or target_every_episodes"
-)
-
-
-class FunctionalLoss:
-    """A TorchRL loss module as a function of its weights that returns one loss per transition.
-
-    TorchRL stores the weights of a loss in `TensorDictParams` of the module. During a call plain TensorDicts
-    replace them, which both `torch.func` and `torch.compile` accept.
-    """
-
-    def __init__(self, loss: LossModule) -> None:
-        loss.reduction = "none"
-        if hasattr(loss, "scalar_output_mode"):
-            loss.scalar_output_mode = "exclude"  # drops scalars that are not losses of transitions
-        # Created lazily at first access, which a compiler would see as a change; a loss may have neither.
-        getattr(loss, "in_keys", None)
-        with suppress(NotImplementedError):
-            getattr(loss, "value_estimator", None)
-        self._groups = {name: group.batch_size for name, group in groups_of(loss).items()}
-        self._singles = tuple(_single_weights(loss))
-        for name in (*self._groups, *self._singles):
-            delattr(loss, name)
-            setattr(loss, name, None)
-        refuse_updaters(loss, _NO_UPDATER.format(type(loss).__name__))
-        self.module = loss
-
-    def __call__(self, params: Weights, targets: Weights, batch: TensorDict) -> Tensor:
-        """The loss of each transition, [L, b], or [b] under vmap; a single number if the loss reduces it."""
-        flat = {**params, **targets}
-        for name, size in self._groups.items():
-            prefix = f"{name}:"
-            group = {key.removeprefix(prefix): flat[key] for key in flat if key.startswith(prefix)}
-            setattr(self.module, name, TensorDict(group, size).unflatten_keys("."))
-        for name in self._singles:
-            setattr(self.module, name, params[name])
-        if not torch.compiler.is_compiling():
-            forget_cached_weights(self.module)
-        losses = total(self.module(batch), self.module)
-        for name in (*self._groups, *self._singles):
-            setattr(self.module, name, None)
-        return losses
-
-
-def own_targets(loss: LossModule) -> None:
-    """Marks the targets of a loss as updated, by the engine, so that TorchRL does not warn."""
-    if any(f"target_{name}_params" in groups_of(loss) for name in updated_weights(loss)):
-        raise ValueError(_NO_UPDATER.format(type(loss).__name__))
-    promise_targets(loss)
-
-
-def total(out: Any, loss: LossModule) -> Tensor:
-    """The sum of all entries that TorchRL calls a loss."""
-    entries = dict(out.items()) if is_tensor_collection(out) else {}
-    losses = [value for name, value in entries.items() if name.startswith("loss")]
-    if not losses:
-        kind = type(loss)
-        has = f" with the entries {sorted(entries)}" if entries else ""
-        raise ValueError(
-            f"the loss {kind.__module__}:{kind.__qualname__} returns a {type(out).__name__}{has}; allowed: "
-            'a TensorDict with entries whose names begin with "loss"'
-        )
-    summed: Tensor = sum(losses[1:], losses[0])
-    return summed
-
-
-def groups_of(loss: LossModule) -> dict[str, TensorDictParams]:
-    """The groups of weights of a loss by name, including targets."""
-    named = loss.named_modules(remove_duplicate=False)
-    return {name: group for name, group in named if isinstance(group, TensorDictParams) and "." not in name}
-
-
-def _single_weights(loss: LossModule) -> dict[str, nn.Parameter]:
-    """The weights of a loss that are in no group, by name; `LossModule.named_parameters` omits some."""
-    return dict(nn.Module.named_parameters(loss, recurse=False, remove_duplicate=False))
-
-
-def targets_of(loss: LossModule) -> dict[str, TensorDictParams]:
-    """The groups of weights that have targets, by name."""
-    groups = groups_of(loss)
-    return {name: group for name, group in groups.items() if f"target_{name}" in groups}
-
-
-def _named(loss: LossModule) -> Weights:
-    """All weights of a loss, not copied, by "group:name"; weights in no group by their name."""
-    grouped = {
-        f"{group}:{key}": value
-        for group, weights in groups_of(loss).items()
-        for key, value in weights.flatten_keys(".").items()
-    }
-    return {**grouped, **_single_weights(loss)}
-
-
-def weights_of(loss: LossModule) -> Weights:
-    """Copies of all weights of a loss, including targets, by name."""
-    return {name: value.detach().clone() for name, value in _named(loss).items()}
-
 
 BETA_1, BETA_2 = 0.9, 0.999
 """Adam's decay rates (Kingma and Ba 2015, torch's defaults)."""
@@ -213,7 +119,6 @@ def change_weights(
 
     Args:
         weights: [L, ...] each.
-        gradients: of each weight; clipped by their norm if the rule says so.
         means: running means of gradients; empty if the optimiser has none.
         squares: running means of squared gradients, likewise.
         step_size: Adam's learning rate with bias correction.
@@ -277,8 +182,7 @@ class Engine(ABC):
         ones also their states.
 
         Args:
-            observation: k observations of each lane.
-            recurrent: what recurrent networks read besides, likewise: see `cprl.networks.recurrent`.
+            recurrent: what recurrent networks read besides, see `cprl.networks.recurrent`.
             part: which of an agent's networks, see `cprl.networks.agent.parts_of`; the first one acts.
         """
         if self.sharing == 1:
@@ -315,11 +219,10 @@ class Engine(ABC):
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """The full state except the buffer; the tensors themselves, not copies."""
+        """The full state; the tensors themselves, not copies."""
 
     @abstractmethod
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues from a state that `state_dict` returned."""
+    def load_state_dict(self, state: Mapping[str, Any]) -> None: ...
 
 
 class ListEngine(Engine):
@@ -374,9 +277,8 @@ class ListEngine(Engine):
         return torch.stack(given)
 
     def copy_to_targets(self, which: Tensor) -> None:
-        for network in which.nonzero().flatten().tolist():
-            updater = self.updaters[network]
-            if updater is not None:
+        for marked, updater in zip(which.tolist(), self.updaters, strict=True):
+            if marked and updater is not None:
                 updater.step()
 
     def network_state(self, network: int) -> Weights:
@@ -386,7 +288,12 @@ class ListEngine(Engine):
         return weights_of(self.losses[network])
 
     def finite(self) -> Tensor:
-        return torch.tensor(list(map(_is_finite, self.losses, self.optimizers)))
+        sound = []
+        for loss, optimizer in zip(self.losses, self.optimizers, strict=True):
+            moments = [value for state in optimizer.state.values() for value in state.values()]
+            values = (*loss.state_dict().values(), *moments)
+            sound.append(all_finite(value for value in values if isinstance(value, Tensor)))
+        return torch.tensor(sound)
 
     def state_dict(self) -> dict[str, Any]:
         return {
@@ -408,22 +315,15 @@ def _target_updater(loss: LossModule, tau: float | None) -> TargetNetUpdater | N
     return HardUpdate(loss, value_network_update_interval=0) if tau is None else SoftUpdate(loss, tau=tau)
 
 
-def _is_finite(loss: LossModule, optimizer: torch.optim.Optimizer) -> bool:
-    moments = [value for state in optimizer.state.values() for value in state.values()]
-    values: list[Any] = [*loss.state_dict().values(), *moments]
-    return all_finite(value for value in values if isinstance(value, Tensor))
-
-
 class _FromRing(NamedTuple):
-    """A batch that the step itself gathers from the fields of a ring."""
+    """A batch that the step itself gathers from the fields of a ring, then an index and perhaps noise."""
 
     rows: int
     horizon: Horizon | None
 
     def batch(self, columns: Sequence[Tensor]) -> TensorDict:
         index, *noise = columns[len(FIELDS) :]
-        fields = dict(zip(FIELDS, columns, strict=False))
-        return gather(fields, index, self.rows, self.horizon, noise[0] if noise else None)
+        return gather(dict(zip(FIELDS, columns, strict=False)), index, self.rows, self.horizon, *noise)
 
 
 class _Given(NamedTuple):
@@ -449,8 +349,6 @@ class FunctionalEngine(Engine):
         networks: of one architecture; their weights are copied.
         target_networks: networks with the initial target weights; by default targets start as copies.
         batching: see `Batching`; not "list".
-        compile: whether torch compiles the step. If compilation fails, the engine warns once and runs the
-            step uncompiled.
     """
 
     def __init__(
@@ -468,19 +366,15 @@ class FunctionalEngine(Engine):
         self.batching: Final = batching
         self._vmapped = batching == "vmapped"
         network, loss, weights = self._stacked(networks, make_loss)
-        named = _named(loss)
+        named = named_weights(loss)
         self.params = {name: weights[name] for name, value in named.items() if value.requires_grad}
         self.targets = {name: value for name, value in weights.items() if name not in self.params}
         if target_networks is not None:
             _, _, others = self._stacked(target_networks, make_loss)
             self.targets |= {name: others[_source(name)] for name in self.targets if _source(name) in others}
         self._mean, self._square = (
-            {
-                name: torch.zeros_like(value)
-                for name, value in self.params.items()
-                if rule.optimizer in optimizers
-            }
-            for optimizers in (WITH_MEAN, WITH_SQUARE)
+            {name: torch.zeros_like(value) for name, value in kept.items()}
+            for kept in (self.params if rule.optimizer in kinds else {} for kinds in (WITH_MEAN, WITH_SQUARE))
         )
         places = {value.data_ptr(): name for name, value in named.items()}
         self._in_loss = {
@@ -496,8 +390,7 @@ class FunctionalEngine(Engine):
                     parameter.requires_grad_(False).data = self._in_loss[name]
         self.loss = FunctionalLoss(loss)
         self._names, self._target_names = tuple(self.params), tuple(self.targets)
-        groups = self.params, self.targets, self._mean, self._square
-        self._tensors = [list(group.values()) for group in groups]
+        self._tensors = [list(group.values()) for group in self._groups().values()]
         self.steps = 0
         kind = self._tensors[0][0]
         self._scalars = kind.new_zeros(()), kind.new_zeros(())
@@ -514,7 +407,7 @@ class FunctionalEngine(Engine):
         if self._vmapped:
             each = [weights_of(make_loss(one)) for one in networks]
             return network, loss, {name: torch.stack([one[name] for one in each]) for name in each[0]}
-        if shared := _single_weights(loss):
+        if shared := single_weights(loss):
             raise ValueError(f"all agents would share the weights {', '.join(shared)} of the loss")
         if any(group.batch_size for group in groups_of(loss).values()):
             raise ValueError("the loss stacks networks along an axis before the lane axis")
@@ -573,7 +466,6 @@ class FunctionalEngine(Engine):
     def _gradients(
         self, params: list[Tensor], targets: list[Tensor], batch: TensorDict
     ) -> tuple[list[Tensor], Tensor]:
-        """The gradients of the trained weights, and each network's loss."""
         gradient = torch.func.grad(self._losses, has_aux=True)
         if self._vmapped:
             gradient = torch.vmap(gradient)
@@ -583,16 +475,13 @@ class FunctionalEngine(Engine):
     def _losses(
         self, params: list[Tensor], targets: list[Tensor], batch: TensorDict
     ) -> tuple[Tensor, Tensor]:
-        """The sum of the losses of all networks, to differentiate, and each one's loss; under vmap there is
-        one."""
-        by_name = (
-            dict(zip(self._names, params, strict=True)),
-            dict(zip(self._target_names, targets, strict=True)),
-        )
-        flat = self.batching == "lane_axis_flat"
-        each = self.loss(*by_name, batch.reshape(-1) if flat else batch)
-        if flat:
-            each = each.reshape(batch.batch_size)
+        """The sum of the losses of all networks, to differentiate, and each one's loss."""
+        named = zip((self._names, self._target_names), (params, targets), strict=True)
+        weights = [dict(zip(names, values, strict=True)) for names, values in named]
+        if self.batching == "lane_axis_flat":
+            each = self.loss(*weights, batch.reshape(-1)).reshape(batch.batch_size)
+        else:
+            each = self.loss(*weights, batch)
         losses = (each.mean() if self._vmapped else each.flatten(1).mean(-1)) * self._rule.loss_share
         return losses.sum(), losses
 
@@ -634,14 +523,14 @@ class FunctionalEngine(Engine):
         lanes, every = len(self._tensors[0][0]), [value for group in self._tensors for value in group]
         return finite_lanes([value for value in every if value.ndim and len(value) == lanes])
 
+    def _groups(self) -> dict[str, Weights]:
+        return {"own": self.params, "targets": self.targets, "mean": self._mean, "square": self._square}
+
     def state_dict(self) -> dict[str, Any]:
-        groups = {"own": self.params, "targets": self.targets, "mean": self._mean, "square": self._square}
-        return {**groups, "steps": self.steps}
+        return {**self._groups(), "steps": self.steps}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        groups = self.state_dict()
-        del groups["steps"]
-        for group, tensors in groups.items():
+        for group, tensors in self._groups().items():
             if set(state[group]) != set(tensors):
                 raise ValueError(
                     f"the state has the weights {sorted(state[group])}; allowed: {sorted(tensors)}"
@@ -661,14 +550,12 @@ def make_engine(
     rule: UpdateRule,
     *,
     batching: Batching,
+    compile: bool,
     target_networks: Sequence[nn.Module] | None = None,
     sharing: int = 1,
-    compile: bool,
 ) -> Engine:
     """The engine of all lanes over their networks; `compile` is ignored for "list"."""
-    options = networks, make_loss, rule
+    options: dict[str, Any] = {"target_networks": target_networks, "sharing": sharing}
     if batching == "list":
-        return ListEngine(*options, target_networks=target_networks, sharing=sharing)
-    return FunctionalEngine(
-        *options, target_networks=target_networks, batching=batching, sharing=sharing, compile=compile
-    )
+        return ListEngine(networks, make_loss, rule, **options)
+    return FunctionalEngine(networks, make_loss, rule, batching=batching, compile=compile, **options)

@@ -5,42 +5,41 @@ from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final, Protocol
 
-import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor, nn
 
-from cprl import keys
-from cprl.learners.base import EVALUATION, EXPLORATION, Learner, LearningAgents
+from cprl.keys import Turn
+from cprl.learners.base import Learner, LearningAgents
 from cprl.learners.engine import WAYS, Batching, Engine, ListEngine, MakeLoss, UpdateRule, make_engine
 from cprl.learners.ring import Horizon, TransitionForm
-from cprl.learners.transitions import LaneTurn, array_of, joint_actions, lane_turn, seen_next
+from cprl.learners.transitions import LaneTurn, joint_actions, lane_turn
 from cprl.learners.trial import TRIAL_LANES, fitting_engine
 from cprl.networks.agent import acting_part
 from cprl.networks.recurrent import state_cells_of
 from cprl.networks.specification import refuse_unseen
 from cprl.policies.lanes import LaneActor
+from cprl.policies.rng import EVALUATION, seed_of
 from cprl.system.memory import check_memory
 
 MakeTeam = Callable[[Sequence[nn.Module]], nn.Module]
 """Makes the networks of a team from those of its members: `AgentNetworks`, a `cprl.networks.team.Team` first.
 Members that share parameters are one and the same network."""
 
+STATE_BEFORE, STATE = "recurrent_state_before", "recurrent_state"
+"""Entries of the states of recurrent networks in a turn."""
 _SHARED: Final = 1
 """The last number of the seed of the parts that a team adds to its members' networks."""
 _COPIES: Final = 6
 """Of a lane's weights while it trains: as made, stacked, target, gradient and two of the optimiser."""
-_LARGEST_SEED: Final = 2**63 - 1
 
 
 class Acts(Protocol):
-    """Evaluates the current networks of many lanes; an `Engine` does."""
+    """Evaluates the current networks of many lanes, as an `Engine` does."""
 
-    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
-        """The outputs of the networks: [L, k, ...] to [L, k, ...]; recurrent ones read and give states."""
+    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any: ...
 
-    def network_state(self, lane: int) -> dict[str, Tensor]:
-        """Copies of the current weights of one lane, as the state dict of its acting network."""
+    def network_state(self, lane: int) -> dict[str, Tensor]: ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,11 +60,9 @@ class Method:
     """Whether each member of a team learns from what it wants itself, with rewards [.., S, 1]; else all have
     the team reward, [.., 1]."""
     noise_numbers: int = 0
-    """How many uniform numbers the loss reads for each transition, of each member of a team: the entry
-    "noise", float32 [.., noise_numbers] or [.., S, noise_numbers], from random numbers of each lane's own."""
+    """See `cprl.algorithms.OffPolicy`; the numbers are each lane's own."""
     stochastic: bool = False
-    """Whether networks output the logits of a policy from which actions are sampled, with no epsilon; else
-    action values, with `epsilon` of the settings."""
+    """See `cprl.algorithms.Algorithm`."""
     sees_peers: bool = False
     """Whether a lane's stored action is that of all N agents, see `transitions.joint_actions`."""
 
@@ -74,7 +71,7 @@ class Lanes:
     """What learns apart: each of R x S agents, or the team of S agents of each replica; in order of replicas.
 
     Members of a team have the seeds of initial weights and exploration that they would have as independent
-    agents. Parts that `make_team` adds are initialised from torch's generator, which is seeded for each team.
+    agents.
     """
 
     def __init__(self, who: LearningAgents, method: Method) -> None:
@@ -90,8 +87,7 @@ class Lanes:
         """The axes of the members of a lane: (S,) of a team, () of one agent."""
         self._sharing = size if who.share_parameters else 1
         self.state_cells = 0
-        """The numbers H of the state of an acting network; known once there are networks, 0 for those without
-        a state."""
+        """The numbers H of the state of an acting network, 0 without one; known once there are networks."""
         self._acting: Any = None
         """The acting network of a team, of which architecture alone matters; likewise."""
 
@@ -117,33 +113,31 @@ class Lanes:
             sequence_steps=sequence_steps,
         )
 
-    def turn(self, batch: TensorDictBase, rewards: Any) -> LaneTurn:
+    def turn(self, turn: Turn, rewards: Any) -> LaneTurn:
         """One transition of every lane; see `lane_turn`.
 
         Args:
             rewards: of all agents, [R, N]; those of a team without `own_rewards` all the same.
         """
-        turn = lane_turn(self.agents, batch, rewards, are_team=self.is_team)
+        lanes = lane_turn(self.agents, turn, rewards, are_team=self.is_team)
         if self.is_team and not self.method.own_rewards:
-            turn = turn._replace(reward=turn.reward[:, 0])
+            lanes = lanes._replace(reward=lanes.reward[:, 0])
         if self.method.sees_peers:
-            turn = turn._replace(action=joint_actions(self.agents, batch))
+            lanes = lanes._replace(action=joint_actions(self.agents, turn))
         if self.state_cells:
-            before, after = self.recurrent_state(batch), self.recurrent_state(batch, keys.RECURRENT_STATE)
-            turn = turn._replace(recurrent_state=array_of(before), next_recurrent_state=array_of(after))
-        return turn
+            before, after = (self.states_in(turn, name) for name in (STATE_BEFORE, STATE))
+            lanes = lanes._replace(recurrent_state=before, next_recurrent_state=after)
+        return lanes
 
-    def seen_next(self, batch: TensorDictBase) -> Tensor:
+    def seen_next(self, turn: Turn) -> Tensor:
         """The observations of lanes after a turn, uint8 [L, 1, *observation_shape]."""
-        seen = seen_next(batch)[:, list(self.agents)]
+        seen = torch.as_tensor(turn.next_agents["observation"])[:, list(self.agents)]
         return seen.reshape(len(self), 1, *self.member_shape, *self.spaces.observation_shape)
 
-    def recurrent_state(
-        self, batch: TensorDictBase, entry: tuple[str, str] = keys.RECURRENT_STATE_BEFORE
-    ) -> Tensor:
-        """The states that lanes had before a turn, or by another entry after it, float32 [L, H], of teams
-        [L, S, H]."""
-        states: Tensor = batch.get(entry)[:, list(self.agents), : self.state_cells]
+    def states_in(self, turn: Turn, name: str = STATE_BEFORE) -> Any:
+        """The states of recurrent networks before a turn, or by their other name after it, float32 [L, H], of
+        teams [L, S, H]; an array as those of a `LaneTurn`."""
+        states = turn.agents[name][:, list(self.agents), : self.state_cells]
         return states.reshape(len(self), *self.member_shape, self.state_cells)
 
     def by_agent(self, values: Tensor) -> Tensor:
@@ -163,15 +157,15 @@ class Lanes:
         """New networks for each lane, or for each replica whose agents share one; the acting ones with the
         weights to start from, if there are any.
         """
-        make_network, names = self.method.make_network, self.who.names
+        make_network = self.method.make_network
         first, *others = self.who.seeds(purpose)[:: self._sharing]
         networks = [init_network(make_network, first)]
         _check_networks(networks[0], 1 + len(others), self.who.device)
         self.state_cells = state_cells_of(acting_part(networks[0]))
         networks += [init_network(make_network, seed) for seed in others]
+        starts = [self.who.start_from.get(name, {}) for name in self.who.names]
         for place, network in enumerate(networks):
-            sharing = names[place * self._sharing : (place + 1) * self._sharing]
-            start, *same = (self.who.start_from.get(name, {}) for name in sharing)
+            start, *same = starts[place * self._sharing : (place + 1) * self._sharing]
             if any(not _equal(start, weights) for weights in same):
                 raise ValueError(
                     f"the agents {list(self.agents)} would start from different weights; allowed for agents "
@@ -192,16 +186,8 @@ class Lanes:
             teams.append(init_network(lambda members=members: make_team(members), (*seed, _SHARED)))  # type: ignore[misc]
         return teams
 
-    def actor(self, engine: Acts, *, compile: bool) -> LaneActor:
-        """The actor of training: the current weights, and random numbers of its own for each agent."""
-        return self._actor(engine, EXPLORATION, compile=compile and not isinstance(engine, ListEngine))
-
-    def evaluation_actor(self, engine: Acts, worlds: int, *, epsilon: float) -> LaneActor:
-        actor = self._actor(engine, EVALUATION, worlds=worlds)
-        actor.epsilon = epsilon
-        return actor
-
-    def _actor(self, engine: Acts, purpose: int, *, worlds: int = 1, compile: bool = False) -> LaneActor:
+    def actor(self, engine: Acts, purpose: int, *, worlds: int = 1, compile: bool = False) -> LaneActor:
+        """An actor with the current weights, and random numbers of its own for each agent and purpose."""
         return LaneActor(
             _of_members(engine, len(self.agents)) if self.is_team else engine.outputs,
             self.spaces.actions,
@@ -210,7 +196,7 @@ class Lanes:
             worlds=worlds,
             stochastic=self.method.stochastic,
             state_cells=self.state_cells,
-            compile=compile,
+            compile=compile and not isinstance(engine, ListEngine),
         )
 
     def states(self, engine: Acts) -> dict[str, dict[str, Tensor]]:
@@ -223,13 +209,6 @@ class Lanes:
         replica, member = divmod(place, len(self.agents))
         state: dict[str, Tensor] = self._acting.member_state(engine.network_state(replica), member)
         return state
-
-    def networks(self, engine: Acts) -> dict[str, nn.Module]:
-        made = {}
-        for name, weights in self.states(engine).items():
-            made[name] = acting_part(self.method.make_network())
-            made[name].load_state_dict(weights)
-        return made
 
 
 def _of_members(engine: Acts, size: int) -> Callable[..., Any]:
@@ -265,6 +244,7 @@ class LaneLearner(Learner):
 
     @property
     def present(self) -> Acts:
+        """The networks as they are now."""
         acts: Acts = self.engine
         return acts
 
@@ -281,34 +261,31 @@ class LaneLearner(Learner):
         if batching is None or batching not in self.ways:
             few = networks[:TRIAL_LANES]
             batching = fitting_engine(few, method.make_loss, self._trial(len(few)), self.ways)
-        return make_engine(
-            networks,
-            method.make_loss,
-            rule,
-            batching=batching,
-            target_networks=targets,
-            sharing=self._lanes.sharing,
-            compile=compile,
-        )
+        options: dict[str, Any] = {"target_networks": targets, "sharing": self._lanes.sharing}
+        make_loss = method.make_loss
+        return make_engine(networks, make_loss, rule, batching=batching, compile=compile, **options)
 
     def _trial(self, lanes: int) -> TensorDict:
         """A synthetic batch of so many lanes, as the loss reads it."""
         raise NotImplementedError
 
     def evaluation_actor(self, worlds: int) -> LaneActor:
-        return self._lanes.evaluation_actor(self.present, worlds, epsilon=0.0)
+        actor = self._lanes.actor(self.present, EVALUATION, worlds=worlds)
+        actor.epsilon = getattr(self.settings, "epsilon_evaluation", 0.0)
+        return actor
 
     def networks(self) -> dict[str, nn.Module]:
-        return self._lanes.networks(self.present)
+        made = {}
+        for name, weights in self._lanes.states(self.present).items():
+            made[name] = acting_part(self._lanes.method.make_network())
+            made[name].load_state_dict(weights)
+        return made
 
     def finite(self) -> Tensor:
         return self._lanes.by_agent(self.engine.finite())
 
     def state_dict(self) -> dict[str, Any]:
-        """The full state of all lanes; the tensors themselves, not copies.
-
-        The entry "networks" repeats the weights of "update" in the form that `cprl.load` reads.
-        """
+        """The full state of all lanes, of which "networks" repeats weights as `cprl.load` reads them."""
         return {
             "networks": self._lanes.states(self.present),
             "update": self.engine.state_dict(),
@@ -346,8 +323,3 @@ def init_network(make_network: Callable[[], nn.Module], seed: Sequence[int]) -> 
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed_of(seed))
         return make_network()
-
-
-def seed_of(seed: Sequence[int]) -> int:
-    """The seed of a lane as one for a generator of torch."""
-    return int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0] & _LARGEST_SEED)

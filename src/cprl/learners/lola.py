@@ -2,24 +2,23 @@
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from typing import Any, Final
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from cprl.learners.base import WEIGHTS, LearningAgents
-from cprl.learners.engine import UpdateRule, shortened, torch_optimizer, total
+from cprl.keys import Turn
+from cprl.learners.base import LearningAgents
+from cprl.learners.engine import UpdateRule, shortened, torch_optimizer
 from cprl.learners.lanes import Acts, LaneLearner, Method
-from cprl.learners.rollouts import refuse_full, refuse_other_parts, rollout_fields, write_turn
+from cprl.learners.rollouts import Rollout, advantages, refuse_other_parts
 from cprl.learners.settings import LOLASettings
-from cprl.learners.transitions import wanted_in
 from cprl.networks.finite import finite_lanes
 from cprl.networks.stacked import lane_state, stack_lanes
 from cprl.objectives import LOLADiCELoss, dice_objective
-
-_SMALL: Final = 1e-8
+from cprl.objectives.functional import total
+from cprl.policies.rng import EXPLORATION, WEIGHTS
 
 
 class Members(nn.ModuleList):
@@ -99,12 +98,8 @@ class LOLANetworks(nn.Module):
         policies.step()
 
     def update_critics(self, observation: Tensor, target: Tensor) -> None:
-        """One step of all critics along their mean squared errors.
-
-        Args:
-            observation: [R, P, T, S, *shape].
-            target: the values wanted, [R, P, T, S, 1].
-        """
+        """One step of all critics along their mean squared errors, from observations [R, P, T, S, *shape] and
+        the values wanted, [R, P, T, S, 1]."""
         _, critics = self.optimizers
         critics.zero_grad()
         (self.critics(observation) - target).square().mean((1, 2)).sum().backward()
@@ -112,20 +107,13 @@ class LOLANetworks(nn.Module):
 
     def finite(self) -> Tensor:
         """Whether the weights and moments of each member are finite, bool [R, S]."""
-        moments = {
-            weight: [value for value in state.values() if value.ndim]
-            for optimizer in self.optimizers
-            for weight, state in optimizer.state.items()
-        }
+        states = {weight: state for optimizer in self.optimizers for weight, state in optimizer.state.items()}
         stacks = [self.actors, self.critics, self.playing, *([] if self.ahead is None else [self.ahead])]
-        of_members = [
-            [weight for stack in stacks for weight in stack[member].parameters()]
-            for member in range(len(self.actors))
-        ]
-        sound = [
-            finite_lanes([*weights, *(moment for weight in weights for moment in moments.get(weight, ()))])
-            for weights in of_members
-        ]
+        sound = []
+        for member in range(len(self.actors)):
+            weights = [weight for stack in stacks for weight in stack[member].parameters()]
+            moments = [value for weight in weights for value in states.get(weight, {}).values() if value.ndim]
+            sound.append(finite_lanes([*weights, *moments]))
         return torch.stack(sound, -1)
 
     def get_extra_state(self) -> list[dict[str, Any]]:
@@ -166,9 +154,9 @@ class LOLALearner(LaneLearner):
         self._looks_ahead = isinstance(self.engine.loss, LOLADiCELoss)
         self.rollouts = 1 + members if self._looks_ahead else 2
         """The number P of rollouts that an update takes."""
-        self.actor = self._lanes.actor(self.engine.playing, compile=compile)
-        self._rollouts = rollout_fields(self._lanes, (self.rollouts, self.rollout_steps))
-        self._size, self._phase = 0, 0
+        self.actor = self._lanes.actor(self.engine.playing, EXPLORATION, compile=compile)
+        self._rollouts = Rollout(self._lanes, self.rollout_steps, self.rollouts)
+        self._phase = 0
 
     @property
     def present(self) -> Acts:
@@ -180,14 +168,13 @@ class LOLALearner(LaneLearner):
 
     def begin(self) -> None:
         """Drops the rollouts that an earlier training left unfinished; see `Learner`."""
-        self._size, self._phase = 0, 0
+        self._rollouts.size, self._phase = 0, 0
         self.engine.play(None)
 
-    def store(self, batch: TensorDictBase) -> None:
-        refuse_full(self._size, self.rollout_steps)
-        turn = self._lanes.turn(batch, wanted_in(self.wants, batch))
-        write_turn(self._rollouts, (self._phase, self._size), turn)
-        self._size += 1
+    def store(self, batch: TensorDictBase | Turn) -> None:
+        turn = Turn.of(batch)
+        self._rollouts.refuse_full()
+        self._rollouts.write(self._lanes.turn(turn, self._wanted(turn)), self._phase)
         self.steps += 1
 
     def update(self) -> Tensor | None:
@@ -195,9 +182,9 @@ class LOLALearner(LaneLearner):
 
         The loss is the mean discounted return of the pieces of rollouts of the present weights, negative.
         """
-        if self._size < self.rollout_steps:
+        if not self._rollouts.is_full:
             return None
-        self._size, self._phase = 0, self._phase + 1
+        self._rollouts.size, self._phase = 0, self._phase + 1
         if self._phase < self.rollouts:
             if self._looks_ahead:
                 self._play_ahead(self._phase - 1)
@@ -222,26 +209,17 @@ class LOLALearner(LaneLearner):
         size = self.replicas, len(self.agents)
         return {
             name: field[:rollouts].reshape(rollouts, -1, *size, *field.shape[3:]).movedim(2, 0)
-            for name, field in self._rollouts.items()
+            for name, field in self._rollouts.fields.items()
         }
 
     def _batch(self, rollouts: int) -> tuple[Tensor, TensorDict, Tensor]:
         """Of the first rollouts: observations [R, P, T, S, *shape], the input of the loss [R, P, T], and what
         critics should say, [R, P, T, S, 1]."""
         columns = self._columns(rollouts)
+        critics = self.engine.critics
         with torch.no_grad():
-            critics = self.engine.critics
-            advantage, target = generalized_advantage_estimate(
-                self.settings.gamma,
-                self.settings.gae_lambda,
-                critics(columns["observation"]),
-                critics(columns["next_observation"]),
-                *(columns[name].unsqueeze(-1) for name in ("reward", "done", "terminated")),
-                time_dim=2,
-            )
-        if self.settings.normalize_advantage:
-            advantage = advantage - advantage.mean(2, keepdim=True)
-            advantage = advantage / (advantage.std(2, keepdim=True) + _SMALL)
+            value, following = critics(columns["observation"]), critics(columns["next_observation"])
+            advantage, target = advantages(columns, value, following, settings=self.settings, over=(2,))
         entries = {
             "observation": columns["observation"],
             "action": columns["action"],
@@ -258,20 +236,20 @@ class LOLALearner(LaneLearner):
         returns = dice_objective(torch.zeros_like(reward), reward, gamma=self.settings.gamma, done=done)
         return -returns.mean(1)
 
-    def values(self, batch: TensorDictBase) -> Tensor:
+    def values(self, batch: TensorDictBase | Turn) -> Tensor:
         """The value that each member's critic gives to the state after a turn, [R, S]."""
         with torch.no_grad():
-            expected = self.engine.critics.outputs(self._lanes.seen_next(batch))
+            expected = self.engine.critics.outputs(self._lanes.seen_next(Turn.of(batch)))
         return expected.reshape(self.replicas, len(self.agents))
 
     def finite(self) -> Tensor:
         return self.engine.finite()
 
     def state_dict(self) -> dict[str, Any]:
-        return {**super().state_dict(), "rollouts": self._rollouts, "size": self._size, "phase": self._phase}
+        rollouts = {"rollouts": self._rollouts.fields, "size": self._rollouts.size, "phase": self._phase}
+        return {**super().state_dict(), **rollouts}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         super().load_state_dict(state)
-        for name, field in self._rollouts.items():
-            field.copy_(state["rollouts"][name])
-        self._size, self._phase = int(state["size"]), int(state["phase"])
+        self._rollouts.load(state["rollouts"], state["size"])
+        self._phase = int(state["phase"])

@@ -6,7 +6,7 @@ targets and what actors draw are those of the fast learners, the sampled batches
 to say what the fast learners compute, and what these are tested against.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -17,16 +17,17 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler, Sampler, SamplerWithoutReplacement
 from torchrl.objectives.value import GAE
 
-from cprl.learners.base import NOISE, SAMPLING, LearningAgents
+from cprl.learners.base import LearningAgents
 from cprl.learners.engine import ListEngine
-from cprl.learners.lanes import Lanes, Method, seed_of
+from cprl.learners.lanes import Lanes, Method
 from cprl.learners.replay import ReplayLearner
-from cprl.learners.ring import Noise, TransitionForm
+from cprl.learners.ring import Noise
 from cprl.learners.rollouts import ACTOR, CRITIC, RolloutLearner
-from cprl.learners.settings import DQNSettings, RolloutSettings
+from cprl.learners.settings import RolloutSettings
 from cprl.learners.transitions import LaneTurn
+from cprl.policies.rng import NOISE, SAMPLING, seed_of
 from cprl.system.memory import check_memory
-from cprl.values import made
+from cprl.values import Custom, made
 
 MakeSampler = Callable[[int], Sampler]
 """Makes a TorchRL sampler for an agent, by its lane = replica x S + position among the agents. Comparisons
@@ -34,32 +35,40 @@ with the fast engine pass one that replays given indices."""
 
 
 class StockBuffers:
-    """A `TensorDictReplayBuffer` for each agent, of a `LazyTensorStorage`.
+    """A `TensorDictReplayBuffer` for each agent, of a `LazyTensorStorage`; the random numbers of each depend
+    on its own seed alone.
 
     Args:
-        form: of the transitions, and of the uniform numbers that the loss reads with them.
+        noise_shape: of the uniform numbers that the loss reads with each transition.
     """
 
     def __init__(
-        self, lanes: Lanes, settings: DQNSettings, form: TransitionForm, make_sampler: MakeSampler
+        self,
+        lanes: Lanes,
+        make_sampler: MakeSampler,
+        *,
+        size: int,
+        batch_size: int,
+        transforms: Sequence[Custom] = (),
+        noise_shape: tuple[int, ...] = (),
     ) -> None:
-        device = torch.device(lanes.who.device)
-        self._generators = _generators(lanes)
+        device, seeds = torch.device(lanes.who.device), lanes.seeds(SAMPLING)
+        self._generators = [torch.Generator(device).manual_seed(seed_of(seed)) for seed in seeds]
         self.each = [
             TensorDictReplayBuffer(
-                storage=LazyTensorStorage(settings.buffer_size, device=device),
+                storage=LazyTensorStorage(size, device=device),
                 sampler=make_sampler(lane),
-                batch_size=settings.batch_size,
+                batch_size=batch_size,
                 generator=generator,
             )
             for lane, generator in enumerate(self._generators)
         ]
         for buffer in self.each:
-            for transform in settings.replay_transforms:
+            for transform in transforms:
                 buffer.append_transform(made(transform))
         self._noise = None
-        if form.noise_shape:
-            self._noise = Noise(lanes.seeds(NOISE), settings.batch_size, form.noise_shape, device)
+        if noise_shape:
+            self._noise = Noise(lanes.seeds(NOISE), batch_size, noise_shape, device)
 
     def write(self, turn: LaneTurn) -> None:
         """Stores a turn of every agent, [L], under TorchRL's default keys."""
@@ -154,7 +163,14 @@ class TorchRLReplayLearner(ReplayLearner):
             'a smaller buffer_size or batch_size, fewer replicas, or engine="compiled", which needs half',
             device=lanes.who.device,
         )
-        return StockBuffers(lanes, settings, form, self._make_sampler)
+        return StockBuffers(
+            lanes,
+            self._make_sampler,
+            size=settings.buffer_size,
+            batch_size=settings.batch_size,
+            transforms=settings.replay_transforms,
+            noise_shape=form.noise_shape,
+        )
 
 
 class TorchRLRolloutLearner(RolloutLearner):
@@ -180,28 +196,21 @@ class TorchRLRolloutLearner(RolloutLearner):
                 'turns: MLP, Conv, Custom; engine="compiled" and "eager" learn from sequences'
             )
         self.estimators = [_gae(parts[CRITIC], settings) for parts in self.engine.parts]
-        self._generators = _generators(self._lanes)
-        self.buffers = [
-            TensorDictReplayBuffer(
-                storage=LazyTensorStorage(settings.rollout_steps, device=who.device),
-                sampler=make_sampler(lane) if make_sampler else SamplerWithoutReplacement(),
-                batch_size=settings.minibatch_size,
-                generator=generator,
-            )
-            for lane, generator in enumerate(self._generators)
-        ]
+        make_sampler = make_sampler or (lambda lane: SamplerWithoutReplacement())
+        sizes = {"size": settings.rollout_steps, "batch_size": settings.minibatch_size}
+        self.buffer = StockBuffers(self._lanes, make_sampler, **sizes)
 
     def update(self) -> Tensor | None:
-        if self._size < self.rollout_steps:
+        if not self._rollout.is_full:
             return None
-        self._size = 0
-        rollout = _transitions(self._columns(), [self.lanes, self.rollout_steps])
+        self._rollout.size = 0
+        rollout = _transitions(self._rollout.columns(), [self.lanes, self.rollout_steps])
         losses = [self._learn(lane, rollout[lane].clone()) for lane in range(self.lanes)]
         return self._lanes.by_agent(torch.stack(losses))
 
     def _learn(self, lane: int, rollout: TensorDict) -> Tensor:
         """Runs all epochs of one agent over its rollout, [T]; returns its mean loss."""
-        buffer = self.buffers[lane]
+        buffer = self.buffer.each[lane]
         self.estimators[lane](rollout)
         with torch.no_grad():
             logits = self.engine.parts[lane][ACTOR](rollout["observation"])
@@ -213,15 +222,11 @@ class TorchRLRolloutLearner(RolloutLearner):
         return torch.stack([self.engine.learn(lane, buffer.sample()) for _ in range(minibatches)]).mean()
 
     def state_dict(self) -> dict[str, Any]:
-        """The full state of all agents. The buffers are refilled from each rollout, so only the states of
-        their generators are stored."""
-        generators = [generator.get_state() for generator in self._generators]
-        return {**super().state_dict(), "generators": generators}
+        return {**super().state_dict(), **self.buffer.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         super().load_state_dict(state)
-        for generator, drawn in zip(self._generators, state["generators"], strict=True):
-            generator.set_state(drawn.cpu())
+        self.buffer.load_state_dict(state)
 
 
 def _refuse_sharing(who: LearningAgents) -> None:
@@ -239,12 +244,6 @@ def _gae(critic: nn.Module, settings: RolloutSettings) -> GAE:
         average_gae=settings.normalize_advantage,
         deactivate_vmap=True,  # a user's network may not support it
     )
-
-
-def _generators(lanes: Lanes) -> list[torch.Generator]:
-    """A random number generator for the sampling of each agent, seeded by its own seed alone."""
-    device = lanes.who.device
-    return [torch.Generator(device).manual_seed(seed_of(seed)) for seed in lanes.seeds(SAMPLING)]
 
 
 def _transitions(turn: Mapping[str, Any], size: list[int]) -> TensorDict:

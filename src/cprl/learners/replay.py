@@ -8,15 +8,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from cprl import keys
-from cprl.learners.base import NOISE, SAMPLING, TARGET_WEIGHTS, WEIGHTS, LearningAgents
+from cprl.keys import Turn
+from cprl.learners.base import LearningAgents
 from cprl.learners.engine import COMPILED_STEPS, UpdateRule
-from cprl.learners.lanes import LaneLearner, Method
+from cprl.learners.lanes import STATE, LaneLearner, Method
 from cprl.learners.ring import Horizon, Ring
 from cprl.learners.settings import DQNSettings
-from cprl.learners.transitions import wanted_in
 from cprl.learners.trial import refuse_for_replay, trial_batch
-from cprl.policies.lanes import LaneActor
+from cprl.policies.rng import EXPLORATION, NOISE, SAMPLING, TARGET_WEIGHTS, WEIGHTS
 
 
 class ReplayLearner(LaneLearner):
@@ -57,7 +56,7 @@ class ReplayLearner(LaneLearner):
         is_short = settings.sequence_steps <= COMPILED_STEPS
         self.engine = self._make_engine(networks, targets, rule=rule, compile=compile and is_short)
         self.buffer = self._make_buffer()
-        self.actor = lanes.actor(self.engine, compile=compile)
+        self.actor = lanes.actor(self.engine, EXPLORATION, compile=compile)
         self.actor.epsilon = settings.epsilon(0)
         self._episodes = torch.zeros(self.replicas, dtype=torch.int64)
         self._owed = 0
@@ -88,15 +87,13 @@ class ReplayLearner(LaneLearner):
             device=self.who.device,
         )
 
-    def evaluation_actor(self, worlds: int) -> LaneActor:
-        return self._lanes.evaluation_actor(self.engine, worlds, epsilon=self.settings.epsilon_evaluation)
-
     def begin(self) -> None:
         """Ends the episodes that an earlier training left unfinished; see `Learner`."""
         self.buffer.cut()
 
-    def store(self, batch: TensorDictBase) -> None:
-        self.buffer.write(self._lanes.turn(batch, wanted_in(self.wants, batch)))
+    def store(self, batch: TensorDictBase | Turn) -> None:
+        turn = Turn.of(batch)
+        self.buffer.write(self._lanes.turn(turn, self._wanted(turn)))
         self.steps += 1
         self._owed += self.steps >= self.settings.learning_starts
         self.actor.explore_with(self.settings.epsilon(self.steps))
@@ -116,11 +113,8 @@ class ReplayLearner(LaneLearner):
         return self._lanes.by_agent(losses)
 
     def end_episode(self, ended: Tensor) -> None:
-        """Counts an episode of the marked replicas, bool [R].
-
-        Every `target_every_episodes` episodes the weights of a replica are copied to its targets. With `tau`
-        they move after every update instead.
-        """
+        """Counts an episode of the marked replicas, bool [R]: their weights are copied to targets every
+        `target_every_episodes` episodes. With `tau` these move after every update instead."""
         self._episodes += ended
         if self.settings.tau is not None:
             return
@@ -128,17 +122,15 @@ class ReplayLearner(LaneLearner):
         if due.any():
             self.engine.copy_to_targets(self._lanes.of_replicas(due))
 
-    def values(self, batch: TensorDictBase) -> Tensor:
+    def values(self, batch: TensorDictBase | Turn) -> Tensor:
         """The highest action value of each agent at the end of a turn, [R, S]; NaN where its network
         outputs a policy."""
         if self._lanes.method.stochastic:
             return torch.full((self.replicas, len(self.agents)), torch.nan)
-        seen = [self._lanes.seen_next(batch)]
-        is_recurrent = self._lanes.state_cells > 0
-        if is_recurrent:
-            seen.append(self._lanes.recurrent_state(batch, keys.RECURRENT_STATE).unsqueeze(1))
+        turn, is_recurrent = Turn.of(batch), self._lanes.state_cells > 0
+        states = [torch.as_tensor(self._lanes.states_in(turn, STATE)).unsqueeze(1)] if is_recurrent else []
         with torch.no_grad():
-            outputs = self.engine.outputs(*seen)
+            outputs = self.engine.outputs(self._lanes.seen_next(turn), *states)
         highest: Tensor = (outputs[0] if is_recurrent else outputs).amax(-1)
         return highest.view(self.replicas, len(self.agents))
 

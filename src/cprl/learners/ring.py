@@ -59,7 +59,8 @@ class TransitionForm:
 
     @property
     def dtype(self) -> torch.dtype:
-        return torch_dtype(self.observation_dtype)
+        dtype: torch.dtype = getattr(torch, self.observation_dtype)
+        return dtype
 
     @property
     def steps_ahead(self) -> int:
@@ -130,10 +131,9 @@ def sequences(fields: Fields, index: Tensor, rows: int, steps: int) -> TensorDic
     one does so too. The T - 1 turns that follow each place must have been written.
     """
     lanes, size = index.shape
-    ahead = torch.arange(steps, device=index.device)
+    ahead, lane = (torch.arange(count, device=index.device) for count in (steps, lanes))
     places = ((index.unsqueeze(-1) + ahead) % len(fields["done"])).reshape(lanes, -1)
-    batch = gather(fields, places, rows)
-    lane = torch.arange(lanes, device=index.device)[:, None]
+    batch, lane = gather(fields, places, rows), lane[:, None]
     row, states = fields["row"][places, lane], fields[STATE]
     for owner, at in ((batch, row), (batch["next"], row + 1)):
         rows_read = states.index_select(0, (lane * rows + at % rows).reshape(-1))
@@ -167,18 +167,10 @@ def _returns(fields: Fields, index: Tensor, lane: Tensor, horizon: Horizon) -> t
 ENDS_PER_TRANSITION: Final = 0.02
 """Extra rows for the last observations of episodes: one per fifty transitions. With episodes shorter than 50
 steps the buffer holds fewer transitions; those that it holds are always correct."""
-
 LOOKS_EVERY: Final = 32
 """Steps between checks for transitions whose observations are about to be overwritten."""
-
 NUMBERS_AHEAD: Final = 2**14
 """About as many numbers for losses that sample, or for an epoch, are generated at once for each lane."""
-
-
-def torch_dtype(name: str) -> torch.dtype:
-    """The torch dtype of a name that numpy and torch share, e.g. "uint8"."""
-    dtype: torch.dtype = getattr(torch, name)
-    return dtype
 
 
 def _rows(transitions: int) -> int:
@@ -207,8 +199,7 @@ class Noise:
 
 
 class Ring:
-    """Stores up to T transitions of each of L lanes, those of recurrent agents with their states, and samples
-    uniformly from them, with a random number generator for each lane.
+    """Stores up to T transitions of each of L lanes, and samples uniformly from them, each lane for itself.
 
     Args:
         seeds: the sampling seed of each of the L lanes; a lane's samples depend on it alone.
@@ -235,7 +226,19 @@ class Ring:
         self.horizon, self.sequence_steps, self.capacity = form.horizon, form.sequence_steps, transitions
         self.lanes, self.rows, self.device = len(seeds), _rows(transitions), torch.device(device)
         self._ahead, lanes = form.steps_ahead, self.lanes
-        _check_memory(form.stored_bytes(lanes, transitions), form.sampled_bytes(lanes, batch_size), self)
+        needed, what = (
+            form.stored_bytes(lanes, transitions),
+            f"{lanes} learners x {transitions:,} transitions",
+        )
+        check_memory(
+            f"the replay buffers of {what}",
+            needed + form.sampled_bytes(lanes, batch_size),
+            "a smaller buffer_size or batch_size, or fewer replicas",
+            device=self.device,
+        )
+        if needed >= 2**20:
+            sizes = needed / 2**30, free_bytes(self.device) / 2**30
+            logging.getLogger("cprl").info("Replay buffers of %s: %.2f GiB of %.1f GiB free", what, *sizes)
         forms = {
             "observation": ((lanes * self.rows, *form.observation_shape), form.dtype),
             "action": ((transitions, lanes, *form.action_shape), torch.int64),
@@ -268,8 +271,7 @@ class Ring:
         return min(self._written, self.capacity)
 
     def oldest(self) -> tuple[Any, int]:
-        """The number of each lane's oldest complete transition, int64 [L], a numpy array if the ring is on
-        the CPU; and the number of the next transition to be written."""
+        """The number of each lane's oldest complete transition, int64 [L]; and that of the next one."""
         return _at_least(self._oldest, self._written - self.capacity), self._written
 
     def write(self, turn: LaneTurn) -> None:
@@ -277,18 +279,15 @@ class Ring:
         arrays, place, row = self._arrays, self._written % self.capacity, self._next_row
         for seen in (turn.observation, turn.next_observation):
             refuse_other_dtype(seen.dtype, arrays["observation"].dtype)
+        first = self._begins
         for name in self._of_rows:
             if self._any_begins:
-                first = self._begins
                 arrays[name][(self._base + row % self.rows)[first]] = getattr(turn, name)[first]
             arrays[name][self._base + (row + 1) % self.rows] = getattr(turn, f"next_{name}")
-        arrays["action"][place] = turn.action
-        arrays["reward"][place] = turn.reward
-        arrays["done"][place] = turn.done
-        arrays["terminated"][place] = turn.terminated
+        for name in ("action", "reward", "done", "terminated"):
+            arrays[name][place] = getattr(turn, name)
         arrays["row"][place] = row
-        self._begins = turn.done | turn.terminated
-        begins = self._begins
+        self._begins = begins = turn.done | turn.terminated
         self._any_begins = bool(np.count_nonzero(begins) if isinstance(begins, np.ndarray) else begins.any())
         self._next_row = row + 1 + self._begins if self._any_begins else row + 1
         self._written += 1
@@ -321,15 +320,13 @@ class Ring:
 
     def _forget(self) -> None:
         """Excludes transitions whose observations are about to be overwritten from sampling."""
-        oldest = _at_least(self._oldest, self._written - self.capacity)
-        soon = self._next_row - self.rows + 2 * LOOKS_EVERY + 1
+        self._oldest, soon = self.oldest()[0], self._next_row - self.rows + 2 * LOOKS_EVERY + 1
         while True:
-            lost = self._arrays["row"][oldest % self.capacity, self._lane] <= soon
-            lost &= oldest < self._written
+            lost = self._arrays["row"][self._oldest % self.capacity, self._lane] <= soon
+            lost &= self._oldest < self._written
             if not lost.any():
                 break
-            oldest += lost
-        self._oldest = oldest
+            self._oldest += lost
 
     def draw(self) -> Tensor:
         """The places of a sample, int64 [L, b]."""
@@ -396,16 +393,6 @@ def _zeros(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> 
     # numpy leaves it to the system to clear pages when they are first written; torch writes them all at once,
     # for a gigabyte in a second or more.
     return torch.from_numpy(np.zeros(shape, array_of(torch.empty(0, dtype=dtype)).dtype))
-
-
-def _check_memory(needed: int, sample: int, ring: Ring) -> None:
-    """Raises a TooLargeError if there is too little memory for a ring and its samples; logs what it takes."""
-    what = f"{ring.lanes} learners x {ring.capacity:,} transitions"
-    cure = "a smaller buffer_size or batch_size, or fewer replicas"
-    check_memory(f"the replay buffers of {what}", needed + sample, cure, device=ring.device)
-    if needed >= 2**20:
-        sizes = needed / 2**30, free_bytes(ring.device) / 2**30
-        logging.getLogger("cprl").info("Replay buffers of %s: %.2f GiB of %.1f GiB free", what, *sizes)
 
 
 def _at_least(numbers: Any, lowest: int) -> Any:

@@ -11,16 +11,17 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from cprl.learners.base import SAMPLING, WEIGHTS, LearningAgents
+from cprl.keys import Turn
+from cprl.learners.base import LearningAgents
 from cprl.learners.engine import COMPILED_STEPS, Engine, UpdateRule
 from cprl.learners.lanes import LaneLearner, Lanes, Method
 from cprl.learners.ring import steps_ahead
-from cprl.learners.settings import RolloutSettings
-from cprl.learners.transitions import LaneTurn, refuse_other_dtype, wanted_in
+from cprl.learners.settings import LOLASettings, RolloutSettings
+from cprl.learners.transitions import LaneTurn, refuse_other_dtype
 from cprl.learners.trial import reads, refuse_other_advantages, trial_batch, trial_rollout
 from cprl.networks.agent import AgentNetworks, parts_of
 from cprl.networks.recurrent import state_shape_of
-from cprl.policies.rng import LaneRng
+from cprl.policies.rng import EXPLORATION, SAMPLING, WEIGHTS, LaneRng
 from cprl.system.memory import check_memory
 
 ACTOR, CRITIC = range(2)
@@ -49,10 +50,10 @@ def states_in(network: nn.Module) -> dict[str, tuple[int, ...]]:
 class States:
     """The states of recurrent actors and critics of L lanes, from one rollout to the next.
 
-    Turns are evaluated in order. The actor's first state of a rollout is the one by which it acted; that of
-    the critic, which does not act, is what it had after the rollout before. Gradients run through the
-    `sequence` turns of a minibatch, which begin with the states that the rollout had there, as of stored
-    states in Kapturowski et al., "Recurrent Experience Replay in Distributed Reinforcement Learning" (2019).
+    The actor's first state of a rollout is the one by which it acted; that of the critic, which does not act,
+    is what it had after the rollout before. Gradients run through the `sequence` turns of a minibatch, which
+    begin with the states that the rollout had there: the stored states of Kapturowski et al., "Recurrent
+    Experience Replay in Distributed Reinforcement Learning" (2019).
 
     Args:
         sequence: turns T' of a minibatch.
@@ -68,9 +69,9 @@ class States:
         """The next rollout begins with new episodes."""
         self._ended.fill_(True)
 
-    def begin(self, batch: TensorDictBase) -> None:
+    def begin(self, turn: Turn) -> None:
         """Notes by which states agents act in the first turn of a rollout."""
-        self._first[NAMES[ACTOR]].copy_(self._lanes.recurrent_state(batch))
+        self._first[NAMES[ACTOR]].copy_(torch.as_tensor(self._lanes.states_in(turn)))
 
     def evaluate(
         self, engine: Engine, columns: Mapping[str, Tensor]
@@ -90,12 +91,8 @@ class States:
     def value_next(
         self, engine: Engine, columns: Mapping[str, Tensor], size: int, seen_next: Tensor
     ) -> Tensor:
-        """The value of the state after the latest turn.
-
-        Args:
-            size: the turns that it has so far; 0 directly after a rollout.
-            seen_next: the observations after the latest turn, [L, 1, ...].
-        """
+        """The value of the state after the latest of `size` turns, 0 directly after a rollout, from the
+        observations after it, [L, 1, ...]."""
         after = self._first[NAMES[CRITIC]].unsqueeze(1)
         if size:
             so_far = {name: column[:, :size] for name, column in columns.items()}
@@ -111,7 +108,7 @@ class States:
     def _in_order(
         self, engine: Engine, columns: Mapping[str, Tensor], began: Tensor, part: int
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """The outputs of a network, its states before each turn, and those after each, [L, T, ...]."""
+        """The outputs of a network, its states before each turn and after it, [L, T, ...]."""
         observation, first = columns["observation"], self._first[NAMES[part]]
         given = first.new_zeros(*observation.shape[:2], *first.shape[1:])
         given[:, 0] = torch.where(_like(began[:, 0], first), 0.0, first)
@@ -158,11 +155,10 @@ class RolloutLearner(LaneLearner):
         rule = UpdateRule.of(settings)
         self.engine = self._make_engine(networks, rule=rule, compile=compile and is_short)
         self._states = States(shapes, self._lanes, sequence=settings.minibatch_size) if shapes else None
-        self.actor = self._lanes.actor(self.engine, compile=compile)
+        self.actor = self._lanes.actor(self.engine, EXPLORATION, compile=compile)
         steps = settings.rollout_steps
         self.rng = LaneRng(self._lanes.seeds(SAMPLING), steps, ahead=steps_ahead(steps))
-        self._rollout = rollout_fields(self._lanes, (steps,))
-        self._size = 0
+        self._rollout = Rollout(self._lanes, steps)
 
     def _trial(self, lanes: int) -> TensorDict:
         actions = self.spaces.actions
@@ -177,22 +173,21 @@ class RolloutLearner(LaneLearner):
 
     def begin(self) -> None:
         """Drops the rollout that an earlier training left unfinished; see `Learner`."""
-        self._size = 0
+        self._rollout.size = 0
         if self._states is not None:
             self._states.forget()
 
-    def store(self, batch: TensorDictBase) -> None:
-        refuse_full(self._size, self.rollout_steps)
-        if self._states is not None and not self._size:
-            self._states.begin(batch)
-        turn = self._lanes.turn(batch, wanted_in(self.wants, batch))
-        write_turn(self._rollout, (self._size,), turn)
-        self._size += 1
+    def store(self, batch: TensorDictBase | Turn) -> None:
+        turn = Turn.of(batch)
+        self._rollout.refuse_full()
+        if self._states is not None and not self._rollout.size:
+            self._states.begin(turn)
+        self._rollout.write(self._lanes.turn(turn, self._wanted(turn)))
         self.steps += 1
 
     def update(self) -> Tensor | None:
         """Runs all epochs over a full rollout; returns the mean losses [R, S], or None if it is not full."""
-        if self._size < self.rollout_steps:
+        if not self._rollout.is_full:
             return None
         batch = self._batch()
         lane = torch.arange(self.lanes, device=batch["action"].device)[:, None]
@@ -200,7 +195,7 @@ class RolloutLearner(LaneLearner):
         for _ in range(self.settings.epochs):
             places = self._minibatches(self.rng.next())
             losses += [self.engine.update_from(batch[lane, place.to(lane.device)]) for place in places]
-        self._size = 0
+        self._rollout.size = 0
         return self._lanes.by_agent(torch.stack(losses).mean(0))
 
     def _minibatches(self, numbers: Tensor) -> Tensor:
@@ -214,7 +209,7 @@ class RolloutLearner(LaneLearner):
     def _batch(self) -> TensorDict:
         """The rollout with advantages, [L, T], under the keys of TorchRL's losses; advantages are normalised
         within each lane if the settings say so."""
-        columns = self._columns()
+        columns = self._rollout.columns()
         with torch.no_grad():
             entries: dict[str, Tensor] = {}
             if self._states is not None:
@@ -224,7 +219,8 @@ class RolloutLearner(LaneLearner):
                 value = self.engine.outputs(columns["observation"], part=CRITIC)
                 next_value = self.engine.outputs(columns["next_observation"], part=CRITIC)
             chances = logits.log_softmax(-1)
-            advantage, target = advantages(columns, value, next_value, settings=self.settings)
+            over = tuple(range(1, value.ndim))
+            advantage, target = advantages(columns, value, next_value, settings=self.settings, over=over)
         chosen = chances.gather(-1, columns["action"].unsqueeze(-1)).squeeze(-1)
         return TensorDict(
             {
@@ -240,51 +236,50 @@ class RolloutLearner(LaneLearner):
             [self.lanes, self.rollout_steps],
         )
 
-    def _columns(self) -> dict[str, Tensor]:
-        return {name: field.transpose(0, 1) for name, field in self._rollout.items()}
-
-    def values(self, batch: TensorDictBase) -> Tensor:
+    def values(self, batch: TensorDictBase | Turn) -> Tensor:
         """The value that each agent's critic gives to the state after a turn, [R, S]."""
         with torch.no_grad():
-            seen = self._lanes.seen_next(batch)
+            seen = self._lanes.seen_next(Turn.of(batch))
             if self._states is None:
                 expected: Tensor = self.engine.outputs(seen, part=CRITIC)
             else:
-                expected = self._states.value_next(self.engine, self._columns(), self._size, seen)
+                columns = self._rollout.columns()
+                expected = self._states.value_next(self.engine, columns, self._rollout.size, seen)
         return expected.reshape(self.replicas, len(self.agents))
 
     def state_dict(self) -> dict[str, Any]:
         return {
             **super().state_dict(),
-            "rollout": self._rollout,
-            "size": self._size,
+            "rollout": self._rollout.fields,
+            "size": self._rollout.size,
             "draws": self.rng.state_dict(),
             **({} if self._states is None else {"recurrent": self._states.state_dict()}),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         super().load_state_dict(state)
-        for name, field in self._rollout.items():
-            field.copy_(state["rollout"][name])
+        self._rollout.load(state["rollout"], state["size"])
         self.rng.load_state_dict(state["draws"])
-        self._size = int(state["size"])
         if self._states is not None:
             self._states.load_state_dict(state["recurrent"])
 
 
 def advantages(
-    columns: Mapping[str, Tensor], value: Tensor, next_value: Tensor, *, settings: RolloutSettings
+    columns: Mapping[str, Tensor],
+    value: Tensor,
+    next_value: Tensor,
+    *,
+    settings: RolloutSettings | LOLASettings,
+    over: tuple[int, ...],
 ) -> tuple[Tensor, Tensor]:
-    """The advantage of each step, and the target of its value.
+    """The advantage of each step, and the target of its value, both of the shape of `value`.
 
     Args:
         columns: "reward", "done" and "terminated", of lanes [L, T], or of members of teams [L, T, S].
         value: of the states before each step, [L, T, ..., 1].
         next_value: of the states after it.
-        settings: the discount, lambda, and whether advantages are normalised within each lane.
-
-    Returns:
-        Both of the shape of `value`.
+        settings: the discount, lambda, and whether advantages are normalised.
+        over: the axes over which they are, that of time first.
     """
     advantage, target = generalized_advantage_estimate(
         settings.gamma,
@@ -292,12 +287,11 @@ def advantages(
         value,
         next_value,
         *(_like(columns[name], value).expand_as(value) for name in ("reward", "done", "terminated")),
-        time_dim=1,
+        time_dim=over[0],
     )
     if settings.normalize_advantage:
-        of_lane = tuple(range(1, advantage.ndim))
-        spread = advantage.std(of_lane, keepdim=True)
-        advantage = (advantage - advantage.mean(of_lane, keepdim=True)) / (spread + _SMALL)
+        spread = advantage.std(over, keepdim=True)
+        advantage = (advantage - advantage.mean(over, keepdim=True)) / (spread + _SMALL)
     return advantage, target
 
 
@@ -306,44 +300,64 @@ def _like(column: Tensor, value: Tensor) -> Tensor:
     return column.reshape(*column.shape, *[1] * (value.ndim - column.ndim))
 
 
-def rollout_fields(lanes: Lanes, size: tuple[int, ...]) -> dict[str, Tensor]:
-    """The fields of a `LaneTurn` for so many steps, zeros [*size, L, ...] each.
+class Rollout:
+    """The turns of a rollout of all lanes, field by field as of a `LaneTurn`.
 
     Args:
-        size: the number of steps; with several rollouts, their number first.
+        steps: T, of one rollout.
+        rollouts: P, those that are kept at once; by default one, without an axis of its own.
     """
-    form, device = lanes.form(), lanes.who.device
-    check_memory(
-        f"the rollouts of {len(lanes)} learners x {prod(size):,} steps",
-        prod(size) * len(lanes) * (2 * prod(form.observation_shape) * (form.dtype.itemsize + 4) + 64),
-        "fewer rollout_steps or fewer replicas",
-        device=device,
-    )
-    fields: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
-        "observation": (form.observation_shape, form.dtype),
-        "action": (form.action_shape, torch.int64),
-        "next_observation": (form.observation_shape, form.dtype),
-        "reward": (form.reward_shape, torch.float32),
-        "done": ((), torch.bool),
-        "terminated": ((), torch.bool),
-    }
-    return {
-        name: torch.zeros((*size, len(lanes), *shape), dtype=dtype, device=device)
-        for name, (shape, dtype) in fields.items()
-    }
 
+    def __init__(self, lanes: Lanes, steps: int, rollouts: int | None = None) -> None:
+        form, device = lanes.form(), lanes.who.device
+        axes = (steps,) if rollouts is None else (rollouts, steps)
+        turns = prod(axes)
+        check_memory(
+            f"the rollouts of {len(lanes)} learners x {turns:,} steps",
+            turns * len(lanes) * (2 * prod(form.observation_shape) * (form.dtype.itemsize + 4) + 64),
+            "fewer rollout_steps or fewer replicas",
+            device=device,
+        )
+        forms: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
+            "observation": (form.observation_shape, form.dtype),
+            "action": (form.action_shape, torch.int64),
+            "next_observation": (form.observation_shape, form.dtype),
+            "reward": (form.reward_shape, torch.float32),
+            "done": ((), torch.bool),
+            "terminated": ((), torch.bool),
+        }
+        self.fields = {
+            name: torch.zeros((*axes, len(lanes), *shape), dtype=dtype, device=device)
+            for name, (shape, dtype) in forms.items()
+        }
+        """[T, L, ...], or [P, T, L, ...]."""
+        self.steps, self.size = steps, 0
 
-def refuse_full(stored: int, steps: int) -> None:
-    if stored == steps:
-        raise ValueError(f"the rollout already has {steps} steps; call update() before store()")
+    @property
+    def is_full(self) -> bool:
+        return self.size == self.steps
 
+    def refuse_full(self) -> None:
+        if self.is_full:
+            raise ValueError(f"the rollout already has {self.steps} steps; call update() before store()")
 
-def write_turn(fields: Mapping[str, Tensor], at: tuple[int, ...], turn: LaneTurn) -> None:
-    for name, field in fields.items():
-        column = torch.as_tensor(getattr(turn, name))
-        if name in ("observation", "next_observation"):
-            refuse_other_dtype(column.dtype, field.dtype)
-        field[at] = column
+    def write(self, turn: LaneTurn, *rollout: int) -> None:
+        """Writes the next turn, of a rollout if several are kept."""
+        for name, field in self.fields.items():
+            column = torch.as_tensor(getattr(turn, name))
+            if name in ("observation", "next_observation"):
+                refuse_other_dtype(column.dtype, field.dtype)
+            field[(*rollout, self.size)] = column
+        self.size += 1
+
+    def columns(self) -> dict[str, Tensor]:
+        """The fields of a single rollout, [L, T, ...]."""
+        return {name: field.transpose(0, 1) for name, field in self.fields.items()}
+
+    def load(self, fields: Mapping[str, Tensor], size: int) -> None:
+        for name, field in self.fields.items():
+            field.copy_(fields[name])
+        self.size = int(size)
 
 
 def refuse_other_parts(network: nn.Module) -> None:

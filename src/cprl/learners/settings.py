@@ -116,32 +116,49 @@ class DQNSettings(Exploring):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RolloutSettings(Value):
-    """Hyperparameters of one independent on-policy agent. The study has none; the defaults are ours."""
+class _OfRollouts(Value, stored=False):
+    """What agents have in common that learn from rollouts of their present policies. The study has none; the
+    defaults are ours."""
 
     rollout_steps: Positive = 250
-    """Steps T collected between updates."""
-    epochs: Positive = 4
-    """Passes over each rollout."""
-    minibatch_size: Positive = 50
-    """Steps in a minibatch; must divide `rollout_steps`."""
+    """Steps T collected between updates; an update of LOLA takes several rollouts, see
+    `cprl.algorithms.LOLA.estimator`."""
     gamma: Share = 0.995
     """Discount factor per step."""
     optimizer: Optimizer = "adam"
-    """See `Optimizer`."""
-    gae_lambda: Share = 0.95
-    """Lambda of generalised advantage estimation (Schulman et al. 2016)."""
-    normalize_advantage: bool = True
-    """Whether each agent's advantages of a rollout are normalised to mean 0 and standard deviation 1."""
+    """See `cprl.learners.settings.Optimizer`; that of LOLA's papers is "sgd"."""
     learning_rate: LearningRate = 3e-4
     """The optimiser's step size."""
     adam_eps: OptimizerEps = 1e-5
     """Added to the denominator of Adam, AdamW and both kinds of RMSprop."""
     max_grad_norm: NormLimit = 0.5
     """The norm to which an agent's gradient is clipped; None for no clipping."""
+    gae_lambda: Share = 0.95
+    """Lambda of generalised advantage estimation (Schulman et al. 2016). At 1 advantages are returns to the
+    end of the episode, or of the rollout, less a value."""
+    normalize_advantage: bool = True
+    """Whether each agent's advantages of a rollout are normalised to mean 0 and standard deviation 1."""
     hidden_cells: Layers = DEFAULT_HIDDEN_CELLS
     """Units of each hidden layer, with ReLU, of the actor and of the critic; used if the algorithm has no
     `network`."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.normalize_advantage and self.rollout_steps == 1:
+            raise ValueError(
+                f"{type(self).__name__}.rollout_steps is 1; allowed with normalize_advantage: 2 or more, "
+                "because one advantage has no standard deviation"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RolloutSettings(_OfRollouts):
+    """Hyperparameters of one independent on-policy agent."""
+
+    epochs: Positive = 4
+    """Passes over each rollout."""
+    minibatch_size: Positive = 50
+    """Steps in a minibatch; must divide `rollout_steps`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -150,15 +167,6 @@ class RolloutSettings(Value):
                 f"RolloutSettings.minibatch_size is {self.minibatch_size}; it must divide rollout_steps, "
                 f"{self.rollout_steps}"
             )
-        _refuse_one_advantage(self)
-
-
-def _refuse_one_advantage(settings: "RolloutSettings | LOLASettings") -> None:
-    if settings.normalize_advantage and settings.rollout_steps == 1:
-        raise ValueError(
-            f"{type(settings).__name__}.rollout_steps is 1; allowed with normalize_advantage: 2 or more, "
-            "because one advantage has no standard deviation"
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,41 +194,19 @@ class TabularSettings(Exploring):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LOLASettings(Value):
-    """Hyperparameters of the members of a team that learns by LOLA. The study has none; the defaults are
-    ours.
-    """
+class LOLASettings(_OfRollouts):
+    """Hyperparameters of the members of a team that learns by LOLA."""
 
-    rollout_steps: Positive = 250
-    """Steps T of a rollout; an update takes several rollouts, see `cprl.algorithms.LOLA.estimator`."""
-    gamma: Share = 0.995
-    """Discount factor per step."""
     look_ahead_rate: Annotated[float, Range(0, 1e12)] = 0.03
     """The size of the step, by plain gradient descent, that each member expects of the others; 0 is
     naive learning. The papers' 0.3 to 1 are for policies of five numbers; on boards of the commons 0.03 is a
     step as long as a tenth of the weights, 1 a policy that has nothing to do with the present one."""
-    optimizer: Optimizer = "adam"
-    """The optimiser of the policies, see `cprl.learners.settings.Optimizer`. The papers' is "sgd"."""
     learning_rate: LearningRate = 1e-3
-    """Its step size."""
-    adam_eps: OptimizerEps = 1e-5
-    """Added to the denominator of Adam, AdamW and both kinds of RMSprop."""
     max_grad_norm: NormLimit = None
-    """The norm to which each member's gradient is clipped; None for no clipping."""
     gae_lambda: Share = 1.0
-    """Lambda of generalised advantage estimation: at 1 advantages are returns to the end of the
-    episode, or of the rollout, less a value."""
     normalize_advantage: bool = False
-    """Whether each member's advantages of a rollout are normalised to mean 0 and standard deviation 1. This
-    scales the gradients, and so the steps that are expected of the others."""
+    """As of other agents; it scales the gradients, and so the steps that are expected of the others."""
     critic_learning_rate: LearningRate = 1e-3
     """The step size of Adam for the critics."""
     critic_epochs: Natural = 10
     """Steps of each critic after an update of the policies, over all its rollouts."""
-    hidden_cells: Layers = DEFAULT_HIDDEN_CELLS
-    """Units of each hidden layer, with ReLU, of the actor and of the critic; used if the algorithm has no
-    `network`."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _refuse_one_advantage(self)

@@ -23,9 +23,11 @@ from torch import Tensor, nn
 
 from cprl import keys
 from cprl.commons.spaces import Spaces
-from cprl.learners.base import EVALUATION, EXPLORATION, Learner, LearningAgents
+from cprl.keys import Turn
+from cprl.learners.base import Learner, LearningAgents
 from cprl.learners.settings import TabularSettings
-from cprl.learners.transitions import lane_turn, wanted_in
+from cprl.learners.transitions import lane_turn
+from cprl.policies.rng import EVALUATION, EXPLORATION
 from cprl.policies.tabular import NEVER_MET, QTables, TableNetwork, TabularActor, observed_entries, states_of
 
 
@@ -67,15 +69,16 @@ class TabularLearner(Learner):
         actor.epsilon = self.settings.epsilon_evaluation
         return actor
 
-    def store(self, batch: TensorDictBase) -> None:
+    def store(self, batch: TensorDictBase | Turn) -> None:
         """Queues one step of every replica for `update`."""
-        batch = batch.cpu()  # where the tables are
-        turn = lane_turn(self.agents, batch, wanted_in(self.wants, batch))
-        before, after = keys.entry(batch, keys.AGENTS), keys.entry(batch, "next")
-        seen = states_of(before, self._observed, self.agents)
+        came = Turn.of(batch)
+        if came.batch.device is not None and came.batch.device.type != "cpu":
+            came = Turn.of(came.batch.cpu())  # where the tables are
+        turn = lane_turn(self.agents, came, self._wanted(came))
+        seen = states_of(came.batch[keys.AGENTS], self._observed, self.agents)
         rows = self.tables.find_or_add(seen, self._every_lane)
         on = np.flatnonzero(~turn.terminated)
-        next_seen = states_of(keys.entry(after, keys.AGENTS), self._observed, self.agents)
+        next_seen = states_of(came.batch["next", keys.AGENTS], self._observed, self.agents)
         next_rows = np.full(self.lanes, NEVER_MET, np.int64)
         next_rows[on] = self.tables.find_or_add([next_seen[lane] for lane in on], on.tolist())
         reward, action = turn.reward.astype(np.float64), turn.action.copy()
@@ -101,9 +104,9 @@ class TabularLearner(Learner):
             sound = np.array([np.isfinite(self.tables.of_lane(lane)[1]).all() for lane in self._every_lane])
         return torch.from_numpy(sound).view(self.replicas, len(self.agents))
 
-    def values(self, batch: TensorDictBase) -> Tensor:
+    def values(self, batch: TensorDictBase | Turn) -> Tensor:
         """The highest action value of each agent at the end of a turn, [R, S]."""
-        after = keys.entry(keys.entry(batch, "next"), keys.AGENTS)
+        after = Turn.of(batch).batch["next", keys.AGENTS]
         rows = self.tables.find(states_of(after, self._observed, self.agents), self._every_lane)
         return torch.from_numpy(self.tables.values[rows].max(1)).view(self.replicas, len(self.agents))
 
@@ -122,11 +125,8 @@ class TabularLearner(Learner):
         return states
 
     def state_dict(self) -> dict[str, Any]:
-        """The full state of all lanes.
-
-        The entry "networks" repeats the values of "tables" in the form that `cprl.load` reads. It is empty if
-        there is no such form, see `Tabular.make_network`.
-        """
+        """The full state of all lanes, of which "networks" repeats "tables" as `cprl.load` reads them; it is
+        empty where there is no such form, see `Tabular.make_network`."""
         turns = [{name: torch.from_numpy(array) for name, array in turn.items()} for turn in self._turns]
         return {
             "tables": self.tables.state_dict(),

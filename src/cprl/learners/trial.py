@@ -4,7 +4,7 @@ The algorithms of cprl name theirs (`cprl.algorithms.base.Algorithm.batching`); 
 """
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
 from typing import Any, Final
@@ -15,26 +15,16 @@ from torch import Tensor, nn
 from torchrl.objectives import A2CLoss, LossModule, PPOLoss, ReinforceLoss, ValueEstimators
 from torchrl.objectives.value import GAE, TD0Estimator, ValueEstimatorBase
 
-from cprl.learners.engine import (
-    WAYS,
-    Batching,
-    MakeLoss,
-    UpdateRule,
-    groups_of,
-    make_engine,
-    own_targets,
-    targets_of,
-    total,
-)
+from cprl.learners.engine import WAYS, Batching, MakeLoss, UpdateRule, make_engine
 from cprl.learners.ring import Ring, TransitionForm
 from cprl.learners.settings import DQNSettings, RolloutSettings
+from cprl.objectives.functional import groups_of, own_targets, targets_of, total
 from cprl.system.compiling import TOLERANCE
 
 TRIAL_LANES: Final = 2
-"""Lanes of a trial: enough to show whether lanes influence each other."""
+"""Enough to show whether lanes influence each other."""
 TRIAL_TRANSITIONS: Final = 16
-TRIAL_UPDATES: Final = 3
-"""Enough to show stale weights or targets."""
+TRIAL_UPDATES: Final = 3  # enough to show stale weights or targets
 TRIAL_RULE: Final = UpdateRule(learning_rate=0.1, adam_eps=1.0)
 """With these values Adam's first step changes a weight by 0.1 g / (abs(g) + 1), where g is its gradient."""
 
@@ -53,8 +43,7 @@ def fitting_engine(
     try:
         _tried("list", networks, make_loss, trial)
     except KeyError as error:
-        names = trial.keys(True, True)
-        entries = ", ".join(sorted("/".join(key) if isinstance(key, tuple) else key for key in names))
+        entries = ", ".join(sorted(trial.flatten_keys("/").keys()))
         raise ValueError(
             f"the loss reads an entry that its batches do not have: {error}; they have {entries}"
         ) from error
@@ -150,12 +139,8 @@ def trial_rollout(
     actions: int | None = None,
     states: Mapping[str, Sequence[int]] | None = None,
 ) -> TensorDict:
-    """A synthetic batch of a rollout, from synthetic transitions.
-
-    Args:
-        actions: their number A, for a batch with logits.
-        states: the shapes of the states of recurrent networks by their entries; every third step is an init.
-    """
+    """A synthetic batch of a rollout, from synthetic transitions: with the logits of so many actions, and the
+    states of recurrent networks, of these shapes, whose every third step is an init."""
     chance, device = torch.Generator().manual_seed(1), transitions["action"].device
     batch = transitions.select("observation", "action")
 
@@ -174,26 +159,18 @@ def trial_rollout(
     return batch
 
 
-_OF_ONE_STEP: Final = (None, ValueEstimators.TD0, TD0Estimator)
-_OF_ROLLOUTS: Final = (None, ValueEstimators.GAE, ValueEstimators.MAGAE)
-
-
 def refuse_for_replay(loss: LossModule, settings: DQNSettings, make_batch: Callable[[], TensorDict]) -> None:
-    """Raises a ValueError if a loss cannot learn from a replay buffer with these settings.
-
-    Args:
-        loss: the loss of one lane; it is called if `n_steps` is above 1.
-        make_batch: makes synthetic transitions of one lane, [b].
-    """
+    """Raises a ValueError if the loss of a lane cannot learn from a replay buffer with these settings; with
+    `n_steps` above 1 it is tried with synthetic transitions, [b]."""
     name = type(loss).__name__
     if isinstance(loss, A2CLoss | PPOLoss | ReinforceLoss):
         raise ValueError(
             f"{name} is on-policy and cannot learn from a replay buffer; use RolloutLearner, or "
             "cprl.algorithms.PPO, A2C or Reinforce in a population"
         )
-    if loss.value_type not in _OF_ONE_STEP:
+    if loss.value_type not in (None, ValueEstimators.TD0, TD0Estimator):
         raise ValueError(
-            f"{name} has the value estimator {_name(loss.value_type)}, which reads consecutive steps; a "
+            f"{name} has the value estimator {loss.value_type}, which reads consecutive steps; a "
             "replay buffer samples single transitions; allowed: ValueEstimators.TD0, with n_steps for longer "
             "returns"
         )
@@ -204,7 +181,8 @@ def refuse_for_replay(loss: LossModule, settings: DQNSettings, make_batch: Calla
             )
     if settings.n_steps == 1:
         return
-    _refuse_other_numbers(loss, (loss, *_estimators(loss)), settings, gamma="gamma")
+    for owner in (loss, *_estimators(loss)):
+        _refuse_another(loss, owner, "gamma", "gamma", settings)
     own_targets(loss)
     if _ignores_steps(loss, make_batch()):
         raise ValueError(
@@ -216,44 +194,41 @@ def refuse_for_replay(loss: LossModule, settings: DQNSettings, make_batch: Calla
 def refuse_other_advantages(loss: LossModule, settings: RolloutSettings) -> None:
     """Raises a ValueError if a loss needs other advantages than those of `RolloutLearner`."""
     kind = loss.value_type
-    if kind not in _OF_ROLLOUTS and not (isinstance(kind, type) and issubclass(kind, GAE)):
+    is_gae = isinstance(kind, type) and issubclass(kind, GAE)
+    if not is_gae and kind not in (None, ValueEstimators.GAE, ValueEstimators.MAGAE):
         raise ValueError(
-            f"{type(loss).__name__} has the value estimator {_name(kind)}; allowed: GAE, which "
+            f"{type(loss).__name__} has the value estimator {kind}; allowed: GAE, which "
             "RolloutLearner computes: leave make_value_estimator out, and set gamma and gae_lambda in the "
             "settings"
         )
-    _refuse_other_numbers(loss, _estimators(loss), settings, gamma="gamma", lmbda="gae_lambda")
+    for owner in _estimators(loss):
+        _refuse_another(loss, owner, "gamma", "gamma", settings)
+        _refuse_another(loss, owner, "lmbda", "gae_lambda", settings)
 
 
-def _refuse_other_numbers(
-    loss: LossModule, owners: Iterable[Any], settings: DQNSettings | RolloutSettings, **fields: str
+def _refuse_another(
+    loss: LossModule, owner: Any, name: str, field: str, settings: DQNSettings | RolloutSettings
 ) -> None:
-    """Raises a ValueError if a loss or its estimators have other numbers than fields of the settings."""
-    for owner in owners:
-        for name, field in fields.items():
-            expected = getattr(settings, field)
-            value = float(getattr(owner, name, expected))
-            if abs(value - expected) > 1e-6:
-                raise ValueError(
-                    f"{type(loss).__name__} has {name} {value:g} and the settings have {field} {expected:g}, "
-                    "by which the learner sums rewards; they must be equal, or leave make_value_estimator out"
-                )
+    """Raises a ValueError if a loss or an estimator of it has another number than the settings."""
+    expected = getattr(settings, field)
+    value = float(getattr(owner, name, expected))
+    if abs(value - expected) > 1e-6:
+        raise ValueError(
+            f"{type(loss).__name__} has {name} {value:g} and the settings have {field} {expected:g}, "
+            "by which the learner sums rewards; they must be equal, or leave make_value_estimator out"
+        )
 
 
 def reads(loss: LossModule, key: str) -> bool:
+    """Whether a loss lists an entry among those that it reads."""
     try:
-        listed: Iterable[object] = getattr(loss, "in_keys", None) or ()
+        return key in (getattr(loss, "in_keys", None) or ())
     except NotImplementedError:
         return False
-    return key in listed
 
 
 def _estimators(loss: LossModule) -> list[ValueEstimatorBase]:
     return [child for child in loss.children() if isinstance(child, ValueEstimatorBase)]
-
-
-def _name(kind: object) -> str:
-    return kind.__name__ if isinstance(kind, type) else str(kind)
 
 
 def _ignores_steps(loss: LossModule, batch: TensorDict) -> bool:

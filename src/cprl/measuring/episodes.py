@@ -19,6 +19,7 @@ from cprl.commons.game import Game
 from cprl.commons.yields import sustainable_yield
 from cprl.envs.unwrap import agent_count, commons_of
 from cprl.institutions import COUNTS, Institution
+from cprl.keys import Turn
 from cprl.measuring import institutions, social
 from cprl.measuring.metrics import (
     FIELDS,
@@ -255,16 +256,17 @@ class EpisodeTracker:
         self._places: list[tuple[str, Any, str]] = []
         self._checked: torch.Size | None = None
 
-    def add(self, tensordict: TensorDictBase) -> list[Episode]:
+    def add(self, batch: TensorDictBase | Turn) -> list[Episode]:
         """Adds the next turns of all worlds, batch size [B] or [B, T], with the entries of `cprl.keys`.
 
         Returns:
             The episodes that ended, ordered by turn, then by world.
         """
+        tensordict = batch.batch if isinstance(batch, Turn) else batch
         if self.reported is None:
             reported = reported_in(tensordict)
             self._begin(reported, self._zeros(reported, _widths_in(tensordict)))
-        turns, size = self._read(tensordict), tensordict.batch_size
+        turns, size = self._read(batch, tensordict), tensordict.batch_size
         if len(size) == 1:
             return self._add_turn(turns)
         return [
@@ -331,24 +333,27 @@ class EpisodeTracker:
             },
         }
 
-    def _read(self, tensordict: TensorDictBase) -> Turns:
+    def _read(self, batch: TensorDictBase | Turn, tensordict: TensorDictBase) -> Turns:
         """All entries as arrays, [B, ...] or [B, T, ...], without a copy if the batch is on the CPU.
 
         "had_ended", the worlds that had ended before the turn, and the agents' decisions are included only
         if a world has ended now.
         """
-        entry = keys.entry
         try:
-            agents, following = entry(tensordict, keys.AGENTS), entry(tensordict, "next")
-            groups: dict[Any, Any] = {("agents",): agents, ("next",): following}
-            groups["next", "agents"], had_ended = entry(following, keys.AGENTS), entry(tensordict, keys.DONE)
-            turns: Turns = {
-                name: entry(groups[group], key).numpy(force=True) for name, group, key in self._places
+            turn = Turn.of(batch)
+            groups: dict[Any, Any] = {
+                ("agents",): turn.agents,
+                ("next",): turn.next_world,
+                ("next", "agents"): turn.next_agents,
             }
-            if np.count_nonzero(turns["done"]):  # a tenth of the time that `any` takes on so few
-                turns["had_ended"] = had_ended.numpy(force=True)
-                if tensordict.get(keys.BALLOTS_DUE, None) is not None:
-                    turns["decision"] = entry(agents, "decision").numpy(force=True)
+            turns: Turns = {name: groups[group][key] for name, group, key in self._places}
+            turns["had_ended"] = turn.world[keys.DONE]
+            if isinstance(turns["done"], Tensor):
+                turns = {name: tensor.numpy(force=True) for name, tensor in turns.items()}
+            if not np.count_nonzero(turns["done"]):  # a tenth of the time that `any` takes on so few
+                del turns["had_ended"]
+            elif tensordict.get(keys.BALLOTS_DUE, None) is not None:
+                turns["decision"] = tensordict[keys.DECISION].numpy(force=True)
         except KeyError as error:
             places = [(*group, key) for _, group, key in (*self._places, ("", (), keys.DONE))]
             missing = [f"({', '.join(key)})" for key in places if tensordict.get(key, None) is None]

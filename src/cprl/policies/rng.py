@@ -12,6 +12,32 @@ from cprl.system.memory import check_memory
 DRAWN_AHEAD: Final = 1024
 """Steps whose numbers are generated at once."""
 
+_LARGEST_SEED: Final = 2**63 - 1
+
+WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION, EXHIBITION, NOISE = range(7)
+"""The purposes of a lane's random numbers; each has its own seed."""
+
+
+def lane_seeds(
+    seed: int, *, replicas: Sequence[int], agents: Sequence[int], purpose: int
+) -> list[tuple[int, int, int, int]]:
+    """The seed of each lane, replica by replica: (seed of the run, replica, agent, purpose)."""
+    return [(seed, replica, agent, purpose) for replica in replicas for agent in agents]
+
+
+def lane_name(replica: int, agent: int) -> str:
+    return f"replica_{replica}/agent_{agent}"
+
+
+def lane_names(*, replicas: Sequence[int], agents: Sequence[int]) -> list[str]:
+    """The name of each lane, replica by replica: "replica_0/agent_0" and so on."""
+    return [lane_name(replica, agent) for replica in replicas for agent in agents]
+
+
+def seed_of(seed: Sequence[int]) -> int:
+    """The seed of a lane as one for a generator of torch."""
+    return int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0] & _LARGEST_SEED)
+
 
 class LaneRng:
     """Uniform numbers in 0..1, `count` for each lane and step.

@@ -37,7 +37,7 @@ def save_decisions(run: Path, values: Mapping[str, Tensor]) -> None:
     """Write the values of agents' decisions atomically; no file if they learn none.
 
     Args:
-        values: float64 [C] by the agent's name, see `cprl.learners.decisions.BanditDecider.learned`.
+        values: float64 [C] by the agent's name, see `cprl.policies.decisions.BanditDecider.learned`.
     """
     if values:
         _save(run, DECISIONS, values)

@@ -15,28 +15,26 @@ from cprl.algorithms.base import Algorithm, TeamAlgorithm
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.envs.make_env import make_env, spaces_of
+from cprl.envs.preferences import named
 from cprl.envs.state import load_transforms_state
 from cprl.envs.unwrap import commons_of
 from cprl.experiment import Experiment
-from cprl.learners.base import (
-    EVALUATION,
-    EXHIBITION,
-    EXPLORATION,
-    Learner,
-    LearningAgents,
-    lane_name,
-    lane_seeds,
-)
-from cprl.learners.decisions import Bandit, BanditDecider, stored_decisions
-from cprl.learners.preferences import named
+from cprl.learners.base import Learner, LearningAgents
 from cprl.networks.agent import acting_part
 from cprl.networks.finite import all_finite
 from cprl.networks.recurrent import state_cells_of, state_shape_of
 from cprl.networks.stacked import stack_lanes
 from cprl.policies.assignment import AgentIndices, AgentPolicies
-from cprl.policies.decisions import ballot_sizes, decider_by_chance
+from cprl.policies.decisions import (
+    Bandit,
+    BanditDecider,
+    ballot_sizes,
+    decider_by_chance,
+    stored_decisions,
+)
 from cprl.policies.lanes import LaneActor, random_agents
 from cprl.policies.present import PresentPolicy
+from cprl.policies.rng import EVALUATION, EXHIBITION, EXPLORATION, lane_name, lane_seeds
 from cprl.policies.scripted import ScriptedPolicy, scripted_lanes
 from cprl.population import (
     AgentSpec,
@@ -277,10 +275,17 @@ def stored_policies(
     seeds = partial(lane_seeds, seed, replicas=replicas, purpose=EVALUATION)
     decisions = None
     if isinstance(playing, Game):
-        values = [[stored.decisions for stored in of_replicas] for of_replicas in agents]
-        decisions = stored_decisions(values, playing, replicas=replicas, worlds=worlds, seed=seed)
+        stored = _stored_values(by_index)
+        decisions = stored_decisions(playing, stored, replicas=replicas, worlds=worlds, seed=seed)
     actors = _actors(by_index, playing, kinds=kinds, seeds=seeds, worlds=worlds, stacks=True)
     return AgentPolicies(actors, decisions=decisions)
+
+
+def _stored_values(agents: Mapping[int, Sequence[StoredAgent]]) -> dict[int, list[Tensor]]:
+    """The values of the decisions of each replica, of agents that have any; scripted ones have none."""
+    values = {agent: [stored.decisions for stored in of_replicas] for agent, of_replicas in agents.items()}
+    known = {agent: [value for value in each if value is not None] for agent, each in values.items()}
+    return {agent: each for agent, each in known.items() if each}
 
 
 def _actors(
@@ -483,15 +488,10 @@ class Population:
             (spec.decisions or Bandit()) if isinstance(spec, Learning | Team) else None
             for spec in self._by_agent
         ]
-        stored: dict[int, list[Tensor]] = {}
-        for agent, of_replicas in self._stored.items():
-            values = [agent_of_replica.decisions for agent_of_replica in of_replicas]
-            known = [value for value in values if value is not None]  # scripted agents have none
-            stored |= {agent: known} if known else {}
         return BanditDecider(
             sizes,
             bandits=bandits,
-            stored=stored,
+            stored=_stored_values(self._stored),
             replicas=self.replicas,
             seed=self.seed,
             first_replica=self._numbers.start,

@@ -15,14 +15,15 @@ from math import isfinite
 from typing import Any, Final
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
-from torch import Tensor, float64
+from torch import Tensor
 
-from cprl import keys
 from cprl.commons.spaces import Spaces
 from cprl.experiment.experiment import OnNan
-from cprl.learners.base import LaneLosses, Learner
+from cprl.keys import Turn
+from cprl.learners.base import Learner
+from cprl.training.learning import LaneLosses
 
 EVERY_STEPS: Final = 16
 """Steps between two looks at the sums; to look in every step took 3 to 8 % of a training."""
@@ -81,18 +82,16 @@ class FiniteCheck:
         self._is_fresh = True
         self._weights_step = 0
 
-    def add(self, batch: TensorDictBase) -> None:
+    def add(self, turn: Turn) -> None:
         """Sums up what agents observe after a turn, [R]; this needs no synchronisation with a GPU."""
-        if not self._entries:
-            return
-        seen = [keys.entry(keys.entry(batch, "next"), keys.AGENTS)]
-        if self._is_fresh:  # the first observation after a reset was nobody's next
-            seen.append(keys.entry(batch, keys.AGENTS))
+        seen = [turn.next_agents]
+        if self._entries and self._is_fresh:  # the first observation after a reset was nobody's next
+            seen.append(turn.agents)
             self._is_fresh = False
         for name in self._entries:
             for agents in seen:
-                entry: Tensor = keys.entry(agents, name)
-                sums = entry.reshape(*entry.shape[:2], -1).sum(-1, dtype=float64)
+                entry = torch.as_tensor(agents[name])
+                sums = entry.reshape(*entry.shape[:2], -1).sum(-1, dtype=torch.float64)
                 self._sums[name] = sums + self._sums[name] if name in self._sums else sums
 
     def check(

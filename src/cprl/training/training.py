@@ -20,15 +20,8 @@ from cprl.envs.state import carried_state, env_state, load_carried, load_env_sta
 from cprl.envs.stepping import begin_states
 from cprl.envs.unwrap import commons_of
 from cprl.experiment.experiment import OnNan
-from cprl.learners.base import (
-    LaneLosses,
-    Learner,
-    WantedReturns,
-    check_agents,
-    check_decisions,
-    check_numbers,
-    learned_in,
-)
+from cprl.keys import Turn
+from cprl.learners.base import Learner
 from cprl.measuring.episodes import Episode, tracker_of
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import Decider
@@ -36,6 +29,14 @@ from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.files import TRAINING_STATE_FORMAT
 from cprl.system.times import Times
 from cprl.training.finite import EVERY_STEPS, FiniteCheck
+from cprl.training.learning import (
+    LaneLosses,
+    WantedReturns,
+    check_agents,
+    check_decisions,
+    check_numbers,
+    learned_in,
+)
 from cprl.values import Custom, shown
 
 
@@ -199,10 +200,11 @@ class Training:
 
     def _take(self, batch: TensorDictBase) -> None:
         self.steps += 1
-        self.finite.add(batch)
         began = time.perf_counter()
+        turn = Turn.of(batch)
+        self.finite.add(turn)
         for learner in self.learners.values():
-            learner.store(batch)
+            learner.store(turn)
         self._wanted.add()
         if self.steps % self.update_every == 0:
             for _ in range(self.update_every):
@@ -211,9 +213,9 @@ class Training:
         self.times.busy_s += time.perf_counter() - began
         for on_step in self._on_step:
             on_step(batch)
-        ended = self._tracker.add(batch)
+        ended = self._tracker.add(turn)
         if ended:
-            self._end(ended, batch)
+            self._end(ended, turn)
         elif self.steps % EVERY_STEPS == 0:
             self._check_finite()
 
@@ -230,11 +232,11 @@ class Training:
             returns[episode.world] = episode.return_
         self.finite.check(self._losses, returns, self.steps, weights=weights)
 
-    def _end(self, ended: Sequence[Episode], batch: TensorDictBase) -> None:
+    def _end(self, ended: Sequence[Episode], turn: Turn) -> None:
         self._check_finite(ended, weights=True)
         worlds = torch.zeros(len(self._played), dtype=torch.bool)
         worlds[[episode.world for episode in ended]] = True
-        values = {agents: learner.values(batch) for agents, learner in self.learners.items()}
+        values = {agents: learner.values(turn) for agents, learner in self.learners.items()}
         learning = [learned_in(episode.world, self.learners, self._losses, values) for episode in ended]
         for learner in self.learners.values():
             learner.end_episode(worlds)

@@ -40,6 +40,7 @@ from cprl.system.compat.losses import updated_weights as updated_weights
 from cprl.system.compat.recordings import StoredLayout as StoredLayout
 from cprl.system.compat.recordings import end_recordings as end_recordings
 from cprl.system.compat.recordings import keep_native as keep_native
+from cprl.system.compat.tensordicts import Views as Views
 from cprl.system.compat.tensordicts import entry as entry
 from cprl.system.compat.tensordicts import put as put
 from cprl.system.compat.tensordicts import put_all as put_all

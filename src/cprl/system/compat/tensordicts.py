@@ -22,6 +22,23 @@ def entry(tensordict: TensorDictBase, name: str) -> Any:
     return tensordict._get_str(name, NO_DEFAULT)
 
 
+class Views(dict[str, Any]):
+    """The entries of a TensorDict as arrays, numpy's on the CPU, else tensors, each made when first read.
+
+    Raises:
+        KeyError: if there is no such entry.
+    """
+
+    def __init__(self, tensordict: TensorDictBase) -> None:
+        super().__init__()
+        self._tensordict = tensordict
+
+    def __missing__(self, name: str) -> Any:
+        tensor = self._tensordict._get_str(name, NO_DEFAULT)
+        self[name] = view = tensor.numpy() if tensor.is_cpu else tensor
+        return view
+
+
 def put(tensordict: TensorDictBase, name: str, value: Any) -> None:
     """`tensordict.set(name, value)` without key handling or checks; the value must fit."""
     tensordict._set_str(name, value, validated=True, inplace=False, non_blocking=False)

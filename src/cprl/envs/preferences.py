@@ -146,15 +146,15 @@ class WantedRewards:
 
     def __init__(self, preferences: Preference | Sequence[Preference]) -> None:
         self.preferences = preferences
-        listed = tuple(preferences) if isinstance(preferences, list | tuple) else ()
+        listed: Any = preferences if isinstance(preferences, list | tuple) and preferences else ()
         for place, preference in enumerate(listed):
             checked(f"preferences[{place}]", preference, Preference)
         if not listed:
             checked("preferences", preferences, Preference)
-        self._listed = listed
-        kinds: Any = dict.fromkeys(listed) if listed else [preferences]
-        self._columns = {
-            preference: [agent for agent, other in enumerate(listed) if other == preference]
+        self._listed = tuple(listed)
+        kinds: Any = dict.fromkeys(self._listed or [preferences])
+        self._agents_of = {
+            preference: [agent for agent, other in enumerate(self._listed) if other == preference]
             for preference in kinds
         }
         self._smoothed: dict[Preference, Doubles] = {}
@@ -169,7 +169,7 @@ class WantedRewards:
                 f"preferences has {len(self._listed)} entries; allowed: one preference for all agents, "
                 f"or one for each of {agents}"
             )
-        for preference in self._columns:
+        for preference in self._agents_of:
             check_preference("preferences", preference, agents)
         self._agents = agents
 
@@ -190,14 +190,13 @@ class WantedRewards:
             self.now = torch.as_tensor(wanted, device=rewards.device)
             return self.now
         with np.errstate(all="ignore"):  # rewards that are not finite are found and named elsewhere
-            columns = {preference: self._wanted(preference, rewards, ended) for preference in self._columns}
-        if not self._listed:
-            (self.now,) = columns.values()
-            return self.now
-        self.now = np.empty(rewards.shape, np.float32)
-        for preference, of_preference in columns.items():
-            agents = self._columns[preference]
-            self.now[:, agents] = of_preference[:, agents]
+            if not self._listed:
+                (preference,) = self._agents_of
+                self.now = self._wanted(preference, rewards, ended)
+                return self.now
+            self.now = np.empty(rewards.shape, np.float32)
+            for preference, agents in self._agents_of.items():
+                self.now[:, agents] = self._wanted(preference, rewards, ended)[:, agents]
         return self.now
 
     def _wanted(self, preference: Preference, rewards: Array, ended: Array) -> Array:
@@ -208,13 +207,14 @@ class WantedRewards:
         assert not isinstance(preference, str)
         given = smoothed = rewards.astype(np.float64)
         if isinstance(preference, InequityAversion):
-            before = self._smoothed.get(preference)
-            if before is not None and before.shape != rewards.shape:
-                raise ValueError(
-                    f"rewards is {list(rewards.shape)}; allowed: {list(before.shape)}, as in the turn "
-                    "before, or clear() before"
-                )
-            smoothed = given.copy() if before is None else preference.smoothing * before + given
+            smoothed = given.copy()
+            if (before := self._smoothed.get(preference)) is not None:
+                if before.shape != rewards.shape:
+                    raise ValueError(
+                        f"rewards is {list(rewards.shape)}; allowed: {list(before.shape)}, as in the turn "
+                        "before, or clear() before"
+                    )
+                smoothed = preference.smoothing * before + given
         wanted = preference.wanted(given, smoothed).astype(np.float32)
         if isinstance(preference, InequityAversion):
             smoothed[ended] = 0
@@ -228,19 +228,17 @@ class WantedRewards:
             self._smoothed = {}
             return
         marked = worlds.numpy(force=True) if isinstance(worlds, Tensor) else worlds
-        self._smoothed = {
-            preference: np.where(marked[:, None], 0.0, smoothed)
-            for preference, smoothed in self._smoothed.items()
-        }
+        for preference, smoothed in self._smoothed.items():
+            self._smoothed[preference] = np.where(marked[:, None], 0.0, smoothed)
 
     def state_dict(self) -> dict[str, Tensor]:
         """What is remembered: "smoothed" float64 [K, B, N], for each of the K preferences that remember, in
         the order of their first agents; empty if nothing is."""
-        tables = [self._smoothed[preference] for preference in self._columns if preference in self._smoothed]
+        tables = [self._smoothed[kind] for kind in self._agents_of if kind in self._smoothed]
         return {"smoothed": torch.from_numpy(np.stack(tables))} if tables else {}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        remember = [preference for preference in self._columns if isinstance(preference, InequityAversion)]
+        remember = [kind for kind in self._agents_of if isinstance(kind, InequityAversion)]
         smoothed = state.get("smoothed")
         if smoothed is not None and (smoothed.ndim != 3 or len(smoothed) != len(remember)):
             raise ValueError(
@@ -339,25 +337,18 @@ class PreferenceWrapper(BaseParallelWrapper[str, Any, Any]):
     def __repr__(self) -> str:
         return f"PreferenceWrapper({self.env!r})"
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Begins the next episode; nothing is remembered of the last one."""
         self.wants.clear()
-        first: tuple[dict[str, Any], dict[str, dict[str, Any]]] = self.env.reset(seed=seed, options=options)
-        return first
+        return self.env.reset(seed=seed, options=options)
 
-    def step(
-        self, actions: dict[str, Any]
-    ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+    def step(self, actions: dict[str, Any]) -> Any:
         seen, given, terminations, truncations, infos = self.env.step(actions)
         everyone = self.env.possible_agents
         of_turn = np.array([[given.get(agent, 0.0) for agent in everyone]], np.float32)
-        wanted = self.wants.add(of_turn, np.zeros(1, np.bool_))[0]
+        wanted = dict(zip(everyone, self.wants.add(of_turn, np.zeros(1, np.bool_))[0], strict=True))
         infos = {
             agent: {**infos.get(agent, {}), "env_reward": float(reward)} for agent, reward in given.items()
         }
-        rewards = {
-            agent: float(reward) for agent, reward in zip(everyone, wanted, strict=True) if agent in given
-        }
+        rewards = {agent: float(reward) for agent, reward in wanted.items() if agent in given}
         return seen, rewards, terminations, truncations, infos
