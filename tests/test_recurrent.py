@@ -246,7 +246,7 @@ def test_a_rollout_is_evaluated_as_it_was_played_across_rollouts_and_episodes():
         own = logits.log_softmax(-1).gather(-1, half["action"][6][:, None])[:, 0]
         torch.testing.assert_close(own, half["action_log_prob"][6])
         assert (half["recurrent_state"][6, 0] != 0).any()
-        learner._size = 0  # the same weights play on
+        learner._rollout.size = 0  # the same weights play on
 
 
 def test_the_critic_goes_on_from_rollout_to_rollout_and_values_the_state_after_each_turn():
@@ -272,10 +272,10 @@ def test_the_critic_goes_on_from_rollout_to_rollout_and_values_the_state_after_e
         played.append(next(turns))
         learner.store(played[-1])
         torch.testing.assert_close(learner.values(played[-1]), wanted(played)[0])
-        if learner._size == 10:
-            _, _, next_value, _ = learner._states.evaluate(learner.engine, learner._columns())
+        if learner._rollout.is_full:
+            _, _, next_value, _ = learner._states.evaluate(learner.engine, learner._rollout.columns())
             torch.testing.assert_close(next_value[0, -1:], wanted(played)[0])
-            learner._size = 0
+            learner._rollout.size = 0
             torch.testing.assert_close(learner.values(played[-1]), wanted(played)[0])
 
 
