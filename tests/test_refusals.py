@@ -5,9 +5,9 @@ from functools import partial
 
 import pytest
 import torch
-from dqn_parts import dqn_learner, dqn_loss, learner_of_parts, make_learner
+from dqn_parts import dqn_learner, dqn_loss, learner_of_parts, make_learner, played
 from tensordict.nn import TensorDictModule
-from test_networks import GAME, REPLAY, ROLLOUTS, SPACES, played
+from test_networks import GAME, REPLAY, ROLLOUTS, SPACES
 from torchrl.modules import QValueActor
 from torchrl.objectives import ClipPPOLoss, DQNLoss, HardUpdate, KLPENPPOLoss, SoftUpdate, ValueEstimators
 
@@ -136,7 +136,7 @@ def test_ppo_with_a_kl_penalty_gets_the_old_logits_and_each_agent_a_penalty_of_i
     seen = []
     update_from = learner.engine.update_from
     learner.engine.update_from = lambda batch: seen.append(batch) or update_from(batch)
-    losses = played(learner)
+    losses = [loss for loss in played(learner, CommonsEnv(GAME, 2, seed=3), 24) if loss is not None]
     assert torch.isfinite(torch.stack(losses)).all()
     first = seen[0]
     chosen = first["logits"].log_softmax(-1).gather(-1, first["action"].unsqueeze(-1)).squeeze(-1)

@@ -84,8 +84,10 @@ class FiniteCheck:
 
     def add(self, turn: Turn) -> None:
         """Sums up what agents observe after a turn, [R]; this needs no synchronisation with a GPU."""
+        if not self._entries:
+            return
         seen = [turn.next_agents]
-        if self._entries and self._is_fresh:  # the first observation after a reset was nobody's next
+        if self._is_fresh:  # the first observation after a reset was nobody's next
             seen.append(turn.agents)
             self._is_fresh = False
         for name in self._entries:

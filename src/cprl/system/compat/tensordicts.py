@@ -30,7 +30,6 @@ class Views(dict[str, Any]):
     """
 
     def __init__(self, tensordict: TensorDictBase) -> None:
-        super().__init__()
         self._tensordict = tensordict
 
     def __missing__(self, name: str) -> Any:
