@@ -476,12 +476,13 @@ class FunctionalEngine(Engine):
         self, params: list[Tensor], targets: list[Tensor], batch: TensorDict
     ) -> tuple[Tensor, Tensor]:
         """The sum of the losses of all networks, to differentiate, and each one's loss."""
-        named = zip((self._names, self._target_names), (params, targets), strict=True)
-        weights = [dict(zip(names, values, strict=True)) for names, values in named]
-        if self.batching == "lane_axis_flat":
-            each = self.loss(*weights, batch.reshape(-1)).reshape(batch.batch_size)
-        else:
-            each = self.loss(*weights, batch)
+        flat = self.batching == "lane_axis_flat"
+        each = self.loss(
+            dict(zip(self._names, params, strict=True)),
+            dict(zip(self._target_names, targets, strict=True)),
+            batch.reshape(-1) if flat else batch,
+        )
+        each = each.reshape(batch.batch_size) if flat else each
         losses = (each.mean() if self._vmapped else each.flatten(1).mean(-1)) * self._rule.loss_share
         return losses.sum(), losses
 

@@ -197,8 +197,9 @@ class TorchRLRolloutLearner(RolloutLearner):
             )
         self.estimators = [_gae(parts[CRITIC], settings) for parts in self.engine.parts]
         make_sampler = make_sampler or (lambda lane: SamplerWithoutReplacement())
-        sizes = {"size": settings.rollout_steps, "batch_size": settings.minibatch_size}
-        self.buffer = StockBuffers(self._lanes, make_sampler, **sizes)
+        self.buffer = StockBuffers(
+            self._lanes, make_sampler, size=settings.rollout_steps, batch_size=settings.minibatch_size
+        )
 
     def update(self) -> Tensor | None:
         if not self._rollout.is_full:
