@@ -52,7 +52,6 @@ from cprl.measuring.statistics import agents_without_harvest, over_replicas, soc
 from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import LaneActor, random_agents
-from cprl.policies.rng import EVALUATION, lane_seeds
 from cprl.population import Frozen, Scripted
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.recipe import start_run
