@@ -392,8 +392,7 @@ class FunctionalEngine(Engine):
         self._names, self._target_names = tuple(self.params), tuple(self.targets)
         self._tensors = [list(group.values()) for group in self._groups().values()]
         self.steps = 0
-        kind = self._tensors[0][0]
-        self._scalars = kind.new_zeros(()), kind.new_zeros(())
+        self._scalars = tuple(self._tensors[0][0].new_zeros(()) for _ in range(2))
         self._rule, self._is_warm = rule, not compile
         self._compiled = Compiled(FunctionalEngine._step, what="updates run", changes=(5,), enabled=compile)
 
@@ -497,7 +496,6 @@ class FunctionalEngine(Engine):
         return torch.vmap(outputs)(self._of_part(name), *seen)
 
     def _of_part(self, name: str) -> Weights:
-        """The weights of one of an agent's networks, by their names in that network."""
         prefix = f"{name}." if name else ""
         weights = self._in_loss.items()
         return {key.removeprefix(prefix): value for key, value in weights if key.startswith(prefix)}
