@@ -13,7 +13,8 @@ from rich.text import Text
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from cprl import keys, maps
+from cprl import keys
+from cprl.commons import maps
 from cprl.commons.colours import APPLE, BEAM, PALETTE, WALL, Colour, agent_colour
 from cprl.commons.game import Game
 from cprl.commons.maps import SIGN_OF_HEADING
