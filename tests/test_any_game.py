@@ -3,6 +3,7 @@
 import io
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -292,8 +293,9 @@ def test_the_table_of_an_evaluation_says_what_is_left_out():
     episodes = evaluate(MatrixGame(2), tit_for_tat)
 
     class Evaluation:
-        run = type("Run", (), {"path": Path("run"), "algorithms": {}, "replicas": [0]})
-        trained, random = {0: episodes}, {0: episodes}
+        nobody = SimpleNamespace(agents=0)
+        run = SimpleNamespace(path=Path("run"), game=nobody, replicas=[0])
+        trained, random, played = {0: episodes}, {0: episodes}, {0: episodes}
         fresh = Fresh(replicas=(0,), episodes=2, seed=1, greedy=True)
 
         def measures(self, policy):
