@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache, partial
+from operator import methodcaller
 from pathlib import Path
 from queue import Full, Queue
 from threading import Thread
@@ -269,15 +270,16 @@ def served(files: Sequence[Path]) -> Iterator[WebViewer]:
         layout = next((StoredLayout(reader.stream(store=stored)) for stored in reader.blueprints()), None)
     recording = _recording(store.application_id, store.recording_id, send_properties=False)
     page = WebViewer(_serve(recording, FILES_MEMORY, layout))
+    stream = LiveStream("recording", recording, period_s=0.0)
     try:
         if header is not None:
-            send_text(recording, "header", header)
+            stream.do(partial(send_text, name="header", text=header))
         for path in readers:
-            recording.log_file_from_path(path)
+            stream.do(methodcaller("log_file_from_path", path))
         yield page
     finally:
         page.close()
-        recording.disconnect()
+        stream.close()
 
 
 def _newest_header(readers: Sequence[RrdReader]) -> tuple[RrdReader, str | None]:
