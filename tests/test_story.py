@@ -405,7 +405,7 @@ def test_a_bar_below_the_board_is_as_long_as_its_apples_are_many(run):
     _, words = column(path, "world/stock", "LineStrips2D:labels")
     boards = dict(zip(*column(path, "world/board", "SegmentationImage:buffer", "frame"), strict=True))
     sites = len(SMALL.map.sites)
-    for frame, (whole, filled), (_, label) in zip(frames, bars, words, strict=True):
+    for frame, (whole, filled, _), (_, _, label) in zip(frames, bars, words, strict=True):
         apples = sum(kind == APPLE for kind in boards[frame][0])
         covered = int(label.split()[0]) - apples
         assert 0 <= covered <= SMALL.agents, "an agent may stand where an apple is"

@@ -27,7 +27,7 @@ from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.commons.picture import DIGIT_HIGH, INK_COLOUR, MARK_COLOUR, POINTS, number_paths
 from cprl.commons.world import Bytes
 from cprl.envs.commons_env import CommonsEnv
-from cprl.viewer.layout import Curves, Scene, classes, styles, window_corners
+from cprl.viewer.layout import TEXT, Curves, Scene, classes, styles, window_corners
 
 if TYPE_CHECKING:
     from cprl.viewer.logger import RerunLogger
@@ -322,7 +322,11 @@ def board_styles() -> dict[str, list[Any]]:
         "marks": [lines(colors=[MARK_COLOUR], radii=[RADIUS_CELLS])],
         "out": [rr.Boxes2D.from_fields(radii=[OUT_STROKE_CELLS], show_labels=False)],
         "out/numbers": [lines(radii=[RADIUS_CELLS])],
-        "stock": [lines(colors=[PALETTE[WALL], PALETTE[APPLE]], radii=[BAR_CELLS], show_labels=True)],
+        "stock": [
+            lines(
+                colors=[PALETTE[WALL], PALETTE[APPLE], TEXT], radii=[BAR_CELLS] * 2 + [0.0], show_labels=True
+            )
+        ],
     }
 
 
@@ -365,12 +369,12 @@ def _stock(scene: Scene, frames: Frames) -> tuple[NDArray[np.intp], Any]:
     changed = _changes(apples)
     apples, sites = apples[changed], max(1, len(scene.sites))
     left, low = RIM_CELLS, scene.height + 2 * RIM_CELLS + 2 * BAR_CELLS
-    bars = np.full((len(apples), 2, 2, 2), (left, low), np.float32)
-    bars[:, 0, 1, 0] += scene.width
+    bars = np.full((len(apples), 3, 2, 2), (left, low), np.float32)  # the last one has the text
+    bars[:, 0::2, 1, 0] += scene.width
     bars[:, 1, 1, 0] += scene.width * apples / sites
-    words = [text for count in apples for text in ("", f"{count} of {len(scene.sites)} apples")]
+    words = [text for count in apples for text in ("", "", f"{count} of {len(scene.sites)} apples")]
     columns = rr.LineStrips2D.columns(strips=bars.reshape(-1, 2, 2), labels=words)
-    return changed, columns.partition([2] * len(apples))
+    return changed, columns.partition([3] * len(apples))
 
 
 def _pictures(images: Bytes) -> Any:
