@@ -369,9 +369,10 @@ def _stock(scene: Scene, frames: Frames) -> tuple[NDArray[np.intp], Any]:
     changed = _changes(apples)
     apples, sites = apples[changed], max(1, len(scene.sites))
     left, low = RIM_CELLS, scene.height + 2 * RIM_CELLS + 2 * BAR_CELLS
-    bars = np.full((len(apples), 3, 2, 2), (left, low), np.float32)  # the last one has the text
-    bars[:, 0::2, 1, 0] += scene.width
+    bars = np.full((len(apples), 3, 2, 2), (left, low), np.float32)  # the last, a point, has the text
+    bars[:, 0, 1, 0] += scene.width
     bars[:, 1, 1, 0] += scene.width * apples / sites
+    bars[:, 2, :, 0] += scene.width / 2
     words = [text for count in apples for text in ("", "", f"{count} of {len(scene.sites)} apples")]
     columns = rr.LineStrips2D.columns(strips=bars.reshape(-1, 2, 2), labels=words)
     return changed, columns.partition([3] * len(apples))
