@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from cprl.terminal.style import MARK, MEAN, RAW, SMALL_PT, head, save
+from cprl.terminal.style import MARK, MEAN, RAW, drawing
 from cprl.theory import herders
 
 PATH: Final = Path(__file__).parent / "theory" / "herders.png"
@@ -17,47 +16,48 @@ HERDS: Final = (2, 5, 100)
 MANY: Final = np.unique(np.geomspace(1, 100, 60).round().astype(int))
 
 
-def figure() -> Figure:
+def draw() -> None:
     """What all gain against the animals that graze; animals and the price of anarchy by the herders."""
-    made = Figure((10.0, 3.9), layout="constrained")
-    left, middle, right = made.subplots(1, 3, width_ratios=(1.25, 1, 1))
-    one = herders(1)
-    totals = np.linspace(0, 1.05 * one.open_access_total, 200)
-    left.plot(totals, [one.surplus(total) for total in totals], color=MEAN, linewidth=2)
-    left.axhline(0, color=RAW, linewidth=1)
-    for name, at in (
-        ("optimum", one.optimum_total),
-        *((f"n = {herd}", herders(herd).nash_total) for herd in HERDS),
-    ):
-        is_best = name == "optimum"
-        left.plot(at, one.surplus(at), "o", color="black" if is_best else MARK, markersize=6)
-        above = {"xytext": (0, 6), "ha": "center"} if is_best else {"xytext": (6, 4), "ha": "left"}
-        left.annotate(name, (at, one.surplus(at)), textcoords="offset points", fontsize=SMALL_PT, **above)
-    left.set_ylim(-1.2, 1.15 * one.surplus(one.optimum_total))
-    left.set_xlim(0, 1.3 * one.open_access_total)
-    left.set_title("what all gain; red: in equilibrium", fontsize=SMALL_PT + 1)
-    left.set_xlabel("animals A", fontsize=SMALL_PT)
-    games = [herders(int(herd)) for herd in MANY]
-    middle.plot(MANY, [own.nash_total for own in games], color=MARK, linewidth=2, label="equilibrium A*")
-    middle.plot(MANY, [own.optimum_total for own in games], color="black", linewidth=2, label="optimum A**")
-    access = one.open_access_total
-    middle.axhline(access, color=RAW, linestyle=":", linewidth=1.4, label="open access")
-    middle.set_ylim(0, 1.1 * access)
-    middle.set_title("animals, by the number of herders", fontsize=SMALL_PT + 1)
-    middle.legend(fontsize=SMALL_PT, frameon=False, loc="lower right")
-    right.plot(MANY, [own.price_of_anarchy for own in games], color=MARK, linewidth=2)
-    right.set_ylim(0, None)
-    right.set_title("gain at the optimum\nover that in equilibrium", fontsize=SMALL_PT + 1)
-    for panel in (middle, right):
-        panel.set_xscale("log")
-        panel.set_xticks([1, 2, 5, 10, 100], ["1", "2", "5", "10", "100"])
-        panel.minorticks_off()
-        panel.set_xlabel("herders n", fontsize=SMALL_PT)
-    for panel in (left, middle, right):
-        panel.tick_params(labelsize=SMALL_PT)
-    head(made, "The herders' game", "an animal is worth 10 - A^2 and costs 1")
-    return made
+    with drawing(PATH) as sheet:
+        left, middle, right = sheet.panels(3, columns=3, high=23, width_ratios=(1.25, 1, 1))
+        one = herders(1)
+        totals = np.linspace(0, 1.05 * one.open_access_total, 200)
+        left.plot(totals, [one.surplus(total) for total in totals], color=MEAN, linewidth=2)
+        left.axhline(0, color=RAW, linewidth=1)
+        for name, at in (
+            ("optimum", one.optimum_total),
+            *((f"n = {herd}", herders(herd).nash_total) for herd in HERDS),
+        ):
+            is_best = name == "optimum"
+            left.plot(at, one.surplus(at), "o", color="black" if is_best else MARK, markersize=6)
+            above = {"xytext": (0, 6), "ha": "center"} if is_best else {"xytext": (6, 4), "ha": "left"}
+            left.annotate(name, (at, one.surplus(at)), textcoords="offset points", **above)
+        left.set_ylim(-1.2, 1.15 * one.surplus(one.optimum_total))
+        left.set_xlim(0, 1.3 * one.open_access_total)
+        left.set_title("what all gain; red: in equilibrium")
+        left.set_xlabel("animals A")
+        games = [herders(int(herd)) for herd in MANY]
+        middle.plot(MANY, [own.nash_total for own in games], color=MARK, linewidth=2, label="equilibrium A*")
+        middle.plot(
+            MANY, [own.optimum_total for own in games], color="black", linewidth=2, label="optimum A**"
+        )
+        access = one.open_access_total
+        middle.axhline(access, color=RAW, linestyle=":", linewidth=1.4, label="open access")
+        middle.set_ylim(0, 1.1 * access)
+        middle.set_title("animals, by the number of herders")
+        middle.legend(loc="lower right")
+        right.plot(MANY, [own.price_of_anarchy for own in games], color=MARK, linewidth=2)
+        right.set_ylim(0, None)
+        right.set_title("gain at the optimum over that in equilibrium")
+        for panel in (middle, right):
+            panel.set_xscale("log")
+            panel.set_xticks([1, 2, 5, 10, 100], ["1", "2", "5", "10", "100"])
+            panel.minorticks_off()
+            panel.set_xlabel("herders n")
+        sheet.title = "The herders' game"
+        sheet.caption = "An animal is worth 10 - A^2 and costs 1."
 
 
 if __name__ == "__main__":
-    print(save(figure(), PATH))
+    draw()
+    print(PATH)

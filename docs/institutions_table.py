@@ -15,14 +15,13 @@ from typing import Final
 
 import numpy as np
 import tyro
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cprl.measuring.statistics import Estimate, curve_interval, estimate, holm
 from cprl.runs.curves import as_curves, centres, curves_of, running_mean
 from cprl.runs.episodes import read_table
 from cprl.terminal import style
-from cprl.terminal.style import INTERVAL, MEAN, RANDOM_LINE, SMALL_PT
+from cprl.terminal.style import INTERVAL, MEAN, RANDOM_LINE
 
 NONE: Final = "none"
 NAMES: Final = {
@@ -86,23 +85,21 @@ def table(head: str, rows: dict[str, list[str]]) -> str:
 
 def forest(differences: dict[str, dict[str, Estimate]], path: Path) -> None:
     """Draws the paired differences of every metric, with their intervals."""
-    figure = Figure((12.0, 0.42 * len(differences) + 1.4), layout="constrained")
     names = list(differences)
-    for axes, metric in zip(figure.subplots(1, len(METRICS), sharey=True), METRICS, strict=True):
-        for place, name in enumerate(names):
-            found = differences[name][metric]
-            axes.plot([found.low, found.high], [place, place], color=INTERVAL, linewidth=2.5)
-            axes.plot([found.value], [place], "o", color=MEAN, markersize=6)
-        axes.axvline(0, **RANDOM_LINE)
-        axes.set_title(METRICS[metric], fontsize=SMALL_PT)
-        axes.set_yticks(range(len(names)), [NAMES[name] for name in names])
-        axes.tick_params(labelsize=SMALL_PT)
-    figure.axes[0].invert_yaxis()
-    figure.suptitle(
-        f"difference from none, paired by replica; means of the last {LAST} episodes, 95 % intervals",
-        fontsize=SMALL_PT + 1,
-    )
-    style.save(figure, path)
+    with style.drawing(path) as sheet:
+        panels = sheet.panels(len(METRICS), columns=3, high=2.4 * len(names) + 6, sharey=True)
+        for axes, metric in zip(panels, METRICS, strict=True):
+            for place, name in enumerate(names):
+                found = differences[name][metric]
+                axes.plot([found.low, found.high], [place, place], color=INTERVAL, linewidth=2.5)
+                axes.plot([found.value], [place], "o", color=MEAN, markersize=6)
+            axes.axvline(0, **RANDOM_LINE)
+            axes.set_title(METRICS[metric])
+            axes.set_yticks(range(len(names)), [NAMES[name] for name in names])
+            axes.locator_params(axis="x", nbins=4)
+        panels[0].invert_yaxis()
+        sheet.title = "Differences from no institution"
+        sheet.caption = f"Paired by replica; means of the last {LAST} episodes, 95 % intervals."
 
 
 def courses(runs: dict[str, Path], path: Path) -> None:
@@ -110,29 +107,22 @@ def courses(runs: dict[str, Path], path: Path) -> None:
     returns = {name: curves_of(run)["collective_return"] for name, run in runs.items()}
     random = as_curves(read_table(runs[NONE] / "evaluation" / "random.parquet"))["collective_return"].mean()
     others = [name for name in runs if name != NONE]
-    rows = -(-len(others) // 4)
-    figure = Figure((12.0, 2.6 * rows + 0.5), layout="constrained")
-    grid = figure.subplots(rows, 4, sharex=True, sharey=True, squeeze=False).reshape(-1)
-    for axes, name in zip(grid, others, strict=False):
-        for own, colour in ((NONE, "#777777"), (name, MEAN)):
-            smooth = running_mean(returns[own], SMOOTHED)
-            at = centres(returns[own], SMOOTHED)
-            middle, low, high = curve_interval(smooth)
-            axes.fill_between(at, low, high, color=colour, alpha=0.25, linewidth=0)
-            axes.plot(
-                at, middle, color=colour, linewidth=2, label=NAMES[own] if own != NONE else "no institution"
-            )
-        axes.axhline(random, **RANDOM_LINE, label="random play")
-        axes.set_title(NAMES[name], fontsize=SMALL_PT + 1)
-        axes.tick_params(labelsize=SMALL_PT)
-    for axes in grid[len(others) :]:
-        axes.set_visible(False)
-    figure.supxlabel("episode", fontsize=SMALL_PT + 1)
-    figure.supylabel(f"harvest, apples; centred mean of {SMOOTHED} episodes", fontsize=SMALL_PT + 1)
-    handles, labels = grid[0].get_legend_handles_labels()
-    labels[1] = "with the institution"
-    figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=SMALL_PT)
-    style.save(figure, path)
+    with style.drawing(path) as sheet:
+        panels = sheet.panels(len(others), columns=4, high=15, sharex=True, sharey=True)
+        for axes, name in zip(panels, others, strict=True):
+            for institution, colour in ((NONE, "#777777"), (name, MEAN)):
+                middle, low, high = curve_interval(running_mean(returns[institution], SMOOTHED))
+                at = centres(returns[institution], SMOOTHED)
+                label = "no institution" if institution == NONE else "with the institution"
+                axes.fill_between(at, low, high, color=colour, alpha=0.25, linewidth=0)
+                axes.plot(at, middle, color=colour, linewidth=2, label=label)
+            axes.axhline(random, **RANDOM_LINE, label="random play")
+            axes.set_title(NAMES[name])
+        for axes in panels[-4:]:
+            axes.tick_params(labelbottom=True)
+            axes.set_xlabel("episode")
+        sheet.title = "Harvest under each institution, apples"
+        sheet.caption = f"Centred means of {SMOOTHED} episodes; bands: 95 % intervals."
 
 
 def main(*, runs: Path, figures: Path) -> None:

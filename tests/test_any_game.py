@@ -302,8 +302,8 @@ def test_the_table_of_an_evaluation_says_what_is_left_out():
             return social_measures({0: episodes})
 
     table = run_table(Evaluation())
-    assert table.caption.startswith("left out: collective_return")
-    assert list(table.columns[0].cells) == ["survival_steps (steps)"]
+    assert table.note.startswith("left out: collective_return")
+    assert [name for name, *_ in table.rows] == ["survival, steps"]
 
 
 def test_bars_know_the_clock_of_a_game_or_of_its_environment():

@@ -1,5 +1,6 @@
 """Figures: everything drawn is in the legend, which lies beside the data; phases only in long trainings."""
 
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -52,10 +53,11 @@ def the_tragedy(replicas, episodes):
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """The figures that are saved, in order; not rendered."""
+    """The figures that are saved, in order, each with its caption; not rendered."""
     figures = []
 
-    def keep(figure, path, **how):
+    def keep(figure, path, *, caption, **how):
+        figure.caption = caption
         figures.append(figure)
         return path
 
@@ -66,10 +68,6 @@ def drawn(monkeypatch):
 def labels(figure):
     (legend,) = figure.legends
     return [text.get_text().replace("\n", " ") for text in legend.get_texts()]
-
-
-def note(figure):
-    return figure.legends[0].get_title().get_text().replace("\n", " ")
 
 
 def curves_panels(figure):
@@ -86,13 +84,32 @@ def see_that_the_legend_is_whole(figure):
         boundaries = [line for line in axes.lines if line.get_color() == "#999999"]  # of bands
         for line in set(axes.lines) - set(boundaries):
             assert line.get_color() in looks
-        for own in axes.collections:
-            if isinstance(own, PolyCollection):
-                assert tuple(np.round(own.get_facecolor()[0], 3)) in looks
+        for collection in axes.collections:
+            if isinstance(collection, PolyCollection):
+                assert tuple(np.round(collection.get_facecolor()[0], 3)) in looks
         for patch in axes.patches:
             assert tuple(np.round(patch.get_facecolor(), 3)) in looks
         assert not legend.get_window_extent().overlaps(axes.get_window_extent())
-        assert axes.get_legend() is None
+
+
+def see_that_it_can_be_read(figure, width_in=3.3):
+    """No text is smaller than 6 pt or reaches over the edge, and no two names of ticks lie on each other."""
+    figure.draw_without_rendering()
+    assert figure.get_figwidth() == width_in
+    for text in figure.findobj(Text):
+        if text.get_visible() and text.get_text():
+            assert text.get_fontsize() >= (6 if text.get_text() != figure.caption else 5)
+    page = figure.bbox.padded(2)
+    for axes in figure.axes:
+        if not axes.get_visible():
+            continue
+        box = axes.get_tightbbox()
+        assert page.x0 <= box.x0 <= box.x1 <= page.x1
+        assert page.y0 <= box.y0 <= box.y1 <= page.y1
+        for axis in (axes.xaxis, axes.yaxis):
+            names = [name.get_window_extent() for name in axis.get_ticklabels() if name.get_text()]
+            names = [name.padded(-1) for name in names if name.width and name.height]
+            assert not any(one.overlaps(other) for one, other in pairwise(names))
 
 
 def test_a_short_training_shows_its_peak_its_end_random_play_and_where_exploration_ends(tmp_path, drawn):
@@ -115,7 +132,7 @@ def test_a_short_training_shows_its_peak_its_end_random_play_and_where_explorati
     ):
         assert words in told
     assert "phase" not in told
-    assert note(figure) == "Running means are over 10 episodes, centred."
+    assert figure.caption == "Running means are over 10 episodes, centred."
     see_that_the_legend_is_whole(figure)
     levels = [line for line in above.lines if line.get_color() == style.RANDOM_LINE["color"]]
     assert [(line.get_linestyle(), line.get_ydata()[0]) for line in levels] == [("--", 282.0)]
@@ -134,7 +151,7 @@ def test_a_centred_running_mean_stands_at_the_middle_of_its_episodes(tmp_path, d
 def test_what_is_not_over_by_the_last_episode_is_said(tmp_path, drawn):
     training_curve(a_run(tmp_path / "run", the_tragedy(2, 40)), title="short", exploration_steps=10**6)
     assert "exploration ends" not in " ".join(labels(drawn[0]))
-    assert note(drawn[0]).endswith("Exploration was not over at the last episode.")
+    assert drawn[0].caption.endswith("Exploration was not over at the last episode.")
 
 
 @pytest.mark.parametrize(("episodes", "has_bands"), [(999, False), (1000, True)])
@@ -204,38 +221,77 @@ def test_a_game_without_a_harvest_has_one_panel_and_an_agents_colour_has_an_edge
     assert style.on_white(0)["linestyle"] != style.on_white(4)["linestyle"], "its colour may be the same"
 
 
-def test_a_figure_is_written_with_150_dots_an_inch_and_a_long_title_wraps(tmp_path):
-    figure, (axes,) = style.new_figure([2.0], title="a title of many words " * 8)
-    axes.plot([1, 2], label="a line")
-    style.legend_below(figure, [axes])
-    with Image.open(style.save(figure, tmp_path / "a.png")) as picture:
-        assert round(picture.info["dpi"][0]) == 150
-        assert picture.width == 1200
-    title = figure.get_suptitle()
-    assert max(map(len, title.splitlines())) <= style.TITLE_CHARACTERS
-    assert imread(tmp_path / "a.png")[:, 0].min() == 1, "nothing reaches over the edge"
+def a_line(path, title="a line", name="a line", **look):
+    """A figure of one line, and who drew it."""
+    with style.drawing(path, **look) as sheet:
+        (axes,) = sheet.panels(1, high=12)
+        axes.plot([1, 2], label=name)
+        axes.set_xticks([0, 1], [name, "other"])
+        sheet.title, sheet.caption = title, "Made up, here and now."
+    return sheet.figure
+
+
+@pytest.mark.parametrize(("width", "pixels", "dots"), [("page", 1200, 150), ("column", 990, 300)])
+def test_a_figure_is_as_wide_as_a_page_or_a_column_and_a_long_title_wraps(width, pixels, dots, tmp_path):
+    figure = a_line(tmp_path / "new" / "a.png", title="a title of many words " * 8, width=width)
+    with Image.open(tmp_path / "new" / "a.png") as picture:
+        assert (picture.width, round(picture.info["dpi"][0])) == (pixels, dots)
+        assert picture.text["Description"] == "Made up, here and now."
+    picture = imread(tmp_path / "new" / "a.png")
+    assert all(edge.min() == 1 for edge in (picture[:, 0], picture[:, -1])), "nothing reaches over the edge"
+    texts = [text.get_text() for text in figure.texts]
+    assert texts[0].count("\n") > 0
+    captions = {path.name: path.read_text() for path in (tmp_path / "new").glob("*.txt")}
+    if width == "page":
+        assert (texts[1], captions) == ("Made up, here and now.", {})
+    else:
+        assert texts[1] == ""
+        assert captions["a.caption.txt"].endswith("\n\nMade up, here and now.\n")
+
+
+def test_the_suffix_says_what_is_written_the_same_each_time(tmp_path):
+    for suffix, head in ((".png", b"\x89PNG"), (".pdf", b"%PDF"), (".svg", b"<?xml")):
+        contents = []
+        for name in ("a", "b"):
+            a_line(tmp_path / f"{name}{suffix}")
+            contents.append((tmp_path / f"{name}{suffix}").read_bytes())
+        assert contents[0].startswith(head)
+        assert contents[0] == contents[1]
+    for path, look in (("a.jpg", {}), ("a.png", {"is_new": True}), ("b.png", {"width": "poster"})):
+        with pytest.raises((ValueError, FileExistsError), match=r"path is|a\.png|width is"):
+            a_line(tmp_path / path, **look)
 
 
 @pytest.mark.parametrize("name", ["pay_$1_or_$_", "$a$", r"\$5"])
 def test_names_in_figures_are_no_formulas(name, tmp_path):
-    figure, (axes,) = style.new_figure([1.0], title=name)
-    axes.plot([1, 2], label=name)
-    axes.set_xticks([0, 1], [name, "other"])
-    style.legend_below(figure, [axes])
-    style.save(figure, tmp_path / "a.png")
+    figure = a_line(tmp_path / "a.png", title=name, name=name)
     texts = [text for text in figure.findobj(Text) if text.get_text() == name]
     assert len(texts) >= 3, "the title, the tick and the legend"
     assert not any(text.get_parse_math() for text in texts)
 
 
+def test_long_names_break_at_their_signs_and_only_where_they_must():
+    assert style.wrapped("target_every_episodes", 8) == "target_every_\nepisodes"
+    assert style.wrapped("beside a target_network", 10) == "beside a\ntarget_network"
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("width", ["page", "column"])
+def test_a_training_curve_can_be_read_at_every_width(width, tmp_path, drawn):
+    run = a_run(tmp_path / "run", the_tragedy(4, 1200))
+    random = [an_episode(0, collective_return=282.0, survival_steps=1000.0)]
+    training_curve(run, title="commons", random=random, exploration_steps=50_000, width=width)
+    see_that_it_can_be_read(drawn[0], style.WIDTH_IN[width])
+
+
 @pytest.mark.integration
 @pytest.mark.parametrize("colours", [style.COLOURS, style.SHADES])
 def test_a_figure_of_few_colours_looks_like_one_with_all_in_half_the_room(colours, tmp_path):
-    figure, (axes,) = style.new_figure([3.0], title="heat")
-    axes.figure.colorbar(axes.imshow(np.linspace(-1, 1, 900).reshape(30, 30), cmap="RdBu"))
-    style.save(figure, tmp_path / "few.png")  # the first drawing still moves the colour bar
-    figure.savefig(tmp_path / "all.png", dpi=style.DPI)
-    style.save(figure, tmp_path / "few.png", colours=colours)
+    with style.drawing(tmp_path / "few.png", colours=colours) as sheet:
+        (axes,) = sheet.panels(1, high=24)
+        sheet.figure.colorbar(axes.imshow(np.linspace(-1, 1, 900).reshape(30, 30), cmap="RdBu"))
+    style.save(sheet.figure, tmp_path / "few.png", colours=colours)  # the first one still moves the bar
+    sheet.figure.savefig(tmp_path / "all.png")
     with Image.open(tmp_path / "few.png") as picture:
         assert len(picture.getcolors()) <= colours
     drawn, few = (imread(tmp_path / name)[..., :3] for name in ("all.png", "few.png"))
@@ -282,7 +338,7 @@ def test_figures_that_are_compared_have_the_same_vertical_range(tmp_path, drawn)
 def test_a_figure_beside_the_published_curve_says_how_both_are_smoothed(tmp_path, drawn):
     _, _, path = next(reported.draw_figures([a_result("a", "commons", 500.0)], tmp_path))
     assert path == tmp_path / "a_collective_return.png"
-    assert note(drawn[0]) == "Running means over the 30 episodes that follow."
+    assert drawn[0].caption == "Running means over the 30 episodes that follow."
     told = labels(drawn[0])
     assert told[:4] == ["ours, each replica", "ours, 95 % interval", "ours, mean of 3 replicas", "published"]
     assert "exploration ends, episode 101" in told
@@ -297,7 +353,7 @@ def test_one_replica_has_no_interval_and_an_experiment_of_ones_own_no_published_
     (path,) = [path for _, _, path in reported.draw_figures([result], tmp_path)]
     assert path.name == "a_collective_return.png"
     assert labels(drawn[0]) == ["ours, one replica", "exploration ends, episode 101"]
-    assert note(drawn[0]) == "Running means over the 100 episodes that follow."
+    assert drawn[0].caption == "Running means over the 100 episodes that follow."
     see_that_the_legend_is_whole(drawn[0])
 
 

@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 from study_runs import EXPERIMENT, TIME_OUT, write_run, write_study
+from test_figures import see_that_it_can_be_read
 
 from cprl import Study
 from cprl.commands import main as cli
@@ -24,6 +25,7 @@ from cprl.studies.tables.pooled import pooled_table
 from cprl.studies.tables.sources import circumstances_of, design_of, ending, study_table
 from cprl.studies.tables.table import METADATA, StudyTable
 from cprl.studies.trials import trials_of
+from cprl.terminal.style import WIDTH_IN
 
 SEES = "game.rules.window_rows"
 GAMMA = "agents.*.algorithm.settings.gamma"
@@ -450,7 +452,7 @@ def assert_drawn(path):
 def drawn(monkeypatch):
     """The figures that are drawn, instead of their files."""
     made = []
-    monkeypatch.setattr(figures, "save", lambda figure, path, **_: made.append(figure))
+    monkeypatch.setattr("cprl.terminal.style.save", lambda figure, path, **_: made.append(figure))
     return made
 
 
@@ -468,8 +470,40 @@ def test_figures_of_a_grid_are_drawn_with_a_condition_that_has_no_run(grid_runs,
         "phases": lambda path: figures.phase_diagram(table, pair, path),
     }.items():
         assert_drawn(draw(tmp_path / f"{name}.png"))
-        with pytest.raises(ValueError, match=r"path is '.*\.pdf'"):
-            draw(tmp_path / f"{name}.pdf")
+        with pytest.raises(ValueError, match=r"path is '.*\.jpg'"):
+            draw(tmp_path / f"{name}.jpg")
+
+
+LONG = "agents.*.algorithm.settings"
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("width", ["page", "column"])
+def test_a_study_of_24_conditions_most_of_which_were_not_run_has_figures_that_can_be_read(width, tmp_path):
+    factors = {
+        TIME_OUT: [5, 25],
+        f"{LONG}.optimizer": ["adam", "keras_rmsprop"],
+        f"{LONG}.gamma": [0.9, 0.99],
+        f"{LONG}.target_every_episodes": [3, 10, 30],
+    }
+    study = Study(EXPERIMENT, factors, name="combat", replicas=2)
+    names = [condition.name for condition in study.all_conditions]
+    table = study_table(study, write_study(study, tmp_path / "runs", harvest, but=names[5:]))
+    drawn = []
+
+    def keep(figure, path, *, caption, **how):
+        figure.caption = caption
+        drawn.append(figure)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("cprl.terminal.style.save", keep)
+        for _, _, draw in figures.figures_of(table, 30):
+            draw(tmp_path / "a.png", width=width)
+    assert len(drawn) > 5
+    for figure in drawn:
+        see_that_it_can_be_read(figure, WIDTH_IN[width])
+        assert "no run" not in {text.get_text() for axes in figure.axes for text in axes.texts}
+        assert "Not run: 19 of 24 conditions." in figure.caption
 
 
 @pytest.mark.integration
@@ -485,7 +519,8 @@ def test_conditions_of_any_name_are_in_the_legend_of_the_courses_and_have_a_pane
     together, apart = drawn
     texts = [text.get_text() for text in together.legends[0].get_texts()]
     assert all(any(name in text for text in texts) for name in names[:4])
-    assert [axes.get_title() for axes in apart.axes if axes.get_visible()] == names[1:], "beside the first"
+    titles = [axes.get_title("left") for axes in apart.axes if axes.get_visible()]
+    assert titles == names[1:], "beside the first"
 
 
 def test_conditions_that_were_not_run_do_not_count_among_the_replicas_of_a_figure():
@@ -554,7 +589,7 @@ def test_a_figure_counts_the_episodes_in_which_a_metric_is_undefined(tmp_path, d
     idle = {"equality": lambda replica, number: NAN if number == 39 else 0.5}
     table = table_of(tmp_path, {TIME_OUT: [1, 5]}, written=idle)
     figures.by_factor(table, TIME_OUT, "i.png", metrics=["equality"])
-    assert "undefined in 4 of 120 episodes" in drawn[0].axes[0].get_title().replace("\n", " ")
+    assert "undefined in 4 of 120 episodes" in drawn[0].axes[0].get_title("left").replace("\n", " ")
 
 
 @pytest.mark.integration

@@ -102,12 +102,12 @@ def test_units_are_those_of_the_docs():
 @pytest.mark.parametrize(
     ("name", "rewards", "told"),
     [
-        ("survival_steps", "", "survival_steps (steps)"),
-        ("agent_0/return", "apples", "agent_0/return (apples)"),
-        ("agent_0/return", "", "agent_0/return"),
+        ("survival_steps", "", "survival, steps"),
+        ("agent_0/return", "apples", "agent 0: return, apples"),
+        ("agent_0/return", "", "agent 0: return"),
         ("of_ones_own", "apples", "of_ones_own"),
     ],
 )
-def test_a_name_in_code_has_its_unit_in_brackets(name, rewards, told):
+def test_a_metric_is_called_by_the_same_words_with_its_unit_everywhere(name, rewards, told):
     assert with_unit(name, rewards=rewards) == told
     assert title("of_ones_own") == "of_ones_own"

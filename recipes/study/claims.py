@@ -82,7 +82,7 @@ def more(claim: str, measure: str, values: Values, reference: Values, *, paired:
         claim=claim,
         measure=measure,
         published="",
-        ours=f"{values.mean():.4g} and {reference.mean():.4g}, difference {found}",
+        ours=f"{values.mean():.4g} and {reference.mean():.4g}, difference {found:.4g}",
         verdict=verdicts.of_claim(found.low, found.high, above=0, replicas=min(len(values), len(reference))),
     )
 
@@ -118,7 +118,7 @@ def where(is_long: bool, claim: Claim) -> Claim:
 
 def with_interval(values: Values) -> str:
     """The mean of replicas, [R], with its 95 % interval by Student's t."""
-    return f"{estimate(values)}"
+    return f"{estimate(values):.4g}"
 
 
 def undefined_in(values: Values) -> str:

@@ -17,7 +17,7 @@ from cprl.measuring.phases import PHASES, PHASES_BEGIN
 from cprl.runs.curves import running_mean
 from cprl.terminal import style
 from cprl.terminal.figures import (
-    STRIP_IN,
+    STRIP,
     Bands,
     add_keys,
     bands_of,
@@ -31,9 +31,13 @@ TITLES: Final = {
     "return_1": "return of the random walker, apples",
 }
 """Of the returns of single agents, which are drawn for experiment 4 alone."""
-HEIGHT_IN: Final = 3.3
+HIGH: Final = 27
+"""Of the panel of a metric, in em."""
 MARGIN: Final = 0.04
 """Empty room above and below all curves, as a share of their range."""
+
+MOST_BOLD: Final = 4
+"""Replicas whose curves can be told apart; those of more are fainter."""
 
 Limits = tuple[float, float]
 
@@ -113,24 +117,24 @@ def _draw(result: Result, metric: str, limits: Limits, path: Path) -> None:
         strips["published"] = published_bands(result.study.episodes)
         if result.phases:
             strips["ours"] = bands_of(result.phases)
-    heights = [STRIP_IN * len(strips)] * bool(strips) + [HEIGHT_IN]
-    figure, panels = style.new_figure(heights, title=result.title)
-    axes = panels[-1]
-    draw_bands(axes, strips.get("ours", []))
+    heights = [STRIP * len(strips)] * bool(strips) + [HIGH]
     smoothed = running_mean(result.curves[metric], result.window)
-    _draw_curves(axes, smoothed, metric)
-    _draw_published(axes, result, metric)
-    mark_exploration([axes], result.exploration_ends)
-    add_keys(axes, *strips.values())
-    low, high = limits
-    margin = MARGIN * ((high - low) or 1.0)
-    longest = max(result.curves[metric].shape[1], result.study.episodes if result.study else 0)
-    axes.set(xlim=(0, longest), ylim=(low - margin, high + margin), ylabel=axis_title(metric))
-    axes.set_xlabel("first episode of a running mean" if smoothed.shape[1] > 1 else "episode")
-    for strip in panels[:-1]:
-        draw_strip(strip, strips)
-    style.legend_below(figure, [axes], note=_note(result, metric))
-    style.save(figure, path)
+    with style.drawing(path) as sheet:
+        *above, axes = sheet.panels(len(heights), high=heights, sharex=True)
+        draw_bands(axes, strips.get("ours", []))
+        _draw_curves(axes, smoothed, metric)
+        _draw_published(axes, result, metric)
+        mark_exploration([axes], result.exploration_ends)
+        add_keys(axes, *strips.values())
+        low, high = limits
+        margin = MARGIN * ((high - low) or 1.0)
+        longest = max(result.curves[metric].shape[1], result.study.episodes if result.study else 0)
+        axes.set(xlim=(0, longest), ylim=(low - margin, high + margin), ylabel=axis_title(metric))
+        axes.set_xlabel("episode")
+        for strip in above:
+            draw_strip(sheet, strip, strips)
+        sheet.title = f"{result.name}: {axis_title(metric)}"
+        sheet.caption = f"{result.title}. {_note(result, metric)}"
 
 
 def _draw_curves(axes: Axes, smoothed: Values, metric: str) -> None:
@@ -143,7 +147,8 @@ def _draw_curves(axes: Axes, smoothed: Values, metric: str) -> None:
     faint, wide = (style.RAW, style.RAW) if of_agent else (style.REPLICA, style.INTERVAL)
     dot = "." if len(middle) < 3 else None  # a line needs two points
     if replicas > 1:
-        lines = axes.plot(smoothed.T, color=faint, linewidth=0.6, alpha=0.8, zorder=2)
+        alpha = 0.8 if replicas <= MOST_BOLD else 0.25
+        lines = axes.plot(smoothed.T, color=faint, linewidth=0.6, alpha=alpha, zorder=2)
         lines[0].set_label("ours, each replica")
         at, interval = np.arange(len(middle)), "ours, 95 % interval"
         axes.fill_between(at, low, high, color=wide, alpha=0.45, lw=0, label=interval, zorder=2.2)

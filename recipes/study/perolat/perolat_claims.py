@@ -208,9 +208,9 @@ def row(claim: Claim, name: str, runs: Path, episodes: int | None = None) -> str
     pairs = pairs[:, np.isfinite(pairs).all(0)]
     if not pairs.size:
         return line(*cells, "", "undefined in all replicas")
-    cells[2:] = [f"{own}: {estimate(one)}" for own, one in zip(both, pairs, strict=True)]
+    cells[2:] = [f"{own}: {estimate(one):.4g}" for own, one in zip(both, pairs, strict=True)]
     apart = difference(*pairs, paired=True)
-    return line(*cells, str(apart), verdict(apart))
+    return line(*cells, f"{apart:.4g}", verdict(apart))
 
 
 def line(*cells: str) -> str:

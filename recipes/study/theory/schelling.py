@@ -58,8 +58,8 @@ def row_of(board: str, rules: str, found: SchellingDiagram) -> list[str]:
     dilemma = found.dilemma()
     return [
         *(f"`{board}`", rules, found.greedy if found.greedy in SCRIPTED_POLICIES else "trained DQN"),
-        *(str(estimate(values)) for values in ends),
-        *(str(margin) for margin in (dilemma.restraint, dilemma.fear, dilemma.greed)),
+        *(f"{estimate(values):.4g}" for values in ends),
+        *(f"{margin:.4g}" for margin in (dilemma.restraint, dilemma.fear, dilemma.greed)),
         dilemma.name,
     ]
 

@@ -36,7 +36,7 @@ import cprl
 from cprl import keys
 from cprl.envs.taking import TakingGame
 from cprl.measuring.statistics import estimate
-from cprl.terminal.style import MARK, MEAN, RAW, SMALL_PT, WIDTH_IN, head, save
+from cprl.terminal.style import MARK, MEAN, RAW, drawing
 from cprl.theory import SharingGame
 
 GAMES: Final = (("herders", 2), ("herders", 5), ("appropriation", 8))
@@ -110,31 +110,26 @@ _NAMES: Final = ("game", "agents", "learner", "reward")
 
 def draw(table: pa.Table, path: Path) -> None:
     """Total taken over the training, a panel for each game, with what theory says."""
-    from matplotlib.figure import Figure
-
-    figure = Figure((WIDTH_IN, 9.5), layout="constrained")
-    panels: list[Axes] = list(figure.subplots(len(GAMES), 1, sharex=True))
-    for panel, (kind, herd) in zip(panels, GAMES, strict=True):
-        sharing = sharing_of(kind, herd)
-        _draw_theory(panel, sharing)
-        for learner, wants in WAYS:
-            found = of_condition(table, (kind, herd, learner, wants))
-            if found:
-                look: Any = {"color": COLOURS[wants], "linestyle": DASHES[learner]}
-                at = found["episode"] + BLOCK / 2
-                panel.plot(at, found["total"], **look, linewidth=0.5, alpha=0.35)
-                label = f"{learner}, {wants} reward"
-                panel.plot(at, found["total"].mean(1), **look, linewidth=2, label=label)
-        panel.set_title(f"{kind}, {herd} agents", fontsize=SMALL_PT + 1)
-        panel.set_ylabel("taken a turn, in all", fontsize=SMALL_PT)
-        panel.set_ylim(0, 1.12 * sharing.open_access_total)
-        panel.tick_params(labelsize=SMALL_PT)
-    panels[-1].set_xlabel(f"episode of {TURNS} turns", fontsize=SMALL_PT)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=SMALL_PT, frameon=False)
-    note = "thick: the mean of 8 replicas, thin: each; means of five episodes, exploration included."
-    head(figure, "Independent learners and what theory expects", note)
-    save(figure, path)
+    with drawing(path) as sheet:
+        panels = sheet.panels(len(GAMES), high=24, sharex=True)
+        for panel, (kind, herd) in zip(panels, GAMES, strict=True):
+            sharing = sharing_of(kind, herd)
+            _draw_theory(panel, sharing)
+            for learner, wants in WAYS:
+                found = of_condition(table, (kind, herd, learner, wants))
+                if found:
+                    look: Any = {"color": COLOURS[wants], "linestyle": DASHES[learner]}
+                    at = found["episode"] + BLOCK / 2
+                    panel.plot(at, found["total"], **look, linewidth=0.5, alpha=0.35)
+                    label = f"{learner}, {wants} reward"
+                    panel.plot(at, found["total"].mean(1), **look, linewidth=2, label=label)
+            panel.set(title=f"{kind}, {herd} agents", ylabel="taken a turn, in all")
+            panel.set_ylim(0, 1.12 * sharing.open_access_total)
+        panels[-1].set_xlabel(f"episode of {TURNS} turns")
+        sheet.title = "Independent learners and what theory expects"
+        sheet.caption = (
+            "Thick: the mean of 8 replicas, thin: each; means of five episodes, exploration included."
+        )
 
 
 def _draw_theory(panel: Axes, sharing: SharingGame) -> None:
@@ -146,7 +141,7 @@ def _draw_theory(panel: Axes, sharing: SharingGame) -> None:
     for name, (total, look) in lines.items():
         panel.axhline(total, linewidth=1.3, **look)
         at = {"x": 1.0, "y": total, "transform": panel.get_yaxis_transform()}
-        panel.text(**at, s=f" {name}", fontsize=SMALL_PT, va="center", color=look["color"])
+        panel.text(**at, s=f" {name}", va="center", color=look["color"])
 
 
 def print_table(table: pa.Table) -> None:
@@ -162,7 +157,7 @@ def print_table(table: pa.Table) -> None:
             share = 100 * found["gain"][end:].mean(0) / sharing.surplus(sharing.optimum_total)
             theory = f"{sharing.nash_total:.4g} | {sharing.optimum_total:.4g}"
             cells = " | ".join(map(str, condition))
-            print(f"| {cells} | {taken} | {theory} | {estimate(share)} |")
+            print(f"| {cells} | {taken:.4g} | {theory} | {estimate(share):.4g} |")
 
 
 def main() -> None:

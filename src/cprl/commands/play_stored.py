@@ -5,19 +5,18 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from cprl.commons.published import Variant, check_board
 from cprl.system.defaults import EGTA_RESAMPLES, FILM_SEED, FILM_SUFFIXES, PLAY_SEED, SEED, Diagonal
-from cprl.system.output import OUT, console, printed, say
+from cprl.system.output import printed, say
 from cprl.system.process import prepare_process
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from cprl.evaluation.lanes import Results
+    from cprl.terminal.tables import Cells
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +40,9 @@ class Files:
     out: Path | None = None
     """A parquet file to be, with every episode."""
     figure: Path | None = None
-    """A PNG to be, see docs/evaluation.md."""
+    """A .png, .pdf or .svg to be, see docs/evaluation.md."""
+    figure_width: Literal["page", "column"] = "page"
+    """Of the figure: a page, or a column of a paper, 3.3 inches, with its caption in a file beside it."""
 
     def check(self) -> None:
         """Refuse what is there already before hours of work."""
@@ -185,11 +186,12 @@ def visits(
 
     Args:
         run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
-        figure: a PNG to be: a map for each agent of where it spends its time, in the first of the replicas.
+        figure: a .png, .pdf or .svg to be: a map for each agent of where it spends its time, in the first of
+            the replicas.
         random: draw random agents in the same worlds instead.
     """
     if random and figure is None:
-        raise ValueError("--random says who is drawn; allowed: with --figure FILE.png")
+        raise ValueError("--random says who is drawn; allowed: with --figure FILE")
     files = Files(figure=figure)
     _begin(fresh.seed, run, files=files)
 
@@ -404,6 +406,7 @@ def exploit(
     from cprl.commands.studies import StudyOptions, carry_out, executor_of
     from cprl.evaluation.exploit import TABLE, exploitability_tables, measure, plan_responses
     from cprl.studies.study import directory_of
+    from cprl.terminal.tables import show
 
     plan = plan_responses(run, **vars(responses))
     folder = directory_of(plan.study, plan.out if out is None else out)
@@ -414,7 +417,7 @@ def exploit(
     carry_out(plan.study, options, ["cprl", *sys.argv[1:]])
     if dry_run:
         return
-    print_tables(exploitability_tables(measure(plan, folder)))
+    show(exploitability_tables(measure(plan, folder)))
     say(f"Episodes: {folder / TABLE}")
 
 
@@ -432,26 +435,27 @@ def _begin(seed: int, *runs: Path | str, files: Files = Files()) -> None:
 def _show(
     played: "Results | None",
     files: Files,
-    tables: "Iterable[Table]",
+    tables: "Iterable[Cells]",
     *,
     above: str = "",
     below: str = "",
-    draw: Callable[[Path], Path] | None = None,
+    draw: Callable[..., Path] | None = None,
 ) -> None:
     """Write every episode, print tables with a line above and below them, and draw."""
+    from cprl.terminal.tables import show
+
     if files.out is not None and played is not None:
         from cprl.runs.episodes import write_table
 
         write_table(files.out, played.table())
-    if above:
-        say(above)
-    print_tables(tables)
+    show([above] * bool(above))
+    show(tables)
     if below:
         say(below)
     if files.out is not None:
         say(f"Episodes: {files.out}")
     if files.figure is not None and draw is not None:
-        say(f"Figure: {draw(files.figure)}")
+        say(f"Figure: {draw(files.figure, width=files.figure_width)}")
 
 
 def _paths(named: Sequence[str] | Mapping[str, str]) -> Iterable[str]:
@@ -474,9 +478,3 @@ def runs_by_name(words: Sequence[str]) -> list[str] | dict[str, str]:
         if names.count(name) > 1:
             raise ValueError(f"{name} names {names.count(name)} runs; allowed: each its own, NAME=PATH")
     return dict(named)
-
-
-def print_tables(tables: "Iterable[Table]") -> None:
-    terminal = console(width=None if OUT.isatty() else 250)
-    for table in tables:
-        terminal.print(table)

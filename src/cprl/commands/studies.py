@@ -209,7 +209,7 @@ def search(words: Sequence[str], /) -> None:
         return
     result = _run(partial(run_search, wanted), options, executor, command)
     _say_best(result)
-    _say_result(result, command)
+    _say_result(result, command, options.last)
 
 
 def _read(words: Sequence[str], options: RecipeOptions, program: str) -> "tuple[Experiment, RecipeOptions]":
@@ -321,7 +321,7 @@ def carry_out(study: "Study", options: StudyOptions, command: Sequence[str]) -> 
         return _list(study, options)
     run = partial(run_study, study, only=options.only, keep_checkpoints=options.keep_checkpoints)
     result = _run(run, options, executor, command)
-    _say_result(result, command)
+    _say_result(result, command, options.last)
     return result.out
 
 
@@ -370,11 +370,20 @@ def _say_best(result: "SearchResult") -> None:
         say(f"  {len(refused)} points were refused, e.g. {refused[0].name}: {refused[0].reason}")
 
 
-def _say_result(result: "StudyResult", command: Sequence[str]) -> None:
-    """Says where a study is; of trials that failed why, where to look and what to do, and exits."""
+def _say_result(result: "StudyResult", command: Sequence[str], last: int) -> None:
+    """Says what came out of a study, and where it is; of trials that failed why, where to look and what to
+    do, and exits."""
+    from cprl.studies.results import FIGURES
     from cprl.studies.status import Status
     from cprl.studies.study import STATUS
+    from cprl.studies.tables.comparing import cells, compare, metrics_of, of_finished
+    from cprl.terminal.tables import show
 
+    if result.table is not None and result.table.metrics:
+        compared = [compare(result.table, metric, last=last) for metric in metrics_of(result.table)]
+        show([of_finished(cells(compared))])
+        for figure in sorted((result.out / FIGURES).glob("*.png")):
+            say(f"Figure: {figure}")
     say(result.out)
     if not result.failed:
         return

@@ -10,11 +10,11 @@ import tyro
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.runs.recipe import runs_in
 from cprl.system.defaults import LAST, WINDOW
-from cprl.system.output import OUT, console, say
+from cprl.system.output import OUT, say
 
 if TYPE_CHECKING:
     from cprl.studies import StudyTable
-    from cprl.studies.tables.comparing import Cells
+    from cprl.terminal.tables import Cells
 
 _TRAINING: Final = "training"
 _SUFFIXES: Final = (".parquet", ".csv", ".md")
@@ -85,13 +85,12 @@ def table(
         OUT.write(study_table.to_csv())
         return
 
-    from cprl.studies.tables.comparing import rich_table
+    from cprl.studies.tables.comparing import of_finished
+    from cprl.terminal.tables import show
 
     last = LAST if compare.last is None else compare.last
     compared = _compared(study_table, compare.metric, compare.part, last)
-    terminal = console(width=None if OUT.isatty() else 250)
-    for cells in compared:
-        terminal.print(rich_table(cells))
+    show(map(of_finished, compared))
     say(str(study_table))
     if summary:
         from cprl.studies.results import write_summary
@@ -138,7 +137,7 @@ def _write(table: "StudyTable", compared: "Sequence[Cells]", out: Path) -> None:
         return
     content = table.to_csv()
     if out.suffix == ".md":
-        from cprl.studies.tables.comparing import markdown
+        from cprl.terminal.tables import markdown
 
         lines = [line for cells in compared for line in (cells.heading, "", *markdown(cells))]
         content = "\n".join([*lines, *str(table).split("\n"), ""])

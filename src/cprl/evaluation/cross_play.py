@@ -19,11 +19,10 @@ from typing import Final, NamedTuple
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
-from rich.table import Table
 
 from cprl.evaluation.evaluate import (
     SEED,
+    beyond,
     heading,
     opened,
     refuse_other_games,
@@ -36,6 +35,7 @@ from cprl.measuring.metrics import with_unit
 from cprl.measuring.statistics import HOLM, Estimate, Measured, starred
 from cprl.system.defaults import Diagonal
 from cprl.terminal import style
+from cprl.terminal.tables import Cells
 from cprl.training.agents import LoadedRun
 from cprl.values import checked, refusal
 
@@ -196,49 +196,70 @@ def _texts(by_cell: Mapping[Pair, Gain], form: str = "") -> dict[Whose, dict[Pai
 
 
 _COLOURS: Final = "RdBu"
-_CELL_IN: Final = (0.82, 0.45)
-_NARROWEST_IN: Final = 7.0
+_CELL: Final = (4.4, 3.0)
+"""How wide and high cells are that have room for their numbers, in em."""
 
 
-def draw_gains(played: CrossPlay, path: Path | str) -> Path:
+def draw_gains(played: CrossPlay, path: Path | str, *, width: style.Width = "page") -> Path:
     """Draws `gains`, a row for each focal agent's run, a column for each of background agents; a star where
-    one is not 0 by Holm's method for all that are drawn."""
-    path, by_cell = style.picture_path(path), gains(played)
-    names, texts = list(played.runs), _texts(by_cell, "+.3g")
+    one is not 0 by Holm's method for all that are drawn. Cells that are too small for their numbers have the
+    star alone."""
+    by_cell, names, unit = gains(played), list(played.runs), unit_of_rewards(played)
+    texts = _texts(by_cell, "+.3g")
     at_home = {(name, name): f"{played.cell(name, name).mean_returns('focal').mean():.3g}" for name in names}
-    returns = with_unit("focal/return", rewards=unit_of_rewards(played)).partition("/")[2]
-    width = max(_CELL_IN[0] * len(names) + 2.6, _NARROWEST_IN)
-    figure = Figure((width, 2 * (_CELL_IN[1] * len(names) + 0.9) + 1.2), layout="constrained")
-    for axes, (whose, beside) in zip(figure.subplots(2, 1), _BESIDE.items(), strict=True):
-        differences = {pair: getattr(gain, whose).value for pair, gain in by_cell.items()}
-        draw_matrix(axes, names, differences, texts[whose] | at_home)
-        style.write_small(
-            axes, x="background agents", y="focal agent", title=f"difference in {returns} of {beside}"
+    with style.drawing(path, width=width, colours=style.SHADES) as sheet:
+        panels = sheet.panels(2, high=matrix_height(names))
+        for axes, (whose, beside) in zip(panels, _BESIDE.items(), strict=True):
+            differences = {pair: getattr(gain, whose).value for pair, gain in by_cell.items()}
+            draw_matrix(sheet, axes, names, differences, texts[whose] | at_home)
+            axes.set(xlabel="background agents", ylabel="focal agent")
+            axes.set_title(beside)
+        sheet.title = "Cross-play: who gains among whom"
+        sheet.caption = (
+            f"Difference in return{f', {unit}' if unit else ''}; {played.fresh} with focal agent at each "
+            f"index; diagonal ({played.diagonal.replace('_', '-')}): an agent's return. {HOLM} for these "
+            f"{2 * len(by_cell)}."
         )
-    note = (
-        f"{played.fresh} with focal agent at each index; diagonal ({played.diagonal.replace('_', '-')}): an "
-        f"agent's return. {HOLM} for these {2 * len(by_cell)}."
-    )
-    style.head(figure, "Cross-play: who gains among whom", note)
-    return style.save(figure, path, colours=style.SHADES)
+    return Path(path)
+
+
+def matrix_height(names: Sequence[str]) -> float:
+    """Of a panel with a matrix, in em."""
+    return max(_CELL[1] * len(names), 12) + 8
 
 
 def draw_matrix(
-    axes: Axes, names: Sequence[str], values: Mapping[Pair, float], texts: Mapping[Pair, str]
+    sheet: style.Sheet,
+    axes: Axes,
+    names: Sequence[str],
+    values: Mapping[Pair, float],
+    texts: Mapping[Pair, str],
+    *,
+    share: float = 1.0,
 ) -> None:
-    """A matrix of differences in colours about 0; cells without a value are empty but for their text."""
+    """A matrix of differences in colours about 0; cells without a value are empty but for their text.
+
+    Args:
+        share: of the width of the sheet, which the panel has.
+    """
     reach = max(map(abs, values.values())) or 1.0
     scale, colours = Normalize(-reach, reach), matplotlib.colormaps[_COLOURS]
+    rows = [style.wrapped(name, 0.25 * share * sheet.width_em) for name in names]
+    longest = style.CHARACTER * max(len(line) for name in rows for line in name.splitlines())
+    wide = (0.8 * share * sheet.width_em - longest - 2) / len(names)
     for (row, column), text in texts.items():
         value = values.get((row, column))
         colour = style.EMPTY if value is None else colours(scale(value))
+        text = text if wide >= _CELL[0] else "*" * text.endswith("*")
         style.draw_cell(axes, names.index(column), names.index(row), colour, text)
-    axes.set_xticks(range(len(names)), [style.wrapped(name, _CELL_IN[0]) for name in names])
-    axes.set_yticks(range(len(names)), names)
+    is_narrow = wide < min(longest, 6)
+    columns = names if is_narrow else [style.wrapped(name, wide) for name in names]
+    axes.set_xticks(range(len(names)), columns, rotation=90 if is_narrow else 0)
+    axes.set_yticks(range(len(names)), rows)
     axes.set(xlim=(-0.5, len(names) - 0.5), ylim=(len(names) - 0.5, -0.5))
     axes.tick_params(length=0)
-    bar = axes.figure.colorbar(matplotlib.cm.ScalarMappable(scale, _COLOURS), ax=axes)
-    bar.ax.tick_params(labelsize=style.SMALL_PT)
+    axes.spines[:].set_visible(False)
+    sheet.figure.colorbar(matplotlib.cm.ScalarMappable(scale, _COLOURS), ax=axes)
 
 
 def crossplay_heading(played: CrossPlay) -> str:
@@ -246,24 +267,23 @@ def crossplay_heading(played: CrossPlay) -> str:
     return heading("Cross-play", played.fresh, played.runs.values(), each, f", diagonal: {played.diagonal}")
 
 
-def crossplay_tables(played: CrossPlay) -> Iterator[Table]:
-    """A matrix for each metric, rows the focal agent's run, columns the background agents' run; one for what
-    focal agents gain and one for what background agents do; and all returns by the focal agent's index."""
+def crossplay_tables(played: CrossPlay) -> Iterator[Cells]:
+    """A matrix of what focal agents gain, one of what background agents do, and one for each metric, rows the
+    focal agent's run, columns the background agents' run; and all returns by the focal agent's index."""
     cells = {pair: cell.measures() for pair, cell in played.cells.items()}
-    rewards, names = unit_of_rewards(played), list(played.runs)
+    rewards, names, corner = unit_of_rewards(played), list(played.runs), "focal \\ background"
+    by_cell = gains(played)
+    for whose, texts in _texts(by_cell).items():
+        name = with_unit(f"{whose}/return", rewards=rewards)
+        title = f"{name}, difference of {_BESIDE[whose]}, paired by replica [95 % interval by Student's t]"
+        yield matrix_table(title, corner, names, texts, f"{HOLM} for all {2 * len(by_cell)} differences")
     # A reward is an apple but for what institutions take and give.
     repeats = () if any("institutions/fines" in cell for cell in cells.values()) else ("collective_return",)
     for name in next(iter(cells.values())):
         measured = {pair: cell[name] for pair, cell in cells.items()}
         if name not in repeats and not says_nothing(name, measured.values()):
-            yield matrix_table(with_unit(name, rewards=rewards), "focal \\ background", names, measured)
-    by_cell = gains(played)
-    for whose, texts in _texts(by_cell).items():
-        name = with_unit(f"{whose}/return", rewards=rewards)
-        title = f"{name}, difference of {_BESIDE[whose]}, paired by replica [95 % interval by Student's t]"
-        table = matrix_table(title, "focal \\ background", names, texts)
-        table.caption = f"{HOLM} for all {2 * len(by_cell)} differences"
-        yield table
+            note = beyond((name, of_cell) for of_cell in measured.values())
+            yield matrix_table(with_unit(name, rewards=rewards), corner, names, measured, note)
     returns = ("focal/return", "background/return", "group/return")
     headings = ["focal", "background", "focal agent", *(with_unit(name, rewards=rewards) for name in returns)]
     rows = []
@@ -274,7 +294,9 @@ def crossplay_tables(played: CrossPlay) -> Iterator[Table]:
     yield table_of("returns by the focal agent's index", headings, rows, texts=3)
 
 
-def matrix_table(title: str, corner: str, names: Sequence[str], cells: Mapping[Pair, object]) -> Table:
+def matrix_table(
+    title: str, corner: str, names: Sequence[str], cells: Mapping[Pair, object], note: str = ""
+) -> Cells:
     """A row and a column for each name, with the text of each pair, "" where there is none."""
     rows = [(row, *(str(cells.get((row, column), "")) for column in names)) for row in names]
-    return table_of(title, [corner, *names], rows)
+    return table_of(title, [corner, *names], rows, note=note)

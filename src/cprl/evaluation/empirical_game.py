@@ -22,18 +22,17 @@ from functools import cached_property
 from itertools import permutations
 from math import isnan, nan
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
-from matplotlib.figure import Figure
-from rich.table import Table
 
-from cprl.evaluation.cross_play import CrossPlay, Runs, draw_matrix, matrix_table, named_runs
+from cprl.evaluation.cross_play import CrossPlay, Runs, draw_matrix, matrix_height, matrix_table, named_runs
 from cprl.evaluation.evaluate import SEED, heading, table_of
 from cprl.evaluation.lanes import Part, Played, Results, Who, agents_of, fresh_of, shifted
 from cprl.measuring.statistics import CONFIDENCE, HOLM, Estimate, estimate, starred
 from cprl.system.defaults import EGTA_RESAMPLES
 from cprl.terminal import style
+from cprl.terminal.tables import Cells
 from cprl.theory.payoff_table import PayoffTable, Values, compositions
 from cprl.theory.solutions import (
     MOST_PROFILES,
@@ -253,7 +252,7 @@ def egta_heading(game: EmpiricalGame) -> str:
     return heading(kind, game.fresh, game.runs.values(), _CHOICES)
 
 
-def egta_tables(analysis: Analysis) -> Iterator[Table]:
+def egta_tables(analysis: Analysis) -> Iterator[Cells]:
     """The payoffs, the runs by alpha-rank, the equilibria, and where replicator dynamics end."""
     yield _payoff_table(analysis.game)
     title = "alpha-rank at the limit of infinite alpha: share of the agents in the long run"
@@ -275,7 +274,7 @@ def egta_tables(analysis: Analysis) -> Iterator[Table]:
     yield table_of("equilibria", ["", "what is played", "how certain"], _ends(analysis), texts=2)
 
 
-def _payoff_table(game: EmpiricalGame) -> Table:
+def _payoff_table(game: EmpiricalGame) -> Cells:
     """By the runs of both of two agents, else by how many agents play as each."""
     if game.agents == 2:
         others = "the other" if game.of_agents == 2 else f"all other {game.of_agents - 1}"
@@ -326,13 +325,10 @@ def mixture_text(mixture: Values, names: Sequence[str]) -> str:
     return played[0][0] if len(played) == 1 else ", ".join(f"{name} {share:.2f}" for name, share in played)
 
 
-_SIZE_IN: Final = (9.0, 4.3)
-
-
-def draw_egta(analysis: Analysis, path: Path | str) -> Path:
+def draw_egta(analysis: Analysis, path: Path | str, *, width: style.Width = "page") -> Path:
     """Draws what one agent gains that plays as another run than all others, with a star where it is not 0 by
     Holm's method; and each run's share by alpha-rank, with the most frequent end of replicator dynamics."""
-    path, game, names = style.check_picture(path), analysis.game, analysis.game.names
+    game, names = analysis.game, analysis.game.names
     usual = np.diagonal(game.pairs, axis1=1, axis2=2)
     gains = {
         (names[played], names[others]): estimate(game.pairs[:, played, others] - usual[:, others])
@@ -340,30 +336,30 @@ def draw_egta(analysis: Analysis, path: Path | str) -> Path:
     }
     texts = dict(zip(gains, starred(list(gains.values()), "+.3g"), strict=True))
     texts |= {(name, name): f"{mean:.3g}" for name, mean in zip(names, usual.mean(0), strict=True)}
-    figure = Figure(_SIZE_IN, layout="constrained")
-    matrix, rank = figure.subplots(1, 2, width_ratios=(1.35, 1))
-    draw_matrix(matrix, names, {pair: gain.value for pair, gain in gains.items()}, texts)
-    style.write_small(
-        matrix,
-        x="run of all others",
-        y="run of an agent",
-        title="what an agent gains by another run than all others",
-    )
-    places = np.arange(len(names))
-    share, low, high = np.array([(share.value, share.low, share.high) for share in analysis.shares]).T
-    rank.barh(places, share, color=style.REPLICA, height=0.6)
-    rank.hlines(places, low, high, color=style.PUBLISHED)
-    if len(analysis.ends.mixtures):
-        label = f"end of replicator dynamics, from {analysis.ends.shares[0]:.0%} of the starts"
-        rank.plot(analysis.ends.mixtures[0], places, "D", color=style.MARK, label=label, clip_on=False)
-        rank.legend(loc="lower center", bbox_to_anchor=(0.5, 1.08), fontsize=style.SMALL_PT, frameon=False)
-    rank.set_yticks(places, [style.wrapped(name, 1.6) for name in names])
-    rank.set(xlim=(0, 1), ylim=(len(places) - 0.5, -0.5))
-    style.write_small(rank, x="share of the agents in the long run", title="alpha-rank, infinite alpha")
-    kind = f"pairwise reduction of {game.of_agents} agents" if game.is_reduction else f"{game.agents} agents"
-    note = (
-        f"{kind}; {game.fresh}{_CHOICES}. {HOLM} for these {len(gains)}; diagonal: an agent's return; "
-        f"intervals of shares: 95 % of {analysis.resamples} resamples of the replicas"
-    )
-    style.head(figure, f"Empirical game of {', '.join(names)}", note)
-    return style.save(figure, path, colours=style.SHADES)
+    with style.drawing(path, width=width, colours=style.SHADES, is_new=True) as sheet:
+        columns = sheet.fitting(2, 24)
+        ratios: Any = {"width_ratios": (1.35, 1)} if columns == 2 else {}
+        matrix, rank = sheet.panels(2, columns=columns, high=matrix_height(names), **ratios)
+        differences = {pair: gain.value for pair, gain in gains.items()}
+        draw_matrix(sheet, matrix, names, differences, texts, share=1.15 / columns)
+        matrix.set(xlabel="run of all others", ylabel="run of an agent")
+        matrix.set_title("gain of an agent by another run")
+        places = np.arange(len(names))
+        share, low, high = np.array([(share.value, share.low, share.high) for share in analysis.shares]).T
+        rank.barh(places, share, color=style.REPLICA, height=0.6)
+        rank.hlines(places, low, high, color=style.PUBLISHED)
+        if len(analysis.ends.mixtures):
+            label = f"end of replicator dynamics, from {analysis.ends.shares[0]:.0%} of the starts"
+            rank.plot(analysis.ends.mixtures[0], places, "D", color=style.MARK, label=label, clip_on=False)
+        rank.set_yticks(places, [style.wrapped(name, 9) for name in names])
+        rank.set(xlim=(0, 1), ylim=(len(places) - 0.5, -0.5), xlabel="share of the agents in the long run")
+        rank.set_title("alpha-rank, infinite alpha")
+        kind = (
+            f"pairwise reduction of {game.of_agents} agents" if game.is_reduction else f"{game.agents} agents"
+        )
+        sheet.title = f"Empirical game of {', '.join(names)}"
+        sheet.caption = (
+            f"{kind}; {game.fresh}{_CHOICES}. {HOLM} for these {len(gains)}; diagonal: an agent's return; "
+            f"intervals of shares: 95 % of {analysis.resamples} resamples of the replicas."
+        )
+    return Path(path)

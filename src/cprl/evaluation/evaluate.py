@@ -8,14 +8,14 @@ from typing import Any, Final, Literal
 
 import numpy as np
 import torch
-from rich.table import Table
 
 from cprl.envs.unwrap import agent_names
 from cprl.evaluation.lanes import Fresh, Part, Played, Results, Values, agents_of, fresh_of, scripted
-from cprl.measuring.metrics import left_out, with_unit
+from cprl.measuring.metrics import bounds, left_out, with_unit
 from cprl.measuring.series import OF_AGENTS
 from cprl.measuring.statistics import Estimate, Measured, agents_without_harvest, over_replicas
 from cprl.system.defaults import SEED as SEED
+from cprl.terminal.tables import Cells
 from cprl.training.agents import LoadedRun, load
 from cprl.values import checked, differences, to_config
 
@@ -124,14 +124,20 @@ def opened(run: str | Path | LoadedRun, allow: Sequence[str] = ()) -> LoadedRun:
     return run if isinstance(run, LoadedRun) else load(run, allow=allow)
 
 
-def table_of(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1) -> Table:
+def table_of(
+    title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1, note: str = ""
+) -> Cells:
     """Return a table for the terminal whose first columns are texts and all others numbers."""
-    table = Table(title=title, title_justify="left")
-    for place, column in enumerate(columns):
-        table.add_column(column, justify="left" if place < texts else "right")
-    for row in rows:
-        table.add_row(*row)
-    return table
+    return Cells(title, columns, list(rows), note, texts)
+
+
+def beyond(measures: Iterable[tuple[str, Measured]]) -> str:
+    """A sentence for a table of metrics some of whose intervals reach beyond what the metric can be."""
+    for name, measured in measures:
+        low, high = bounds(name)
+        if measured.estimate is not None and (measured.estimate.low < low or measured.estimate.high > high):
+            return "Some intervals by Student's t reach beyond what a metric can be."
+    return ""
 
 
 def bars_of(estimates: Iterable[Estimate]) -> tuple[Values, Values]:
@@ -141,7 +147,7 @@ def bars_of(estimates: Iterable[Estimate]) -> tuple[Values, Values]:
     return means, np.nan_to_num([means - low, high - means])
 
 
-def run_table(evaluation: Evaluation) -> Table:
+def run_table(evaluation: Evaluation) -> Cells:
     """A row for each metric: mean over replicas and 95 % interval, of the run's agents and random agents.
 
     Metrics of institutions that are undefined everywhere, since the game has other institutions, have none.
@@ -153,13 +159,14 @@ def run_table(evaluation: Evaluation) -> Table:
         for name, measured in trained.items()
         if not says_nothing(name, [measured, random[name]])
     ]
+    zeros = "" if len(rows) == len(trained) else "Numbers of institutions that are 0 everywhere are left out."
     without = [agents_without_harvest(played) for played in (evaluation.trained, evaluation.random)]
     if None not in without:
         counts = (f"{count[0]} of {count[1]}" for count in without if count)
         rows.append(("agents without a harvest, not in sustainability", *counts))
-    table = table_of(*heading_beside_random(evaluation.run, evaluation.fresh), rows)
-    table.caption = left_out(next(iter(evaluation.trained.values()))[0].reported) or None
-    return table
+    notes = left_out(next(iter(evaluation.trained.values()))[0].reported), zeros, beyond(trained.items())
+    title, columns = heading_beside_random(evaluation.run, evaluation.fresh)
+    return table_of(title, columns, rows, note="\n".join(filter(None, notes)))
 
 
 def heading_beside_random(run: LoadedRun, fresh: Fresh) -> tuple[str, list[str]]:
@@ -168,8 +175,10 @@ def heading_beside_random(run: LoadedRun, fresh: Fresh) -> tuple[str, list[str]]
 
 
 def says_nothing(name: str, measured: Iterable[Measured]) -> bool:
-    """Whether it is a metric of institutions that is undefined everywhere."""
-    return name.startswith("institutions/") and all(of_run.estimate is None for of_run in measured)
+    """Whether it is of institutions, and undefined or 0 everywhere: what no institution of the game does."""
+    kinds = name.startswith("institutions/"), name.endswith(("/fines", "/transfers", "/violations"))
+    values = [of_run.estimate.value for of_run in measured if of_run.estimate is not None]
+    return any(kinds) and not any(values) and "in_force" not in name
 
 
 def unit_of_rewards(results: Results) -> str:

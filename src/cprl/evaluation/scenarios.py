@@ -17,13 +17,12 @@ from typing import Annotated, Any, Final, Literal, TypeAlias, get_args
 
 import numpy as np
 import pyarrow as pa
-from matplotlib.figure import Figure
-from rich.table import Table
 
 from cprl.commons.game import Game
 from cprl.evaluation.evaluate import (
     SEED,
     bars_of,
+    beyond,
     heading,
     opened,
     refuse_other_games,
@@ -47,6 +46,7 @@ from cprl.measuring.metrics import with_unit
 from cprl.measuring.statistics import HOLM, Estimate, Measured, estimate, starred
 from cprl.population import Frozen, Scripted
 from cprl.terminal import style
+from cprl.terminal.tables import Cells
 from cprl.training.agents import LoadedRun, check_scripted, load
 from cprl.values import Value, Where, refusal
 
@@ -307,7 +307,7 @@ def scenario_heading(scores: Scores) -> str:
     return heading(f"Scenarios of {scores.run.path.name}", scores.fresh, [scores.run], " in each placement")
 
 
-def scenario_tables(scores: Scores) -> Iterator[Table]:
+def scenario_tables(scores: Scores) -> Iterator[Cells]:
     """A table of returns, a row for each scenario, and one of social metrics of all agents together."""
     columns = ["scenario", "focal: the run's agents", "random in their place", "greedy in their place"]
     columns += ["run's - random's, paired", "run's - greedy's, paired", "background"]
@@ -318,14 +318,14 @@ def scenario_tables(scores: Scores) -> Iterator[Table]:
     for name, score in by_scenario.items():
         focal = [str(score.measures(who)["focal/return"]) for who in FOCAL_AGENTS]
         rows.append((name, *focal, next(texts), next(texts), str(score.measures()["background/return"])))
-    table = table_of("return per agent (apples)", columns, rows)
     left_out = left_out_of(scores.run.game)
-    table.caption = f"{HOLM} for all {len(ahead)} differences" + f". Left out: {left_out}" * bool(left_out)
-    yield table
+    note = f"{HOLM} for all {len(ahead)} differences" + f". Left out: {left_out}" * bool(left_out)
+    yield table_of("return per agent, apples", columns, rows, note=note)
     title = "all agents together, with the run's agents in the focal places"
     measured = {name: score.measures() for name, score in by_scenario.items()}
     social = [(name, *(str(measures[metric]) for metric in SOCIAL)) for name, measures in measured.items()]
-    yield table_of(title, ["scenario", *map(with_unit, SOCIAL)], social)
+    note = beyond((metric, measures[metric]) for measures in measured.values() for metric in SOCIAL)
+    yield table_of(title, ["scenario", *map(with_unit, SOCIAL)], social, note=note)
 
 
 def estimates(scores: Scores) -> pa.Table:
@@ -359,32 +359,33 @@ _LOOKS: Final[dict[tuple[FocalAgents, Whose], tuple[str, str, str]]] = {
     ("run", "background"): ("|", "#000000", "background agents, beside the run's"),
 }
 """Marker, colour and name of each number."""
-_ROW_IN: Final = 0.55
+_ROW: Final = 4.4
+"""The height of a scenario in em."""
 _BAND: Final = 0.16
 """The distance between two numbers of a scenario, in rows."""
 
 
-def draw_scenarios(scores: Scores, path: Path | str) -> Path:
+def draw_scenarios(scores: Scores, path: Path | str, *, width: style.Width = "page") -> Path:
     """Draws the mean return per agent, a row for each scenario: of the run's agents in the focal places, of
     greedy and of random ones there, and of the background; intervals by Student's t.
     """
-    path, by_scenario = style.picture_path(path), scores.by_scenario
-    figure = Figure((8.0, _ROW_IN * len(by_scenario) + 2.0), layout="constrained")
-    axes, rows = figure.subplots(), np.arange(len(by_scenario))
-    for place, ((who, whose), (marker, colour, label)) in enumerate(_LOOKS.items()):
-        returns = [score.where(focal=who).mean_returns(whose) for score in by_scenario.values()]
-        means, reach = bars_of(map(estimate, returns))
-        at = rows + _BAND * (place - (len(_LOOKS) - 1) / 2)
-        axes.errorbar(means, at, xerr=reach, fmt=marker, color=colour, markersize=6, label=label)
-    for row in range(1, len(by_scenario)):
-        axes.axhline(row - 0.5, color="#dddddd", linewidth=0.8)
-    axes.set_yticks(rows, [name.replace("_", " ") for name in by_scenario])
-    axes.set_ylim(len(by_scenario) - 0.5, -0.5)
-    style.write_small(axes, x="return per agent, apples")
-    figure.legend(loc="outside lower center", ncols=2, fontsize=style.SMALL_PT, frameon=False)
-    note = (
-        f"{scores.fresh} in each placement, the same worlds for all; mean over replicas, 95 % interval by "
-        "Student's t."
-    )
-    style.head(figure, f"Scenarios of {scores.run.path.name}", note)
-    return style.save(figure, path)
+    by_scenario = scores.by_scenario
+    rows = np.arange(len(by_scenario))
+    with style.drawing(path, width=width) as sheet:
+        (axes,) = sheet.panels(1, high=_ROW * len(rows) + 4)
+        for place, ((who, whose), (marker, colour, label)) in enumerate(_LOOKS.items()):
+            returns = [score.where(focal=who).mean_returns(whose) for score in by_scenario.values()]
+            means, reach = bars_of(map(estimate, returns))
+            at = rows + _BAND * (place - (len(_LOOKS) - 1) / 2)
+            axes.errorbar(means, at, xerr=reach, fmt=marker, color=colour, markersize=6, label=label)
+        for row in rows[1:]:
+            axes.axhline(row - 0.5, color="#dddddd", linewidth=0.8)
+        names = [style.wrapped(name.replace("_", " "), 0.3 * sheet.width_em) for name in by_scenario]
+        axes.set_yticks(rows, names)
+        axes.set(ylim=(len(rows) - 0.5, -0.5), xlabel="return per agent, apples")
+        sheet.title = f"{scores.run.path.name}: returns by scenario"
+        sheet.caption = (
+            f"{scores.fresh} in each placement, the same worlds for all; mean over replicas, 95 % interval "
+            "by Student's t."
+        )
+    return Path(path)

@@ -29,8 +29,6 @@ from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from rich.table import Table
 
 from cprl.commons.game import Game
 from cprl.evaluation.evaluate import SEED, bars_of, heading, table_of
@@ -50,6 +48,7 @@ from cprl.evaluation.lanes import (
 from cprl.measuring.statistics import Estimate, Measured, difference, estimate
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.terminal import style
+from cprl.terminal.tables import Cells
 from cprl.values import refusal, trust
 
 _NAMES: Final = ("prisoner's dilemma", "chicken", "stag hunt", "no dilemma")
@@ -214,31 +213,36 @@ def _refuse_alike(game: Any, restrained: str, greedy: str) -> None:
 
 _RESTRAINED: Final = "#1b7837"
 _GREEDY: Final = "#b2182b"
-_SIZE_IN: Final = (7.5, 3.6)
 
 
-def draw_schelling(diagram: SchellingDiagram, path: Path | str) -> Path:
+def draw_schelling(diagram: SchellingDiagram, path: Path | str, *, width: style.Width = "page") -> Path:
     """Draws what an agent gets that is restrained or greedy, by how many of the others are restrained; beside
     it what all get together.
     """
-    path = style.check_picture(path)
-    figure = Figure(_SIZE_IN, layout="constrained")
-    single, group = figure.subplots(1, 2)
-    for payoffs, who, role, colour, marker in (
-        (diagram.restrained_payoffs, diagram.restrained, "restrained", _RESTRAINED, "o"),
-        (diagram.greedy_payoffs, diagram.greedy, "greedy", _GREEDY, "s"),
-    ):
-        _line(single, payoffs, label=f"{role}: {Path(who).name}", color=colour, marker=marker)
-    x = f"restrained agents among the other {diagram.agents - 1}"
-    style.write_small(single, x=x, y="return of the agent")
-    single.legend(fontsize=style.SMALL_PT)
-    _line(group, diagram.group_payoffs, color=style.MEAN, marker="o")
-    style.write_small(group, x=f"restrained agents of {diagram.agents}", y="return of all together")
-    for axes in (single, group):
-        axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
-    note = f"{diagram.fresh} for each choice of restrained agents; bars: 95 % intervals by Student's t"
-    style.head(figure, f"Schelling diagram: {diagram.dilemma().name}", note)
-    return style.save(figure, path)
+    with style.drawing(path, width=width, is_new=True) as sheet:
+        single, group = sheet.panels(2, columns=sheet.fitting(2, 24), high=20)
+        for payoffs, who, role, colour, marker in (
+            (diagram.restrained_payoffs, diagram.restrained, "restrained", _RESTRAINED, "o"),
+            (diagram.greedy_payoffs, diagram.greedy, "greedy", _GREEDY, "s"),
+        ):
+            name = Path(who).name
+            label = role if name == role else f"{role}: {name}"
+            _line(single, payoffs, label=label, color=colour, marker=marker)
+        single.set_xlabel(f"restrained agents among the other {diagram.agents - 1}")
+        single.set_title("return of the agent")
+        _line(group, diagram.group_payoffs, color=style.MEAN, marker="o")
+        group.set_xlabel(f"restrained agents of {diagram.agents}")
+        group.set_title("return of all together")
+        for axes in (single, group):
+            axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+        candidates = diagram.dilemma().candidates
+        sheet.title = f"Schelling diagram: {candidates[0] if len(candidates) == 1 else 'undecided'}"
+        sheet.caption = (
+            f"{diagram.fresh} for each choice of restrained agents; bars: 95 % intervals by Student's t."
+        )
+        if len(candidates) > 1:
+            sheet.caption += f" The intervals allow {' or '.join(candidates)}."
+    return Path(path)
 
 
 def _line(axes: Axes, values: Values, **look: Any) -> None:
@@ -248,8 +252,17 @@ def _line(axes: Axes, values: Values, **look: Any) -> None:
     axes.set_xticks(range(len(means)))
 
 
-def schelling_tables(diagram: SchellingDiagram) -> Iterator[Table]:
-    """The payoffs by the number of restrained others, and the margins between them that make a dilemma."""
+def schelling_tables(diagram: SchellingDiagram) -> Iterator[Cells]:
+    """The margins that make a dilemma, and the payoffs by the number of restrained others."""
+    dilemma, last = diagram.dilemma(), diagram.agents - 1
+    margins = {
+        f"restraint of all instead of none, R({last}) - G(0)": dilemma.restraint,
+        f"company of the restrained, R({last}) - R(0)": dilemma.company,
+        "fear, G(0) - R(0)": dilemma.fear,
+        f"greed, G({last}) - R({last})": dilemma.greed,
+    }
+    rows = [(name, str(margin)) for name, margin in margins.items()]
+    yield table_of(f"{dilemma.name}, by returns", ["", "difference, paired by replica"], rows)
     payoffs = zip(diagram.restrained_payoffs.T, diagram.greedy_payoffs.T, strict=True)
     yield table_of(
         heading("Schelling diagram", diagram.fresh, (), " for each choice of restrained agents"),
@@ -261,12 +274,3 @@ def schelling_tables(diagram: SchellingDiagram) -> Iterator[Table]:
         [(str(count), *(str(estimate(values)) for values in pair)) for count, pair in enumerate(payoffs)],
         texts=0,
     )
-    dilemma, last = diagram.dilemma(), diagram.agents - 1
-    margins = {
-        f"restraint of all instead of none, R({last}) - G(0)": dilemma.restraint,
-        f"company of the restrained, R({last}) - R(0)": dilemma.company,
-        "fear, G(0) - R(0)": dilemma.fear,
-        f"greed, G({last}) - R({last})": dilemma.greed,
-    }
-    rows = [(name, str(margin)) for name, margin in margins.items()]
-    yield table_of(f"{dilemma.name}, by returns", ["", "difference, paired by replica"], rows)

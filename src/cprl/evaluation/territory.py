@@ -2,16 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import ceil
 from pathlib import Path
-from textwrap import fill
 from typing import Any, Final, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from rich.table import Table
 
 from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, agent_colour
 from cprl.commons.maps import Map
@@ -21,6 +17,7 @@ from cprl.measuring import movement
 from cprl.measuring.movement import Trace, overlap, owners, trace, visits
 from cprl.measuring.statistics import Estimate, estimate
 from cprl.terminal import style
+from cprl.terminal.tables import Cells
 from cprl.training.agents import LoadedRun
 from cprl.values import checked, refusal
 
@@ -132,57 +129,57 @@ DARKEST: Final = 0.3
 
 
 def draw_visits(
-    territory: Territory, path: str | Path, *, replica: int | None = None, policy: Policy = "trained"
+    territory: Territory,
+    path: str | Path,
+    *,
+    replica: int | None = None,
+    policy: Policy = "trained",
+    width: style.Width = "page",
 ) -> Path:
-    """Draws where each agent of a replica spends its time, and last of all who spends most time in each cell.
+    """Draws who spends most time in each cell, and where each agent of a replica spends its time.
 
     Hue is the agent. Brightness is the share of its time by its square root, the same scale in all maps, from
     the least to the longest stay of any agent. A ring is where the agent starts, small squares are sites, and
-    grey cells walls. In the last map a cell has the hue of its owner; it is brighter the more time the owner
+    grey cells walls. In the first map a cell has the hue of its owner; it is brighter the more time the owner
     spends there, and the larger its share in the time of all. As agents have four hues, numbers say who owns
     what, each where its owner spends most time.
 
     Args:
         replica: the index of the replica in the run; by default the first one that played.
     """
-    path = style.check_picture(path)
-    stays = territory.of(policy)
-    replicas = territory.fresh.replicas
+    stays, replicas = territory.of(policy), territory.fresh.replicas
     number = replicas[0] if replica is None else replica
     if number not in replicas:
         raise refusal("replica", number, f"one that played, of {list(replicas)}")
     place = replicas.index(number)
     board, shares = territory.run.game.map, stays.visits[place]
-    columns = min(COLUMNS, len(shares) + 1)
-    lines, wide = ceil((len(shares) + 1) / columns), style.WIDTH_IN * 1.25 / columns
-    size = wide * columns, lines * (wide * board.height / board.width + 0.3) + 0.7
-    figure = Figure(size, layout="constrained")
-    panels = [figure.add_subplot(lines, columns, at + 1) for at in range(len(shares) + 1)]
     owner, longest, total = owners(shares), shares.max(0), shares.sum(0)
     hues = np.stack([_rgb(agent_colour(agent)) for agent in range(len(shares))])
-    for agent, panel in enumerate(panels[:-1]):
-        title = f"agent {agent}, tagged {int(stays.taggings[place, agent].sum()):,} times"
-        _show(panel, board, hues[agent], _light(shares[agent], shares.max()), title)
-        row, col, _ = board.starts[agent]
-        panel.plot(col, row, "o", markersize=5, fillstyle="none", color="white", markeredgewidth=0.8)
-        owned = np.where(owner == agent, shares[agent], 0.0)
-        if owned.any():
-            row, col = divmod(int(owned.argmax()), board.width)
-            panels[-1].text(
-                col, row, str(agent), color="white", fontsize=7, ha="center", va="center_baseline"
-            )
     alone = np.divide(longest, total, out=np.zeros_like(total), where=total > 0)
     light = DARKEST + (1 - DARKEST) * np.sqrt(longest / max(longest.max(), 1e-12)) * alone
-    owned_light = np.where(owner >= 0, light, 0.0)
-    _show(panels[-1], board, hues[owner], owned_light, "who spends most time where")
-    index, sharing = (float(stays.by_replica[name][place]) for name in (EXCLUSION, VISITORS))
-    who = "random agents" if policy == "random" else "its agents"
-    title = (
-        f"{territory.run.path.name}, replica {number}: where {who} spend {territory.fresh.episodes} "
-        f"episodes; exclusion {index:.2f}, {sharing:.1f} agents share a cell"
-    )
-    figure.suptitle(fill(title, style.TITLE_CHARACTERS), fontsize=11)
-    return style.save(figure, path, colours=style.SHADES)
+    with style.drawing(path, width=width, colours=style.SHADES, is_new=True) as sheet:
+        columns = sheet.fitting(min(COLUMNS, len(shares) + 1), 16)
+        high = sheet.width_em / columns * board.height / board.width + 2
+        whole, *panels = sheet.panels(len(shares) + 1, columns=columns, high=high)
+        _show(whole, board, hues[owner], np.where(owner >= 0, light, 0.0), "who spends most time where")
+        for agent, panel in enumerate(panels):
+            title = f"agent {agent}, tagged {int(stays.taggings[place, agent].sum()):,} times"
+            _show(panel, board, hues[agent], _light(shares[agent], shares.max()), title)
+            row, col, _ = board.starts[agent]
+            panel.plot(col, row, "o", markersize=5, fillstyle="none", color="white", markeredgewidth=0.8)
+            owned = np.where(owner == agent, shares[agent], 0.0)
+            if owned.any():
+                row, col = divmod(int(owned.argmax()), board.width)
+                look: Any = {"color": "white", "ha": "center", "va": "center_baseline"}
+                whole.text(col, row, str(agent), **look)
+        index, sharing = (float(stays.by_replica[name][place]) for name in (EXCLUSION, VISITORS))
+        sheet.title = f"Where {'random ' if policy == 'random' else ''}agents spend their time"
+        sheet.caption = (
+            f"{territory.run.path.name}, replica {number}, {territory.fresh.episodes} episodes; exclusion "
+            f"{index:.2f}, {sharing:.1f} agents share a cell. The brighter, the longer; a ring is where an "
+            "agent starts, squares are sites of apples, grey cells walls."
+        )
+    return Path(path)
 
 
 def _show(panel: Axes, board: Map, hues: Array, light: Array, title: str) -> None:
@@ -194,7 +191,8 @@ def _show(panel: Axes, board: Map, hues: Array, light: Array, title: str) -> Non
     rows, cols = np.array(board.sites).T
     panel.scatter(cols, rows, s=1.5, marker="s", color=_rgb(PALETTE[APPLE]), linewidths=0)
     panel.set(xticks=[], yticks=[])
-    panel.set_title(title, fontsize=style.SMALL_PT)
+    panel.spines[:].set_visible(False)
+    panel.set_title(title)
 
 
 def _light(shares: Array, longest: float) -> Array:
@@ -206,7 +204,7 @@ def _rgb(colour: tuple[int, int, int]) -> Array:
     return np.array(colour) / 255
 
 
-def territory_table(territory: Territory) -> Table:
+def territory_table(territory: Territory) -> Cells:
     """A row for each measure of territory: mean over replicas and 95 % interval, of the run's agents and of
     random ones; a dash where it is undefined in all."""
     trained, random = territory.trained.measures(), territory.random.measures()

@@ -6,6 +6,7 @@ number needs are named in `cprl.measuring.social.SOCIAL` for metrics, and here f
 """
 
 from collections.abc import Collection, Mapping
+from math import inf
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -73,14 +74,25 @@ def unit(name: str) -> str:
 
 
 def with_unit(name: str, *, rewards: str = "") -> str:
-    """The name of a metric in code with its unit, e.g. "survival_steps (steps)".
+    """What a table calls a metric, with its unit, e.g. "survival, steps" or "agent 0: return, apples".
 
     Args:
         name: of a metric, or of what an agent gets or pays: ".../return", ".../fines", ".../transfers".
         rewards: the unit of rewards; "" if the game does not say.
     """
-    word = rewards if name.endswith(("/return", "/fines", "/transfers")) else NAMES.get(name, ("", ""))[1]
-    return f"{name} ({word})" if word else name
+    if name in NAMES:
+        return title(name)
+    who, slash, what = name.rpartition("/")
+    if who == "institutions":
+        return f"in force: decision {what.removeprefix('in_force_')}"
+    unit_of = rewards if what in ("return", "fines", "transfers") else ""
+    return ", ".join(filter(None, (f"{who.replace('_', ' ')}: {what}" if slash else name, unit_of)))
+
+
+def bounds(name: str) -> tuple[float, float]:
+    """What a metric can be, as far as its unit says so."""
+    is_share = name in NAMES and NAMES[name][1] == social.SHARE
+    return 0.0 if is_share or name in social.SOCIAL else -inf, 1.0 if is_share else inf
 
 
 OPTIONAL: Final = ("harvest", "in_play", "fired", "hit_by", "tagged_by", "stock")

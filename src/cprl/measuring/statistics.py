@@ -38,9 +38,22 @@ class Estimate:
     NaN for a single replica."""
 
     def __str__(self) -> str:
-        """The value with its interval, of a single replica the value alone."""
-        has_interval = np.isfinite([self.low, self.high]).all()
-        return f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]" if has_interval else f"{self.value:.4g}"
+        return f"{self:}"
+
+    def __format__(self, form: str) -> str:
+        """The value with its interval, of a single replica the value alone; "" and "+" choose the digits."""
+        numbers = [self.value, self.low, self.high]
+        if form in ("", "+"):
+            form += (
+                f",.{digits_for(max([abs(number) for number in numbers if not isnan(number)], default=0))}f"
+            )
+        value, low, high = (f"{number:{form}}" for number in numbers)
+        return f"{value} [{low}, {high}]" if np.isfinite([self.low, self.high]).all() else value
+
+
+def digits_for(largest: float) -> int:
+    """Return how many digits after the point a number of this size is shown with."""
+    return next((digits for digits, size in enumerate((100, 10, 0.5)) if largest >= size), 3)
 
 
 def estimate(values: ArrayLike) -> Estimate:

@@ -11,17 +11,15 @@ from functools import partial
 from itertools import combinations
 from math import isclose, nan
 from pathlib import Path
-from textwrap import fill
 from typing import Any, Final
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize, to_hex
-from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from cprl.measuring.statistics import Estimate, curve_interval
+from cprl.measuring.statistics import Estimate, curve_interval, digits_for
 from cprl.runs.curves import SMOOTHED_EPISODES, running_mean
 from cprl.studies.tables.comparing import (
     INTERVALS,
@@ -30,7 +28,6 @@ from cprl.studies.tables.comparing import (
     Kind,
     compare,
     differing,
-    digits_for,
     metric_title,
     metrics_of,
 )
@@ -39,16 +36,16 @@ from cprl.studies.tables.table import RANDOM, TRAINING, Design, StudyTable
 from cprl.system.defaults import LAST
 from cprl.terminal.figures import COLOURS as PHASE_COLOURS
 from cprl.terminal.style import (
-    CHARACTER_IN,
+    CHARACTER,
+    DASHES,
     EMPTY,
     MEAN,
     RANDOM_LINE,
     SHADES,
-    SMALL_PT,
+    Sheet,
+    Width,
     draw_cell,
-    head,
-    picture_path,
-    save,
+    drawing,
     wrapped,
 )
 from cprl.values import refusal
@@ -57,8 +54,11 @@ MOST_CONDITIONS: Final = 60
 """A figure with a row or panel for each condition has at most so many."""
 COLOURS: Final = ("#08519c", "#d95f02", "#1b9e77", "#7b3294", "#a50f15", "#8c6d31", "#e7298a", "#555555")
 """Of conditions or lines that have names; numbers get a scale from dark to light."""
-_NAME_CHARACTERS: Final = 34
-"""The largest number of characters on a line of a condition's name; then it wraps."""
+_NAME: Final = 16
+"""The largest width of a condition's name in em, and at most 0.3 of the figure's; then it wraps."""
+CHANCE: Final = "random play (in the colour of its conditions where they differ)"
+_LINE: Final = 1.25
+"""The height of a line of text in em."""
 _MAPPED: Final = 2
 """Metrics that have a heat map."""
 
@@ -67,15 +67,15 @@ def figures_of(table: StudyTable, last: int) -> Iterator[tuple[str, str, Callabl
     """Yield what fits a study: the name of each figure's file, what it shows, and what draws it."""
     if not table.metrics:
         return
-    design = table.design
+    design, conditions = table.design, finished(table)
     for factor in design.factors:
-        if is_numeric(design.levels(factor)):
+        if is_numeric([design.conditions[name][factor] for name in conditions]):
             draw = partial(by_factor, table, factor, last=last)
             yield f"by_{_file_name(factor)}.png", f"Outcome by {factor}", draw
-    if len(design.conditions) <= MOST_CONDITIONS:
+    if len(conditions) <= MOST_CONDITIONS:
         yield "levels.png", "Outcome by condition", partial(by_condition, table, last=last)
         yield "courses.png", "The course of the training", partial(courses, table)
-        if len(design.conditions) > 1 and table.replicas[design.reference]:
+        if len(conditions) > 1 and table.replicas[design.reference]:
             draw = partial(by_condition, table, kind="differences", last=last)
             yield "differences.png", f"Differences from {design.reference}", draw
     for pair in grids(design):
@@ -83,8 +83,9 @@ def figures_of(table: StudyTable, last: int) -> Iterator[tuple[str, str, Callabl
         for metric in metrics_of(table)[:_MAPPED]:
             draw = partial(heat_map, table, pair, metric=metric, last=last)
             yield f"map_{words}_{metric}.png", f"{metric_title(metric)} by {what}", draw
-        title = f"In which phase most replicas end, by {what}"
-        yield f"phases_{words}.png", title, partial(phase_diagram, table, pair)
+        if len({next(iter(counts)) for counts in table.endings.values()}) > 1:
+            title = f"In which phase most replicas end, by {what}"
+            yield f"phases_{words}.png", title, partial(phase_diagram, table, pair)
 
 
 DRAWN: Final = re.compile(r"(by_|map_|phases|levels|differences|courses).*\.png")
@@ -106,7 +107,13 @@ _APART: Final = 30
 
 
 def by_factor(
-    table: StudyTable, factor: str, path: Path | str, *, metrics: Sequence[str] = (), last: int = LAST
+    table: StudyTable,
+    factor: str,
+    path: Path | str,
+    *,
+    metrics: Sequence[str] = (),
+    last: int = LAST,
+    width: Width = "page",
 ) -> Path:
     """Draw metrics against a factor whose levels are numbers.
 
@@ -116,51 +123,66 @@ def by_factor(
     are several. In random draws, where hardly any are, points stand alone: the other factors vary too. There
     are no dashes where random play differs and points stand alone that have the same level.
     """
-    design, path = table.design, picture_path(path)
+    design = table.design
     numeric = [name for name in design.factors if is_numeric(design.levels(name))]
     if factor not in numeric:
         allowed = ", ".join(numeric) or "none, as no factor has levels that are numbers"
         raise refusal("factor", factor, allowed)
     comparisons = [compare(table, metric, last=last) for metric in metrics_of(table, metrics)]
-    lines, others = _lines(design, factor), [name for name in design.factors if name != factor]
+    lines, others = _lines(table, factor), [name for name in design.factors if name != factor]
     only = [design.conditions[names[0]][others[0]] for names in lines.values()] if len(others) == 1 else []
     colours = colours_of(list(lines), only or range(len(lines)))
-    level_of = {name: levels[factor] for name, levels in design.conditions.items()}
+    level_of = {name: design.conditions[name][factor] for name in finished(table)}
     places, is_even = places_of(level_of.values())
-    columns = min(len(comparisons), _COLUMNS)
-    rows = -(-len(comparisons) // columns)
-    figure, panels = _panels(max(4.0 * columns, 6.0), 2.9 * rows + 1.3, rows, columns, len(comparisons))
-    for axes, comparison in zip(panels, comparisons, strict=True):
-        chance = _chance(table, comparison.metric)
-        at_levels = [[chance[name] for name in chance if level_of[name] == level] for level in places]
-        is_same = all(map(is_one, at_levels))
-        for label, names in lines.items():
-            at = [places[level_of[name]] for name in names]
-            style = "-" if design.is_grid and len(set(at)) == len(at) else "none"
-            for place, name in zip(at, names, strict=True):
-                compared = comparison.by_name[name]
-                _draw_spread(axes, place, compared.defined, compared.estimate, colours[label])
-            means = [_value(comparison.by_name[name].estimate) for name in names]
-            look: dict[str, Any] = {"marker": "o", "linestyle": style, "linewidth": 1.4, "zorder": 4}
-            axes.plot(at, means, color=colours[label], label=label or "mean and interval", **look)
-            if is_same or len(lines) > 1:
-                look = RANDOM_LINE if is_same else {**RANDOM_LINE, "color": colours[label]}
-                look = look if style == "-" else {**look, "linestyle": "none"}
-                by_chance = [chance.get(name, nan) for name in names]
-                axes.plot(at, by_chance, marker="_", markersize=9, **look)
+    with drawing(path, width=width) as sheet:
+        columns = sheet.fitting(min(len(comparisons), 3), 16)
+        panels = sheet.panels(len(comparisons), columns=columns, high=19, sharex=True)
+        for axes, comparison in zip(panels, comparisons, strict=True):
+            _draw_levels(axes, table, comparison, lines, colours, {n: places[level_of[n]] for n in level_of})
+            _scale(axes, places, _replicas_by_level(table, factor), is_even=is_even)
+            axes.set_title(title_of(comparison))
+        for axes in panels[-columns:]:
+            axes.tick_params(labelbottom=True)
+            axes.set_xlabel(f"{short(factor)}, at equal distances" if is_even else short(factor))
+        sheet.title = f"{design.name}: outcome by {short(factor)}"
+        sheet.caption = (
+            f"{replicas_text(table.replicas)}. {levels_note(comparisons[0])} Faint: single replicas."
+            f"{_not_run(table)}"
+        )
+        if others and list(lines) == [""]:
+            sheet.caption += f" Conditions differ in {', '.join(map(short, others))} too."
+    return Path(path)
+
+
+def _draw_levels(
+    axes: Axes,
+    table: StudyTable,
+    comparison: Comparison,
+    lines: Mapping[str, Sequence[str]],
+    colours: Mapping[str, str],
+    places: Mapping[str, float],
+) -> None:
+    """Draw a metric of conditions at their places, those of a line joined, and random play."""
+    chance = _chance(table, comparison.metric)
+    by_place: dict[float, list[float]] = {}
+    for name in chance:
+        by_place.setdefault(places[name], []).append(chance[name])
+    is_same = all(map(is_one, by_place.values()))
+    for label, names in lines.items():
+        at = [places[name] for name in names]
+        style = "-" if table.design.is_grid and len(set(at)) == len(at) else "none"
+        for place, name in zip(at, names, strict=True):
+            compared = comparison.by_name[name]
+            _draw_spread(axes, place, compared.defined, compared.estimate, colours[label])
+        means = [_value(comparison.by_name[name].estimate) for name in names]
+        look: dict[str, Any] = {"marker": "o", "linestyle": style, "linewidth": 1.4, "zorder": 4}
+        axes.plot(at, means, color=colours[label], label=label or "mean and interval", **look)
         if is_same or len(lines) > 1:
-            text = "random play" if is_same else "random play, in the colour of its conditions"
-            axes.plot([], [], label=text, **RANDOM_LINE)
-        _scale(axes, places, _replicas_by_level(table, factor), is_even=is_even)
-        axes.set_title(wrapped(title_of(comparison), 3.6), fontsize=SMALL_PT + 1)
-    for axes in panels[-_COLUMNS:]:
-        axes.set_xlabel(f"{factor}\n(levels at equal distances)" if is_even else factor, fontsize=SMALL_PT)
-    legend(figure, panels[0])
-    note = f"{replicas_text(table.replicas)}. {levels_note(comparisons[0])} Faint: single replicas."
-    if others and list(lines) == [""]:
-        note += f" Conditions differ in {', '.join(map(short, others))} too."
-    head(figure, f"{design.name}: outcome by {short(factor)}", note)
-    return save(figure, path)
+            look = RANDOM_LINE if is_same else {**RANDOM_LINE, "color": colours[label]}
+            look = look if style == "-" else {**look, "linestyle": "none"}
+            axes.plot(at, [chance.get(name, nan) for name in names], marker="_", markersize=9, **look)
+    if chance and (is_same or len(lines) > 1):
+        axes.plot([], [], label=CHANCE, **RANDOM_LINE)
 
 
 def places_of(levels: Iterable[float]) -> tuple[dict[float, float], bool]:
@@ -175,8 +197,9 @@ def places_of(levels: Iterable[float]) -> tuple[dict[float, float], bool]:
 
 def _replicas_by_level(table: StudyTable, factor: str) -> dict[float, int]:
     counts: dict[float, int] = {}
-    for name, levels in table.design.conditions.items():
-        counts[levels[factor]] = counts.get(levels[factor], 0) + table.replicas[name]
+    for name in finished(table):
+        level = table.design.conditions[name][factor]
+        counts[level] = counts.get(level, 0) + table.replicas[name]
     return counts
 
 
@@ -194,16 +217,18 @@ def _scale(
         axes.set_xticks(list(places.values()), texts)
 
 
-def _lines(design: Design, factor: str) -> dict[str, list[str]]:
+def _lines(table: StudyTable, factor: str) -> dict[str, list[str]]:
     """Conditions that are equal but for a factor, in the order of its levels, by what they have in common."""
+    design, names = table.design, finished(table)
     others = [name for name in design.factors if name != factor]
     lines: dict[str, list[str]] = {}
-    for name, levels in design.conditions.items():  # lines are in the order of the conditions
+    for name in names:  # lines are in the order of the conditions
+        levels = design.conditions[name]
         common = ", ".join(f"{short(other)} {levels[other]}" for other in others) if design.is_grid else ""
         lines.setdefault(common, []).append(name)
     if len(lines) > _MOST_LINES:
-        lines = {"": list(design.conditions)}
-    level_of = {name: float(levels[factor]) for name, levels in design.conditions.items()}
+        lines = {"": names}
+    level_of = {name: float(design.conditions[name][factor]) for name in names}
     return {common: sorted(names, key=lambda name: level_of[name]) for common, names in lines.items()}
 
 
@@ -222,58 +247,65 @@ def is_logarithmic(levels: Sequence[float]) -> bool:
 # Conditions one below the other
 
 
-def by_condition(table: StudyTable, path: Path | str, *, kind: Kind = "levels", last: int = LAST) -> Path:
+def by_condition(
+    table: StudyTable, path: Path | str, *, kind: Kind = "levels", last: int = LAST, width: Width = "page"
+) -> Path:
     """Draw conditions one below the other: means over replicas, or differences from the reference.
 
     Args:
-        table: the table, of at most `MOST_CONDITIONS` conditions.
+        table: the table, of at most `MOST_CONDITIONS` conditions that were run; the others are left out.
         kind: "levels", with random play as dashes; or "differences", with a dashed line at 0.
     """
-    design, path, is_levels = table.design, picture_path(path), kind == "levels"
-    conditions = [name for name in design.conditions if is_levels or name != design.reference]
+    design, is_levels = table.design, kind == "levels"
+    conditions = [name for name in finished(table) if is_levels or name != design.reference]
     if not is_levels and not table.replicas[design.reference]:
         raise ValueError(f"the reference {design.reference} has no finished run; allowed: one that has")
     if not 0 < len(conditions) <= MOST_CONDITIONS:
         raise refusal("table", table, f"1 to {MOST_CONDITIONS} conditions, not {len(conditions)}")
     comparisons = [compare(table, metric, last=last) for metric in metrics_of(table)]
-    first, names = comparisons[0], names_of(table)
-    rows_in = 0.34 if all("\n" not in names[name] for name in conditions) else 0.46
-    height, columns = rows_in * len(conditions) + 1.8, len(comparisons)
-    figure, panels = _panels(12.0, height, 1, columns, columns, shared="y")
-    for axes, comparison in zip(panels, comparisons, strict=True):
-        chance = _chance(table, comparison.metric) if is_levels else {}
-        for place, name in enumerate(conditions):
-            _draw_row(axes, place, comparison.by_name[name], kind)
-            if name in chance:
-                look = {**RANDOM_LINE, "linestyle": (0, (2, 1))}
-                axes.plot([chance[name]] * 2, [place - 0.42, place + 0.42], **look)
+    first = comparisons[0]
+    with drawing(path, width=width) as sheet:
+        names = {
+            name: wrapped(word, min(_NAME, 0.3 * sheet.width_em)) for name, word in names_of(table).items()
+        }
+        lines = [names[name].count("\n") + 1 for name in conditions]
+        row = _LINE * max(*lines, 1) + 0.8
+        columns = sheet.fitting(len(comparisons), 12.5)
+        high = row * len(conditions) + 7
+        beside = CHARACTER * max(len(line) for name in conditions for line in names[name].splitlines())
+        panels = sheet.panels(len(comparisons), columns=columns, high=high, beside=beside, sharey=True)
+        for axes, comparison in zip(panels, comparisons, strict=True):
+            chance = _chance(table, comparison.metric) if is_levels else {}
+            for place, name in enumerate(conditions):
+                _draw_row(axes, place, comparison.by_name[name], kind)
+                if name in chance:
+                    look = {**RANDOM_LINE, "linestyle": (0, (2, 1))}
+                    axes.plot([chance[name]] * 2, [place - 0.42, place + 0.42], **look)
+            if not is_levels:
+                axes.axvline(0, **RANDOM_LINE)
+            axes.set_title(title_of(comparison))
+            axes.set_yticks(range(len(conditions)), [names[name] for name in conditions])
+            axes.locator_params(axis="x", nbins=3)
+            axes.grid(axis="y", color="#e6e6e6", linewidth=0.6)
+        panels[0].set_ylim(len(conditions) - 0.4, -0.6)
+        by = short(design.factors[0]) if len(design.factors) == 1 else "condition"
+        sheet.title, note = f"{design.name}: outcome by {by}", levels_note(first)
+        note += " Faint: single replicas. Dashed: random play."
         if not is_levels:
-            axes.axvline(0, **RANDOM_LINE)
-        axes.set_title(wrapped(title_of(comparison), 9.5 / columns), fontsize=SMALL_PT)
-        axes.set_yticks(range(len(conditions)), [names[name] for name in conditions])
-        axes.locator_params(axis="x", nbins=3)
-        axes.grid(axis="y", color="#e6e6e6", linewidth=0.6)
-        axes.set_axisbelow(True)
-    panels[0].set_ylim(len(conditions) - 0.4, -0.6)
-    what = short(design.factors[0]) if len(design.factors) == 1 else "condition"
-    figure.supylabel(what, fontsize=SMALL_PT + 1)
-    title, note = f"{design.name}: outcome by condition", levels_note(first)
-    note += " Faint: single replicas. Dashed: random play."
-    if not is_levels:
-        title = f"{design.name}: difference from {' '.join(design.reference.splitlines())}"
-        pairing = f"{first.pairing_text[0].upper()}{first.pairing_text[1:]}"
-        note = f"{pairing}; means of {first.episodes_text}; {INTERVALS}."
-    head(figure, title, f"{replicas_text(table.replicas)}. {note}")
-    return save(figure, path)
+            sheet.title = f"{design.name}: difference from {' '.join(design.reference.splitlines())}"
+            pairing = f"{first.pairing_text[0].upper()}{first.pairing_text[1:]}"
+            note = f"{pairing}; means of {first.episodes_text}; {INTERVALS}."
+        sheet.caption = f"{replicas_text(table.replicas)}. {note}{_not_run(table)}"
+    return Path(path)
 
 
 def _draw_row(axes: Axes, place: int, compared: Compared, kind: Kind) -> None:
     mean = compared.estimate if kind == "levels" else compared.difference
     if mean is None:
-        why = "no run" if not compared.replicas else "undefined" if compared.estimate is None else "no pairs"
+        why = "undefined" if compared.estimate is None else "no pairs"
         box = {"facecolor": "white", "edgecolor": "none", "pad": 1}
         middle: dict[str, Any] = {"ha": "center", "va": "center", "transform": axes.get_yaxis_transform()}
-        axes.text(0.5, place, why, fontsize=SMALL_PT, bbox=box, **middle)
+        axes.text(0.5, place, why, bbox=box, **middle)
         return
     _draw_spread(axes, place, compared.defined if kind == "levels" else [], mean, MEAN, across=True)
     axes.plot([mean.value], [place], "o", color=MEAN, markersize=6, zorder=4)
@@ -287,11 +319,11 @@ _PART: Final = 20
 """A running mean takes in at most one part in so many of a training, so that short ones keep their course."""
 _MOST_TOGETHER: Final = 6
 """Conditions that one panel shows; more have a panel each, beside the reference."""
-_PANELS: Final = 4
-"""Of these in a row."""
 
 
-def courses(table: StudyTable, path: Path | str, *, metrics: Sequence[str] = ()) -> Path:
+def courses(
+    table: StudyTable, path: Path | str, *, metrics: Sequence[str] = (), width: Width = "page"
+) -> Path:
     """Draw the mean over replicas in the course of the training, its 95 % interval, and random play.
 
     Up to six conditions share panels, one for each metric; more have a panel each, of the first metric, with
@@ -300,65 +332,74 @@ def courses(table: StudyTable, path: Path | str, *, metrics: Sequence[str] = ())
     Args:
         metrics: by default the collective return and survival; else the first that the table has.
     """
-    path, design = picture_path(path), table.design
+    design, conditions = table.design, finished(table)
     usual = [metric for metric in _USUAL if metric in table.metrics]
     chosen = metrics_of(table, metrics or usual)[: len(metrics) or 2]
-    conditions = [name for name in design.conditions if table.replicas[name]]
     if len(conditions) > MOST_CONDITIONS:
         raise ValueError(f"the table has {len(conditions)} conditions; allowed: up to {MOST_CONDITIONS}")
     names, factor = names_of(table), design.factors[0] if len(design.factors) == 1 else None
     is_together = len(conditions) <= _MOST_TOGETHER
+    views: list[tuple[str, list[str], dict[str, tuple[str, str]]]]
     if is_together:
         levels = [name if factor is None else design.conditions[name][factor] for name in conditions]
         colours = colours_of(conditions, levels)
         lines = {name: (colours[name], names[name]) for name in conditions}
         views = [(metric, conditions, lines) for metric in chosen]
-        figure, panels = _panels(9.0, 2.9 * len(views) + 1.4, len(views), 1, len(views), shared="x")
     else:
-        reference = design.reference
+        reference, alone = design.reference, ("#08519c", "the condition of the panel")
         beside = {reference: ("#777777", f"reference: {names[reference]}")} if reference in conditions else {}
-        alone = "#08519c", "the condition of the panel"
         others = [name for name in conditions if name != reference]
         views = [(chosen[0], [name], {**beside, name: alone}) for name in others]
-        rows = -(-len(views) // _PANELS)
-        figure, panels = _panels(12.0, 2.5 * rows + 1.6, rows, _PANELS, len(views), shared="xy")
-        figure.supylabel(metric_title(chosen[0]), fontsize=SMALL_PT + 1)
     windows: set[int] = set()
-    for axes, (metric, of_panel, lines) in zip(panels, views, strict=True):
-        windows |= _draw_courses(axes, table, metric, lines)
-        chance = {name: value for name, value in _chance(table, metric).items() if name in of_panel}
-        is_same = is_one(chance.values())
-        for name, value in list(chance.items())[: 1 if is_same else None]:
-            colour = RANDOM_LINE["color"] if is_same else lines[name][0]
-            axes.axhline(value, **{**RANDOM_LINE, "color": colour, "linewidth": 1.4 if is_same else 1.0})
-        if chance:
-            text = "random play" if is_same else "random play, in the colour of its condition"
-            axes.plot([], [], **RANDOM_LINE, label=text if is_together else f"{text} under it")
-        if is_together:
-            axes.set_ylabel(metric_title(metric), fontsize=SMALL_PT + 1)
-        else:
-            axes.set_title(names[of_panel[0]], fontsize=SMALL_PT)
-    for axes in panels[-1 if is_together else -_PANELS :]:
-        axes.tick_params(labelbottom=True)
-        axes.set_xlabel("episode", fontsize=SMALL_PT + 1)
-    for group in [[axes] for axes in panels] if is_together else [panels]:
-        if all(axes.dataLim.y0 >= 0 for axes in group):
-            group[0].set_ylim(0, None)
-    legend(figure, panels[0], title=short(factor) if factor is not None and is_together else None)
-    over = f"{min(windows)} to {max(windows)}" if len(windows) > 1 else f"{max(windows)}"
-    smoothed = f"Centred running means over {over} episodes" if max(windows) > 1 else "Nothing is smoothed"
-    note = f"{smoothed}, then over replicas; bands: 95% intervals over replicas by Student's t."
-    head(figure, f"{design.name}: the course of the training", f"{replicas_text(table.replicas)}. {note}")
-    return save(figure, path)
+    is_dashed = factor is None or not is_numeric(design.levels(factor))
+    with drawing(path, width=width) as sheet:
+        columns = 1 if is_together else sheet.fitting(4, 14)
+        shared = {"sharex": True, "sharey": not is_together}
+        panels = sheet.panels(len(views), columns=columns, high=21 if is_together else 15, **shared)
+        for axes, (metric, of_panel, lines) in zip(panels, views, strict=True):
+            windows |= _draw_courses(axes, table, metric, lines, is_dashed=is_dashed)
+            _draw_chance(axes, table, metric, {name: lines[name][0] for name in of_panel}, is_together)
+            axes.set_title(metric_title(metric) if is_together else names[of_panel[0]])
+        for axes in panels[-columns:]:
+            axes.tick_params(labelbottom=True)
+            axes.set_xlabel("episode")
+        for group in [[axes] for axes in panels] if is_together else [panels]:
+            if all(axes.dataLim.y0 >= 0 for axes in group):
+                group[0].set_ylim(0, None)
+        sheet.legend_title = short(factor) if factor is not None and is_together else ""
+        what = "course of the training" if is_together else metric_title(chosen[0])
+        sheet.title = f"{design.name}: {what}"
+        over = f"{min(windows)} to {max(windows)}" if len(windows) > 1 else f"{max(windows)}"
+        smoothed = (
+            f"Centred running means over {over} episodes" if max(windows) > 1 else "Nothing is smoothed"
+        )
+        sheet.caption = (
+            f"{replicas_text(table.replicas)}. {smoothed}, then over replicas; bands: 95% intervals over "
+            f"replicas by Student's t.{_not_run(table)}"
+        )
+    return Path(path)
+
+
+def _draw_chance(
+    axes: Axes, table: StudyTable, metric: str, colours: Mapping[str, str], is_together: bool
+) -> None:
+    """Draw random play under some conditions, a line for all where it is the same."""
+    chance = {name: value for name, value in _chance(table, metric).items() if name in colours}
+    is_same = is_one(chance.values())
+    for name, value in list(chance.items())[: 1 if is_same else None]:
+        look = {} if is_same else {"color": colours[name], "linewidth": 1.0}
+        axes.axhline(value, **{**RANDOM_LINE, **look})
+    if chance:
+        axes.plot([], [], **RANDOM_LINE, label=CHANCE if is_together else "random play under it")
 
 
 def _draw_courses(
-    axes: Axes, table: StudyTable, metric: str, lines: Mapping[str, tuple[str, str]]
+    axes: Axes, table: StudyTable, metric: str, lines: Mapping[str, tuple[str, str]], *, is_dashed: bool
 ) -> set[int]:
     """Draw the courses of conditions, each of a colour and with a label, and return over how many episodes
     their running means are."""
     windows = set()
-    for name, (colour, label) in lines.items():
+    for place, (name, (colour, label)) in enumerate(lines.items()):
         grid = table.values(name, metric, TRAINING)
         if grid is None:
             continue
@@ -372,7 +413,9 @@ def _draw_courses(
         axes.fill_between(at, low, high, color=colour, alpha=0.2, linewidth=0)
         label = " ".join(label.splitlines())
         label = f"\N{ZERO WIDTH SPACE}{label}" if label.startswith("_") else label  # matplotlib would hide it
-        axes.plot(at, middle, color=colour, linewidth=2, marker="." if len(at) < 3 else None, label=label)
+        dash = DASHES[place % len(DASHES)] if is_dashed and len(lines) > 2 else "-"
+        dot = "." if len(at) < 3 else None
+        axes.plot(at, middle, color=colour, linewidth=2, linestyle=dash, marker=dot, label=label)
         windows.add(min(count, int(is_whole.sum())) * length)
     return windows or {1}
 
@@ -387,7 +430,8 @@ PHASES: Final = {
     NO_BETTER: "#cfcfcf",
 }
 """Colours of phases, light enough for text before them."""
-_CELL_IN: Final = (1.05, 0.55)
+_CELL: Final = 4.4
+"""The height of a cell in em."""
 _WORD_CHARACTERS: Final = 24
 
 Grid = dict[tuple[Any, Any], str]
@@ -420,6 +464,7 @@ def heat_map(
     *,
     metric: str = "collective_return",
     last: int = LAST,
+    width: Width = "page",
 ) -> Path:
     """Draw a metric over two factors: its mean with the number of replicas, and its difference.
 
@@ -429,57 +474,67 @@ def heat_map(
     Args:
         factors: two of its factors; any others are at the levels of the reference.
     """
-    path, comparison = picture_path(path), compare(table, metric, last=last)
-    grid, elsewhere = _grid_of(table.design, factors)
+    comparison = compare(table, metric, last=last)
+    grid, elsewhere = _grid_of(table, factors)
     rows, columns = _levels_of(grid)
-    width = max(2 * _CELL_IN[0] * len(columns) + 3.4, 8.0)
-    figure, panels = _panels(width, _CELL_IN[1] * len(rows) + 2.3, 1, 2, 2, shared="y")
     levels, differences = _numbers(comparison, grid)
     means = [value for value, _ in levels.values()]
     reach = max((abs(value) for value, _ in differences.values()), default=1.0) or 1.0
-    scales = Normalize(min(means, default=0), max(means, default=1)), Normalize(-reach, reach)
-    titles = "mean over replicas (n)", "difference (* not 0 by Holm's method)"
-    for axes, numbers, scale, name, title in zip(
-        panels, (levels, differences), scales, ("viridis", "RdBu"), titles, strict=True
-    ):
-        shades = matplotlib.colormaps[name]
-        drawn = {at: (shades(scale(value)), text) for at, (value, text) in numbers.items()}
-        _draw_grid(axes, grid, factors, drawn)
-        axes.set_title(title, fontsize=SMALL_PT + 1)
-        bar = matplotlib.cm.ScalarMappable(scale, name)
-        figure.colorbar(bar, ax=axes).ax.tick_params(labelsize=SMALL_PT)
-    panels[0].set_ylabel(factors[0], fontsize=SMALL_PT)
-    note = f"{levels_note(comparison)} Differences from {table.design.reference}, {comparison.pairing_text}."
-    head(figure, f"{table.design.name}: {title_of(comparison)}", f"{note}{elsewhere}")
-    return save(figure, path, colours=SHADES)
+    maps = [(levels, Normalize(min(means, default=0), max(means, default=1)), "viridis", "mean (n)")]
+    if differences:
+        title = "difference (* not 0 by Holm's method)"
+        maps.append((differences, Normalize(-reach, reach), "RdBu", title))
+    with drawing(path, width=width, colours=SHADES) as sheet:
+        side_by_side = sheet.fitting(len(maps), 5.5 * len(columns) + 12)
+        panels = sheet.panels(len(maps), columns=side_by_side, high=_CELL * len(rows) + 8)
+        for axes, (numbers, scale, name, title) in zip(panels, maps, strict=True):
+            shades = matplotlib.colormaps[name]
+            drawn = {at: (shades(scale(value)), text) for at, (value, text) in numbers.items()}
+            _draw_grid(sheet, axes, grid, factors, drawn, side_by_side)
+            axes.set_title(title)
+            sheet.figure.colorbar(matplotlib.cm.ScalarMappable(scale, name), ax=axes)
+        sheet.title = f"{table.design.name}: {title_of(comparison)}"
+        differ = f"Differences from {table.design.reference}, {comparison.pairing_text}."
+        sheet.caption = f"{levels_note(comparison)} {differ}{elsewhere}{_not_run(table)}"
+    return Path(path)
 
 
-def phase_diagram(table: StudyTable, factors: tuple[str, str], path: Path | str) -> Path:
+def phase_diagram(
+    table: StudyTable, factors: tuple[str, str], path: Path | str, *, width: Width = "page"
+) -> Path:
     """Draw in which phase most replicas end over two factors."""
-    path = picture_path(path)
-    grid, elsewhere = _grid_of(table.design, factors)
-    rows, columns = _levels_of(grid)
-    figure, [axes] = _panels(max(1.3 * len(columns) + 2.5, 7.0), 0.6 * len(rows) + 2.2, 1, 1, 1)
+    grid, elsewhere = _grid_of(table, factors)
     phases = {}
-    for name, counts in table.endings.items():
-        label, number = next(iter(counts.items()))
-        phases[name] = PHASES[label], f"{wrapped(label, 1.1)}\n{number} of {sum(counts.values())}"
-    _draw_grid(axes, grid, factors, phases)
-    axes.set_ylabel(factors[0], fontsize=SMALL_PT)
-    note = f"{replicas_text(table.replicas)}. In which phase a replica ends: {'; '.join(table.ending_rules)}."
-    head(figure, f"{table.design.name}: phases at the end of the training", f"{note}{elsewhere}")
-    return save(figure, path)
+    with drawing(path, width=width) as sheet:
+        (axes,) = sheet.panels(1, high=_CELL * len(_levels_of(grid)[0]) + 6)
+        wide = (sheet.width_em - 10) / len(_levels_of(grid)[1])
+        for name, counts in table.endings.items():
+            label, number = next(iter(counts.items()))
+            phases[name] = PHASES[label], f"{wrapped(label, wide)}\n{number} of {sum(counts.values())}"
+        _draw_grid(sheet, axes, grid, factors, phases)
+        sheet.title = f"{table.design.name}: phases at the end"
+        rules = "; ".join(table.ending_rules)
+        sheet.caption = (
+            f"{replicas_text(table.replicas)}. In which phase most replicas end: {rules}.{elsewhere}"
+            f"{_not_run(table)}"
+        )
+    return Path(path)
 
 
-def _grid_of(design: Design, factors: tuple[str, str]) -> tuple[Grid, str]:
-    """The conditions of two factors, and a sentence on the others."""
-    by_pair = grids(design)
+def _grid_of(table: StudyTable, factors: tuple[str, str]) -> tuple[Grid, str]:
+    """The conditions of two factors, of levels that were run, and a sentence on the others."""
+    design, by_pair = table.design, grids(table.design)
     if tuple(factors) not in by_pair:
         pairs = "; ".join(map(" and ".join, by_pair))
         raise refusal("factors", factors, pairs or "none, as the conditions are no grid of two factors")
     at = design.conditions[design.reference]
     rest = [f"{short(factor)} {at[factor]}" for factor in design.factors if factor not in factors]
-    return by_pair[factors[0], factors[1]], f" Elsewhere: {', '.join(rest)}." if rest else ""
+    grid = by_pair[factors[0], factors[1]]
+    rows, columns = _levels_of(
+        {levels: name for levels, name in grid.items() if table.replicas[name]} or grid
+    )
+    grid = {pair: name for pair, name in grid.items() if pair[0] in rows and pair[1] in columns}
+    return grid, f" Elsewhere: {', '.join(rest)}." if rest else ""
 
 
 def _levels_of(grid: Grid) -> tuple[Sequence[Any], Sequence[Any]]:
@@ -509,16 +564,23 @@ def _numbers(comparison: Comparison, grid: Grid) -> tuple[Numbers, Numbers]:
 
 
 def _draw_grid(
-    axes: Axes, grid: Grid, factors: tuple[str, str], drawn: Mapping[str, tuple[Any, str]]
+    sheet: Sheet,
+    axes: Axes,
+    grid: Grid,
+    factors: tuple[str, str],
+    drawn: Mapping[str, tuple[Any, str]],
+    side_by_side: int = 1,
 ) -> None:
     rows, columns = _levels_of(grid)
     for (row, column), name in grid.items():
         draw_cell(axes, columns.index(column), rows.index(row), *drawn.get(name, (EMPTY, "no run")))
-    axes.set_xticks(range(len(columns)), [wrapped(_word(level), _CELL_IN[0]) for level in columns])
-    axes.set_yticks(range(len(rows)), [_word(level) for level in rows])
+    wide = (sheet.width_em / side_by_side - 12) / len(columns)
+    axes.set_xticks(range(len(columns)), [wrapped(_word(level), wide) for level in columns])
+    axes.set_yticks(range(len(rows)), [wrapped(_word(level), 7) for level in rows])
     axes.set(xlim=(-0.5, len(columns) - 0.5), ylim=(-0.5, len(rows) - 0.5))
-    axes.set_xlabel(factors[1], fontsize=SMALL_PT)
+    axes.set(xlabel=short(factors[1]), ylabel=short(factors[0]))
     axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
 
 
 def _word(level: Any) -> str:
@@ -529,19 +591,15 @@ def _word(level: Any) -> str:
 # What all of them share
 
 
-def _panels(
-    width_in: float, height_in: float, rows: int, columns: int, number: int, *, shared: str = ""
-) -> tuple[Figure, list[Axes]]:
-    """An empty figure with so many panels in rows and columns, which share the axes "x", "y" or "xy"."""
-    figure = Figure((width_in, height_in), layout="constrained")
-    panels = list(
-        figure.subplots(rows, columns, sharex="x" in shared, sharey="y" in shared, squeeze=False).reshape(-1)
-    )
-    for axes in panels:
-        axes.tick_params(labelsize=SMALL_PT)
-    for axes in panels[number:]:
-        axes.set_visible(False)
-    return figure, panels[:number]
+def finished(table: StudyTable) -> list[str]:
+    """Return the conditions that have a finished run; figures show no others."""
+    return [name for name in table.design.conditions if table.replicas[name]]
+
+
+def _not_run(table: StudyTable) -> str:
+    """A sentence on the conditions that a figure leaves out."""
+    count = len(table.design.conditions) - len(finished(table))
+    return f" Not run: {count} of {len(table.design.conditions)} conditions." if count else ""
 
 
 def _chance(table: StudyTable, metric: str) -> dict[str, float]:
@@ -584,9 +642,8 @@ def short(factor: str) -> str:
 
 
 def names_of(table: StudyTable) -> dict[str, str]:
-    """What figures call each condition: the level alone where there is one factor; wrapped.
-
-    With the number of replicas where it is not the same for all.
+    """What figures call each condition: the level alone where there is one factor, else its name; with
+    the number of replicas where that is not the same for all.
     """
     design, names = table.design, list(table.design.conditions)
     words = names
@@ -596,10 +653,7 @@ def names_of(table: StudyTable) -> dict[str, str]:
         words = words if len(set(words)) == len(words) else names
     is_same = len(_counts(table.replicas)) == 1
     counts = ["" if is_same else f" (n={table.replicas[name]})" for name in names]
-    return {
-        name: f"{fill(word, _NAME_CHARACTERS)}{count}"
-        for name, word, count in zip(names, words, counts, strict=True)
-    }
+    return {name: f"{word}{count}" for name, word, count in zip(names, words, counts, strict=True)}
 
 
 def colours_of(names: Sequence[str], levels: Sequence[Any]) -> dict[str, str]:
@@ -635,22 +689,3 @@ def title_of(comparison: Comparison) -> str:
     episodes = sum(compared.episodes for compared in comparison.conditions)
     name = metric_title(comparison.metric)
     return f"{name}, undefined in {undefined:,} of {episodes:,} episodes" if undefined else name
-
-
-def legend(figure: Figure, axes: Axes, *, title: str | None = None) -> None:
-    """Draw a legend of a panel below the figure, each label once, in as many columns as there is room for."""
-    handles, labels = axes.get_legend_handles_labels()
-    entries = dict(zip(labels, handles, strict=True))
-    if not entries:
-        return
-    widest_in = CHARACTER_IN * (max(map(len, entries)) + 6)
-    figure.legend(
-        list(entries.values()),
-        list(entries),
-        loc="outside lower center",
-        ncols=max(1, min(len(entries), int(figure.get_figwidth() / widest_in))),
-        fontsize=SMALL_PT,
-        title=title,
-        title_fontsize=SMALL_PT,
-        frameon=False,
-    )

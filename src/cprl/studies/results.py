@@ -9,9 +9,10 @@ from typing import Final
 from cprl.runs.files import refuse_links, write_atomically
 from cprl.studies.figures import DRAWN, figures_of
 from cprl.studies.study import STATUS, Study
-from cprl.studies.tables.comparing import LAST, Cells, cell, cells, compare, markdown, metrics_of
+from cprl.studies.tables.comparing import LAST, cells, compare, metrics_of
 from cprl.studies.tables.sources import study_table
 from cprl.studies.tables.table import EVALUATION, RANDOM, TRAINING, WINDOW, StudyTable
+from cprl.terminal.tables import Cells, cell, markdown
 
 TABLE: Final = "table.parquet"
 SUMMARY: Final = "summary.md"

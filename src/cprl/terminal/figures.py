@@ -19,7 +19,7 @@ from cprl.measuring.phases import Phase
 from cprl.runs.curves import SMOOTHED_EPISODES, centres, curves_of, episode_of_step, phases_of, running_mean
 from cprl.runs.episodes import read_evaluations
 from cprl.terminal import style
-from cprl.terminal.style import MARK, SMALL_PT, WIDTH_IN
+from cprl.terminal.style import CHARACTER, MARK, Sheet, Width
 
 Bands = Sequence[tuple[float, float, str]]
 """First episode, last episode and name of each phase."""
@@ -32,9 +32,8 @@ COLOURS: Final = {
     UNNAMED: "#ffffff",
 }
 """Light enough for curves before them; the four are apart under deuteranopia too."""
-STRIP_IN: Final = 0.24
-"""The height of a row of a strip in inches."""
-_CHARACTER_IN: Final = 0.075
+STRIP: Final = 2.0
+"""The height of a row of a strip in em."""
 
 
 def bands_of(phases: Sequence[Phase]) -> Bands:
@@ -43,7 +42,8 @@ def bands_of(phases: Sequence[Phase]) -> Bands:
 
 def draw_bands(panel: Axes, bands: Bands) -> None:
     for first, last, name in bands:
-        panel.axvspan(first, last, **_look(name, "#e6e6e6"), zorder=0, linewidth=0)
+        if name != UNNAMED:  # which is white, and hatched in the strip alone
+            panel.axvspan(first, last, **_look(name, "#e6e6e6"), zorder=0, linewidth=0)
         panel.axvline(last, color="#999999", linewidth=0.6, zorder=0.5)
 
 
@@ -59,7 +59,7 @@ def _look(name: str, edge: str) -> dict[str, Any]:
     return {"facecolor": COLOURS[name], "edgecolor": edge, **hatch}
 
 
-def draw_strip(panel: Axes, rows: Mapping[str, Bands]) -> None:
+def draw_strip(sheet: Sheet, panel: Axes, rows: Mapping[str, Bands]) -> None:
     """Draws rows of named blocks into a panel of its own, above that of the curves.
 
     A name that is wider than its block is left to the legend of the bands.
@@ -68,13 +68,11 @@ def draw_strip(panel: Axes, rows: Mapping[str, Bands]) -> None:
     for at, bands in enumerate(rows.values()):
         for first, last, name in bands:
             panel.barh(at, last - first, left=first, height=0.9, **_look(name, "#777777"))
-            room_in = (last - first) / (high - low) * (WIDTH_IN - 1)
-            if len(name) * _CHARACTER_IN < room_in:
+            if CHARACTER * len(name) < (last - first) / (high - low) * (sheet.width_em - 8):
                 box = {"facecolor": COLOURS[name], "edgecolor": "none", "pad": 1}
-                middle = (first + last) / 2
-                panel.text(middle, at, name, ha="center", va="center", fontsize=SMALL_PT, bbox=box)
+                panel.text((first + last) / 2, at, name, ha="center", va="center", bbox=box)
     panel.set(yticks=range(len(rows)), yticklabels=list(rows), ylim=(len(rows) - 0.5, -0.5))
-    panel.tick_params(left=False, bottom=False, labelbottom=False, labelsize=SMALL_PT)
+    panel.tick_params(left=False, bottom=False, labelbottom=False)
     panel.spines[:].set_visible(False)
 
 
@@ -93,7 +91,8 @@ Values = NDArray[np.float64]
 
 PARTS: Final = 20
 """A running mean takes in at most one part in so many of a training, so that short ones keep their course."""
-HEIGHTS_IN: Final = (3.1, 1.7, 1.5, 1.5)
+HEIGHTS: Final = (24, 13, 12, 12)
+"""Of panels, in em."""
 OF_INSTITUTIONS: Final = ("institutions/violations", "institutions/fines")
 """What has a panel in games with institutions."""
 
@@ -117,6 +116,8 @@ def training_curve(
     random: list[Episode] | None = None,
     smoothed: int = SMOOTHED_EPISODES,
     exploration_steps: int | None = None,
+    path: Path | None = None,
+    width: Width = "page",
 ) -> Path:
     """Plots the collective return in each episode of a run, and survival below it.
 
@@ -131,9 +132,10 @@ def training_curve(
         smoothed: the largest window of the running means, in episodes; they take in at most 1/20 of all.
         exploration_steps: the environment step of a replica at which exploration ends, see
             `cprl.population.exploration_steps`; a tick marks its episode.
+        path: of the picture, by default `figures/training_curve.png` of the run.
 
     Returns:
-        The PNG, `figures/training_curve.png` of the run.
+        The path.
     """
     title = title.encode("utf-8", "replace").decode()
     curves = curves_of(run)
@@ -143,29 +145,29 @@ def training_curve(
     ours = bands_of(phases_of(curves, centred=True) or [])
     strips = {"this run": ours} if ours else {}
 
-    heights = [STRIP_IN * len(strips)] * bool(strips) + list(HEIGHTS_IN[: len(panels)])
-    figure, every = style.new_figure(heights, title=title)
-    strip, drawn = every[: len(strips) > 0], every[len(strips) > 0 :]
+    heights = [STRIP] * len(strips) + list(HEIGHTS[: len(panels)])
     levels = [f"{panel.random:,.4g} {panel.unit}".strip() for panel in panels if panel.random is not None]
     dashed = f"random play, {', '.join(levels)}"
-    for axes, panel in zip(drawn, panels, strict=True):
-        draw_bands(axes, ours)
-        _draw(axes, panel, window, dashed)
-        axes.set_xlim(-0.5, max(episodes - 0.5, 1))
-    add_keys(drawn[0], *strips.values())
-    _mark_peak(drawn[0], panels[0], window)
-    ends = None if exploration_steps is None else episode_of_step(curves, exploration_steps)
-    mark_exploration(drawn, ends)
-    for axes in strip:
-        draw_strip(axes, strips)
-    drawn[-1].set_xlabel("episode")
-    note = f"Running means are over {window} episodes, centred." if window > 1 else "Nothing is smoothed."
-    if exploration_steps is not None and ends is None:
-        note += " Exploration was not over at the last episode."
-    style.legend_below(figure, drawn, note=note)
-    picture = run / "figures" / "training_curve.png"
-    picture.parent.mkdir(exist_ok=True)
-    return style.save(figure, picture)
+    path = path or run / "figures" / "training_curve.png"
+    with style.drawing(path, width=width) as sheet:
+        every = sheet.panels(len(heights), high=heights, sharex=True)
+        drawn = every[len(strips) :]
+        for axes, panel in zip(drawn, panels, strict=True):
+            draw_bands(axes, ours)
+            _draw(axes, panel, window, dashed)
+            axes.set_xlim(-0.5, max(episodes - 0.5, 1))
+        add_keys(drawn[0], *strips.values())
+        _mark_peak(drawn[0], panels[0], window)
+        ends = None if exploration_steps is None else episode_of_step(curves, exploration_steps)
+        mark_exploration(drawn, ends)
+        for axes in every[: len(strips)]:
+            draw_strip(sheet, axes, strips)
+        drawn[-1].set_xlabel("episode")
+        note = f"Running means are over {window} episodes, centred." if window > 1 else "Nothing is smoothed."
+        if exploration_steps is not None and ends is None:
+            note += " Exploration was not over at the last episode."
+        sheet.title, sheet.caption = title, note
+    return path
 
 
 def _panels(run: Path, curves: dict[str, Values], random: Sequence[Episode]) -> list[_Panel]:

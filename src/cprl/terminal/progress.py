@@ -8,6 +8,7 @@ from typing import Final, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
+from rich.table import Column
 from rich.text import Text
 from tensordict import TensorDictBase
 
@@ -58,15 +59,16 @@ class ProgressBar:
         self._title, self._clock = title, getattr(rules, "episode_steps", None)
         self._last_steps = 0
         self._progress = Progress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            _Now(),
+            TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, ratio=1)),
+            BarColumn(None, table_column=Column(ratio=1)),
+            MofNCompleteColumn(table_column=Column(no_wrap=True)),
+            _Now(table_column=Column(no_wrap=True)),
             console=self.console,
+            expand=True,
             disable=not self.console.is_terminal,
         )
         self._task = self._progress.add_task(title, total=episodes, values="")
-        self._latest = {"return": "-", "epsilon": "-"}
+        self._latest = {"return": "-", "epsilon": ""}
         self._turns = self._steps = self._steps_then = self._steps_this_episode = self._episodes = 0
         self._started = self._then = _running_s()
         self._left_of, self._replicas, self._before = episodes, replicas, 0
@@ -96,7 +98,10 @@ class ProgressBar:
     def _show(self, waited: float) -> None:
         rate = (self._steps - self._steps_then) / waited
         self._steps_then, self._then = self._steps, _running_s()
-        values = f"return {self._latest['return']}  epsilon {self._latest['epsilon']}  {rate:,.0f} steps/s"
+        values = f"return {self._latest['return']}"
+        if self._latest["epsilon"]:
+            values += f"  epsilon {self._latest['epsilon']}"
+        values += f"  {rate:,.0f} steps/s"
         episode_steps = self._clock or self._last_steps
         running = min(self._replicas, self._steps_this_episode / episode_steps) if episode_steps else 0
         done = (self._episodes + running) / self._replicas

@@ -1,35 +1,62 @@
-"""What all figures share: sizes and colours on white, legends that lie beside the data, cells of a matrix."""
+"""What all figures share: size, letters and colours, where title, legend and caption stand, their files.
 
-from collections.abc import Sequence
+    with style.drawing("diagram.pdf", width="column") as sheet:
+        left, right = sheet.panels(2, columns=sheet.fitting(2, 25), high=16)
+        left.plot(means, label="mean of the replicas")
+        sheet.title, sheet.caption = "Who gains", "Bars: 95 % intervals by Student's t."
+
+Lengths are in em, the size of the text: a page is 64 em wide, a column of a paper 36.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
-from textwrap import fill
-from typing import Any, Final
+from typing import Any, Final, Literal
 
+import matplotlib
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
-from matplotlib.legend import Legend
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import Normal, Stroke
-from matplotlib.text import Text
 
 from cprl.commons.colours import agent_colour
 from cprl.runs.files import refuse_to_write_over, write_atomically
-from cprl.values import refusal
+from cprl.terminal.tables import lines_of
+from cprl.values import checked, refusal
 
-DPI: Final = 150
+Width = Literal["page", "column"]
+SUFFIXES: Final = (".png", ".pdf", ".svg")
+WIDTH_IN: Final[dict[Width, float]] = {"page": 8.0, "column": 3.3}
+TEXT_PT: Final[dict[Width, float]] = {"page": 9.0, "column": 6.5}
+"""The size of all text but titles; a page shows a figure of 1,200 pixels at about 800."""
+DPI: Final[dict[Width, int]] = {"page": 150, "column": 300}
 COLOURS: Final = 128
 """Of a PNG of lines, which looks the same with all of them and is three times as large."""
 SHADES: Final = 256
 """Of a PNG with a scale of colours."""
-WIDTH_IN: Final = 8.0
-TITLE_CHARACTERS: Final = 84
-"""The largest number of characters on a line of a title; then it wraps."""
-SMALL_PT: Final = 9
-"""The size of the smallest text. A page shows a figure of 1,200 pixels at about 800."""
-CHARACTER_IN: Final = 0.083
-"""The width of a character of small text, about."""
+CHARACTER: Final = 0.56
+"""The width of a character in em, about."""
+_LOOK: Final[dict[str, Any]] = {
+    **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon", "text.parse_math"), False),
+    **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), "#6b6b6b"),
+    **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor", "axes.labelcolor"), "#222222"),
+    **dict.fromkeys(
+        ("axes.titlesize", "axes.labelsize", "legend.fontsize", "legend.title_fontsize"), "medium"
+    ),
+    **dict.fromkeys(("xtick.labelsize", "ytick.labelsize"), "medium"),
+    "axes.titlelocation": "left",
+    "axes.axisbelow": True,
+    "legend.handlelength": 1.8,
+    "legend.columnspacing": 1.6,
+    "svg.hashsalt": "cprl",
+    "pdf.fonttype": 42,
+}
+"""Names are no formulas, though they may have dollar signs."""
 
 MEAN: Final = "#08519c"
 REPLICA: Final = "#6baed6"
@@ -52,82 +79,145 @@ POINT: Final[dict[str, Any]] = {
 }
 PUBLISHED: Final = "#000000"
 MARK: Final = "#a50f15"
+EMPTY: Final = "#f2f2f2"
+"""The colour of a cell without a number."""
+DASHES: Final[tuple[Any, ...]] = ("-", (0, (6, 2)), (0, (4, 1, 1, 1)), (0, (1, 1)))
+_AGENTS_OF_A_DASH: Final = 4
 _EDGE: Final = "#303030"
-AGENTS_OF_A_DASH: Final = 4
-_DASHES: Final = ("-", (0, (6, 2)), (0, (4, 1, 1, 1)), (0, (1, 1)))
+_FAINT: Final = "#555555"
 
 
-def new_figure(heights_in: Sequence[float], *, title: str) -> tuple[Figure, list[Axes]]:
-    """An empty figure with one panel below the other, and the same episodes in all."""
-    lines = fill(title, TITLE_CHARACTERS)
-    height = sum(heights_in) + 1.9 + 0.2 * lines.count("\n")
-    figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
-    grid = figure.add_gridspec(len(heights_in), 1, height_ratios=list(heights_in))
-    panels: list[Axes] = []
-    for row in range(len(heights_in)):
-        panels.append(figure.add_subplot(grid[row], sharex=panels[0] if panels else None))
-    for panel in panels[:-1]:
-        panel.tick_params(labelbottom=False)
-    figure.suptitle(lines, fontsize=11)
-    return figure, panels
+class Sheet:
+    """A figure that is being drawn. Whatever has a label in a panel is in the legend below all panels."""
+
+    def __init__(self, width: Width) -> None:
+        self.width: Width = width
+        self.width_em = 72 * WIDTH_IN[width] / TEXT_PT[width]
+        self._layout = ConstrainedLayoutEngine()
+        self.figure = Figure(layout=self._layout, dpi=DPI[width])
+        self.title, self.caption, self.legend_title = "", "", ""
+        """The title has some five words; how the figure was made is said in the caption."""
+        self._high = self._wide = 0.0
+
+    def fitting(self, number: int, least: float) -> int:
+        """Return how many of so many panels stand side by side, each at least so many em wide."""
+        return max(1, min(number, int(self.width_em / least)))
+
+    def panels(
+        self,
+        number: int,
+        *,
+        columns: int = 1,
+        high: float | Sequence[float],
+        beside: float = 0.0,
+        **grid: Any,
+    ) -> list[Axes]:
+        """Add panels in rows.
+
+        Args:
+            high: a row with its labels, in em; or each of them.
+            beside: em that names of rows take in each row of panels.
+            grid: of `Figure.subplots`, e.g. sharex.
+        """
+        rows = -(-number // columns)
+        heights = [float(high)] * rows if isinstance(high, int | float) else list(high)
+        self._high, self._wide = sum(heights), (self.width_em - beside) / columns
+        panels = list(
+            self.figure.subplots(
+                rows, columns, squeeze=False, gridspec_kw={"height_ratios": heights}, **grid
+            ).reshape(-1)
+        )
+        for axes in panels[number:]:
+            axes.set_visible(False)
+        for axes, row in zip(panels, [row for row in heights for _ in range(columns)], strict=True):
+            axes.set_gid(f"{row}")
+        return panels[:number]
+
+    def finish(self) -> None:
+        """Put title, legend and caption around the panels, as high as they are."""
+        figure, em_in = self.figure, TEXT_PT[self.width] / 72
+        figure.set_size_inches(WIDTH_IN[self.width], 10)
+        for axes in figure.axes:
+            axes.set_title(wrapped(axes.get_title("left"), self._wide - 1))
+            axes.set_xlabel(wrapped(axes.get_xlabel(), self._wide - 2))
+            axes.set_ylabel(wrapped(axes.get_ylabel(), float(axes.get_gid() or self._high) - 3))
+        renderer: Any = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
+        title = figure.text(
+            0, 1, wrapped(self.title, 0.86 * self.width_em), fontsize="large", va="top", ha="left"
+        )
+        drawn = wrapped(self.caption, self.width_em - 1, 0.47) if self.width == "page" else ""
+        caption = figure.text(0, 0, drawn, fontsize="small", color=_FAINT, va="bottom", ha="left")
+        legend = self._legend(renderer)
+        em_pixels, parts = em_in * figure.dpi, (title, caption, *([legend] if legend else []))
+        over, under, keys = ([part.get_window_extent(renderer).height / em_pixels for part in parts] + [0])[
+            :3
+        ]
+        over, under = (over + 0.8) * bool(self.title), (under + 0.4) * bool(drawn)
+        total = over + self._high + keys + under + 0.6
+        figure.set_size_inches(WIDTH_IN[self.width], total * em_in)
+        left = 0.5 / self.width_em
+        title.set_position((left, 1 - 0.2 / total))
+        caption.set_position((left, 0.3 / total))
+        if legend:
+            legend.set_bbox_to_anchor((0, (under + 0.1) / total))
+        inner = (0, (under + keys) / total, 1, 1 - (under + keys + over) / total)
+        self._layout.set(rect=inner)
+        scale = TEXT_PT[self.width] / TEXT_PT["page"]
+        for line in figure.findobj(Line2D) if scale != 1 else ():
+            assert isinstance(line, Line2D)
+            line.set(linewidth=scale * line.get_linewidth(), markersize=scale * line.get_markersize())
+
+    def _legend(self, renderer: Any) -> Any:
+        """A legend of everything that has a label, each label once, in as many columns as fit."""
+        entries: dict[str, Any] = {}
+        for axes in self.figure.axes:
+            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+                entries.setdefault(wrapped(label, self.width_em - 4), handle)
+        legend = None
+        for columns in range(len(entries), 0, -1):
+            legend = self.figure.legend(
+                list(entries.values()),
+                list(entries),
+                loc="lower left",
+                ncols=columns,
+                title=wrapped(self.legend_title, self.width_em - 4) or None,
+                alignment="left",
+            )
+            if columns == 1 or legend.get_window_extent(renderer).width <= self.figure.bbox.width:
+                break
+            legend.remove()
+        return legend
 
 
-def on_white(agent: int) -> dict[str, Any]:
-    """An agent's colour for a line on white, with a dark edge because some agents are as light as yellow.
-
-    Agents 4 and on have dashes too, because their colours repeat.
-    """
-    red, green, blue = agent_colour(agent)
-    edge = [Stroke(linewidth=3.2, foreground=_EDGE), Normal()]
-    dashes = _DASHES[agent // AGENTS_OF_A_DASH % len(_DASHES)]
-    return {"color": (red / 255, green / 255, blue / 255), "path_effects": edge, "linestyle": dashes}
-
-
-def legend_below(figure: Figure, panels: Sequence[Axes], *, note: str = "", columns: int = 2) -> Legend:
-    """A legend of everything in the panels that has a label, each label once, below them all.
+@contextmanager
+def drawing(
+    path: Path | str, *, width: Width = "page", colours: int = COLOURS, is_new: bool = False
+) -> Iterator[Sheet]:
+    """Draw a figure in a block of code, and write it at its end: a PNG, PDF or SVG by the name of the path.
 
     Args:
-        note: a sentence above the entries, e.g. how the curves are smoothed.
+        width: "page", or "column" of a paper, 3.3 inches wide; then the caption stands in a file beside it,
+            `NAME.caption.txt`.
+        colours: of a PNG.
+        is_new: whether a picture that is there is refused.
     """
-    entries: dict[str, Any] = {}
-    for panel in panels:
-        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
-    return figure.legend(
-        list(entries.values()),
-        [fill(label, 58) for label in entries],
-        loc="outside lower center",
-        ncols=columns,
-        fontsize=SMALL_PT,
-        title=fill(note, 110) or None,
-        title_fontsize=SMALL_PT,
-        frameon=False,
-    )
-
-
-def head(figure: Figure, title: str, note: str) -> None:
-    """A title, and below it what is drawn."""
-    width_in = figure.get_figwidth()
-    figure.suptitle(f"{wrapped(title, width_in)}\n{wrapped(note, width_in)}", fontsize=SMALL_PT + 1)
-
-
-def wrapped(title: str, width_in: float) -> str:
-    return fill(title, int(width_in / CHARACTER_IN))
-
-
-def write_small(axes: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
-    """Gives a panel its labels, in small text as its ticks."""
-    axes.set_xlabel(x, fontsize=SMALL_PT)
-    axes.set_ylabel(y, fontsize=SMALL_PT)
-    axes.set_title(title, fontsize=SMALL_PT)
-    axes.tick_params(labelsize=SMALL_PT)
+    path = (check_picture if is_new else picture_path)(path)
+    checked("width", width, Width)
+    look: Any = {**_LOOK, "font.size": TEXT_PT[width]}
+    with matplotlib.rc_context(look):
+        sheet = Sheet(width)
+        yield sheet
+        sheet.finish()
+        save(sheet.figure, path, colours=colours, title=sheet.title, caption=sheet.caption)
+        if width == "column":
+            save_caption(path.with_suffix(".caption.txt"), f"{sheet.title}\n\n{sheet.caption}\n")
 
 
 def picture_path(path: str | Path, name: str = "path") -> Path:
     """The path of a picture to be, whose folder may be missing; a picture that is there is drawn anew."""
     path = Path(path)
-    if path.suffix != ".png":
-        raise refusal(name, str(path), "a file whose name ends in .png")
+    if path.suffix not in SUFFIXES:
+        raise refusal(name, str(path), f"a file whose name ends in {', '.join(SUFFIXES)}")
     return path
 
 
@@ -138,45 +228,63 @@ def check_picture(path: str | Path, name: str = "path") -> Path:
     return path
 
 
-def save(figure: Figure, path: Path, *, colours: int = COLOURS) -> Path:
-    """Write a PNG of so few colours atomically; its folder is created if missing.
-
-    Texts are drawn as they are: a name with two dollar signs is no formula.
-    """
+def save(figure: Figure, path: Path, *, colours: int = COLOURS, title: str = "", caption: str = "") -> Path:
+    """Write a picture atomically, a PNG of so few colours; its folder is created if missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    for text in figure.findobj(Text):
-        text.set_parse_math(False)
     drawn = BytesIO()
-    figure.savefig(drawn, format="png", dpi=DPI)
-    few = _with_colours(drawn, colours)
-    write_atomically(path, lambda file: file.write(few.getvalue()))
+    if path.suffix == ".png":
+        figure.savefig(drawn, format="png")
+        drawn = _with_colours(drawn, colours, figure.dpi, {"Title": title, "Description": caption})
+    else:
+        about = {"Title": title, "Subject": caption, "CreationDate": None}
+        if path.suffix == ".svg":
+            about = {"Title": title, "Description": caption, "Date": None}
+        figure.savefig(drawn, format=path.suffix[1:], metadata=about)
+    write_atomically(path, lambda file: file.write(drawn.getvalue()))
     return path
 
 
-def _with_colours(drawn: BytesIO, colours: int) -> BytesIO:
+def save_caption(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, lambda file: file.write(text.encode("utf-8", "replace")))
+
+
+def _with_colours(drawn: BytesIO, colours: int, dpi: float, about: dict[str, str]) -> BytesIO:
     """A picture as a PNG of so few colours, each near those that it stands for."""
     from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
 
-    few = BytesIO()
+    few, texts = BytesIO(), PngInfo()
+    for name, text in about.items():
+        texts.add_itxt(name, text)
     with Image.open(drawn) as picture:
         chosen = picture.convert("RGB").quantize(
             colours, method=Image.Quantize.MAXCOVERAGE, kmeans=2, dither=Image.Dither.NONE
         )
-        chosen.save(few, format="png", optimize=True, dpi=(DPI, DPI))
+        chosen.save(few, format="png", optimize=True, dpi=(dpi, dpi), pnginfo=texts)
     return few
 
 
-EMPTY: Final = "#f2f2f2"
-"""The colour of a cell without a number."""
+def wrapped(text: str, wide: float, character: float = CHARACTER) -> str:
+    """A text in lines of so many em."""
+    return lines_of(text, max(4, int(wide / character)))
+
+
+def on_white(agent: int) -> dict[str, Any]:
+    """An agent's colour for a line on white, with a dark edge because some agents are as light as yellow.
+
+    Agents 4 and on have dashes too, because their colours repeat.
+    """
+    red, green, blue = agent_colour(agent)
+    edge = [Stroke(linewidth=3.2, foreground=_EDGE), Normal()]
+    dashes = DASHES[agent // _AGENTS_OF_A_DASH % len(DASHES)]
+    return {"color": (red / 255, green / 255, blue / 255), "path_effects": edge, "linestyle": dashes}
 
 
 def draw_cell(axes: Axes, x: int, y: int, colour: Any, text: str) -> None:
-    """Draws the cell about (x, y), one unit wide and high."""
-    axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=colour, edgecolor="white"))
-    axes.text(x, y, text, ha="center", va="center", fontsize=SMALL_PT, color=_ink(colour))
-
-
-def _ink(colour: Any) -> str:
-    """Black on light cells, white on dark ones."""
+    """Draws the cell about (x, y), one unit wide and high, its text black on light cells and white on dark
+    ones."""
     red, green, blue, _ = to_rgba(colour)
-    return "black" if 0.299 * red + 0.587 * green + 0.114 * blue > 0.5 else "white"
+    ink = "black" if 0.299 * red + 0.587 * green + 0.114 * blue > 0.5 else "white"
+    axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=colour, edgecolor="white"))
+    axes.text(x, y, text, ha="center", va="center", color=ink)

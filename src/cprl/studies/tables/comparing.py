@@ -4,22 +4,21 @@ Intervals are by Student's t over replicas, each of a single comparison. Where a
 that are marked differ by Holm's method: with 95 % none of the marked ones is by chance.
 """
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from math import isnan
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.table import Table
-from rich.text import Text
 
 from cprl.measuring.metrics import is_own, title
 from cprl.measuring.statistics import CONFIDENCE, Estimate, difference, estimate, holm
 from cprl.studies.tables.table import NET, PARTS, RANDOM, TRAINING, StudyTable
 from cprl.system.defaults import LAST as LAST
+from cprl.terminal.tables import Cells as Cells
+from cprl.terminal.tables import markdown as markdown
 from cprl.values import Positive, checked, refusal
 
 METRICS: Final = ("collective_return", NET, "equality", "sustainability", "survival_steps", "peacefulness")
@@ -186,17 +185,6 @@ def differing(comparisons: Sequence[Comparison]) -> set[tuple[str, str]]:
     return {place for place, differs in zip(differences, is_different, strict=True) if differs}
 
 
-class Cells(NamedTuple):
-    """A table of texts."""
-
-    heading: str
-    """What it shows, in a sentence."""
-    head: list[str]
-    rows: list[list[str]]
-    note: str = ""
-    """What is bold, below the table."""
-
-
 def cells(comparisons: Sequence[Comparison], kind: Kind = "levels") -> Cells:
     """Return a row for each condition, a column for each metric.
 
@@ -231,13 +219,18 @@ def cells(comparisons: Sequence[Comparison], kind: Kind = "levels") -> Cells:
     return Cells(heading, head, rows, note)
 
 
+def of_finished(table: Cells) -> Cells:
+    """Return a table of `cells` without the conditions that were not run."""
+    return table._replace(rows=[row for row in table.rows if row[1] != "0"])
+
+
 def level_text(compared: Compared) -> str:
     """Return a mean over replicas with its interval, and where the metric is undefined."""
     if not compared.replicas:
         return "-"
     if compared.estimate is None:
         return f"undefined in all {compared.episodes} episodes"
-    text = estimate_text(compared.estimate)
+    text = str(compared.estimate)
     if compared.undefined:
         text += f", undefined in {compared.undefined} of {compared.episodes} episodes"
     return text
@@ -247,56 +240,12 @@ def difference_text(compared: Compared, *, is_marked: bool) -> str:
     """Return a difference with its interval, bold where it is marked; fewer pairs than replicas are said."""
     if compared.difference is None:
         return "-"
-    text = estimate_text(compared.difference, signed=True)
+    text = f"{compared.difference:+}"
     text = f"**{text}**" if is_marked else text
     pairs = compared.difference.replicas
     return f"{text} (of {pairs})" if pairs < compared.replicas else text
 
 
-def estimate_text(estimated: Estimate, *, signed: bool = False) -> str:
-    """Return an estimate with its interval; of a single replica the value alone."""
-    numbers = [estimated.value, estimated.low, estimated.high]
-    digits = digits_for(max(abs(number) for number in numbers if not isnan(number)))
-    value, low, high = (f"{number:{'+' if signed else ''},.{digits}f}" for number in numbers)
-    return value if isnan(estimated.low) else f"{value} [{low}, {high}]"
-
-
-def digits_for(largest: float) -> int:
-    """Return how many digits after the point a number of this size is shown with."""
-    return next((digits for digits, size in enumerate((100, 10, 0.5)) if largest >= size), 3)
-
-
 def metric_title(metric: str) -> str:
     """Return what a metric is called, with its unit."""
     return "return of all agents together" if metric == NET else title(metric)
-
-
-def markdown(table: Cells) -> list[str]:
-    """Return the lines of a table, numbers to the right, each part followed by an empty line."""
-    rows = [[*map(cell, table.head)], *([cell(name), *texts] for name, *texts in table.rows)]
-    lines = [f"| {' | '.join(row)} |" for row in rows]
-    lines.insert(1, "|---|" + "---:|" * (len(table.head) - 1))
-    return [*lines, "", *[table.note, ""] * bool(table.note)]
-
-
-def cell(name: str) -> str:
-    """Return a name of a user's as a cell of a table in Markdown, in which its signs mean nothing."""
-    return re.sub(r"[\\`*<$|]", r"\\\g<0>", " ".join(name.splitlines()))
-
-
-def rich_table(cells: Cells) -> Table:
-    """Return a table for the terminal; what is bold has a star too."""
-    caption = cells.note.replace("Bold:", "*") or None
-    table = Table(title=cells.heading, title_justify="left", caption=caption, caption_justify="left")
-    for column, name in enumerate(cells.head):
-        table.add_column(name, justify="right" if column else "left", overflow="fold")
-    for row in cells.rows:
-        table.add_row(*map(_for_terminal, row))
-    return table
-
-
-def _for_terminal(text: str) -> Text:
-    if not text.startswith("**"):
-        return Text(text)
-    bold, _, more = text.removeprefix("**").partition("**")
-    return Text(f"{bold} *{more}", style="bold")
