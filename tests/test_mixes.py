@@ -280,7 +280,7 @@ def test_certainty_is_the_share_of_resampled_replicas(made):
     one = analyse(with_payoffs(made, ["a", "b"], [gains]))
     assert np.isnan([one.shares[0].low, *one.pure.values(), *one.in_support]).all()
     assert one.resamples == 0
-    assert all(list(table.columns) for table in egta_tables(one))
+    assert all(table.head for table in egta_tables(one))
 
 
 @pytest.mark.integration
