@@ -163,9 +163,11 @@ def test_evaluations_are_logged_recorded_and_drawn(tmp_path, monkeypatch):
     episodes, values = column(stored / "run.rrd", entity, "Scalars:scalars", "episode")
     assert episodes == [1, 3]
     assert np.ravel(values) == pytest.approx(wanted)
+    figures = []
     with monkeypatch.context() as patched:
-        patched.setattr("cprl.terminal.style.save", lambda figure, path: figure)
-        panel = next(axes for axes in training_curve(stored, title="evaluated").axes if axes.lines)
+        patched.setattr("cprl.terminal.style.save", lambda figure, path, **how: figures.append(figure))
+        training_curve(stored, title="evaluated")
+    panel = next(axes for axes in figures[0].axes if axes.lines)
     (line,) = (line for line in panel.lines if line.get_label() == "greedy, evaluated while trained")
     assert np.column_stack(line.get_data()) == pytest.approx(np.column_stack([[1, 3], wanted]))
 

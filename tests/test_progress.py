@@ -38,6 +38,19 @@ def test_the_bar_shows_square_brackets_of_the_title_as_they_are():
     assert "run [a]" in told.getvalue()
 
 
+def test_the_bar_is_one_line_of_80_columns(monkeypatch):
+    monkeypatch.setattr(progress, "_BAR_PERIOD_S", 0.0)
+    told = io.StringIO()
+    console = Console(file=told, force_terminal=True, width=80, legacy_windows=False)
+    with ProgressBar(GAME, episodes=1200, title="a title of many words " * 4, console=console) as bar:
+        for _ in range(30):
+            bar.on_step(TensorDict(batch_size=[4]))
+        bar._progress.refresh()
+    shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", told.getvalue())
+    lines = [line for line in re.split(r"[\r\n]+", shown) if line.strip()]
+    assert all("steps/s" in line and len(line) <= 80 for line in lines[1:])
+
+
 def test_lines_count_episodes_from_where_a_stopped_training_was(monkeypatch):
     shown = [int(number) for number in re.findall(r"episode (\d+)/9", lines(monkeypatch, before=0))]
     assert (shown[0], shown[-1]) == (0, 5)

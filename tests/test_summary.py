@@ -13,6 +13,7 @@ from test_results import an_episode
 
 from cprl.measuring.metrics import NAMES, title, with_unit
 from cprl.terminal.summary import summarise
+from cprl.terminal.tables import Cells
 
 
 def episode(number, harvest, **metrics):
@@ -74,6 +75,42 @@ def test_episodes_with_an_undefined_net_equality_are_counted(tmp_path):
     rows, _ = told_of(tmp_path, trained=fined)
     (cells,) = (cells for name, cells in rows.items() if "net" in name)
     assert cells == ["0.60, undefined in 1 of 3"]
+
+
+def test_the_outcome_comes_first_and_what_institutions_never_did_has_no_table(tmp_path):
+    def governed(number, harvest, broken):
+        nothing = {"fines": np.zeros(2), "transfers": np.zeros(2), "violations": np.array(broken)}
+        return replace(
+            episode(number, harvest), institutions={"fines": 0.0, "violations": sum(broken)}, **nothing
+        )
+
+    idle, busy = (governed(0, harvest, [0, 0]) for harvest in ([1, 1], [90, 30]))
+    _, text = told_of(tmp_path, random=[idle], trained=[busy])
+    first = (
+        "trained 120, 60.0 times that of random play; random play 2.0: apples an episode, all agents together"
+    )
+    assert text.splitlines()[0] == first
+    assert "institutions" not in text
+    rows, text = told_of(tmp_path, random=[idle], trained=[governed(0, [9, 3], [2, 0])])
+    assert rows["agent 0: violations"] == ["0.0", "2.0"]
+    assert "fined" not in text, "nobody was fined"
+
+
+@pytest.mark.parametrize("names", [["a"] * 9, ["commons_targets_10_decay_500k, gamma=0.997"] * 4, ["x" * 90]])
+def test_every_table_fits_80_columns_and_loses_no_number(names):
+    head = ["condition", *(f"return of {name}, apples" for name in names)]
+    numbers = [
+        f"1,{place}00 [1,{place}11, 1,{place}22], undefined in {place} of 160" for place in range(len(names))
+    ]
+    rows = [[f"a_long_name_of_a_condition={place}, {names[0]}", *numbers] for place in range(3)]
+    output = io.StringIO()
+    Console(file=output, width=80).print(Cells("a heading " * 20, head, rows, "Bold: a note " * 20))
+    text = output.getvalue()
+    assert max(map(len, text.splitlines())) <= 80
+    for place in range(len(names)):
+        assert text.count(f"[1,{place}11, 1,{place}22]") == 3
+        assert text.count(f"undefined in {place}") == 3
+    assert text.count("condition=2") >= 1
 
 
 def test_one_episode_has_no_error_and_one_policy_no_baseline(tmp_path):

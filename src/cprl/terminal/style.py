@@ -152,6 +152,7 @@ class Sheet:
         over, under, keys = ([part.get_window_extent(renderer).height / em_pixels for part in parts] + [0])[
             :3
         ]
+        keys += 0.5 * bool(legend)
         over, under = (over + 0.8) * bool(self.title), (under + 0.4) * bool(drawn)
         total = over + self._high + keys + under + 0.6
         figure.set_size_inches(WIDTH_IN[self.width], total * em_in)
