@@ -338,7 +338,7 @@ def test_figures_that_are_compared_have_the_same_vertical_range(tmp_path, drawn)
 def test_a_figure_beside_the_published_curve_says_how_both_are_smoothed(tmp_path, drawn):
     _, _, path = next(reported.draw_figures([a_result("a", "commons", 500.0)], tmp_path))
     assert path == tmp_path / "a_collective_return.png"
-    assert drawn[0].caption == "Running means over the 30 episodes that follow."
+    assert drawn[0].caption.endswith(". Running means over the 30 episodes that follow.")
     told = labels(drawn[0])
     assert told[:4] == ["ours, each replica", "ours, 95 % interval", "ours, mean of 3 replicas", "published"]
     assert "exploration ends, episode 101" in told
@@ -353,7 +353,7 @@ def test_one_replica_has_no_interval_and_an_experiment_of_ones_own_no_published_
     (path,) = [path for _, _, path in reported.draw_figures([result], tmp_path)]
     assert path.name == "a_collective_return.png"
     assert labels(drawn[0]) == ["ours, one replica", "exploration ends, episode 101"]
-    assert drawn[0].caption == "Running means over the 100 episodes that follow."
+    assert drawn[0].caption.endswith(". Running means over the 100 episodes that follow.")
     see_that_the_legend_is_whole(drawn[0])
 
 

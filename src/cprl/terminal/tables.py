@@ -29,7 +29,10 @@ class Cells(NamedTuple):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
         yield Text(self.heading, style="bold")
         room, rows = options.max_width, [list(row) for row in self.rows]
-        widths = self._widths(rows)
+        heads = [max(map(len, [*name.splitlines(), ""])) for name in self.head]
+        widths = [max(pair) for pair in zip(heads, self._widths(rows), strict=True)]
+        if _total(widths) > room:
+            widths = self._widths(rows)
         for name in (room // 2, room // 3, room // 4):
             if _total(widths) > room:
                 rows = [
