@@ -51,7 +51,7 @@ def test_rows_have_units_and_say_whose_return_is_the_measure(tmp_path):
     assert rows["times that of random play"] == ["1.0", "3.0"]
     assert rows["survival, steps"] == ["900.0", "900.0"]
     assert rows["equality (1 - Gini), 0 to 1"] == ["0.88", "0.62"]
-    assert rows["stock left at the end, apples"] == ["11.0", "11.0"]
+    assert rows["stock left at the end, apples"] == ["1.0", "1.0"]
     assert rows["episodes"] == ["2", "2"]
 
 
