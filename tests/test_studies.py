@@ -407,6 +407,7 @@ def test_values_of_several_numbers_are_read_in_each_of_their_forms(values, data)
         (f"{FREEZE}=many", r"at the path game\.rules\.freeze_steps is 'many'"),
         (f"{FREEZE}=0.5", "is '0.5'"),
         (f"{FREEZE}=True", "is 'True'"),
+        (f"{GAMMA}=nan", "is 'nan'"),
         (f"{OF_ALL}.tau=soft", "is 'soft'"),
         ("game.rules.beam-length-cells=1x2", r"is '1x2'"),
         ("agents.0.reward=greedy", "is 'greedy'"),

@@ -228,8 +228,9 @@ def changed(table, place, value):
 @pytest.mark.parametrize(
     ("place", "value"),
     [
-        *((("seed",), 10**30), (("game", "rules", "episode_steps"), 10**400), (("agents",), {})),
-        *((("agents", 0), []), (("agents", 0, "kind"), {}), (("game",), None), (("game", "map"), 3)),
+        *((("seed",), 1e400), (("seed",), 10**30), (("game", "rules", "episode_steps"), 10**400)),
+        *((("agents",), {}), (("agents", 0), []), (("agents", 0, "policy"), "\ud800")),
+        *((("agents", 0, "kind"), {}), (("game",), None), (("game", "map"), 3), (("device",), "\0")),
     ],
 )
 def test_hostile_tables_are_refused_by_the_place(place, value):

@@ -40,11 +40,11 @@ REFERENCE: Final = {
 
 _MODULES: Final = {
     "commons": ("maps", "published", "observation", "rules", "game", "spaces", "state"),
-    "envs": ("make_env",),
+    "envs": ("make_env", "preferences"),
     "experiment": ("presets",),
-    "learners": ("settings", "preferences"),
+    "learners": ("settings",),
     "measuring": ("social", "phases", "statistics"),
-    "policies": ("scripted", "assignment"),
+    "policies": ("scripted", "assignment", "decisions"),
     "training": ("training",),
     "values": ("custom",),
     "viewer": ("callback",),

@@ -123,9 +123,10 @@ _MODULES: Final = {
     "study_main": "cprl.commands.studies",
     "train": "cprl.training",
 }
-_INNER: Final = {"maps": "cprl.commons.maps", "presets": "cprl.experiment.presets"}
 """Where names are that no package is called. All are imported when they are used: torch alone takes seconds,
 which `cprl --help` and mistyped commands need not wait for."""
+_INNER: Final = {"maps": "cprl.commons.maps", "presets": "cprl.experiment.presets"}
+"""Modules within packages."""
 
 
 def __getattr__(name: str) -> Any:
