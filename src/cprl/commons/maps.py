@@ -8,6 +8,7 @@ from bisect import bisect_left, insort
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from inspect import cleandoc
+from math import isqrt
 from typing import Annotated, Final, Literal
 
 import numpy as np
@@ -340,26 +341,60 @@ def random(
             f"{count} sites and {agents} agents do not fit on {cells} cells; allowed: a lower density, or "
             "fewer agents"
         )
-    free = list(range(cells))
-    beside: list[int] = []  # free cells next to a site; both lists stay in ascending order
-    is_free, is_beside = [True] * cells, [False] * cells
+    free, beside = _Cells(cells, full=True), _Cells(cells)  # beside: free cells next to a site
     for _ in range(count):
-        near = beside and rng.random() < clustering
+        near = beside.count and rng.random() < clustering
         choices = beside if near else free
-        cell = choices[int(rng.integers(len(choices)))]
-        del free[bisect_left(free, cell)]
-        is_free[cell] = False
-        if is_beside[cell]:
-            del beside[bisect_left(beside, cell)]
-            is_beside[cell] = False
+        cell = choices.at(int(rng.integers(choices.count)))
+        free.discard(cell)
+        beside.discard(cell)
         row, col = divmod(cell, width)
-        for neighbour_row, neighbour_col in ((row - 1, col), (row + 1, col), (row, col - 1), (row, col + 1)):
-            neighbour = neighbour_row * width + neighbour_col
-            is_on_board = 0 <= neighbour_row < height and 0 <= neighbour_col < width
-            if is_on_board and is_free[neighbour] and not is_beside[neighbour]:
-                insort(beside, neighbour)
-                is_beside[neighbour] = True
-    chosen = np.array(free)[rng.choice(len(free), agents, replace=False)].tolist()
+        for inside, neighbour in (
+            (row > 0, cell - width),
+            (row < height - 1, cell + width),
+            (col > 0, cell - 1),
+            (col < width - 1, cell + 1),
+        ):
+            if inside and free.has[neighbour]:
+                beside.add(neighbour)
+    places = np.flatnonzero(np.frombuffer(free.has, np.bool_))
+    chosen = places[rng.choice(len(places), agents, replace=False)].tolist()
     starts = tuple((*divmod(cell, width), int(rng.integers(4))) for cell in chosen)
-    sites = tuple(divmod(cell, width) for cell in range(cells) if not is_free[cell])
+    sites = tuple(divmod(cell, width) for cell in range(cells) if not free.has[cell])
     return Map(height=height, width=width, sites=sites, starts=starts)
+
+
+class _Cells:
+    """A set of cells, 0 .. cells - 1, whose n-th smallest is quickly found on large boards too: ascending
+    cells in blocks of about the square root of their largest number."""
+
+    def __init__(self, cells: int, *, full: bool = False) -> None:
+        self.has = bytearray([full]) * cells
+        """By cell, whether it is in the set."""
+        self.count = cells * full
+        self._size = isqrt(cells) + 1
+        firsts = range(0, cells, self._size)
+        self._blocks = [list(range(cells)[first : first + self._size] if full else ()) for first in firsts]
+        self._lengths = np.array(list(map(len, self._blocks)))
+
+    def at(self, place: int) -> int:
+        """The cell at a place in ascending order."""
+        ends = self._lengths.cumsum()
+        block = int(ends.searchsorted(place, side="right"))
+        return self._blocks[block][place - int(ends[block])]
+
+    def add(self, cell: int) -> None:
+        if not self.has[cell]:
+            insort(self._blocks[cell // self._size], cell)
+            self._note(cell, 1)
+
+    def discard(self, cell: int) -> None:
+        if self.has[cell]:
+            block = self._blocks[cell // self._size]
+            del block[bisect_left(block, cell)]
+            self._note(cell, -1)
+
+    def _note(self, cell: int, more: int) -> None:
+        self.has[cell] = more > 0
+        self._lengths[cell // self._size] += more
+        self.count += more
