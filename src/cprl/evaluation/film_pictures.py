@@ -242,22 +242,30 @@ def write_gif(path: Path, pictures: Iterable[Bytes], samples: Sequence[Bytes], *
 
     Args:
         pictures: uint8 [height, width, 3] each, RGB.
-        samples: some of the pictures; the palette has their most frequent colours.
+        samples: some of the pictures; their most frequent colours are exact, others become the nearest.
         fps: pictures per second; a GIF counts hundredths of a second, so it is rounded to 100 / n.
     """
     counts: Any = Image.fromarray(np.concatenate(samples)).getcolors(2**24)
-    colours = [channel for _, colour in sorted(counts, reverse=True)[:_COLOURS] for channel in colour]
-    colours += [0] * (3 * (_COLOURS + 1) - len(colours))
-    palette = Image.new("P", (1, 1))
-    palette.putpalette(colours)
-    first, *others = (
-        Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures
-    )
+    known = np.array([colour for _, colour in sorted(counts, reverse=True)[:_COLOURS]])
+    palette = known.astype(np.uint8).tobytes() + bytes(3)
+    index = np.full(2**24, -1, np.int16)
+
+    def indexed(picture: Bytes) -> Image.Image:
+        # Pillow's own quantize takes colours for equal that differ by up to 4.
+        packed = picture @ np.array([1 << 16, 1 << 8, 1], np.int32)
+        new = np.unique(packed[index[packed] < 0])
+        apart = np.stack([new >> 16, new >> 8 & 255, new & 255], -1)[:, None] - known
+        index[new] = (apart**2).sum(-1).argmin(1)
+        image = Image.fromarray(index[packed].astype(np.uint8), "P")
+        image.putpalette(palette)
+        return image
+
+    first, *others = map(indexed, pictures)
     options = {
         "append_images": others,
         "duration": [10 * max(2, round(100 / fps))] * len(others) + [round(1000 * HOLD_S)],
-        "palette": bytes(colours),
-        "transparency": _COLOURS,
+        "palette": palette,
+        "transparency": len(known),
     }
     write_atomically(
         path, lambda file: first.save(file, format="GIF", save_all=True, loop=0, optimize=True, **options)
