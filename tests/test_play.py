@@ -155,11 +155,14 @@ def test_a_game_without_a_beam_has_no_key_for_it():
         (["commons", "--steps", "0"], "steps is 0"),
         (["odd.txt"], r"odd\.txt: unknown sign 'x' at row 0, column 1"),
         (["odd.txt", "--variant", "as_run"], "variant is 'as_run'"),
+        (["huge.txt"], r"huge\.txt has more than 10,000,000 bytes"),
     ],
 )
 def test_what_cannot_be_played_is_refused(tmp_path, monkeypatch, words, said):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "odd.txt").write_text(".x>A\n")
+    with (tmp_path / "huge.txt").open("wb") as file:
+        file.truncate(10_000_001)
     monkeypatch.setattr("sys.argv", ["cprl", "play", *words])
     with pytest.raises(SystemExit, match=said):
         cli.main()

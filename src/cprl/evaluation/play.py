@@ -225,6 +225,9 @@ def board_text(session: Session) -> Text:
     return text
 
 
+_LARGEST_DRAWING_BYTES: Final = 10_000_000
+
+
 def board_named(
     board: str, variant: Variant = "published", *, allow: Sequence[str] = ()
 ) -> tuple[Game, LoadedRun | None]:
@@ -244,6 +247,8 @@ def board_named(
     if path.is_dir():
         run = load(path, allow=allow)
         return commons_game(run), run
+    if path.stat().st_size > _LARGEST_DRAWING_BYTES:
+        raise ValueError(f"{path} has more than {_LARGEST_DRAWING_BYTES:,} bytes; allowed: a drawing")
     try:
         return Game(map=maps.parse(path.read_text(encoding="utf-8")), rules=Rules()), None
     except ValueError as error:
