@@ -309,7 +309,7 @@ def agents_specified(place: Place, specs: Sequence[AgentSpec], fresh: Fresh) -> 
         if not isinstance(spec, Scripted | Frozen):
             allowed = "Scripted(policy) or Frozen(run, agent, replica)"
             raise ValueError(f"agents[{agent}] is a {type(spec).__name__}; allowed: {allowed}")
-    refuse_trained_in(fresh.seed, (load(spec.run) for spec in by_agent if isinstance(spec, Frozen)))
+    refuse_trained_in(fresh.seed, map(load, {spec.run for spec in by_agent if isinstance(spec, Frozen)}))
     population = Population(place.env(len(fresh.replicas)), specs)
     return [of_replicas.__getitem__ for of_replicas in population.as_stored(fresh.replicas)]
 
