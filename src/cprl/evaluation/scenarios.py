@@ -318,7 +318,8 @@ def scenario_tables(scores: Scores) -> Iterator[Cells]:
     for name, score in by_scenario.items():
         focal = [str(score.measures(who)["focal/return"]) for who in FOCAL_AGENTS]
         rows.append((name, *focal, next(texts), next(texts), str(score.measures()["background/return"])))
-    left_out = left_out_of(scores.run.game)
+    everything = {scenario.name for scenario in scenarios_of(scores.run.game)}
+    left_out = left_out_of(scores.run.game) if everything == set(by_scenario) else ""
     note = f"{HOLM} for all {len(ahead)} differences" + f". Left out: {left_out}" * bool(left_out)
     yield table_of("return per agent, apples", columns, rows, note=note)
     title = "all agents together, with the run's agents in the focal places"
