@@ -44,6 +44,7 @@ from cprl.evaluation import (
     schelling,
     territory_of,
 )
+from cprl.evaluation.evaluate import refuse_unlike
 from cprl.evaluation.lanes import Fresh, Part, Turns, agents_of
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.metrics import with_unit
@@ -281,8 +282,22 @@ def test_a_matrix_of_scripted_agents_gives_the_numbers_worked_by_hand(corridors)
     assert visit.measures()["collective_return"].episodes == 2 * 2 * 2
     at_home = found.cell("sustainable", "sustainable").measures()
     assert (at_home["equality"].undefined, at_home["equality"].episodes) == (4, 4), "each episode once"
+    focal_agents = found.where(focal="greedy", background="greedy").table()["focal_agent"]
+    assert set(focal_agents.to_pylist()) == {-1}
     with pytest.raises(ValueError, match=r"the cell is \('greedy', 'DQN'\)"):
         found.cell("greedy", "DQN")
+    for cell in (visit, found.cell("greedy", "greedy")):
+        with pytest.raises(ValueError, match="agent is 2"):
+            cell.measures(2)
+
+
+def test_games_are_unlike_in_fields_that_a_refusal_names():
+    rules, observation = replace(MEADOW.rules, freeze_steps=7), Observation(agents_apart=True)
+    other = replace(MEADOW, rules=rules, observation=observation)
+    fields = r"Game\.rules\.freeze_steps was 2, is 7; Game\.observation\.agents_apart was False, is True;"
+    with pytest.raises(ValueError, match=f"^one and another have different games: {fields}"):
+        refuse_unlike("one and another", MEADOW, other)
+    refuse_unlike("one and another", MEADOW, replace(MEADOW))
 
 
 def test_each_cell_is_what_the_loaded_runs_agents_play_with_one_focal_agent(learned):
@@ -525,9 +540,12 @@ def test_a_command_prints_its_numbers_and_writes_its_files_once(
             command(monkeypatch, capsys, *words, "--figure", tmp_path / "a.jpg")
 
 
-def test_the_table_of_an_evaluation_has_every_metric(alike, monkeypatch, capsys):
-    found = cprl.evaluate_run(alike, episodes=1)
-    rows = rows_of(command(monkeypatch, capsys, "evaluate", alike, "--episodes", 1))
+def test_the_table_of_an_evaluation_has_every_metric_and_its_file_every_episode(
+    alike, tmp_path, monkeypatch, capsys
+):
+    found, out = cprl.evaluate_run(alike, episodes=1), tmp_path / "episodes.parquet"
+    rows = rows_of(command(monkeypatch, capsys, "evaluate", alike, "--episodes", 1, "--out", out))
+    assert pq.read_table(out).equals(found.table())
     for name, random in found.measures("random").items():
         assert [with_unit(name, rewards="apples"), str(found.measures()[name]), str(random)] in rows
 

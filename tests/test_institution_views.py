@@ -278,7 +278,7 @@ def test_an_evaluation_reports_institutions(evaluation):
     paid = np.mean([episode.fines[2] for episodes in evaluation.random.values() for episode in episodes])
     assert measures["agent_2/fines"].estimate.value == pytest.approx(paid)
     text = printed(run_table(evaluation))
-    assert "net" in text or measures["institutions/net_equality"].estimate is None
+    assert "equality of net incomes" in text or measures["institutions/net_equality"].estimate is None
     assert "agent 2: fines, apples" in text
     assert "where one may bite" not in text, "undefined everywhere"
     assert {"fines", "violations", "own_bites", "in_force_0"} <= set(evaluation.table().column_names)

@@ -214,6 +214,14 @@ def test_the_episodes_are_those_of_an_evaluation(alike):
     assert found.random.taggings.sum() > 0
 
 
+def test_a_replica_alone_stays_where_it_stays_among_all(alike):
+    both, alone = (territory_of(alike, episodes=3, replicas=replicas) for replicas in ((), [2]))
+    np.testing.assert_array_equal(alone.trained.visits[0], both.trained.visits[2])
+    np.testing.assert_array_equal(alone.random.tagged_where[0], both.random.tagged_where[2])
+    for name, values in both.random.by_replica.items():
+        np.testing.assert_array_equal(alone.random.by_replica[name], values[2:])
+
+
 def test_the_maps_show_where_each_agent_was_and_are_not_written_over(corridors, tmp_path):
     found = territory_of(corridors["greedy"], episodes=2)
     path = draw_visits(found, tmp_path / "new" / "visits.png", replica=1)
@@ -229,7 +237,7 @@ def test_the_maps_show_where_each_agent_was_and_are_not_written_over(corridors, 
     [
         ({"replica": 2}, "replica is 2"),
         ({"policy": "greedy"}, "policy is 'greedy'"),
-        ({"path": "visits.pdf"}, "path is '.*visits.pdf'"),
+        ({"path": "visits.gif"}, "path is '.*visits.gif'"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(more, message, corridors, tmp_path):

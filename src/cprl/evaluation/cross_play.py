@@ -65,6 +65,8 @@ class Cell(Results):
         parts = self.parts
         if agent is not None:
             parts = [part._replace(focal=((agent,),)) for part in parts if (agent,) in part.focal]
+            if not parts:
+                raise refusal("agent", agent, f"one of {list(self.by_agent)}")
         return replace(self, parts=parts).estimates("focal", "background", "group")
 
 

@@ -159,7 +159,8 @@ def run_table(evaluation: Evaluation) -> Cells:
         for name, measured in trained.items()
         if not says_nothing(name, [measured, random[name]])
     ]
-    zeros = "" if len(rows) == len(trained) else "Numbers of institutions that are 0 everywhere are left out."
+    zeros = "Numbers of institutions that are 0 or undefined everywhere are left out."
+    zeros *= len(rows) < len(trained)
     without = [agents_without_harvest(played) for played in (evaluation.trained, evaluation.random)]
     if None not in without:
         counts = (f"{count[0]} of {count[1]}" for count in without if count)
