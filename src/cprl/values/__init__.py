@@ -140,11 +140,7 @@ class Value:
             object.__setattr__(self, name, checked(place, getattr(self, name), hint))
 
     def to_config(self) -> dict[str, Any]:
-        """Return a value as JSON can hold it: tables, lists, texts, numbers, booleans and None.
-
-        Raises:
-            ValueError: for what is neither of `KINDS` nor of JSON, with its place and what to write instead.
-        """
+        """Return the fields as JSON can hold them, see `cprl.values.to_config`."""
         names = hints_of(type(self))
         return {name: to_config(getattr(self, name), f"{self._called}.{name}") for name in names}
 
