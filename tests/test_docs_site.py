@@ -7,6 +7,7 @@ import sys
 import time
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 from threading import Thread
@@ -42,6 +43,8 @@ def test_every_package_is_on_a_page_of_the_reference_or_named_as_internal():
     shown = set(reference.REFERENCE) - {"cprl"}
     assert not shown & reference.INTERNAL
     assert shown | reference.INTERNAL == reference.packages_there()
+    for package, names in reference._MODULES.items():
+        assert all(find_spec(f"cprl.{package}.{name}") for name in names), package
 
 
 def test_the_page_of_commands_has_the_help_of_each():
