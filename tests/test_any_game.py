@@ -82,6 +82,19 @@ def test_what_a_game_of_torchrl_reports_is_read_from_its_specs():
     assert reported_by(TransformedEnv(CommonsEnv(GAME, 1), StepCounter())) == OPTIONAL
 
 
+def test_each_metric_needs_what_is_said_and_nothing_else():
+    of_entry = {"harvest": ("harvest", "harvest_steps", "harvest_time"), "in_play": ("in_play_steps",)}
+    totals = {name: torch.rand(4, 2, dtype=torch.float64) for names in of_entry.values() for name in names}
+    steps = torch.full((4,), 9.0, dtype=torch.float64)
+    whole = social.measured(social.SOCIAL, social.Totals(steps=steps, **totals))
+    assert tuple(whole) == social.METRICS == tuple(METRICS)
+    for given in ((), ("harvest",), ("in_play",)):
+        known = {name: totals[name] for entry in given for name in of_entry[entry]}
+        part = social.measured(social.SOCIAL, social.Totals(steps=steps, **known))
+        assert tuple(part) == available(METRICS, given)
+        assert all(torch.equal(part[name], whole[name]) for name in part)
+
+
 def test_what_the_docs_say_is_left_out_is_what_needs_the_entry():
     text = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
     rows = dict(re.findall(r'^\| "(\w+)" \| (.*) \|$', text, re.MULTILINE))

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from cprl import keys
 from cprl.keys import Turn
 from cprl.learners.base import Learner, LearningAgents
 from cprl.learners.engine import WAYS, Batching, Engine, ListEngine, MakeLoss, UpdateRule, make_engine
@@ -26,7 +27,7 @@ MakeTeam = Callable[[Sequence[nn.Module]], nn.Module]
 """Makes the networks of a team from those of its members: `AgentNetworks`, a `cprl.networks.team.Team` first.
 Members that share parameters are one and the same network."""
 
-STATE_BEFORE, STATE = "recurrent_state_before", "recurrent_state"
+STATE_BEFORE, STATE = keys.RECURRENT_STATE_BEFORE[-1], keys.RECURRENT_STATE[-1]
 """Entries of the states of recurrent networks in a turn."""
 _SHARED: Final = 1
 """The last number of the seed of the parts that a team adds to its members' networks."""

@@ -217,10 +217,11 @@ class TorchRLRolloutLearner(RolloutLearner):
             logits = self.engine.parts[lane][ACTOR](rollout["observation"])
             policy = torch.distributions.Categorical(logits=logits)
             chosen = policy.log_prob(rollout["action"])  # type: ignore[no-untyped-call]
-        buffer.empty()
         buffer.extend(rollout.update({"logits": logits, "action_log_prob": chosen}))
         minibatches = self.settings.epochs * (self.rollout_steps // self.settings.minibatch_size)
-        return torch.stack([self.engine.learn(lane, buffer.sample()) for _ in range(minibatches)]).mean()
+        losses = [self.engine.learn(lane, buffer.sample()) for _ in range(minibatches)]
+        buffer.empty()  # a checkpoint holds the rollout once
+        return torch.stack(losses).mean()
 
     def state_dict(self) -> dict[str, Any]:
         return {**super().state_dict(), **self.buffer.state_dict()}

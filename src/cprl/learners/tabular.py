@@ -71,14 +71,14 @@ class TabularLearner(Learner):
 
     def store(self, batch: TensorDictBase | Turn) -> None:
         """Queues one step of every replica for `update`."""
-        came = Turn.of(batch)
-        if came.batch.device is not None and came.batch.device.type != "cpu":
-            came = Turn.of(came.batch.cpu())  # where the tables are
-        turn = lane_turn(self.agents, came, self._wanted(came))
-        seen = states_of(came.batch[keys.AGENTS], self._observed, self.agents)
+        whole = Turn.of(batch)
+        if isinstance(whole.next_world[keys.DONE], Tensor):  # on a GPU; tables are on the CPU
+            whole = Turn.of(whole.batch.cpu())
+        turn = lane_turn(self.agents, whole, self._wanted(whole))
+        seen = states_of(whole.batch[keys.AGENTS], self._observed, self.agents)
         rows = self.tables.find_or_add(seen, self._every_lane)
         on = np.flatnonzero(~turn.terminated)
-        next_seen = states_of(came.batch["next", keys.AGENTS], self._observed, self.agents)
+        next_seen = states_of(whole.batch["next", keys.AGENTS], self._observed, self.agents)
         next_rows = np.full(self.lanes, NEVER_MET, np.int64)
         next_rows[on] = self.tables.find_or_add([next_seen[lane] for lane in on], on.tolist())
         reward, action = turn.reward.astype(np.float64), turn.action.copy()

@@ -4,8 +4,8 @@ Modules, in the order in which one reads them:
     lanes           LaneActor: many agents at once, by the values or logits of their networks
     scripted        agents that follow a rule; scripted_rules is compiled for them
     tabular         agents that look actions up in tables
-    decisions       Decider: what agents decide at an episode's begin, where a game asks them
+    decisions       Decider: what agents decide at an episode's begin; Bandit: how they learn it
     assignment      AgentPolicies: which policy controls which agents
     present         PresentPolicy: the first replica's agents as they are now, beside the training
-    rng             random numbers of each lane's own
+    rng             names and seeds of lanes, and random numbers of each lane's own
 """
