@@ -322,8 +322,9 @@ def egta(
         game = pairwise_game(crossplay(named, **vars(fresh)))
     else:
         game = play_empirical_game(named, **vars(fresh))
+    _write(game, files)  # An analysis that fails loses no episodes.
     analysis = analyse(game, resamples=resamples)
-    _show(game, files, egta_tables(analysis), above=egta_heading(game), draw=partial(draw_egta, analysis))
+    _show(None, files, egta_tables(analysis), above=egta_heading(game), draw=partial(draw_egta, analysis))
 
 
 def scenarios(
@@ -444,10 +445,8 @@ def _show(
     """Write every episode, print tables with a line above and below them, and draw."""
     from cprl.terminal.tables import show
 
-    if files.out is not None and played is not None:
-        from cprl.runs.episodes import write_table
-
-        write_table(files.out, played.table())
+    if played is not None:
+        _write(played, files)
     show([above] * bool(above))
     show(tables)
     if below:
@@ -456,6 +455,13 @@ def _show(
         say(f"Episodes: {files.out}")
     if files.figure is not None and draw is not None:
         say(f"Figure: {draw(files.figure, width=files.figure_width)}")
+
+
+def _write(played: "Results", files: Files) -> None:
+    if files.out is not None:
+        from cprl.runs.episodes import write_table
+
+        write_table(files.out, played.table())
 
 
 def _paths(named: Sequence[str] | Mapping[str, str]) -> Iterable[str]:
