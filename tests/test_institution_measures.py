@@ -310,7 +310,7 @@ def test_undefined_numbers_are_counted_apart():
     first, second = (played(*an_episode())[0] for _ in range(2))
     first.institutions["detection_rate"] = NAN
     found = institution_measures({0: [first, second]})
-    assert str(found["institutions/detection_rate"]) == "0.5, undefined in 1 of 2"
+    assert str(found["institutions/detection_rate"]) == "0.50, undefined in 1 of 2"
     assert not any(name.startswith("institutions") for name in social_measures({0: [first]}))
 
 

@@ -391,8 +391,13 @@ def test_a_run_that_is_written_is_locked_by_name_until_its_process_dies(tmp_path
 
 
 @pytest.mark.integration
-def test_a_lock_of_another_host_is_refused_unless_it_is_taken_over(whole, tmp_path):
+def test_a_run_that_is_written_is_not_resumed_and_a_lock_of_another_host_is_taken_over(whole, tmp_path):
     stopped = copied(whole, tmp_path / "run")
+    with RunLock(stopped):
+        before = contents(stopped)
+        with pytest.raises(RunLockedError, match="is being written by process"):
+            resumed(FIELD, stopped)
+        assert contents(stopped) == before
     (stopped / "run.lock").write_text('{"host": "elsewhere", "pid": 7, "started": "2026-11-22T10:00:00"}\n')
     before = contents(stopped)
     with pytest.raises(RunLockedError, match=r"locked by process 7 on elsewhere since .*--take-over"):

@@ -15,7 +15,21 @@ def test_intervals_are_by_student():
     assert (found.value, found.replicas) == (2.5, 4)
     assert (found.low, found.high) == pytest.approx((2.5 - reach, 2.5 + reach), abs=1e-3)
     assert difference(values, [0.0] * 4, paired=True) == found
-    assert str(estimate([2.0, 2.0])) == "2 [2, 2]"
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ([1234.0] * 2, "+1,234 [+1,234, +1,234]"),
+        ([2.0] * 2, "+2.00 [+2.00, +2.00]"),
+        ([-0.25], "-0.250"),
+        ([0.0] * 2, "+0 [+0, +0]"),
+        ([4e-6] * 2, "+4e-06 [+4e-06, +4e-06]"),
+    ],
+)
+def test_an_estimate_has_the_digits_of_the_largest_of_its_numbers(values, text):
+    assert f"{estimate(values):+}" == text
+    assert str(estimate(values)) == text.replace("+", "")
 
 
 def test_one_replica_has_no_interval_and_values_that_are_not_finite_are_refused():

@@ -104,6 +104,9 @@ def test_every_table_fits_80_columns_and_loses_no_number(names):
         f"1,{place}00 [1,{place}11, 1,{place}22], undefined in {place} of 160" for place in range(len(names))
     ]
     rows = [[f"a_long_name_of_a_condition={place}, {names[0]}", *numbers] for place in range(3)]
+    rows.append(
+        ["marked", *(f"**+{place}.5 [+{place}.1, +{place}.9]** (of 3)" for place in range(len(names)))]
+    )
     output = io.StringIO()
     Console(file=output, width=80).print(Cells("a heading " * 20, head, rows, "Bold: a note " * 20))
     text = output.getvalue()
@@ -111,6 +114,7 @@ def test_every_table_fits_80_columns_and_loses_no_number(names):
     for place in range(len(names)):
         assert text.count(f"[1,{place}11, 1,{place}22]") == 3
         assert text.count(f"undefined in {place}") == 3
+        assert text.count(f"[+{place}.1, +{place}.9] * (of 3)") == 1
     assert text.count("condition=2") >= 1
 
 

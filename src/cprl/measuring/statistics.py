@@ -38,22 +38,21 @@ class Estimate:
     NaN for a single replica."""
 
     def __str__(self) -> str:
-        return f"{self:}"
+        return format(self)
 
-    def __format__(self, form: str) -> str:
-        """The value with its interval, of a single replica the value alone; "" and "+" choose the digits."""
-        numbers = [self.value, self.low, self.high]
-        if form in ("", "+"):
-            form += (
-                f",.{digits_for(max([abs(number) for number in numbers if not isnan(number)], default=0))}f"
-            )
-        value, low, high = (f"{number:{form}}" for number in numbers)
+    def __format__(self, sign: str) -> str:
+        """The value with its interval, of a single replica the value alone; with signs if asked for "+"."""
+        numbers = self.value, self.low, self.high
+        value, low, high = (f"{number:{sign}{form_for(*numbers)}}" for number in numbers)
         return f"{value} [{low}, {high}]" if np.isfinite([self.low, self.high]).all() else value
 
 
-def digits_for(largest: float) -> int:
-    """Return how many digits after the point a number of this size is shown with."""
-    return next((digits for digits, size in enumerate((100, 10, 0.5)) if largest >= size), 3)
+def form_for(*numbers: float) -> str:
+    """Return the format of numbers that are shown together, with two or three digits of the largest."""
+    largest = max((abs(number) for number in numbers if not isnan(number)), default=0.0)
+    if largest < 0.001:
+        return ".3g"
+    return f",.{next((digits for digits, size in enumerate((100, 10, 0.5)) if largest >= size), 3)}f"
 
 
 def estimate(values: ArrayLike) -> Estimate:

@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize, to_hex
 from matplotlib.ticker import NullLocator
 
-from cprl.measuring.statistics import Estimate, curve_interval, digits_for
+from cprl.measuring.statistics import Estimate, curve_interval, form_for
 from cprl.runs.curves import SMOOTHED_EPISODES, running_mean
 from cprl.studies.tables.comparing import (
     INTERVALS,
@@ -98,7 +98,6 @@ def _file_name(factor: str) -> str:
 
 # A metric by a factor
 
-_COLUMNS: Final = 3
 _MOST_LINES: Final = 8
 _CLOSEST: Final = 0.07
 """The smallest distance of two levels, as a share of the axis, at which their names can be read."""
@@ -553,13 +552,13 @@ def _numbers(comparison: Comparison, grid: Grid) -> tuple[Numbers, Numbers]:
         compared = comparison.by_name[name]
         if compared.estimate is not None:
             value = compared.estimate.value
-            levels[name] = value, f"{value:,.{digits_for(abs(value))}f}\nn={len(compared.defined)}"
+            levels[name] = value, f"{value:{form_for(value)}}\nn={len(compared.defined)}"
             if name == comparison.reference:
                 differences[name] = 0.0, "reference"
         if compared.difference is not None:
             value = compared.difference.value
             star = " *" if (comparison.metric, name) in marked else ""
-            differences[name] = value, f"{value:+,.{digits_for(abs(value))}f}{star}"
+            differences[name] = value, f"{value:+{form_for(value)}}{star}"
     return levels, differences
 
 

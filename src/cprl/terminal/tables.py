@@ -29,8 +29,7 @@ class Cells(NamedTuple):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
         yield Text(self.heading, style="bold")
         room, rows = options.max_width, [list(row) for row in self.rows]
-        heads = [max(map(len, [*name.splitlines(), ""])) for name in self.head]
-        widths = [max(pair) for pair in zip(heads, self._widths(rows), strict=True)]
+        widths = [max(_longest(head), wide) for head, wide in zip(self.head, self._widths(rows), strict=True)]
         if _total(widths) > room:
             widths = self._widths(rows)
         for name in (room // 2, room // 3, room // 4):
@@ -53,9 +52,11 @@ class Cells(NamedTuple):
 
     def _widths(self, rows: Sequence[Sequence[str]]) -> list[int]:
         """Of the columns, whose heads wrap."""
-        heads = [max([len(word) for word in name.split()] + [min(len(name), 9)]) for name in self.head]
-        lines = [[_longest(row[column]) for row in rows] for column in range(len(heads))]
-        return [max([min(head, 18), *of_column]) for head, of_column in zip(heads, lines, strict=True)]
+        widths = []
+        for column, head in enumerate(self.head):
+            word = max([min(len(head), 9), *map(len, head.split())])
+            widths.append(max([min(word, 18), *(_longest(row[column]) for row in rows)]))
+        return widths
 
 
 def show(tables: Iterable[RenderableType]) -> None:
@@ -108,7 +109,7 @@ def _blocks(widths: Sequence[int], texts: int, room: int) -> Iterator[list[int]]
 
 
 def _longest(text: str) -> int:
-    return max(map(len, text.replace("**", "").splitlines()), default=0)
+    return max(map(len, _bold(text).plain.splitlines()), default=0)
 
 
 def _narrow(numbers: Sequence[str]) -> list[str]:
