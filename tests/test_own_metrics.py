@@ -101,7 +101,9 @@ def test_one_that_gives_no_number_is_refused_before_anything_is_written(target, 
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("targets", [["equality"], ["steps"], ["return_1"], ["largest_share"] * 2])
+@pytest.mark.parametrize(
+    "targets", [["equality"], ["steps"], ["return_1"], ["policy"], ["largest_share"] * 2]
+)
 def test_one_with_the_name_of_another_number_is_refused(targets):
     with pytest.raises(ValueError, match=f"another number of an episode is called {targets[0]}"):
         experiment(*targets)

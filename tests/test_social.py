@@ -49,6 +49,7 @@ def test_each_metric_is_what_we_work_out_by_hand():
         (0.5, 6, 0.5),  # 4 apples of 0.5 per step * 4 steps + 6 at first = 8
         (0.1, 0, 4 / (0.1 * 4)),  # and not that of float32
         (0, 0, math.nan),  # a share of nothing
+        (torch.tensor([0.0, 0.5, 1.0]), torch.tensor([4, 6, 0]), [1.0, 0.5, 1.0]),  # of each episode
     ],
 )
 def test_the_yield_share_sets_the_harvest_against_what_the_map_bears(sustainable_yield, first_stock, share):
@@ -59,7 +60,7 @@ def test_the_yield_share_sets_the_harvest_against_what_the_map_bears(sustainable
         first_stock=first_stock,
     )
     (measured,) = social.measured({"yield_share": social.SOCIAL["yield_share"]}, totals).values()
-    assert measured.item() == pytest.approx(share, rel=1e-15, nan_ok=True)
+    assert measured.tolist() == pytest.approx(share, rel=1e-15, nan_ok=True)
 
 
 def test_episodes_of_a_batch_are_measured_apart_and_those_without_a_harvest_have_no_equality():

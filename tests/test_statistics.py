@@ -30,6 +30,7 @@ def test_intervals_are_by_student():
 def test_an_estimate_has_the_digits_of_the_largest_of_its_numbers(values, text):
     assert f"{estimate(values):+}" == text
     assert str(estimate(values)) == text.replace("+", "")
+    assert f"{estimate([1.5, 1.5]):.1f}" == "1.5 [1.5, 1.5]"
 
 
 def test_one_replica_has_no_interval_and_values_that_are_not_finite_are_refused():

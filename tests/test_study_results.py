@@ -649,6 +649,10 @@ def test_the_results_of_a_study_are_a_table_a_summary_and_figures(grid_runs, tmp
         "by_game_rules_freeze_steps.png", "by_game_rules_window_rows.png", "levels.png", "courses.png",
         "differences.png", f"map_{pair}_collective_return.png", f"map_{pair}_equality.png",
     }  # fmt: skip
+    unlike = {name: {phase: 3} for name, phase in zip(table.endings, ["tragedy", "decline"], strict=False)}
+    assert f"phases_{pair}.png" in [
+        name for name, *_ in figures.figures_of(replace(table, endings=unlike), 30)
+    ]
     assert StudyTable.read(tmp_path / "table.parquet").summary == table.summary
     text, (lacking,) = (tmp_path / "summary.md").read_text(), table.lacking
     for line in (

@@ -137,8 +137,10 @@ _TAKEN: Final = {
     "replica",
     "agent",
     "net",
+    *("policy", "trained_episodes", "focal", "focal_agent", "focal_agents", "background", "scenario"),
+    *("restrained", "runs", "worlds", "response", "chosen"),
 }
-"""What columns of a table and other metrics are called."""
+"""What columns of tables, their labels and other metrics are called."""
 
 
 def own_name(metric: Custom) -> str:

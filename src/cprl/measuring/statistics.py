@@ -40,10 +40,11 @@ class Estimate:
     def __str__(self) -> str:
         return format(self)
 
-    def __format__(self, sign: str) -> str:
-        """The value with its interval, of a single replica the value alone; with signs if asked for "+"."""
+    def __format__(self, form: str) -> str:
+        """The value with its interval, of a single replica the value alone; "" and "+" choose the digits."""
         numbers = self.value, self.low, self.high
-        value, low, high = (f"{number:{sign}{form_for(*numbers)}}" for number in numbers)
+        form += form_for(*numbers) if form in ("", "+") else ""
+        value, low, high = (f"{number:{form}}" for number in numbers)
         return f"{value} [{low}, {high}]" if np.isfinite([self.low, self.high]).all() else value
 
 
