@@ -92,6 +92,10 @@ def test_nothing_else_of_a_run_changes(tmp_path):
     plain = train(TINY, tmp_path / "plain", watch="off")
     tables = [read_episodes(measured).drop(["largest_share"]), read_episodes(plain)]
     assert repr(tables[0].to_pydict()) == repr(tables[1].to_pydict())
+    for runs in ({"a": measured, "b": plain}, {"a": plain, "b": measured}, {"a": measured, "b": measured}):
+        played = cprl.crossplay(runs, episodes=1, allow=ALLOW)
+        assert ("largest_share" in played.table().column_names) == (plain not in runs.values())
+        assert ("largest_share" in played.cell("a", "b").estimates("focal")) == (plain not in runs.values())
 
 
 @pytest.mark.parametrize("target", ["no_number", "fails", "of_another_game", "missing"])

@@ -12,6 +12,7 @@ with the background agents.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -119,17 +120,17 @@ def crossplay(
     if diagonal == "cross_seed" and len(numbers) < 2:
         raise ValueError(f"the replicas are {list(numbers)}; allowed for cross_seed: at least 2")
     following = dict(zip(numbers, (*numbers[1:], numbers[0]), strict=True))
-    parts = []
+    play, parts = partial(fresh.play, among=named.values()), []
     for focal, background in product(named, repeat=2):
         where, labels = named[background], {"focal": focal, "background": background}
         home = agents_of(where)
         if focal == background and diagonal == "self":
             each = tuple((agent,) for agent in range(len(home)))
-            parts.append(Part({**labels, "focal_agent": SELF_PLAY}, fresh.play(where, home), each))
+            parts.append(Part({**labels, "focal_agent": SELF_PLAY}, play(where, home), each))
             continue
         for agent, visitor in enumerate(agents_of(named[focal], following if focal == background else None)):
             mixed = [*home[:agent], visitor, *home[agent + 1 :]]
-            parts.append(Part({**labels, "focal_agent": agent}, fresh.play(where, mixed), ((agent,),)))
+            parts.append(Part({**labels, "focal_agent": agent}, play(where, mixed), ((agent,),)))
     return CrossPlay(runs=named, parts=parts, fresh=fresh, diagonal=diagonal)
 
 

@@ -122,7 +122,7 @@ def play_empirical_game(
         played = {}
         for who in shifted(counts):
             mixed = [of_runs[run][agent] for agent, run in enumerate(who)]
-            played[who] = fresh.play(named[names[who[0]]], mixed)
+            played[who] = fresh.play(named[names[who[0]]], mixed, among=named.values())
             parts.append(Part({"runs": " ".join(names[run] for run in who)}, played[who]))
         payoffs.append(_payoffs(len(named), played))
     return EmpiricalGame(

@@ -4,7 +4,7 @@ All replicas play at once, as lanes: a step of all takes as long as a step of on
 numbers depend on (seed, replica, agent) alone.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -126,12 +126,15 @@ class Fresh(Value, stored=False):
         counts = {"replica": len(self.replicas), "episode": self.episodes}
         return ", ".join(f"{count} {name}{'s' * (count != 1)}" for name, count in counts.items()) + " each"
 
-    def play(self, where: Place, agents: Sequence[Agent]) -> Played:
-        """The episodes by replica."""
+    def play(self, where: Place, agents: Sequence[Agent], *, among: Collection[LoadedRun] = ()) -> Played:
+        """The episodes by replica, with the metrics of the user's own that all runs among which they are
+        compared have; by default those of where they play."""
+        first, *others = among or [where]
+        metrics = [metric for metric in first.metrics if all(metric in run.metrics for run in others)]
         played: Played = {}
         for group, env in self.worlds(where):
             policies = self.policies(where, agents, group)
-            ended = evaluate(env, policies, explore=not self.greedy, metrics=where.metrics)
+            ended = evaluate(env, policies, explore=not self.greedy, metrics=metrics)
             for place, replica in enumerate(group):
                 played[replica] = ended[place * self.episodes : (place + 1) * self.episodes]
         return played
