@@ -90,7 +90,8 @@ def test_a_run_has_the_same_outcome_watched_or_not_and_its_recording_shows_the_e
     assert headers[0].startswith("#### Episode 1 of 3 · begins")
     assert headers[-2].startswith("#### Episode 3 of 3 · begins, exploring · ")
     assert f" apples, random play {random:.3g} · " in headers[-2]
-    assert f"#### Finished, 3 episodes · trained {trained:.3g} apples, random play {random:.3g}" in headers[-1]
+    ended = f"#### Finished, 3 episodes · trained {trained:.3g} apples, random play {random:.3g} · "
+    assert headers[-1].startswith(ended)
     events = [text[0] for text in column(watched / "run.rrd", "log", "TextLog:text")[1]]
     assert any(event.startswith(f"random play {random:.1f} ± ") for event in events)
     assert any(event.startswith(f"finished: trained {trained:.1f}") for event in events)
