@@ -16,6 +16,7 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+import rerun as rr
 import torch
 from filelock import FileLock
 from tensordict import TensorDict
@@ -120,8 +121,9 @@ def test_entries_are_read_and_written_past_the_checks_of_tensordict():
     views = compat.Views(moment)
     assert views["a"] is views["a"]
     assert torch.equal(torch.from_numpy(views["a"]), tensor)
-    with pytest.raises(KeyError):
-        compat.entry(moment, "b")
+    for read in (views.__getitem__, lambda name: compat.entry(moment, name)):
+        with pytest.raises(KeyError):
+            read("b")
     compat.put(moment, "b", other)
     assert moment["b"] is other
     compat.put(moment, "b", tensor)
@@ -484,6 +486,7 @@ LIBRARY_PARTS = (
     r"\b(?:torchrl|tensordict|numba|rerun)(?:\.\w+)*\._\w+",
     r"_debug_get_cache_entry_list",
     r"skip_all_guards_unsafe",
+    r"_log_to_stream",
     r"\"_nrt\"",
 )
 
@@ -599,10 +602,37 @@ def test_vector_instructions_are_looked_for_once_for_all_processes(tmp_path, mon
     assert len(searches) == 3
 
 
+def test_the_layout_of_a_stored_recording_is_taken_over_by_another_one(tmp_path, monkeypatch):
+    import rerun.blueprint as rrb
+    from rerun.chunk import RrdReader
+
+    def stored(name, layout):
+        """The chunks of a recording's layout, and the values of its entities."""
+        recording = rr.RecordingStream("cprl", recording_id=name)
+        recording.save(tmp_path / name, default_blueprint=layout)
+        recording.disconnect()
+        reader = RrdReader(tmp_path / name)
+        (store,) = reader.blueprints()
+        batches = {chunk.entity_path: chunk.to_record_batch() for chunk in reader.stream(store=store)}
+        values = {
+            (entity, part): batch[part].to_pylist()
+            for entity, batch in batches.items()
+            for part in batch.schema.names
+            if ":" in part
+        }
+        return reader.stream(store=store), values
+
+    view = rrb.TimeSeriesView(name="Harvest", origin="/harvest")
+    chunks, first = stored("first", rrb.Blueprint(view, collapse_panels=True))
+    assert [["Harvest"]] in first.values()
+    assert stored("second", compat.StoredLayout(chunks))[1] == first
+    monkeypatch.delattr(rrb.Blueprint, "_log_to_stream")
+    with pytest.raises(ImportError, match=r"rerun-sdk \S+ has no Blueprint\._log_to_stream, on which cprl"):
+        compat.StoredLayout(chunks)
+
+
 def test_what_ends_a_recording_waits_for_its_viewer_and_is_in_a_private_part():
     """`RecordingStream.__del__` flushes; `keep_native` keeps `inner` alive in its place."""
-    import rerun as rr
-
     recording = rr.RecordingStream("cprl", recording_id="kept")
     native = recording.inner
     before = sys.getrefcount(native)

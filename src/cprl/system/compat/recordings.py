@@ -5,7 +5,7 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Self
 
-from cprl.system.libraries import relying_on
+from cprl.system.libraries import relying_on, require
 
 
 def end_recordings() -> None:
@@ -33,6 +33,7 @@ class StoredLayout:
     """
 
     def __init__(self, chunks: Any) -> None:
+        require("rerun-sdk", import_module("rerun.blueprint").Blueprint, "_log_to_stream")
         self._chunks = chunks
 
     def to_blueprint(self) -> Self:
