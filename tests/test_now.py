@@ -26,6 +26,11 @@ def test_a_tragedy_is_seen_from_its_numbers_before_it_is_over():
     expected = [("begins", 9), ("steady", 4), ("rising", 56), ("steady", 14), ("falling", 27)]
     assert labels(TRAGEDY) == expected
     assert labels([*TRAGEDY, *[189] * 20])[-1] == ("below random play", 18)
+    now = Now()
+    for apples in TRAGEDY:
+        now.add(apples)
+    assert now.peak == pytest.approx(629.0, rel=0.01)
+    assert now.mean == pytest.approx(np.mean(TRAGEDY[-11:]))
 
 
 @pytest.mark.parametrize(

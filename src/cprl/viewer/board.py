@@ -262,9 +262,9 @@ def _mark(mark: str) -> list[Floats]:
 
 
 RIM_CELLS: Final = 1
+"""The width of the wall shown around the board, in cells."""
 BAR_CELLS: Final = 0.3
 """Half the height of the bar of apples below the board."""
-"""The width of the wall shown around the board, in cells."""
 BEAM_OPACITY: Final = 0.7
 IMAGES: Final = ("board", "beams")
 """The parts of a board that are images of classes; all others are lines and boxes."""
