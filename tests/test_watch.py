@@ -18,7 +18,7 @@ from subprocess import PIPE
 from types import SimpleNamespace
 from urllib.error import HTTPError
 from urllib.parse import urlsplit
-from urllib.request import urlopen
+from urllib.request import ProxyHandler, build_opener
 
 import numpy as np
 import psutil
@@ -460,7 +460,10 @@ def ports_of(process):
     return {tuple(each.laddr) for each in connections if each.status == psutil.CONN_LISTEN}
 
 
-def test_a_page_with_a_short_address_is_on_this_machine_alone_until_it_is_closed():
+def test_a_page_with_a_short_address_is_on_this_machine_alone_until_it_is_closed(monkeypatch):
+    monkeypatch.setattr("urllib.request._opener", None)  # it knows the proxies of before
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
+    urlopen = build_opener(ProxyHandler({})).open
     before = ports_of(psutil.Process())
     page, source = WebViewer("rerun+http://127.0.0.1:9/proxy"), "rerun%2Bhttp%3A%2F%2F127.0.0.1%3A9%2Fproxy"
     try:
@@ -531,6 +534,33 @@ def test_without_a_display_or_on_request_a_run_is_served_until_it_is_interrupted
         for reader in (served, whole)
     ]
     assert layouts[0] == layouts[1], "views have names of their own"
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+@pytest.mark.parametrize("beside", [True, False])
+def test_a_recording_that_is_cut_is_served_up_to_there(beside, tmp_path):
+    with RerunLogger("run", tmp_path, curves=SCENE) as logger:
+        logger.log_frames(frames(3)[0])
+    whole, cut = (tmp_path / name for name in ("run.rrd", "run-2.rrd"))
+    cut.write_bytes(whole.read_bytes()[:-2000])
+
+    def boards():
+        with suppress(RuntimeError):  # it is being written
+            reader = RrdReader(tmp_path / "got.rrd")
+            chunks = [chunk for store in reader.recordings() for chunk in reader.stream(store=store)]
+            return [chunk for chunk in chunks if chunk.entity_path == "/world/board" and not chunk.is_static]
+
+    with pytest.raises(RuntimeError, match="exceeds file size"):
+        RrdReader(cut).recordings()
+    with streams.served([whole, cut] if beside else [cut]) as served:
+        client = connected(served.addresses["native"].split()[-1], tmp_path)
+        try:
+            wait(boards)
+        finally:
+            client.terminate()
+            client.wait()
+    with pytest.raises(ValueError, match="no recording can be read"), streams.served([]):
+        pass
 
 
 def test_a_run_without_a_recording_is_refused(tmp_path):

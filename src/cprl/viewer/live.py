@@ -257,24 +257,31 @@ def served(files: Sequence[Path]) -> Iterator[WebViewer]:
     while they load the history they would show old ones as the present.
     """
     exit_in_time()
-    readers: dict[Path, RrdReader] = {}
+    recordings, readers = [], []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the recording of a run that was killed has no footer
         for path in files:
-            with suppress(RuntimeError):  # it is none, or cut
-                readers[path] = RrdReader(path)
-        if not readers:
+            with suppress(RuntimeError):
+                reader = RrdReader(path)  # fails where it is none
+                recordings.append(path)
+                reader.recordings()  # fails where it is cut; viewers get what is before that
+                readers.append(reader)
+        if not recordings:
             raise ValueError(f"no recording can be read of {', '.join(map(str, files))}")
-        reader, header = _newest_header(list(readers.values()))
-        store = reader.recordings()[0]
-        layout = next((StoredLayout(reader.stream(store=stored)) for stored in reader.blueprints()), None)
-    recording = _recording(store.application_id, store.recording_id, send_properties=False)
+        # Without one that is whole: a name of its own leaves viewers of "cprl" the layout in the file.
+        application, recording_id, header, layout = "cut", "cut", None, None
+        if readers:
+            reader, header = _newest_header(readers)
+            store = reader.recordings()[0]
+            application, recording_id = store.application_id, store.recording_id
+            layout = next((StoredLayout(reader.stream(store=stored)) for stored in reader.blueprints()), None)
+    recording = _recording(application, recording_id, send_properties=False)
     page = WebViewer(_serve(recording, FILES_MEMORY, layout))
     stream = LiveStream("recording", recording, period_s=0.0)
     try:
         if header is not None:
             stream.do(partial(send_text, name="header", text=header))
-        for path in readers:
+        for path in recordings:
             stream.do(methodcaller("log_file_from_path", path))
         yield page
     finally:

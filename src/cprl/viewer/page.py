@@ -13,7 +13,7 @@ from pathlib import Path
 from threading import Event, Thread, current_thread, main_thread
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 from urllib.parse import quote
-from urllib.request import urlopen
+from urllib.request import ProxyHandler, build_opener
 
 from cprl.system.output import console, printed
 from cprl.system.process import at_signals
@@ -30,6 +30,8 @@ _THIS_MACHINE: Final = (
     f"default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' http://{LOCALHOST}:*"
 )
 """Rerun's page would ask other machines for fonts, and tell one of its use."""
+_OPEN: Final = build_opener(ProxyHandler({})).open
+"""Past the proxies of the environment, which do not know the ports of this machine."""
 _UNTIL_THE_PIPE_CLOSES: Final = '"$@" & read -r _; kill $!'
 """A shell ends Rerun's server when this process ends, even when it is killed."""
 
@@ -91,7 +93,7 @@ class _Page(BaseHTTPRequestHandler):
             self.end_headers()
             return
         try:
-            with urlopen(self._origin + self.path) as answer:
+            with _OPEN(self._origin + self.path) as answer:
                 content = answer.read()
         except OSError as error:
             self.send_error(getattr(error, "code", HTTPStatus.SERVICE_UNAVAILABLE))
