@@ -459,14 +459,14 @@ WRITTEN = [
         ],
         [
             ["bites", "2.50 [2.50, 2.50]", "2.50 [2.50, 2.50]"],
-            ["sustainable", "0.000 [0.000, 0.000]", "0.000 [0.000, 0.000]"],
-            ["bites", "sustainable", "1", "3.00 [3.00, 3.00]", "0.000 [0.000, 0.000]", "3.00 [3.00, 3.00]"],
+            ["sustainable", "0 [0, 0]", "0 [0, 0]"],
+            ["bites", "sustainable", "1", "3.00 [3.00, 3.00]", "0 [0, 0]", "3.00 [3.00, 3.00]"],
             ["sustainable", "0.50 [0.50, 0.50]", "undefined in all 2"],  # equality
             # In place of a sustainable agent, which gets nothing, a greedy one gets 2.5; the other as before.
             # Replicas are alike, so that of four differences those have a star that are not 0.
             ["bites", "", "2.50 [2.50, 2.50] *"],
             ["sustainable", "-2.50 [-2.50, -2.50] *", ""],
-            ["bites", "", "0.000 [0.000, 0.000]"],
+            ["bites", "", "0 [0, 0]"],
         ],
         (1 + 2 + 2 + 1) * 2 * 2,  # visits, replicas, agents
         True,
@@ -497,7 +497,7 @@ WRITTEN = [
         ],
         # What is not 0 differs for certain; all together get 3 or 2, as one of them plays greedy.
         [
-            ["minority_among_greedy", "0.000 [0.000, 0.000]"],
+            ["minority_among_greedy", "0 [0, 0]"],
             ["minority_among_greedy", "2.50 [2.50, 2.50]", "0.50 [0.50, 0.50]"],
         ],
         3 * 2 * 2 * 2,  # who is focal, placements, replicas, agents
