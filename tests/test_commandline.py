@@ -21,9 +21,9 @@ from cprl import Experiment, presets
 from cprl.algorithms import DQN, PPO, QMIX, DQNSettings, RolloutSettings
 from cprl.commands import main as cli
 from cprl.commands.recipe import RunOptions, parse, recipe_main, refuse_mistyped_flags
-from cprl.envs.preferences import Exchange
 from cprl.institutions import Boundaries, GraduatedSanctions, Quota
 from cprl.networks import MLP
+from cprl.objectives.preferences import Exchange
 from cprl.population import Learning, Scripted, Team
 from cprl.runs.recipe import resume_command, start_run
 from cprl.system import shipped

@@ -26,8 +26,8 @@ from test_teams import TEAMS
 import cprl
 from cprl import CommonsEnv, Experiment
 from cprl.algorithms import DQN, Tabular, TabularSettings
-from cprl.envs.preferences import InequityAversion
 from cprl.evaluation import crossplay, evaluate_run
+from cprl.objectives.preferences import InequityAversion
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in
 from cprl.training import train

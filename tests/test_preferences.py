@@ -15,7 +15,8 @@ from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.envs import make_env, parallel_env
-from cprl.envs.preferences import (
+from cprl.envs.state import env_state, load_env_state, load_transforms_state, transforms_state
+from cprl.objectives.preferences import (
     Exchange,
     InequityAversion,
     PreferenceTransform,
@@ -23,7 +24,6 @@ from cprl.envs.preferences import (
     SocialValueOrientation,
     WantedRewards,
 )
-from cprl.envs.state import env_state, load_env_state, load_transforms_state, transforms_state
 from cprl.training.training import StepCollector
 
 AVERSE = InequityAversion(alpha=5, beta=0.05, smoothing=0.9)

@@ -15,8 +15,8 @@ from cprl import CommonsEnv, Experiment
 from cprl.algorithms import DQN, IPPO, MADDPG, MAPPO, PPO, QMIX, SAC, VDN, Tabular, TabularSettings
 from cprl.commands import main as cli
 from cprl.commands.recipe import parse
-from cprl.envs.preferences import Exchange
 from cprl.measuring.evaluate import evaluate
+from cprl.objectives.preferences import Exchange
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.checkpoints import checkpoints_in
 from cprl.runs.weights import load_weights, save_weights

@@ -29,13 +29,13 @@ from cprl.algorithms import (
 )
 from cprl.commands.recipe import parse
 from cprl.envs.matrix import MatrixGame
-from cprl.envs.preferences import SocialValueOrientation
 from cprl.envs.taking import TakingGame
 from cprl.experiment import changes
 from cprl.institutions import Tax
 from cprl.learners.base import LearningAgents
 from cprl.learners.settings import Exploring
 from cprl.networks import GRU, LSTM, Conv
+from cprl.objectives.preferences import SocialValueOrientation
 from cprl.policies.decisions import Bandit
 from cprl.policies.rng import LaneRng
 from cprl.population import Frozen, Learning, Scripted, Team

@@ -15,9 +15,9 @@ from cprl import CommonsEnv, Custom, Experiment, Game, Rules, algorithms, maps
 from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
 from cprl.commands.recipe import parse
 from cprl.envs import spaces_of
-from cprl.envs.preferences import Exchange, InequityAversion, SocialValueOrientation, WantedRewards
 from cprl.institutions import Tax
 from cprl.measuring.episodes import EpisodeTracker
+from cprl.objectives.preferences import Exchange, InequityAversion, SocialValueOrientation, WantedRewards
 from cprl.population import Learning, Scripted, Team
 from cprl.runs.episodes import read_episodes
 from cprl.training import Training, train

@@ -8,9 +8,9 @@ from tiny_study import GAME, LEARNING, TINY
 
 import cprl
 from cprl import algorithms, institutions, population, theory
-from cprl.envs import preferences
 from cprl.envs.matrix import prisoners_dilemma
 from cprl.envs.taking import TakingGame
+from cprl.objectives import preferences
 from cprl.values import KINDS
 
 REQUIRED = {

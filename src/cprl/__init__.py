@@ -9,7 +9,7 @@ A package imports only from those above it:
     theory       games with a known answer: herders, appropriation, what apples can bear; numpy alone
     envs         TorchRL, PettingZoo, Gymnasium; make_env, where environments are put together
     networks     from observations to numbers
-    objectives   losses that TorchRL lacks: log-cosh, MADDPG, PR2, LOLA
+    objectives   what agents want, and losses that TorchRL lacks: log-cosh, MADDPG, PR2, LOLA
     policies     from observations to actions: learned, tabular and scripted agents
     learners     replay and rollouts, updates of many agents at once
     algorithms   what agents learn by: DQN, PPO, QMIX and so on, frozen values

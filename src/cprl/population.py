@@ -11,8 +11,8 @@ from posixpath import normpath
 from typing import Annotated, Any, Final, TypeAlias
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
-from cprl.envs.preferences import Preference
 from cprl.learners.settings import Exploring
+from cprl.objectives.preferences import Preference
 from cprl.policies.decisions import Bandit
 from cprl.policies.scripted import ScriptedPolicy
 from cprl.values import AgentIndices, Custom, Natural, Value, Where, checked
@@ -68,7 +68,7 @@ class Learning(Value):
     Args:
         algorithm: e.g. `cprl.algorithms.DQN(settings=...)`.
         reward: what it wants: "individual", its own reward; "team", the sum of the rewards of all agents of
-            the game; or a value of `cprl.envs.preferences`, e.g. `Exchange(0.5)`.
+            the game; or a value of `cprl.objectives.preferences`, e.g. `Exchange(0.5)`.
         start_from: the agent whose weights its acting network, and the target of it, start with; None for
             new ones. The optimiser, critics, exploration and decisions begin anew.
         decisions: how it learns what it decides, in a game with votes or elections; None for `Bandit()`.

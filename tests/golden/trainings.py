@@ -42,9 +42,9 @@ def experiments() -> dict[str, dict[str, object]]:
         Tabular,
         TabularSettings,
     )
-    from cprl.envs.preferences import Exchange, InequityAversion, SocialValueOrientation
     from cprl.institutions import Monitoring, Quota, Sanctioner, Tax, Vote
     from cprl.networks import GRU, LSTM, Conv
+    from cprl.objectives.preferences import Exchange, InequityAversion, SocialValueOrientation
     from cprl.population import Learning, Scripted, Team
 
     def board(variant: str) -> Game:

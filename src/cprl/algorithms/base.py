@@ -14,7 +14,6 @@ from torchrl.modules import ProbabilisticActor, QValueActor
 from torchrl.objectives import LossModule, ValueEstimators
 
 from cprl.commons.spaces import Spaces
-from cprl.envs.preferences import Preference, named
 from cprl.learners.base import Learner, LearningAgents
 from cprl.learners.engine import Batching
 from cprl.learners.lanes import Method
@@ -26,6 +25,7 @@ from cprl.networks.agent import AgentNetworks
 from cprl.networks.mlp import MLP
 from cprl.networks.recurrent import Recurrent, state_shape_of
 from cprl.networks.specification import Network, new_network
+from cprl.objectives.preferences import Preference, named
 from cprl.objectives.td import TORCHRL_DISTANCES
 from cprl.system.compat.losses import LaneCategorical
 from cprl.values import Custom, Range, Value, Where, checked

@@ -9,8 +9,8 @@ from cprl.algorithms import Tabular
 from cprl.algorithms.base import TeamAlgorithm, TrainingEngine
 from cprl.commons.game import Game
 from cprl.envs.make_env import PlayableGame, game_of, stored_game
-from cprl.envs.preferences import check_preference
 from cprl.measuring.episodes import check_own_metrics
+from cprl.objectives.preferences import check_preference
 from cprl.population import AgentSpec, Frozen, Learning, Team, refuse_undecided, specs_by_agent, stored_of
 from cprl.runs.files import RECIPE_FORMAT, written_by_another
 from cprl.runs.recipe import recipe_config, with_runs_moved

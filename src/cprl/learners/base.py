@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from cprl import keys
 from cprl.commons.spaces import Spaces
-from cprl.envs.preferences import Preference, WantedRewards, check_preference
 from cprl.keys import Turn
+from cprl.objectives.preferences import Preference, WantedRewards, check_preference
 from cprl.policies.rng import lane_names, lane_seeds
 from cprl.system.memory import check_memory
 from cprl.values import Natural, Range, Value
@@ -40,7 +40,7 @@ class LearningAgents(Value, stored=False):
     first_replica: int = 0
     """The index of the first replica, so that replica r can be trained alone."""
     reward_kind: Preference = "individual"
-    """What they want, see `cprl.envs.preferences`."""
+    """What they want, see `cprl.objectives.preferences`."""
     start_from: StartFrom = field(default_factory=dict)
     """The weights with which acting networks, and their targets, start, by the lane's name; the others, such
     as critics, are new."""

@@ -69,8 +69,8 @@ class Episode:
     tagged_by: NDArray[np.int64] | None = None
     """[N, N], how often the agent of the row was tagged by the agent of the column."""
     wanted_return: NDArray[np.float64] | None = None
-    """[N], the sum of the rewards that each agent wanted in a training, `cprl.envs.preferences`; NaN for
-    agents that do not learn. None outside of a training."""
+    """[N], the sum of the rewards that each agent wanted in a training, see `cprl.objectives.preferences`;
+    NaN for agents that do not learn. None outside of a training."""
     stock_left: int | None = None
     """Apples on the board at the end."""
     depletion_step: int | None = None

@@ -15,7 +15,6 @@ from cprl.algorithms.base import Algorithm, TeamAlgorithm
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.envs.make_env import make_env, spaces_of
-from cprl.envs.preferences import named
 from cprl.envs.state import load_transforms_state
 from cprl.envs.unwrap import commons_of
 from cprl.experiment import Experiment
@@ -24,6 +23,7 @@ from cprl.networks.agent import acting_part
 from cprl.networks.finite import all_finite
 from cprl.networks.recurrent import state_cells_of, state_shape_of
 from cprl.networks.stacked import stack_lanes
+from cprl.objectives.preferences import named
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import (
     Bandit,
