@@ -338,6 +338,7 @@ def test_a_table_that_is_no_study_is_refused():
         ({"factors": None}, "NoneType"),
         ({"factors": [["a", {"distribution": "Normal", "low": 0, "high": 1}]]}, "Normal"),
         ({"experiment": {"name": "x"}}, "lacks game, agents, episodes"),
+        ({"pairing": False}, "pairing"),
         ({"format": 3}, "format"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -23,7 +23,7 @@ REFERENCE: Final = {
     "institutions": "rules that people make",
     "theory": "games with a known answer",
     "networks": "from observations to numbers",
-    "objectives": "losses that TorchRL lacks",
+    "objectives": "what agents want, and losses that TorchRL lacks",
     "policies": "agents that follow a rule",
     "algorithms": "what agents learn by",
     "learners": "the hyper-parameters",
@@ -40,10 +40,11 @@ REFERENCE: Final = {
 
 _MODULES: Final = {
     "commons": ("maps", "published", "observation", "rules", "game", "spaces", "state"),
-    "envs": ("make_env", "preferences"),
+    "envs": ("make_env",),
     "experiment": ("presets",),
     "learners": ("settings",),
     "measuring": ("social", "phases", "statistics"),
+    "objectives": ("preferences",),
     "policies": ("scripted", "assignment", "decisions"),
     "training": ("training",),
     "values": ("custom",),

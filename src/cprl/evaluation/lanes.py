@@ -129,8 +129,8 @@ class Fresh(Value, stored=False):
     def play(self, where: Place, agents: Sequence[Agent], *, among: Collection[LoadedRun] = ()) -> Played:
         """The episodes by replica, with the metrics of the user's own that all runs among which they are
         compared have; by default those of where they play."""
-        first, *others = among or [where]
-        metrics = [metric for metric in first.metrics if all(metric in run.metrics for run in others)]
+        compared: Sequence[Place] = [*among] or [where]
+        metrics = [metric for metric in compared[0].metrics if all(metric in run.metrics for run in compared)]
         played: Played = {}
         for group, env in self.worlds(where):
             policies = self.policies(where, agents, group)

@@ -233,9 +233,9 @@ def write_circumstances(run: Path) -> list[str]:
     recipe = read_recipe(run)
     now = _circumstances(recipe)
     before = {name: recipe[name] for name in now if recipe.get(name) is not None}
-    last = (recipe.get("resumed") or [before])[-1]
+    last = (recipe.get("resumed") or [recipe])[-1]
     changed = [line for name in before for line in differences(before[name], now[name], name)]
-    if any(last[name] != now[name] for name in last if name in now):
+    if any(last.get(name) != now[name] for name in now):
         recipe |= {**_code_text(recipe), "resumed": [*recipe.get("resumed", []), now]}
         write_json(run / RECIPE_FILE, recipe)
     return changed

@@ -238,6 +238,8 @@ class Study(Value, stored=False):
         refuse_newer("the study", table, STUDY_FORMAT)
         if table.get("format") != STUDY_FORMAT:
             raise refusal("the study's format", table.get("format"), str(STUDY_FORMAT))
+        if table.get("pairing") is False:
+            raise refusal("the study's pairing", False, "True")
         trust(*allow)
         try:
             values = {"experiment": table["experiment"]}
