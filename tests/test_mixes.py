@@ -284,7 +284,7 @@ def test_certainty_is_the_share_of_resampled_replicas(made):
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("runs", [3, 4])
+@pytest.mark.parametrize("runs", [2, 3, 4])
 def test_analyses_are_drawn_for_any_number_of_runs(runs, made, tmp_path):
     pytest.importorskip("open_spiel")
     pytest.importorskip("nashpy")
@@ -292,7 +292,9 @@ def test_analyses_are_drawn_for_any_number_of_runs(runs, made, tmp_path):
     game = with_payoffs(made, [f"run {own}" for own in range(runs)], rng.random((3, runs, runs)))
     found = analyse(game, resamples=3)
     drawn = draw_egta(found, tmp_path / "new" / "game.png")
-    assert imread(drawn).shape[1] > 1000
+    height, width, _ = imread(drawn).shape
+    assert width > 1000
+    assert (height > 0.6 * width) == (runs < 4), "two and three have a phase portrait"
     with pytest.raises(FileExistsError):
         draw_egta(found, drawn)
 

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from cprl.evaluation.cross_play import CrossPlay, Runs, draw_matrix, matrix_height, matrix_table, named_runs
 from cprl.evaluation.evaluate import SEED, heading, table_of
@@ -42,6 +43,7 @@ from cprl.theory.solutions import (
     Equilibrium,
     alpha_rank,
     equilibria,
+    replicator,
     replicator_ends,
 )
 from cprl.training.agents import LoadedRun
@@ -325,9 +327,16 @@ def mixture_text(mixture: Values, names: Sequence[str]) -> str:
     return played[0][0] if len(played) == 1 else ", ".join(f"{name} {share:.2f}" for name, share in played)
 
 
+_POINTS: Final = 41
+_GRID: Final = 14
+_CORNERS: Final = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, 3**0.5 / 2]])
+_DYNAMICS_HIGH: Final = 22.0
+
+
 def draw_egta(analysis: Analysis, path: Path | str, *, width: style.Width = "page") -> Path:
     """Draws what one agent gains that plays as another run than all others, with a star where it is not 0 by
-    Holm's method; and each run's share by alpha-rank, with the most frequent end of replicator dynamics."""
+    Holm's method; each run's share by alpha-rank, with the most frequent end of replicator dynamics; and the
+    phase portrait of these dynamics where there are two or three runs."""
     game, names = analysis.game, analysis.game.names
     usual = np.diagonal(game.pairs, axis1=1, axis2=2)
     gains = {
@@ -339,7 +348,12 @@ def draw_egta(analysis: Analysis, path: Path | str, *, width: style.Width = "pag
     with style.drawing(path, width=width, colours=style.SHADES, is_new=True) as sheet:
         columns = sheet.fitting(2, 24)
         ratios: Any = {"width_ratios": (1.35, 1)} if columns == 2 else {}
-        matrix, rank = sheet.panels(2, columns=columns, high=matrix_height(names), **ratios)
+        draw_dynamics = {2: _draw_line, 3: _draw_simplex}.get(len(names))
+        heights = [matrix_height(names)] * (3 - columns) + [_DYNAMICS_HIGH] * bool(draw_dynamics)
+        panels = sheet.panels(2 + bool(draw_dynamics), columns=columns, high=heights, **ratios)
+        matrix, rank = panels[:2]
+        if draw_dynamics:
+            draw_dynamics(panels[2], analysis)
         differences = {pair: gain.value for pair, gain in gains.items()}
         draw_matrix(sheet, matrix, names, differences, texts, share=1.15 / columns)
         matrix.set(xlabel="run of all others", ylabel="run of an agent")
@@ -363,3 +377,59 @@ def draw_egta(analysis: Analysis, path: Path | str, *, width: style.Width = "pag
             f"intervals of shares: 95 % of {analysis.resamples} resamples of the replicas."
         )
     return Path(path)
+
+
+def _draw_line(axes: Axes, analysis: Analysis) -> None:
+    """What the first of two runs gains over the second, by its share, with the points of rest."""
+    shares, (first, second) = np.linspace(0, 1, _POINTS), analysis.game.names
+    tables = [analysis.game.payoff_table([place]) for place in range(len(analysis.game.payoffs))]
+    curves = [[np.subtract(*table.against([share, 1 - share])) for share in shares] for table in tables]
+    means = [estimate(gains) for gains in np.transpose(curves)]
+    middle, low, high = np.array([(mean.value, mean.low, mean.high) for mean in means]).T
+    axes.fill_between(shares, low, high, color=style.REPLICA, alpha=0.35, lw=0)
+    axes.plot(shares, middle, color=style.MEAN)
+    axes.axhline(0, color=style.RAW, lw=1, zorder=1)
+    for at, is_stable in _rests(shares, middle):
+        face = style.MARK if is_stable else "white"
+        axes.plot(at, 0, "o", markersize=8, color=style.MARK, markerfacecolor=face, clip_on=False, zorder=4)
+    for start in (0.12, 0.37, 0.62, 0.87):
+        ahead = 0.03 if np.interp(start, shares, middle) > 0 else -0.03
+        axes.annotate(
+            "", (start + ahead, 0), (start - ahead, 0), arrowprops={"arrowstyle": "->", "color": style.MARK}
+        )
+    axes.set(
+        xlim=(-0.02, 1.02), xlabel=f"share that plays as {first}", ylabel=f"return as {first} less {second}"
+    )
+    axes.set_title("replicator dynamics, filled: attracts")
+
+
+def _rests(shares: Values, gains: Values) -> list[tuple[float, bool]]:
+    """Where nothing changes, and whether shares nearby move there."""
+    rests = [(0.0, bool(gains[0] < 0)), (1.0, bool(gains[-1] > 0))]
+    for place in np.flatnonzero(gains[:-1] * gains[1:] < 0):
+        low, high = gains[place], gains[place + 1]
+        at = shares[place] + (shares[place + 1] - shares[place]) * low / (low - high)
+        rests.append((float(at), bool(low > 0)))
+    return rests
+
+
+def _draw_simplex(axes: Axes, analysis: Analysis) -> None:
+    """The direction in which the shares of three runs move, where they end, and the corners by name."""
+    axes.plot(*np.vstack([_CORNERS, _CORNERS[:1]]).T, color=style.RAW, lw=1)
+    mixtures = (compositions(_GRID - 3, 3) + 1) / _GRID
+    moves = np.array([replicator(analysis.table.normalised, mixture) for mixture in mixtures]) @ _CORNERS
+    lengths = np.linalg.norm(moves, axis=1, keepdims=True)
+    arrows = np.divide(moves, lengths, out=np.zeros_like(moves), where=lengths > 0)
+    axes.quiver(
+        *(mixtures @ _CORNERS).T, *arrows.T, lengths[:, 0], cmap="viridis", scale=24, width=0.005, pivot="mid"
+    )
+    for mixture, share in zip(analysis.ends.mixtures, analysis.ends.shares, strict=True):
+        at = mixture @ _CORNERS
+        axes.plot(*at, "o", color=style.MARK, markersize=9, zorder=4)
+        axes.annotate(f"{share:.0%}", at, (8, 8), textcoords="offset points")
+    for corner, name in zip(_CORNERS, analysis.game.names, strict=True):
+        at, side = ((0, 3), "bottom") if corner[1] > 0 else ((0, -3), "top")
+        axes.annotate(name, corner, at, textcoords="offset points", ha="center", va=side)
+    axes.set(xlim=(-0.08, 1.08), ylim=(-0.1, 1.06), aspect="equal")
+    axes.set_axis_off()
+    axes.set_title("replicator dynamics, bright: fast")
