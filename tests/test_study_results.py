@@ -393,7 +393,7 @@ def test_differences_are_bold_that_differ_among_all_of_their_table(tmp_path):
     metrics = "collective_return", "equality", "peace"
     several = cells([compare(table, metric) for metric in metrics], "differences")
     assert [row[2] for row in several.rows] == ["+5.00 [+2.52, +7.48]", "**+41.0 [+38.5, +43.5]**"]
-    assert several.rows[0][3] == "+0.000 [+0.000, +0.000]"
+    assert several.rows[0][3] == "+0 [+0, +0]"
     assert "for 6 comparisons" in several.note
     assert markdown(several)[-2:] == [several.note, ""]
 
