@@ -544,7 +544,6 @@ def test_the_table_of_an_evaluation_has_every_metric_and_its_file_every_episode(
     alike, tmp_path, monkeypatch, capsys
 ):
     found, out = cprl.evaluate_run(alike, episodes=1), tmp_path / "episodes.parquet"
-    monkeypatch.setenv("COLUMNS", "200")  # as others would have it, intervals take a line of their own
     rows = rows_of(command(monkeypatch, capsys, "evaluate", alike, "--episodes", 1, "--out", out))
     assert pq.read_table(out).equals(found.table())
     for name, random in found.measures("random").items():

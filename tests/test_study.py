@@ -124,15 +124,17 @@ def test_runs_of_one_experiment_are_pooled_where_it_is_asked_for(run, other, tmp
     ours, theirs = (as_curves(read_episodes(each))["collective_return"].mean(1) for each in (run, other))
     assert len(ours) == 2
     assert len(theirs) == 3
-    assert f"| four+other | 4 | 184.07 | {estimate(np.concatenate([ours, theirs]))} |" in text
-    assert f"| longer | 4 | 184.07 | {estimate(ours)} |" in text, "of another experiment"
+    assert f"| four+other | 4 | 184.07 | {estimate(np.concatenate([ours, theirs])):.4g} |" in text
+    assert f"| longer | 4 | 184.07 | {estimate(ours):.4g} |" in text, "of another experiment"
     assert "as runs of one experiment: four and other as four+other.\n" in text
     before, after = text.split("## Share of the possible")
     assert "| four | two_against_random" in before, "each run has its training and its command"
     assert "| four |" not in after
     assert (tmp_path / "pooled" / "figures" / "four+other_return_1.png").exists()
     apart = write_report([run, other], tmp_path / "apart").read_text()
-    assert f"| four | 4 | 184.07 | {estimate(ours)} |" in apart, "nothing is pooled unless it is asked for"
+    assert f"| four | 4 | 184.07 | {estimate(ours):.4g} |" in apart, (
+        "nothing is pooled unless it is asked for"
+    )
     none = write_report([run, longer], tmp_path / "none", pool=True).read_text()
     assert "Nothing is pooled: no two runs have experiments equal but for name, seed" in none
 

@@ -9,6 +9,7 @@ from typing import Any, Final, Literal
 import numpy as np
 import torch
 
+from cprl.envs.make_env import stored_game
 from cprl.envs.unwrap import agent_names
 from cprl.evaluation.lanes import Fresh, Part, Played, Results, Values, agents_of, fresh_of, scripted
 from cprl.measuring.metrics import bounds, left_out, with_unit
@@ -46,7 +47,8 @@ def differing(state: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
 
 def refuse_unlike(names: str, game: Any, other: Any, what: str = "") -> None:
     """Raises a ValueError that says where two games differ."""
-    lines = differences(to_config(game), to_config(other), what or type(game).__name__)
+    before, now = (to_config(stored_game(value)) for value in (game, other))
+    lines = differences(before, now, what or type(game).__name__)
     if lines:
         raise ValueError(
             f"{names} have different games: {'; '.join(lines[:MOST_DIFFERENCES])}; allowed: the same game"
