@@ -78,8 +78,6 @@ def told(episodes):
 
 def command(monkeypatch, capsys, *words):
     monkeypatch.setattr("sys.argv", ["cprl", *map(str, words)])
-    monkeypatch.setenv(
-        "COLUMNS", "200"
-    )  # workers of pytest have 80, which wraps
+    monkeypatch.setenv("COLUMNS", "200")  # workers of pytest have 80, which wraps
     cli.main()
     return capsys.readouterr().out
