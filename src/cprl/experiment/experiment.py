@@ -52,10 +52,14 @@ class Experiment(Value, stored=False, called="experiment"):
     """What is played."""
     agents: tuple[AgentSpec, ...]
     """How each agent is specified; see `cprl.population`."""
-    episodes: Positive
-    """Episodes that each replica trains."""
+    episodes: Positive | None = None
+    """Episodes that each replica trains, those of all its worlds together; or say `steps`."""
+    steps: Positive | None = None
+    """Steps that each replica trains, a turn of W worlds being W; or say `episodes`."""
     replicas: Annotated[int, Range(1, 2**20)] = 1
     """Independent repetitions R of the whole training, side by side."""
+    worlds: Annotated[int, Range(1, 2**20)] = 1
+    """Worlds W in which each replica plays at once, and from all of which its agents learn."""
     seed: Annotated[int, Range(0, MOST_SEED)] = 0
     """Of chance, weights, exploration and replay."""
     evaluation_episodes: Annotated[int, Range(1, 2**20)] = 20
@@ -155,6 +159,15 @@ _MOST_WORLDS: Final = 2**22
 
 
 def _check_numbers(experiment: Experiment) -> None:
+    if (experiment.episodes is None) == (experiment.steps is None):
+        raise ValueError(
+            f"experiment.episodes is {experiment.episodes} and steps {experiment.steps}; allowed: one of them"
+        )
+    if experiment.replicas * experiment.worlds > _MOST_WORLDS:
+        raise ValueError(
+            f"experiment.worlds is {experiment.worlds}; allowed for {experiment.replicas} replicas: up to "
+            f"{_MOST_WORLDS // experiment.replicas}, because all are played at once"
+        )
     worlds = experiment.replicas * experiment.evaluation_episodes
     if worlds > _MOST_WORLDS:
         raise ValueError(

@@ -35,6 +35,8 @@ class LearningAgents(Value, stored=False):
     """The indices of the agents, each once."""
     replicas: Annotated[int, Range(1, 2**20)]
     """The number of replicas R."""
+    worlds: Annotated[int, Range(1, 2**20)] = 1
+    """The worlds W in which each replica plays; world b of a batch belongs to replica b // W."""
     seed: int = 0
     """The seed of the run."""
     first_replica: int = 0

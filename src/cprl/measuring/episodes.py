@@ -44,9 +44,11 @@ class Episode:
     world: int
     """The index of the world in its batch."""
     episode: int
-    """The index of the episode in its world, counted from 0."""
+    """The index of the episode in its world, or in a training in its replica, counted from 0."""
     steps: int
     """Steps played, at least 1."""
+    replica: int | None = None
+    """The replica that played it in a training; None outside of one."""
     terminated: bool
     """True if the game itself ended, e.g. no apple was left and none could grow; else the episode was
     truncated at its time limit."""
