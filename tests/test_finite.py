@@ -156,7 +156,7 @@ def test_with_continue_a_broken_lane_is_named_once_and_other_replicas_learn_as_w
 
 @pytest.fixture
 def looks_every_step(monkeypatch):
-    monkeypatch.setattr(cprl.training.training, "EVERY_STEPS", 1)
+    monkeypatch.setattr(cprl.training.training, "EVERY_TURNS", 1)
 
 
 def test_a_single_infinite_loss_is_named_with_its_step_and_whether_the_weights_are_sound():

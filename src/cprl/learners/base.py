@@ -84,16 +84,20 @@ class Learner(ABC):
 
     def __init__(self, who: LearningAgents, settings: Any) -> None:
         self.who, self.settings = who, settings
+        if hasattr(settings, "refuse_worlds"):
+            settings.refuse_worlds(who.worlds)
         self.wants = WantedRewards(who.reward_kind)
         """What its agents want."""
         self.spaces, self.agents, self.replicas = who.spaces, who.agents, who.replicas
+        self.worlds = who.worlds
         self.steps = 0
+        """Steps of each replica that were stored: a turn of W worlds is W."""
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(agents={self.agents}, replicas={self.replicas})"
 
     def _wanted(self, turn: Turn) -> Any:
-        """The rewards that all agents want in a turn, [R, N]; called once for each turn, in order."""
+        """The rewards that all agents want in a turn, [B, N]; called once for each turn, in order."""
         rewards, done = turn.next_agents["reward"], turn.next_world[keys.DONE]
         return self.wants.add(rewards[..., 0], done[..., 0])
 
@@ -103,18 +107,19 @@ class Learner(ABC):
 
     @abstractmethod
     def store(self, batch: TensorDictBase | Turn) -> None:
-        """Stores one turn of every replica, of batch size [R], as collectors yield it."""
+        """Stores one turn of every world, of batch size [B], as collectors yield it."""
 
     @abstractmethod
     def update(self) -> Tensor | None:
-        """Updates every agent once; returns the losses [R, S], or None if too little is stored."""
+        """Updates every agent as often as a turn asks for; returns the mean losses [R, S], or None if too
+        little is stored."""
 
     def end_episode(self, ended: Tensor) -> None:  # noqa: B027 - likewise
-        """Called after an episode has ended in the marked replicas, bool [R]."""
+        """Called after an episode has ended in the marked worlds, bool [B]."""
 
     @abstractmethod
     def values(self, batch: TensorDictBase | Turn) -> Tensor:
-        """Each agent's estimate of the value of the state after the turn, [R, S]; for display only."""
+        """Each agent's estimate of the value of the state after the turn, [B, S]; for display only."""
 
     @abstractmethod
     def finite(self) -> Tensor:

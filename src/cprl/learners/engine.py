@@ -177,6 +177,12 @@ class Engine(ABC):
             batch = batch.reshape(lanes // self.sharing, self.sharing * sizes[0], *sizes[1:])
         return self._update(batch)
 
+    def update_at(self, batch: TensorDict, place: Tensor) -> Tensor:
+        """Updates every network once from the steps at places [L, ...] of a batch [L, n]; returns their
+        losses, [L / S]."""
+        lane = torch.arange(len(place), device=place.device).view(-1, *[1] * (place.ndim - 1))
+        return self.update_from(batch[lane, place])
+
     def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
         """The outputs of the networks with their current weights: [L, k, ...] to [L, k, ...]; of recurrent
         ones also their states.
@@ -316,14 +322,16 @@ def _target_updater(loss: LossModule, tau: float | None) -> TargetNetUpdater | N
 
 
 class _FromRing(NamedTuple):
-    """A batch that the step itself gathers from the fields of a ring, then an index and perhaps noise."""
+    """A batch that the step itself gathers from the fields of a ring, then places, their columns and perhaps
+    noise."""
 
     rows: int
     horizon: Horizon | None
 
     def batch(self, columns: Sequence[Tensor]) -> TensorDict:
-        index, *noise = columns[len(FIELDS) :]
-        return gather(dict(zip(FIELDS, columns, strict=False)), index, self.rows, self.horizon, *noise)
+        index, column, *noise = columns[len(FIELDS) :]
+        fields = dict(zip(FIELDS, columns, strict=False))
+        return gather(fields, index, column, self.rows, self.horizon, *noise)
 
 
 class _Given(NamedTuple):
@@ -415,11 +423,11 @@ class FunctionalEngine(Engine):
     def update(self, ring: Ring) -> Tensor:
         if ring.sequence_steps > 1 or self.sharing > 1:
             return super().update(ring)
-        index = ring.draw()
-        columns = [*ring.fields.values(), index]
+        drawn = ring.draw()
+        columns = [*ring.fields.values(), *drawn]
         if ring.noise is not None:
             columns.append(ring.noise.next())
-        return self._run(_FromRing(ring.rows, ring.horizon), columns, (ring.sizes, index.shape))
+        return self._run(_FromRing(ring.rows, ring.horizon), columns, (ring.sizes, drawn[0].shape))
 
     def _update(self, batch: TensorDict) -> Tensor:
         entries = sorted(batch.items(True, True), key=lambda entry: str(entry[0]))

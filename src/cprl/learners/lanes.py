@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from math import prod
 from typing import Any, ClassVar, Final, Protocol
 
 import torch
@@ -14,7 +15,7 @@ from cprl.keys import Turn
 from cprl.learners.base import Learner, LearningAgents
 from cprl.learners.engine import WAYS, Batching, Engine, ListEngine, MakeLoss, UpdateRule, make_engine
 from cprl.learners.ring import Horizon, TransitionForm
-from cprl.learners.transitions import LaneTurn, joint_actions, lane_turn
+from cprl.learners.transitions import LaneTurn, by_lane, joint_actions, lane_turn
 from cprl.learners.trial import TRIAL_LANES, fitting_engine
 from cprl.networks.agent import acting_part
 from cprl.networks.recurrent import state_cells_of
@@ -79,6 +80,7 @@ class Lanes:
         refuse_unseen(who.spaces)
         self.who, self.method = who, method
         self.spaces, self.agents, self.replicas = who.spaces, who.agents, who.replicas
+        self.worlds = who.worlds
         size, self.is_team = len(who.agents), method.make_team is not None
         if self.is_team and method.sees_peers:
             raise ValueError(
@@ -114,11 +116,26 @@ class Lanes:
             sequence_steps=sequence_steps,
         )
 
+    @property
+    def columns(self) -> Tensor:
+        """Where the worlds of each lane stand in a `LaneTurn`, int64 [L, W]."""
+        return self.by_lane(torch.arange(len(self) * self.worlds))
+
+    def by_lane(self, columns: Any) -> Tensor:
+        """A field of a `LaneTurn`, [C, ...], as one of lanes and their worlds, [L, W, ...]."""
+        return by_lane(torch.as_tensor(columns), replicas=self.replicas, worlds=self.worlds)
+
+    def by_world(self, values: Tensor) -> Tensor:
+        """Values of lanes in their worlds, [L, W, 1], of teams [L, W, S, 1], as those of the agents of each
+        world, [B, S]."""
+        by_replica = values.reshape(self.replicas, -1, self.worlds, prod(self.member_shape))
+        return by_replica.transpose(1, 2).reshape(-1, len(self.agents))
+
     def turn(self, turn: Turn, rewards: Any) -> LaneTurn:
-        """One transition of every lane; see `lane_turn`.
+        """One transition of every lane in each of its worlds; see `lane_turn`.
 
         Args:
-            rewards: of all agents, [R, N]; those of a team without `own_rewards` all the same.
+            rewards: of all agents, [B, N]; those of a team without `own_rewards` all the same.
         """
         lanes = lane_turn(self.agents, turn, rewards, are_team=self.is_team)
         if self.is_team and not self.method.own_rewards:
@@ -131,15 +148,15 @@ class Lanes:
         return lanes
 
     def seen_next(self, turn: Turn) -> Tensor:
-        """The observations of lanes after a turn, uint8 [L, 1, *observation_shape]."""
+        """The observations of lanes after a turn, uint8 [L, W, *observation_shape]."""
         seen = torch.as_tensor(turn.next_agents["observation"])[:, list(self.agents)]
-        return seen.reshape(len(self), 1, *self.member_shape, *self.spaces.observation_shape)
+        return self.by_lane(seen.reshape(-1, *self.member_shape, *self.spaces.observation_shape))
 
     def states_in(self, turn: Turn, name: str = STATE_BEFORE) -> Any:
-        """The states of recurrent networks before a turn, or by their other name after it, float32 [L, H], of
-        teams [L, S, H]; an array as those of a `LaneTurn`."""
+        """The states of recurrent networks before a turn, or by their other name after it, float32 [C, H], of
+        teams [C, S, H]; an array as those of a `LaneTurn`."""
         states = turn.agents[name][:, list(self.agents), : self.state_cells]
-        return states.reshape(len(self), *self.member_shape, self.state_cells)
+        return states.reshape(-1, *self.member_shape, self.state_cells)
 
     def by_agent(self, values: Tensor) -> Tensor:
         """Values of networks as values of the agents of each replica, [R, S]; members of a team, and agents

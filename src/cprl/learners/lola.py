@@ -98,8 +98,8 @@ class LOLANetworks(nn.Module):
         policies.step()
 
     def update_critics(self, observation: Tensor, target: Tensor) -> None:
-        """One step of all critics along their mean squared errors, from observations [R, P, T, S, *shape] and
-        the values wanted, [R, P, T, S, 1]."""
+        """One step of all critics along their mean squared errors, from observations [R, B, T, S, *shape] and
+        the values wanted, [R, B, T, S, 1]."""
         _, critics = self.optimizers
         critics.zero_grad()
         (self.critics(observation) - target).square().mean((1, 2)).sum().backward()
@@ -126,7 +126,7 @@ class LOLANetworks(nn.Module):
 
 
 class LOLALearner(LaneLearner):
-    """R teams of S agents that learn with opponent-learning awareness, from rollouts of T steps.
+    """R teams of S agents that learn with opponent-learning awareness, from rollouts of T turns of W worlds.
 
     An update takes P rollouts, one after the other in the worlds of the training. With `LOLALoss` they are
     two, of the present weights, which are its two independent batches. With `LOLADiCELoss` they are 1 + S:
@@ -154,7 +154,7 @@ class LOLALearner(LaneLearner):
         self._looks_ahead = isinstance(self.engine.loss, LOLADiCELoss)
         self.rollouts = 1 + members if self._looks_ahead else 2
         """The number P of rollouts that an update takes."""
-        self.actor = self._lanes.actor(self.engine.playing, EXPLORATION, compile=compile)
+        self.actor = self._lanes.actor(self.engine.playing, EXPLORATION, worlds=self.worlds, compile=compile)
         self._rollouts = Rollout(self._lanes, self.rollout_steps, self.rollouts)
         self._phase = 0
 
@@ -175,7 +175,7 @@ class LOLALearner(LaneLearner):
         turn = Turn.of(batch)
         self._rollouts.refuse_full()
         self._rollouts.write(self._lanes.turn(turn, self._wanted(turn)), self._phase)
-        self.steps += 1
+        self.steps += self.worlds
 
     def update(self) -> Tensor | None:
         """Updates after the last rollout; returns each member's loss, [R, S], or None if there is no update.
@@ -192,7 +192,7 @@ class LOLALearner(LaneLearner):
         self._phase = 0
         observation, rollouts, target = self._batch(self.rollouts)
         losses = self._losses(1 if self._looks_ahead else 2)
-        self.engine.update_policies(rollouts.unsqueeze(2) if self._looks_ahead else rollouts)
+        self.engine.update_policies(rollouts if self._looks_ahead else rollouts.flatten(1, 2))
         for _ in range(self.settings.critic_epochs):
             self.engine.update_critics(observation, target)
         self.engine.play(None)
@@ -202,45 +202,47 @@ class LOLALearner(LaneLearner):
         """The next rollout is that of a member whose others have looked ahead."""
         if member == 0:
             _, rollouts, _ = self._batch(1)
-            self.engine.look_ahead(rollouts)
+            self.engine.look_ahead(rollouts.flatten(1, 2))
         self.engine.play(member)
 
     def _columns(self, rollouts: int) -> dict[str, Tensor]:
+        """Fields of the first rollouts, [R, P, W, T, S, ...]."""
         size = self.replicas, len(self.agents)
         return {
-            name: field[:rollouts].reshape(rollouts, -1, *size, *field.shape[3:]).movedim(2, 0)
+            name: field[:rollouts].view(rollouts, *size, *field.shape[2:]).movedim((1, 2), (0, 4))
             for name, field in self._rollouts.fields.items()
         }
 
     def _batch(self, rollouts: int) -> tuple[Tensor, TensorDict, Tensor]:
-        """Of the first rollouts: observations [R, P, T, S, *shape], the input of the loss [R, P, T], and what
-        critics should say, [R, P, T, S, 1]."""
+        """Of the first rollouts: observations [R, P x W, T, S, *shape], the input of the loss [R, P, W, T],
+        and what critics should say, [R, P x W, T, S, 1]."""
         columns = self._columns(rollouts)
         critics = self.engine.critics
+        options: dict[str, Any] = {"settings": self.settings, "over": (2, 3), "time_dim": 3}
         with torch.no_grad():
             value, following = critics(columns["observation"]), critics(columns["next_observation"])
-            advantage, target = advantages(columns, value, following, settings=self.settings, over=(2,))
+            advantage, target = advantages(columns, value, following, **options)
         entries = {
             "observation": columns["observation"],
             "action": columns["action"],
             "advantage": advantage,
             "done": columns["done"][..., :1],
         }
-        size = (self.replicas, rollouts, self.rollout_steps)
-        return columns["observation"], TensorDict(entries, size), target
+        size = (self.replicas, rollouts, self.worlds, self.rollout_steps)
+        return columns["observation"].flatten(1, 2), TensorDict(entries, size), target.flatten(1, 2)
 
     def _losses(self, rollouts: int) -> Tensor:
         """The negative mean returns of the first rollouts, [R, S]."""
         columns = self._columns(rollouts)
         reward, done = columns["reward"], columns["done"][..., :1]
         returns = dice_objective(torch.zeros_like(reward), reward, gamma=self.settings.gamma, done=done)
-        return -returns.mean(1)
+        return -returns.mean((1, 2))
 
     def values(self, batch: TensorDictBase | Turn) -> Tensor:
-        """The value that each member's critic gives to the state after a turn, [R, S]."""
+        """The value that each member's critic gives to the state after a turn, [B, S]."""
         with torch.no_grad():
             expected = self.engine.critics.outputs(self._lanes.seen_next(Turn.of(batch)))
-        return expected.reshape(self.replicas, len(self.agents))
+        return self._lanes.by_world(expected)
 
     def finite(self) -> Tensor:
         return self.engine.finite()

@@ -52,6 +52,7 @@ class StockBuffers:
         transforms: Sequence[Custom] = (),
         noise_shape: tuple[int, ...] = (),
     ) -> None:
+        self._columns = lanes.columns
         device, seeds = torch.device(lanes.who.device), lanes.seeds(SAMPLING)
         self._generators = [torch.Generator(device).manual_seed(seed_of(seed)) for seed in seeds]
         self.each = [
@@ -71,10 +72,10 @@ class StockBuffers:
             self._noise = Noise(lanes.seeds(NOISE), batch_size, noise_shape, device)
 
     def write(self, turn: LaneTurn) -> None:
-        """Stores a turn of every agent, [L], under TorchRL's default keys."""
+        """Stores a turn of every agent in all of its worlds, under TorchRL's default keys."""
         transitions = _transitions(turn._asdict(), [len(turn.done)])
-        for lane, buffer in enumerate(self.each):
-            buffer.extend(transitions[lane : lane + 1])
+        for columns, buffer in zip(self._columns, self.each, strict=True):
+            buffer.extend(transitions[columns])
 
     def sample(self) -> TensorDict:
         """The next batch of every agent, [L, b]."""
@@ -198,27 +199,30 @@ class TorchRLRolloutLearner(RolloutLearner):
         self.estimators = [_gae(parts[CRITIC], settings) for parts in self.engine.parts]
         make_sampler = make_sampler or (lambda lane: SamplerWithoutReplacement())
         self.buffer = StockBuffers(
-            self._lanes, make_sampler, size=settings.rollout_steps, batch_size=settings.minibatch_size
+            self._lanes,
+            make_sampler,
+            size=settings.rollout_steps * self.worlds,
+            batch_size=settings.minibatch_size,
         )
 
     def update(self) -> Tensor | None:
         if not self._rollout.is_full:
             return None
         self._rollout.size = 0
-        rollout = _transitions(self._rollout.columns(), [self.lanes, self.rollout_steps])
+        rollout = _transitions(self._rollout.fields, [self.lanes, self.worlds, self.rollout_steps])
         losses = [self._learn(lane, rollout[lane].clone()) for lane in range(self.lanes)]
         return self._lanes.by_agent(torch.stack(losses))
 
     def _learn(self, lane: int, rollout: TensorDict) -> Tensor:
-        """Runs all epochs of one agent over its rollout, [T]; returns its mean loss."""
+        """Runs all epochs of one agent over its rollout, [W, T]; returns its mean loss."""
         buffer = self.buffer.each[lane]
         self.estimators[lane](rollout)
         with torch.no_grad():
             logits = self.engine.parts[lane][ACTOR](rollout["observation"])
             policy = torch.distributions.Categorical(logits=logits)
             chosen = policy.log_prob(rollout["action"])  # type: ignore[no-untyped-call]
-        buffer.extend(rollout.update({"logits": logits, "action_log_prob": chosen}))
-        minibatches = self.settings.epochs * (self.rollout_steps // self.settings.minibatch_size)
+        buffer.extend(rollout.update({"logits": logits, "action_log_prob": chosen}).flatten())
+        minibatches = self.settings.epochs * rollout.numel() // self.settings.minibatch_size
         losses = [self.engine.learn(lane, buffer.sample()) for _ in range(minibatches)]
         buffer.empty()  # a checkpoint holds the rollout once
         return torch.stack(losses).mean()

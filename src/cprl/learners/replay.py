@@ -56,11 +56,13 @@ class ReplayLearner(LaneLearner):
         is_short = settings.sequence_steps <= COMPILED_STEPS
         self.engine = self._make_engine(networks, targets, rule=rule, compile=compile and is_short)
         self.buffer = self._make_buffer()
-        self.actor = lanes.actor(self.engine, EXPLORATION, compile=compile)
+        self.actor = lanes.actor(self.engine, EXPLORATION, worlds=self.worlds, compile=compile)
         self.actor.epsilon = settings.epsilon(0)
         self._episodes = torch.zeros(self.replicas, dtype=torch.int64)
         self._owed = 0
         """Steps since the last update, of those that count, from `learning_starts` on."""
+        self._first_update = max(settings.learning_starts, (self._form.steps_ahead + 1) * self.worlds)
+        """The steps before the first update, by when each world has stored what a sample reads."""
 
     def _refuse_other_sequences(self) -> None:
         """Raises a ValueError unless recurrent networks, and they alone, learn from sequences."""
@@ -84,6 +86,7 @@ class ReplayLearner(LaneLearner):
             noise_seeds=self._lanes.seeds(NOISE),
             transitions=self.settings.buffer_size,
             batch_size=self.settings.batch_size,
+            columns=self._lanes.columns,
             device=self.who.device,
         )
 
@@ -94,45 +97,48 @@ class ReplayLearner(LaneLearner):
     def store(self, batch: TensorDictBase | Turn) -> None:
         turn = Turn.of(batch)
         self.buffer.write(self._lanes.turn(turn, self._wanted(turn)))
-        self.steps += 1
-        self._owed += self.steps >= self.settings.learning_starts
+        self.steps += self.worlds
+        self._owed += self.worlds * (self.steps >= self._first_update)
         self.actor.explore_with(self.settings.epsilon(self.steps))
 
     def update(self) -> Tensor | None:
-        """Updates every lane `updates_per_step` times; returns the mean losses [R, S], or None while fewer
-        than `learning_starts` transitions are stored, and between updates, see `steps_per_update`."""
+        """Updates every lane as often as a turn asks for: `updates_per_step` times for every
+        `steps_per_update` of the W steps; returns the mean losses [R, S], or None before the first update and
+        between updates."""
         every = self.settings.steps_per_update
-        is_early = self.steps < self.settings.learning_starts
-        if is_early or self._owed < every > 1:  # one that updates after every step may do so whenever it asks
+        # One that updates after every step may do so whenever it asks.
+        due = self.worlds if every == 1 else min(self._owed // every, self.worlds)
+        if self.steps < self._first_update or not due:
             return None
-        self._owed = max(0, self._owed - every)
+        self._owed = max(0, self._owed - every * due)
         losses = self.engine.update(self.buffer)
-        if self.settings.updates_per_step > 1:
-            others = [self.engine.update(self.buffer) for _ in range(self.settings.updates_per_step - 1)]
+        if (updates := due * self.settings.updates_per_step) > 1:
+            others = [self.engine.update(self.buffer) for _ in range(updates - 1)]
             losses = torch.stack([losses, *others]).mean(0)
         return self._lanes.by_agent(losses)
 
     def end_episode(self, ended: Tensor) -> None:
-        """Counts an episode of the marked replicas, bool [R]: their weights are copied to targets every
-        `target_every_episodes` episodes. With `tau` these move after every update instead."""
-        self._episodes += ended
+        """Counts an episode of the marked worlds, bool [B]: the weights of a replica are copied to targets
+        every `target_every_episodes` episodes. With `tau` these move after every update instead."""
+        before = self._episodes
+        self._episodes = before + ended.view(self.replicas, self.worlds).sum(1)
         if self.settings.tau is not None:
             return
-        due = ended & (self._episodes % self.settings.target_every_episodes == 0)
+        every = self.settings.target_every_episodes
+        due = self._episodes // every > before // every
         if due.any():
             self.engine.copy_to_targets(self._lanes.of_replicas(due))
 
     def values(self, batch: TensorDictBase | Turn) -> Tensor:
-        """The highest action value of each agent at the end of a turn, [R, S]; NaN where its network
+        """The highest action value of each agent at the end of a turn, [B, S]; NaN where its network
         outputs a policy."""
         if self._lanes.method.stochastic:
-            return torch.full((self.replicas, len(self.agents)), torch.nan)
+            return torch.full((self.replicas * self.worlds, len(self.agents)), torch.nan)
         turn, is_recurrent = Turn.of(batch), self._lanes.state_cells > 0
-        states = [torch.as_tensor(self._lanes.states_in(turn, STATE)).unsqueeze(1)] if is_recurrent else []
+        states = [self._lanes.by_lane(self._lanes.states_in(turn, STATE))] if is_recurrent else []
         with torch.no_grad():
             outputs = self.engine.outputs(self._lanes.seen_next(turn), *states)
-        highest: Tensor = (outputs[0] if is_recurrent else outputs).amax(-1)
-        return highest.view(self.replicas, len(self.agents))
+        return self._lanes.by_world((outputs[0] if is_recurrent else outputs).amax(-1))
 
     def state_dict(self) -> dict[str, Any]:
         return {

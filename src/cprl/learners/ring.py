@@ -1,9 +1,10 @@
 """The replay buffer of many lanes, a ring that stores each observation once; each lane samples for itself.
 
-A lane is one agent of one replica. All lanes step together, so a transition is a row [L]. The observation
-after a transition is also the one before the next transition, and is stored once. Only at the end of an
-episode it takes an extra row. What is read are transitions, returns of several steps, or sequences, as
-TensorDicts with the keys that TorchRL's losses read.
+A lane is one agent of one replica, and has a column for each of the W worlds in which it plays. All step
+together, so the transitions of a turn are a row [C] of C = L x W columns. The observation after a transition
+is also the one before the next transition, and is stored once. Only at the end of an episode it takes an
+extra row. What is read are transitions, returns of several steps, or sequences, as TensorDicts with the keys
+that TorchRL's losses read.
 """
 
 import logging
@@ -67,10 +68,10 @@ class TransitionForm:
         """The turns after its first one that a sample reads."""
         return (self.horizon.steps if self.horizon else self.sequence_steps) - 1
 
-    def stored_bytes(self, lanes: int, transitions: int) -> int:
+    def stored_bytes(self, columns: int, turns: int) -> int:
         row = prod(self.observation_shape) * self.dtype.itemsize + 4 * self.state_cells
         beside = 8 * prod(self.action_shape) + 4 * prod(self.reward_shape) + 8 + 1 + 1
-        return lanes * (_rows(transitions) * row + transitions * beside)
+        return columns * (_rows(turns) * row + turns * beside)
 
     def sampled_bytes(self, lanes: int, batch_size: int) -> int:
         """Of the observations of a sample, as stored and as numbers of networks."""
@@ -79,10 +80,15 @@ class TransitionForm:
 
 
 def gather(
-    fields: Fields, index: Tensor, rows: int, horizon: Horizon | None = None, noise: Tensor | None = None
+    fields: Fields,
+    index: Tensor,
+    column: Tensor,
+    rows: int,
+    horizon: Horizon | None = None,
+    noise: Tensor | None = None,
 ) -> TensorDict:
-    """Transitions at places [L, b] of a `Ring`, as TorchRL's losses read them; changes nothing. Uniform
-    numbers [L, b, ...] become the entry "noise".
+    """Transitions at places [L, b] of columns [L, b] or [L, 1] of a `Ring`, as TorchRL's losses read them;
+    changes nothing. Uniform numbers [L, b, ...] become the entry "noise".
 
     With a horizon of n steps "reward" is the discounted sum of the rewards from there on: of n, or of those
     until the episode ends. What is "next" is that of the last of these steps, and "steps_to_next_obs", int64
@@ -91,23 +97,21 @@ def gather(
     flags "done" and "terminated", which it leaves those of the first step, so that it bootstraps from the
     observations at which episodes terminate.
     """
-    lanes, size = index.shape
-    lane = torch.arange(lanes, device=index.device)[:, None]
-    row = fields["row"][index, lane]
+    row = fields["row"][index, column]
     windows = fields["observation"]
-    shape = lanes, size, *windows.shape[1:]
+    shape = *index.shape, *windows.shape[1:]
 
     def seen(at: Tensor) -> Tensor:
-        return windows.index_select(0, (lane * rows + at % rows).reshape(-1)).reshape(shape)
+        return windows.index_select(0, (column * rows + at % rows).reshape(-1)).reshape(shape)
 
     def field(name: str, place: Tensor) -> Tensor:
-        return fields[name][place, lane].unsqueeze(-1)
+        return fields[name][place, column].unsqueeze(-1)
 
     last, last_row, reward = index, row, field("reward", index)
     more = {} if noise is None else {"noise": noise}
     if horizon is not None:
-        last, reward, steps = _returns(fields, index, lane, horizon)
-        last_row = fields["row"][last, lane]
+        last, reward, steps = _returns(fields, index, column, horizon)
+        last_row = fields["row"][last, column]
         more["steps_to_next_obs"] = steps.unsqueeze(-1)
     following = TensorDict(
         {
@@ -116,14 +120,14 @@ def gather(
             "done": field("done", last),
             "terminated": field("terminated", last),
         },
-        [lanes, size],
+        index.shape,
     )
-    entries = {"observation": seen(row), "action": fields["action"][index, lane], "next": following}
-    return TensorDict({**entries, **more}, [lanes, size])
+    entries = {"observation": seen(row), "action": fields["action"][index, column], "next": following}
+    return TensorDict({**entries, **more}, index.shape)
 
 
-def sequences(fields: Fields, index: Tensor, rows: int, steps: int) -> TensorDict:
-    """Sequences [L, b, T] of T turns from places [L, b] of a `Ring` on, for recurrent networks.
+def sequences(fields: Fields, index: Tensor, column: Tensor, rows: int, steps: int) -> TensorDict:
+    """Sequences [L, b, T] of T turns from places [L, b] of columns of a `Ring` on, for recurrent networks.
 
     Entries are those of `gather`, the states with which agents acted, "recurrent_state", float32
     [L, b, T, K], and "is_init", bool [L, b, T], as `cprl.networks.recurrent` says: where a sequence or an
@@ -131,12 +135,13 @@ def sequences(fields: Fields, index: Tensor, rows: int, steps: int) -> TensorDic
     one does so too. The T - 1 turns that follow each place must have been written.
     """
     lanes, size = index.shape
-    ahead, lane = (torch.arange(count, device=index.device) for count in (steps, lanes))
+    ahead = torch.arange(steps, device=index.device)
     places = ((index.unsqueeze(-1) + ahead) % len(fields["done"])).reshape(lanes, -1)
-    batch, lane = gather(fields, places, rows), lane[:, None]
-    row, states = fields["row"][places, lane], fields[STATE]
+    column = column.expand(lanes, size).repeat_interleave(steps, 1)
+    batch = gather(fields, places, column, rows)
+    row, states = fields["row"][places, column], fields[STATE]
     for owner, at in ((batch, row), (batch["next"], row + 1)):
-        rows_read = states.index_select(0, (lane * rows + at % rows).reshape(-1))
+        rows_read = states.index_select(0, (column * rows + at % rows).reshape(-1))
         owner.set(STATE, rows_read.reshape(*places.shape, *states.shape[1:]))
     turns: TensorDict = batch.reshape(lanes, size, steps)
     ends = (turns["next", "done"] | turns["next", "terminated"]).squeeze(-1)
@@ -144,20 +149,22 @@ def sequences(fields: Fields, index: Tensor, rows: int, steps: int) -> TensorDic
     return turns.set("is_init", is_init).set(("next", "is_init"), is_init.clone())
 
 
-def _returns(fields: Fields, index: Tensor, lane: Tensor, horizon: Horizon) -> tuple[Tensor, Tensor, Tensor]:
+def _returns(
+    fields: Fields, index: Tensor, column: Tensor, horizon: Horizon
+) -> tuple[Tensor, Tensor, Tensor]:
     """From each place: the last place of its return [L, b], the return [L, b, 1], or [L, b, S, 1] of the
     members of a team, and its steps [L, b]."""
     places = len(fields["done"])
 
     def goes_on(place: Tensor) -> Tensor:
-        return ~(fields["done"][place, lane] | fields["terminated"][place, lane])
+        return ~(fields["done"][place, column] | fields["terminated"][place, column])
 
     last, steps, going = index, torch.ones_like(index), goes_on(index)
-    total = fields["reward"][index, lane]
+    total = fields["reward"][index, column]
     of_members = (...,) + (None,) * (total.ndim - index.ndim)  # a world ends for all members of a team
     for step in range(1, horizon.steps):
         place = (index + step) % places
-        total = total + going[of_members] * horizon.gamma**step * fields["reward"][place, lane]
+        total = total + going[of_members] * horizon.gamma**step * fields["reward"][place, column]
         last = torch.where(going, place, last)
         steps = steps + going
         going = going & goes_on(place)
@@ -173,10 +180,10 @@ NUMBERS_AHEAD: Final = 2**14
 """About as many numbers for losses that sample, or for an epoch, are generated at once for each lane."""
 
 
-def _rows(transitions: int) -> int:
-    """Observation rows per lane: one per transition, those for the ends of episodes, and at most two per step
+def _rows(turns: int) -> int:
+    """Observation rows per column: one per turn, those for the ends of episodes, and at most two per turn
     until the next check for overwritten rows."""
-    return transitions + max(8, round(transitions * ENDS_PER_TRANSITION)) + 2 * LOOKS_EVERY + 2
+    return turns + max(8, round(turns * ENDS_PER_TRANSITION)) + 2 * LOOKS_EVERY + 2
 
 
 def steps_ahead(count: int) -> int:
@@ -199,11 +206,14 @@ class Noise:
 
 
 class Ring:
-    """Stores up to T transitions of each of L lanes, and samples uniformly from them, each lane for itself.
+    """Stores the latest T turns of each of W worlds of L lanes, and samples uniformly from the T x W
+    transitions of each lane, each lane for itself.
 
     Args:
         seeds: the sampling seed of each of the L lanes; a lane's samples depend on it alone.
-        transitions: the capacity per lane, T.
+        transitions: the capacity per lane, of which T x W are used.
+        columns: where the worlds of each lane are written, int64 [L, W]; by default lane l, in one world, in
+            column l.
         batch_size: transitions b sampled per lane, or sequences.
         noise_seeds: the seed of the noise of each lane; by default `seeds`.
 
@@ -220,15 +230,24 @@ class Ring:
         seeds: Sequence[Sequence[int]],
         transitions: int,
         batch_size: int,
+        columns: Tensor | None = None,
         noise_seeds: Sequence[Sequence[int]] | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        self.horizon, self.sequence_steps, self.capacity = form.horizon, form.sequence_steps, transitions
-        self.lanes, self.rows, self.device = len(seeds), _rows(transitions), torch.device(device)
-        self._ahead, lanes = form.steps_ahead, self.lanes
+        self.horizon, self.sequence_steps, self.device = (
+            form.horizon,
+            form.sequence_steps,
+            torch.device(device),
+        )
+        columns = torch.arange(len(seeds))[:, None] if columns is None else columns
+        self.columns, count = columns.to(self.device), columns.numel()
+        lanes, self.worlds = columns.shape
+        self.capacity = turns = transitions // self.worlds
+        """Turns T that are kept."""
+        self.rows, self._ahead = _rows(turns), form.steps_ahead
         needed, what = (
-            form.stored_bytes(lanes, transitions),
-            f"{lanes} learners x {transitions:,} transitions",
+            form.stored_bytes(count, turns),
+            f"{lanes} learners x {turns * self.worlds:,} transitions",
         )
         check_memory(
             f"the replay buffers of {what}",
@@ -240,25 +259,25 @@ class Ring:
             sizes = needed / 2**30, free_bytes(self.device) / 2**30
             logging.getLogger("cprl").info("Replay buffers of %s: %.2f GiB of %.1f GiB free", what, *sizes)
         forms = {
-            "observation": ((lanes * self.rows, *form.observation_shape), form.dtype),
-            "action": ((transitions, lanes, *form.action_shape), torch.int64),
-            "reward": ((transitions, lanes, *form.reward_shape), torch.float32),
-            "done": ((transitions, lanes), torch.bool),
-            "terminated": ((transitions, lanes), torch.bool),
-            "row": ((transitions, lanes), torch.int64),
-            **({STATE: ((lanes * self.rows, form.state_cells), torch.float32)} if form.state_cells else {}),
+            "observation": ((count * self.rows, *form.observation_shape), form.dtype),
+            "action": ((turns, count, *form.action_shape), torch.int64),
+            "reward": ((turns, count, *form.reward_shape), torch.float32),
+            "done": ((turns, count), torch.bool),
+            "terminated": ((turns, count), torch.bool),
+            "row": ((turns, count), torch.int64),
+            **({STATE: ((count * self.rows, form.state_cells), torch.float32)} if form.state_cells else {}),
         }
         self.fields: Fields = {name: _zeros(*of_field, self.device) for name, of_field in forms.items()}
-        """Observations [L x rows, ...], actions and rewards [T, L, ...], the rest [T, L]; `row` counts the
-        observations that a lane has written. A state [L x rows, K] stands in the row of the observation that
-        the lane saw next."""
+        """Observations [C x rows, ...], actions and rewards [T, C, ...], the rest [T, C]; `row` counts the
+        observations that a column has written. A state [C x rows, K] stands in the row of the observation
+        that was seen next."""
         self.sizes = tuple((field.shape, field.dtype) for field in self.fields.values())
         self._of_rows = [name for name in self.fields if name in ("observation", STATE)]
         # Steps are written with numpy on the CPU: for so few numbers torch takes five times as long.
         self._arrays = {name: array_of(field) for name, field in self.fields.items()}
-        self._lane = array_of(torch.arange(lanes, device=self.device))
-        self._base = self._lane * self.rows
-        zeros = torch.zeros(lanes, dtype=torch.int64, device=self.device)
+        self._column = array_of(torch.arange(count, device=self.device))
+        self._base = self._column * self.rows
+        zeros = torch.zeros(count, dtype=torch.int64, device=self.device)
         self._next_row, self._oldest = array_of(zeros), array_of(zeros.clone())
         self._begins, self._any_begins = array_of(zeros == 0), True
         self._written = 0
@@ -267,15 +286,15 @@ class Ring:
             self.noise = Noise(noise_seeds or seeds, batch_size, form.noise_shape, self.device)
 
     def __len__(self) -> int:
-        """Transitions stored in the fullest lane."""
+        """Turns stored."""
         return min(self._written, self.capacity)
 
     def oldest(self) -> tuple[Any, int]:
-        """The number of each lane's oldest complete transition, int64 [L]; and that of the next one."""
+        """The number of each column's oldest complete transition, int64 [C]; and that of the next one."""
         return _at_least(self._oldest, self._written - self.capacity), self._written
 
     def write(self, turn: LaneTurn) -> None:
-        """Writes the next transition of every lane, numpy arrays if the ring is on the CPU."""
+        """Writes the next transition of every column, numpy arrays if the ring is on the CPU."""
         arrays, place, row = self._arrays, self._written % self.capacity, self._next_row
         for seen in (turn.observation, turn.next_observation):
             refuse_other_dtype(seen.dtype, arrays["observation"].dtype)
@@ -322,30 +341,42 @@ class Ring:
         """Excludes transitions whose observations are about to be overwritten from sampling."""
         self._oldest, soon = self.oldest()[0], self._next_row - self.rows + 2 * LOOKS_EVERY + 1
         while True:
-            lost = self._arrays["row"][self._oldest % self.capacity, self._lane] <= soon
+            lost = self._arrays["row"][self._oldest % self.capacity, self._column] <= soon
             lost &= self._oldest < self._written
             if not lost.any():
                 break
             self._oldest += lost
 
-    def draw(self) -> Tensor:
-        """The places of a sample, int64 [L, b]."""
+    def draw(self) -> tuple[Tensor, Tensor]:
+        """The places of a sample, int64 [L, b], and the columns, [L, b], or [L, 1] of lanes in one world."""
         oldest, written = self.oldest()
         written -= self._ahead  # the newest transitions have no full return or sequence yet
-        shares = array_of(self.rng.next().to(self.device)) * (written - oldest)[:, None]
+        numbers = array_of(self.rng.next().to(self.device))
+        if self.worlds > 1:
+            return self._draw_of_worlds(torch.as_tensor(oldest), written, torch.as_tensor(numbers))
+        shares = numbers * (written - oldest)[:, None]
         # numpy on the CPU: for so few numbers torch takes three times as long.
         numbers = shares.astype(np.int64) if isinstance(shares, np.ndarray) else shares.long()
-        return torch.as_tensor((oldest[:, None] + numbers) % self.capacity)
+        return torch.as_tensor((oldest[:, None] + numbers) % self.capacity), self.columns
 
-    def get(self, index: Tensor) -> TensorDict:
-        """The transitions at places [L, b], or the sequences that begin there."""
+    def _draw_of_worlds(self, oldest: Tensor, written: int, numbers: Tensor) -> tuple[Tensor, Tensor]:
+        """As `draw`, from numbers in 0..1, [L, b]: all transitions of a lane's worlds one after the other."""
+        oldest = oldest[self.columns]
+        ends = (written - oldest).cumsum(1)
+        at = (numbers * ends[:, -1:]).long()
+        world = torch.searchsorted(ends, at, right=True)
+        place = written - (ends.gather(1, world) - at)
+        return place % self.capacity, self.columns.gather(1, world)
+
+    def get(self, index: Tensor, column: Tensor) -> TensorDict:
+        """The transitions at places [L, b] of columns, or the sequences that begin there."""
         if self.sequence_steps > 1:
-            return sequences(self.fields, index, self.rows, self.sequence_steps)
-        return gather(self.fields, index, self.rows, self.horizon)
+            return sequences(self.fields, index, column, self.rows, self.sequence_steps)
+        return gather(self.fields, index, column, self.rows, self.horizon)
 
     def sample(self) -> TensorDict:
         """The next sample: transitions [L, b], or sequences, with the entry "noise" if the loss samples."""
-        batch = self.get(self.draw())
+        batch = self.get(*self.draw())
         if self.noise is not None:
             batch.set("noise", self.noise.next())
         return batch
@@ -382,9 +413,9 @@ class Ring:
         self._written, self._any_begins = int(stored["written"]), bool(self._begins.any())
 
     def _by_row(self) -> Fields:
-        """The fields of rows, [L, rows, ...]."""
+        """The fields of rows, [C, rows, ...]."""
         fields = {name: self.fields[name] for name in self._of_rows}
-        return {name: field.view(self.lanes, self.rows, *field.shape[1:]) for name, field in fields.items()}
+        return {name: field.view(-1, self.rows, *field.shape[1:]) for name, field in fields.items()}
 
 
 def _zeros(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:

@@ -48,7 +48,7 @@ def states_in(network: nn.Module) -> dict[str, tuple[int, ...]]:
 
 
 class States:
-    """The states of recurrent actors and critics of L lanes, from one rollout to the next.
+    """The states of recurrent actors and critics of L lanes in W worlds, from one rollout to the next.
 
     The actor's first state of a rollout is the one by which it acted; that of the critic, which does not act,
     is what it had after the rollout before. Gradients run through the `sequence` turns of a minibatch, which
@@ -56,14 +56,15 @@ class States:
     Experience Replay in Distributed Reinforcement Learning" (2019).
 
     Args:
-        sequence: turns T' of a minibatch.
+        sequence: consecutive turns T' of a minibatch.
     """
 
     def __init__(self, shapes: Mapping[str, tuple[int, ...]], lanes: Lanes, *, sequence: int) -> None:
         self._lanes, self._sequence, device = lanes, sequence, lanes.who.device
-        self._first = {name: torch.zeros(len(lanes), *shape, device=device) for name, shape in shapes.items()}
-        self._ended = torch.ones(len(lanes), dtype=torch.bool, device=device)
-        """Whether the episode of a lane ended with the last turn of the rollout before."""
+        size = len(lanes), lanes.worlds
+        self._first = {name: torch.zeros(*size, *shape, device=device) for name, shape in shapes.items()}
+        self._ended = torch.ones(size, dtype=torch.bool, device=device)
+        """Whether the episode ended with the last turn of the rollout before."""
 
     def forget(self) -> None:
         """The next rollout begins with new episodes."""
@@ -71,53 +72,52 @@ class States:
 
     def begin(self, turn: Turn) -> None:
         """Notes by which states agents act in the first turn of a rollout."""
-        self._first[NAMES[ACTOR]].copy_(torch.as_tensor(self._lanes.states_in(turn)))
+        self._first[NAMES[ACTOR]].copy_(self._lanes.by_lane(self._lanes.states_in(turn)))
 
     def evaluate(
         self, engine: Engine, columns: Mapping[str, Tensor]
     ) -> tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]:
-        """The logits, values and next values of a full rollout, [L, T, ...], and what losses read besides:
+        """The logits, values and next values of a full rollout, [L, W, T, ...], and what losses read besides:
         the states before each turn, and "is_init". Keeps the critic's states for the next rollout."""
         began, states = self._began(columns["done"]), {}
         logits, states[NAMES[ACTOR]], _ = self._in_order(engine, columns, began, ACTOR)
         value, states[NAMES[CRITIC]], after = self._in_order(engine, columns, began, CRITIC)
         next_value, _ = engine.outputs(columns["next_observation"], after, part=CRITIC)
-        self._first[NAMES[CRITIC]].copy_(after[:, -1])
-        self._ended.copy_(columns["done"][:, -1])
+        self._first[NAMES[CRITIC]].copy_(after[:, :, -1])
+        self._ended.copy_(columns["done"][..., -1])
         is_init = began.clone()
-        is_init[:, :: self._sequence] = True
+        is_init[..., :: self._sequence] = True
         return logits, value, next_value, {**states, "is_init": is_init}
 
     def value_next(
         self, engine: Engine, columns: Mapping[str, Tensor], size: int, seen_next: Tensor
     ) -> Tensor:
         """The value of the state after the latest of `size` turns, 0 directly after a rollout, from the
-        observations after it, [L, 1, ...]."""
-        after = self._first[NAMES[CRITIC]].unsqueeze(1)
+        observations after it, [L, W, ...]."""
+        after = self._first[NAMES[CRITIC]]
         if size:
-            so_far = {name: column[:, :size] for name, column in columns.items()}
+            so_far = {name: column[:, :, :size] for name, column in columns.items()}
             _, _, each = self._in_order(engine, so_far, self._began(so_far["done"]), CRITIC)
-            after = each[:, -1:]
+            after = each[:, :, -1]
         value: Tensor = engine.outputs(seen_next, after, part=CRITIC)[0]
         return value
 
     def _began(self, done: Tensor) -> Tensor:
-        """Whether an episode begins with a turn, bool [L, T]."""
-        return torch.cat([self._ended[:, None], done[:, :-1]], 1)
+        """Whether an episode begins with a turn, bool [L, W, T]."""
+        return torch.cat([self._ended.unsqueeze(-1), done[..., :-1]], -1)
 
     def _in_order(
         self, engine: Engine, columns: Mapping[str, Tensor], began: Tensor, part: int
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """The outputs of a network, its states before each turn and after it, [L, T, ...]."""
+        """The outputs of a network, its states before each turn and after it, [L, W, T, ...]."""
         observation, first = columns["observation"], self._first[NAMES[part]]
-        given = first.new_zeros(*observation.shape[:2], *first.shape[1:])
-        given[:, 0] = torch.where(_like(began[:, 0], first), 0.0, first)
+        given = first.new_zeros(*observation.shape[:3], *first.shape[2:])
+        given[:, :, 0] = torch.where(_like(began[..., 0], first), 0.0, first)
         is_init = began.clone()
-        is_init[:, 0] = True
+        is_init[..., 0] = True
         outputs, after = engine.outputs(observation, given, is_init, part=part)
-        before = torch.cat(
-            [given[:, :1], torch.where(_like(began[:, 1:], after[:, 1:]), 0.0, after[:, :-1])], 1
-        )
+        begins, later = began[..., 1:], after[:, :, :-1]
+        before = torch.cat([given[:, :, :1], torch.where(_like(begins, later), 0.0, later)], 2)
         return outputs, before, after
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -131,9 +131,11 @@ class States:
 class RolloutLearner(LaneLearner):
     """R x S independent agents that learn from the latest steps of their current policies.
 
-    After every `rollout_steps` steps the learner estimates advantages with TorchRL's GAE and updates for
-    `epochs` epochs. Each lane shuffles its own minibatches, and learns exactly as it would alone. Minibatches
-    of recurrent networks are consecutive steps, and the update of more than `COMPILED_STEPS` is not compiled.
+    After T = `rollout_steps` turns of the W worlds the learner estimates advantages with TorchRL's GAE and
+    updates for `epochs` epochs over all T x W steps. Each lane shuffles its own minibatches, and learns
+    exactly as it would alone. Minibatches of recurrent networks are consecutive turns of one world, or, where
+    they are larger than a rollout, the rollouts of several worlds; the update of more than `COMPILED_STEPS`
+    turns is not compiled.
 
     Args:
         method: makes networks that are "actor" and "critic", see `cprl.algorithms.on_policy`.
@@ -151,14 +153,15 @@ class RolloutLearner(LaneLearner):
         loss = method.make_loss(deepcopy(networks[0]))
         refuse_other_advantages(loss, settings)
         self._reads_logits = reads(loss, "logits")
-        is_short = not shapes or settings.minibatch_size <= COMPILED_STEPS
+        self._sequence = min(settings.minibatch_size, settings.rollout_steps)
+        is_short = not shapes or self._sequence <= COMPILED_STEPS
         rule = UpdateRule.of(settings)
         self.engine = self._make_engine(networks, rule=rule, compile=compile and is_short)
-        self._states = States(shapes, self._lanes, sequence=settings.minibatch_size) if shapes else None
-        self.actor = self._lanes.actor(self.engine, EXPLORATION, compile=compile)
-        steps = settings.rollout_steps
+        self._states = States(shapes, self._lanes, sequence=self._sequence) if shapes else None
+        self.actor = self._lanes.actor(self.engine, EXPLORATION, worlds=self.worlds, compile=compile)
+        steps = settings.rollout_steps * self.worlds
         self.rng = LaneRng(self._lanes.seeds(SAMPLING), steps, ahead=steps_ahead(steps))
-        self._rollout = Rollout(self._lanes, steps)
+        self._rollout = Rollout(self._lanes, settings.rollout_steps)
 
     def _trial(self, lanes: int) -> TensorDict:
         actions = self.spaces.actions
@@ -183,33 +186,36 @@ class RolloutLearner(LaneLearner):
         if self._states is not None and not self._rollout.size:
             self._states.begin(turn)
         self._rollout.write(self._lanes.turn(turn, self._wanted(turn)))
-        self.steps += 1
+        self.steps += self.worlds
 
     def update(self) -> Tensor | None:
         """Runs all epochs over a full rollout; returns the mean losses [R, S], or None if it is not full."""
         if not self._rollout.is_full:
             return None
         batch = self._batch()
-        lane = torch.arange(self.lanes, device=batch["action"].device)[:, None]
         losses = []
         for _ in range(self.settings.epochs):
-            places = self._minibatches(self.rng.next())
-            losses += [self.engine.update_from(batch[lane, place.to(lane.device)]) for place in places]
+            places = self._minibatches(self.rng.next()).to(batch["action"].device)
+            losses += [self.engine.update_at(batch, place) for place in places]
         self._rollout.size = 0
         return self._lanes.by_agent(torch.stack(losses).mean(0))
 
     def _minibatches(self, numbers: Tensor) -> Tensor:
-        """The steps of an epoch's minibatches, int64 [minibatches, L, size], from random numbers [L, T];
-        those of recurrent networks are consecutive."""
+        """The steps of an epoch's minibatches, int64 [minibatches, L, size], from random numbers [L, W x T];
+        of recurrent networks T' consecutive turns, [minibatches, L, T'], or several such sequences of each
+        lane, [minibatches, L, sequences, T']."""
         size = self.settings.minibatch_size
         if self._states is None:
             return numbers.argsort(-1).view(len(numbers), -1, size).transpose(0, 1)
-        return numbers[:, ::size].argsort(-1).T.unsqueeze(-1) * size + torch.arange(size)
+        turns = self._sequence
+        sequences = numbers[:, ::turns].argsort(-1).view(len(numbers), -1, size // turns).transpose(0, 1)
+        places = sequences.unsqueeze(-1) * turns + torch.arange(turns)
+        return places.squeeze(2)
 
     def _batch(self) -> TensorDict:
-        """The rollout with advantages, [L, T], under the keys of TorchRL's losses; advantages are normalised
-        within each lane if the settings say so."""
-        columns = self._rollout.columns()
+        """The rollout with advantages, [L, W x T], under the keys of TorchRL's losses; advantages are
+        normalised within each lane if the settings say so."""
+        columns = self._rollout.fields
         with torch.no_grad():
             entries: dict[str, Tensor] = {}
             if self._states is not None:
@@ -220,32 +226,32 @@ class RolloutLearner(LaneLearner):
                 next_value = self.engine.outputs(columns["next_observation"], part=CRITIC)
             chances = logits.log_softmax(-1)
             over = tuple(range(1, value.ndim))
-            advantage, target = advantages(columns, value, next_value, settings=self.settings, over=over)
+            options: dict[str, Any] = {"settings": self.settings, "over": over, "time_dim": 2}
+            advantage, target = advantages(columns, value, next_value, **options)
         chosen = chances.gather(-1, columns["action"].unsqueeze(-1)).squeeze(-1)
-        return TensorDict(
-            {
-                "observation": columns["observation"],
-                "action": columns["action"],
-                "action_log_prob": chosen,
-                "advantage": advantage,
-                "value_target": target,
-                "state_value": value,
-                **({"logits": logits} if self._reads_logits else {}),
-                **entries,
-            },
-            [self.lanes, self.rollout_steps],
-        )
+        read = {
+            "observation": columns["observation"],
+            "action": columns["action"],
+            "action_log_prob": chosen,
+            "advantage": advantage,
+            "value_target": target,
+            "state_value": value,
+            **({"logits": logits} if self._reads_logits else {}),
+            **entries,
+        }
+        size = [self.lanes, self.worlds * self.rollout_steps]
+        return TensorDict({name: entry.flatten(1, 2) for name, entry in read.items()}, size)
 
     def values(self, batch: TensorDictBase | Turn) -> Tensor:
-        """The value that each agent's critic gives to the state after a turn, [R, S]."""
+        """The value that each agent's critic gives to the state after a turn, [B, S]."""
         with torch.no_grad():
             seen = self._lanes.seen_next(Turn.of(batch))
             if self._states is None:
                 expected: Tensor = self.engine.outputs(seen, part=CRITIC)
             else:
-                columns = self._rollout.columns()
+                columns = self._rollout.fields
                 expected = self._states.value_next(self.engine, columns, self._rollout.size, seen)
-        return expected.reshape(self.replicas, len(self.agents))
+        return self._lanes.by_world(expected)
 
     def state_dict(self) -> dict[str, Any]:
         return {
@@ -270,16 +276,18 @@ def advantages(
     next_value: Tensor,
     *,
     settings: RolloutSettings | LOLASettings,
+    time_dim: int,
     over: tuple[int, ...],
 ) -> tuple[Tensor, Tensor]:
     """The advantage of each step, and the target of its value, both of the shape of `value`.
 
     Args:
-        columns: "reward", "done" and "terminated", of lanes [L, T], or of members of teams [L, T, S].
-        value: of the states before each step, [L, T, ..., 1].
+        columns: "reward", "done" and "terminated", of lanes [L, .., T], or of members of teams [L, .., T, S].
+        value: of the states before each step, [L, .., T, .., 1].
         next_value: of the states after it.
         settings: the discount, lambda, and whether advantages are normalised.
-        over: the axes over which they are, that of time first.
+        time_dim: the axis of time.
+        over: the axes over which they are normalised.
     """
     advantage, target = generalized_advantage_estimate(
         settings.gamma,
@@ -287,7 +295,7 @@ def advantages(
         value,
         next_value,
         *(_like(columns[name], value).expand_as(value) for name in ("reward", "done", "terminated")),
-        time_dim=over[0],
+        time_dim=time_dim,
     )
     if settings.normalize_advantage:
         spread = advantage.std(over, keepdim=True)
@@ -301,7 +309,7 @@ def _like(column: Tensor, value: Tensor) -> Tensor:
 
 
 class Rollout:
-    """The turns of a rollout of all lanes, field by field as of a `LaneTurn`.
+    """The turns of a rollout of all lanes in their worlds, field by field as of a `LaneTurn`.
 
     Args:
         steps: T, of one rollout.
@@ -309,12 +317,11 @@ class Rollout:
     """
 
     def __init__(self, lanes: Lanes, steps: int, rollouts: int | None = None) -> None:
-        form, device = lanes.form(), lanes.who.device
-        axes = (steps,) if rollouts is None else (rollouts, steps)
-        turns = prod(axes)
+        form, device, self._lanes = lanes.form(), lanes.who.device, lanes
+        axes = (*(() if rollouts is None else (rollouts,)), len(lanes), lanes.worlds, steps)
         check_memory(
-            f"the rollouts of {len(lanes)} learners x {turns:,} steps",
-            turns * len(lanes) * (2 * prod(form.observation_shape) * (form.dtype.itemsize + 4) + 64),
+            f"the rollouts of {len(lanes)} learners x {prod(axes) // len(lanes):,} steps",
+            prod(axes) * (2 * prod(form.observation_shape) * (form.dtype.itemsize + 4) + 64),
             "fewer rollout_steps or fewer replicas",
             device=device,
         )
@@ -327,10 +334,10 @@ class Rollout:
             "terminated": ((), torch.bool),
         }
         self.fields = {
-            name: torch.zeros((*axes, len(lanes), *shape), dtype=dtype, device=device)
+            name: torch.zeros((*axes, *shape), dtype=dtype, device=device)
             for name, (shape, dtype) in forms.items()
         }
-        """[T, L, ...], or [P, T, L, ...]."""
+        """[L, W, T, ...], or [P, L, W, T, ...]."""
         self.steps, self.size = steps, 0
 
     @property
@@ -344,15 +351,12 @@ class Rollout:
     def write(self, turn: LaneTurn, *rollout: int) -> None:
         """Writes the next turn, of a rollout if several are kept."""
         for name, field in self.fields.items():
-            column = torch.as_tensor(getattr(turn, name))
+            column = getattr(turn, name)
             if name in ("observation", "next_observation"):
-                refuse_other_dtype(column.dtype, field.dtype)
-            field[(*rollout, self.size)] = column
+                refuse_other_dtype(torch.as_tensor(column).dtype, field.dtype)
+            of_rollout = field[rollout] if rollout else field
+            of_rollout[:, :, self.size] = self._lanes.by_lane(column)
         self.size += 1
-
-    def columns(self) -> dict[str, Tensor]:
-        """The fields of a single rollout, [L, T, ...]."""
-        return {name: field.transpose(0, 1) for name, field in self.fields.items()}
 
     def load(self, fields: Mapping[str, Tensor], size: int) -> None:
         for name, field in self.fields.items():

@@ -55,12 +55,13 @@ class DQNSettings(Exploring):
     """
 
     buffer_size: Annotated[int, Range(1, 2**40 - 1)] = 100_000
-    """Capacity of the replay buffer, in transitions."""
+    """Capacity of the replay buffer, in transitions of all worlds of a replica; of W worlds the largest
+    multiple of W is used."""
     batch_size: Positive = 8
     """Transitions in a minibatch, or sequences of `sequence_steps` transitions."""
     learning_starts: Steps = 16
     """Transitions stored before the first update; after that `updates_per_step` updates follow every
-    `steps_per_update` environment steps."""
+    `steps_per_update` steps. A turn of W worlds is W steps."""
     gamma: Share = 0.995
     """Discount factor per step."""
     learning_rate: LearningRate = 1e-5
@@ -70,10 +71,11 @@ class DQNSettings(Exploring):
     hidden_cells: Layers = DEFAULT_HIDDEN_CELLS
     """Units of each hidden layer, with ReLU; used if the algorithm has no `network`."""
     updates_per_step: Positive = 1
-    """Updates per environment step, or after `steps_per_update` of them, each with a new minibatch."""
+    """Updates per step, or after `steps_per_update` of them, each with a new minibatch."""
     steps_per_update: Steps = 1
-    """Environment steps from one update to the next; the study updates after each, Mnih et al. (2015) after
-    every fourth, with minibatches of 32."""
+    """Steps from one update to the next; the study updates after each, Mnih et al. (2015) after every fourth,
+    with minibatches of 32. With W worlds the default is thus W updates a turn; `steps_per_update=W` is one,
+    which samples as many transitions a step as the study with a `batch_size` W times as large."""
     n_steps: Turns = 1
     """Rewards that an n-step target sums before it bootstraps; fewer if the episode ends sooner. As TorchRL's
     `MultiStepTransform`; the study used 1."""
@@ -114,6 +116,14 @@ class DQNSettings(Exploring):
             other = f"n_steps {self.n_steps}" if self.n_steps > 1 else "replay_transforms"
             raise ValueError(f"DQNSettings.sequence_steps is {self.sequence_steps}; allowed with {other}: 1")
 
+    def refuse_worlds(self, worlds: int) -> None:
+        """Raises a ValueError where a replica of so many worlds W cannot learn by these."""
+        fewest = worlds * 2 * max(1, self.n_steps, self.sequence_steps) if worlds > 1 else 1
+        if self.buffer_size < fewest:
+            raise ValueError(
+                f"DQNSettings.buffer_size is {self.buffer_size}; allowed in {worlds} worlds: {fewest} or more"
+            )
+
 
 @dataclass(frozen=True, kw_only=True)
 class _OfRollouts(Value, stored=False):
@@ -121,8 +131,8 @@ class _OfRollouts(Value, stored=False):
     defaults are ours."""
 
     rollout_steps: Positive = 250
-    """Steps T collected between updates; an update of LOLA takes several rollouts, see
-    `cprl.algorithms.LOLA.estimator`."""
+    """Turns T of each world collected between updates, so T x W steps of W worlds; an update of LOLA takes
+    several rollouts, see `cprl.algorithms.LOLA.estimator`."""
     gamma: Share = 0.995
     """Discount factor per step."""
     optimizer: Optimizer = "adam"
@@ -158,14 +168,24 @@ class RolloutSettings(_OfRollouts):
     epochs: Positive = 4
     """Passes over each rollout."""
     minibatch_size: Positive = 50
-    """Steps in a minibatch; must divide `rollout_steps`."""
+    """Steps in a minibatch, of all worlds of a replica; must divide the `rollout_steps` x W steps of its W
+    worlds."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.rollout_steps % self.minibatch_size:
+        longest = max(self.rollout_steps, self.minibatch_size)
+        if longest % self.rollout_steps or longest % self.minibatch_size:
             raise ValueError(
                 f"RolloutSettings.minibatch_size is {self.minibatch_size}; it must divide rollout_steps, "
-                f"{self.rollout_steps}"
+                f"{self.rollout_steps}, or be a multiple of it, of agents in several worlds"
+            )
+
+    def refuse_worlds(self, worlds: int) -> None:
+        """Raises a ValueError where a replica of so many worlds W cannot learn by these."""
+        if (self.rollout_steps * worlds) % self.minibatch_size:
+            raise ValueError(
+                f"RolloutSettings.minibatch_size is {self.minibatch_size}; it must divide rollout_steps x "
+                f"worlds, {self.rollout_steps} x {worlds}"
             )
 
 

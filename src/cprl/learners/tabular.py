@@ -26,7 +26,7 @@ from cprl.commons.spaces import Spaces
 from cprl.keys import Turn
 from cprl.learners.base import Learner, LearningAgents
 from cprl.learners.settings import TabularSettings
-from cprl.learners.transitions import lane_turn
+from cprl.learners.transitions import by_lane, lane_turn
 from cprl.policies.rng import EVALUATION, EXPLORATION
 from cprl.policies.tabular import NEVER_MET, QTables, TableNetwork, TabularActor, observed_entries, states_of
 
@@ -50,9 +50,14 @@ class TabularLearner(Learner):
             if name in who.start_from:
                 start = who.start_from[name]
                 self.tables.add_lane(lane, start["states"].numpy(), start["values"].numpy())
-        self.actor = self._actor(EXPLORATION, worlds=1)
+        self.actor = self._actor(EXPLORATION, worlds=self.worlds)
         self.actor.epsilon = settings.epsilon(0)
-        self._observed, self._every_lane = observed_entries(who.spaces), range(self.lanes)
+        self._observed = observed_entries(who.spaces)
+        columns = torch.arange(self.lanes * self.worlds)
+        self._columns = by_lane(columns, replicas=self.replicas, worlds=self.worlds).T.numpy()
+        """Where the lanes stand in a turn, of one world after the other, int64 [W, L]."""
+        self._lane = np.empty(len(columns), np.int64)
+        self._lane[self._columns] = np.arange(self.lanes)
         self._turns: deque[dict[str, NDArray[Any]]] = deque()
 
     @property
@@ -70,45 +75,50 @@ class TabularLearner(Learner):
         return actor
 
     def store(self, batch: TensorDictBase | Turn) -> None:
-        """Queues one step of every replica for `update`."""
+        """Queues one turn of every world for `update`."""
         whole = Turn.of(batch)
         if isinstance(whole.next_world[keys.DONE], Tensor):  # on a GPU; tables are on the CPU
             whole = Turn.of(whole.batch.cpu())
         turn = lane_turn(self.agents, whole, self._wanted(whole))
         seen = states_of(whole.batch[keys.AGENTS], self._observed, self.agents)
-        rows = self.tables.find_or_add(seen, self._every_lane)
+        rows = self.tables.find_or_add(seen, self._lane.tolist())
         on = np.flatnonzero(~turn.terminated)
         next_seen = states_of(whole.batch["next", keys.AGENTS], self._observed, self.agents)
-        next_rows = np.full(self.lanes, NEVER_MET, np.int64)
-        next_rows[on] = self.tables.find_or_add([next_seen[lane] for lane in on], on.tolist())
+        next_rows = np.full(len(rows), NEVER_MET, np.int64)
+        next_states = [next_seen[column] for column in on]
+        next_rows[on] = self.tables.find_or_add(next_states, self._lane[on].tolist())
         reward, action = turn.reward.astype(np.float64), turn.action.copy()
         self._turns.append({"row": rows, "action": action, "reward": reward, "next_row": next_rows})
-        self.steps += 1
+        self.steps += self.worlds
         self.actor.epsilon = self.settings.epsilon(self.steps)
 
     def update(self) -> Tensor | None:
-        """Learns from the oldest queued turn; returns the squared errors [R, S], or None if there is none."""
+        """Learns from the oldest queued turn, of one world after the other; returns the mean squared errors
+        [R, S], or None if there is none."""
         if not self._turns:
             return None
         turn, values = self._turns.popleft(), self.tables.values
-        place = turn["row"], turn["action"]
-        self.tables.visits[place] += 1  # no two lanes share a row
-        target = turn["reward"] + self.settings.gamma * values[turn["next_row"]].max(1)
-        error = target - values[place]
-        values[place] += self.settings.rates(self.tables.visits[place]) * error
-        return torch.from_numpy(error**2).view(self.replicas, len(self.agents))
+        errors = []
+        for columns in self._columns:
+            place = turn["row"][columns], turn["action"][columns]
+            self.tables.visits[place] += 1  # no two lanes share a row
+            target = turn["reward"][columns] + self.settings.gamma * values[turn["next_row"][columns]].max(1)
+            errors.append(target - values[place])
+            values[place] += self.settings.rates(self.tables.visits[place]) * errors[-1]
+        squares = np.square(errors).mean(0)
+        return torch.from_numpy(squares).view(self.replicas, len(self.agents))
 
     def finite(self) -> Tensor:
         sound = np.ones(self.lanes, np.bool_)
         if not np.isfinite(self.tables.values[: self.tables.size].sum()):
-            sound = np.array([np.isfinite(self.tables.of_lane(lane)[1]).all() for lane in self._every_lane])
+            sound = np.array([np.isfinite(self.tables.of_lane(lane)[1]).all() for lane in range(self.lanes)])
         return torch.from_numpy(sound).view(self.replicas, len(self.agents))
 
     def values(self, batch: TensorDictBase | Turn) -> Tensor:
-        """The highest action value of each agent at the end of a turn, [R, S]."""
+        """The highest action value of each agent at the end of a turn, [B, S]."""
         after = Turn.of(batch).batch["next", keys.AGENTS]
-        rows = self.tables.find(states_of(after, self._observed, self.agents), self._every_lane)
-        return torch.from_numpy(self.tables.values[rows].max(1)).view(self.replicas, len(self.agents))
+        rows = self.tables.find(states_of(after, self._observed, self.agents), self._lane.tolist())
+        return torch.from_numpy(self.tables.values[rows].max(1)).view(-1, len(self.agents))
 
     def networks(self) -> dict[str, nn.Module]:
         made: dict[str, nn.Module] = {}

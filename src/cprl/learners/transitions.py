@@ -12,46 +12,47 @@ from cprl.keys import Turn
 
 
 class LaneTurn(NamedTuple):
-    """One transition of each of L lanes, numpy arrays on the CPU, else tensors. Where lanes are teams of S
-    agents, their fields have the axis of members next: [L, S, ...]."""
+    """One transition of each of L lanes in each of its W worlds, C = L x W columns in the order of the
+    worlds, see `by_lane`; numpy arrays on the CPU, else tensors. Where lanes are teams of S agents, their
+    fields have the axis of members next: [C, S, ...]."""
 
     observation: Any
-    """uint8 [L, C, X, Y]."""
+    """[C, *shape] of observations."""
     action: Any
-    """int64 [L], or [L, N] for lanes that see the actions of their peers, see `joint_actions`."""
+    """int64 [C], or [C, N] for lanes that see the actions of their peers, see `joint_actions`."""
     next_observation: Any
-    """uint8 [L, C, X, Y]."""
+    """[C, *shape]."""
     reward: Any
-    """float32 [L]; of teams [L, S] or, if their members share it, [L]."""
+    """float32 [C]; of teams [C, S] or, if their members share it, [C]."""
     done: Any
-    """bool [L]."""
+    """bool [C]."""
     terminated: Any
-    """bool [L]."""
+    """bool [C]."""
     recurrent_state: Any = None
-    """float32 [L, K], before the turn, of lanes with a recurrent network."""
+    """float32 [C, K], before the turn, of lanes with a recurrent network."""
     next_recurrent_state: Any = None
     """After it, likewise."""
 
 
 def lane_turn(agents: Sequence[int], turn: Turn, rewards: Any, *, are_team: bool = False) -> LaneTurn:
-    """One transition of each of some agents of every replica, lane = replica x S + position in `agents`;
-    views where that is possible.
+    """One transition of each of S agents in every world, column = world x S + position in `agents`; views
+    where that is possible.
 
     Args:
-        rewards: those that all agents want, [R, N].
-        are_team: whether the agents of a replica are one lane.
+        rewards: those that all agents want, [B, N].
+        are_team: whether the agents of a world are one column.
     """
-    replicas, everyone = rewards.shape
+    worlds, everyone = rewards.shape
     at = list(agents)
     everyone_learns = at == list(range(everyone))
-    lanes = (replicas, len(at)) if are_team else (replicas * len(at),)
+    columns = (worlds, len(at)) if are_team else (worlds * len(at),)
 
     def of(array: Any) -> Any:
-        return (array if everyone_learns else array[:, at]).reshape(*lanes, *array.shape[2:])
+        return (array if everyone_learns else array[:, at]).reshape(*columns, *array.shape[2:])
 
     def of_world(flags: Any) -> Any:
         if are_team:
-            return flags.reshape(replicas)
+            return flags.reshape(worlds)
         return flags.repeat(len(at)) if isinstance(flags, np.ndarray) else flags.repeat_interleave(len(at))
 
     return LaneTurn(
@@ -65,16 +66,28 @@ def lane_turn(agents: Sequence[int], turn: Turn, rewards: Any, *, are_team: bool
 
 
 def joint_actions(agents: Sequence[int], turn: Turn) -> Any:
-    """The actions of all N agents in one turn, as each of some agents of every replica sees them.
+    """The actions of all N agents in one turn, as each of S agents of every world sees them.
 
     Returns:
-        int64 [R x S, N]: first a lane's own action, then the others' in the order of their indices. They are
-        those that agents chose, also where an agent was out of play and its action did not count.
+        int64 [B x S, N]: first an agent's own action, then the others' in the order of their indices. They
+        are those that agents chose, also where an agent was out of play and its action did not count.
     """
     actions = turn.agents["action"]
     everyone = actions.shape[1]
     order = [[agent, *(other for other in range(everyone) if other != agent)] for agent in agents]
     return actions[:, order].reshape(len(actions) * len(agents), everyone)
+
+
+def by_lane(columns: Tensor, *, replicas: int, worlds: int) -> Tensor:
+    """Values of all columns of a turn, [C, ...], as those of lanes and their worlds, [L, W, ...].
+
+    Columns are in the order of the B = R x W worlds, and within a world in that of its lanes: the agents that
+    learn apart, or one team.
+    """
+    if worlds == 1:
+        return columns[:, None]
+    by_world = columns.reshape(replicas, worlds, -1, *columns.shape[1:])
+    return by_world.swapaxes(1, 2).reshape(-1, worlds, *columns.shape[1:])
 
 
 def array_of(tensor: Tensor) -> Any:

@@ -183,7 +183,8 @@ class Bandit(Value):
 
 
 class BanditDecider(Decider):
-    """The agents of R replicas, of which some learn their decisions, beside others that do not.
+    """The agents of R replicas, of which some learn their decisions, beside others that do not; those of a
+    replica learn from the episodes of all of its worlds.
 
     Args:
         bandits: by agent; None for those that do not learn.
@@ -198,6 +199,7 @@ class BanditDecider(Decider):
         bandits: Sequence[Bandit | None],
         stored: Mapping[int, Sequence[Tensor]],
         replicas: int,
+        worlds: int = 1,
         seed: int,
         first_replica: int = 0,
     ) -> None:
@@ -207,6 +209,7 @@ class BanditDecider(Decider):
             sizes,
             seeds=_seeds(seed, self._numbers_of_replicas, agents, EXPLORATION),
             agents=agents,
+            worlds=worlds,
             values=_table(sizes, stored, replicas=replicas, agents=agents),
             epsilon=np.zeros((replicas, agents)),
             by_chance=[bandit is None and agent not in stored for agent, bandit in enumerate(bandits)],

@@ -40,8 +40,8 @@ class QTables:
     def find_or_add(self, states: Sequence[bytes], lanes: Sequence[int]) -> NDArray[np.int64]:
         """As `find`, but adds a row for each state that has none."""
         rows = self.find(states, lanes)
-        for n in np.flatnonzero(rows == NEVER_MET).tolist():
-            rows[n] = self._add(states[n], lanes[n])
+        for n in np.flatnonzero(rows == NEVER_MET).tolist():  # of two that are the same the first adds it
+            rows[n] = self.rows[lanes[n]].get(states[n]) or self._add(states[n], lanes[n])
         return rows
 
     def _add(self, state: bytes, lane: int) -> int:

@@ -32,7 +32,7 @@ RECIPE_FORMAT: Final = 2
 """Of `recipe.json`, and of the journal and `report.json` beside it."""
 MANIFEST_FORMAT: Final = 1
 """Of `manifest.json`, and of what it lists: weights, tables, transforms, decisions."""
-TRAINING_STATE_FORMAT: Final = 4
+TRAINING_STATE_FORMAT: Final = 5
 """Of checkpoints."""
 STUDY_FORMAT: Final = 1
 """Of `study.json`."""

@@ -352,6 +352,7 @@ class Population:
         env: a world for each replica, with its transforms: agents are made for what it shows them.
         specs: the specification of each agent, see `cprl.population`.
         seed: of the run; each agent of each replica has random numbers of its own.
+        worlds: the worlds W of each replica; world b of `env` belongs to replica b // W.
         first_replica: the number of the first replica, so that replica r can be trained alone.
         engine: "compiled", "eager" or "torchrl", see `Experiment.engine`.
         starts: whether agents that start from stored weights get them; False where a checkpoint follows,
@@ -366,13 +367,14 @@ class Population:
         specs: Sequence[AgentSpec],
         *,
         seed: int = 0,
+        worlds: int = 1,
         first_replica: int = 0,
         engine: str = "compiled",
         starts: bool = True,
         weights: Mapping[str, str] | None = None,
     ) -> None:
         self.spaces, self.specs, self.seed = spaces_of(env), tuple(specs), seed
-        self.replicas = env.batch_size.numel()
+        self.replicas, self.worlds = env.batch_size.numel() // worlds, worlds
         commons = commons_of(env)
         self._game = None if commons is None else commons.game
         self._device = env.device or torch.device("cpu")
@@ -385,7 +387,7 @@ class Population:
         for spec, agents in groups:
             if isinstance(spec, Learning | Team):
                 self.learners[agents] = self._learner(spec, agents, engine, starts)
-        self.others: dict[AgentIndices, nn.Module] = self._others(EXPLORATION, worlds=1)
+        self.others: dict[AgentIndices, nn.Module] = self._others(EXPLORATION, worlds=worlds)
         self.decisions: BanditDecider | None = self._decisions()
         """What the agents decide, and learn to, where the game asks them."""
 
@@ -493,6 +495,7 @@ class Population:
             bandits=bandits,
             stored=_stored_values(self._stored),
             replicas=self.replicas,
+            worlds=self.worlds,
             seed=self.seed,
             first_replica=self._numbers.start,
         )
@@ -502,6 +505,7 @@ class Population:
             self.spaces,
             agents=agents,
             replicas=self.replicas,
+            worlds=self.worlds,
             seed=self.seed,
             first_replica=self._numbers.start,
             reward_kind=spec.reward,

@@ -1,7 +1,7 @@
 """FiniteCheck: finds losses, weights, rewards and observations that are NaN or infinite during a training.
 
 Rewards, losses and observations of floating-point numbers are summed up; the sums are looked at every
-`EVERY_STEPS` steps, when episodes end and before the state of a training is saved, the latter two times
+`EVERY_TURNS` turns, when episodes end and before the state of a training is saved, the latter two times
 weights as well. One loss that is infinite is reported, even if the weights stay finite: most losses are
 means, so whatever the agent learned from that batch is lost. Weights that are not finite never become so
 again. "Weights" are all that a learner keeps of an agent: targets, critics and its optimiser's state too.
@@ -25,8 +25,8 @@ from cprl.keys import Turn
 from cprl.learners.base import Learner
 from cprl.training.learning import LaneLosses
 
-EVERY_STEPS: Final = 16
-"""Steps between two looks at the sums; to look in every step took 3 to 8 % of a training."""
+EVERY_TURNS: Final = 16
+"""Turns between two looks at the sums; to look in every step took 3 to 8 % of a training."""
 
 _LEARNED: Final = ("loss", "weights")
 _NAMED: Final = 8
@@ -50,7 +50,7 @@ class NotFinite:
     what: str
     """"loss", "weights", "reward" or the name of an entry that agents observe."""
     replica: int
-    """The replica, which is the world of the environment."""
+    """The replica, in whichever of its worlds."""
     agent: int
     step: int
     """The step at which it was seen first."""
@@ -66,12 +66,18 @@ class FiniteCheck:
 
     Args:
         spaces: what agents observe; entries of integers are not looked at.
+        worlds: the worlds W of each replica.
     """
 
     def __init__(
-        self, learners: Mapping[tuple[int, ...], Learner], spaces: Spaces, *, on_nan: OnNan = "stop"
+        self,
+        learners: Mapping[tuple[int, ...], Learner],
+        spaces: Spaces,
+        *,
+        worlds: int = 1,
+        on_nan: OnNan = "stop",
     ) -> None:
-        self.on_nan, self.learners = on_nan, learners
+        self.on_nan, self.learners, self._worlds = on_nan, learners, worlds
         self.reported: list[NotFinite] = []
         """Each agent and kind of number once, in the order in which they were reported."""
         self.saved_step = 0
@@ -83,7 +89,7 @@ class FiniteCheck:
         self._weights_step = 0
 
     def add(self, turn: Turn) -> None:
-        """Sums up what agents observe after a turn, [R]; this needs no synchronisation with a GPU."""
+        """Sums up what agents observe after a turn, [B]; this needs no synchronisation with a GPU."""
         if not self._entries:
             return
         seen = [turn.next_agents]
@@ -108,20 +114,21 @@ class FiniteCheck:
 
         Args:
             losses: by the indices of their agents.
-            returns: the return of each agent in the running episode of each replica, or in the one that has
-                just ended, [R, N].
+            returns: the return of each agent in the running episode of each world, or in the one that has
+                just ended, [B, N].
             weights: whether to check them in any case.
 
         Raises:
             NotFiniteError: with "stop", see `OnNan`.
         """
         known = {finding.place for finding in self.reported}
-        findings = _marked("reward", returns, range(returns.shape[1]), step)
+        findings = _marked("reward", self._by_replica(returns), range(returns.shape[1]), step)
         for agents, lane_losses in losses.items():
             of_losses = _marked("loss", lane_losses.total, agents, step)
             findings += [loss for loss in of_losses if ("weights", *loss.place[1:]) not in known]
         for name, sums in self._sums.items():
-            findings += _marked(name, sums.numpy(force=True), range(sums.shape[1]), step)
+            of_replicas = self._by_replica(sums.numpy(force=True))
+            findings += _marked(name, of_replicas, range(sums.shape[1]), step)
         if weights or any(finding.place not in known for finding in findings):
             for agents, learner in self.learners.items():
                 sound = np.where(learner.finite().numpy(force=True), 0.0, np.nan)
@@ -129,6 +136,12 @@ class FiniteCheck:
         self._report([finding for finding in findings if finding.place not in known])
         if weights:
             self._is_fresh, self._weights_step = True, step
+
+    def _by_replica(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        """Sums over the worlds of each replica, of numbers [B, N]; not finite where one is not."""
+        with np.errstate(all="ignore"):
+            sums: NDArray[Any] = numbers.reshape(-1, self._worlds, numbers.shape[1]).sum(1)
+        return sums
 
     def _report(self, findings: Sequence[NotFinite]) -> None:
         if not findings:

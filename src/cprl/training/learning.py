@@ -1,6 +1,6 @@
 """What a training keeps of its learners, episode by episode, and whom it accepts."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import nan
 from typing import Any, TypeAlias
 
@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torchrl.envs import EnvBase
 
 from cprl.learners.base import Learner
 from cprl.policies.assignment import AgentIndices, agent_indices
@@ -46,20 +47,21 @@ class LaneLosses:
 
 
 class WantedReturns:
-    """The sums of the rewards that agents want, over the running episode of each replica.
+    """The sums of the rewards that agents want, over the running episode of each world.
 
     Args:
+        worlds: of all replicas, B.
         agents: the number of agents N; those that do not learn have NaN.
     """
 
-    def __init__(self, replicas: int, agents: int, learners: Learners) -> None:
+    def __init__(self, worlds: int, agents: int, learners: Learners) -> None:
         self._wants: list[tuple[Any, Any]] = []
         self._first = np.full(agents, nan)
         for indices, learner in learners.items():
             learner.wants.clear()
             self._wants.append((slice(None) if len(indices) == agents else list(indices), learner.wants))
             self._first[list(indices)] = 0
-        self.returns = np.tile(self._first, (replicas, 1))
+        self.returns = np.tile(self._first, (worlds, 1))
 
     def add(self) -> None:
         """Adds the turn that the learners have just stored."""
@@ -68,10 +70,10 @@ class WantedReturns:
             turn = turn.numpy(force=True) if isinstance(turn, Tensor) else turn
             self.returns[:, columns] += turn[:, columns]
 
-    def take(self, replica: int) -> NDArray[np.float64]:
-        """The wanted return of each agent of a replica, [N], whose next episode begins at 0."""
-        taken: NDArray[np.float64] = self.returns[replica].copy()
-        self.returns[replica] = self._first
+    def take(self, world: int) -> NDArray[np.float64]:
+        """The wanted return of each agent of a world, [N], whose next episode begins at 0."""
+        taken: NDArray[np.float64] = self.returns[world].copy()
+        self.returns[world] = self._first
         return taken
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -81,26 +83,45 @@ class WantedReturns:
         self.returns[:] = state["returns"].numpy()
 
 
+def losses_of(replica: int, losses: Mapping[tuple[int, ...], LaneLosses]) -> dict[int, float]:
+    """The mean loss of each learning agent of a replica since it last ended an episode, then begun anew."""
+    return {agent: loss for of_agents in losses.values() for agent, loss in of_agents.take(replica).items()}
+
+
 def learned_in(
-    replica: int,
+    world: int,
     learners: Learners,
-    losses: Mapping[tuple[int, ...], LaneLosses],
-    values: Mapping[tuple[int, ...], Tensor],
+    losses: Mapping[int, float],
+    values: Mapping[tuple[int, ...], Sequence[Sequence[float]]],
 ) -> dict[str, float]:
-    """What was learned in the episode of a replica that has just ended."""
+    """What was learned in the episode of a world that has just ended.
+
+    Args:
+        losses: by agent, see `losses_of`.
+        values: of the states of all worlds, [B, S].
+    """
     learning = {}
     for agents, learner in learners.items():
-        for place, (agent, loss) in enumerate(losses[agents].take(replica).items()):
-            learning[f"agent_{agent}/loss"] = loss
+        for place, agent in enumerate(agents):
+            learning[f"agent_{agent}/loss"] = losses[agent]
             learning[f"agent_{agent}/epsilon"] = learner.actor.epsilon
-            learning[f"agent_{agent}/q"] = float(values[agents][replica, place])
+            learning[f"agent_{agent}/q"] = values[agents][world][place]
     return learning
 
 
 def check_agents(
-    agents: int, replicas: int, learners: Learners, others: Mapping[AgentIndices, nn.Module]
-) -> None:
-    """Raises a ValueError unless each of N agents has one learner or actor, with R replicas."""
+    env: EnvBase,
+    agents: int,
+    worlds: int,
+    learners: Learners,
+    others: Mapping[AgentIndices, nn.Module],
+) -> int:
+    """Return the number of replicas R; raise a ValueError unless each of N agents has one learner or actor,
+    in W worlds of each replica."""
+    everywhere: int = env.batch_size.numel()
+    replicas, left = divmod(everywhere, worlds)
+    if left:
+        raise ValueError(f"worlds is {worlds}; allowed: a divisor of the environment's {everywhere} worlds")
     taken = sorted(agent for indices in [*learners, *others] for agent in agent_indices(indices))
     if taken != (wanted := list(range(agents))):
         raise ValueError(
@@ -109,11 +130,13 @@ def check_agents(
     for indices, learner in learners.items():
         if learner.agents != agent_indices(indices):
             raise ValueError(f"a learner made for the agents {learner.agents} is given for {indices}")
-        if learner.replicas != replicas:
+        of_learner = learner.replicas, getattr(learner, "worlds", 1)
+        if of_learner != (replicas, worlds):
             raise ValueError(
-                f"the environment has {replicas} worlds; the learner of {indices} has {learner.replicas} "
-                "replicas; allowed: a world for each replica"
+                f"the environment has {replicas} replicas of {worlds} worlds; the learner of {indices} has "
+                f"{of_learner[0]} of {of_learner[1]}; allowed: the same"
             )
+    return replicas
 
 
 def check_decisions(decisions: Decider | None, options: int) -> None:
@@ -127,10 +150,17 @@ def check_decisions(decisions: Decider | None, options: int) -> None:
         )
 
 
-def check_numbers(episodes: int, update_every: int, learners: Learners) -> None:
-    """Raises a ValueError for numbers below 1, and for rollouts that `update_every` does not divide."""
-    for name, number in (("episodes", episodes), ("update_every", update_every)):
-        checked(name, number, Positive)
+def check_numbers(
+    episodes: int | None, steps: int | None, worlds: int, update_every: int, learners: Learners
+) -> None:
+    """Raises a ValueError for numbers below 1, for none or both of episodes and steps, and for rollouts that
+    `update_every` does not divide."""
+    if (episodes is None) == (steps is None):
+        raise ValueError(f"episodes is {episodes} and steps {steps}; allowed: one of them")
+    numbers = {"episodes": episodes, "steps": steps, "worlds": worlds, "update_every": update_every}
+    for name, number in numbers.items():
+        if number is not None:
+            checked(name, number, Positive)
     for learner in learners.values():
         steps = getattr(learner, "rollout_steps", update_every)
         if steps % update_every:

@@ -4,6 +4,7 @@ import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -28,7 +29,7 @@ from cprl.policies.decisions import Decider
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.files import TRAINING_STATE_FORMAT
 from cprl.system.times import Times
-from cprl.training.finite import EVERY_STEPS, FiniteCheck
+from cprl.training.finite import EVERY_TURNS, FiniteCheck
 from cprl.training.learning import (
     LaneLosses,
     WantedReturns,
@@ -36,6 +37,7 @@ from cprl.training.learning import (
     check_decisions,
     check_numbers,
     learned_in,
+    losses_of,
 )
 from cprl.values import Custom, shown
 
@@ -84,23 +86,26 @@ class StepCollector(BaseCollector):
 
 
 MakeCollector = Callable[[EnvBase, nn.Module], BaseCollector]
-"""A collector out of an environment and a policy; it yields batches [R], or [R, T] of T turns."""
+"""A collector out of an environment and a policy; it yields batches [B], or [B, T] of T turns."""
 
 
 class Training:
-    """A training that takes one step after the other, and whose whole state can be read and set.
+    """A training that takes one turn after the other, and whose whole state can be read and set.
 
-    All replicas take each step together. A replica whose episodes are short plays on until the last one has
-    played its last episode; callbacks get no episodes beyond `episodes`.
+    All replicas take each turn together. A replica whose episodes are short plays on until the last one has
+    played its last episode; callbacks get no episodes beyond `episodes`. Episodes of a replica are counted in
+    the order of the turns in which they end, and within a turn in that of its worlds.
 
     Args:
-        env: a world for each replica R.
+        env: W worlds of each replica R; world b belongs to replica b // W.
         learners: by the indices of their agents, a tuple; each updates these agents in every replica.
-        episodes: how many to play, at least 1.
+        episodes: how many each replica plays, at least 1; or `steps`.
+        steps: how many each replica takes, at least 1; a turn of W worlds is W steps.
+        worlds: the worlds W of each replica.
         others: the actors of the agents that do not learn, likewise; an actor of one agent by its index.
         decisions: what all agents decide, and learn to, where the game asks them; see `Game.decisions`.
         callbacks: called after each turn and each episode, in this order; see `Callback`.
-        update_every: steps k after which each learner updates, then k times.
+        update_every: turns k after which each learner updates, then k times.
         make_collector: what plays; one of TorchRL's own is several times slower, and cannot be resumed.
         on_nan: whether the training stops where a loss, weight, reward or observation is not finite, see
             `cprl.training.finite`.
@@ -112,7 +117,9 @@ class Training:
         env: EnvBase,
         learners: Mapping[tuple[int, ...], Learner],
         *,
-        episodes: int,
+        episodes: int | None = None,
+        steps: int | None = None,
+        worlds: int = 1,
         others: Mapping[AgentIndices, nn.Module] | None = None,
         decisions: Decider | None = None,
         callbacks: Sequence[Any] = (),
@@ -122,14 +129,14 @@ class Training:
         metrics: Sequence[Custom] = (),
     ) -> None:
         spaces = spaces_of(env)
-        replicas = env.batch_size.numel()
-        check_env(env, replicas)
+        check_env(env, env.batch_size.numel())
         check_callbacks(callbacks)
-        self.env, self.episodes, self.callbacks = env, episodes, list(callbacks)
+        self.env, self.callbacks = env, list(callbacks)
+        self.episodes, self.all_steps, self.worlds = episodes, steps, worlds
         self.update_every = update_every
         self.learners, self.others = dict(learners), dict(others or {})
-        check_agents(spaces.agents, replicas, self.learners, self.others)
-        check_numbers(episodes, update_every, self.learners)
+        check_numbers(episodes, steps, worlds, update_every, self.learners)
+        self.replicas = check_agents(env, spaces.agents, worlds, self.learners, self.others)
         actors: dict[AgentIndices, nn.Module] = {
             agents: learner.actor for agents, learner in self.learners.items()
         }
@@ -139,22 +146,30 @@ class Training:
         self._collector = make_collector(env, AgentPolicies({**actors, **self.others}, decisions=decisions))
         self._turns = iter(self._collector)
         self._tracker = tracker_of(env, metrics)
-        self._losses = {agents: LaneLosses(replicas, agents) for agents in self.learners}
-        self._wanted = WantedReturns(replicas, spaces.agents, self.learners)
+        self._losses = {agents: LaneLosses(self.replicas, agents) for agents in self.learners}
+        self._wanted = WantedReturns(self.replicas * worlds, spaces.agents, self.learners)
         for learner in self.learners.values():
             learner.begin()
-        self.finite = FiniteCheck(self.learners, spaces, on_nan=on_nan)
+        self.finite = FiniteCheck(self.learners, spaces, worlds=worlds, on_nan=on_nan)
         self._on_step = self._hooks("on_step")
-        self._played = [0] * replicas
+        self._played = [0] * self.replicas
         self.steps = 0
+        """Steps of each replica so far."""
         self.times = Times()
 
     def __repr__(self) -> str:
-        return f"Training({self.env!r}, {self.steps} steps, {self.episodes} episodes)"
+        length = f"{self.all_steps} steps" if self.episodes is None else f"{self.episodes} episodes"
+        return f"Training({self.env!r}, {self.steps} steps of {length})"
 
     @property
     def is_over(self) -> bool:
-        return min(self._played) >= self.episodes
+        if self.all_steps is not None:
+            return self.steps >= self.all_steps
+        return min(self._played) >= self._most_episodes
+
+    @property
+    def _most_episodes(self) -> float:
+        return inf if self.episodes is None else self.episodes
 
     @property
     def is_sound(self) -> bool:
@@ -164,12 +179,12 @@ class Training:
     @property
     def is_ending(self) -> bool:
         """Whether a replica has played its last episode; episodes that it plays beyond are not recorded."""
-        return max(self._played) >= self.episodes
+        return max(self._played) >= self._most_episodes
 
     @property
     def episodes_played(self) -> int:
         """Episodes that all replicas together have ended so far, those beyond `episodes` left out."""
-        return sum(min(played, self.episodes) for played in self._played)
+        return sum(played if self.episodes is None else min(played, self.episodes) for played in self._played)
 
     def start(self) -> None:
         """Calls `on_start` of the callbacks; `run` does before the first step."""
@@ -199,14 +214,15 @@ class Training:
             self._take(turn)
 
     def _take(self, batch: TensorDictBase) -> None:
-        self.steps += 1
+        self.steps += self.worlds
+        turns = self.steps // self.worlds
         began = time.perf_counter()
         turn = Turn.of(batch)
         self.finite.add(turn)
         for learner in self.learners.values():
             learner.store(turn)
         self._wanted.add()
-        if self.steps % self.update_every == 0:
+        if turns % self.update_every == 0:
             for _ in range(self.update_every):
                 for agents, learner in self.learners.items():
                     self._losses[agents].add(self._update(learner))
@@ -216,7 +232,7 @@ class Training:
         ended = self._tracker.add(turn)
         if ended:
             self._end(ended, turn)
-        elif self.steps % EVERY_STEPS == 0:
+        elif turns % EVERY_TURNS == 0:
             self._check_finite()
 
     def _update(self, learner: Learner) -> Tensor | None:
@@ -234,21 +250,27 @@ class Training:
 
     def _end(self, ended: Sequence[Episode], turn: Turn) -> None:
         self._check_finite(ended, weights=True)
-        worlds = torch.zeros(len(self._played), dtype=torch.bool)
+        worlds = torch.zeros(self.replicas * self.worlds, dtype=torch.bool)
         worlds[[episode.world for episode in ended]] = True
-        values = {agents: learner.values(turn) for agents, learner in self.learners.items()}
-        learning = [learned_in(episode.world, self.learners, self._losses, values) for episode in ended]
+        values = {agents: learner.values(turn).tolist() for agents, learner in self.learners.items()}
+        replicas = {episode.world // self.worlds for episode in ended}
+        losses = {replica: losses_of(replica, self._losses) for replica in replicas}
+        learning = [
+            learned_in(episode.world, self.learners, losses[episode.world // self.worlds], values)
+            for episode in ended
+        ]
         for learner in self.learners.values():
             learner.end_episode(worlds)
         recorded: list[tuple[Episode, dict[str, float]]] = []
         for episode, of_agents in zip(ended, learning, strict=True):
-            wanted = self._wanted.take(episode.world)
-            episode = replace(episode, wanted_return=wanted)
+            replica, wanted = episode.world // self.worlds, self._wanted.take(episode.world)
+            number = self._played[replica]
+            episode = replace(episode, replica=replica, episode=number, wanted_return=wanted)
             if self.decisions is not None and episode.decision is not None:
                 returns = np.where(np.isnan(wanted), episode.return_, wanted)
-                self.decisions.learn(episode.world, episode.decision, returns)
-            self._played[episode.world] += 1
-            if self._played[episode.world] <= self.episodes:
+                self.decisions.learn(replica, episode.decision, returns)
+            self._played[replica] += 1
+            if number < self._most_episodes:
                 recorded.append((episode, of_agents))
         for on_ended in self._hooks("on_ended") if recorded else ():
             on_ended(recorded)
@@ -336,7 +358,9 @@ def train(
     env: EnvBase,
     learners: Mapping[tuple[int, ...], Learner],
     *,
-    episodes: int,
+    episodes: int | None = None,
+    steps: int | None = None,
+    worlds: int = 1,
     others: Mapping[AgentIndices, nn.Module] | None = None,
     decisions: Decider | None = None,
     callbacks: Sequence[Any] = (),
@@ -346,7 +370,8 @@ def train(
     on_nan: OnNan = "stop",
     metrics: Sequence[Custom] = (),
 ) -> Training:
-    """Plays so many episodes of every replica; each learner stores every turn and then updates.
+    """Plays so many episodes, or takes so many steps, of every replica; each learner stores every turn and
+    then updates.
 
     Returns the `Training`, which is over; arguments are its own. The checkpointer says where it resumes from,
     and saves its state now and then.
@@ -358,6 +383,8 @@ def train(
         env,
         learners,
         episodes=episodes,
+        steps=steps,
+        worlds=worlds,
         others=others,
         decisions=decisions,
         callbacks=callbacks,
@@ -380,7 +407,7 @@ class Callback(Protocol):
         """The `Training` is about to take its first step, or the first after a checkpoint."""
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """One turn of every world, as the collector yields it, [R]."""
+        """One turn of every world, as the collector yields it, [B]."""
 
     def on_ended(self, ended: Sequence[tuple[Episode, dict[str, float]]]) -> None:
         """Episodes of some replicas have ended in one turn: all of them, with what was learned in each,
