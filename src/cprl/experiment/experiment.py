@@ -16,6 +16,7 @@ from cprl.runs.files import RECIPE_FORMAT, written_by_another
 from cprl.runs.recipe import recipe_config, with_runs_moved
 from cprl.system.memory import Device
 from cprl.values import (
+    MOST_INT64,
     Custom,
     DirectoryName,
     Positive,
@@ -54,7 +55,7 @@ class Experiment(Value, stored=False, called="experiment"):
     """How each agent is specified; see `cprl.population`."""
     episodes: Positive | None = None
     """Episodes that each replica trains, those of all its worlds together; or say `steps`."""
-    steps: Positive | None = None
+    steps: Annotated[int, Range(1, MOST_INT64)] | None = None
     """Steps that each replica trains, a turn of W worlds being W; or say `episodes`."""
     replicas: Annotated[int, Range(1, 2**20)] = 1
     """Independent repetitions R of the whole training, side by side."""

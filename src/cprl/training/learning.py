@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from math import nan
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from cprl.learners.base import Learner
 from cprl.policies.assignment import AgentIndices, agent_indices
 from cprl.policies.decisions import Decider
-from cprl.values import Positive, checked
+from cprl.values import MOST_INT64, Range, checked
 
 Learners: TypeAlias = Mapping[tuple[int, ...], Learner]
 """By the indices of their agents."""
@@ -160,7 +160,7 @@ def check_numbers(
     numbers = {"episodes": episodes, "steps": steps, "worlds": worlds, "update_every": update_every}
     for name, number in numbers.items():
         if number is not None:
-            checked(name, number, Positive)
+            checked(name, number, Annotated[int, Range(1, MOST_INT64)])
     for learner in learners.values():
         steps = getattr(learner, "rollout_steps", update_every)
         if steps % update_every:
