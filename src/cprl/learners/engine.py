@@ -180,8 +180,7 @@ class Engine(ABC):
     def update_at(self, batch: TensorDict, place: Tensor) -> Tensor:
         """Updates every network once from the steps at places [L, ...] of a batch [L, n]; returns their
         losses, [L / S]."""
-        lane = torch.arange(len(place), device=place.device).view(-1, *[1] * (place.ndim - 1))
-        return self.update_from(batch[lane, place])
+        return self.update_from(_at(batch, place))
 
     def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Any:
         """The outputs of the networks with their current weights: [L, k, ...] to [L, k, ...]; of recurrent
@@ -335,16 +334,24 @@ class _FromRing(NamedTuple):
 
 
 class _Given(NamedTuple):
-    """A batch that exists before the step: the names of its entries, and its batch size."""
+    """A batch that exists before the step: the names of its entries, and its batch size [L, n]; of which the
+    step takes places [L, ...], if they are a last column."""
 
     names: tuple[Any, ...]
     size: tuple[int, ...]
 
     def batch(self, columns: Sequence[Tensor]) -> TensorDict:
         batch = TensorDict({}, batch_size=self.size)
-        for name, column in zip(self.names, columns, strict=True):
+        for name, column in zip(self.names, columns, strict=False):
             batch.set(name, column)
-        return batch
+        return _at(batch, columns[-1]) if len(columns) > len(self.names) else batch
+
+
+def _at(batch: TensorDict, place: Tensor) -> TensorDict:
+    """The steps at places [L, ...] of a batch [L, n]."""
+    lane = torch.arange(len(place), device=place.device).view(-1, *[1] * (place.ndim - 1))
+    steps: TensorDict = batch[lane, place]
+    return steps
 
 
 class FunctionalEngine(Engine):
@@ -429,11 +436,14 @@ class FunctionalEngine(Engine):
             columns.append(ring.noise.next())
         return self._run(_FromRing(ring.rows, ring.horizon), columns, (ring.sizes, drawn[0].shape))
 
-    def _update(self, batch: TensorDict) -> Tensor:
+    def update_at(self, batch: TensorDict, place: Tensor) -> Tensor:
+        return super().update_at(batch, place) if self.sharing > 1 else self._update(batch, place)
+
+    def _update(self, batch: TensorDict, *place: Tensor) -> Tensor:
         entries = sorted(batch.items(True, True), key=lambda entry: str(entry[0]))
         given = _Given(tuple(name for name, _ in entries), tuple(batch.batch_size))
-        sizes = tuple((column.shape, column.dtype) for _, column in entries)
-        return self._run(given, [column for _, column in entries], sizes)
+        columns = [*(column for _, column in entries), *place]
+        return self._run(given, columns, tuple((column.shape, column.dtype) for column in columns))
 
     def _run(self, source: _FromRing | _Given, columns: list[Tensor], sizes: tuple[Any, ...]) -> Tensor:
         self.steps += 1
