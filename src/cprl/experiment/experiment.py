@@ -199,7 +199,13 @@ def _check_agents(experiment: Experiment) -> None:
             check_preference(f"{where}.reward", spec.reward, experiment.game.agents)
         if isinstance(spec, Team) and isinstance(spec.algorithm, TeamAlgorithm):
             spec.algorithm._check_team(len(spec.agents), spec.reward)
-        steps = getattr(getattr(getattr(spec, "algorithm", None), "settings", None), "rollout_steps", None)
+        settings = getattr(getattr(spec, "algorithm", None), "settings", None)
+        if hasattr(settings, "refuse_worlds"):
+            try:
+                settings.refuse_worlds(experiment.worlds)
+            except ValueError as error:
+                raise ValueError(f"{where}.algorithm.settings: {error}") from error
+        steps = getattr(settings, "rollout_steps", None)
         if steps is not None and steps % experiment.update_every:
             raise ValueError(
                 f"experiment.update_every is {experiment.update_every}; it must divide "

@@ -13,7 +13,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from cprl.keys import Turn
 from cprl.learners.base import LearningAgents
-from cprl.learners.engine import COMPILED_STEPS, Engine, UpdateRule
+from cprl.learners.engine import COMPILED_STEPS, Engine, ListEngine, UpdateRule
 from cprl.learners.lanes import LaneLearner, Lanes, Method
 from cprl.learners.ring import steps_ahead
 from cprl.learners.settings import LOLASettings, RolloutSettings
@@ -22,6 +22,7 @@ from cprl.learners.trial import reads, refuse_other_advantages, trial_batch, tri
 from cprl.networks.agent import AgentNetworks, parts_of
 from cprl.networks.recurrent import state_shape_of
 from cprl.policies.rng import EXPLORATION, SAMPLING, WEIGHTS, LaneRng
+from cprl.system.compiling import Compiled
 from cprl.system.memory import check_memory
 
 ACTOR, CRITIC = range(2)
@@ -159,6 +160,8 @@ class RolloutLearner(LaneLearner):
         self.engine = self._make_engine(networks, rule=rule, compile=compile and is_short)
         self._states = States(shapes, self._lanes, sequence=self._sequence) if shapes else None
         self.actor = self._lanes.actor(self.engine, EXPLORATION, worlds=self.worlds, compile=compile)
+        compiles = compile and not isinstance(self.engine, ListEngine)
+        self._both = Compiled(_outputs_of_both, what="rollouts are evaluated", enabled=compiles)
         steps = settings.rollout_steps * self.worlds
         self.rng = LaneRng(self._lanes.seeds(SAMPLING), steps, ahead=steps_ahead(steps))
         self._rollout = Rollout(self._lanes, settings.rollout_steps)
@@ -221,9 +224,7 @@ class RolloutLearner(LaneLearner):
             if self._states is not None:
                 logits, value, next_value, entries = self._states.evaluate(self.engine, columns)
             else:
-                logits = self.engine.outputs(columns["observation"], part=ACTOR)
-                value = self.engine.outputs(columns["observation"], part=CRITIC)
-                next_value = self.engine.outputs(columns["next_observation"], part=CRITIC)
+                logits, value, next_value = self._evaluated(columns)
             chances = logits.log_softmax(-1)
             over = tuple(range(1, value.ndim))
             options: dict[str, Any] = {"settings": self.settings, "over": over, "time_dim": 2}
@@ -241,6 +242,27 @@ class RolloutLearner(LaneLearner):
         }
         size = [self.lanes, self.worlds * self.rollout_steps]
         return TensorDict({name: entry.flatten(1, 2) for name, entry in read.items()}, size)
+
+    def _evaluated(self, columns: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """The logits, values and next values of a full rollout, [L, W, T, ...]."""
+        seen, following = columns["observation"], columns["next_observation"]
+        if self.worlds == 1:  # in one piece, since products of other shapes round in other ways
+            logits, value = _outputs_of_both(self.engine, seen)
+            return logits, value, self.engine.outputs(following, part=CRITIC)
+        # In pieces that stay in the processor's caches.
+        pieces = seen.flatten(1, 2).split(self.settings.minibatch_size, 1)
+        given = [self._both((piece.shape, piece.dtype), self.engine, piece) for piece in pieces]
+        logits, value = (
+            torch.cat(each, 1).unflatten(1, seen.shape[1:3]) for each in zip(*given, strict=True)
+        )
+        # What is seen after a turn is seen before the next one, but where an episode or the rollout ends.
+        next_value = torch.cat([value[:, :, 1:], value[:, :, -1:]], 2).flatten(1, 2)
+        ends = columns["done"].clone()
+        ends[:, :, -1] = True
+        place = _places(ends.flatten(1))
+        lane = torch.arange(self.lanes, device=place.device)[:, None]
+        next_value[lane, place] = self.engine.outputs(following.flatten(1, 2)[lane, place], part=CRITIC)
+        return logits, value, next_value.view_as(value)
 
     def values(self, batch: TensorDictBase | Turn) -> Tensor:
         """The value that each agent's critic gives to the state after a turn, [B, S]."""
@@ -268,6 +290,19 @@ class RolloutLearner(LaneLearner):
         self.rng.load_state_dict(state["draws"])
         if self._states is not None:
             self._states.load_state_dict(state["recurrent"])
+
+
+def _outputs_of_both(engine: Engine, observation: Tensor) -> list[Tensor]:
+    """The logits of actors and the values of critics, [L, ..., A] and [L, ..., 1]."""
+    return [engine.outputs(observation, part=part) for part in (ACTOR, CRITIC)]
+
+
+def _places(marked: Tensor) -> Tensor:
+    """Where each row has a mark, int64 [L, m] of bool [L, n]; of rows with fewer marks the last one again."""
+    order = marked.byte().argsort(dim=1, descending=True, stable=True)
+    counts = marked.sum(1, keepdim=True)
+    at = torch.arange(int(counts.max()), device=marked.device)
+    return order.gather(1, at.minimum(counts - 1))
 
 
 def advantages(

@@ -24,12 +24,15 @@ class LaneCategorical(torch.distributions.Categorical):
     def entropy(self) -> torch.Tensor:
         """As of `Categorical`, and 0 for NaN."""
         entropy: torch.Tensor = super().entropy()  # type: ignore[no-untyped-call]
-        # Compiled losses take a sample, made below, where the entropy is NaN.
+        # Compiled losses take a sample, and so the log-probability of one, where the entropy is NaN.
         return entropy if torch.compiler.is_compiling() else entropy.nan_to_num(nan=0.0)
 
     def sample(self, sample_shape: Any = ()) -> torch.Tensor:
-        """As of `Categorical`, and uniform for NaN."""
+        """As of `Categorical`, and uniform for NaN; in compiled losses, which sample in every case and look
+        at samples of NaN alone, always 0."""
         size = torch.Size(sample_shape)
+        if torch.compiler.is_compiling():
+            return self.probs.new_zeros(self._extended_shape(size), dtype=torch.int64)
         weights = self.probs.reshape(-1, self._num_events).nan_to_num(nan=1.0)
         return torch.multinomial(weights, size.numel(), True).T.reshape(self._extended_shape(size))
 
