@@ -87,7 +87,8 @@ def test_dices_others_act_by_their_weights_ahead_and_what_is_stored_evaluated_an
 def by_hand(learner, rollouts, gamma):
     """The losses of the members over rollouts [R, P, T] of the learner's columns, by parameters."""
     columns = learner._columns(learner.rollouts)
-    taken = {name: columns[name][:, rollouts] for name in ("observation", "action", "reward", "done")}
+    names = ("observation", "action", "reward", "done")
+    taken = {name: columns[name][:, rollouts].squeeze(2) for name in names}  # of one world
     done = taken["done"][..., :1]
     returns, last = torch.zeros_like(taken["reward"]), 0.0
     for step in reversed(range(taken["reward"].shape[2])):
@@ -170,8 +171,9 @@ def test_critics_learn_and_advantages_are_normalised_where_asked_and_gradients_c
     learner._phase = 0
     before = actor_weights(learner.engine.critics)
     observation, rollouts, target = learner._batch(2)
-    torch.testing.assert_close(rollouts["advantage"].mean(2), torch.zeros(2, 2, 2, 1), atol=1e-5, rtol=0)
-    torch.testing.assert_close(rollouts["advantage"].std(2), torch.ones(2, 2, 2, 1), atol=1e-3, rtol=0)
+    advantage = rollouts["advantage"].squeeze(2)  # of one world
+    torch.testing.assert_close(advantage.mean(2), torch.zeros(2, 2, 2, 1), atol=1e-5, rtol=0)
+    torch.testing.assert_close(advantage.std(2), torch.ones(2, 2, 2, 1), atol=1e-3, rtol=0)
 
     def error():
         with torch.no_grad():

@@ -273,8 +273,8 @@ def test_the_critic_goes_on_from_rollout_to_rollout_and_values_the_state_after_e
         learner.store(played[-1])
         torch.testing.assert_close(learner.values(played[-1]), wanted(played)[0])
         if learner._rollout.is_full:
-            _, _, next_value, _ = learner._states.evaluate(learner.engine, learner._rollout.columns())
-            torch.testing.assert_close(next_value[0, -1:], wanted(played)[0])
+            _, _, next_value, _ = learner._states.evaluate(learner.engine, learner._rollout.fields)
+            torch.testing.assert_close(next_value[0, 0, -1:], wanted(played)[0])
             learner._rollout.size = 0
             torch.testing.assert_close(learner.values(played[-1]), wanted(played)[0])
 
@@ -337,7 +337,7 @@ def test_every_turn_is_sampled_once_enough_follow_it():
     learner = learner_of(DQNS["GRU"], replicas=1)
     play(learner, 100)
     oldest, written = learner.buffer.oldest()
-    drawn = torch.cat([learner.buffer.draw() for _ in range(200)], 1)
+    drawn = torch.cat([learner.buffer.draw()[0] for _ in range(200)], 1)
     places = {int(place) % 60 for place in range(int(oldest[0]), written - 5)}
     assert set(drawn.flatten().tolist()) == places
 

@@ -191,7 +191,7 @@ def test_the_first_replica_alone_acts_with_the_weights_of_the_moment(engine):
 @pytest.mark.parametrize(
     ("learners", "others", "message"),
     [
-        ({(0, 1): {"replicas": 3}}, {}, r"has 2 worlds; the learner of \(0, 1\) has 3 replicas"),
+        ({(0, 1): {"replicas": 3}}, {}, r"has 2 replicas of 1 worlds; the learner of \(0, 1\) has 3"),
         ({(0,): {"replicas": 2}}, {}, r"made for the agents \(0, 1\) is given for \(0,\)"),
         ({(0, 1): {"replicas": 2}}, {1: RandomActor(8)}, r"control the agents \[0, 1, 1\]"),
     ],

@@ -66,18 +66,18 @@ def test_every_transition_kept_is_what_came_and_the_last_ones_are_kept(lanes):
 
 def test_lanes_draw_for_themselves_and_uniformly():
     ring = filled([0, 1, 2], steps=30, transitions=20)
-    drawn = torch.stack([ring.draw() for _ in range(3000)])
+    drawn = torch.stack([ring.draw()[0] for _ in range(3000)])
     assert not torch.equal(drawn[:, 0], drawn[:, 1])
     counts = torch.stack([torch.bincount(drawn[:, lane].flatten(), minlength=20) for lane in range(3)])
     assert (counts - 600).abs().max() < 6 * 600**0.5
     alone = filled([1], steps=30, transitions=20)
-    assert torch.equal(torch.stack([alone.draw() for _ in range(3000)])[:, 0], drawn[:, 1])
+    assert torch.equal(torch.stack([alone.draw()[0] for _ in range(3000)])[:, 0], drawn[:, 1])
 
 
 def test_a_ring_goes_on_as_it_was_from_its_state_and_a_sample_is_what_is_drawn():
     lanes = [0, 1, 2]
     ring, other, same = filled(lanes, steps=73), filled(lanes, steps=5), filled(lanes, steps=73)
-    assert_close(filled(lanes, steps=73).sample(), same.get(same.draw()))
+    assert_close(filled(lanes, steps=73).sample(), same.get(*same.draw()))
     other.load_state_dict(ring.state_dict())
     for step in range(73, 120):
         assert_close(ring.sample(), other.sample())
@@ -109,8 +109,8 @@ def test_returns_of_several_steps_are_what_one_works_out_by_hand(lanes, n_steps)
         oldest, written = ring.oldest()
         if written < n_steps:
             continue
-        index = ring.draw()
-        batch = ring.get(index)
+        index, column = ring.draw()
+        batch = ring.get(index, column)
         for place, lane in enumerate(lanes):
             for drawn, turn in zip(index[place].tolist(), batch[place], strict=True):
                 number = written - 1 - (written - 1 - drawn) % transitions

@@ -122,10 +122,11 @@ def test_advantages_are_normalised_within_a_team(name):
     _, learner = team_of(name)
     env = CommonsEnv(GAME, 2, seed=3)
     seen = []
-    update_from = learner.engine.update_from
-    learner.engine.update_from = lambda batch: seen.append(batch) or update_from(batch)
+    update_at = learner.engine.update_at
+    learner.engine.update_at = lambda batch, place: seen.append((batch, place)) or update_at(batch, place)
     train(env, {FOUR: learner}, episodes=2)
-    advantage = torch.cat([batch["advantage"] for batch in seen[:2]], 1)
+    teams = torch.arange(2)[:, None]
+    advantage = torch.cat([batch["advantage"][teams, place] for batch, place in seen[:2]], 1)
     assert advantage.shape == (2, 20, 4, 1)
     torch.testing.assert_close(advantage.flatten(1).mean(1), torch.zeros(2), atol=1e-5, rtol=0)
     torch.testing.assert_close(advantage.flatten(1).std(1), torch.ones(2), atol=1e-4, rtol=0)

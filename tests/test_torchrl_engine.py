@@ -126,10 +126,10 @@ def both(algorithm):
         draw = fast.buffer.draw
 
         def recorded():
-            places = draw()
+            places, columns = draw()
             for sampler, own in zip(samplers, places, strict=True):
                 sampler.places.append(own)
-            return places
+            return places, columns
 
         fast.buffer.draw = recorded
     else:

@@ -72,7 +72,7 @@ def test_observers_see_every_turn_and_every_episode_and_each_learner_stores_its_
         (1, {"others": {0: RandomActor(8), **OTHER}}, r"control the agents \[0, 0, 1\]"),
         (1, {"episodes": 0}, "episodes is 0"),
         (1, {"callbacks": [7]}, "callback 7"),
-        (2, {}, r"has 2 worlds; the learner of \(0,\) has 1 replicas"),
+        (2, {}, r"has 2 replicas of 1 worlds; the learner of \(0,\) has 1 of 1"),
     ],
 )
 def test_what_cannot_be_trained_is_refused(worlds, arguments, message):

@@ -200,7 +200,7 @@ def _check_agents(experiment: Experiment) -> None:
         if isinstance(spec, Team) and isinstance(spec.algorithm, TeamAlgorithm):
             spec.algorithm._check_team(len(spec.agents), spec.reward)
         settings = getattr(getattr(spec, "algorithm", None), "settings", None)
-        if hasattr(settings, "refuse_worlds"):
+        if settings is not None and hasattr(settings, "refuse_worlds"):
             try:
                 settings.refuse_worlds(experiment.worlds)
             except ValueError as error:

@@ -368,8 +368,10 @@ class Ring:
         place = written - (ends.gather(1, world) - at)
         return place % self.capacity, self.columns.gather(1, world)
 
-    def get(self, index: Tensor, column: Tensor) -> TensorDict:
-        """The transitions at places [L, b] of columns, or the sequences that begin there."""
+    def get(self, index: Tensor, column: Tensor | None = None) -> TensorDict:
+        """The transitions at places [L, b] of columns, those of the first worlds by default, or the sequences
+        that begin there."""
+        column = self.columns[:, :1] if column is None else column
         if self.sequence_steps > 1:
             return sequences(self.fields, index, column, self.rows, self.sequence_steps)
         return gather(self.fields, index, column, self.rows, self.horizon)

@@ -250,10 +250,11 @@ class RolloutLearner(LaneLearner):
             logits, value = _outputs_of_both(self.engine, seen)
             return logits, value, self.engine.outputs(following, part=CRITIC)
         # In pieces that stay in the processor's caches.
-        pieces = seen.flatten(1, 2).split(self.settings.minibatch_size, 1)
+        pieces = torch.split(seen.flatten(1, 2), self.settings.minibatch_size, 1)
         given = [self._both((piece.shape, piece.dtype), self.engine, piece) for piece in pieces]
         logits, value = (
-            torch.cat(each, 1).unflatten(1, seen.shape[1:3]) for each in zip(*given, strict=True)
+            torch.cat(each, 1).reshape(*seen.shape[:3], *each[0].shape[2:])
+            for each in zip(*given, strict=True)
         )
         # What is seen after a turn is seen before the next one, but where an episode or the rollout ends.
         next_value = torch.cat([value[:, :, 1:], value[:, :, -1:]], 2).flatten(1, 2)

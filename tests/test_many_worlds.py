@@ -1,0 +1,403 @@
+"""A replica that learns from many worlds: what it stores, samples, learns and counts, beside work by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from dqn_parts import MEADOW, make_learner
+from torch.nn import functional
+
+from cprl import CommonsEnv, Experiment, Game, Rules, maps
+from cprl.algorithms import (
+    DQN,
+    LOLA,
+    PPO,
+    QMIX,
+    DQNSettings,
+    LOLASettings,
+    RolloutSettings,
+    Tabular,
+    TabularSettings,
+)
+from cprl.envs.make_env import make_env
+from cprl.learners.ring import Horizon, Ring, TransitionForm
+from cprl.learners.transitions import LaneTurn
+from cprl.networks import GRU
+from cprl.population import Learning, Team
+from cprl.training.agents import Population
+from cprl.training.training import Training
+
+WORLDS = 3
+SETTINGS = DQNSettings(
+    buffer_size=150,
+    batch_size=8,
+    learning_rate=1e-3,
+    hidden_cells=(8,),
+    epsilon_hold_steps=20,
+    epsilon_decay_steps=100,
+    target_every_episodes=4,
+    steps_per_update=3,
+)
+ROLLOUTS = RolloutSettings(rollout_steps=10, minibatch_size=10, learning_rate=1e-3, hidden_cells=(8,))
+SEQUENCES = replace(SETTINGS, sequence_steps=4, hidden_cells=(32, 32))
+CELLS = GRU(recurrent_cells=5)
+AGENTS = {
+    "DQN": (Learning(DQN(settings=SETTINGS)),) * 2,
+    "DQN, three steps": (Learning(DQN(settings=replace(SETTINGS, n_steps=3, tau=0.1))),) * 2,
+    "DQN, recurrent": (Learning(DQN(settings=SEQUENCES, network=CELLS)),) * 2,
+    "PPO": (Learning(PPO(settings=ROLLOUTS)),) * 2,
+    "PPO, recurrent": (
+        Learning(PPO(settings=replace(ROLLOUTS, minibatch_size=30, hidden_cells=(32, 32)), network=CELLS)),
+    )
+    * 2,
+    "QMIX": (Team(QMIX(settings=SETTINGS), agents=(0, 1), reward="team"),),
+    "LOLA": (Team(LOLA(settings=LOLASettings(rollout_steps=10, critic_epochs=2)), agents=(0, 1)),),
+    "tabular": (Learning(Tabular(settings=TabularSettings(epsilon_decay_steps=100))),) * 2,
+}
+EXACT = {"DQN", "DQN, three steps", "QMIX", "tabular"}
+"""Those whose products do not depend on how many replicas are beside them."""
+
+
+class Record:
+    def __init__(self):
+        self.episodes = []
+
+    def on_episode(self, episode, learning):
+        self.episodes.append((episode, learning))
+
+
+def training(agents, *, replicas=2, first=0, worlds=WORLDS, game=MEADOW, **how):
+    env = make_env(game, worlds=replicas * worlds, seed=4, first_world=first * worlds)
+    population = Population(env, agents, seed=4, worlds=worlds, first_replica=first, engine="eager")
+    length = how if {"steps", "episodes"} & set(how) else {"steps": 40 * worlds, **how}
+    made = Training(env, population.learners, worlds=worlds, others=population.others, **length)
+    return population, made
+
+
+def weights(population):
+    states = [learner.state_dict()["networks"] for learner in population.learners.values()]
+    return {
+        f"{lane}/{name}": value.clone()
+        for state in states
+        for lane, network in state.items()
+        for name, value in network.items()
+    }
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", AGENTS)
+def test_a_replica_of_many_worlds_is_what_it_would_be_alone(name):
+    both, alone = training(AGENTS[name]), training(AGENTS[name], replicas=1, first=1)
+    before = weights(both[0])
+    for _, run in (both, alone):
+        run.run()
+    after, of_one = weights(both[0]), weights(alone[0])
+    assert set(of_one) == {lane for lane in after if lane.startswith("replica_1")}
+    tolerance = {"rtol": 0, "atol": 0} if name in EXACT else {"rtol": 1e-4, "atol": 1e-5}
+    for lane, value in of_one.items():
+        torch.testing.assert_close(after[lane], value, **tolerance)
+    assert any(not torch.equal(after[lane], before.get(lane)) for lane in of_one)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", AGENTS)
+def test_a_training_goes_on_from_its_state_bit_for_bit(name):
+    whole, stopped, resumed = (training(AGENTS[name]) for _ in range(3))
+    whole[1].run()
+    for _ in range(17):
+        stopped[1].step()
+    resumed[1].load_state_dict(stopped[1].state_dict())
+    resumed[1].run()
+    wanted, found = weights(whole[0]), weights(resumed[0])
+    assert {lane: torch.equal(found[lane], value) for lane, value in wanted.items()} == dict.fromkeys(
+        wanted, True
+    )
+    assert whole[1].steps == resumed[1].steps == 40 * WORLDS
+
+
+def test_steps_are_counted_over_worlds_and_episodes_over_the_replica():
+    settings = replace(SETTINGS, steps_per_update=1, learning_starts=10)
+    record = Record()
+    population, run = training((Learning(DQN(settings=settings)),) * 2, episodes=7, callbacks=[record])
+    (learner,) = population.learners.values()
+    updates = []
+    update = learner.engine.update
+    learner.engine.update = lambda ring: updates.append(run.steps) or update(ring)
+    while not run.is_over:
+        run.step()
+        assert learner.steps == run.steps
+        assert learner.actor.epsilon == pytest.approx(settings.epsilon(run.steps))
+    turns = run.steps // WORLDS
+    assert updates == [WORLDS * turn for turn in range(4, turns + 1) for _ in range(WORLDS)]
+    episodes = [episode for episode, _ in record.episodes]
+    for replica in range(2):
+        of_replica = [episode for episode in episodes if episode.replica == replica]
+        assert [episode.episode for episode in of_replica] == list(range(7))
+        worlds = [episode.world for episode in of_replica]
+        assert {world // WORLDS for world in worlds} == {replica}
+        assert worlds[:3] == sorted(worlds[:3]), "of one turn in the order of their worlds"
+    assert run.episodes_played == 14
+    assert all(np.isfinite(learning["agent_1/loss"]) for _, learning in record.episodes)
+
+
+def test_a_training_of_steps_ends_with_the_turn_that_has_them():
+    _, run = training(AGENTS["DQN"], steps=100)
+    run.run()
+    assert run.steps == 102
+    with pytest.raises(ValueError, match="episodes is 3 and steps 4"):
+        training(AGENTS["DQN"], steps=4, episodes=3)
+
+
+def test_fewer_updates_than_turns_and_targets_by_the_episodes_of_a_replica():
+    settings = replace(SETTINGS, steps_per_update=7, learning_starts=10)
+    population, run = training((Learning(DQN(settings=settings)),) * 2, steps=300)
+    (learner,) = population.learners.values()
+    updates, copies = [], []
+    update, copy = learner.engine.update, learner.engine.copy_to_targets
+    learner.engine.update = lambda ring: updates.append(run.steps) or update(ring)
+    learner.engine.copy_to_targets = lambda due: copies.append((run.steps, due.tolist())) or copy(due)
+    run.run()
+    # From the turn on that has 10 steps, 12, of which the steps of that turn count.
+    assert updates == [
+        next(s for s in range(9, 400, 3) if s >= 9 + 7 * nth) for nth in range(1, len(updates) + 1)
+    ]
+    assert len(updates) == (300 - 9) // 7
+    # All three worlds end with their clock, of 12 turns: episodes 3, 6, 9, .., and 4, 8 and 12 are crossed.
+    assert [steps for steps, _ in copies] == [36 * nth for nth in (2, 3, 4, 6, 7, 8)]
+    assert all(all(due) for _, due in copies)
+
+
+def row(lanes, worlds, step):
+    """A turn of lanes in worlds whose observation says the lane, world and step; ends differ by world."""
+    world, lane = np.divmod(np.arange(lanes * worlds), lanes)
+    done = (step + 1) % (5 + world) == 0
+    now, following = (np.stack([lane, world, np.full_like(lane, at)], 1) for at in (step, step + 1))
+    fields = (
+        now.astype(np.uint8),
+        lane * 100 + world,
+        following.astype(np.uint8),
+        (step + world).astype(np.float32),
+    )
+    return LaneTurn(*fields, done, done & (world == 1))
+
+
+@pytest.mark.parametrize("horizon", [None, Horizon(3, 0.9)])
+def test_a_ring_samples_every_transition_of_every_world_evenly(horizon):
+    lanes, worlds, turns = 2, 3, 20
+    form = TransitionForm(observation_shape=(3,), horizon=horizon)
+    columns = torch.arange(lanes * worlds).view(worlds, lanes).T
+    ring = Ring(form, seeds=[(7, 0), (7, 1)], transitions=62, batch_size=50, columns=columns)
+    assert ring.capacity == turns
+    for step in range(43):
+        ring.write(row(lanes, worlds, step))
+    oldest = ring.oldest()[0]
+    stored = {
+        (world, step)
+        for world in range(worlds)
+        for step in range(int(oldest[2 * world]), 43 - (2 if horizon else 0))
+    }
+    assert len({int(oldest[2 * world]) for world in range(worlds)}) > 1 or len(stored) >= 54
+    counts = [dict.fromkeys(stored, 0) for _ in range(lanes)]
+    for _ in range(400):
+        batch = ring.sample()
+        for lane in range(lanes):
+            seen = batch["observation"][lane].long()
+            assert (seen[:, 0] == lane).all()
+            assert torch.equal(batch["action"][lane], 100 * lane + seen[:, 1])
+            ahead = batch["next", "observation"][lane].long() - seen
+            assert (ahead[:, :2] == 0).all()
+            if horizon is None:
+                assert (ahead[:, 2] == 1).all()
+                assert torch.equal(batch["next", "reward"][lane, :, 0], (seen[:, 1] + seen[:, 2]).float())
+            for _, world, step in seen.tolist():
+                counts[lane][world, step] += 1
+    for of_lane in counts:
+        expected = 400 * 50 / len(stored)
+        assert all(abs(count - expected) < 6 * expected**0.5 for count in of_lane.values())
+    assert counts[0] != counts[1]
+
+
+def turns_of(agents, worlds, count, game=MEADOW, seed=3):
+    """So many turns of random play, each a batch [B]."""
+    env, moment = CommonsEnv(game, worlds, seed=seed), None
+    chance, played = torch.Generator().manual_seed(seed), []
+    moment = env.reset()
+    for _ in range(count):
+        moment["agents", "action"] = torch.randint(8, (worlds, agents), generator=chance)
+        turn, moment = env.step_and_maybe_reset(moment)
+        played.append(turn.clone())
+    return played
+
+
+def learner_of(algorithm, worlds, **how):
+    return make_learner(
+        algorithm, MEADOW.spaces, engine="eager", agents=(0, 1), replicas=1, worlds=worlds, **how
+    )
+
+
+def linear(network, seen):
+    """The outputs of a network without hidden layers for observations [n, C, X, Y]."""
+    (layer,) = network.linears
+    return functional.linear(seen.flatten(1).float() / 255, layer.weight, layer.bias)
+
+
+def test_an_update_of_dqn_in_two_worlds_is_the_one_by_hand():
+    settings = DQNSettings(
+        buffer_size=40, batch_size=6, hidden_cells=(), learning_rate=0.5, optimizer="sgd", gamma=0.9,
+        learning_starts=10, steps_per_update=22,
+    )  # fmt: skip
+    learner, played = learner_of(DQN(settings=settings), 2), turns_of(2, 2, 15)
+    networks = learner.networks()
+    for turn in played:
+        learner.store(turn)
+    numbers = learner.buffer.rng.next().clone()  # by which the update would draw
+    learner.buffer.rng._used -= 1
+    losses = learner.update()
+    for agent in range(2):
+        network = networks[f"replica_0/agent_{agent}"]
+        # The numbers count through the 15 transitions of world 0, then those of world 1.
+        drawn = [divmod(int(number * 30), 15) for number in numbers[agent]]
+        assert len({world for world, _ in drawn}) == 2
+        errors = []
+        for world, step in drawn:
+            turn = played[step][world]
+            after = turn["next"]
+            with torch.no_grad():
+                best = linear(network, after["agents", "observation"][agent][None]).max()
+            reward, goes_on = after["agents", "reward"][agent, 0], ~after["terminated"][0]
+            value = linear(network, turn["agents", "observation"][agent][None])[
+                0, turn["agents", "action"][agent]
+            ]
+            errors.append((reward + 0.9 * goes_on * best - value) ** 2)
+        loss = torch.stack(errors).mean()
+        loss.backward()
+        torch.testing.assert_close(losses[0, agent], loss.detach())
+        found = learner.networks()[f"replica_0/agent_{agent}"]
+        for own, wanted in zip(found.parameters(), network.parameters(), strict=True):
+            torch.testing.assert_close(
+                own.detach(), wanted.detach() - 0.5 * wanted.grad, rtol=1e-5, atol=1e-6
+            )
+
+
+def test_an_update_of_ppo_in_two_worlds_is_the_one_by_hand():
+    settings = RolloutSettings(
+        rollout_steps=14, minibatch_size=28, epochs=1, hidden_cells=(), learning_rate=0.5, optimizer="sgd",
+        gamma=0.9, gae_lambda=0.8, max_grad_norm=None,
+    )  # fmt: skip
+    algorithm = PPO(settings=settings, entropy_coeff=0.0, critic_coeff=0.5)
+    learner, played = learner_of(algorithm, 2), turns_of(2, 2, 14)
+    actors = learner.networks()
+    critics = [
+        {name: value.clone() for name, value in learner.engine.weights(agent).items() if "critic" in name}
+        for agent in range(2)
+    ]
+    for turn in played:
+        learner.store(turn)
+    learner.update()
+    for agent in range(2):
+        actor = actors[f"replica_0/agent_{agent}"]
+        weight, bias = (
+            next(value for name, value in critics[agent].items() if name.endswith(part))
+            for part in ("weights.0", "biases.0")
+        )
+
+        def value_of(seen, weight=weight, bias=bias):
+            return (seen.flatten().float() / 255 @ weight + bias.flatten())[0]
+
+        advantages, chances = [], []
+        for world in range(2):
+            gain = 0.0
+            for turn in reversed(played):
+                now, after = turn[world], turn[world]["next"]
+                value = value_of(now["agents", "observation"][agent])
+                following = value_of(after["agents", "observation"][agent])
+                reward = after["agents", "reward"][agent, 0]
+                delta = reward + 0.9 * following * ~after["terminated"][0] - value
+                gain = delta + 0.9 * 0.8 * ~after["done"][0] * gain
+                logits = linear(actor, now["agents", "observation"][agent][None])[0]
+                chances.append(logits.log_softmax(-1)[now["agents", "action"][agent]])
+                advantages.append(gain)
+        gains = torch.stack(advantages)
+        gains = (gains - gains.mean()) / (gains.std() + 1e-8)
+        chances = torch.stack(chances)
+        (-gains.detach() * (chances - chances.detach()).exp()).mean().backward()
+        found = learner.networks()[f"replica_0/agent_{agent}"]
+        for own, wanted in zip(found.parameters(), actor.parameters(), strict=True):
+            torch.testing.assert_close(
+                own.detach(), wanted.detach() - 0.5 * wanted.grad, rtol=1e-4, atol=1e-6
+            )
+
+
+def permuted(turn):
+    return turn[torch.tensor([2, 0, 1])]
+
+
+def test_the_same_experience_in_another_order_of_worlds_gives_the_same_update():
+    whole = RolloutSettings(rollout_steps=14, minibatch_size=42, epochs=2, hidden_cells=(8,))
+    one, other = (learner_of(PPO(settings=whole), 3) for _ in range(2))
+    for turn in turns_of(2, 3, 14):
+        one.store(turn)
+        other.store(permuted(turn))
+    torch.testing.assert_close(one.update(), other.update(), rtol=1e-5, atol=1e-5)
+    for lane, network in one.networks().items():
+        for value, same in zip(network.parameters(), other.networks()[lane].parameters(), strict=True):
+            torch.testing.assert_close(value, same, rtol=0, atol=1e-5)
+
+    one, other = (learner_of(DQN(settings=replace(SETTINGS, learning_starts=30)), 3) for _ in range(2))
+    for turn in turns_of(2, 3, 14):
+        one.store(turn)
+        other.store(permuted(turn))
+    places = torch.arange(14).repeat(2, 3)
+    for learner in (one, other):  # of all that is stored
+        worlds = learner.buffer.columns.repeat_interleave(14, 1)
+        learner.engine.update_from(learner.buffer.get(places, worlds))
+    for lane, network in one.networks().items():
+        for value, same in zip(network.parameters(), other.networks()[lane].parameters(), strict=True):
+            torch.testing.assert_close(value, same, rtol=0, atol=1e-5)
+
+
+def test_worlds_that_settings_do_not_fit_are_refused_by_name():
+    def made(algorithm, **how):
+        return Experiment(name="x", game=MEADOW, agents=(Learning(algorithm),) * 2, episodes=1, **how)
+
+    with pytest.raises(ValueError, match=r"agents\[0\].algorithm.settings: .*minibatch_size is 40"):
+        made(PPO(settings=RolloutSettings(rollout_steps=20, minibatch_size=40)), worlds=3)
+    made(PPO(settings=RolloutSettings(rollout_steps=20, minibatch_size=40)), worlds=4)
+    with pytest.raises(ValueError, match="buffer_size is 100; allowed in 64 worlds: 128 or more"):
+        made(DQN(settings=DQNSettings(buffer_size=100)), worlds=64)
+    with pytest.raises(ValueError, match="worlds is 4194304"):
+        made(DQN(settings=SETTINGS), worlds=2**22)
+    with pytest.raises(ValueError, match="episodes is 1 and steps 5"):
+        made(DQN(settings=SETTINGS), steps=5)
+
+
+@pytest.mark.integration
+def test_what_compiled_pieces_of_a_rollout_say_is_what_the_networks_say():
+    """Also where episodes end within the rollout, in some worlds earlier than in others."""
+    short = Game(
+        map=maps.parse(">A<"),
+        rules=Rules(
+            regrow_prob=(0.0, 0.0, 0.0), window_rows=3, window_columns=5, episode_steps=9, freeze_steps=2
+        ),
+    )
+    settings = RolloutSettings(rollout_steps=20, minibatch_size=10, hidden_cells=(8,))
+    learner = make_learner(PPO(settings=settings), short.spaces, agents=(0, 1), replicas=1, worlds=4)
+    ends = set()
+    for turn in turns_of(2, 4, 20, game=short):
+        learner.store(turn)
+        ends.add(tuple(turn["next", "done"].flatten().tolist()))
+    assert len(ends) > 2, "they end at times of their own"
+    columns = learner._rollout.fields
+    logits, value, next_value = learner._evaluated(columns)
+    seen, following = columns["observation"], columns["next_observation"]
+    torch.testing.assert_close(logits, learner.engine.outputs(seen, part=0), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(value, learner.engine.outputs(seen, part=1), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(next_value, learner.engine.outputs(following, part=1), rtol=1e-4, atol=1e-5)
+    compiled = learner.update()
+    eager = make_learner(
+        PPO(settings=settings), short.spaces, agents=(0, 1), replicas=1, worlds=4, engine="eager"
+    )
+    for turn in turns_of(2, 4, 20, game=short):
+        eager.store(turn)
+    torch.testing.assert_close(compiled, eager.update(), rtol=1e-4, atol=1e-5)
