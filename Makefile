@@ -80,6 +80,7 @@ bench: $(INSTALLED)
 	$(BIN)/python benchmarks/institutions.py
 	$(BIN)/python benchmarks/lane_updates.py
 	$(BIN)/python benchmarks/training_step.py
+	$(BIN)/python benchmarks/many_worlds.py
 	$(BIN)/python benchmarks/losses.py
 	$(BIN)/python benchmarks/watching.py
 
