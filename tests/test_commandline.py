@@ -173,7 +173,7 @@ def test_help_lists_what_people_change_and_all_help_every_number_and_equal_agent
     first, second = flags.index("--spare"), flags.index("--episodes")
     assert first < flags.index("--out") < second < flags.index("--game.rules.freeze-steps")
     assert {"--agents", "--game.map", "--game.institutions", "--seed", "--replicas"} <= set(flags)
-    assert len(flags) < 25
+    assert len(flags) < 27
     assert "--help-all lists all flags" in words
     assert "a number of its own. (default: 3)" in words
     words = help_of(experiment, capsys, "--help-all")

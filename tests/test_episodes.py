@@ -93,6 +93,7 @@ def test_an_episode_is_what_we_work_out_by_hand():
     metrics = values.pop("metrics")
     assert values == {
         "world": "0",
+        "replica": "0",
         "episode": "0",
         "steps": "3",
         "terminated": "True",

@@ -105,7 +105,7 @@ def test_the_table_has_a_row_for_each_evaluation_replica_episode_and_agent(evalu
     assert sorted(places) == [
         (t, r, e, a) for t in (2, 4) for r in range(2) for e in range(3) for a in range(4)
     ]
-    assert set(read_episodes(evaluated).column_names) - {"wanted_return"} <= set(table)
+    assert set(read_episodes(evaluated).column_names) - {"wanted_return", "world"} <= set(table)
 
 
 @pytest.mark.integration

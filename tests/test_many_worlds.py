@@ -1,5 +1,6 @@
 """A replica that learns from many worlds: what it stores, samples, learns and counts, beside work by hand."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,8 @@ import torch
 from dqn_parts import MEADOW, make_learner
 from torch.nn import functional
 
-from cprl import CommonsEnv, Experiment, Game, Rules, maps
+import cprl
+from cprl import CommonsEnv, Experiment, Game, Rules, Study, maps
 from cprl.algorithms import (
     DQN,
     LOLA,
@@ -20,11 +22,15 @@ from cprl.algorithms import (
     Tabular,
     TabularSettings,
 )
+from cprl.commands.recipe import parse
 from cprl.envs.make_env import make_env
 from cprl.learners.ring import Horizon, Ring, TransitionForm
 from cprl.learners.transitions import LaneTurn
+from cprl.measuring.episodes import Episode
+from cprl.measuring.series import Series
 from cprl.networks import GRU
 from cprl.population import Learning, Team
+from cprl.runs.episodes import read_episodes, read_table
 from cprl.training.agents import Population
 from cprl.training.training import Training
 
@@ -401,3 +407,120 @@ def test_what_compiled_pieces_of_a_rollout_say_is_what_the_networks_say():
     for turn in turns_of(2, 4, 20, game=short):
         eager.store(turn)
     torch.testing.assert_close(compiled, eager.update(), rtol=1e-4, atol=1e-5)
+
+
+# A whole run
+
+
+def experiment(**changes):
+    length = {} if {"steps", "episodes"} & set(changes) else {"episodes": 20}
+    values = {
+        "replicas": 2,
+        "worlds": WORLDS,
+        "evaluation_episodes": 2,
+        "engine": "eager",
+        **length,
+        **changes,
+    }
+    return Experiment(name="many", game=MEADOW, agents=AGENTS["DQN"], **values)
+
+
+def rows_of(run):
+    return read_episodes(run).sort_by([(name, "ascending") for name in ("replica", "episode", "agent")])
+
+
+def written(table):
+    """A table as text, in which what is undefined is the same."""
+    return repr(table.to_pydict())
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    out = tmp_path_factory.mktemp("many") / "run"
+    return cprl.run(experiment(), out, figures=False)
+
+
+@pytest.mark.integration
+def test_a_run_has_a_row_for_each_episode_of_each_replica_with_its_world(finished):
+    rows = rows_of(finished).to_pydict()
+    places = list(zip(rows["replica"], rows["episode"], rows["agent"], strict=True))
+    assert places == [(r, e, a) for r in range(2) for e in range(20) for a in range(2)]
+    assert {world // WORLDS == replica for world, replica in zip(rows["world"], rows["replica"], strict=True)}
+    assert set(rows["world"]) == set(range(2 * WORLDS))
+    report = json.loads((finished / "report.json").read_text())
+    turns, left = divmod(report["steps"], WORLDS)
+    assert (report["worlds"], left) == (WORLDS, 0)
+    assert turns * WORLDS >= sum(rows["steps"][: 20 * 2 : 2])
+    evaluation = read_table(finished / "evaluation" / "trained.parquet")
+    assert "world" not in evaluation.column_names
+    assert evaluation.num_rows == 2 * 2 * 2
+    assert (finished / "run.rrd").exists()
+    again = cprl.load(finished)
+    assert again.experiment == experiment()
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    ("short", "whole"), [({"episodes": 5}, {"episodes": 20}), ({"steps": 60}, {"steps": 200})]
+)
+def test_a_run_that_is_extended_equals_one_that_was_begun_as_long(short, whole, tmp_path):
+    """Also where more episodes end in the last turn than were asked for."""
+    longer = cprl.run(experiment(**whole), tmp_path / "whole", watch="off", figures=False)
+    run = cprl.run(experiment(**short), tmp_path / "run", watch="off", figures=False)
+    before = rows_of(run)
+    cprl.run(experiment(**whole), run, resume=True, watch="off", figures=False)
+    assert written(rows_of(run)) == written(rows_of(longer))
+    assert before.num_rows < rows_of(run).num_rows
+    for path in ("evaluation/trained.parquet", "evaluation/random.parquet"):
+        assert written(read_table(run / path)) == written(read_table(longer / path))
+    with pytest.raises(ValueError, match=r"worlds"):
+        cprl.run(experiment(**whole, worlds=2), run, resume=True, watch="off")
+
+
+@pytest.mark.integration
+def test_a_study_varies_worlds_and_its_table_counts_the_steps_of_replicas(tmp_path):
+    study = Study(experiment(steps=60, replicas=1), {"worlds": [1, 3]})
+    results = cprl.run_study(study, tmp_path / "study")
+    table = results.table
+    assert {name: lengths["steps"] for name, lengths in table.lengths.items()} == {
+        "worlds=1": (60, 60),
+        "worlds=3": (60, 60),
+    }
+    assert not table.lacking
+
+
+def test_words_say_worlds_and_steps_in_place_of_episodes(monkeypatch):
+    def of(*words):
+        made, _ = parse(lambda: experiment(), ["recipe.py", *words])
+        return made
+
+    assert of("--worlds", "7").worlds == 7
+    assert (of("--steps", "900").steps, of("--steps", "900").episodes) == (900, None)
+    assert of("--episodes", "3").episodes == 3
+    with pytest.raises(ValueError, match="episodes is 3 and steps 900"):
+        of("--steps", "900", "--episodes", "3")
+    assert experiment(steps=30).expected_episodes == 3  # of 12 turns
+
+
+def test_numbers_of_many_worlds_are_means_over_the_episodes_of_each_in_turn():
+    series = Series(2, 3)
+
+    def add(replica, number, value):
+        episode = Episode(
+            world=3 * replica, replica=replica, episode=number, steps=1, terminated=False, return_=np.zeros(1),
+            metrics={},
+        )  # fmt: skip
+        return series.add(episode, {"a": value, "b": np.nan})
+
+    for number in range(3):
+        assert add(0, number, number) is None
+    assert add(1, 0, 4.0) is None
+    assert add(0, 3, 100.0) is None
+    other = Series(2, 3)
+    other.load_state_dict(series.state_dict())
+    for each in (series, other):
+        series = each
+        assert add(1, 1, np.nan) is None
+        found = add(1, 2, 6.0)
+        assert found["a"].tolist() == [1.0, 5.0]
+        assert np.isnan(found["b"]).all()

@@ -86,7 +86,9 @@ def test_each_agent_of_each_episode_has_a_row(table):
         table.add(first)
         table.add(replace(an_episode(1), terminated=True), an_episode(2), replica=8)
     rows = pq.read_table(table.path)
-    columns = [(name, kind) for name, kind in COLUMNS.items() if name != "wanted_return"]  # of trainings
+    columns = [
+        (name, kind) for name, kind in COLUMNS.items() if name not in ("wanted_return", "world")
+    ]  # of trainings
     assert rows.schema == pa.schema([*columns, *((name, pa.float64()) for name in social.METRICS)])
     assert rows["replica"].to_pylist() == [3, 3, 8, 8, 8, 8]
     assert rows["terminated"].to_pylist() == [False, False, True, True, False, False]

@@ -317,14 +317,14 @@ def test_the_header_says_where_a_run_is_and_which_institutions_are_in_force():
     institutions = (Quota(share=0.25, window_steps=50, fine=2.0), Vote(on=Tax(), choices=(0.0, 0.5)))
     rules = rules_of(replace(GAME, institutions=institutions))
     assert rules == "quota (share 0.25, fine 2), vote (on tax (rate 0.1))"
-    header = Header(episodes=4800, replicas=8, unit="apples", rules=rules)
+    header = Header(episodes=4800, boards=8, unit="apples", rules=rules)
     assert header.begins("compiling, 3 s so far") == (
         f"#### Episode 1 of 4,800 · compiling, 3 s so far · {rules}"
     )
     line = header.line(episode=640, label="falling", mean=436.4, random_play=282.1, died=2.0)
     said = "Episode 640 of 4,800 · falling · 436 apples, random play 282 · 2 of 8 boards died early"
     assert line == f"#### {said} · {rules}"
-    alone = Header(episodes=200, replicas=1, unit="return")
+    alone = Header(episodes=200, boards=1, unit="return")
     for died in (None, float("nan"), 0.0):
         line = alone.line(episode=1, label="steady", mean=4.25, random_play=None, died=died)
         assert line == "#### Episode 1 of 200 · steady · return 4.25"

@@ -337,7 +337,7 @@ def test_a_table_that_is_no_study_is_refused():
     for change, message in (
         ({"factors": None}, "NoneType"),
         ({"factors": [["a", {"distribution": "Normal", "low": 0, "high": 1}]]}, "Normal"),
-        ({"experiment": {"name": "x"}}, "lacks game, agents, episodes"),
+        ({"experiment": {"name": "x"}}, "lacks game, agents"),
         ({"pairing": False}, "pairing"),
         ({"format": 3}, "format"),
     ):

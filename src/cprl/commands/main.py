@@ -109,6 +109,7 @@ def run(
     *,
     options: Annotated[RunOptions, tyro.conf.arg(name="")] = _OPTIONS,
     episodes: int | None = None,
+    steps: int | None = None,
 ) -> None:
     """Trains the experiment of a recipe or of a run anew, or resumes a run that was stopped.
 
@@ -119,6 +120,7 @@ def run(
         recipe: a recipe.json, or the directory of a run.
         options: --out is with --resume the run itself.
         episodes: instead of those of the recipe; with --resume more of them extend the run.
+        steps: likewise, of a recipe that trains so many steps.
     """
     trial = _TRIAL.get()
     if trial is not None:
@@ -133,8 +135,8 @@ def run(
     experiment = Experiment.from_recipe(table, directory=directory)
     if options.resume and options.out is None:
         options = replace(options, out=directory)
-    if episodes is not None:
-        experiment = replace(experiment, episodes=episodes)
+    if episodes is not None or steps is not None:
+        experiment = replace(experiment, episodes=episodes, steps=steps)
     if trial is None:
         say(run_with(experiment, options, command=sys.argv))
         return

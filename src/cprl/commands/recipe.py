@@ -11,7 +11,7 @@ import sys
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,7 +37,19 @@ ALLOW: Final = (
 )
 
 _LISTED: Final = (
-    *("out", "resume", "watch", "episodes", "replicas", "seed", "map", "agents", "institutions"),
+    *(
+        "out",
+        "resume",
+        "watch",
+        "episodes",
+        "steps",
+        "replicas",
+        "worlds",
+        "seed",
+        "map",
+        "agents",
+        "institutions",
+    ),
     *("game.rules.episode_steps", "game.rules.freeze_steps"),
     *("agents.0.policy", "agents.0.algorithm.settings.learning_rate", "agents.0.algorithm.settings.gamma"),
 )
@@ -196,7 +208,7 @@ def parse_with(
     )
     if not isinstance(made, Experiment):
         raise refusal("what the recipe makes", made, "an Experiment")
-    start = in_shape(made, shape)
+    start = _of_length(in_shape(made, shape), given)
     shaped = shape_of(start)
 
     def read(
@@ -221,6 +233,16 @@ def parse_with(
         )
     except RefusedError as error:
         raise ValueError(str(error)) from error.__cause__
+
+
+def _of_length(experiment: "Experiment", words: Sequence[str]) -> "Experiment":
+    """An experiment whose length is counted in what words say, --episodes or --steps, however many these."""
+    names = {word.partition("=")[0] for word in words}
+    if "--steps" in names and experiment.steps is None and "--episodes" not in names:
+        return replace(experiment, episodes=None, steps=1)
+    if "--episodes" in names and experiment.episodes is None and "--steps" not in names:
+        return replace(experiment, episodes=1, steps=None)
+    return experiment
 
 
 def _refuse_names(make_experiment: "Callable[..., Experiment]", taken: set[str]) -> None:

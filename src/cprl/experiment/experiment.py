@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from math import ceil
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -88,9 +89,29 @@ class Experiment(Value, stored=False, called="experiment"):
 
     def __repr__(self) -> str:
         return (
-            f"Experiment({self.name!r}, {self.game!r}, {self.episodes} episodes, {self.replicas} replicas, "
+            f"Experiment({self.name!r}, {self.game!r}, {self.length} {self.unit}, {self.replicas} replicas, "
             f"seed={self.seed})"
         )
+
+    @property
+    def unit(self) -> Literal["episodes", "steps"]:
+        """What its length is counted in."""
+        return "episodes" if self.steps is None else "steps"
+
+    @property
+    def length(self) -> int:
+        """How many episodes, or steps, each replica trains."""
+        length: int = getattr(self, self.unit)
+        return length
+
+    @property
+    def expected_episodes(self) -> int:
+        """The episodes of each replica; of one that trains so many steps, as many as these are where each
+        lasts as long as the clock lets it, and 1 in a game without a clock."""
+        if self.episodes is not None:
+            return self.episodes
+        clock = getattr(getattr(self.game, "rules", None), "episode_steps", self.length)
+        return ceil(self.length / clock)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -149,7 +170,7 @@ class Experiment(Value, stored=False, called="experiment"):
         return self.to_config() == other.to_config() if isinstance(other, Experiment) else NotImplemented
 
     def __hash__(self) -> int:
-        return hash((self.name, self.episodes, self.replicas, self.seed))
+        return hash((self.name, self.unit, self.length, self.replicas, self.seed))
 
 
 def changes(before: Experiment, now: Experiment) -> list[str]:

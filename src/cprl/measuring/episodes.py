@@ -47,8 +47,8 @@ class Episode:
     """The index of the episode in its world, or in a training in its replica, counted from 0."""
     steps: int
     """Steps played, at least 1."""
-    replica: int | None = None
-    """The replica that played it in a training; None outside of one."""
+    replica: int = -1
+    """The replica that played it in a training; outside of one, by default the world."""
     terminated: bool
     """True if the game itself ended, e.g. no apple was left and none could grow; else the episode was
     truncated at its time limit."""
@@ -94,6 +94,10 @@ class Episode:
     institutions: Mapping[str, float] = field(default_factory=dict)
     """`cprl.measuring.institutions.METRICS` of the episode; NaN where undefined, empty without
     institutions."""
+
+    def __post_init__(self) -> None:
+        if self.replica < 0:
+            object.__setattr__(self, "replica", self.world)
 
     def __repr__(self) -> str:
         returns = [round(value, 2) for value in self.return_.tolist()]

@@ -39,28 +39,39 @@ def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence
 
 
 class Series:
-    """Collects the numbers of an episode until all replicas have ended it, so that they are comparable."""
+    """Collects the numbers of an episode until all replicas have ended it, so that they are comparable.
 
-    def __init__(self, replicas: int) -> None:
-        self.replicas = replicas
-        self._waiting: dict[int, dict[int, dict[str, float]]] = {}
+    Of replicas in W worlds, which end as many episodes in the time of one, they are means over every W
+    episodes, each replica's one after the other, of those in which they are defined.
+    """
 
-    def add(self, episode: int, replica: int, numbers: Mapping[str, float]) -> dict[str, Values] | None:
+    def __init__(self, replicas: int, worlds: int = 1) -> None:
+        self.replicas, self.worlds = replicas, worlds
+        self._waiting: dict[int, dict[int, list[dict[str, float]]]] = {}
+        """By the number of W episodes, and by replica."""
+
+    def add(self, episode: Episode, numbers: Mapping[str, float]) -> dict[str, Values] | None:
         """Adds the numbers of an episode of a replica.
 
         Returns:
-            Its numbers, [R] by name, NaN where a replica has none, if all replicas have ended the episode;
-            else None.
+            The numbers, [R] by name, NaN where a replica has none, if all replicas have ended the episode and
+            it is the last of W; else None.
         """
-        of_episode = self._waiting.setdefault(episode, {})
-        of_episode[replica] = dict(numbers)
-        if len(of_episode) < self.replicas:
+        together = episode.episode // self.worlds
+        of_replicas = self._waiting.setdefault(together, {})
+        of_replicas.setdefault(episode.replica, []).append(dict(numbers))
+        if len(of_replicas) < self.replicas or min(map(len, of_replicas.values())) < self.worlds:
             return None
-        del self._waiting[episode]
-        names = {name: None for numbers in of_episode.values() for name in numbers}
+        del self._waiting[together]
+        names = {name: None for each in of_replicas.values() for one in each for name in one}
         return {
-            name: np.array([of_episode[r].get(name, np.nan) for r in range(self.replicas)]) for name in names
+            name: np.array([self._mean(of_replicas[r], name) for r in range(self.replicas)]) for name in names
         }
+
+    def _mean(self, episodes: Sequence[Mapping[str, float]], name: str) -> float:
+        if self.worlds == 1:
+            return episodes[0].get(name, np.nan)
+        return mean_of(np.array([numbers.get(name, np.nan) for numbers in episodes]))
 
     def state_dict(self) -> dict[str, Any]:
         """The incomplete episodes."""
@@ -68,7 +79,10 @@ class Series:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continues with the incomplete episodes of a state."""
-        self._waiting = {int(episode): dict(numbers) for episode, numbers in state["waiting"].items()}
+        self._waiting = {
+            int(together): {int(replica): list(numbers) for replica, numbers in of_replicas.items()}
+            for together, of_replicas in state["waiting"].items()
+        }
 
 
 def mean_of(values: Values) -> float:

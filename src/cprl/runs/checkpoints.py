@@ -22,7 +22,7 @@ from cprl.runs.files import (
     verify,
     write_atomically,
 )
-from cprl.runs.recipe import resume_command, write_more_episodes
+from cprl.runs.recipe import resume_command, write_length
 from cprl.system.output import RESUMES, say
 from cprl.system.process import at_signals
 
@@ -48,8 +48,8 @@ class Checkpointer:
     Args:
         run: the run's directory, which is made if it does not exist.
         every_s: seconds between checkpoints, above 0.
-        keep_ending: whether the state in which the first replica has played its last episode is kept even
-            after `done`: from there a training of more episodes continues bit for bit.
+        keep_ending: whether the last state before a replica may play its last episode, or that after the last
+            step, is kept even after `done`: from there a longer training continues bit for bit.
     """
 
     def __init__(
@@ -213,7 +213,7 @@ def steps_of(path: Path) -> int:
 
 
 def is_ending(path: Path) -> bool:
-    """Whether a checkpoint is the one from which more episodes can be trained."""
+    """Whether a checkpoint is the one from which a longer training can go on."""
     return path.name.startswith("ending")
 
 
@@ -244,11 +244,11 @@ def read_tensors(path: Path, refusal: str) -> dict[str, Any]:
     return content
 
 
-def refuse_to_extend(run: Path, episodes: int, callbacks: Iterable[Any]) -> None:
-    """Check that a run of more episodes would equal one that had been begun with so many.
+def refuse_to_extend(run: Path, episodes: int | None, callbacks: Iterable[Any]) -> None:
+    """Check that a longer run would equal one that had been begun as such.
 
     Args:
-        episodes: how many it has so far.
+        episodes: how many it has so far; None of one that trains so many steps.
         callbacks: those of the training; one with `on_start` sees the number of episodes, and may depend on
             it unless it has a true `is_extendable`.
     """
@@ -268,7 +268,7 @@ def refuse_to_extend(run: Path, episodes: int, callbacks: Iterable[Any]) -> None
         raise ValueError(
             f"{run} keeps no state of its training to extend it from: it was run without keep_checkpoint"
         )
-    elif checkpoints and max(read_checkpoint(checkpoints[-1])["played"]) >= episodes:
+    elif episodes and checkpoints and max(read_checkpoint(checkpoints[-1])["played"]) >= episodes:
         raise ValueError(
             f"{run} was stopped while its last replicas played their last episodes, and keeps no state from "
             "before; finish it with as many episodes as it has"
@@ -280,16 +280,16 @@ def depends_on_episodes(callback: Any) -> bool:
     return hasattr(callback, "on_start") and not getattr(callback, "is_extendable", False)
 
 
-def extend(run: Path, before: int, episodes: int) -> None:
-    """Make a run one of more episodes, to be resumed; results so far are kept under a name with the number
-    of their episodes: `checkpoints/final-4800.pt`, `evaluation-4800/`, `report-4800.json`.
+def extend(run: Path, before: int, length: int) -> None:
+    """Make a run a longer one, to be resumed; results so far are kept under a name with the number of their
+    episodes, or steps: `checkpoints/final-4800.pt`, `evaluation-4800/`, `report-4800.json`.
 
     It can be repeated if it was interrupted. The recipe changes last.
 
     Args:
         run: its directory, which `refuse_to_extend` has checked.
-        before: the number of episodes so far.
-        episodes: the number to be.
+        before: the number of episodes, or steps, so far.
+        length: the number to be.
     """
     weights = [f"{FOLDER}/{name}.pt" for name in ("final", "transforms", "decisions")]
     for name in (REPORT, *weights, "evaluation"):
@@ -301,4 +301,4 @@ def extend(run: Path, before: int, episodes: int) -> None:
     for path in checkpoints:
         if last is not None and steps_of(path) > last:
             path.unlink()
-    write_more_episodes(run, episodes)
+    write_length(run, length)

@@ -129,7 +129,7 @@ class EpisodeTable:
         """Append episodes; the first one of a table determines the columns and metrics of all.
 
         Args:
-            replica: the index of their replica; by default each episode's world.
+            replica: the index of their replica; by default each episode's own.
         """
         if not episodes:
             return
@@ -246,6 +246,7 @@ def _reopen(path: Path, journal: Path) -> None:
 
 COLUMNS: Final = {
     "replica": pa.int32(),
+    "world": pa.int32(),
     "episode": pa.int32(),
     "agent": pa.int32(),
     "return": pa.float32(),
@@ -263,7 +264,8 @@ COLUMNS: Final = {
 """The columns of a table, as in `Episode`; the metrics follow, float64, NaN where undefined.
 
 Values of the whole episode are repeated in the row of each agent. Values that the game does not report have
-no column; nor has the wanted return outside of a training. It is null for agents that do not learn."""
+no column; nor have, outside of a training, the world, which counts through those of all replicas, and the
+wanted return. It is null for agents that do not learn."""
 
 OF_INSTITUTIONS: Final = {
     "decision": pa.int32(),
@@ -304,14 +306,14 @@ def _schema(names: Iterable[str]) -> pa.Schema:
 
 def schema_of(episode: Episode) -> pa.Schema:
     """The columns that an episode has; the schema's metadata names those that it lacks."""
-    schema, missing = _schema(_columns(episode, 0)), left_out(episode.reported)
+    schema, missing = _schema(_columns(episode)), left_out(episode.reported)
     return schema.with_metadata({LEFT_OUT: missing}) if missing else schema
 
 
 def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema) -> pa.RecordBatch:
     """A row for each episode and agent, with the schema of the table's first episode; None as the replica for
-    each episode's world."""
-    parts = [_columns(episode, episode.world if replica is None else replica) for episode in episodes]
+    each episode's own."""
+    parts = [_columns(episode, replica) for episode in episodes]
     for columns in parts:
         if columns.keys() != set(schema.names):
             more, lacks = columns.keys() - set(schema.names), set(schema.names) - columns.keys()
@@ -330,12 +332,16 @@ def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema)
     return pa.record_batch(arrays, schema=schema)
 
 
-def _columns(episode: Episode, replica: int) -> dict[str, Any]:
+def _columns(episode: Episode, replica: int | None = None) -> dict[str, Any]:
     """The columns of an episode in order, [N] each."""
     agents = np.arange(len(episode.return_))
     entries: dict[str, Any] = dict(episode.counts or {})
     entries |= {name: value for name, value in vars(episode).items() if value is not None}
-    entries |= {"replica": replica, "agent": agents, "return": episode.return_}
+    entries |= {"agent": agents, "return": episode.return_}
+    if replica is not None:
+        entries["replica"] = replica
+    if episode.wanted_return is None:  # no training, of whose worlds it is one
+        del entries["world"]
     values = {name: entries[name] for name in (*COLUMNS, *OF_INSTITUTIONS) if name in entries}
     if episode.in_force is not None:
         values |= {f"in_force_{place}": value for place, value in enumerate(episode.in_force.tolist())}

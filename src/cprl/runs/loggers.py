@@ -70,7 +70,8 @@ class LoggerCallback:
     """Writes the numbers of each episode to a TorchRL logger, by the names of docs/metrics.md.
 
     A callback of `cprl.training`, and a context manager. The step of every number is the episode, counted
-    from 0. An episode is written once all replicas have ended it: the mean over replicas as
+    from 0; of replicas in W worlds every W episodes are written together. An episode is written once all
+    replicas have ended it: the mean over replicas as
     `social/equality`, and with several replicas the metrics and returns of each as
     `replica_0/social/equality`. Undefined values are not written, nor metrics that the game does not report,
     see `cprl.measuring.metrics`.
@@ -81,27 +82,30 @@ class LoggerCallback:
         logger: any TorchRL logger, see `make_logger`. It is flushed at each checkpoint, and closed when the
             block ends, also by an error.
         replicas: the number of replicas R.
+        worlds: the worlds W of each; a turn of them is W steps.
         agents: the names of the agents; by default agent_0 and so on.
     """
 
-    def __init__(self, logger: Logger, *, replicas: int = 1, agents: Sequence[str] | None = None) -> None:
+    def __init__(
+        self, logger: Logger, *, replicas: int = 1, worlds: int = 1, agents: Sequence[str] | None = None
+    ) -> None:
         for method in ("log_metrics", "flush", "shutdown"):
             if not callable(getattr(logger, method, None)):
                 kind = type(logger).__name__
                 raise TypeError(f"logger is a {kind} without {method}; allowed: a TorchRL logger")
         self.logger = logger
-        self._agents, self._series = agents, Series(replicas)
+        self._agents, self._series, self._worlds = agents, Series(replicas, worlds), worlds
         self._steps, self._steps_then, self._then = 0, 0, time.perf_counter()
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Count the environment steps of each replica."""
-        self._steps += 1 if batch.batch_dims == 1 else batch.batch_size[1]
+        self._steps += self._worlds * (1 if batch.batch_dims == 1 else batch.batch_size[1])
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Write the numbers of an episode once all replicas have ended it."""
         agents = self._agents or [f"agent_{agent}" for agent in range(len(episode.return_))]
         numbers = numbers_of(episode, learning, agents)
-        by_replica = self._series.add(episode.episode, episode.world, numbers)
+        by_replica = self._series.add(episode, numbers)
         if by_replica is not None:
             self._log(episode.episode, by_replica)
 

@@ -112,31 +112,41 @@ def _refuse_contents(directory: Path) -> None:
 def refuse_another_run(
     out: Path | None, to_recipe: Callable[[Path], Mapping[str, Any]], kind: Any = None
 ) -> int:
-    """Refuse to resume what was not begun with the same recipe; only the number of episodes may grow, and
-    `on_nan` be another.
+    """Refuse to resume what was not begun with the same recipe; only its number of episodes, or of steps, may
+    grow, and `on_nan` be another.
 
     Args:
         kind: the dataclass of what the recipe holds, `cprl.Experiment`; fields that an earlier version did
             not know are then no differences while they have their defaults.
 
     Returns:
-        The number of episodes of the run so far, below that of the recipe if it is to be extended.
+        The length of the run so far, below that of the recipe if it is to be extended.
     """
     if out is None:
         raise ValueError("resume requires the directory of the run as out")
     before, now = read_recipe(out)["experiment"], to_recipe(out)["experiment"]
-    free = {"episodes": 0, "on_nan": ""}
+    free = {**ANY_LENGTH, "on_nan": ""}
     differ = differences({**before, **free}, {**now, **free}, "experiment", kind)
     if differ:
         more = f"; and {len(differ) - _NAMED} more" if len(differ) > _NAMED else ""
         raise ValueError(f"{out} was started with another recipe: {'; '.join(differ[:_NAMED])}{more}")
-    episodes = before.get("episodes")
-    if not isinstance(episodes, int) or episodes > now["episodes"]:
+    (unit, length), (unit_now, length_now) = length_in(before), length_in(now)
+    if unit != unit_now or not isinstance(length, int) or length > length_now:
         raise ValueError(
-            f"{out} has {episodes} episodes, which cannot become {now['episodes']}; allowed: as many, or "
+            f"{out} has {length} {unit}, which cannot become {length_now} {unit_now}; allowed: as many, or "
             "more to extend it"
         )
-    return episodes
+    return length
+
+
+ANY_LENGTH: Final = {"episodes": None, "steps": None}
+"""In place of how long experiments train, where their tables are compared without it."""
+
+
+def length_in(experiment: Mapping[str, Any]) -> tuple[str, Any]:
+    """How long the table of an experiment says that it trains: "episodes" or "steps", and how many."""
+    unit = "episodes" if experiment.get("steps") is None else "steps"
+    return unit, experiment.get(unit)
 
 
 def read_recipe(run: Path) -> dict[str, Any]:
@@ -205,11 +215,12 @@ def runs_in(paths: Iterable[Path | str]) -> list[Path]:
     return runs
 
 
-def write_more_episodes(run: Path, episodes: int) -> None:
-    """Write into a run's recipe that it is extended to so many episodes, and by which versions."""
+def write_length(run: Path, length: int) -> None:
+    """Write into a run's recipe that it is extended to so many episodes, or steps, and by which versions."""
     recipe = read_recipe(run)
-    earlier = {"episodes": recipe["experiment"]["episodes"], **_circumstances(recipe)}
-    recipe["experiment"]["episodes"] = episodes
+    unit, before = length_in(recipe["experiment"])
+    earlier = {unit: before, **_circumstances(recipe)}
+    recipe["experiment"][unit] = length
     recipe |= {**_code_text(recipe), "extended": [*recipe.get("extended", []), earlier]}
     write_json(run / RECIPE_FILE, recipe)
 

@@ -98,7 +98,7 @@ class Overview:
         return Snapshot(rows=tuple(rows), left_s=left_s)
 
     def _row(self, trial: Trial) -> Row:
-        of = trial.experiment.episodes * trial.experiment.replicas
+        of = trial.experiment.expected_episodes * trial.experiment.replicas
         state = "finished" if trial.name in self._finished else trial.state(self._runs)
         if state == "finished":
             self._finished.add(trial.name)

@@ -97,11 +97,11 @@ class StatusFile:
             "host": socket.gethostname(),
             "cpu": cpu(),
             "episodes": 0,
-            "of": experiment.episodes * experiment.replicas,
+            "of": experiment.expected_episodes * experiment.replicas,
             "steps": 0,
             "beat": 0,
         }
-        self._began, self._compiled_s = time.monotonic(), CLOCK.total_s
+        self._began, self._compiled_s, self._worlds = time.monotonic(), CLOCK.total_s, experiment.worlds
         self._first: tuple[int, float] | None = None
         """Episodes and seconds of work when this process began to train."""
         self._is_over = Event()
@@ -149,8 +149,8 @@ class StatusFile:
         self._first = training.episodes_played, work_s
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Counts a step of every world."""
-        self._table["steps"] += 1
+        """Counts the steps of a replica: a turn of each of its worlds."""
+        self._table["steps"] += self._worlds
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Counts an episode."""

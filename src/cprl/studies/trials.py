@@ -22,7 +22,16 @@ from cprl.experiment import Experiment
 from cprl.population import Frozen, with_stored
 from cprl.runs.checkpoints import FOLDER, REPORT, checkpoints_in, depends_on_episodes, is_ending
 from cprl.runs.files import LOCK_FILE, RunLock, RunLockedError, refuse_missing, remove_partial
-from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, recipe_config, start_run, write_on_nan
+from cprl.runs.recipe import (
+    ANY_LENGTH,
+    RECIPE_FILE,
+    changed_code,
+    length_in,
+    read_recipe,
+    recipe_config,
+    start_run,
+    write_on_nan,
+)
 from cprl.runs.weights import partners_of
 from cprl.studies.status import LOCKED, STOPPED, Status, StatusFile
 from cprl.studies.study import Block, Condition, Study
@@ -86,13 +95,14 @@ class Trial:
     def refuse_another(self, run: Path) -> None:
         """Refuses a run that is not this trial, e.g. one that was renamed or restored from a backup.
 
-        One that has not finished may have fewer episodes: a shorter run, copied to be continued.
+        One that has not finished may have fewer episodes, or steps: a shorter run, copied to be continued.
         """
         stored = recipe_config(read_recipe(run))
         wanted = self.experiment.to_recipe(run)["experiment"]
-        episodes = stored.get("episodes")
-        may_grow = state_of(run) != "finished" and isinstance(episodes, int) and episodes < wanted["episodes"]
-        free = {**_FREE, "episodes": 0} if may_grow else _FREE
+        (unit, length), (unit_wanted, length_wanted) = length_in(stored), length_in(wanted)
+        is_shorter = unit == unit_wanted and isinstance(length, int) and length < length_wanted
+        may_grow = state_of(run) != "finished" and is_shorter
+        free = {**_FREE, **ANY_LENGTH} if may_grow else _FREE
         if differ := differences({**stored, **free}, {**wanted, **free}, "experiment", Experiment):
             raise ValueError(
                 f"{run} was started as another trial than its name says: {differ[0]}; give it back its name, "
@@ -179,9 +189,9 @@ class Task:
         """What stands after `cprl` on the command line that runs it."""
         allow = [word for target in self.targets for word in ("--allow", target)]
         keep = "--keep-checkpoint" if self.keep_checkpoint else "--no-keep-checkpoint"
-        episodes = str(self.trial.experiment.episodes)
-        directory = os.path.abspath(self.directory)
-        return ["run", directory, "--resume", "--episodes", episodes, "--watch", "off", keep, *allow]
+        experiment, directory = self.trial.experiment, os.path.abspath(self.directory)
+        length = f"--{experiment.unit}", str(experiment.length)
+        return ["run", directory, "--resume", *length, "--watch", "off", keep, *allow]
 
     @property
     def command(self) -> str:
@@ -314,7 +324,7 @@ def begin_from_shorter(run: Path, experiment: Experiment, recipe: Mapping[str, A
     callbacks = [callback.resolve() for callback in experiment.callbacks]
     if any(not isinstance(callback, type) or depends_on_episodes(callback) for callback in callbacks):
         return None
-    free = {**_FREE, "episodes": 0}
+    free = {**_FREE, **ANY_LENGTH}
     wanted, beginnings = {**recipe["experiment"], **free}, []
     for other in sorted(path.parent for path in run.parent.glob(f"*/{RECIPE_FILE}")):
         with suppress(ValueError, KeyError, TypeError):  # of a recipe that cannot be read
@@ -323,11 +333,12 @@ def begin_from_shorter(run: Path, experiment: Experiment, recipe: Mapping[str, A
             if (
                 state_of(other) == "finished"
                 and not differences({**before, **free}, wanted, "experiment", Experiment)
-                and before["episodes"] < experiment.episodes
+                and length_in(before)[0] == experiment.unit
+                and length_in(before)[1] < experiment.length
                 and not changed_code(stored)
                 and any(map(is_ending, checkpoints_in(other / FOLDER)))
             ):
-                beginnings.append((before["episodes"], other))
+                beginnings.append((length_in(before)[1], other))
     if not beginnings:
         return None
     _, shorter = max(beginnings)

@@ -4,7 +4,7 @@ import time
 from collections.abc import Mapping
 from threading import Event, Thread
 from types import TracebackType
-from typing import Final, Self
+from typing import Any, Final, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
@@ -43,6 +43,8 @@ class ProgressBar:
     Args:
         game: a game or its environment. The length of an episode is `episode_steps` of its `rules`, if it has
             them; else that of the last episode.
+        episodes: of each replica, about.
+        steps: of each replica; None for a training of so many episodes. The bar counts what is given.
     """
 
     def __init__(
@@ -50,6 +52,7 @@ class ProgressBar:
         game: object = None,
         *,
         episodes: int,
+        steps: int | None = None,
         title: str = "training",
         replicas: int = 1,
         console: Console | None = None,
@@ -67,17 +70,33 @@ class ProgressBar:
             expand=True,
             disable=not self.console.is_terminal,
         )
-        self._task = self._progress.add_task(title, total=episodes, values="")
+        self._all_steps = steps
+        self._task = self._progress.add_task(title, total=steps or episodes, values="")
         self._latest = {"return": "-", "epsilon": ""}
         self._turns = self._steps = self._steps_then = self._steps_this_episode = self._episodes = 0
         self._started = self._then = _running_s()
-        self._left_of, self._replicas, self._before = episodes, replicas, 0
+        self._left_of, self._replicas, self._before = steps or episodes, replicas, 0.0
         self._compiled_before_s = CLOCK.total_s
         self._is_over, self._lines = Event(), Thread(target=self._say_compiling, daemon=True)
 
+    @classmethod
+    def of(cls, experiment: Any) -> Self:
+        """Return the bar of an `Experiment`."""
+        return cls(
+            experiment.game,
+            episodes=experiment.expected_episodes,
+            steps=experiment.steps,
+            replicas=experiment.replicas,
+        )
+
+    def on_start(self, training: Any) -> None:
+        """Continues where the training does."""
+        self._steps = self._steps_then = training.steps * self._replicas
+        self._before = self._done()
+
     def on_step(self, batch: TensorDictBase) -> None:
         """Counts the turns of a batch and updates the bar if it is due."""
-        if not self._steps:  # do not count the time before the first step
+        if not self._turns:  # do not count the time before the first step
             self._started = self._then = _running_s()
         self._turns += 1
         self._steps += batch.numel()
@@ -102,18 +121,26 @@ class ProgressBar:
         if self._latest["epsilon"]:
             values += f"  epsilon {self._latest['epsilon']}"
         values += f"  {rate:,.0f} steps/s"
-        episode_steps = self._clock or self._last_steps
-        running = min(self._replicas, self._steps_this_episode / episode_steps) if episode_steps else 0
-        done = (self._episodes + running) / self._replicas
+        done = self._done()
         values += self._time_left(done)
         self._progress.update(self._task, completed=done, values=values)
         if not self.console.is_terminal:
-            episode = self._episodes // self._replicas
-            self.console.print(f"{self._title}: episode {episode}/{self._left_of}  {values}", soft_wrap=True)
+            at = f"episode {self._episodes // self._replicas}/{self._left_of}"
+            if self._all_steps is not None:
+                at = f"step {done:,.0f}/{self._left_of:,}"
+            self.console.print(f"{self._title}: {at}  {values}", soft_wrap=True)
+
+    def _done(self) -> float:
+        """Episodes of each replica so far, or steps."""
+        if self._all_steps is not None:
+            return self._steps / self._replicas
+        episode_steps = self._clock or self._last_steps
+        running = min(self._replicas, self._steps_this_episode / episode_steps) if episode_steps else 0
+        return (self._episodes + running) / self._replicas
 
     def _time_left(self, done: float) -> str:
         """The time left after so many episodes, in words; empty before enough steps were timed."""
-        since = done - self._before / self._replicas
+        since = done - self._before
         if self._turns < TIMED_STEPS or not since:
             return ""
         left_s = (_running_s() - self._started) / since * (self._left_of - done)
@@ -132,7 +159,7 @@ class ProgressBar:
         return {"episodes": self._episodes}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        self._episodes = self._before = int(state["episodes"])
+        self._episodes = int(state["episodes"])
 
     def __enter__(self) -> Self:
         self._compiled_before_s = CLOCK.total_s
@@ -147,7 +174,8 @@ class ProgressBar:
         self._is_over.set()
         if self._lines.is_alive():
             self._lines.join()
-        self._progress.update(self._task, completed=self._episodes / self._replicas)
+        self._steps_this_episode = 0
+        self._progress.update(self._task, completed=self._done())
         self._progress.stop()
 
 

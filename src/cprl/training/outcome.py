@@ -40,9 +40,15 @@ def make_agents(
             is resumed reads its own.
         weights: those that `Frozen` agents play with, see `Population`.
     """
-    env = _worlds(experiment, experiment.replicas, device=experiment.device)
+    env = _worlds(experiment, experiment.replicas * experiment.worlds, device=experiment.device)
     population = Population(
-        env, experiment.agents, seed=experiment.seed, engine=experiment.engine, starts=starts, weights=weights
+        env,
+        experiment.agents,
+        seed=experiment.seed,
+        worlds=experiment.worlds,
+        engine=experiment.engine,
+        starts=starts,
+        weights=weights,
     )
     with torch.random.fork_rng(devices=[]):
         fresh_env(experiment)  # what the evaluation cannot have is refused now, not after hours
@@ -118,8 +124,8 @@ class Evaluations:
 
     def on_ended(self, ended: Sequence[tuple[Episode, dict[str, float]]]) -> None:
         every = self._experiment.evaluate_every
-        due = {
-            episode.world: (episode.episode + 1, learning)
+        due = {  # of several in one turn the last
+            episode.replica: (episode.episode + 1, learning)
             for episode, learning in ended
             if every is not None and (episode.episode + 1) % every == 0
         }

@@ -119,19 +119,19 @@ def run(
     observers: list[Any] = [*(made(callback) for callback in experiment.callbacks), *callbacks]
     check_callbacks(observers)
     try_own_metrics(experiment.metrics, env)
-    episodes = refuse_another_run(out, experiment.to_recipe, Experiment) if resume else experiment.episodes
-    if resumed is not None and episodes >= experiment.episodes and (resumed / REPORT).exists():
+    length = refuse_another_run(out, experiment.to_recipe, Experiment) if resume else experiment.length
+    if resumed is not None and length >= experiment.length and (resumed / REPORT).exists():
         _tidy_up(resumed, keep_checkpoint=keep_checkpoint, take_over=take_over)
         return resumed
     directory = _start(experiment, out) if resumed is None else resumed
-    if episodes < experiment.episodes:
-        refuse_to_extend(directory, episodes, observers)
+    if length < experiment.length:
+        refuse_to_extend(directory, length if experiment.unit == "episodes" else None, observers)
     checkpointer = Checkpointer(directory, keep_ending=keep_checkpoint, take_over=take_over)
     closing = ExitStack()  # of the viewer, which outlives the rest
     try:
         with checkpointer:
             if resume:
-                _begin_again(directory, experiment, is_begun=is_begun, episodes=episodes)
+                _begin_again(directory, experiment, is_begun=is_begun, length=length)
             viewer = closing.enter_context(_make_viewer(watch, directory, experiment, env, population))
             work = _Work(directory, experiment, env, population, viewer)
             _carry_out(work, observers, checkpointer, times, figures=figures)
@@ -186,13 +186,16 @@ def _train(work: _Work, observers: Sequence[Any], checkpointer: Checkpointer) ->
     """Trains with the callbacks that write the table of episodes, show the progress and write to loggers, and
     saves what was learned."""
     directory, experiment, env, population, viewer = work
-    replicas, names = experiment.replicas, agent_names(env)
+    names = agent_names(env)
     watching = [] if viewer is None else [viewer]
     with ExitStack() as stack:
         table = stack.enter_context(EpisodeTable(directory / "episodes.parquet", resumable=True))
-        bar = stack.enter_context(ProgressBar(env, episodes=experiment.episodes, replicas=replicas))
+        bar = stack.enter_context(ProgressBar.of(experiment))
         loggers = [make_logger(made(logger), directory) for logger in experiment.loggers]
-        logging = [LoggerCallback(logger, replicas=replicas, agents=names) for logger in loggers]
+        logging = [
+            LoggerCallback(logger, replicas=experiment.replicas, worlds=experiment.worlds, agents=names)
+            for logger in loggers
+        ]
         evaluations = Evaluations(directory, experiment, env, population)
         training = train(
             env,
@@ -200,6 +203,8 @@ def _train(work: _Work, observers: Sequence[Any], checkpointer: Checkpointer) ->
             others=population.others,
             decisions=population.decisions,
             episodes=experiment.episodes,
+            steps=experiment.steps,
+            worlds=experiment.worlds,
             callbacks=[evaluations, table, bar, *observers, *watching, *map(stack.enter_context, logging)],
             checkpointer=checkpointer,
             update_every=experiment.update_every,
@@ -230,11 +235,12 @@ def _draw(experiment: Experiment, directory: Path, random: list[Episode]) -> Pat
 
 def _write_report(directory: Path, training: Training, times: Times) -> None:
     """Writes `report.json`, the sign that a run is finished."""
-    report = {
+    report: dict[str, Any] = {
         **times.report(training.times),
         "steps": training.steps,
         "finished": datetime.now().astimezone().isoformat(timespec="seconds"),
         "episodes": training.episodes,
+        "worlds": training.worlds,
     }
     if training.finite.reported:
         report["not_finite"] = [asdict(finding) for finding in training.finite.reported]
@@ -255,7 +261,9 @@ def _summarise(
 
 
 def _title(experiment: Experiment) -> str:
-    return f"{experiment.name}, {experiment.replicas} replicas, {experiment.episodes} episodes"
+    worlds = f" of {experiment.worlds:,} worlds" if experiment.worlds > 1 else ""
+    length = experiment.length if experiment.unit == "episodes" else f"{experiment.length:,}"
+    return f"{experiment.name}, {experiment.replicas} replicas{worlds}, {length} {experiment.unit}"
 
 
 def _partners(experiment: Experiment) -> list[str]:
@@ -270,14 +278,14 @@ def _weights_of_partners(experiment: Experiment, run: Path) -> dict[str, str]:
     return {partner: name for partner, name in names.items() if name is not None}
 
 
-def _begin_again(directory: Path, experiment: Experiment, *, is_begun: bool, episodes: int) -> None:
-    """Says what is new since a run was begun, of so many episodes, and writes it into its recipe."""
+def _begin_again(directory: Path, experiment: Experiment, *, is_begun: bool, length: int) -> None:
+    """Says what is new since a run was begun, of such a length, and writes it into its recipe."""
     say_changes(directory, write_circumstances(directory))
     if not is_begun:
         say("No checkpoint yet: begins with the first episode")
     write_on_nan(directory, experiment.on_nan)
-    if episodes < experiment.episodes:
-        extend(directory, episodes, experiment.episodes)
+    if length < experiment.length:
+        extend(directory, length, experiment.length)
 
 
 def _make_viewer(
@@ -293,7 +301,9 @@ def _make_viewer(
         directory,
         env,
         title=_title(experiment),
-        episodes=experiment.episodes,
+        episodes=experiment.expected_episodes,
+        is_about=experiment.unit == "steps",
+        worlds=experiment.worlds,
         metrics=[own_name(metric) for metric in experiment.metrics],
         recipe={**recipe["experiment"], **circumstances},
         live=None if watch == "file" else watch,

@@ -178,8 +178,12 @@ class Training:
 
     @property
     def is_ending(self) -> bool:
-        """Whether a replica has played its last episode; episodes that it plays beyond are not recorded."""
-        return max(self._played) >= self._most_episodes
+        """Whether a replica may play its last episode in the next turn, in which each of its worlds can end
+        one; episodes that it plays beyond are not recorded. Of a training of so many steps: whether it is
+        over."""
+        if self.episodes is None:
+            return self.is_over
+        return max(self._played) > self.episodes - self.worlds
 
     @property
     def episodes_played(self) -> int:

@@ -54,16 +54,20 @@ class ViewerCallback:
     metrics see `cprl.measuring.metrics`. One event of the recording names them. With transforms, windows
     show the observations of the `CommonsEnv` itself.
 
-    Frames are recorded for every k-th episode, including the first and the last, and for the episode after
-    each new best. With several replicas metrics are logged once all have ended an episode: the mean and each
-    replica; returns, losses and the like as means only. A callback of `cprl.training`, and a context manager.
+    Frames are recorded for every k-th episode of that world, including the first and the last, and for the
+    episode after each new best. With several replicas metrics are logged once all have ended an episode: the
+    mean and each replica; returns, losses and the like as means only. Those of every W episodes of replicas
+    in W worlds are logged together. A callback of `cprl.training`, and a context manager.
 
     Of a run that is resumed the views get the episodes in its table, and viewers the recording so far.
 
     Args:
         run: the run's directory, where the recording is written. If there is one already, the new file is
             `run-2.rrd` and so on; the viewer shows them as one recording.
-        env: a world for each replica, with transforms or without; the first is shown.
+        env: the worlds of all replicas, with transforms or without; the first is shown.
+        episodes: of each replica.
+        is_about: whether it is only about as many, because so many steps are trained.
+        worlds: the worlds W of each replica.
         metrics: the names of the user's own.
         live: "serve" or "spawn", see `cprl.viewer.live`; None for the file alone.
         exhibited: what is exhibited live: the present policy and one world for it, see
@@ -81,6 +85,8 @@ class ViewerCallback:
         *,
         title: str,
         episodes: int,
+        is_about: bool = False,
+        worlds: int = 1,
         metrics: Sequence[str] = (),
         recipe: Mapping[str, object] | None = None,
         live: str | None = None,
@@ -90,7 +96,7 @@ class ViewerCallback:
     ) -> None:
         self.env, self._run, self._agents = env, run, agent_names(env)
         reported, commons = reported_by(env), commons_of(env)
-        curves = curves_of(env, self._agents, reported, episodes=episodes, own=metrics)
+        curves = curves_of(env, self._agents, reported, episodes=episodes, worlds=worlds, own=metrics)
         scene = None if commons is None else scene_of(commons, curves, is_replay=is_replay)
         self._earlier = [] if file_name else recordings_of(run)
         self.logger = RerunLogger(
@@ -102,10 +108,10 @@ class ViewerCallback:
             file_name=file_name or (f"run-{len(self._earlier) + 1}.rrd" if self._earlier else FILE_NAME),
             recording_id=recording_id(run, file_name or FILE_NAME),
         )
-        self.filming = Filming(commons, self.logger, scene, episodes=episodes)
-        """Which episodes are recorded frame by frame."""
-        self._series = Series(curves.replicas)
-        self._step = self._episode = 0
+        self.filming = Filming(commons, self.logger, scene, episodes=-(-episodes // worlds))
+        """Which episodes of the first world are recorded frame by frame."""
+        self._series = Series(curves.replicas, worlds)
+        self._turn = self._step = self._episode = self._filmed = 0
         self._rate_at, self._rate_step = time.perf_counter(), 0
         self.logger.log_hparams({"run": run.name, **(recipe or {})})
         self.logger.log_text(f"{title} begins")
@@ -116,13 +122,18 @@ class ViewerCallback:
         self.story: Story | None = None
         self.exhibition: Exhibition | None = None
         """What the present policy plays for viewers; None where nothing is exhibited."""
-        self._views = self._make_views(episodes, exhibited, is_replay=is_replay)
+        self._views = self._make_views(episodes, exhibited, is_about=is_about, is_replay=is_replay)
         self._sampled = gcd(*(view.stride for view in self._views)) or 1
-        """Steps from one look at the worlds to the next where no frame is recorded."""
+        """Turns from one look at the worlds to the next where no frame is recorded."""
         self.filming.choose(0)
 
     def _make_views(
-        self, episodes: int, exhibited: tuple[PresentPolicy, EnvBase] | None, *, is_replay: bool
+        self,
+        episodes: int,
+        exhibited: tuple[PresentPolicy, EnvBase] | None,
+        *,
+        is_about: bool,
+        is_replay: bool,
     ) -> list[View]:
         """What the game has to show."""
         logger, commons = self.logger, commons_of(self.env)
@@ -144,15 +155,15 @@ class ViewerCallback:
         if is_replay:
             return views
         if commons is not None and scene is not None:
-            if scene.replicas > 1:
-                recorded = episodes // max(1, self.filming.every) + 1
+            if scene.boards > 1:
+                recorded = episodes // scene.worlds // max(1, self.filming.every) + 1
                 steps = commons.game.rules.episode_steps * recorded
                 views.append(Wall(commons, logger, scene, recorded_steps=steps))
             views += [Visits(commons, logger, scene, every=every), Turns(commons, logger, every=every)]
         if curves.has_lorenz:
             views.append(Lorenz(logger, every=every))
         game = None if commons is None else commons.game
-        self.story = Story(logger, self.filming, episodes=episodes, game=game)
+        self.story = Story(logger, self.filming, episodes=episodes, is_about=is_about, game=game)
         views.append(self.story)
         if live is not None:
             views.append(CompilingNotice(self._show_status))
@@ -170,6 +181,7 @@ class ViewerCallback:
     def _resume(self, step: int) -> None:
         """Gives the views the episodes that the run's table has, and viewers the recording so far."""
         self._step = self._rate_step = step
+        self._turn = step // self._series.worlds
         with self.logger.silent():
             for episode in _stored_episodes(self._run):
                 self.on_episode(episode, {})
@@ -187,13 +199,14 @@ class ViewerCallback:
 
         Otherwise it only counts: reading a tensor each turn would cost a training some percent.
         """
-        self._step += 1
-        if not self.filming.is_on and self._step % self._sampled:
+        self._turn += 1
+        self._step += self._series.worlds
+        if not self.filming.is_on and self._turn % self._sampled:
             return  # nothing is due; whatever runs here displaces a training's data from the fast caches
-        self.filming.choose(self._episode)
+        self.filming.choose(self._filmed)
         frame = self.filming.add(batch, step=self._step, episode=self._episode)
         for view in self._views:
-            view.on_step(self._step, self._episode, frame)
+            view.on_step(self._turn, self._episode, frame)
             view.on_batch(batch)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
@@ -201,18 +214,20 @@ class ViewerCallback:
         self.logger.at(step=self._step, episode=episode.episode)
         for view in self._views:
             view.on_episode(episode)
+        if episode.replica == 0:
+            self._episode = episode.episode + 1
         if episode.world == 0:
-            self._episode, self.filming.shows_next = episode.episode + 1, False
+            self._filmed, self.filming.shows_next = self._filmed + 1, False
         numbers, died = numbers_of(episode, learning, self._agents), has_died(episode)
-        of_all = self._series.add(
-            episode.episode, episode.world, numbers if died is None else {**numbers, _DIED: float(died)}
-        )
+        of_all = self._series.add(episode, numbers if died is None else {**numbers, _DIED: float(died)})
         if of_all is not None:
-            deaths = of_all.pop(_DIED, None)
+            shares, worlds = of_all.pop(_DIED, None), self._series.worlds
+            deaths = None if shares is None else float(np.nansum(shares)) * worlds
+            last = episode.episode // worlds * worlds + worlds - 1
             for view in self._views:
-                view.on_all(episode.episode, of_all, None if deaths is None else float(np.nansum(deaths)))
+                view.on_all(last, of_all, deaths)
             self._log_speed()
-        self.filming.choose(self._episode)
+        self.filming.choose(self._filmed)
 
     def _log_speed(self) -> None:
         now, steps = time.perf_counter(), (self._step - self._rate_step) * self._series.replicas
@@ -286,7 +301,8 @@ def _stored_episodes(run: Path) -> Iterator[Episode]:
             return int(columns[name][row]) if name in columns else None
 
         yield Episode(
-            world=replica,
+            world=int(columns["world"][row]) if "world" in columns else replica,
+            replica=replica,
             episode=number,
             steps=int(columns["steps"][row]),
             terminated=bool(columns["terminated"][row]),

@@ -91,7 +91,7 @@ class Exhibition(View):
         # Compiling may take half a minute, and of a run that is resumed no policy is loaded yet.
         self._send(_before_the_first_step(commons.game), "the board as an episode begins")
 
-    def on_step(self, step: int, episode: int, frame: int | None) -> None:
+    def on_step(self, turn: int, episode: int, frame: int | None) -> None:
         """Plays the steps of two seconds if they are due; `episode` is the training's, for the caption."""
         now = self._clock()
         if now >= self._due and not self.is_over:

@@ -107,6 +107,10 @@ def window_of(episodes: int) -> int:
     return max(10, round(0.02 * episodes))
 
 
+_MOST_BOARDS: Final = 16
+"""Of the worlds of a replica, side by side."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Curves:
     """The numbers that a recording plots; a game without a board has nothing else."""
@@ -115,6 +119,8 @@ class Curves:
     """The names of the agents, agent 0 first."""
     replicas: int = 1
     """The number of replicas: each is a thin line, and their mean a thick one."""
+    worlds: int = 1
+    """The worlds W of each replica."""
     mean_over: int = 10
     """The episodes whose mean is the bold line."""
     metrics: tuple[str, ...] = (*METRICS, "stock_left", "yield_share")
@@ -129,6 +135,12 @@ class Curves:
     """What is decided in an episode, in words, e.g. "the tax rate"."""
     joint: tuple[str, ...] = ()
     """The joint actions whose shares are plotted, e.g. "CC" and so on."""
+
+    @property
+    def boards(self) -> int:
+        """How many boards are shown side by side: that of each replica, or, of replicas in several worlds,
+        the first ones of the first."""
+        return self.replicas if self.worlds == 1 else min(self.worlds, _MOST_BOARDS)
 
     @property
     def has_lorenz(self) -> bool:
@@ -177,6 +189,7 @@ def curves_of(
     reported: Sequence[str],
     *,
     episodes: int,
+    worlds: int = 1,
     own: Sequence[str] = (),
 ) -> Curves:
     """The numbers of an environment that are plotted, and metrics of the user's own by their names."""
@@ -186,7 +199,8 @@ def curves_of(
     game = getattr(base_env(env), "game", None)
     return Curves(
         agents=agents,
-        replicas=env.batch_size.numel(),
+        replicas=env.batch_size.numel() // worlds,
+        worlds=worlds,
         mean_over=window_of(episodes),
         metrics=metrics,
         has_phases=episodes in phases.EPISODES and set(phases.METRICS) <= set(metrics),
@@ -517,7 +531,7 @@ def _overview(curves: Curves, *, live: bool) -> Any:
     board = (
         _board("Present policy", curves, origin="exhibition", below=4.2) if live else _board("Board", curves)
     )
-    boards = _wall(curves) if curves.replicas > 1 else _social(curves, "survival_steps")
+    boards = _wall(curves) if curves.boards > 1 else _social(curves, "survival_steps")
     beside = _present([gets, _social(curves, "stock_left"), boards])
     return rrb.Horizontal(board, rrb.Vertical(*beside), column_shares=[3, 2], name="Overview")
 
@@ -589,8 +603,9 @@ def _present(views: Iterable[Any]) -> list[Any]:
 
 
 def _wall(scene: Scene) -> Any:
-    wall = boards_of(scene, scene.replicas)
-    return wall.view("All replicas; orange: the board of its last episode died", "wall")
+    whose = "All replicas" if scene.worlds == 1 else "Worlds of the first replica"
+    wall = boards_of(scene, scene.boards)
+    return wall.view(f"{whose}; orange: the board of its last episode died", "wall")
 
 
 def _tags(agents: int) -> Any:

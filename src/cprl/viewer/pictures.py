@@ -46,10 +46,10 @@ class View:
     """
 
     stride = 0
-    """The view needs to look at the worlds in every so many steps; 0 for no certain ones."""
+    """The view needs to look at the worlds in every so many turns; 0 for no certain ones."""
 
-    def on_step(self, step: int, episode: int, frame: int | None) -> None:
-        """Look at the worlds after a step of the run; `frame` is the number of the recorded one, if any."""
+    def on_step(self, turn: int, episode: int, frame: int | None) -> None:
+        """Look at the worlds after a turn of the run; `frame` is the number of the recorded one, if any."""
 
     def on_batch(self, batch: TensorDictBase) -> None:
         """Look at a turn of all worlds, after `on_step`."""
@@ -58,7 +58,8 @@ class View:
         """Add an episode of a replica."""
 
     def on_all(self, episode: int, numbers: Mapping[str, Values], died: float | None) -> None:
-        """Add an episode, counted from 0, that all replicas have ended.
+        """Add an episode, counted from 0, that all replicas have ended; of replicas in W worlds the last of W
+        whose means these are.
 
         Args:
             numbers: [R] by name.
@@ -133,9 +134,9 @@ class JointActions(View):
 
     def __init__(self, logger: RerunLogger, *, actions: int) -> None:
         curves = logger.curves
-        self._logger, self._worlds = logger, np.arange(curves.replicas)
+        self._logger, self._worlds = logger, np.arange(curves.replicas * curves.worlds)
         self._places = actions ** np.arange(len(curves.agents))[::-1]
-        self._counts = np.zeros((curves.replicas, len(curves.joint)))
+        self._counts = np.zeros((len(self._worlds), len(curves.joint)))
         self._shares: dict[int, list[NDArray[np.float64]]] = {}
         self._recent = [Recent(curves.mean_over) for _ in curves.joint]
 
@@ -146,17 +147,19 @@ class JointActions(View):
     def on_episode(self, episode: Episode) -> None:
         counts = self._counts[episode.world]
         if counts.any():
-            self._shares.setdefault(episode.episode, []).append(counts / counts.sum())
+            together = episode.episode // self._logger.curves.worlds
+            self._shares.setdefault(together, []).append(counts / counts.sum())
         counts[:] = 0
 
     def on_all(self, episode: int, numbers: Mapping[str, Values], died: float | None) -> None:
-        if shares := self._shares.pop(episode, None):
+        if shares := self._shares.pop(episode // self._logger.curves.worlds, None):
             means = zip(self._recent, np.mean(shares, 0), strict=True)
             self._logger.log_lines(JOINT, [recent.add(share) for recent, share in means])
 
 
 class Tags(View):
-    """Draws a matrix of who tagged whom every ten episodes: the sum over the last fifty, of all replicas."""
+    """Draws a matrix of who tagged whom every ten episodes of a world: the sum over the last fifty, of all
+    replicas."""
 
     EVERY, OVER = 10, 5
 
@@ -176,7 +179,7 @@ class Tags(View):
             self._last[-1] += episode.tagged_by
 
     def on_all(self, episode: int, numbers: Mapping[str, Values], died: float | None) -> None:
-        if (episode + 1) % self.EVERY == 0:
+        if (episode + 1) // self._logger.curves.worlds % self.EVERY == 0:
             tags = np.sum(self._last, 0)
             light = (tags / max(1.0, tags.max()))[..., None]
             image = np.array(PALETTE[GROUND]) * (1 - light) + np.array(STATES["combat"]) * light
@@ -190,21 +193,22 @@ class Tags(View):
 
 
 class Looks:
-    """Keeps some arrays of the worlds as they are at some steps.
+    """Keeps some arrays of the first worlds as they are at some steps.
 
     A copy takes a microsecond; adding up right away takes twenty, since whatever runs between two steps of a
     training runs out of cold caches.
 
     Args:
         names: the arrays, by their names in `cprl.commons.world.Worlds`.
+        worlds: how many worlds.
     """
 
     ROOM = 100
     """Looks that are kept, at most."""
 
-    def __init__(self, env: CommonsEnv, names: Sequence[str]) -> None:
+    def __init__(self, env: CommonsEnv, names: Sequence[str], worlds: int) -> None:
         self._read = env.worlds.driver.read
-        arrays = [getattr(env.worlds.now, name) for name in names]
+        arrays = [getattr(env.worlds.now, name)[:worlds] for name in names]
         self._pairs = [(array, np.empty((self.ROOM, *array.shape), array.dtype)) for array in arrays]
         self._on_cpu = all(isinstance(array, np.ndarray) for array in arrays)
         self._count = 0
@@ -239,11 +243,11 @@ _Row: TypeAlias = tuple[int, int, int, NDArray[np.uint8], list[str], NDArray[np.
 
 
 class Wall(View):
-    """Logs the boards of all replicas: same rules, as many fates.
+    """Logs the boards of all replicas, or of the first worlds of one: same rules, as many fates.
 
     Viewers get them every two seconds, after hours more rarely; the file gets every `stride_in_file`-th step
     of the episodes whose frames are recorded. The text of a board says its turn, in orange if the episode of
-    its replica before this one ended because no apple was left.
+    its world before this one ended because no apple was left.
 
     Args:
         recorded_steps: the steps of the run whose frames are recorded, about; determines the stride.
@@ -251,19 +255,20 @@ class Wall(View):
 
     def __init__(self, env: CommonsEnv, logger: RerunLogger, scene: Scene, *, recorded_steps: int) -> None:
         self._env, self._logger, self._scene = env, logger, scene
-        self._panels = boards_of(scene, scene.replicas)
+        self._panels = boards_of(scene, scene.boards)
         rows, columns = self._panels.shape
-        row_bytes = 100 + 20 * scene.replicas + 0.35 * rows * columns
+        row_bytes = 100 + 20 * scene.boards + 0.35 * rows * columns
         self._stride = max(_FEWEST_STEPS, ceil(recorded_steps * row_bytes / WALL_BYTES))
-        self._died = np.zeros(scene.replicas, np.bool_)
+        self._died = np.zeros(scene.boards, np.bool_)
         self._rows: list[_Row] = []
         self._began = self._due = time.perf_counter()
         form = rr.SegmentationImage.from_fields(format=image_form(self._panels.shape), opacity=1.0)
         logger.log_static("wall/boards", form)
         logger.log_static("wall/labels", self._panels.labels(colours=None))
 
-    def on_step(self, step: int, episode: int, frame: int | None) -> None:
-        if frame is not None and step % self._stride == 0:
+    def on_step(self, turn: int, episode: int, frame: int | None) -> None:
+        step = turn * self._scene.worlds
+        if frame is not None and turn % self._stride == 0:
             self._rows.append(self._row(step, episode, frame))
         elif (now := time.perf_counter()) > self._due:
             self._due = now + max(_LIVE_PERIOD_S, (now - self._began) / _LIVE_ROWS)
@@ -272,8 +277,9 @@ class Wall(View):
                 self._logger.do(partial(_send_rows, rows=[row]), live_only=True)
 
     def on_episode(self, episode: Episode) -> None:
-        """Notes whether the replica's board has died, and sends the rows of the episode."""
-        self._died[episode.world] = bool(has_died(episode))
+        """Notes whether the board has died, and sends the rows of the episode."""
+        if episode.world < len(self._died):
+            self._died[episode.world] = bool(has_died(episode))
         if episode.world == 0:
             self.close()
 
@@ -284,10 +290,11 @@ class Wall(View):
 
     def _row(self, step: int, episode: int, frame: int) -> _Row:
         now, read = self._env.worlds.now, self._env.worlds.driver.read
-        state = {name: read(getattr(now, name)) for name in ("stock", "in_play", "row", "col")}
+        shown = len(self._died)
+        state = {name: read(getattr(now, name)[:shown]) for name in ("stock", "in_play", "row", "col")}
         image = self._panels.joined(boards(self._scene, {"step": state["stock"], **state}), UNSEEN)
-        turns = read(now.step)[:, 0].tolist()
-        labels = [f"{replica}: turn {turn}" for replica, turn in enumerate(turns)]
+        turns = read(now.step[:shown])[:, 0].tolist()
+        labels = [f"{board}: turn {turn}" for board, turn in enumerate(turns)]
         colours = np.where(self._died[:, None], _DIED, TEXT).astype(np.uint8)
         return step, episode, frame, image, labels, colours
 
@@ -313,8 +320,8 @@ class Picture(View):
         self._ended = self._logged = 0
 
     def on_all(self, episode: int, numbers: Mapping[str, Values], died: float | None) -> None:
-        self._ended = episode + 1
-        if self._ended % self._every == 0:
+        before, self._ended = self._ended, episode + 1
+        if self._ended // self._every > before // self._every:
             self.close()
 
     def close(self) -> None:
@@ -331,20 +338,22 @@ class Picture(View):
 
 
 class Sampled(Picture):
-    """A picture of some arrays of the worlds every `stride` steps."""
+    """A picture of some arrays of the first worlds every `stride` turns."""
 
-    def __init__(self, env: CommonsEnv, names: Sequence[str], *, every: int, stride: int) -> None:
+    def __init__(
+        self, env: CommonsEnv, names: Sequence[str], *, worlds: int, every: int, stride: int
+    ) -> None:
         super().__init__(every)
-        self.stride, self._looks = stride, Looks(env, names)
+        self.stride, self._looks = stride, Looks(env, names, worlds)
 
-    def on_step(self, step: int, episode: int, frame: int | None) -> None:
-        if step % self.stride == 0:
+    def on_step(self, turn: int, episode: int, frame: int | None) -> None:
+        if turn % self.stride == 0:
             self._looks.add()
             if self._looks.is_full:
                 self._add(*self._looks.take())
 
     def _add(self, *arrays: NDArray[Any]) -> None:
-        """Add the arrays [T, R, ...] at T steps."""
+        """Add the arrays [T, worlds, ...] at T steps."""
         raise NotImplementedError
 
 
@@ -353,14 +362,14 @@ _DARKEST: Final = 0.35
 
 
 class Visits(Sampled):
-    """Counts the agents' cells in the first replica, the one that is shown, every ten steps.
+    """Counts the agents' cells in the first world, the one that is shown, every ten turns.
 
     The image has a map for each agent: hue the agent, brightness the time it spent on the cell while in play,
     by its square root, as a share of the longest time that any agent spent on one cell.
     """
 
     def __init__(self, env: CommonsEnv, logger: RerunLogger, scene: Scene, *, every: int) -> None:
-        super().__init__(env, ("row", "col", "in_play"), every=every, stride=10)
+        super().__init__(env, ("row", "col", "in_play"), worlds=1, every=every, stride=10)
         self._logger = logger
         self.counts = np.zeros((len(scene.agents), scene.height, scene.width), np.int64)
         """Of the time since the last image."""
@@ -440,22 +449,24 @@ def _ticks(end: float) -> list[float]:
 
 
 class Turns(Sampled):
-    """Logs the apples on the board over the turns of each replica's last episode, grey where the board lived
-    until the time was up, in the colour of a tragedy where it died.
+    """Logs the apples on the board over the turns of the last episode of each replica, or of each world that
+    the wall shows, grey where the board lived until the time was up, in the colour of a tragedy where it
+    died.
     """
 
     POINTS = 100
     """The points of a line, at most."""
 
     def __init__(self, env: CommonsEnv, logger: RerunLogger, *, every: int) -> None:
-        game, replicas = env.game, env.worlds.size
+        game, boards = env.game, logger.curves.boards
+        self._whose = "each replica" if logger.curves.worlds == 1 else "each world shown"
         stride = ceil(game.rules.episode_steps / self.POINTS)
-        super().__init__(env, ("step", "stock_left"), every=every, stride=stride)
-        self._playing = np.full((replicas, game.rules.episode_steps // self.stride + 1, 2), np.nan)
-        """[R, points, 2], turn and stock of the episodes that are being played."""
-        self.lines: list[list[tuple[float, float]]] = [[] for _ in range(replicas)]
-        """The points of each replica's last episode, (turn, stock)."""
-        self._died = [False] * replicas
+        super().__init__(env, ("step", "stock_left"), worlds=boards, every=every, stride=stride)
+        self._playing = np.full((boards, game.rules.episode_steps // self.stride + 1, 2), np.nan)
+        """[boards, points, 2], turn and stock of the episodes that are being played."""
+        self.lines: list[list[tuple[float, float]]] = [[] for _ in range(boards)]
+        """The points of each board's last episode, (turn, stock)."""
+        self._died = [False] * boards
         ends = {"x_end": game.rules.episode_steps, "y_end": max(1, len(game.map.sites))}
         self._plot = DrawnPlot(logger, "turn", "turn of the episode", **ends)
 
@@ -466,6 +477,8 @@ class Turns(Sampled):
         self._playing[(*point, 0)], self._playing[(*point, 1)] = turn, stock
 
     def on_episode(self, episode: Episode) -> None:
+        if episode.world >= len(self.lines):
+            return
         self._add(*self._looks.take())
         playing = self._playing[episode.world]
         points = playing[playing[:, 0] < episode.steps]
@@ -475,12 +488,12 @@ class Turns(Sampled):
         playing[1:] = np.nan  # the first point is already that of the next episode, which begins alike
 
     def log(self, episodes: str) -> None:
-        replicas = [replica for replica, line in enumerate(self.lines) if len(line) > 1]
-        if replicas:
+        boards = [board for board, line in enumerate(self.lines) if len(line) > 1]
+        if boards:
             self._plot.log(
-                f"last episode of each replica: {sum(self._died)} of {len(replicas)} boards died (orange)",
-                [tuple(np.array(self.lines[replica]).T) for replica in replicas],
-                colours=[_DIED if self._died[replica] else GREY for replica in replicas],
+                f"last episode of {self._whose}: {sum(self._died)} of {len(boards)} boards died (orange)",
+                [tuple(np.array(self.lines[board]).T) for board in boards],
+                colours=[_DIED if self._died[board] else GREY for board in boards],
                 radii=0.5,
             )
 

@@ -55,39 +55,48 @@ class Header:
     """The headers of one run: a line of Markdown each."""
 
     episodes: int
-    """Of the run."""
-    replicas: int
+    """Of the run, or about as many where it trains so many steps."""
+    boards: int
+    """The worlds of all replicas."""
     unit: str
     """"apples" or "return"."""
     rules: str = ""
     """The institutions in force, in words."""
+    is_about: bool = False
+    """Whether it trains so many steps."""
+
+    @property
+    def _of(self) -> str:
+        return f"of {'about ' * self.is_about}{self.episodes:,}"
 
     def begins(self, status: str) -> str:
-        return self._text(f"Episode 1 of {self.episodes:,}", status)
+        return self._text(f"Episode 1 {self._of}", status)
 
     def line(
         self, *, episode: int, label: str, mean: float, random_play: float | None, died: float | None
     ) -> str:
         """After an episode, in which so many boards died early; None or NaN for a game without stock."""
         beside = "" if random_play is None else f", random play {_number(random_play)}"
-        deaths = "" if died is None or isnan(died) else self._died(round(died), self.replicas)
-        return self._text(
-            f"Episode {episode:,} of {self.episodes:,}", label, f"{self._amount(mean)}{beside}", deaths
-        )
+        deaths = "" if died is None or isnan(died) else self._died(round(died), self.boards)
+        return self._text(f"Episode {episode:,} {self._of}", label, f"{self._amount(mean)}{beside}", deaths)
 
     def finished(self, trained: Played, random: Played) -> str:
         """After the evaluation of a run: the trained policy beside the random one, in fresh worlds."""
         beside = f"trained {self._amount(trained.mean)}, random play {_number(random.mean)}"
         died = "" if trained.died is None else self._died(trained.died, trained.episodes)
-        return self._text(f"Finished, {self.episodes:,} episodes", beside, died)
+        return self._text(self._finished, beside, died)
 
     def ended(self, mean: float) -> str:
-        return self._text(f"Finished, {self.episodes:,} episodes", f"{self._amount(mean)} at the end")
+        return self._text(self._finished, f"{self._amount(mean)} at the end")
+
+    @property
+    def _finished(self) -> str:
+        return "Finished" if self.is_about else f"Finished, {self.episodes:,} episodes"
 
     def stopped(self, episode: int, mean: float) -> str:
         """At the end of a run that was stopped after so many episodes; it can be resumed."""
         amount = "" if isnan(mean) else self._amount(mean)
-        return self._text(f"Stopped after {episode:,} of {self.episodes:,} episodes", amount)
+        return self._text(f"Stopped after {episode:,} {self._of} episodes", amount)
 
     def _text(self, *parts: str) -> str:
         return f"#### {' · '.join(part for part in (*parts, self.rules) if part)}"
@@ -173,16 +182,28 @@ class Story(View):
 
     Args:
         filming: which episodes are recorded; that after a new best is.
+        episodes: of each replica.
+        is_about: whether it is only about as many.
         game: the game, if it is one of cprl's; the published one has the study's phases beside those found.
     """
 
     def __init__(
-        self, logger: RerunLogger, filming: Filming, *, episodes: int, game: Game | None = None
+        self,
+        logger: RerunLogger,
+        filming: Filming,
+        *,
+        episodes: int,
+        is_about: bool = False,
+        game: Game | None = None,
     ) -> None:
         self._logger, self._filming, self._curves, self._game = logger, filming, logger.curves, game
-        self._episodes = episodes
+        self._episodes, self._is_about = episodes, is_about
         self.header = Header(
-            episodes=episodes, replicas=self._curves.replicas, unit=self._curves.unit, rules=rules_of(game)
+            episodes=episodes,
+            boards=self._curves.replicas * self._curves.worlds,
+            unit=self._curves.unit,
+            rules=rules_of(game),
+            is_about=is_about,
         )
         self.now = Now()
         self._course = Course() if set(phases.METRICS) <= set(self._curves.metrics) else None
@@ -201,7 +222,7 @@ class Story(View):
         self._logger.log_text(f"random play {self._in_words(self._random)}")
 
     def on_all(self, episode: int, numbers: Mapping[str, Values], died: float | None) -> None:
-        self._ended = episode + 1
+        before, self._ended = self._ended, episode + 1
         means = {name: mean_of(values) for name, values in numbers.items()}
         events = self._label(episode, means)
         if self._course is not None and (best := self._course.new_best(means)):
@@ -209,7 +230,8 @@ class Story(View):
             self._filming.shows_next = True
         for event in events:
             self._logger.log_text(f"episode {episode:,}: {event}")
-        if episode % -(-self._episodes // MOST_HEADERS) == 0 or self._ended == self._episodes:
+        apart = -(-self._episodes // MOST_HEADERS)
+        if -(-self._ended // apart) > -(-before // apart) or self._ended == self._episodes:
             self._show_episode(died)
 
     def resume(self) -> None:
@@ -258,7 +280,7 @@ class Story(View):
         """Logs the end of a run that is over or was stopped, if `finished` did not."""
         if self._is_over:
             return
-        if self._ended < self._episodes:
+        if self._ended + self._curves.worlds <= self._episodes and not self._is_about:
             self._logger.log_document("header", self.header.stopped(self._ended, self.now.mean))
         else:
             self._end(self.header.ended(self.now.mean))
@@ -266,7 +288,8 @@ class Story(View):
     def _end(self, header: str) -> None:
         self._is_over = True
         if self._course is not None and self._curves.has_phases:
-            found = {round(phase.first): phase.label or ANOTHER for phase in self._course.phases()}
+            worlds = self._curves.worlds
+            found = {round(phase.first) * worlds: phase.label or ANOTHER for phase in self._course.phases()}
             self._logger.log_states(_FOUND, found)
             published = published_phases(self._game).items()
             if within := {first: label for first, label in published if first < self._ended}:
@@ -298,7 +321,7 @@ class Events(View):
 
     def __init__(self, logger: RerunLogger, filming: Filming, *, every: int) -> None:
         self._logger, self._filming, self._every = logger, filming, every
-        self._has_seen_death = False
+        self._has_seen_death, self._ended = False, 0
 
     def on_episode(self, episode: Episode) -> None:
         if episode.world:
@@ -306,8 +329,9 @@ class Events(View):
         words = in_words(episode, self._logger.curves) if episode.episode % self._every == 0 else ""
         if words:
             self._logger.log_text(f"episode {episode.episode:,}: {words}")
-        step = episode.depletion_step or -1
-        if step > 0 and (self._filming.is_shown(episode.episode) or not self._has_seen_death):
+        step, number = episode.depletion_step or -1, self._ended
+        self._ended += 1
+        if step > 0 and (self._filming.is_shown(number) or not self._has_seen_death):
             self._logger.log_text(f"episode {episode.episode:,}: last apple taken in step {step}")
             self._has_seen_death = True
 

@@ -70,8 +70,8 @@ class Source:
     first: int
     """The number of its first replica in the table."""
     replicas: int
-    episodes: int
-    """That each replica trains."""
+    episodes: int | None
+    """That each replica trains; None where it trains so many steps."""
 
 
 def study_table(
@@ -172,7 +172,7 @@ def table_of(
         },
         ending_rules=tuple(dict.fromkeys(run.rule for run in measured)),
         lengths={
-            name: {"episodes": _range(run.source.episodes for run in runs), "steps": _range(steps)}
+            name: {"episodes": _range(run.episodes for run in runs), "steps": _range(steps)}
             for name, runs in by_condition.items()
             if (steps := [run.steps for run in runs if run.steps is not None])
         },
@@ -195,6 +195,8 @@ class _Measured(NamedTuple):
     rule: str
     """How these were told."""
     circumstances: Circumstances
+    episodes: int
+    """Those that every replica ended in training."""
     steps: int | None
     """Those that its report says a replica trained."""
 
@@ -215,7 +217,9 @@ def _measured(source: Source, window: int) -> _Measured:
             length = window if part == TRAINING or window == 1 else values.shape[1]
             windows[part, metric] = _in_windows(values, length)
     phases, rule = _phases(source, curves)
-    return _Measured(source, windows, phases, rule, circumstances_of(source.run), _steps_of(source.run))
+    episodes = curves[TRAINING]["return_0"].shape[1]
+    made = circumstances_of(source.run)
+    return _Measured(source, windows, phases, rule, made, episodes, _steps_of(source.run))
 
 
 def _in_windows(values: Values, window: int) -> Windows:
@@ -243,7 +247,10 @@ def _refuse_gaps(table: pa.Table, source: Source, part: str) -> None:
     played = np.unique(rows[:, :2], axis=0)
     replicas, counts = np.unique(played[:, 0], return_counts=True)
     wanted = source.episodes if part == TRAINING else counts.max(initial=0)
-    if replicas.tolist() != list(range(source.replicas)) or not (counts == wanted).all() or not wanted:
+    if wanted is None:  # of so many steps, in which each replica ends a number of its own
+        wanted = counts
+    is_whole = np.all(counts == wanted) and np.all(counts > 0)
+    if replicas.tolist() != list(range(source.replicas)) or not is_whole:
         raise ValueError(
             f"{source.name} has these episodes by replica in {part}: "
             f"{dict(zip(replicas.tolist(), counts.tolist(), strict=True))}; allowed: {wanted} of each of "
