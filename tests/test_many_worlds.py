@@ -506,10 +506,8 @@ def test_numbers_of_many_worlds_are_means_over_the_episodes_of_each_in_turn():
     series = Series(2, 3)
 
     def add(replica, number, value):
-        episode = Episode(
-            world=3 * replica, replica=replica, episode=number, steps=1, terminated=False, return_=np.zeros(1),
-            metrics={},
-        )  # fmt: skip
+        ended = {"steps": 1, "terminated": False, "return_": np.zeros(1), "metrics": {}}
+        episode = Episode(world=3 * replica, replica=replica, episode=number, **ended)
         return series.add(episode, {"a": value, "b": np.nan})
 
     for number in range(3):

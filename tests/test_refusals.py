@@ -47,7 +47,7 @@ def test_floats_are_not_rounded_into_bytes_and_are_learned_from_where_the_spaces
     if kind == "replay":
         kept = learner.buffer.get(torch.zeros(2, 1, dtype=torch.int64))["observation"][:, 0]
     else:
-        kept = learner._rollout.fields["observation"][0]
+        kept = learner._rollout.fields["observation"][:, 0, 0]
     assert torch.equal(kept, turn["agents", "observation"][0])
 
 

@@ -95,8 +95,8 @@ def stored(name, learner, turns):
     if name == "tables":
         return np.stack([turn["reward"] for turn in learner._turns])
     if name == "look ahead":
-        return learner._rollouts.fields["reward"][0, :turns].numpy()
-    return learner._rollout.fields["reward"][:turns].reshape(turns, -1).numpy()
+        return learner._rollouts.fields["reward"][0, :, 0, :turns].T.numpy()
+    return learner._rollout.fields["reward"][:, 0, :turns].transpose(0, 1).reshape(turns, -1).numpy()
 
 
 @pytest.mark.parametrize("preference", PREFERENCES.values(), ids=PREFERENCES)
