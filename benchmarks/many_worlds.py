@@ -74,7 +74,7 @@ CASES: Final = {
     "maddpg-64": Case(team(MADDPG, ONE), 64, 100),
     "mappo-4": Case(team(MAPPO, rollouts(4)), 64, TURNS),
 }
-"""By name: "dqn-8 x 64" is the study's DQN, an update of 8 transitions a step, so 64 a turn; "dqn-512" has one
+"""By name: "dqn-8 x 64" is the study's DQN, an update of 8 transitions a step, 64 a turn; "dqn-512" has one
 of 512, as many transitions; "dqn-64" one of 64."""
 
 PARTS: Final[dict[str, tuple[type, str]]] = {

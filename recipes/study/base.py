@@ -1,7 +1,8 @@
 """The experiments that the studies of this folder vary: the tragedy of the commons, on two schedules.
 
 Four independent DQN agents on `commons`, by the rules of the study as run: `EXPERIMENT`, 200 episodes of 8
-replicas on the schedule of recipes/tragedy.py, and `PUBLISHED`, experiment 5 as run.
+replicas in one world each on a schedule twenty times shorter than the published one, and `PUBLISHED`,
+experiment 5 as run.
 """
 
 from dataclasses import replace
