@@ -522,3 +522,20 @@ def test_numbers_of_many_worlds_are_means_over_the_episodes_of_each_in_turn():
         found = add(1, 2, 6.0)
         assert found["a"].tolist() == [1.0, 5.0]
         assert np.isnan(found["b"]).all()
+
+
+@pytest.mark.integration
+def test_several_threads_change_the_last_bits_at_most(tmp_path):
+    alike = {"replicas": 1, "steps": 120, "engine": "compiled"}
+    runs = [
+        cprl.run(experiment(**alike), tmp_path / f"{threads}", threads=threads, watch="off", figures=False)
+        for threads in (1, 2)
+    ]
+    one, two = (cprl.load(run).networks for run in runs)
+    for lane, network in one.items():
+        for value, same in zip(network.parameters(), two[lane].parameters(), strict=True):
+            torch.testing.assert_close(value, same, rtol=0, atol=1e-5)
+    reports = [json.loads((run / "report.json").read_text()) for run in runs]
+    assert [report["threads"] for report in reports] == [1, 2]
+    with pytest.raises(ValueError, match="threads is 0"):
+        cprl.run(experiment(), tmp_path / "none", threads=0)

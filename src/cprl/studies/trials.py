@@ -191,7 +191,8 @@ class Task:
         keep = "--keep-checkpoint" if self.keep_checkpoint else "--no-keep-checkpoint"
         experiment, directory = self.trial.experiment, os.path.abspath(self.directory)
         length = f"--{experiment.unit}", str(experiment.length)
-        return ["run", directory, "--resume", *length, "--watch", "off", keep, *allow]
+        plain = "--watch", "off", "--threads", "1"
+        return ["run", directory, "--resume", *length, *plain, keep, *allow]
 
     @property
     def command(self) -> str:
@@ -310,6 +311,7 @@ class Task:
                 keep_checkpoint=self.keep_checkpoint,
                 watch="off",
                 figures=False,
+                threads=1,
                 allow=self.targets,
                 callbacks=(status,),
             )

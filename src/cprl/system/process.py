@@ -23,20 +23,20 @@ _MAX_THRESHOLD_BYTES: Final = 32 * 2**20
 """glibc's highest value of M_MMAP_THRESHOLD, in bytes (mallopt(3))."""
 
 
-def prepare_process(seed: int) -> None:
+def prepare_process(seed: int, *, threads: int = 1) -> None:
     """Prepares the process for a training.
 
-    Seeds torch's global generator, limits torch to one thread, flushes denormal numbers to zero, makes glibc
-    reuse freed memory, keeps what torch compiles in `cache_folder` unless $TORCHINDUCTOR_CACHE_DIR says
-    where, and logs warnings of TorchRL and messages of cprl.
+    Seeds torch's global generator, sets the number of torch's threads, flushes denormal numbers to zero,
+    makes glibc reuse freed memory, keeps what torch compiles in `cache_folder` unless
+    $TORCHINDUCTOR_CACHE_DIR says where, and logs warnings of TorchRL and messages of cprl.
 
-    The networks are so small that a second thread slows them down, up to a hundredfold on a busy machine.
-    Denormal numbers in Adam's moments of dead weights slow a long run by a factor of up to 1.9.
+    In one world the networks are so small that a second thread slows them down, up to a hundredfold on a busy
+    machine. Denormal numbers in Adam's moments of dead weights slow a long run by a factor of up to 1.9.
     """
     import torch
 
     torch.manual_seed(seed)
-    torch.set_num_threads(1)
+    torch.set_num_threads(threads)
     torch.set_flush_denormal(True)
     _keep_freed_memory()
     _keep_compiled_code()
@@ -45,6 +45,12 @@ def prepare_process(seed: int) -> None:
     logger.setLevel(logging.INFO)
     if not logger.handlers:
         logger.addHandler(logging.StreamHandler(OUT))
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return (os.cpu_count() or 1) if affinity is None else len(affinity(0))
 
 
 @contextmanager

@@ -6,10 +6,12 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
+import torch
 from torchrl.envs import EnvBase
 
+from cprl.commons.threads import MOST_THREADS
 from cprl.envs.state import transforms_state
 from cprl.envs.unwrap import agent_names
 from cprl.experiment import Experiment
@@ -31,7 +33,7 @@ from cprl.runs.recipe import (
 from cprl.runs.weights import partners_of, save_decisions, save_transforms, save_weights, weights_of
 from cprl.system.compiling import cleared_up
 from cprl.system.output import RESUMES, console, say
-from cprl.system.process import prepare_process
+from cprl.system.process import cores, prepare_process
 from cprl.system.times import Times
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
@@ -47,7 +49,7 @@ from cprl.training.outcome import (
     write_evaluation,
 )
 from cprl.training.training import Training, check_callbacks, train
-from cprl.values import Custom, made, trust
+from cprl.values import Custom, Range, checked, made, trust
 from cprl.viewer.page import check_watch
 from cprl.viewer.page import linger as stay_served
 
@@ -65,6 +67,7 @@ def run(
     keep_checkpoint: bool = True,
     watch: str = "file",
     linger: bool = False,
+    threads: int | None = None,
     allow: Sequence[str] = (),
     callbacks: Sequence[object] = (),
     figures: bool = True,
@@ -85,6 +88,8 @@ def run(
             live as well, see `cprl.viewer.live.Live`; "off" for none.
         linger: whether the recording stays served after the run, until Ctrl-C (SIGINT) or SIGTERM; only with
             `watch` "serve" or "spawn".
+        threads: torch's threads; by default one for agents in one world, else all cores. Numbers of several
+            threads differ from those of one in their last bits.
         allow: the user's own code, "module:Class", that the process trusts from now on; stored runs of
             `Frozen` agents may need it.
         callbacks: further callbacks of this process (see `cprl.training.Callback`), which the recipe does
@@ -109,7 +114,10 @@ def run(
     for logger in experiment.loggers:
         check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
     trust(*allow)
-    prepare_process(experiment.seed)
+    if threads is None:
+        threads = 1 if experiment.worlds == 1 else cores()
+    threads = checked("threads", threads, Annotated[int, Range(1, MOST_THREADS)])
+    prepare_process(experiment.seed, threads=threads)
     out = None if out is None else Path(out)
     is_new = out is None or not out.exists()
     resumed = out if resume else None
@@ -241,6 +249,7 @@ def _write_report(directory: Path, training: Training, times: Times) -> None:
         "finished": datetime.now().astimezone().isoformat(timespec="seconds"),
         "episodes": training.episodes,
         "worlds": training.worlds,
+        "threads": torch.get_num_threads(),
     }
     if training.finite.reported:
         report["not_finite"] = [asdict(finding) for finding in training.finite.reported]

@@ -16,8 +16,10 @@ from cprl.system.libraries import relying_on, require
 
 require("torch", torch.compiler, "skip_all_guards_unsafe")
 
-COMPILE_OPTIONS: Final[Mapping[str, Any]] = {"cpp_wrapper": True}
-"""Options of `torch.compile`."""
+COMPILE_OPTIONS: Final[Mapping[str, Any]] = {"cpp_wrapper": True, "cpp.threads": 1}
+"""Options of `torch.compile`. What it writes runs in one thread, whatever the number of torch's, which are
+for matrix products: with threads of its own a training in two was thirty times slower, presumably because
+those of two OpenMP runtimes keep each other's cores busy while they wait."""
 
 NO_GUARDS: Final[Mapping[str, Any]] = {"guard_filter_fn": torch.compiler.skip_all_guards_unsafe}
 """Further ones, for functions whose guards torch itself finds broken; `fits` must not be asked then."""
