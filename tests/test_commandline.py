@@ -339,7 +339,7 @@ def test_a_recipe_runs_its_experiment(runs):
     assert how == {
         "resume": True,
         "take_over": False,
-        "threads": None,
+        "threads": 1,
         "keep_checkpoint": True,
         "watch": "file",
         "linger": False,

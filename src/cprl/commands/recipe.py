@@ -83,9 +83,9 @@ class RunOptions:
     """Keep the state of the training of a finished run, buffers included, so that it can be extended."""
     watch: str = "file"
     """"file", or live as well: "serve", "spawn"; "off" for no recording."""
-    threads: int | None = None
-    """Torch's threads; by default one for agents in one world, else all cores. With 1 numbers are the same on
-    any number of cores."""
+    threads: int = 1
+    """Torch's threads. Several are faster for large minibatches of many worlds, where no other program wants
+    the cores, and a hundred times slower where one does; numbers then differ in their last bits."""
     linger: bool = False
     """Keep the recording served after the run is finished, until Ctrl-C; with watch "serve" or "spawn"."""
 

@@ -191,8 +191,7 @@ class Task:
         keep = "--keep-checkpoint" if self.keep_checkpoint else "--no-keep-checkpoint"
         experiment, directory = self.trial.experiment, os.path.abspath(self.directory)
         length = f"--{experiment.unit}", str(experiment.length)
-        plain = "--watch", "off", "--threads", "1"
-        return ["run", directory, "--resume", *length, *plain, keep, *allow]
+        return ["run", directory, "--resume", *length, "--watch", "off", keep, *allow]
 
     @property
     def command(self) -> str:
@@ -311,7 +310,6 @@ class Task:
                 keep_checkpoint=self.keep_checkpoint,
                 watch="off",
                 figures=False,
-                threads=1,
                 allow=self.targets,
                 callbacks=(status,),
             )

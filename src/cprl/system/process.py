@@ -30,8 +30,9 @@ def prepare_process(seed: int, *, threads: int = 1) -> None:
     makes glibc reuse freed memory, keeps what torch compiles in `cache_folder` unless
     $TORCHINDUCTOR_CACHE_DIR says where, and logs warnings of TorchRL and messages of cprl.
 
-    In one world the networks are so small that a second thread slows them down, up to a hundredfold on a busy
-    machine. Denormal numbers in Adam's moments of dead weights slow a long run by a factor of up to 1.9.
+    The networks are so small that a second thread slows them down, up to a hundredfold on a busy machine,
+    unless minibatches are large, of many worlds, and nothing else wants the cores. Denormal numbers in Adam's
+    moments of dead weights slow a long run by a factor of up to 1.9.
     """
     import torch
 
@@ -45,12 +46,6 @@ def prepare_process(seed: int, *, threads: int = 1) -> None:
     logger.setLevel(logging.INFO)
     if not logger.handlers:
         logger.addHandler(logging.StreamHandler(OUT))
-
-
-def cores() -> int:
-    """How many cores this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return (os.cpu_count() or 1) if affinity is None else len(affinity(0))
 
 
 @contextmanager

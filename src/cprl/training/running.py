@@ -33,7 +33,7 @@ from cprl.runs.recipe import (
 from cprl.runs.weights import partners_of, save_decisions, save_transforms, save_weights, weights_of
 from cprl.system.compiling import cleared_up
 from cprl.system.output import RESUMES, console, say
-from cprl.system.process import cores, prepare_process
+from cprl.system.process import prepare_process
 from cprl.system.times import Times
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
@@ -67,7 +67,7 @@ def run(
     keep_checkpoint: bool = True,
     watch: str = "file",
     linger: bool = False,
-    threads: int | None = None,
+    threads: int = 1,
     allow: Sequence[str] = (),
     callbacks: Sequence[object] = (),
     figures: bool = True,
@@ -88,8 +88,8 @@ def run(
             live as well, see `cprl.viewer.live.Live`; "off" for none.
         linger: whether the recording stays served after the run, until Ctrl-C (SIGINT) or SIGTERM; only with
             `watch` "serve" or "spawn".
-        threads: torch's threads; by default one for agents in one world, else all cores. Numbers of several
-            threads differ from those of one in their last bits.
+        threads: torch's threads. Several are faster for large minibatches of many worlds, if no other
+            program wants the cores; numbers then differ in their last bits.
         allow: the user's own code, "module:Class", that the process trusts from now on; stored runs of
             `Frozen` agents may need it.
         callbacks: further callbacks of this process (see `cprl.training.Callback`), which the recipe does
@@ -114,8 +114,6 @@ def run(
     for logger in experiment.loggers:
         check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
     trust(*allow)
-    if threads is None:
-        threads = 1 if experiment.worlds == 1 else cores()
     threads = checked("threads", threads, Annotated[int, Range(1, MOST_THREADS)])
     prepare_process(experiment.seed, threads=threads)
     out = None if out is None else Path(out)
