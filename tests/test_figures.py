@@ -26,7 +26,7 @@ from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.measuring import phases
 from cprl.measuring.phases import PHASES
 from cprl.population import Learning, Scripted, Team, exploration_steps
-from cprl.runs.curves import centres, episode_of_step, phases_of
+from cprl.runs.curves import centres, episode_of_turn, phases_of
 from cprl.terminal import style
 from cprl.terminal.figures import UNNAMED, bands_of, training_curve
 
@@ -38,6 +38,8 @@ def a_run(folder, metrics):
     replica, episode, agent = (axis.ravel() for axis in np.indices(shape))
     columns = {"replica": replica, "episode": episode, "agent": agent}
     columns |= {name: np.repeat(values.ravel(), 2) for name, values in metrics.items()}
+    if "survival_steps" in metrics:
+        columns["steps"] = np.repeat(np.round(metrics["survival_steps"].ravel()).astype(np.int32), 2)
     columns["return"] = np.repeat(metrics["collective_return"].ravel() / 2, 2)
     folder.mkdir(parents=True, exist_ok=True)
     pq.write_table(pa.table(columns), folder / "episodes.parquet")
@@ -115,7 +117,7 @@ def see_that_it_can_be_read(figure, width_in=3.3):
 def test_a_short_training_shows_its_peak_its_end_random_play_and_where_exploration_ends(tmp_path, drawn):
     run = a_run(tmp_path / "run", the_tragedy(4, 200))
     random = [an_episode(0, collective_return=282.0, survival_steps=1000.0)]
-    training_curve(run, title="commons", random=random, exploration_steps=50_000)
+    training_curve(run, title="commons", random=random, exploration_turns=50_000)
     (figure,) = drawn
     above, below = curves_panels(figure)
     assert (above.get_ylabel(), below.get_ylabel()) == ("collective return, apples", "survival, steps")
@@ -149,7 +151,7 @@ def test_a_centred_running_mean_stands_at_the_middle_of_its_episodes(tmp_path, d
 
 
 def test_what_is_not_over_by_the_last_episode_is_said(tmp_path, drawn):
-    training_curve(a_run(tmp_path / "run", the_tragedy(2, 40)), title="short", exploration_steps=10**6)
+    training_curve(a_run(tmp_path / "run", the_tragedy(2, 40)), title="short", exploration_turns=10**6)
     assert "exploration ends" not in " ".join(labels(drawn[0]))
     assert drawn[0].caption.endswith("Exploration was not over at the last episode.")
 
@@ -205,9 +207,12 @@ def test_exploration_ends_with_the_last_agents_epsilon():
     team = Team(MADDPG(settings=DQNSettings()), agents=(3, 4))
     assert exploration_steps([*policies, team]) is None, "they draw from their policies"
     assert exploration_steps([*policies, dqn(0, 70)]) == 70
-    steps = {"survival_steps": np.array([[10.0, 10.0, 10.0], [5.0, 5.0, 20.0]])}
-    assert episode_of_step(steps, 20) == 1.5, "in the second and in the third episode"
-    assert episode_of_step(steps, 31) is None
+    columns = {"replica": [0, 0, 0, 1, 1, 1], "agent": [0] * 6, "steps": [10, 10, 10, 5, 5, 20]}
+    assert episode_of_turn(pa.table(columns), 20) == 1.5, "in the second and in the third episode"
+    assert episode_of_turn(pa.table(columns), 31) is None
+    side_by_side = pa.table({**columns, "world": [0, 1, 0, 2, 3, 3]})
+    assert episode_of_turn(side_by_side, 20) == 2, "in the third of both, after 20 and after 25 turns"
+    assert episode_of_turn(side_by_side, 10) == 1
 
 
 def test_a_game_without_a_harvest_has_one_panel_and_an_agents_colour_has_an_edge(tmp_path, drawn):
@@ -280,7 +285,7 @@ def test_long_names_break_at_their_signs_and_only_where_they_must():
 def test_a_training_curve_can_be_read_at_every_width(width, tmp_path, drawn):
     run = a_run(tmp_path / "run", the_tragedy(4, 1200))
     random = [an_episode(0, collective_return=282.0, survival_steps=1000.0)]
-    training_curve(run, title="commons", random=random, exploration_steps=50_000, width=width)
+    training_curve(run, title="commons", random=random, exploration_turns=50_000, width=width)
     see_that_it_can_be_read(drawn[0], style.WIDTH_IN[width])
 
 

@@ -33,7 +33,6 @@ from cprl.runs.curves import (
     SMOOTHED_EPISODES,
     as_curves,
     curves_of,
-    episode_of_step,
     phases_of,
     running_mean,
 )
@@ -333,7 +332,11 @@ class Result:
     def exploration_ends(self) -> float | None:
         """The episode in which the last epsilon reaches its end, the mean of replicas; None if none does."""
         ends = exploration_steps(self.experiment.agents)
-        return None if ends is None else episode_of_step(dict(self.curves), ends)
+        if ends is None:
+            return None
+        played = self.curves["survival_steps"].cumsum(1)  # of one world, whose episodes follow each other
+        is_over = bool((played[:, -1] >= ends).all())
+        return float((played >= ends).argmax(1).mean()) if is_over else None
 
     @cached_property
     def measures(self) -> Measures:

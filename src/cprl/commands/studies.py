@@ -87,6 +87,8 @@ class MainOptions(StudyOptions):
 
     episodes: int | None = None
     """Of each condition; by default those of the study."""
+    steps: int | None = None
+    """Of each condition of a study that counts them; by default those of the study."""
     replicas: int | None = None
     """Of each condition; by default those of the study."""
 
@@ -153,16 +155,20 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
             read, args=trusting(command[1:]), prog=script, description=_about(study), config=_CONFIG
         )
         changes = _given(options)
-        episodes = changes.pop("episodes", None)
-        if episodes is not None:
-            changes["experiment"] = replace(study.experiment, episodes=episodes)
+        said = {
+            unit: number for unit in ("episodes", "steps") if (number := changes.pop(unit, None)) is not None
+        }
+        if said:
+            length = {"episodes": None, "steps": None, **said}
+            changes["experiment"] = replace(study.experiment, **length)
         study = replace(study, **changes)
-        for condition in study.all_conditions if episodes is not None else ():
-            if condition.experiment.episodes != episodes:
-                raise ValueError(
-                    f"--episodes is {episodes}, and the study's condition {condition.name} says "
-                    f"{condition.experiment.episodes}; allowed: --episodes where no condition says how many"
-                )
+        for unit, number in said.items():
+            for condition in study.all_conditions:
+                if (own := getattr(condition.experiment, unit)) != number:
+                    raise ValueError(
+                        f"--{unit} is {number}, and the study's condition {condition.name} says {own}; "
+                        f"allowed: --{unit} where no condition says how many"
+                    )
         return carry_out(study, options, command)
 
 

@@ -6,6 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute
 import torch
 from numpy.typing import NDArray
 
@@ -115,12 +116,16 @@ def phases_of(curves: dict[str, Values], *, centred: bool = False) -> list[phase
     return phases.find_phases(at if centred else at - at[0], smoothed)
 
 
-def episode_of_step(curves: dict[str, Values], step: int) -> float | None:
-    """The episode in which the replicas reach an environment step, their mean; None if one does not."""
-    played = curves["survival_steps"].cumsum(1)
-    if (played[:, -1] < step).any():
-        return None
-    return float((played >= step).argmax(1).mean())
+def episode_of_turn(table: pa.Table, turn: float) -> float | None:
+    """The episode with which the replicas of a training reach a turn, their mean; None if one does not."""
+    first = table.filter(pa.compute.equal(table["agent"], 0))
+    replica, steps = first["replica"].to_numpy(), first["steps"].to_numpy()
+    world = first["world"].to_numpy() if "world" in first.column_names else replica
+    ended = np.zeros(len(steps), np.int64)
+    for number in np.unique(world):
+        ended[world == number] = steps[world == number].cumsum()
+    reached = [ended[replica == number] >= turn for number in np.unique(replica)]
+    return float(np.mean([each.argmax() for each in reached])) if all(map(np.any, reached)) else None
 
 
 def _after_a_zero(values: Values) -> Values:

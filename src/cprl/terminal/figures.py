@@ -16,8 +16,8 @@ from cprl.measuring.metrics import title as metric_title
 from cprl.measuring.metrics import unit
 from cprl.measuring.phases import UNNAMED as UNNAMED
 from cprl.measuring.phases import Phase
-from cprl.runs.curves import SMOOTHED_EPISODES, centres, curves_of, episode_of_step, phases_of, running_mean
-from cprl.runs.episodes import read_evaluations
+from cprl.runs.curves import SMOOTHED_EPISODES, centres, curves_of, episode_of_turn, phases_of, running_mean
+from cprl.runs.episodes import read_episodes, read_evaluations
 from cprl.terminal import style
 from cprl.terminal.style import CHARACTER, MARK, Sheet, Width
 
@@ -115,7 +115,7 @@ def training_curve(
     title: str,
     random: list[Episode] | None = None,
     smoothed: int = SMOOTHED_EPISODES,
-    exploration_steps: int | None = None,
+    exploration_turns: float | None = None,
     path: Path | None = None,
     width: Width = "page",
 ) -> Path:
@@ -130,7 +130,7 @@ def training_curve(
         random: episodes of the random policy, whose means are dashed lines; those of evaluations while the
             agents were trained are points.
         smoothed: the largest window of the running means, in episodes; they take in at most 1/20 of all.
-        exploration_steps: the environment step of a replica at which exploration ends, see
+        exploration_turns: the turn of all worlds with which exploration ends, from
             `cprl.population.exploration_steps`; a tick marks its episode.
         path: of the picture, by default `figures/training_curve.png` of the run.
 
@@ -158,13 +158,13 @@ def training_curve(
             axes.set_xlim(-0.5, max(episodes - 0.5, 1))
         add_keys(drawn[0], *strips.values())
         _mark_peak(drawn[0], panels[0], window)
-        ends = None if exploration_steps is None else episode_of_step(curves, exploration_steps)
+        ends = None if exploration_turns is None else episode_of_turn(read_episodes(run), exploration_turns)
         mark_exploration(drawn, ends)
         for axes in every[: len(strips)]:
             draw_strip(sheet, axes, strips)
         drawn[-1].set_xlabel("episode")
         note = f"Running means are over {window} episodes, centred." if window > 1 else "Nothing is smoothed."
-        if exploration_steps is not None and ends is None:
+        if exploration_turns is not None and ends is None:
             note += " Exploration was not over at the last episode."
         sheet.title, sheet.caption = title, note
     return path

@@ -235,8 +235,9 @@ def _evaluate(work: _Work, random: list[Episode] | None) -> dict[str, list[Episo
 
 
 def _draw(experiment: Experiment, directory: Path, random: list[Episode]) -> Path:
-    ends = exploration_steps(experiment.agents)
-    return training_curve(directory, title=_title(experiment), random=random, exploration_steps=ends)
+    steps = exploration_steps(experiment.agents)
+    ends = None if steps is None else steps / experiment.worlds
+    return training_curve(directory, title=_title(experiment), random=random, exploration_turns=ends)
 
 
 def _write_report(directory: Path, training: Training, times: Times) -> None:
