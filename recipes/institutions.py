@@ -2,8 +2,8 @@
 
     python recipes/institutions.py --institution quota         16 replicas of 200 episodes
 
-Four independent DQN agents on `commons` with the schedule of recipes/tragedy.py, under one institution, or
-under none. docs/institutions.md compares them.
+Four independent DQN agents on `commons`, in one world of each replica, on a schedule twenty times shorter
+than the published one, under one institution or under none. docs/institutions.md compares them.
 Copy this file and change it: another institution, or several together, is one line.
 """
 
@@ -28,7 +28,7 @@ from cprl.institutions import (
 from cprl.population import Learning
 
 SHORT = {"learning_rate": 1e-4, "epsilon_decay_steps": 100_000, "gamma": 0.95}
-"""What differs from the published schedule, as in recipes/tragedy.py."""
+"""What differs from the published schedule, as in recipes/study/base.py."""
 
 Choice = Literal[
     "none",

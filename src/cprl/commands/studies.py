@@ -164,9 +164,9 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
         study = replace(study, **changes)
         for unit, number in said.items():
             for condition in study.all_conditions:
-                if (own := getattr(condition.experiment, unit)) != number:
+                if (stated := getattr(condition.experiment, unit)) != number:
                     raise ValueError(
-                        f"--{unit} is {number}, and the study's condition {condition.name} says {own}; "
+                        f"--{unit} is {number}, and the study's condition {condition.name} says {stated}; "
                         f"allowed: --{unit} where no condition says how many"
                     )
         return carry_out(study, options, command)
