@@ -361,8 +361,7 @@ class Ring:
 
     def _draw_of_worlds(self, oldest: Tensor, written: int, numbers: Tensor) -> tuple[Tensor, Tensor]:
         """As `draw`, from numbers in 0..1, [L, b]: all transitions of a lane's worlds one after the other."""
-        oldest = oldest[self.columns]
-        ends = (written - oldest).cumsum(1)
+        ends = (written - oldest[self.columns]).clamp(min=0).cumsum(1)
         at = (numbers * ends[:, -1:]).long()
         world = torch.searchsorted(ends, at, right=True)
         place = written - (ends.gather(1, world) - at)
