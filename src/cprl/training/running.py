@@ -127,7 +127,7 @@ def run(
     try_own_metrics(experiment.metrics, env)
     length = refuse_another_run(out, experiment.to_recipe, Experiment) if resume else experiment.length
     if resumed is not None and length >= experiment.length and (resumed / REPORT).exists():
-        _tidy_up(resumed, keep_checkpoint=keep_checkpoint, take_over=take_over)
+        _tidy_up(resumed, experiment, keep_checkpoint=keep_checkpoint, take_over=take_over)
         return resumed
     directory = _start(experiment, out) if resumed is None else resumed
     if length < experiment.length:
@@ -185,7 +185,7 @@ def _carry_out(
     _write_report(work.directory, training, times)
     _summarise(work, training, played, figure)
     checkpointer.done()
-    _say_what_is_kept(work.directory)
+    _say_what_is_kept(work.directory, work.experiment)
 
 
 def _train(work: _Work, observers: Sequence[Any], checkpointer: Checkpointer) -> Training:
@@ -319,13 +319,14 @@ def _make_viewer(
     )
 
 
-def _tidy_up(finished: Path, *, keep_checkpoint: bool, take_over: bool) -> None:
+def _tidy_up(finished: Path, experiment: Experiment, *, keep_checkpoint: bool, take_over: bool) -> None:
     """Says that a run is finished, and tidies up if its process died before it had."""
     refuse_missing(finished)
     if (finished / LOCK_FILE).exists():
         with Checkpointer(finished, keep_ending=keep_checkpoint, take_over=take_over) as checkpointer:
             checkpointer.done()
-    console().print(f"{finished} is finished; with more --episodes it is extended", soft_wrap=True)
+    text = f"{finished} is finished; with more --{experiment.unit} it is extended"
+    console().print(text, soft_wrap=True)
 
 
 def _remove(directory: Path, *, with_directory: bool) -> None:
@@ -339,10 +340,10 @@ def _remove(directory: Path, *, with_directory: bool) -> None:
             directory.rmdir()
 
 
-def _say_what_is_kept(directory: Path) -> None:
+def _say_what_is_kept(directory: Path, experiment: Experiment) -> None:
     for checkpoint in checkpoints_in(directory / FOLDER):
         console().print(
-            f"Kept so that it can be extended (--resume with more --episodes): {checkpoint}, "
+            f"Kept so that it can be extended (--resume with more --{experiment.unit}): {checkpoint}, "
             f"{checkpoint.stat().st_size / 1e6:,.1f} MB",
             soft_wrap=True,
         )
