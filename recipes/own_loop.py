@@ -173,7 +173,7 @@ def main(
         network.load_state_dict(load_weights(best.path)["agent_0"])
         played[f"greedy, best (episode {best.best_episode})"] = evaluate(fresh, policy)
     ends = exploration_steps(experiment.agents)
-    figure = training_curve(run, title=title, random=played["random"], exploration_steps=ends)
+    figure = training_curve(run, title=title, random=played["random"], exploration_turns=ends)
     note = None if best.path else "No best weights: greedy play harvested nothing whenever it was tried"
     summarise(run, title=title, played=played, figure=figure, note=note)
     published = printed([*cprl_here(), "run", "single_basic"])

@@ -18,7 +18,7 @@ def test_a_family_of_algorithms_learns_what_it_did(family, tmp_path):
         name: [] for name in found
     }
     assert_held("weights", {name: case.pop("weights") for name, case in found.items()}, tolerance=1e-4)
-    assert_held("training", found)
+    assert_held("training", found, may_gain=True)  # the column of worlds
 
 
 @pytest.mark.parametrize("family", COMPILED)

@@ -245,25 +245,24 @@ class RolloutLearner(LaneLearner):
 
     def _evaluated(self, columns: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """The logits, values and next values of a full rollout, [L, W, T, ...]."""
-        seen, following = columns["observation"], columns["next_observation"]
+        seen, following = (columns[name].flatten(1, 2) for name in ("observation", "next_observation"))
+        done = columns["done"]
         if self.worlds == 1:  # in one piece, since products of other shapes round in other ways
             logits, value = _outputs_of_both(self.engine, seen)
-            return logits, value, self.engine.outputs(following, part=CRITIC)
-        # In pieces that stay in the processor's caches.
-        pieces = torch.split(seen.flatten(1, 2), self.settings.minibatch_size, 1)
-        given = [self._both((piece.shape, piece.dtype), self.engine, piece) for piece in pieces]
-        logits, value = (
-            torch.cat(each, 1).reshape(*seen.shape[:3], *each[0].shape[2:])
-            for each in zip(*given, strict=True)
-        )
-        # What is seen after a turn is seen before the next one, but where an episode or the rollout ends.
-        next_value = torch.cat([value[:, :, 1:], value[:, :, -1:]], 2).flatten(1, 2)
-        ends = columns["done"].clone()
-        ends[:, :, -1] = True
-        place = _places(ends.flatten(1))
-        lane = torch.arange(self.lanes, device=place.device)[:, None]
-        next_value[lane, place] = self.engine.outputs(following.flatten(1, 2)[lane, place], part=CRITIC)
-        return logits, value, next_value.view_as(value)
+            next_value = self.engine.outputs(following, part=CRITIC)
+        else:  # in pieces that stay in the processor's caches
+            pieces = torch.split(seen, self.settings.minibatch_size, 1)
+            given = [self._both((piece.shape, piece.dtype), self.engine, piece) for piece in pieces]
+            logits, value = (torch.cat(each, 1) for each in zip(*given, strict=True))
+            # What is seen after a turn is seen before the next one, but where an episode or the rollout ends.
+            next_value, ends = value.roll(-1, 1), done.clone()
+            ends[:, :, -1] = True
+            place = _places(ends.flatten(1))
+            lane = torch.arange(self.lanes, device=place.device)[:, None]
+            next_value[lane, place] = self.engine.outputs(following[lane, place], part=CRITIC)
+        by_turn = (entry.reshape(*done.shape, *entry.shape[2:]) for entry in (logits, value, next_value))
+        logits, value, next_value = by_turn
+        return logits, value, next_value
 
     def values(self, batch: TensorDictBase | Turn) -> Tensor:
         """The value that each agent's critic gives to the state after a turn, [B, S]."""
