@@ -33,6 +33,7 @@ from cprl.runs.curves import (
     SMOOTHED_EPISODES,
     as_curves,
     curves_of,
+    episode_reached,
     phases_of,
     running_mean,
 )
@@ -332,11 +333,8 @@ class Result:
     def exploration_ends(self) -> float | None:
         """The episode in which the last epsilon reaches its end, the mean of replicas; None if none does."""
         ends = exploration_steps(self.experiment.agents)
-        if ends is None:
-            return None
-        played = self.curves["survival_steps"].cumsum(1)  # of one world, whose episodes follow each other
-        is_over = bool((played[:, -1] >= ends).all())
-        return float((played >= ends).argmax(1).mean()) if is_over else None
+        ended = self.curves["survival_steps"].cumsum(1)  # in one world episodes follow each other
+        return None if ends is None else episode_reached(ended, ends)
 
     @cached_property
     def measures(self) -> Measures:

@@ -37,19 +37,8 @@ ALLOW: Final = (
 )
 
 _LISTED: Final = (
-    *(
-        "out",
-        "resume",
-        "watch",
-        "episodes",
-        "steps",
-        "replicas",
-        "worlds",
-        "seed",
-        "map",
-        "agents",
-        "institutions",
-    ),
+    *("out", "resume", "watch", "episodes", "steps", "replicas", "worlds", "seed"),
+    *("map", "agents", "institutions"),
     *("game.rules.episode_steps", "game.rules.freeze_steps"),
     *("agents.0.policy", "agents.0.algorithm.settings.learning_rate", "agents.0.algorithm.settings.gamma"),
 )

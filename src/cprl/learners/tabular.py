@@ -56,8 +56,10 @@ class TabularLearner(Learner):
         columns = torch.arange(self.lanes * self.worlds)
         self._columns = by_lane(columns, replicas=self.replicas, worlds=self.worlds).T.numpy()
         """Where the lanes stand in a turn, of one world after the other, int64 [W, L]."""
-        self._lane = np.empty(len(columns), np.int64)
-        self._lane[self._columns] = np.arange(self.lanes)
+        lane_of = np.empty(len(columns), np.int64)
+        lane_of[self._columns] = np.arange(self.lanes)
+        self._lane_of: list[int] = lane_of.tolist()
+        """The lane of each place in a turn."""
         self._turns: deque[dict[str, NDArray[Any]]] = deque()
 
     @property
@@ -81,12 +83,12 @@ class TabularLearner(Learner):
             whole = Turn.of(whole.batch.cpu())
         turn = lane_turn(self.agents, whole, self._wanted(whole))
         seen = states_of(whole.batch[keys.AGENTS], self._observed, self.agents)
-        rows = self.tables.find_or_add(seen, self._lane.tolist())
+        rows = self.tables.find_or_add(seen, self._lane_of)
         on = np.flatnonzero(~turn.terminated)
         next_seen = states_of(whole.batch["next", keys.AGENTS], self._observed, self.agents)
         next_rows = np.full(len(rows), NEVER_MET, np.int64)
-        next_states = [next_seen[column] for column in on]
-        next_rows[on] = self.tables.find_or_add(next_states, self._lane[on].tolist())
+        next_states, lanes = [next_seen[column] for column in on], [self._lane_of[column] for column in on]
+        next_rows[on] = self.tables.find_or_add(next_states, lanes)
         reward, action = turn.reward.astype(np.float64), turn.action.copy()
         self._turns.append({"row": rows, "action": action, "reward": reward, "next_row": next_rows})
         self.steps += self.worlds
@@ -117,7 +119,7 @@ class TabularLearner(Learner):
     def values(self, batch: TensorDictBase | Turn) -> Tensor:
         """The highest action value of each agent at the end of a turn, [B, S]."""
         after = Turn.of(batch).batch["next", keys.AGENTS]
-        rows = self.tables.find(states_of(after, self._observed, self.agents), self._lane.tolist())
+        rows = self.tables.find(states_of(after, self._observed, self.agents), self._lane_of)
         return torch.from_numpy(self.tables.values[rows].max(1)).view(-1, len(self.agents))
 
     def networks(self) -> dict[str, nn.Module]:

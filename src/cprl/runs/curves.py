@@ -1,6 +1,6 @@
 """The episodes of a run as curves: a number for each replica and episode, smoothed as in the study."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -124,7 +124,13 @@ def episode_of_turn(table: pa.Table, turn: float) -> float | None:
     ended = np.zeros(len(steps), np.int64)
     for number in np.unique(world):
         ended[world == number] = steps[world == number].cumsum()
-    reached = [ended[replica == number] >= turn for number in np.unique(replica)]
+    return episode_reached([ended[replica == number] for number in np.unique(replica)], turn)
+
+
+def episode_reached(ended: Iterable[NDArray[Any]], turn: float) -> float | None:
+    """The episode with which the replicas reach a turn, their mean, from the turns in which the episodes of
+    each ended, [E]; None if one does not."""
+    reached = [of_replica >= turn for of_replica in ended]
     return float(np.mean([each.argmax() for each in reached])) if all(map(np.any, reached)) else None
 
 

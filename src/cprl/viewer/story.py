@@ -197,7 +197,7 @@ class Story(View):
         game: Game | None = None,
     ) -> None:
         self._logger, self._filming, self._curves, self._game = logger, filming, logger.curves, game
-        self._episodes, self._is_about = episodes, is_about
+        self._episodes = episodes
         self.header = Header(
             episodes=episodes,
             boards=self._curves.replicas * self._curves.worlds,
@@ -280,7 +280,7 @@ class Story(View):
         """Logs the end of a run that is over or was stopped, if `finished` did not."""
         if self._is_over:
             return
-        if self._ended + self._curves.worlds <= self._episodes and not self._is_about:
+        if self._ended + self._curves.worlds <= self._episodes and not self.header.is_about:
             self._logger.log_document("header", self.header.stopped(self._ended, self.now.mean))
         else:
             self._end(self.header.ended(self.now.mean))
@@ -312,11 +312,11 @@ def published_phases(game: Game | None) -> dict[int, str]:
 
 
 class Events(View):
-    """Logs what institutions did in an episode of the first replica now and then, and its last apple, for the
+    """Logs what institutions did in an episode of the first world now and then, and its last apple, for the
     first time and where one sees it.
 
     Args:
-        every: episodes from one event about institutions to the next.
+        every: episodes of that world from one event about institutions to the next.
     """
 
     def __init__(self, logger: RerunLogger, filming: Filming, *, every: int) -> None:
@@ -326,11 +326,11 @@ class Events(View):
     def on_episode(self, episode: Episode) -> None:
         if episode.world:
             return
-        words = in_words(episode, self._logger.curves) if episode.episode % self._every == 0 else ""
+        number, self._ended = self._ended, self._ended + 1
+        words = in_words(episode, self._logger.curves) if number % self._every == 0 else ""
         if words:
             self._logger.log_text(f"episode {episode.episode:,}: {words}")
-        step, number = episode.depletion_step or -1, self._ended
-        self._ended += 1
+        step = episode.depletion_step or -1
         if step > 0 and (self._filming.is_shown(number) or not self._has_seen_death):
             self._logger.log_text(f"episode {episode.episode:,}: last apple taken in step {step}")
             self._has_seen_death = True
