@@ -21,6 +21,7 @@ from cprl.institutions import (
     Mediation,
     Monitoring,
     Quota,
+    Punishment,
     Sanctioner,
     Tax,
     Vote,
@@ -387,7 +388,7 @@ def test_a_game_with_all_institutions_has_all_metrics_and_others_those_that_conc
     assert set(taxed.institutions) == always
     assert taxed.fines.sum() == pytest.approx(taxed.harvest.sum() / 2)
     assert taxed.in_force is None
-    assert {kind for kind in KINDS if not kind.counts} == {Tax, Levies, Vote, Sanctioner}
+    assert {kind for kind in KINDS if not kind.counts} == {Tax, Levies, Vote, Sanctioner, Punishment}
 
 
 def test_trainings_and_evaluations_measure_what_concerns_the_game_behind_transforms():

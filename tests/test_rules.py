@@ -37,7 +37,15 @@ def test_lists_and_arrays_become_tuples_so_that_rules_compare_and_hash():
 
 def test_every_quirk_is_off_as_published_and_on_as_run():
     switches = {field.name for field in fields(Rules) if field.default is False}
-    quirks = switches - {"walls_block_sight", "shuffle_starts", "agent_1_right_moves_agent_0"}
+    others = {"walls_block_sight", "shuffle_starts", "agent_1_right_moves_agent_0", "regrow_after_bites"}
+    others |= {
+        "beam_tapers",
+        "beam_from_beside",
+        "beam_stops_at_agents",
+        "plays_on_when_empty",
+        "harvest_action",
+    }
+    quirks = switches - others - {"random_headings", "respawn_at_spawns"}
     assert len(quirks) == 8
     for board in presets.BOARDS:
         published = presets.game(board).rules

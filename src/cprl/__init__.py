@@ -145,15 +145,36 @@ def __dir__() -> list[str]:
     return list(__all__)
 
 
+_PRESETS = "cprl.experiment.presets"
+
+
 def _register() -> None:
-    """Register the boards for one agent with `gymnasium.make`, which imports them when it makes one."""
+    """Register games with `gymnasium.make`, as played by one agent, which imports them when it makes one."""
     import gymnasium
+
+    from cprl.commons.literature import SOURCES
 
     gymnasium.register("cprl/Commons-v0", entry_point="cprl.envs.gymnasium_env:CommonsGymnasiumEnv")
     for name, board in (("SingleBasic", "single_basic"), ("SingleComplex", "single_complex")):
         gymnasium.register(
-            f"cprl/{name}-v0", entry_point="cprl.experiment.presets:gymnasium_env", kwargs={"board": board}
+            f"cprl/{name}-v0", entry_point=f"{_PRESETS}:gymnasium_env", kwargs={"board": board}
         )
+    for name in SOURCES:
+        gymnasium.register(name, entry_point=f"{_PRESETS}:gymnasium_env", kwargs={"board": name})
+
+
+def _register_parallel() -> None:
+    """Register games with `pettingzoo.make`, as a parallel environment of all agents."""
+    import pettingzoo
+
+    from cprl.commons.literature import SOURCES
+
+    if hasattr(pettingzoo, "register"):  # since 1.27
+        for name in SOURCES:
+            pettingzoo.register(
+                "parallel", name, entry_point=f"{_PRESETS}:pettingzoo_env", kwargs={"board": name}
+            )
 
 
 when_imported("gymnasium", _register)
+when_imported("pettingzoo", _register_parallel)

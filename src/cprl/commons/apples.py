@@ -5,30 +5,45 @@ from numpy.typing import NDArray
 
 from cprl.commons.chance import (
     BYTE_BITS,
+    FIRST_STOCK,
     LOW_BYTE,
-    LOW_WORD,
     REGROWTH_FIRST_BYTE,
     REGROWTH_REST,
     REST_BITS,
     SITES_PER_DRAW,
-    WORD_BITS,
-    philox4x32,
+    WORD_SIZE,
+    draw,
 )
 from cprl.commons.moves import cell_of
-from cprl.commons.tables import Tables
-from cprl.commons.world import Scratch, Worlds
+from cprl.commons.tables import FURTHER, Tables
+from cprl.commons.world import Actions, Scratch, Worlds
 from cprl.institutions import Law
 from cprl.institutions.law import note_bite, note_step, stops_bite
 
 
 def fill(world: Worlds, tables: Tables) -> None:
-    """Puts an apple on every site."""
+    """Puts an apple on every site, or under `first_stock_share` on a number of them drawn by chance."""
     sites = world.stock.shape[0]
     for k in range(sites):
         world.stock[k] = 1
-        world.stock_before[k] = 1
         world.near[k] = tables.near_first[k + 1] - tables.near_first[k]
     world.stock_left[0] = sites
+    if FURTHER and tables.first_stock < sites:
+        draw_first_stock(world, tables)
+    for k in range(sites):
+        world.stock_before[k] = world.stock[k]
+
+
+def draw_first_stock(world: Worlds, tables: Tables) -> None:
+    """Leaves apples on `first_stock` sites, all sets of that size equally likely: site by site, as many as
+    are still wanted in so many sites (Knuth, The Art of Computer Programming, 3.4.2, algorithm S)."""
+    wanted, sites = tables.first_stock, world.stock.shape[0]
+    for k in range(sites):
+        word = np.int64(draw(world, FIRST_STOCK | k)[0])
+        is_kept = word * (sites - k) < wanted << WORD_SIZE
+        world.stock[k] = is_kept
+        wanted -= is_kept
+    recount(world, tables)
 
 
 def add_apple(world: Worlds, tables: Tables, k: int) -> None:
@@ -57,18 +72,6 @@ def recount(world: Worlds, tables: Tables) -> None:
             world.near[k] += world.stock[tables.near_sites[n]]
 
 
-def draw(world: Worlds, number: int) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
-    """Draws four random 32-bit words; `number` identifies the draw within this world, episode and step."""
-    return philox4x32(
-        np.uint64(number),
-        np.uint64(world.step[0]),
-        np.uint64(world.episode[0]),
-        world.number[0],
-        world.seed[0] & LOW_WORD,
-        world.seed[0] >> WORD_BITS,
-    )
-
-
 def draw_first_bytes(world: Worlds, scratch: Scratch) -> None:
     """Draws the first byte of every site's random word into `scratch.words`, four sites per word."""
     sites = world.stock.shape[0]
@@ -90,24 +93,48 @@ def find_sprouts(world: Worlds, tables: Tables, scratch: Scratch) -> int:
     """
     open_sites = 0
     draw_first_bytes(world, scratch)
-    for k in range(world.stock.shape[0]):
-        first_byte = (scratch.words[k >> 2] >> (8 * (k & 3))) & LOW_BYTE
-        scratch.sprouts[open_sites] = k
-        open_sites += (world.stock[k] == 0) & (first_byte <= tables.regrow_first_byte[world.near[k]])
+    if FURTHER and tables.regrow_by_share:
+        open_sites = find_open_by_share(world, tables, scratch)
+    else:
+        for k in range(world.stock.shape[0]):
+            first_byte = (scratch.words[k >> 2] >> (8 * (k & 3))) & LOW_BYTE
+            scratch.sprouts[open_sites] = k
+            open_sites += (world.stock[k] == 0) & (first_byte <= tables.regrow_first_byte[world.near[k]])
     sprouts = 0
     for n in range(open_sites):
         k = scratch.sprouts[n]
-        if has_sprouted(world, tables, scratch, k):
+        is_free = not FURTHER or tables.regrow_under_agents or not is_stood_on(world, tables, k)
+        if is_free and has_sprouted(world, tables, scratch, k):
             scratch.sprouts[sprouts] = k
             sprouts += 1
     return sprouts
+
+
+def find_open_by_share(world: Worlds, tables: Tables, scratch: Scratch) -> int:
+    """As the first loop of `find_sprouts`, where each site has its own row of thresholds."""
+    open_sites = 0
+    for k in range(world.stock.shape[0]):
+        first_byte = (scratch.words[k >> 2] >> (8 * (k & 3))) & LOW_BYTE
+        row = tables.regrow_row[k] + world.near[k]
+        scratch.sprouts[open_sites] = k
+        open_sites += (world.stock[k] == 0) & (first_byte <= tables.regrow_first_byte[row])
+    return open_sites
 
 
 def has_sprouted(world: Worlds, tables: Tables, scratch: Scratch, k: int) -> bool:
     """Whether the whole random word of site k is below its threshold."""
     first_byte = (scratch.words[k >> 2] >> (8 * (k & 3))) & LOW_BYTE
     rest = np.int64(draw(world, REGROWTH_REST + k)[0]) >> BYTE_BITS
-    return ((first_byte << REST_BITS) | rest) < tables.regrow_below[world.near[k]]
+    row = tables.regrow_row[k] if FURTHER and tables.regrow_by_share else 0
+    return ((first_byte << REST_BITS) | rest) < tables.regrow_below[row + world.near[k]]
+
+
+def is_stood_on(world: Worlds, tables: Tables, k: int) -> bool:
+    """Whether an agent in play stands on site k."""
+    for i in range(world.row.shape[0]):
+        if world.in_play[i] and tables.site_at[cell_of(world.row[i], world.col[i], tables)] == k:
+            return True
+    return False
 
 
 def grow(world: Worlds, tables: Tables, scratch: Scratch, sprouts: int) -> None:
@@ -116,9 +143,15 @@ def grow(world: Worlds, tables: Tables, scratch: Scratch, sprouts: int) -> None:
         add_apple(world, tables, scratch.sprouts[s])
 
 
-def bite(world: Worlds, tables: Tables, law: Law | None, harvest: NDArray[np.float32]) -> None:
-    """Each agent in play harvests the apple on its cell, unless an institution stops it, which notes what the
-    agent breaks; `harvest`: float32 [N], 0 or 1.
+def bite(
+    world: Worlds,
+    tables: Tables,
+    law: Law | None,
+    actions: Actions,
+    harvest: NDArray[np.float32],
+) -> None:
+    """Each agent in play that harvests (`harvest_action`) takes the apple on its cell, unless an institution
+    stops it, which notes what the agent breaks; `harvest`: float32 [N], 0 or 1.
 
     Two agents share a cell only under `pairwise_clashes`: the lower index that may gets the apple.
     """
@@ -129,7 +162,12 @@ def bite(world: Worlds, tables: Tables, law: Law | None, harvest: NDArray[np.flo
             if law is not None:
                 note_step(law, i, cell)
             k = tables.site_at[cell]
-            if k >= 0 and world.stock[k] == 1 and may_bite(law, i, cell, k, world.step[0]):
+            if (
+                k >= 0
+                and world.stock[k] == 1
+                and (not FURTHER or tables.harvest_number in (-1, actions[i]))
+                and may_bite(law, i, cell, k, world.step[0])
+            ):
                 remove_apple(world, tables, k)
                 harvest[i] = 1.0
                 world.harvested[i] += 1

@@ -2,10 +2,11 @@
 
 from cprl.commons.colours import WALL
 from cprl.commons.moves import cell_of
-from cprl.commons.tables import Tables
+from cprl.commons.tables import FURTHER, Tables
 from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Worlds
 from cprl.institutions import Law
 from cprl.institutions.mediation import mediate
+from cprl.institutions.punishment import punish
 from cprl.institutions.sanctions import sanction_tag
 
 
@@ -32,30 +33,68 @@ def beam_cell(world: Worlds, tables: Tables, shooter: int, ahead: int, side: int
     return cell_of(row, col, tables)
 
 
-def beam_reach(world: Worlds, tables: Tables, shooter: int, side: int) -> int:
-    """The number of cells that the beam covers in its column at offset `side`, up to the first wall there."""
-    reach = 0
+def beam_begin(tables: Tables, side: int) -> int:
+    """How many cells ahead the beam begins in its column at offset `side`: 1, or 0 beside the shooter."""
+    return 0 if FURTHER and tables.beam_from_beside and side != 0 else 1
+
+
+def beam_end(world: Worlds, tables: Tables, shooter: int, side: int) -> int:
+    """How many cells ahead the beam ends at most in its column at offset `side`."""
+    length = tables.beam_length[world.heading[shooter]]
+    return length - abs(side) if FURTHER and tables.beam_tapers else length
+
+
+def beam_reach(world: Worlds, tables: Tables, shooter: int, side: int, present: Bools) -> int:
+    """How many cells ahead the last cell is that the beam covers in its column at offset `side`: the last one
+    before a wall there, or under `beam_stops_at_agents` the first one with an agent that is present.
+
+    `present`: bool [N].
+    """
+    reach, end = beam_begin(tables, side) - 1, beam_end(world, tables, shooter, side)
     while (
-        reach < tables.beam_length[world.heading[shooter]]
+        reach < end
         and tables.background[beam_cell(world, tables, shooter, reach + 1, side)] != tables.paints[WALL]
     ):
         reach += 1
+    if FURTHER and tables.beam_stops_at_agents:
+        return first_agent(world, tables, shooter, side, reach, present)
     return reach
+
+
+def first_agent(world: Worlds, tables: Tables, shooter: int, side: int, reach: int, present: Bools) -> int:
+    """How many cells ahead the first agent is in a column of a beam, or its reach if there is none."""
+    for i in range(present.shape[0]):
+        if present[i] and side_of(world, tables, i, shooter) == side:
+            ahead = ahead_of(world, tables, i, shooter)
+            if ahead >= beam_begin(tables, side):
+                reach = min(reach, ahead)
+    return reach
+
+
+def ahead_of(world: Worlds, tables: Tables, i: int, shooter: int) -> int:
+    """How many cells ahead of where a shooter fired agent i is."""
+    heading = world.heading[shooter]
+    rows = world.row[i] - beam_row(world, tables, shooter)
+    cols = world.col[i] - beam_col(world, tables, shooter)
+    return rows * ROW_STEP[heading] + cols * COL_STEP[heading]
+
+
+def side_of(world: Worlds, tables: Tables, i: int, shooter: int) -> int:
+    """How many cells to the right of where a shooter fired agent i is."""
+    right = (world.heading[shooter] + 1) % 4
+    rows = world.row[i] - beam_row(world, tables, shooter)
+    cols = world.col[i] - beam_col(world, tables, shooter)
+    return rows * ROW_STEP[right] + cols * COL_STEP[right]
 
 
 def is_hit(world: Worlds, tables: Tables, target: int, shooter: int) -> bool:
     """Whether the shooter's beam covers the target's cell."""
-    heading = world.heading[shooter]
-    right = (heading + 1) % 4
-    rows = world.row[target] - beam_row(world, tables, shooter)
-    cols = world.col[target] - beam_col(world, tables, shooter)
-    ahead = rows * ROW_STEP[heading] + cols * COL_STEP[heading]
-    side = rows * ROW_STEP[right] + cols * COL_STEP[right]
+    ahead, side = ahead_of(world, tables, target, shooter), side_of(world, tables, target, shooter)
     return (
-        ahead >= 1
-        and ahead <= tables.beam_length[heading]
+        ahead >= beam_begin(tables, side)
+        and ahead <= tables.beam_length[world.heading[shooter]]
         and abs(side) <= tables.beam_half_width
-        and ahead <= beam_reach(world, tables, shooter, side)
+        and ahead <= beam_reach(world, tables, shooter, side, world.in_play)
     )
 
 
@@ -80,6 +119,7 @@ def tag(world: Worlds, tables: Tables, law: Law | None, hit_by: Bools, tagged_by
             take_out_of_play(world, tables, i, steps)
     if law is not None:
         mediate(law.mediation, law.ledger, tagged_by, world.step[0])
+        punish(law.punishment, law.ledger, tagged_by, world.fired)
 
 
 def count_hit(world: Worlds, tables: Tables, hit_by: Bools, tagged_by: Bools, i: int) -> bool:

@@ -5,14 +5,20 @@ The seed is the key; the counter identifies the number: purpose and site, step, 
 So a world plays the same game in any batch, on any number of threads and on any device.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from cprl.commons.world import Worlds
 
 MULTIPLIER_0 = np.uint64(0xD2511F53)
 MULTIPLIER_1 = np.uint64(0xCD9E8D57)
 KEY_STEP_0 = np.uint64(0x9E3779B9)
 KEY_STEP_1 = np.uint64(0xBB67AE85)
 LOW_WORD = np.uint64(0xFFFFFFFF)
-WORD_BITS = np.uint64(32)
+WORD_SIZE = 32
+WORD_BITS = np.uint64(WORD_SIZE)
 ROUNDS = 10
 
 LOW_BYTE = 0xFF
@@ -26,6 +32,10 @@ REGROWTH_REST = 1 << 28
 STARTS = 2 << 28
 DETECTION = 3 << 28
 BALLOT = 4 << 28
+SPAWNS = 5 << 28
+FIRST_STOCK = 6 << 28
+END = 7 << 28
+ORDER = 8 << 28
 """The purpose of a draw: the upper four bits of the first counter word; its lower bits number the draw."""
 
 
@@ -45,3 +55,15 @@ def philox4x32(
         k0 = (k0 + KEY_STEP_0) & LOW_WORD
         k1 = (k1 + KEY_STEP_1) & LOW_WORD
     return c0, c1, c2, c3
+
+
+def draw(world: "Worlds", number: int) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
+    """Draws four random 32-bit words; `number` identifies the draw within this world, episode and step."""
+    return philox4x32(
+        np.uint64(number),
+        np.uint64(world.step[0]),
+        np.uint64(world.episode[0]),
+        world.number[0],
+        world.seed[0] & LOW_WORD,
+        world.seed[0] >> WORD_BITS,
+    )

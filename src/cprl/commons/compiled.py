@@ -105,13 +105,19 @@ def machine_code(function: Any, *arguments: Any) -> Callable[..., Any]:
     return code
 
 
-def compiled(functions: Iterable[Any], jit: Callable[[FunctionType], Callable[..., Any]]) -> Compiled:
-    """Compile plain functions, and before each of them the functions of `cprl` that it calls."""
+def compiled(
+    functions: Iterable[Any], jit: Callable[[FunctionType], Callable[..., Any]], **constants: Any
+) -> Compiled:
+    """Compile plain functions, and before each of them the functions of `cprl` that it calls.
+
+    Args:
+        constants: values of names of their modules, which hold in what is compiled.
+    """
     done: dict[FunctionType, Callable[..., Any]] = {}
 
     def compile_one(function: FunctionType) -> Callable[..., Any]:
         if function not in done:
-            names = dict(function.__globals__)
+            names = function.__globals__ | constants
             for name in function.__code__.co_names:
                 called = names.get(name)
                 if isinstance(called, FunctionType) and called.__module__.startswith("cprl."):
@@ -133,21 +139,26 @@ def _jit_for_cpu(function: FunctionType, *, on_disk: bool) -> Callable[..., Any]
 
 
 @cache
-def rules_for_cpu() -> Compiled:
+def rules_for_cpu(*, further: bool = False) -> Compiled:
     """The rules compiled for CPU threads: about ten seconds the first time, for a game with institutions half
     a minute; then cached on disk.
+
+    With `further` they hold what `FURTHER_RULES` need, which would slow games without them by some 7 %.
 
     Numba's own cache checks only the file of the called function and would miss a change in a rule that this
     function calls; so the cache folder is named after the text of all rules.
     """
-    folder = cache_folder() / _fingerprint()
+    folder = cache_folder() / _fingerprint() / ("further" if further else "plain")
     on_disk = _can_write(folder)
     with kept_in(folder):
-        return compiled(loops.ENTRIES, partial(_jit_for_cpu, on_disk=on_disk))
+        return compiled(loops.ENTRIES, partial(_jit_for_cpu, on_disk=on_disk), FURTHER=further)
 
 
-ENTRIES: Final[tuple[Compiled, Compiled]] = ({}, {})
-"""The machine code of loops, without institutions and with them, as far as it was asked for."""
+ENTRIES: Final[Mapping[tuple[bool, bool], Compiled]] = {
+    (further, governed): {} for further in (False, True) for governed in (False, True)
+}
+"""The machine code of loops, as far as it was asked for: by whether the game has `FURTHER_RULES`, and whether
+it has institutions."""
 
 
 def compiled_entry(loop: str, arguments: tuple[Any, ...]) -> Callable[..., None]:
@@ -158,9 +169,10 @@ def compiled_entry(loop: str, arguments: tuple[Any, ...]) -> Callable[..., None]
     The types are the same in every game: the fields of `Worlds`, `Tables`, `StepOutput` and `Scratch` have
     fixed types.
     """
-    entries = ENTRIES[arguments[0].law is not None]
+    further = arguments[0].tables.further
+    entries = ENTRIES[further, arguments[0].law is not None]
     with CLOCK.running():
-        entries[loop] = machine_code(rules_for_cpu()[loop], *arguments)
+        entries[loop] = machine_code(rules_for_cpu(further=further)[loop], *arguments)
     return entries[loop]
 
 

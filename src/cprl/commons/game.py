@@ -54,6 +54,16 @@ class Game(Value):
                 f"Rules.agent_1_right_moves_agent_0 is True and the map has {agents} agent; "
                 "allowed: at least 2"
             )
+        rules = self.rules
+        if rules.respawn_at_spawns and not self.map.spawns:
+            raise ValueError(
+                "Rules.respawn_at_spawns is True and Map.spawns is empty; allowed: a map with spawn places"
+            )
+        if round(rules.first_stock_share * len(self.map.sites)) == 0 and rules.regrow_prob[0] == 0:
+            raise ValueError(
+                f"Rules.first_stock_share is {rules.first_stock_share} of {len(self.map.sites)} sites, and "
+                "regrow_prob[0] is 0, so no apple can ever grow; allowed: a share of at least one site"
+            )
         check_sizes(self.map, self.rules)
         if self.observation.agents_apart and agents > MAX_AGENTS_APART:
             raise ValueError(
@@ -114,7 +124,7 @@ class Game(Value):
         """The rows and columns of an observation."""
         if self.observation.area == "full":
             return self.map.height, self.map.width
-        return self.rules.window_rows, self.rules.window_columns
+        return self.rules.window_rows + self.rules.window_rows_behind, self.rules.window_columns
 
     @property
     def observation_highest(self) -> int:

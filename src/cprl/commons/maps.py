@@ -1,14 +1,17 @@
-"""Boards: a Map is drawn (`parse`), known by name (`named`), or generated (`crosses`, `rooms`, `random`).
+"""Boards: a Map is drawn (`parse`, `read`), known by name (`named`), or generated (`crosses`, `rooms`,
+`random`).
 
-A drawing is rows of signs: `A` an apple site, `.` open ground, `#` an inner wall, `> ^ < v` an agent with its
-heading. Everything outside the board is wall.
+A drawing is rows of signs: `A` an apple site, `.` open ground, `#` an inner wall, `P` a spawn place,
+`> ^ < v` an agent with its heading. Drawings of others are read by their own signs, see `LEGENDS`. Everything
+outside the board is wall.
 """
 
 from bisect import bisect_left, insort
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from inspect import cleandoc
 from math import isqrt
+from pathlib import Path
 from typing import Annotated, Final, Literal
 
 import numpy as np
@@ -22,7 +25,23 @@ Start = tuple[int, int, int]
 
 SIGN_OF_HEADING: Final = {UP: "^", RIGHT: ">", DOWN: "v", LEFT: "<"}
 HEADING_OF_SIGN: Final = {sign: heading for heading, sign in SIGN_OF_HEADING.items()}
-SITE, GROUND, WALL = "A", ".", "#"
+SITE, GROUND, WALL, SPAWN = "A", ".", "#", "P"
+
+Meaning = Literal["site", "ground", "wall", "spawn", "up", "right", "down", "left"]
+"""What a sign stands for: a cell, or an agent's start with its heading."""
+_HEADINGS: Final = {"up": UP, "right": RIGHT, "down": DOWN, "left": LEFT}
+_SPACES: Final[dict[str, Meaning]] = {"A": "site", " ": "ground", "P": "spawn"}
+LEGENDS: Final[dict[str, dict[str, Meaning]]] = {
+    "cprl": {
+        **{SITE: "site", GROUND: "ground", WALL: "wall", SPAWN: "spawn"},
+        **{"^": "up", ">": "right", "v": "down", "<": "left"},
+    },
+    "melting_pot": {**_SPACES, "W": "wall", "Q": "up", "I": "ground"},
+    "ssd": {**_SPACES, "@": "wall"},
+    "socialjax": {**_SPACES, "W": "wall", "Q": "up"},
+}
+"""The signs of drawings by name: our own; Melting Pot's commons_harvest, whose tiles `I` of hidden rewards
+are ground here; sequential_social_dilemma_games' harvest; SocialJax' harvest."""
 
 LONGEST_SIDE_CELLS: Final = 10_000
 LARGEST_BOARD_CELLS: Final = 2**20
@@ -50,6 +69,9 @@ class Map(Value):
     """(row, col, heading) of each of the N agents, agent 0 first; heading 0 up, 1 right, 2 down, 3 left."""
     walls: tuple[Cell, ...] = ()
     """(row, col) of each inner wall."""
+    spawns: tuple[Cell, ...] = ()
+    """(row, col) of each spawn place: agents whose start is one of them begin each episode at another one,
+    drawn by chance, no two at the same; agents with another start begin there."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -65,10 +87,13 @@ class Map(Value):
         return len(self.starts)
 
     def drawing(self) -> str:
-        """The board as a drawing for `parse`. An agent hides a site on its cell; its index is not shown."""
+        """The board as a drawing for `parse`. An agent hides a site or spawn place on its cell; its index is
+        not shown."""
         signs = [[GROUND] * self.width for _ in range(self.height)]
         for row, col in self.sites:
             signs[row][col] = SITE
+        for row, col in self.spawns:
+            signs[row][col] = SPAWN
         for row, col in self.walls:
             signs[row][col] = WALL
         for row, col, heading in self.starts:
@@ -88,7 +113,8 @@ def _check_cells(board: Map) -> None:
     """Raise a ValueError for a cell outside the board, on a wall, or named twice."""
     walls = set(board.walls)
     starts = [(row, col) for row, col, _ in board.starts]
-    for name, cells in (("site", board.sites), ("start", starts), ("wall", board.walls)):
+    kinds = {"site": board.sites, "start": starts, "spawn place": board.spawns, "wall": board.walls}
+    for name, cells in kinds.items():
         seen: set[Cell] = set()
         for row, col in cells:
             problem = ""
@@ -106,37 +132,79 @@ def _check_cells(board: Map) -> None:
             seen.add((row, col))
 
 
-def parse(drawing: str) -> Map:
-    """Reads a drawing of any size; agents are numbered in reading order, rows and columns from 0.
+def parse(drawing: str, *, legend: str | Mapping[str, Meaning] = "cprl", agents: int | None = None) -> Map:
+    """Read a drawing of any size.
 
-    Common indentation and empty lines around the drawing are ignored.
+    Agents are numbered in reading order, rows and columns from 0; agents that are not drawn start at spawn
+    places, in reading order, and look up. Empty lines around the drawing are ignored, and common indentation
+    is if no sign is a space.
+
+    Args:
+        legend: one of `LEGENDS`, or what each sign means.
+        agents: the number of agents N; None for as many as are drawn.
     """
-    rows = [row.rstrip() for row in cleandoc(drawing).splitlines()]
-    if not rows:
-        raise ValueError("the drawing is empty; allowed: at least one row of signs")
-    _check_drawing(rows)
-    cells = [(r, c, sign) for r, row in enumerate(rows) for c, sign in enumerate(row)]
+    signs = LEGENDS[checked("legend", legend, Literal[tuple(LEGENDS)])] if isinstance(legend, str) else legend
+    for sign, meaning in signs.items():
+        checked(f"legend[{sign!r}]", meaning, Meaning)
+    rows = _rows(drawing, signs)
+    cells = [(r, c, signs[sign]) for r, row in enumerate(rows) for c, sign in enumerate(row)]
+
+    def places(kind: Meaning) -> tuple[Cell, ...]:
+        return tuple((r, c) for r, c, meaning in cells if meaning == kind)
+
+    starts = [(r, c, _HEADINGS[meaning]) for r, c, meaning in cells if meaning in _HEADINGS]
+    spawns, drawn = places("spawn"), len(starts)
+    if agents is None and not starts and spawns:
+        raise refusal("agents", agents, f"1 to {len(spawns)}: the drawing has spawn places, and no agent")
+    if agents is not None:
+        starts += [(*spawn, UP) for spawn in spawns]
+        starts = starts[: checked("agents", agents, Annotated[int, Range(1, max(1, drawn + len(spawns)))])]
     return Map(
         height=len(rows),
         width=len(rows[0]),
-        sites=tuple((r, c) for r, c, sign in cells if sign == SITE),
-        starts=tuple((r, c, HEADING_OF_SIGN[sign]) for r, c, sign in cells if sign in HEADING_OF_SIGN),
-        walls=tuple((r, c) for r, c, sign in cells if sign == WALL),
+        sites=places("site"),
+        starts=tuple(starts),
+        walls=places("wall"),
+        spawns=spawns,
     )
 
 
-def _check_drawing(rows: list[str]) -> None:
-    known = f"{SITE} {GROUND} {WALL} " + " ".join(HEADING_OF_SIGN)
-    width = len(rows[0])
+def read(path: str | Path, *, legend: str | Mapping[str, Meaning] = "cprl", agents: int | None = None) -> Map:
+    """Read a drawing from a file in UTF-8, see `parse`."""
+    if Path(path).stat().st_size > _LARGEST_DRAWING_BYTES:
+        raise ValueError(f"{path} has more than {_LARGEST_DRAWING_BYTES:,} bytes; allowed: a drawing")
+    try:
+        return parse(Path(path).read_text(encoding="utf-8"), legend=legend, agents=agents)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+_LARGEST_DRAWING_BYTES: Final = 10_000_000
+
+
+def _rows(drawing: str, signs: Mapping[str, Meaning]) -> list[str]:
+    """The rows of a drawing, all of them of the same length."""
+    if " " in signs:
+        lines = drawing.splitlines()
+        full = [number for number, line in enumerate(lines) if line.strip()]
+        lines = lines[full[0] : full[-1] + 1] if full else []
+        width = max(map(len, lines), default=0)
+        rows = [line.ljust(width) for line in lines]
+    else:
+        rows = [row.rstrip() for row in cleandoc(drawing).splitlines()]
+    if not rows:
+        raise ValueError("the drawing is empty; allowed: at least one row of signs")
     for r, row in enumerate(rows):
         for c, sign in enumerate(row):
-            if sign not in known or sign == " ":
+            if sign not in signs:
+                known = " ".join("space" if known == " " else known for known in signs)
                 raise ValueError(f"unknown sign {sign!r} at row {r}, column {c}; allowed: {known}")
-        if len(row) != width:
+        if len(row) != len(rows[0]):
             raise ValueError(
-                f"row {r} ends after column {len(row) - 1}, row 0 after column {width - 1}; "
+                f"row {r} ends after column {len(row) - 1}, row 0 after column {len(rows[0]) - 1}; "
                 "all rows of a drawing must have the same length"
             )
+    return rows
 
 
 _DRAWINGS: Final = {
@@ -197,21 +265,24 @@ def named(name: str) -> Map:
     checked("name", name, Literal[NAMES])
     board = parse(_DRAWINGS[name])
     starts = _NUMBERED_STARTS.get(name, board.starts)
-    return Map(height=board.height, width=board.width, sites=board.sites, starts=starts, walls=board.walls)
+    return replace(board, starts=starts)
 
 
 def with_agents(board: Map, agents: int) -> Map:
-    """Return a board with its first starts, or with more of them on the free ground nearest to the first.
+    """Return a board with its first starts, or with more of them: at spawn places, in their order, and then
+    on the free ground nearest to the first start.
 
-    Further agents look the way of the last one. Ground is free where no wall, site or start is; of two cells
-    equally near, the one that is read first comes first.
+    Further agents look the way of the last one. Ground is free where no wall, site, spawn place or start is;
+    of two cells equally near, the one that is read first comes first.
     """
     checked("agents", agents, Annotated[int, Range(1, LARGEST_BOARD_CELLS)])
-    taken = {*board.sites, *board.walls, *((row, col) for row, col, _ in board.starts)}
+    begun = {(row, col) for row, col, _ in board.starts}
+    taken = {*board.sites, *board.walls, *board.spawns, *begun}
     cells = [(row, col) for row in range(board.height) for col in range(board.width)]
     top, left, _ = board.starts[0]
     free = [cell for cell in cells if cell not in taken]
     free.sort(key=lambda cell: abs(cell[0] - top) + abs(cell[1] - left))
+    free = [*(spawn for spawn in board.spawns if spawn not in begun), *free]
     if agents > board.agents + len(free):
         allowed = f"at most {board.agents + len(free)} on this board, whose other cells are walls and sites"
         raise refusal("agents", agents, allowed)

@@ -1,7 +1,10 @@
 """Turning, walking, and clashes between agents that want the same cell, on one world."""
 
+import numpy as np
+
+from cprl.commons.chance import ORDER, SPAWNS, draw
 from cprl.commons.colours import WALL
-from cprl.commons.tables import Tables
+from cprl.commons.tables import FURTHER, Tables
 from cprl.commons.world import COL_STEP, ROW_STEP, Actions, Scratch, Worlds
 
 WALK_TURN = (0, 2, 3, 1)
@@ -21,26 +24,59 @@ def is_wall(row: int, col: int, tables: Tables) -> bool:
 
 
 def act(world: Worlds, tables: Tables, actions: Actions, scratch: Scratch) -> None:
-    """Each agent in play turns, fires or moves; clashing moves are cancelled later. `actions`: int64 [N].
+    """Each agent in play turns, fires or moves; clashing moves are cancelled later, under "in_turn" at once.
+    `actions`: int64 [N].
 
     No agent moves onto a wall or off the board.
     """
+    if FURTHER and tables.moves_in_turn:
+        act_in_turn(world, tables, actions, scratch)
+        return
     for i in range(world.row.shape[0]):
-        scratch.start_row[i] = world.row[i]
-        scratch.start_col[i] = world.col[i]
-        world.fired[i] = False
-        if not world.in_play[i]:
-            continue
-        action = actions[i]
-        if action < TURN_LEFT:
-            mover = moved_by(tables, i, action)
-            walk(world, tables, mover, (world.heading[mover] + WALK_TURN[action]) % 4)
-        elif action == TURN_LEFT:
-            world.heading[i] = (world.heading[i] + 3) % 4
-        elif action == TURN_RIGHT:
-            world.heading[i] = (world.heading[i] + 1) % 4
-        elif action == FIRE and tables.has_beam:
-            world.fired[i] = True
+        act_one(world, tables, actions, scratch, i)
+
+
+def act_in_turn(world: Worlds, tables: Tables, actions: Actions, scratch: Scratch) -> None:
+    """Agents act one after another; who came onto a cell where an agent is goes back."""
+    draw_order(world, scratch)
+    for n in range(world.row.shape[0]):
+        i = scratch.order[n]
+        act_one(world, tables, actions, scratch, i)
+        if world.in_play[i] and shares_a_cell(world, i):
+            go_back(world, scratch, i)
+
+
+def act_one(world: Worlds, tables: Tables, actions: Actions, scratch: Scratch, i: int) -> None:
+    """Agent i acts, if it is in play."""
+    scratch.start_row[i] = world.row[i]
+    scratch.start_col[i] = world.col[i]
+    world.fired[i] = False
+    if not world.in_play[i]:
+        return
+    is_hot = FURTHER and world.cooldown[i] > 0
+    if is_hot:
+        world.cooldown[i] -= 1
+    action = actions[i]
+    if action < TURN_LEFT:
+        mover = moved_by(tables, i, action)
+        walk(world, tables, mover, (world.heading[mover] + WALK_TURN[action]) % 4)
+    elif action == TURN_LEFT:
+        world.heading[i] = (world.heading[i] + 3) % 4
+    elif action == TURN_RIGHT:
+        world.heading[i] = (world.heading[i] + 1) % 4
+    elif action == FIRE and tables.has_beam and not is_hot:
+        world.fired[i] = True
+        if FURTHER:
+            world.cooldown[i] = tables.cooldown_steps
+
+
+def draw_order(world: Worlds, scratch: Scratch) -> None:
+    """Draws a permutation of the agents, all equally likely, into `scratch.order`; see `shuffle_starts`."""
+    for i in range(world.row.shape[0]):
+        scratch.order[i] = i
+    for i in range(world.row.shape[0] - 1, 0, -1):
+        j = int(draw(world, ORDER | i)[0] % np.uint64(i + 1))
+        scratch.order[i], scratch.order[j] = scratch.order[j], scratch.order[i]
 
 
 def moved_by(tables: Tables, i: int, action: int) -> int:
@@ -86,6 +122,44 @@ def have_swapped(world: Worlds, scratch: Scratch, i: int, j: int) -> bool:
 def clash(world: Worlds, scratch: Scratch, i: int, j: int) -> bool:
     """Whether the moves of two agents in play clash: they share a cell or have swapped."""
     return share_a_cell(world, i, j) or have_swapped(world, scratch, i, j)
+
+
+def shares_a_cell(world: Worlds, i: int) -> bool:
+    """Whether agent i is on one cell with another agent in play."""
+    for j in range(world.row.shape[0]):
+        if j != i and world.in_play[j] and share_a_cell(world, i, j):
+            return True
+    return False
+
+
+def settle_by_lot(world: Worlds, scratch: Scratch) -> None:
+    """Of the agents that want a cell, leaves the one that comes first in `scratch.order`, and moves the rest
+    back; all of them if an agent stays there. Agents that swap go back, too.
+
+    An agent that went back stays on its cell, which may cancel another move.
+    """
+    draw_order(world, scratch)
+    unsettled = True
+    while unsettled:
+        unsettled = False
+        for i in range(world.row.shape[0]):
+            scratch.blocked[i] = (
+                world.in_play[i] and has_moved(world, scratch, i) and loses_its_cell(world, scratch, i)
+            )
+            unsettled = unsettled or scratch.blocked[i]
+        for i in range(world.row.shape[0]):
+            if scratch.blocked[i]:
+                go_back(world, scratch, i)
+
+
+def loses_its_cell(world: Worlds, scratch: Scratch, i: int) -> bool:
+    """Whether agent i, which has moved, swaps cells with another agent in play, or loses its cell to one."""
+    for j in range(world.row.shape[0]):
+        if j != i and world.in_play[j]:
+            is_first = not has_moved(world, scratch, j) or scratch.order[j] < scratch.order[i]
+            if have_swapped(world, scratch, i, j) or (is_first and share_a_cell(world, i, j)):
+                return True
+    return False
 
 
 def settle_clashes(world: Worlds, scratch: Scratch) -> None:
@@ -139,17 +213,28 @@ def count_down(world: Worlds) -> None:
 
 
 def return_to_play(world: Worlds, tables: Tables, scratch: Scratch) -> None:
-    """Returns agents to play that have no more turns to miss, if their cell is free.
+    """Returns agents to play that have no more turns to miss, if their cell is free; under
+    `respawn_at_spawns` at a free spawn place.
 
     Agents that wait for the same cell return in the order in which they were tagged. Under `pairwise_clashes`
     no agent waits.
     """
+    if FURTHER and tables.respawn_at_spawns:
+        respawn(world, tables)
+        return
     for i in range(world.row.shape[0]):
         is_not_due = world.in_play[i] or world.out_steps[i] > 0
         scratch.blocked[i] = is_not_due or (not tables.pairwise_clashes and has_to_wait(world, i))
     for i in range(world.row.shape[0]):
         if not scratch.blocked[i]:
             world.in_play[i] = True
+
+
+def respawn(world: Worlds, tables: Tables) -> None:
+    """Returns agents to play that have no more turns to miss, at free spawn places, as far as there are."""
+    for i in range(world.row.shape[0]):
+        if not world.in_play[i] and world.out_steps[i] == 0:
+            world.in_play[i] = draw_place(world, tables, i)
 
 
 def has_to_wait(world: Worlds, i: int) -> bool:
@@ -173,7 +258,57 @@ def place_at_starts(world: Worlds, tables: Tables) -> None:
         world.on_board[i] = True
         world.fired[i] = False
         world.moved_after_firing[i] = False
+        world.cooldown[i] = 0
         world.hits[i] = 0
         world.tagged_step[i] = 0
         world.offences[i] = 0
         world.harvested[i] = 0
+
+
+def draw_starts(world: Worlds, tables: Tables) -> None:
+    """Draws a spawn place for each agent whose start is one, no two the same, and under `random_headings` all
+    headings."""
+    for i in range(world.row.shape[0]):
+        world.in_play[i] = True
+        for s in range(tables.spawns.shape[0]):
+            if is_at(world, tables, i, s):
+                world.in_play[i] = False
+    for i in range(world.row.shape[0]):
+        if not world.in_play[i]:
+            world.in_play[i] = draw_place(world, tables, i)
+        elif tables.random_headings:
+            world.heading[i] = draw(world, SPAWNS | i)[1] % np.uint64(4)
+
+
+def draw_place(world: Worlds, tables: Tables, i: int) -> bool:
+    """Puts agent i, out of play, at a spawn place where no agent in play is, all equally likely; returns
+    whether there is one."""
+    free = 0
+    for s in range(tables.spawns.shape[0]):
+        free += is_free(world, tables, s)
+    if free == 0:
+        return False
+    words = draw(world, SPAWNS | i)
+    place = np.int64(words[0] % np.uint64(free))
+    for s in range(tables.spawns.shape[0]):
+        if is_free(world, tables, s):
+            if place == 0:
+                world.row[i] = tables.spawns[s, 0]
+                world.col[i] = tables.spawns[s, 1]
+            place -= 1
+    if tables.random_headings:
+        world.heading[i] = words[1] % np.uint64(4)
+    return True
+
+
+def is_free(world: Worlds, tables: Tables, s: int) -> bool:
+    """Whether no agent in play is at spawn place s."""
+    for j in range(world.row.shape[0]):
+        if world.in_play[j] and is_at(world, tables, j, s):
+            return False
+    return True
+
+
+def is_at(world: Worlds, tables: Tables, i: int, s: int) -> bool:
+    """Whether agent i is at spawn place s."""
+    return world.row[i] == tables.spawns[s, 0] and world.col[i] == tables.spawns[s, 1]

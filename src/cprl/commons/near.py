@@ -65,6 +65,24 @@ def neighbours(board: Map, rules: Rules) -> tuple[Ints, Indices]:
     return first_of, np.concatenate(sites_near)
 
 
+def growth(rules: Rules, around: Ints) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The probability that a site grows an apple, by the number of apples near it.
+
+    Args:
+        around: the number of sites near each site, [K].
+
+    Returns:
+        The row of each site, [K], and the rows, [rows, largest number of near sites + 1]. Entries of a row
+        beyond the sites near are never used.
+    """
+    probs, most = np.array(rules.regrow_prob), int(around.max())
+    if rules.regrow_by == "count":
+        return np.zeros(1, np.int64), probs[np.minimum(np.arange(most + 1), len(probs) - 1)][None]
+    sizes, of_site = np.unique(around + (rules.regrow_by == "share_with_own"), return_inverse=True)
+    shares = np.arange(most + 1) / np.maximum(sizes, 1)[:, None]
+    return of_site, np.interp(shares, np.linspace(0, 1, len(probs)), probs)
+
+
 def sites_around(board: Map, rules: Rules) -> list[NDArray[np.int64]]:
     """Return the sites near each site, int64 [..] each."""
     first, near = neighbours(board, rules)

@@ -8,6 +8,8 @@ so that command lines are checked without it.
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
+from cprl.commons.literature import SOURCES
+from cprl.commons.literature import game as game_of_literature
 from cprl.values import checked, refusal
 
 if TYPE_CHECKING:
@@ -55,25 +57,42 @@ GAMES: Final[tuple[tuple[Board, Variant], ...]] = tuple(_BOARD_RULES)
 """Every board with each of its variants."""
 
 
+def names() -> tuple[str, ...]:
+    """The names of all games that `game` knows: the boards of the study, then those of the literature."""
+    return *BOARDS, *SOURCES
+
+
 def check_board(board: str) -> None:
-    """Refuse a word that names neither a published board nor a run's directory nor a file."""
-    if board not in BOARDS and not Path(board).exists():
-        raise refusal("board", board, f"{', '.join(BOARDS)}, a run's directory, or a file with a drawing")
+    """Refuse a word that names neither a game nor a run's directory nor a file."""
+    if board not in names() and not Path(board).exists():
+        raise refusal("board", board, f"{', '.join(names())}, a run's directory, or a file with a drawing")
 
 
-def game(board: Board, *, variant: Variant = "published") -> "Game":
+def game(name: str, *, variant: Variant = "published") -> "Game":
+    """Return a game by one of `names`: a board of the study, in a variant, or a game of the literature.
+
+    The ids of the latter say their version and never change their meaning; `docs/games.md` has them all.
+    """
+    if name in SOURCES:
+        if variant != "published":
+            raise refusal("variant", variant, f'"published" with {name}, which has no other')
+        return game_of_literature(name)
     from cprl.commons import maps
     from cprl.commons.game import Game
     from cprl.commons.rules import Rules
 
-    check_variant(board, variant)
+    if name not in BOARDS:
+        raise refusal("board", name, ", ".join(names()))
+    board = check_variant(name, variant)
     quirks = {} if variant == "published" else _AS_RUN
     return Game(map=maps.named(board), rules=Rules(**quirks, **_BOARD_RULES[board, variant]))
 
 
-def check_variant(board: str, variant: str) -> None:
-    checked("board", board, Board)
+def check_variant(board: str, variant: Variant) -> Board:
+    """Return the name of a board of the study; refuse others, and variants that it lacks."""
+    known: Board = checked("board", board, Board)
     checked("variant", variant, Variant)
-    if (board, variant) not in GAMES:
-        allowed = ", ".join(repr(known) for of, known in GAMES if of == board)
-        raise refusal(f"variant of {board}", variant, allowed)
+    if (known, variant) not in GAMES:
+        allowed = ", ".join(repr(other) for of, other in GAMES if of == known)
+        raise refusal(f"variant of {known}", variant, allowed)
+    return known

@@ -35,9 +35,11 @@ def why_out_of_reach(
         is_open[wall] = False
     part = label(is_open)[0]  # the number of the part of the board around each cell that walls enclose
     starts = [(row, col) for row, col, _ in board.starts]
+    begins = [board.spawns if start in board.spawns else (start,) for start in starts]
     of_sites = np.array([part[site] for site in board.sites])
-    of_starts = np.array([part[start] for start in starts])
-    walks = (of_starts[:, None] == of_sites).any(0) if shuffle_starts else of_starts[:, None] == of_sites
+    walks = np.array([np.isin(of_sites, [part[cell] for cell in cells]) for cells in begins])
+    if shuffle_starts:
+        walks[:] = walks.any(0)
     if (allowed & walks).any():
         return None
     named = "; ".join(f"row {row}, column {col}" for row, col in starts[:_STARTS_NAMED])

@@ -1,17 +1,22 @@
 """Rules: every number and switch of the game, with its unit, range and source.
 
 Sources: [W] M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement Learning" (2019);
-[P] Perolat et al. (2017); [run] the program that produced the results of [W], where it differs from the text.
+[P] Perolat et al. (2017); [run] the program that produced the results of [W], where it differs from the text;
+[J] Janssen, Holahan, Lee and Ostrom (2010); [MP] Melting Pot 2.0, commons_harvest; [SSD]
+sequential_social_dilemma_games, harvest; [SJ] SocialJax, harvest_open; see `docs/games.md`.
 `docs/game.md` describes the game in words.
 """
 
 from dataclasses import dataclass, fields
 from typing import Annotated, Final, Literal
 
-from cprl.values import MOST_INT32, Odd, Positive, Range, Value, Where
+from cprl.values import MOST_INT32, Natural, Odd, Positive, Range, Value, Where
 
 ACTIONS: Final = ("forward", "backward", "left", "right", "turn_left", "turn_right", "beam", "stay")
 """The actions by index. If no agent may fire, there is no "beam", and 6 is "stay"."""
+
+HARVEST: Final = "harvest"
+"""The last action under `Rules.harvest_action`."""
 
 Norm = Literal["euclidean", "manhattan", "chebyshev"]
 
@@ -57,6 +62,25 @@ class Rules(Value):
     regrow_norm: Norm = "euclidean"
     """The norm that measures this distance [W]."""
 
+    regrow_by: Literal["count", "share", "share_with_own"] = "count"
+    """What `regrow_prob` is a function of: the number of apples near a site; or the share of the sites near
+    it that hold one [J], at which its entries stand at equal distances from 0 to 1, with straight lines
+    between them. "share_with_own" counts the site itself, which is empty, among those near it."""
+
+    regrow_under_agents: bool = True
+    """Whether a site grows an apple while an agent stands on it; not in [SSD] and [SJ]."""
+
+    regrow_after_bites: bool = False
+    """[SSD] Growth is counted from the stock after the bites of the turn, not from that at its start."""
+
+    first_stock_share: Annotated[float, Range(0, 1)] = 1.0
+    """The share of the sites that hold an apple when an episode begins, rounded to a number of sites; which
+    ones is drawn by chance at each episode. 0.25 in [J]."""
+
+    harvest_action: bool = False
+    """[J] Whether an agent harvests the apple on its cell in turns in which its action was "harvest" alone, a
+    further one. Otherwise it does at the end of every turn in which it is there [W]."""
+
     beam_length_cells: Positive | tuple[Positive, Positive, Positive, Positive] = 5
     """The length of a beam in cells: one number, or four by heading (up, right, down, left)."""
 
@@ -76,12 +100,29 @@ class Rules(Value):
     """The number of turns that a tagged agent misses [W]; by shooter or by offence with
     `cprl.institutions.GraduatedSanctions`."""
 
+    beam_tapers: bool = False
+    """Whether each column of a beam is one cell shorter than its neighbour nearer to the middle [MP, SSD,
+    SJ]."""
+
+    beam_from_beside: bool = False
+    """Whether the outer columns of a beam begin beside the agent, not ahead of that [MP, SSD]."""
+
+    beam_stops_at_agents: bool = False
+    """Whether an agent stops the column of a beam that hits it [MP, SSD]; the picture shows that where it
+    still stands."""
+
+    cooldown_steps: Natural = 0
+    """The number of turns in play after a shot in which an agent cannot fire; 2 in [MP]."""
+
     may_fire: bool = True
     """Whether agents may fire; if not, there is no beam action. For some agents alone:
     `cprl.institutions.Sanctioner`."""
 
     window_rows: Window = 6
     """The rows of a window: the agent's own and those ahead of it [W]."""
+
+    window_rows_behind: Annotated[int, Range(0, LARGEST_WINDOW_CELLS)] = 0
+    """Further rows of a window, behind the agent's own; 1 in [MP] and [SJ], 7 in [SSD]."""
 
     window_columns: Annotated[
         int,
@@ -99,8 +140,33 @@ class Rules(Value):
     episode_steps: Positive = 1000
     """The number of turns after which an episode is truncated [W]."""
 
+    end_prob: Probability = 0.0
+    """The probability with which an episode is truncated by chance, after `end_from_step` turns and every
+    `end_every_steps` turns from there on; 0.15 from turn 1,099 on every 100 turns in [MP]."""
+
+    end_from_step: Positive = 1
+    """The first turn after which it can be."""
+
+    end_every_steps: Positive = 1
+    """The number of turns from there to the next one."""
+
+    plays_on_when_empty: bool = False
+    """Whether an episode goes on where no apple is left and none can grow [MP, SSD, SJ]."""
+
     shuffle_starts: bool = False
     """Whether each episode permutes the agents' starts, all permutations equally likely (ours)."""
+
+    random_headings: bool = False
+    """Whether agents begin, and return to play at spawn places, with a heading drawn by chance [MP, SSD]."""
+
+    respawn_at_spawns: bool = False
+    """Whether a tagged agent returns at a free place of `Map.spawns`, drawn by chance [MP, SJ], and not where
+    it was tagged."""
+
+    clashes: Literal["all_back", "one_moves", "in_turn"] = "all_back"
+    """What becomes of agents that want the same cell: all go back (ours); or one gets it, drawn by chance,
+    unless an agent stays on it [SSD, SJ]; or agents move one after another, in an order drawn at each turn,
+    and onto no cell where an agent is [MP]."""
 
     pairwise_clashes: bool = False
     """[run] All agents move at once. Then, pair by pair in the order of agent indices, two agents on one
@@ -134,10 +200,26 @@ class Rules(Value):
     after agent 0's own action and even while agent 0 is out of play; a beam that agent 0 fires in this turn
     begins where it fired. A fault of the program for two agents until 13 April 2019. At least two agents."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        both = (
+            ("regrow_after_bites", self.regrow_after_bites, "regrow_before_bites", self.regrow_before_bites),
+            ("clashes", self.clashes != "all_back", "pairwise_clashes", self.pairwise_clashes),
+        )
+        for name, is_set, other, is_other_set in both:
+            if is_set and is_other_set:
+                raise ValueError(
+                    f"Rules.{name} is {getattr(self, name)!r} and Rules.{other} is True; allowed: one of them"
+                )
+
     def __repr__(self) -> str:
+        return f"Rules({', '.join(f'{name}={value!r}' for name, value in self.changed.items())})"
+
+    @property
+    def changed(self) -> dict[str, object]:
+        """The fields that differ from their defaults, by name."""
         pairs = ((field, getattr(self, field.name)) for field in fields(self))
-        changed = [f"{field.name}={value!r}" for field, value in pairs if value != field.default]
-        return f"Rules({', '.join(changed)})"
+        return {field.name: value for field, value in pairs if value != field.default}
 
     @property
     def beam_lengths_cells(self) -> tuple[int, int, int, int]:
@@ -147,5 +229,6 @@ class Rules(Value):
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """The names of the actions, by index: 8 of them, or 7 without a beam."""
-        return ACTIONS if self.may_fire else tuple(name for name in ACTIONS if name != "beam")
+        """The names of the actions, by index: 8 of them, or 7 without a beam, and then perhaps "harvest"."""
+        last = (HARVEST,) if self.harvest_action else ()
+        return *(name for name in ACTIONS if self.may_fire or name != "beam"), *last

@@ -17,7 +17,10 @@ State = dict[str, NDArray[Any]]
 DERIVED: Final = ("near", "stock_left")
 """Entries of `Worlds` that are computed from the others."""
 
-OF_A_RULE: Final = {"moved_after_firing": "agent_1_right_moves_agent_0"}
+OF_A_RULE: Final = {
+    "moved_after_firing": "agent_1_right_moves_agent_0",
+    "cooldown": "cooldown_steps",
+}
 """Entries of `Worlds` that only games with a rule have in their state, by the rule: so the states of others
 are those that earlier versions kept."""
 
@@ -79,6 +82,7 @@ def _check_ranges(arrays: State, game: Game) -> None:
         "col": (0, board.width - 1),
         "heading": (0, 3),
         "out_steps": (0, _MAX_INT32),
+        "cooldown": (0, rules.cooldown_steps),
         "hits": (0, rules.hits_to_tag - 1),
         "tagged_step": (0, rules.episode_steps),
         "offences": (0, _MAX_INT32),
@@ -88,6 +92,8 @@ def _check_ranges(arrays: State, game: Game) -> None:
         "ended": (PLAYING, TRUNCATED),
     }
     for name, (low, high) in ranges.items():
+        if name not in arrays:
+            continue
         _refuse(arrays, name, (arrays[name] < low) | (arrays[name] > high), f"{low} to {high}")
     out = arrays["out_steps"] > 0
     _refuse(arrays, "in_play", arrays["in_play"] & out, "False while out_steps is above 0")

@@ -8,12 +8,21 @@ from numpy.typing import NDArray
 from cprl.commons.chance import REST_BITS
 from cprl.commons.colours import FIRST_AGENT, GROUND, WALL, class_colour
 from cprl.commons.maps import Map
-from cprl.commons.near import neighbours
+from cprl.commons.near import growth, neighbours
 from cprl.commons.observation import Observation, classes_shown
-from cprl.commons.rules import Rules
+from cprl.commons.rules import HARVEST, Rules
 from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Indices, Ints
 from cprl.institutions.base import threshold
 
+FURTHER: Final = True
+"""Whether rules are compiled with what only `FURTHER_RULES` need; see `cprl.commons.compiled`."""
+FURTHER_RULES: Final = (
+    *("regrow_by", "regrow_under_agents", "regrow_after_bites", "first_stock_share", "harvest_action"),
+    *("beam_tapers", "beam_from_beside", "beam_stops_at_agents", "cooldown_steps", "end_prob"),
+    *("random_headings", "respawn_at_spawns", "clashes"),
+)
+"""Rules that the study does not have: a game in which all of them are off, on a map without spawn places, is
+played as fast as if there were none."""
 CLASS_SHIFT: Final = 24
 """A paint is a colour in 24 bits, and its class from this bit on."""
 
@@ -38,13 +47,17 @@ class Tables(NamedTuple):
     near_sites: Indices
     """uint32 [pairs], the sites near each site, without the site itself."""
     regrow_below: NDArray[np.int64]
-    """int64 [largest number of near sites + 1]: with this many apples near it, an empty site grows an apple
-    if a uniform 32-bit word is below this threshold."""
+    """int64 [rows of (largest number of near sites + 1)]: with this many apples near it, an empty site grows
+    an apple if a uniform 32-bit word is below this threshold."""
     regrow_first_byte: Ints
-    """[largest number of near sites + 1], the largest first byte of a word below that threshold; -1 where no
-    apple can grow."""
+    """Likewise, the largest first byte of a word below that threshold; -1 where no apple can grow."""
+    regrow_row: Indices
+    """uint32 [K], where the row of a site begins, by the number of sites near it; under "count" there is one
+    row, and [0]."""
     start: Ints
     """[N, 3], row, column and heading of each agent at the start of an episode."""
+    spawns: Ints
+    """[S, 2], row and column of each spawn place."""
     beam_length: Ints
     """[4], in cells, by heading."""
     paints: Ints
@@ -74,9 +87,30 @@ class Tables(NamedTuple):
     sees_all: bool
     """Whether agents observe the whole board."""
     walls_block_sight: bool
+    further: bool
+    """Whether the game has any of `FURTHER_RULES`, or spawn places."""
     shuffle_starts: bool
     never_from_nothing: bool
-    """Whether an empty board stays empty."""
+    """Whether an empty board stays empty, which ends an episode."""
+    regrow_by_share: bool
+    regrow_under_agents: bool
+    regrow_after_bites: bool
+    first_stock: int
+    """Sites that hold an apple when an episode begins."""
+    harvest_number: int
+    """The action that harvests; -1 where none is needed."""
+    beam_tapers: bool
+    beam_from_beside: bool
+    beam_stops_at_agents: bool
+    cooldown_steps: int
+    end_below: int
+    """An episode ends by chance if a uniform 32-bit word is below this threshold."""
+    end_from_step: int
+    end_every_steps: int
+    random_headings: bool
+    respawn_at_spawns: bool
+    moves_in_turn: bool
+    one_moves: bool
     pairwise_clashes: bool
     regrow_before_bites: bool
     freeze_counts_tag_turn: bool
@@ -100,7 +134,7 @@ def check_sizes(board: Map, rules: Rules) -> None:
         )
     rim = _rim(board, rules)
     cells = (board.height + 2 * rim) * (board.width + 2 * rim)
-    entries = 4 * cells * rules.window_rows * rules.window_columns
+    entries = 4 * cells * len(_window_places(rules))
     if rules.walls_block_sight and entries > LARGEST_TABLE:
         raise ValueError(
             f"Rules.walls_block_sight is True with windows of {rules.window_rows} x {rules.window_columns} "
@@ -114,7 +148,15 @@ def _beam_half_width(board: Map, rules: Rules) -> int:
 
 
 def _rim(board: Map, rules: Rules, *, sees_all: bool = False) -> int:
-    window_reach = (0,) if sees_all else (rules.window_rows - 1, rules.window_columns // 2)
+    window_reach = (
+        (0,)
+        if sees_all
+        else (
+            rules.window_rows - 1,
+            rules.window_rows_behind,
+            rules.window_columns // 2,
+        )
+    )
     return max(1, *window_reach, _beam_half_width(board, rules))
 
 
@@ -122,7 +164,9 @@ def _window_places(rules: Rules) -> list[tuple[int, int]]:
     """The (ahead, side) of each cell of a window: farthest row first, leftmost column first."""
     middle = rules.window_columns // 2
     return [
-        (ahead, side) for ahead in range(rules.window_rows - 1, -1, -1) for side in range(-middle, middle + 1)
+        (ahead, side)
+        for ahead in range(rules.window_rows - 1, -1 - rules.window_rows_behind, -1)
+        for side in range(-middle, middle + 1)
     ]
 
 
@@ -201,9 +245,8 @@ def build_tables(board: Map, rules: Rules, observation: Observation, *, highest:
     near_first, near_sites = neighbours(board, rules)
     places = _window_places(rules)
     window_cells = [[_offset(*place, heading, stride) for place in places] for heading in range(4)]
-    max_near = int(np.diff(near_first).max())
-    probs = [rules.regrow_prob[min(n, len(rules.regrow_prob) - 1)] for n in range(max_near + 1)]
-    below = np.array([threshold(p) for p in probs], np.int64)
+    of_site, probs = growth(rules, np.diff(near_first))
+    below = np.array([threshold(p) for p in probs.reshape(-1)], np.int64)
     of_rules: dict[str, Any] = {name: getattr(rules, name) for name in Tables._fields if hasattr(rules, name)}
     return Tables(
         background=background.reshape(-1),
@@ -213,7 +256,9 @@ def build_tables(board: Map, rules: Rules, observation: Observation, *, highest:
         near_sites=near_sites,
         regrow_below=below,
         regrow_first_byte=((below - 1) >> REST_BITS).astype(np.int32),
+        regrow_row=(of_site * probs.shape[1]).astype(np.uint32),
         start=np.array(board.starts, np.int32),
+        spawns=np.array(board.spawns, np.int32).reshape(-1, 2),
         beam_length=np.array(rules.beam_lengths_cells, np.int32),
         paints=paints,
         channel_of=channel_of,
@@ -227,6 +272,13 @@ def build_tables(board: Map, rules: Rules, observation: Observation, *, highest:
         one_hot=observation.encoding == "one_hot",
         one_hot_value=highest,
         sees_all=sees_all,
-        never_from_nothing=rules.regrow_prob[0] == 0,
+        never_from_nothing=rules.regrow_prob[0] == 0 and not rules.plays_on_when_empty,
+        further=bool(board.spawns) or any(name in rules.changed for name in FURTHER_RULES),
+        regrow_by_share=rules.regrow_by != "count",
+        first_stock=round(rules.first_stock_share * len(board.sites)),
+        harvest_number=rules.actions.index(HARVEST) if rules.harvest_action else -1,
+        end_below=threshold(rules.end_prob),
+        moves_in_turn=rules.clashes == "in_turn",
+        one_moves=rules.clashes == "one_moves",
         **of_rules,
     )

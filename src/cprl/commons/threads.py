@@ -75,7 +75,7 @@ class CpuThreads:
             game: what `Played` says, as a plain tuple, which takes a third of the time to make.
         """
         size = len(argument)
-        entry = ENTRIES[game[3] is not None].get(loop)
+        entry = ENTRIES[self.tables.further, game[3] is not None].get(loop)
         if entry is None:
             entry = compiled_entry(loop, (Played(*game), argument, self._scratch[0], 0, size))
         if self.threads == 1:

@@ -2,19 +2,21 @@
 
 import numpy as np
 
-from cprl.commons.apples import bite, draw, fill, find_sprouts, grow, recount
+from cprl.commons.apples import bite, fill, find_sprouts, grow, recount
 from cprl.commons.beam import find_hits, tag, take_out
-from cprl.commons.chance import BALLOT, DETECTION, STARTS
+from cprl.commons.chance import BALLOT, DETECTION, END, STARTS, draw
 from cprl.commons.moves import (
     act,
     count_down,
+    draw_starts,
     note_moved_shooters,
     place_at_starts,
     return_to_play,
+    settle_by_lot,
     settle_clashes,
     settle_pairwise,
 )
-from cprl.commons.tables import Tables
+from cprl.commons.tables import FURTHER, Tables
 from cprl.commons.views import draw_institutions, draw_windows
 from cprl.commons.world import PLAYING, TERMINATED, TRUNCATED, Actions, Scratch, StepOutput, Worlds
 from cprl.institutions import Law
@@ -50,15 +52,19 @@ def play_turn(
         hold_fire(world, law)
     if tables.pairwise_clashes:
         settle_pairwise(world, scratch)
-    else:
+    elif FURTHER and tables.one_moves:
+        settle_by_lot(world, scratch)
+    elif not (FURTHER and tables.moves_in_turn):
         settle_clashes(world, scratch)
     note_moved_shooters(world, tables, scratch)
+    if FURTHER and tables.regrow_after_bites:
+        bite(world, tables, law, actions, output.harvest)
     sprouts = find_sprouts(world, tables, scratch)
     if tables.regrow_before_bites:
         grow(world, tables, scratch, sprouts)
-        bite(world, tables, law, output.harvest)
-    else:
-        bite(world, tables, law, output.harvest)
+    if not (FURTHER and tables.regrow_after_bites):
+        bite(world, tables, law, actions, output.harvest)
+    if not tables.regrow_before_bites:
         grow(world, tables, scratch, sprouts)
     output.regrown[0] = sprouts
     find_hits(world, tables, output.hit_by)
@@ -92,8 +98,8 @@ def shuffle_starts(world: Worlds) -> None:
 def begin_episode(
     world: Worlds, tables: Tables, output: StepOutput, law: Law | None, scratch: Scratch
 ) -> None:
-    """Starts the next episode: all sites hold an apple, all agents are at their starts; institutions forget
-    the last one, but for what votes put in force."""
+    """Starts the next episode: all sites hold an apple, all agents are at their starts, if the rules say
+    nothing else; institutions forget the last one, but for what votes put in force."""
     world.episode[0] += 1
     world.step[0] = 0
     world.ended[0] = PLAYING
@@ -101,6 +107,8 @@ def begin_episode(
     place_at_starts(world, tables)
     if tables.shuffle_starts:
         shuffle_starts(world)
+    if FURTHER and (tables.spawns.shape[0] > 0 or tables.random_headings):
+        draw_starts(world, tables)
     clear_events(output)
     write_state(world, tables, output, scratch)
     if law is not None:
@@ -133,8 +141,16 @@ def check_end(world: Worlds, tables: Tables, began_empty: bool) -> None:
     is_empty = began_empty if tables.ends_one_turn_late else world.stock_left[0] == 0
     if is_empty and tables.never_from_nothing:
         world.ended[0] = TERMINATED
-    elif world.step[0] >= tables.episode_steps:
+    elif world.step[0] >= tables.episode_steps or (FURTHER and ends_by_chance(world, tables)):
         world.ended[0] = TRUNCATED
+
+
+def ends_by_chance(world: Worlds, tables: Tables) -> bool:
+    """Whether this turn is one after which an episode may end by chance, and it does."""
+    later = world.step[0] - tables.end_from_step
+    if tables.end_below == 0 or later < 0 or later % tables.end_every_steps > 0:
+        return False
+    return int(draw(world, END)[0]) < tables.end_below
 
 
 def clear_events(output: StepOutput) -> None:

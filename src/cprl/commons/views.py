@@ -11,7 +11,7 @@ beside a board.
 
 import numpy as np
 
-from cprl.commons.beam import beam_cell, beam_reach
+from cprl.commons.beam import beam_begin, beam_cell, beam_reach
 from cprl.commons.colours import APPLE, BEAM, FIRST_AGENT, GROUND, HIDDEN, MARK, OTHER, SELF, WALL
 from cprl.commons.moves import cell_of
 from cprl.commons.tables import CLASS_SHIFT, Tables
@@ -55,7 +55,8 @@ def paint_mark(world: Worlds, tables: Tables, i: int, picture: Ints) -> None:
 def paint_beam(world: Worlds, tables: Tables, shooter: int, picture: Ints) -> None:
     """Paints the beam of a shooter: over ground and marks only, under `paint_over` over everything."""
     for side in range(-tables.beam_half_width, tables.beam_half_width + 1):
-        for ahead in range(1, beam_reach(world, tables, shooter, side) + 1):
+        last = beam_reach(world, tables, shooter, side, world.on_board)
+        for ahead in range(beam_begin(tables, side), last + 1):
             cell = beam_cell(world, tables, shooter, ahead, side)
             kind = class_of(picture[cell])
             if tables.paint_over or kind in (GROUND, MARK):
@@ -116,7 +117,8 @@ def look(world: Worlds, tables: Tables, i: int, scratch: Scratch) -> None:
 
 
 def cut_window(world: Worlds, tables: Tables, i: int, scratch: Scratch, window: Bytes) -> None:
-    """Writes the observation of agent i: uint8 [C, X, Y]; in a window it is in the middle of the last row.
+    """Writes the observation of agent i: uint8 [C, X, Y]; in a window it is in the middle of the last row,
+    but for `window_rows_behind`.
 
     There are two passes, so that the second writes contiguous memory; unsigned indices avoid Numba's check
     for negative ones. Together this is three times as fast as one plain loop (`benchmarks/env_steps.py`).

@@ -63,6 +63,8 @@ class Worlds(NamedTuple):
     moved_after_firing: Annotated[Bools, "B N"]
     """Whether another agent then moved it by one cell to its right, so that its beam begins one cell to its
     left; only under `agent_1_right_moves_agent_0`, else all false."""
+    cooldown: Annotated[Ints, "B N"]
+    """The number of turns in play in which the agent cannot fire; only under `cooldown_steps`, else all 0."""
     hits: Annotated[Ints, "B N"]
     """Hits since the last tag."""
     tagged_step: Annotated[Ints, "B N"]
@@ -124,6 +126,8 @@ class Scratch(NamedTuple):
     """The row in which each agent began the turn."""
     start_col: Annotated[Ints, "N"]
     """The column in which each agent began the turn."""
+    order: Annotated[Ints, "N"]
+    """A permutation of the agents: the order in which they move, or the rank of each; see `Rules.clashes`."""
     blocked: Annotated[Bools, "N"]
     """Whether the agent's move is being cancelled, or its return to play."""
     words: Annotated[NDArray[np.int64], "words"]

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.maps import Map
-from cprl.commons.near import sites_around
+from cprl.commons.near import growth, sites_around
 from cprl.commons.rules import Rules
 
 
@@ -19,30 +19,30 @@ def sustainable_yield(board: Map, rules: Rules) -> float:
     has two harvested sites with three apples near each: 0.1 apples a turn as run.
     """
     around = sites_around(board, rules)
-    probs = np.array(rules.regrow_prob)
-    most = max(map(len, around))
-    of_count = probs[np.minimum(np.arange(most + 1), len(probs) - 1)]
-    lowest = np.minimum.accumulate(of_count[::-1])[::-1]
-    rate = lowest if rules.regrow_before_bites else lowest / (1 + lowest)
-    return _best(rate, around)
+    of_site, probs = growth(rules, np.array([len(some) for some in around], np.int32))
+    lowest = np.minimum.accumulate(probs[:, ::-1], 1)[:, ::-1]
+    rates = lowest if rules.regrow_before_bites else lowest / (1 + lowest)
+    return _best(np.broadcast_to(rates[of_site], (len(around), rates.shape[1])), around)
 
 
 def _best(rate: NDArray[np.float64], around: list[NDArray[np.int64]]) -> float:
-    """The yield of the harvested sites that a greedy search finds: each added while the sum grows."""
+    """The yield of the harvested sites that a greedy search finds: each added while the sum grows.
+
+    `rate`: [K, counts], what a site bears with so many unharvested sites near it."""
     sites = len(around)
     others = np.array([len(some) for some in around])
     harvested = np.zeros(sites, np.bool_)
 
     def gain(k: int) -> float:
         hurt = around[k][harvested[around[k]]]
-        return float(rate[others[k]] - (rate[others[hurt]] - rate[others[hurt] - 1]).sum())
+        return float(rate[k, others[k]] - (rate[hurt, others[hurt]] - rate[hurt, others[hurt] - 1]).sum())
 
     gains = np.array([gain(k) for k in range(sites)])
     while True:
         gains[harvested] = 0
         k = int(gains.argmax())
         if gains[k] <= 1e-12:
-            return float(rate[others[harvested]].sum())
+            return float(rate[harvested, others[harvested]].sum())
         harvested[k] = True
         others[around[k]] -= 1
         again = {k, *around[k].tolist(), *(int(j) for i in around[k] for j in around[i])}

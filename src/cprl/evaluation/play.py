@@ -225,9 +225,6 @@ def board_text(session: Session) -> Text:
     return text
 
 
-_LARGEST_DRAWING_BYTES: Final = 10_000_000
-
-
 def board_named(
     board: str, variant: Variant = "published", *, allow: Sequence[str] = ()
 ) -> tuple[Game, LoadedRun | None]:
@@ -239,7 +236,7 @@ def board_named(
     """
     checked("variant", variant, Variant)
     check_board(board)
-    if board in presets.BOARDS:
+    if board in presets.names():
         return presets.game(board, variant=variant), None
     if variant != "published":
         raise refusal("variant", variant, f'"published" with {board}, which names no preset')
@@ -247,12 +244,7 @@ def board_named(
     if path.is_dir():
         run = load(path, allow=allow)
         return commons_game(run), run
-    if path.stat().st_size > _LARGEST_DRAWING_BYTES:
-        raise ValueError(f"{path} has more than {_LARGEST_DRAWING_BYTES:,} bytes; allowed: a drawing")
-    try:
-        return Game(map=maps.parse(path.read_text(encoding="utf-8")), rules=Rules()), None
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    return Game(map=maps.read(path), rules=Rules()), None
 
 
 def open_session(

@@ -10,19 +10,33 @@ from cprl.commons.published import Board as Board
 from cprl.commons.published import Variant as Variant
 from cprl.commons.published import check_variant
 from cprl.commons.published import game as game
+from cprl.commons.published import names as names
 
 if TYPE_CHECKING:
     from cprl.envs.gymnasium_env import CommonsGymnasiumEnv
+    from cprl.envs.pettingzoo_env import CommonsParallelEnv
     from cprl.learners.settings import DQNSettings
 
 
 def gymnasium_env(
-    board: Board, *, variant: Variant = "published", seed: int | None = None, render_mode: str | None = None
+    board: str, *, variant: Variant = "published", seed: int | None = None, render_mode: str | None = None
 ) -> "CommonsGymnasiumEnv":
-    """A published board for one agent as a Gymnasium environment, for `gymnasium.make`."""
+    """A game for its first agent alone as a Gymnasium environment, for `gymnasium.make`."""
+    from cprl.commons.maps import with_agents
     from cprl.envs.gymnasium_env import CommonsGymnasiumEnv
 
-    return CommonsGymnasiumEnv(game(board, variant=variant), seed=seed, render_mode=render_mode)
+    played = game(board, variant=variant)
+    alone = replace(played, map=with_agents(played.map, 1))
+    return CommonsGymnasiumEnv(alone, seed=seed, render_mode=render_mode)
+
+
+def pettingzoo_env(
+    board: str, *, variant: Variant = "published", seed: int | None = None, render_mode: str | None = None
+) -> "CommonsParallelEnv":
+    """A game as a PettingZoo environment, for `pettingzoo.make`."""
+    from cprl.envs.pettingzoo_env import CommonsParallelEnv
+
+    return CommonsParallelEnv(game(board, variant=variant), seed=seed, render_mode=render_mode)
 
 
 def dqn_settings(board: Board, *, variant: Variant = "published") -> "DQNSettings":

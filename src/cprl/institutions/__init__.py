@@ -17,6 +17,7 @@ at which it acts, see `cprl.institutions.law`. In reading order:
     monitoring  Monitoring: whether violations are detected, and what that costs
     sanctions   GraduatedSanctions
     mediation   Mediation of tags
+    punishment  Punishment: fines that cost the one who fines
     sanctioner  Sanctioner: who may fire
     law         all of them together, compiled by `cprl.commons` for every target
 """
@@ -28,6 +29,7 @@ from cprl.institutions import (
     mediation,
     monitoring,
     patches,
+    punishment,
     quotas,
     rotation,
     sanctioner,
@@ -43,6 +45,7 @@ from cprl.institutions.ledger import COUNTS, Entries, Ledger, Payments
 from cprl.institutions.mediation import Mediation
 from cprl.institutions.monitoring import Monitoring
 from cprl.institutions.patches import ClosedPatches
+from cprl.institutions.punishment import Punishment
 from cprl.institutions.quotas import Quota
 from cprl.institutions.rotation import Rotation
 from cprl.institutions.sanctioner import Sanctioner
@@ -71,6 +74,7 @@ class Law(NamedTuple):
     votes: votes.Arrays
     sanctions: sanctions.Arrays
     mediation: mediation.Arrays
+    punishment: punishment.Arrays
     sanctioner: sanctioner.Arrays
 
 
@@ -85,6 +89,7 @@ __all__ = [
     "Levies",
     "Mediation",
     "Monitoring",
+    "Punishment",
     "Quota",
     "Rotation",
     "Sanctioner",

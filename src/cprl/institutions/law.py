@@ -16,9 +16,9 @@ the `Ledger`, and:
     forbids      i, cell, site: whether agent i sees that a bite there breaks a rule about places
 
 Rules are called one by one in the order of `MODULES`, so sums of fines do not depend on the order of
-institutions in a game. What a tag costs and who is detected is asked of `sanctions`, `mediation` and
-`monitoring` by the turn itself. Kinds that a game lacks have arrays of length 0, so that no combination
-compiles anything.
+institutions in a game. What a tag costs and who is detected is asked of `sanctions`, `mediation`,
+`punishment` and `monitoring` by the turn itself. Kinds that a game lacks have arrays of length 0, so that no
+combination compiles anything.
 """
 
 from importlib import import_module

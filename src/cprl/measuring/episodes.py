@@ -486,7 +486,7 @@ def yield_of_game(game: Game) -> dict[str, float]:
     """Return the sustainable yield of a game, in apples a turn, and its first stock."""
     return {
         "sustainable_yield": sustainable_yield(game.map, game.rules),
-        "first_stock": float(len(game.map.sites)),
+        "first_stock": float(game.tables.first_stock),
     }
 
 

@@ -13,7 +13,8 @@ They see what a learning agent sees: their observation window.
 
 - "Near" means within `Rules.regrow_radius_cells`, measured by `Rules.regrow_norm`. "In sight" means in the
   window and reachable in it, around walls and other agents.
-- Agents walk forward and sideways, never backward, where they cannot see. Of equally near apples they take
+- Agents walk forward and sideways, never backward, where most cannot see: they do not read
+  `Rules.window_rows_behind`. Of equally near apples they take
   the first in reading order of the window.
 - A wandering agent walks forward with probability 0.9 if the cell ahead is free; otherwise it turns left or
   right with equal probability.
@@ -94,10 +95,15 @@ class ScriptedActor(ActorOfLanes):
                 f"Observation.area is {game.observation.area!r}; allowed with scripted policies: 'window', "
                 "because they rely on the agent's position in it"
             )
+        if game.rules.harvest_action:
+            raise ValueError(
+                "Rules.harvest_action is True; allowed with scripted policies but 'random': False, because "
+                "no window shows what is under an agent"
+            )
         self.policy, self.game, self.epsilon = policy, game, 0.0
         self._settings, self._role_of_class = _settings(game, spare), _roles()
         self._rim, self._frame = _frame(game)
-        size = self._frame.stride * (game.observation_shape[1] + 2 * self._rim)
+        size = self._frame.stride * (game.rules.window_rows + 2 * self._rim)
         self._scratch = Scratch(*np.zeros((2, size), np.bool_), *np.zeros((3, size), np.int32))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -121,7 +127,8 @@ class ScriptedActor(ActorOfLanes):
 
     def _framed(self, observation: Bytes) -> Bytes:
         """The roles of the cells each agent sees, in a frame of wall: uint8 [replicas x k x S, cells]."""
-        seen, rim = classes_seen(self.game, observation), self._rim
+        ahead = observation[..., : self.game.rules.window_rows, :]
+        seen, rim = classes_seen(self.game, ahead), self._rim
         count, (rows, columns) = seen.shape[0] * seen.shape[1], seen.shape[2:]
         roles = np.full((count, rows + 2 * rim, columns + 2 * rim), WALL, np.uint8)
         roles[:, rim:-rim, rim:-rim] = self._role_of_class[seen].reshape(count, rows, columns)
@@ -167,7 +174,7 @@ def _settings(game: Game, spare: int) -> Settings:
 
 def _frame(game: Game) -> tuple[int, Frame]:
     """The width of the frame on each side, and its layout."""
-    rules, (_, rows, columns) = game.rules, game.observation_shape
+    rules, rows, columns = game.rules, game.rules.window_rows, game.rules.window_columns
     reach = min(int(rules.regrow_radius_cells), max(rows, columns))
     rim, around = max(1, reach), range(-reach, reach + 1)
     stride = columns + 2 * rim

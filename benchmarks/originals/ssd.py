@@ -1,0 +1,135 @@
+"""Random play of sequential_social_dilemma_games' harvest and cleanup, for docs/games.md.
+
+    PYTHONPATH=path/to/its/source python benchmarks/originals/ssd.py harvest --out ssd.json
+
+It needs numpy and that program's source alone, which draws from numpy's global generator: of Ray, Gym and
+Matplotlib, which the source imports, random play uses nothing, so stand-ins take their places. Each of the
+five agents draws one of the actions in every step. With `--trace` it writes 200 steps with growth by no
+chance for `tests/test_games.py`.
+"""
+
+import argparse
+import importlib
+import json
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
+
+import numpy as np
+
+AGENTS, STEPS = 5, 1000
+
+
+class _Base:
+    """A base class that does nothing."""
+
+
+for name in ("matplotlib", "matplotlib.pyplot", "gym", "gym.spaces", "gym.utils", "ray", "ray.rllib"):
+    sys.modules[name] = MagicMock()
+for name, kind in (("ray.rllib.agents.callbacks", "DefaultCallbacks"), ("ray.rllib.env", "MultiAgentEnv")):
+    sys.modules[name] = type(sys)(name)
+    setattr(sys.modules[name], kind, _Base)
+sys.modules["gym.spaces"].Discrete = _Base
+
+
+def environment(name: str, agents: int = AGENTS) -> Any:
+    module = importlib.import_module(f"social_dilemmas.envs.{name}")
+    return getattr(module, f"{name.title()}Env")(num_agents=agents)
+
+
+def hits(env: Any) -> set[str]:
+    """The agents that a fining beam of the last step covers."""
+    covered = {(row, col) for row, col, sign in env.beam_pos if sign == b"F"}
+    return {name for name, agent in env.agents.items() if tuple(agent.pos) in covered}
+
+
+def episodes(name: str, count: int, seed: int) -> Iterator[dict[str, float]]:
+    np.random.seed(seed)  # noqa: NPY002
+    rng = np.random.default_rng(seed)
+    env = environment(name)
+    actions = 8 if name == "harvest" else 9
+    for _ in range(count):
+        env.reset()
+        first = int((env.world_map == b"A").sum())
+        harvest = reward = tags = waste = 0
+        for _ in range(STEPS):
+            drawn = {agent: int(rng.integers(actions)) for agent in env.agents}
+            before = env.world_map == b"A"
+            _, rewards, _, _ = env.step(drawn)
+            harvest += sum(bool(before[tuple(agent.pos)]) for agent in env.agents.values())
+            reward += sum(rewards.values())
+            tags += len(hits(env))
+            waste += int((env.world_map == b"H").sum())
+        left = int((env.world_map == b"A").sum())
+        yield {
+            "harvest": harvest,
+            "regrown": harvest + left - first,
+            "tags": tags,
+            "steps": STEPS,
+            "reward": float(reward),
+            **({"waste": waste / STEPS} if name == "cleanup" else {}),
+        }
+
+
+OURS = {2: 0, 3: 1, 0: 2, 1: 3, 6: 4, 5: 5, 7: 6, 4: 7}
+"""The action of cprl for each of that program's."""
+HEADINGS = {"UP": 0, "RIGHT": 1, "DOWN": 2, "LEFT": 3}
+
+
+def trace(seed: int, *, steps: int = 200, growth: bool) -> dict[str, list[Any]]:
+    """Random play of harvest in which an apple grows wherever it can, or never: states, actions, rewards, and
+    the turns in which agents may be in each other's way."""
+    np.random.seed(seed)  # noqa: NPY002
+    rng = np.random.default_rng(seed)
+    env = environment("harvest")
+    sys.modules["social_dilemmas.envs.harvest"].rand = lambda count: np.full(count, 0.0 if growth else 1.0)
+    env.reset()
+    agents = list(env.agents.values())
+
+    held: dict[str, list[Any]] = defaultdict(list)
+
+    def hold() -> None:
+        held["row"].append([int(agent.pos[0]) for agent in agents])
+        held["col"].append([int(agent.pos[1]) for agent in agents])
+        held["heading"].append([HEADINGS[agent.get_orientation()] for agent in agents])
+        held["apples"].append(env.world_map == b"A")
+
+    hold()
+    for _ in range(steps):
+        actions = rng.choice(8, size=AGENTS, p=(0.1, 0.1, 0.3, 0.1, 0.05, 0.1, 0.1, 0.15))
+        before = [tuple(agent.pos) for agent in agents]
+        wanted = [
+            tuple(agent.return_valid_pos(agent.pos + env.rotate_action(move, agent.get_orientation())))
+            if len(np.shape(move := env.all_actions[agent.action_map(action)])) == 1
+            else tuple(agent.pos)
+            for agent, action in zip(agents, actions, strict=True)
+        ]
+        _, rewards, _, _ = env.step(dict(zip(env.agents, map(int, actions), strict=True)))
+        held["actions"].append([OURS[int(action)] for action in actions])
+        held["is_contested"].append(
+            len({*wanted}) < AGENTS
+            or any(cell != own and cell in before for cell, own in zip(wanted, before, strict=True))
+        )
+        held["reward"].append([rewards[name] for name in env.agents])
+        hold()
+    return held
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("name", choices=("harvest", "cleanup"))
+    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--trace", choices=("growth", "none"))
+    parser.add_argument("--out", type=Path, required=True)
+    words = parser.parse_args()
+    if words.trace:
+        np.savez_compressed(words.out, **trace(words.seed, growth=words.trace == "growth"))
+        sys.exit()
+    rows = list(episodes(words.name, words.episodes, words.seed))
+    table = {measure: [row[measure] for row in rows] for measure in rows[0]}
+    words.out.write_text(json.dumps(table) + "\n")
+    print({measure: float(np.mean(values).round(2)) for measure, values in table.items()})

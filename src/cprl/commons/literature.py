@@ -1,0 +1,252 @@
+"""Commons of the literature as games, each with its source; `docs/games.md` has what differs from them.
+
+An id never changes its meaning: other rules are another version. Layouts and numbers are facts of their
+sources, the rules that play them are ours.
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+if TYPE_CHECKING:
+    from cprl.commons.game import Game
+    from cprl.commons.maps import Entrances
+
+_OPEN: Final = """
+WWWWWWWWWWWWWWWWWWWWWWWW
+WAAA    A      A    AAAW
+WAA    AAA    AAA    AAW
+WA    AAAAA  AAAAA    AW
+W      AAA    AAA      W
+W       A      A       W
+W  A                A  W
+W AAA  Q        Q  AAA W
+WAAAAA            AAAAAW
+W AAA              AAA W
+W  A                A  W
+W                      W
+W                      W
+W                      W
+W  PPPPPPPPPPPPPPPPPP  W
+W PPPPPPPPPPPPPPPPPPPP W
+WPPPPPPPPPPPPPPPPPPPPPPW
+WWWWWWWWWWWWWWWWWWWWWWWW
+"""
+_CLOSED: Final = """
+WWWWWWWWWWWWWWWWWWWWWWWW
+WAAA    A  WW  A    AAAW
+WAA    AAA WW AAA    AAW
+WA    AAAAAWWAAAAA    AW
+W      AAA WW AAA      W
+W       A  WW  A       W
+W  A       WW       A  W
+W AAA  Q   WW   Q  AAA W
+WAAAAA     WW     AAAAAW
+W AAA  WWWWWWWWWW  AAA W
+W  A       WW       A  W
+WWWWWWWWWW WW WWWWWWWWWW
+W          WW          W
+W  WWWWWWWWWWWWWWWWWW  W
+W  PPPPPPPPPPPPPPPPPP  W
+W PPPPPPPPPPPPPPPPPPPP W
+WPPPPPPPPPPPPPPPPPPPPPPW
+WWWWWWWWWWWWWWWWWWWWWWWW
+"""
+_PARTNERSHIP: Final = """
+WWWWWWWWWWWWWWWWWWWWWWWW
+WAAA    A  II  A    AAAW
+WAA    AAA II AAA    AAW
+WA    AAAAAIIAAAAA    AW
+W      AAA II AAA      W
+W       A  II  A       W
+W  A       II       A  W
+W AAA  Q   WW   Q  AAA W
+WAAAAA     II     AAAAAW
+W AAA  WWWWWWWWWW  AAA W
+W  A       WW       A  W
+WWWWWWWWWW WW WWWWWWWWWW
+W          WW          W
+W  WWWWWWWWWWWWWWWWWW  W
+W  PPPPPPPPPPPPPPPPPP  W
+W PPPPPPPPPPPPPPPPPPPP W
+WPPPPPPPPPPPPPPPPPPPPPPW
+WWWWWWWWWWWWWWWWWWWWWWWW
+"""
+_HARVEST: Final = """
+@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@
+@ P   P      A    P AAAAA    P  A P  @
+@  P     A P AA    P    AAA    A  A  @
+@     A AAA  AAA    A    A AA AAAA   @
+@ A  AAA A    A  A AAA  A  A   A A   @
+@AAA  A A    A  AAA A  AAA        A P@
+@ A A  AAA  AAA  A A    A AA   AA AA @
+@  A A  AAA    A A  AAA    AAA  A    @
+@   AAA  A      AAA  A    AAAA       @
+@ P  A       A  A AAA    A  A      P @
+@A  AAA  A  A  AAA A    AAAA     P   @
+@    A A   AAA  A A      A AA   A  P @
+@     AAA   A A  AAA      AA   AAA P @
+@ A    A     AAA  A  P          A    @
+@       P     A         P  P P     P @
+@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@
+"""
+
+_MELTING_POT: Final[dict[str, Any]] = {
+    "regrow_prob": (0.0, 0.001, 0.005, 0.025),
+    "regrow_before_bites": True,
+    "beam_length_cells": 4,
+    "beam_tapers": True,
+    "beam_from_beside": True,
+    "beam_stops_at_agents": True,
+    "cooldown_steps": 1,
+    "freeze_steps": 101,
+    "respawn_at_spawns": True,
+    "random_headings": True,
+    "clashes": "in_turn",
+    "window_rows": 10,
+    "window_rows_behind": 1,
+    "window_columns": 11,
+    "episode_steps": 5000,
+    "end_prob": 0.15,
+    "end_from_step": 1099,
+    "end_every_steps": 100,
+    "plays_on_when_empty": True,
+}
+_OPEN_RULES: Final[dict[str, Any]] = _MELTING_POT | {
+    "regrow_prob": (0.0, 0.0025, 0.005, 0.025),
+    "beam_length_cells": 3,
+    "cooldown_steps": 2,
+    "freeze_steps": 5,
+}
+_SSD: Final[dict[str, Any]] = {
+    "regrow_prob": (0.0, 0.005, 0.02, 0.05),
+    "regrow_radius_cells": 1.5,
+    "regrow_under_agents": False,
+    "regrow_after_bites": True,
+    "beam_tapers": True,
+    "beam_from_beside": True,
+    "beam_stops_at_agents": True,
+    "freeze_steps": 0,
+    "random_headings": True,
+    "clashes": "one_moves",
+    "window_rows": 8,
+    "window_rows_behind": 7,
+    "window_columns": 15,
+    "plays_on_when_empty": True,
+}
+_SOCIALJAX: Final[dict[str, Any]] = {
+    "regrow_prob": (0.0, 0.001, 0.005, 0.025),
+    "regrow_under_agents": False,
+    "regrow_before_bites": True,
+    "beam_length_cells": 2,
+    "beam_tapers": True,
+    "freeze_steps": 0,
+    "respawn_at_spawns": True,
+    "random_headings": True,
+    "clashes": "one_moves",
+    "window_rows": 10,
+    "window_rows_behind": 1,
+    "window_columns": 11,
+    "plays_on_when_empty": True,
+}
+_PEROLAT: Final[dict[str, Any]] = {
+    "regrow_prob": (0.0, 0.01, 0.01, 0.05, 0.05, 0.1),
+    "beam_length_cells": 10,
+    "beam_width_cells": 5,
+    "window_rows": 20,
+    "window_columns": 21,
+}
+_JANSSEN: Final[dict[str, Any]] = {
+    "regrow_prob": (0.0, 0.01),
+    "regrow_by": "share",
+    "regrow_radius_cells": 1,
+    "regrow_norm": "chebyshev",
+    "first_stock_share": 0.25,
+    "harvest_action": True,
+    "freeze_steps": 0,
+    "beam_length_cells": 29,
+    "beam_width_cells": 1,
+    "episode_steps": 240,
+}
+
+
+class Source(NamedTuple):
+    """What a game of the literature is after."""
+
+    work: str
+    """Authors, title and year, or the name of a program with its version and file."""
+    url: str
+    rules: Mapping[str, Any]
+    """What differs from the defaults of `Rules`."""
+
+
+_MP, _MP_URL = "Melting Pot 2.4, commons_harvest__{}", "https://github.com/google-deepmind/meltingpot"
+_PEROLAT_WORK = (
+    "J. Perolat et al., A multi-agent reinforcement learning model of common-pool resource appropriation, "
+    "NeurIPS 2017"
+)
+_PEROLAT_URL = "https://arxiv.org/abs/1707.06600"
+_ENTRANCES: "Final[dict[str, Entrances]]" = {
+    "rooms": "single",
+    "rooms_many_entrances": "multiple",
+    "rooms_unequal": "unequal",
+    "rooms_without_walls": "none",
+}
+
+SOURCES: Final[dict[str, Source]] = {
+    "melting_pot/commons_harvest__open-v1": Source(_MP.format("open"), _MP_URL, _OPEN_RULES),
+    "melting_pot/commons_harvest__closed-v1": Source(_MP.format("closed"), _MP_URL, _MELTING_POT),
+    "melting_pot/commons_harvest__partnership-v1": Source(_MP.format("partnership"), _MP_URL, _MELTING_POT),
+    "ssd/harvest-v1": Source(
+        "sequential_social_dilemma_games, HarvestEnv",
+        "https://github.com/eugenevinitsky/sequential_social_dilemma_games",
+        _SSD,
+    ),
+    "socialjax/harvest_open-v1": Source(
+        "SocialJax, harvest_open", "https://github.com/cooperativex/SocialJax", _SOCIALJAX
+    ),
+    **{f"perolat/{name}-v1": Source(_PEROLAT_WORK, _PEROLAT_URL, _PEROLAT) for name in ("open", *_ENTRANCES)},
+    "janssen/foraging-v1": Source(
+        "M. A. Janssen, R. Holahan, A. Lee and E. Ostrom, Lab experiments for the study of social-ecological "
+        "systems, Science 328, 2010",
+        "https://doi.org/10.1126/science.1183532",
+        _JANSSEN,
+    ),
+}
+"""Every game by its id."""
+
+
+def game(name: str) -> "Game":
+    """Return a game of the literature, by one of the ids of `SOURCES`."""
+    from cprl.commons import maps
+    from cprl.commons.game import Game
+    from cprl.commons.observation import Observation
+    from cprl.commons.rules import Rules
+    from cprl.commons.world import UP
+    from cprl.institutions import Punishment
+
+    family, _, version = name.partition("/")
+    called = version.rpartition("-v")[0]
+    rules = Rules(**SOURCES[name].rules)
+    if family == "melting_pot":
+        drawing = {"open": _OPEN, "closed": _CLOSED, "partnership": _PARTNERSHIP}[called.rpartition("__")[2]]
+        return Game(map=maps.parse(drawing, legend="melting_pot", agents=7), rules=rules)
+    if family == "socialjax":
+        lines = [line[1:-1] for line in _OPEN.strip("\n").splitlines()[1:-1]]
+        return Game(map=maps.parse("\n".join(lines), legend="socialjax", agents=7), rules=rules)
+    if family == "ssd":
+        fines = Punishment(fine=50.0, cost=0.0, shot_cost=1.0)
+        return Game(map=maps.parse(_HARVEST, legend="ssd", agents=5), rules=rules, institutions=(fines,))
+    if family == "perolat":
+        if called == "open":
+            board = maps.random(20, 40, agents=12, density=246 / 800, clustering=0.8, seed=1)
+        else:
+            board = maps.rooms(_ENTRANCES[called])
+        return Game(map=board, rules=rules)
+    cells = tuple((row, col) for row in range(29) for col in range(29))
+    starts = tuple((14, 4 + 5 * agent, UP) for agent in range(5))
+    return Game(
+        map=maps.Map(height=29, width=29, sites=cells, starts=starts),
+        rules=rules,
+        observation=Observation(area="full"),
+        institutions=(Punishment(fine=2.0, cost=1.0),),
+    )

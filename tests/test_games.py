@@ -1,0 +1,370 @@
+"""Games of the literature: their traces, rules of their own, and the table of random play in the docs."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pettingzoo
+import pytest
+from boards import Play, random_actions
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_worlds import check_apples, check_no_beam_passes_a_wall, check_places, check_worlds_are_independent
+from test_worlds import games as plain_games
+
+from cprl import Game, Rules, maps, presets
+from cprl.commons.batch import Batch, turn_of
+from cprl.commons.literature import SOURCES
+from cprl.commons.near import growth
+from cprl.institutions import Punishment
+from cprl.values import from_config, to_config
+
+TRACES = sorted((Path(__file__).parent / "traces" / "games").glob("*.npz"))
+GAMES = {
+    "ssd_harvest": "ssd/harvest-v1",
+    "socialjax_harvest": "socialjax/harvest_open-v1",
+    "melting_pot_open": "melting_pot/commons_harvest__open-v1",
+    "melting_pot_closed": "melting_pot/commons_harvest__closed-v1",
+}
+
+
+@pytest.mark.parametrize("path", TRACES, ids=lambda path: path.stem)
+def test_a_game_plays_the_trace_of_its_original(path):
+    """Growth is certain, or there is none; agents that were in each other's way are put where they went."""
+    trace = np.load(path)
+    name, _, growth = path.stem.rpartition("_")
+    game = presets.game(GAMES[name])
+    probs = (0.0, 1.0) if growth == "growth" else (0.0,)
+    game = replace(game, rules=replace(game.rules, regrow_prob=probs))
+    batch = Batch(game, 1)
+    output = batch.begin(batch.new_output())
+    sites = tuple(np.array(game.map.sites).T)
+
+    hidden = trace["hidden"] if "hidden" in trace else np.zeros_like(trace["apples"])
+
+    def put(turn, agents=slice(None)):
+        """Puts agents where they are in the trace."""
+        state = batch.state()
+        for entry in ("row", "col", "heading"):
+            state[entry][0, agents] = trace[entry][turn, agents]
+        batch.load(state, output)
+
+    put(0)
+    for turn, actions in enumerate(trace["actions"]):
+        before = batch.state()
+        played = batch.play(actions[None].astype(np.int64), output)
+        harvest = turn_of(played).harvest[0].copy()
+        reward = harvest if turn_of(played) is played else played.payments.reward[0].copy()
+        tagged = turn_of(played).tagged_by[0].copy()
+        state = batch.state()
+        returned = state["in_play"][0] & ~before["in_play"][0]
+        if game.rules.respawn_at_spawns:
+            returned |= tagged.any(1) & state["in_play"][0]
+        if trace["is_contested"][turn]:
+            returned = state["in_play"][0]
+        put(turn + 1, returned)
+        state, in_play = batch.state(), batch.state()["in_play"][0]
+        if not trace["is_contested"][turn]:
+            for entry in ("row", "col", "heading"):
+                assert state[entry][0, in_play].tolist() == trace[entry][turn + 1, in_play].tolist(), turn
+            assert reward.tolist() == trace["reward"][turn].tolist(), turn
+            if "tagged_by" in trace:
+                assert tagged.tolist() == trace["tagged_by"][turn].tolist(), turn
+        shown = ~hidden[turn + 1][sites]
+        assert state["stock"][0][shown].tolist() == trace["apples"][turn + 1][sites][shown].tolist(), turn
+    assert trace["is_contested"].mean() < 0.25
+
+
+@st.composite
+def games(draw):
+    """Small crowded boards with spawn places, under any of the rules of the literature."""
+    game = draw(plain_games(beam_width_cells=3))
+    board, rules = game.map, game.rules
+    taken = {*board.sites, *board.walls, *((row, col) for row, col, _ in board.starts)}
+    cells = [(r, c) for r in range(board.height) for c in range(board.width) if (r, c) not in taken]
+    begun = [(row, col) for row, col, _ in board.starts]
+    spawns = tuple(cells + begun[: draw(st.integers(0, len(begun)))])
+    switches = ("regrow_under_agents", "beam_tapers", "beam_from_beside", "beam_stops_at_agents")
+    switches += ("plays_on_when_empty", "random_headings", "harvest_action", "shuffle_starts")
+    changes = {name: draw(st.booleans()) for name in switches}
+    growth_time = draw(st.sampled_from(["regrow_after_bites", "regrow_before_bites", None]))
+    if growth_time:
+        changes[growth_time] = True
+    rules = replace(
+        rules,
+        **changes,
+        regrow_prob=draw(st.sampled_from([(0.1, 0.4), (0.0, 0.3, 0.9)])),
+        regrow_by=draw(st.sampled_from(["count", "share", "share_with_own"])),
+        first_stock_share=draw(st.sampled_from([1.0, 0.5])) if len(board.sites) > 1 else 1.0,
+        cooldown_steps=draw(st.integers(0, 3)),
+        respawn_at_spawns=bool(spawns) and draw(st.booleans()),
+        clashes=draw(st.sampled_from(["all_back", "one_moves", "in_turn"])),
+        end_prob=draw(st.sampled_from([0.0, 0.1])),
+    )
+    return replace(game, map=replace(board, spawns=spawns), rules=rules)
+
+
+@settings(max_examples=80, deadline=None)
+@given(games(), st.integers(0, 2**32))
+def test_the_invariants_hold_under_the_rules_of_the_literature(game, seed):
+    check_places(game, seed)
+    check_apples(game, seed)
+    check_no_beam_passes_a_wall(game, seed)
+
+
+@settings(max_examples=20, deadline=None)
+@given(games(), st.integers(0, 2**32))
+def test_a_state_under_these_rules_determines_the_future(game, seed):
+    batch, actions = Batch(game, 3, seed=seed), random_actions(30, 3, game, seed=seed)
+    output = batch.begin(batch.new_output())
+    for chosen in actions[:10]:
+        batch.play(chosen, output)
+    other = Batch(game, 3)
+    again = other.load(batch.state(), other.new_output())
+    for chosen in actions[10:]:
+        one, two = batch.play(chosen, output), other.play(chosen, again)
+        for name, array in batch.state().items():
+            assert np.array_equal(array, other.state()[name]), name
+        for name, array in turn_of(one)._asdict().items():
+            assert np.array_equal(array, getattr(turn_of(two), name)), name
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_a_game_of_the_literature_is_made_everywhere_by_its_id(name):
+    game = presets.game(name)
+    assert presets.game(name) == game
+    assert name in presets.names()
+    assert from_config(to_config(game)) == game
+    parallel = pettingzoo.make("parallel", name)
+    parallel.reset(seed=1)
+    assert len(parallel.agents) == game.agents
+    alone = gymnasium.make(name).unwrapped
+    assert alone.game.agents == 1
+    assert alone.game.rules == game.rules
+    check_worlds_are_independent(game, 3)
+
+
+def test_other_names_and_variants_are_refused():
+    with pytest.raises(ValueError, match=r"board is 'harvest'.*ssd/harvest-v1"):
+        presets.game("harvest")
+    with pytest.raises(ValueError, match="variant is 'as_run'"):
+        presets.game("ssd/harvest-v1", variant="as_run")
+
+
+# One rule at a time
+
+
+def test_no_apple_grows_under_an_agent():
+    play = Play(">AA", regrow_prob=(1.0,), regrow_under_agents=False).turn("forward")
+    assert (play.harvest, play.output.regrown[0, 0]) == ([1], 0)
+    play.turn("stay")
+    assert (play.harvest, play.output.stock[0, 0]) == ([0], 1)
+    play.turn("forward")  # onto the other site, so that the first one is free
+    assert (play.board, play.output.stock[0, 0]) == (".A>", 1)
+
+
+def test_growth_counts_the_stock_after_the_bites():
+    one = Play(">A.A<", regrow_prob=(0.0, 1.0), regrow_after_bites=True).turn("forward", "stay")
+    assert one.output.regrown[0, 0] == 1  # the apple that is left makes the bitten one grow in the same turn
+    assert Play(">A.A<", regrow_prob=(0.0, 1.0)).turn("forward", "stay").output.regrown[0, 0] == 0
+
+
+@pytest.mark.parametrize(
+    ("by", "rows"),
+    [
+        ("count", [[0.0, 0.2, 0.6]]),
+        ("share", [[0.0, 0.6, 0.6], [0.0, 0.2, 0.6]]),  # of one site near it, of two
+        ("share_with_own", [[0.0, 0.2, 0.6], [0.0, 0.4 / 3, 0.2 + 0.4 / 3]]),
+    ],
+)
+def test_growth_by_count_and_by_share(by, rows):
+    rules = Rules(regrow_prob=(0.0, 0.2, 0.6), regrow_by=by)
+    of_site, probs = growth(rules, np.array([1, 2, 1]))
+    assert np.allclose(probs, rows)
+    assert of_site.tolist() == ([0] if by == "count" else [0, 1, 0])
+
+
+def test_sites_grow_as_often_as_the_share_of_full_sites_near_them_says():
+    """The corner has two sites near it, one with an apple; the middle one has four, one with an apple."""
+    board = maps.parse("AAA.\nAAA.\nAAA>")
+    rules = Rules(regrow_prob=(0.0, 0.8), regrow_by="share", regrow_radius_cells=1)
+    batch = Batch(Game(map=board, rules=rules), 4000)
+    output = batch.begin(batch.new_output())
+    state = batch.state()
+    state["stock"][:] = 0
+    state["stock"][:, 1] = 1
+    batch.load(state, output)
+    batch.play(np.full((4000, 1), 7), output)
+    grown = batch.state()["stock"].mean(0)
+    assert grown[[0, 4]] == pytest.approx([0.4, 0.2], abs=0.03)
+    assert grown[[3, 8]].tolist() == [0, 0]
+
+
+def test_an_episode_begins_with_a_share_of_the_apples_drawn_anew_each_time():
+    game = Game(map=maps.named("commons"), rules=Rules(first_stock_share=0.25))
+    batch = Batch(game, 2000)
+    output = batch.begin(batch.new_output())
+    sites = len(game.map.sites)
+    first = batch.state()["stock"]
+    assert (first.sum(1) == round(sites / 4)).all()
+    assert np.abs(first.mean(0) - 0.25).max() < 0.06
+    batch.begin(output)
+    assert (first != batch.state()["stock"]).any(1).all()
+
+
+def test_harvest_is_an_action_of_its_own():
+    play = Play(">AA", harvest_action=True).turn("forward")
+    assert play.game.actions[-2:] == ("stay", "harvest")
+    assert (play.harvest, play.turn("stay").harvest, play.turn("harvest").harvest) == ([0], [0], [1])
+    assert Play(">AA", harvest_action=True, may_fire=False).game.actions[-2:] == ("stay", "harvest")
+
+
+def test_beams_taper_begin_beside_the_agent_and_stop_at_agents():
+    """Four agents look up; only the last one fires. In its column two stand one behind the other."""
+    board = ".^..A\n.....\n.^...\n^....\n.^..."
+    hits = {}
+    for name in ("", "beam_tapers", "beam_from_beside", "beam_stops_at_agents"):
+        rules = {name: True} if name else {}
+        play = Play(board, beam_length_cells=4, **rules).turn("stay", "stay", "stay", "beam")
+        hits[name] = play.output.hit_by[0, :, 3].tolist()
+    assert hits[""] == [True, True, True, False]
+    assert hits["beam_stops_at_agents"] == [False, True, True, False]
+    beside = Play("A.A\n^^.", beam_from_beside=True).turn("stay", "beam")
+    assert beside.output.hit_by[0, 0].tolist() == [False, True]
+    assert not Play("A.A\n^^.").turn("stay", "beam").output.hit_by.any()
+    short = Play("^..\n...\n.^A", beam_length_cells=2, beam_tapers=True).turn("stay", "beam")
+    assert not short.output.hit_by.any()
+    assert Play("^..\n...\n.^A", beam_length_cells=2).turn("stay", "beam").output.hit_by.any()
+
+
+def test_an_agent_cannot_fire_again_before_it_has_cooled_down():
+    play = Play("A>", cooldown_steps=2)
+    assert [bool(play.turn("beam").output.fired[0, 0]) for _ in range(7)] == [True, False, False] * 2 + [True]
+
+
+def test_agents_begin_at_spawn_places_and_return_to_them():
+    board = maps.parse("PPPPP\n.....\nA>A..", agents=4)
+    assert (board.agents, board.starts[1:]) == (4, ((0, 0, maps.UP), (0, 1, maps.UP), (0, 2, maps.UP)))
+    game = Game(map=board, rules=Rules(random_headings=True, respawn_at_spawns=True, freeze_steps=1))
+    batch = Batch(game, 600)
+    output = batch.begin(batch.new_output())
+    state = batch.state()
+    assert (state["row"] == [2, 0, 0, 0]).all()
+    assert (state["col"][:, 0] == 1).all()
+    assert all(len({*row}) == 3 for row in state["col"][:, 1:].tolist())
+    places, headings = (np.bincount(state[name][:, 1:].reshape(-1)) for name in ("col", "heading"))
+    assert np.abs(places / 1800 - 1 / 5).max() < 0.04
+    assert np.abs(headings / 1800 - 1 / 4).max() < 0.04
+    state["row"][:, 0], state["heading"][:, 0] = 1, 0
+    state["col"][:, 0] = state["col"][:, 1]  # right below agent 1
+    batch.load(state, output)
+    batch.play(np.tile([6, 7, 7, 7], (600, 1)), output)
+    assert turn_of(output).tagged_by[:, 1, 0].all()
+    batch.play(np.full((600, 4), 7), output)
+    after = batch.state()
+    assert after["in_play"].all()
+    free = {*range(5)} - {*state["col"][0, 1:].tolist()} | {int(state["col"][0, 1])}
+    assert int(after["col"][0, 1]) in free
+    assert len({*after["col"][:, 1].tolist()}) > 1
+
+
+def test_of_two_agents_that_want_a_cell_one_gets_it_by_lot():
+    gets = {}
+    for clashes in ("all_back", "one_moves", "in_turn"):
+        rules = Rules(clashes=clashes, regrow_prob=(0.0,), may_fire=False)
+        batch = Batch(Game(map=maps.parse(">A<\nA.."), rules=rules), 2000)
+        output = batch.begin(batch.new_output())
+        batch.play(np.zeros((2000, 2), np.int64), output)
+        gets[clashes] = turn_of(output).harvest.mean(0)
+    assert gets["all_back"].tolist() == [0, 0]
+    for clashes in ("one_moves", "in_turn"):
+        assert gets[clashes].sum() == 1
+        assert abs(gets[clashes][0] - 0.5) < 0.05
+
+
+def test_whoever_follows_another_agent_moves_always_or_if_it_comes_later():
+    follows = {}
+    for clashes in ("one_moves", "in_turn"):
+        batch = Batch(Game(map=maps.parse(">>.A"), rules=Rules(clashes=clashes)), 2000)
+        output = batch.begin(batch.new_output())
+        batch.play(np.zeros((2000, 2), np.int64), output)
+        follows[clashes] = (batch.state()["col"][:, 0] == 1).mean()
+    assert follows["one_moves"] == 1
+    assert abs(follows["in_turn"] - 0.5) < 0.05
+
+
+def test_an_episode_ends_by_chance_and_is_truncated():
+    rules = Rules(end_prob=0.25, end_from_step=5, end_every_steps=3, plays_on_when_empty=True)
+    batch = Batch(Game(map=maps.named("single_basic"), rules=rules), 3000)
+    output = batch.begin(batch.new_output())
+    lengths, is_over = np.zeros(3000), np.zeros(3000, np.bool_)
+    while not is_over.all():
+        batch.play(np.full((3000, 1), 4), output)
+        lengths += ~is_over
+        is_over |= turn_of(output).truncated[:, 0]
+    assert {*lengths % 3} == {2}
+    assert lengths.min() == 5
+    assert lengths.mean() == pytest.approx(5 + 3 * 3, abs=0.8)
+
+
+def test_an_empty_board_ends_an_episode_or_not():
+    for plays_on in (False, True):
+        play = Play(">A", plays_on_when_empty=plays_on).turn("forward")
+        assert play.output.terminated[0, 0] != plays_on
+
+
+def test_a_fine_costs_the_one_who_fines():
+    punishment = Punishment(fine=2, cost=1, shot_cost=0.5)
+    play = Play(">.>A\n>.>A", institutions=(punishment,), freeze_steps=0, beam_width_cells=1)
+    assert play.turn("beam", "stay", "stay", "stay").reward == [-1.5, -2, 0, 0]
+    assert play.in_play == [True] * 4
+    assert play.turn("stay", "forward", "stay", "beam").reward == [0, 1, 0, -0.5]
+
+
+@pytest.mark.parametrize(
+    ("rules", "named"),
+    [
+        ({"regrow_after_bites": True, "regrow_before_bites": True}, "regrow_after_bites"),
+        ({"clashes": "in_turn", "pairwise_clashes": True}, "clashes"),
+        ({"first_stock_share": 1.5}, "first_stock_share"),
+        ({"first_stock_share": 0.1}, "first_stock_share"),  # no apple, and none can grow
+        ({"respawn_at_spawns": True}, "respawn_at_spawns"),
+    ],
+)
+def test_rules_that_do_not_go_together_are_refused(rules, named):
+    with pytest.raises(ValueError, match=rf"Rules\.{named} is "):
+        Play(">A", **rules)
+
+
+# Maps
+
+
+def test_drawings_of_others_are_read_by_their_own_legends(tmp_path):
+    board = maps.parse("WWWW\nWA W\nWPQW\nWWWW", legend="melting_pot", agents=2)
+    assert (board.sites, board.spawns) == (((1, 1),), ((2, 1),))
+    assert board.starts == ((2, 2, maps.UP), (2, 1, maps.UP))
+    path = tmp_path / "map.txt"
+    path.write_text("@@@@\n@A @\n@PP@\n@@@@\n")
+    board = maps.read(path, legend="ssd", agents=1)
+    assert (board.agents, len(board.spawns), len(board.walls)) == (1, 2, 12)
+    assert maps.parse("x.o>", legend={"x": "site", ".": "ground", "o": "wall", ">": "left"}).starts[0][2] == 3
+
+
+@pytest.mark.parametrize(
+    ("drawing", "arguments", "message"),
+    [
+        ("@@@\n@?@", {"legend": "ssd"}, "unknown sign '\\?' at row 1, column 1"),
+        ("AP", {}, "agents"),
+        ("AP>", {"agents": 3}, "agents is 3"),
+        ("A>", {"legend": "dm"}, "legend"),
+        ("A>", {"legend": {"A": "apple", ">": "up"}}, "legend\\['A'\\]"),
+    ],
+)
+def test_a_drawing_that_cannot_be_read_is_refused_with_its_place(drawing, arguments, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        maps.parse(drawing, **arguments)
+    path = tmp_path / "map.txt"
+    path.write_text(drawing)
+    with pytest.raises(ValueError, match=message):
+        maps.read(path, **arguments)
