@@ -155,8 +155,8 @@ _PEROLAT: Final[dict[str, Any]] = {
     "window_rows": 20,
     "window_columns": 21,
 }
-_JANSSEN: Final[dict[str, Any]] = {
-    "regrow_prob": (0.0, 0.01),
+_JANSSEN: Final[dict[str, Any]] = {  # a turn is the eighth of a second that a move of a person takes
+    "regrow_prob": (0.0, 0.01 / 8),
     "regrow_by": "share",
     "regrow_radius_cells": 1,
     "regrow_norm": "chebyshev",
@@ -165,7 +165,7 @@ _JANSSEN: Final[dict[str, Any]] = {
     "freeze_steps": 0,
     "beam_length_cells": 29,
     "beam_width_cells": 1,
-    "episode_steps": 240,
+    "episode_steps": 1920,
 }
 
 
