@@ -27,8 +27,11 @@ RGB_SIGN = {
     (255, 0, 0): "o",
     (0, 0, 255): "S",
     (0, 0, 0): "?",
+    (70, 120, 170): "~",
+    (113, 75, 24): "H",
+    (100, 255, 255): "c",
 }
-SIGN_OF_NAME = dict(zip(CLASS_NAMES, ".#AmboS?", strict=True))
+SIGN_OF_NAME = dict(zip(CLASS_NAMES, ".#AmboS?~Hc", strict=True))
 
 
 class Play:

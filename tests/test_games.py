@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from test_worlds import check_apples, check_no_beam_passes_a_wall, check_places, check_worlds_are_independent
 from test_worlds import games as plain_games
 
-from cprl import Game, Rules, maps, presets
+from cprl import Game, Observation, Rules, maps, presets
 from cprl.commons.batch import Batch, turn_of
 from cprl.commons.literature import SOURCES
 from cprl.commons.near import growth
@@ -23,6 +23,7 @@ from cprl.values import from_config, to_config
 TRACES = sorted((Path(__file__).parent / "traces" / "games").glob("*.npz"))
 GAMES = {
     "ssd_harvest": "ssd/harvest-v1",
+    "ssd_cleanup": "ssd/cleanup-v1",
     "socialjax_harvest": "socialjax/harvest_open-v1",
     "melting_pot_open": "melting_pot/commons_harvest__open-v1",
     "melting_pot_closed": "melting_pot/commons_harvest__closed-v1",
@@ -36,7 +37,10 @@ def test_a_game_plays_the_trace_of_its_original(path):
     name, _, growth = path.stem.rpartition("_")
     game = presets.game(GAMES[name])
     probs = (0.0, 1.0) if growth == "growth" else (0.0,)
-    game = replace(game, rules=replace(game.rules, regrow_prob=probs))
+    certain = {"regrow_prob": probs, "pollution_prob": 0.0}
+    if growth == "none" and game.map.river:
+        certain["regrow_prob"] = (2**-32,)  # an empty board that stays empty is refused
+    game = replace(game, rules=replace(game.rules, **certain))
     batch = Batch(game, 1)
     output = batch.begin(batch.new_output())
     sites = tuple(np.array(game.map.sites).T)
@@ -71,6 +75,9 @@ def test_a_game_plays_the_trace_of_its_original(path):
             assert reward.tolist() == trace["reward"][turn].tolist(), turn
             if "tagged_by" in trace:
                 assert tagged.tolist() == trace["tagged_by"][turn].tolist(), turn
+        if game.map.river:
+            river = tuple(np.array(game.map.river).T)
+            assert state["waste"][0].tolist() == trace["waste"][turn + 1][river].tolist(), turn
         shown = ~hidden[turn + 1][sites]
         assert state["stock"][0][shown].tolist() == trace["apples"][turn + 1][sites][shown].tolist(), turn
     assert trace["is_contested"].mean() < 0.25
@@ -335,6 +342,71 @@ def test_a_fine_costs_the_one_who_fines():
 def test_rules_that_do_not_go_together_are_refused(rules, named):
     with pytest.raises(ValueError, match=rf"Rules\.{named} is "):
         Play(">A", **rules)
+
+
+# The river
+
+
+def river(**rules):
+    """Two agents before a river of four cells, two of which have waste; apples grow unless there is waste."""
+    board = "v..A\n~H~.\nH..v"
+    rules = {"regrow_prob": (1.0,), "may_clean": True, "pollution_limit": 0.75, **rules}
+    return Play(board, first_stock_share=0.0, beam_width_cells=1, **rules)
+
+
+def test_cleaning_removes_the_first_waste_ahead_and_apples_grow_the_less_waste_there_is():
+    play = river()
+    assert play.game.actions[-1] == "clean"
+    assert (play.game.map.waste, play.output.waste[0].tolist()) == ((1, 3), [2])
+    play.turn("turn_left", "stay")
+    play.turn("clean", "stay")
+    assert (play.output.cleaned[0].tolist(), play.output.waste[0, 0]) == ([[0], [0]], 2)
+    play.turn("turn_right", "stay").turn("clean", "stay")
+    assert (play.output.cleaned[0].tolist(), play.output.waste[0, 0]) == ([[1], [0]], 1)
+
+
+def test_apples_grow_by_the_share_of_clean_water():
+    grown = {}
+    for limit in (0.5, 1.0):
+        rules = Rules(regrow_prob=(0.8,), first_stock_share=0.0, pollution_limit=limit)
+        game = Game(map=maps.parse("v..A\n~H~.\nH..v"), rules=rules)
+        batch = Batch(game, 4000)
+        output = batch.begin(batch.new_output())
+        batch.play(np.full((4000, 2), 7), output)
+        grown[limit] = turn_of(output).regrown.mean()
+    assert grown[0.5] == 0
+    assert grown[1.0] == pytest.approx(0.8 * 0.5, abs=0.03)
+
+
+def test_waste_comes_to_one_clean_cell_a_turn_up_to_the_limit():
+    rules = Rules(regrow_prob=(0.5,), pollution_prob=0.5, pollution_limit=0.75)
+    game = Game(map=maps.parse(">A.\n~~~~".replace(".", "..")), rules=rules)
+    batch = Batch(game, 4000)
+    output = batch.begin(batch.new_output())
+    batch.play(np.full((4000, 1), 7), output)
+    waste = batch.state()["waste"]
+    assert waste.sum(1).max() == 1
+    assert waste.sum(1).mean() == pytest.approx(1 - 0.5**4, abs=0.02)
+    assert np.abs(waste.mean(0) - (1 - 0.5**4) / 4).max() < 0.03
+    for _ in range(30):
+        batch.play(np.full((4000, 1), 7), output)
+    assert (turn_of(output).waste == 3).all()
+
+
+def test_agents_see_water_waste_and_the_cleaning_beam():
+    play = river(window_rows=3, window_columns=5).turn("stay", "turn_left")
+    assert {"~", "H"} <= {*play.window(0)}
+    play.turn("clean", "stay")
+    assert "c" in play.window(0)
+    encoded = replace(play.game, observation=Observation(encoding="one_hot"))
+    assert encoded.channels[-3:] == ("water", "waste", "cleaning")
+
+
+def test_a_river_needs_a_map_with_one_and_shares_in_order():
+    with pytest.raises(ValueError, match=r"Rules\.may_clean"):
+        Play(">A", may_clean=True)
+    with pytest.raises(ValueError, match=r"Rules\.pollution_free"):
+        Rules(pollution_free=0.5, pollution_limit=0.5)
 
 
 # Maps

@@ -44,6 +44,7 @@ def test_every_quirk_is_off_as_published_and_on_as_run():
         "beam_stops_at_agents",
         "plays_on_when_empty",
         "harvest_action",
+        "may_clean",
     }
     quirks = switches - others - {"random_headings", "respawn_at_spawns"}
     assert len(quirks) == 8

@@ -22,6 +22,7 @@ ORIGINALS = {
     "melting_pot_closed": "melting_pot/commons_harvest__closed-v1",
     "melting_pot_partnership": "melting_pot/commons_harvest__partnership-v1",
     "ssd_harvest": "ssd/harvest-v1",
+    "ssd_cleanup": "ssd/cleanup-v1",
     "socialjax_harvest": "socialjax/harvest_open-v1",
     "socialjax_harvest_walls": "socialjax/harvest_open-v1",
 }
@@ -31,13 +32,21 @@ def play(game: Game, *, episodes: int = 400, seed: int = 0) -> dict[str, Any]:
     """Random play of a first episode in so many worlds: each measure, float [episodes]."""
     batch, rng = Batch(game, episodes, seed=seed), np.random.default_rng(seed)
     output = batch.begin(batch.new_output())
-    names = ("harvest", "regrown", "tags", "steps", "reward")
+    names = ("harvest", "regrown", "tags", "steps", "reward", "waste")
     sums, is_over = {name: np.zeros(episodes) for name in names}, np.zeros(episodes, np.bool_)
     while not is_over.all():
         output = batch.play(rng.integers(len(game.actions), size=(episodes, game.agents)), output)
         turn = turn_of(output)
         reward = turn.harvest if turn is output else output.payments.reward
-        rows = (turn.harvest.sum(1), turn.regrown[:, 0], turn.tagged_by.any(2).sum(1), 1, reward.sum(1))
+        waste = turn.waste.sum(1) / game.rules.episode_steps
+        rows = (
+            turn.harvest.sum(1),
+            turn.regrown[:, 0],
+            turn.tagged_by.any(2).sum(1),
+            1,
+            reward.sum(1),
+            waste,
+        )
         for name, row in zip(names, rows, strict=True):
             sums[name] += row * ~is_over
         is_over |= turn.done[:, 0]

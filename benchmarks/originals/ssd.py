@@ -74,18 +74,18 @@ def episodes(name: str, count: int, seed: int) -> Iterator[dict[str, float]]:
         }
 
 
-OURS = {2: 0, 3: 1, 0: 2, 1: 3, 6: 4, 5: 5, 7: 6, 4: 7}
+OURS = {2: 0, 3: 1, 0: 2, 1: 3, 6: 4, 5: 5, 7: 6, 4: 7, 8: 8}
 """The action of cprl for each of that program's."""
 HEADINGS = {"UP": 0, "RIGHT": 1, "DOWN": 2, "LEFT": 3}
 
 
-def trace(seed: int, *, steps: int = 200, growth: bool) -> dict[str, list[Any]]:
-    """Random play of harvest in which an apple grows wherever it can, or never: states, actions, rewards, and
-    the turns in which agents may be in each other's way."""
+def trace(name: str, seed: int, *, steps: int = 200, growth: bool) -> dict[str, list[Any]]:
+    """Random play in which an apple grows wherever it can, or no apple and no waste ever comes: states,
+    actions, rewards, and the turns in which agents may be in each other's way."""
     np.random.seed(seed)  # noqa: NPY002
     rng = np.random.default_rng(seed)
-    env = environment("harvest")
-    sys.modules["social_dilemmas.envs.harvest"].rand = lambda count: np.full(count, 0.0 if growth else 1.0)
+    env = environment(name)
+    sys.modules[f"social_dilemmas.envs.{name}"].rand = lambda count: np.full(count, 0.0 if growth else 1.0)
     env.reset()
     agents = list(env.agents.values())
 
@@ -96,10 +96,14 @@ def trace(seed: int, *, steps: int = 200, growth: bool) -> dict[str, list[Any]]:
         held["col"].append([int(agent.pos[1]) for agent in agents])
         held["heading"].append([HEADINGS[agent.get_orientation()] for agent in agents])
         held["apples"].append(env.world_map == b"A")
+        held["waste"].append(env.world_map == b"H")
 
     hold()
     for _ in range(steps):
-        actions = rng.choice(8, size=AGENTS, p=(0.1, 0.1, 0.3, 0.1, 0.05, 0.1, 0.1, 0.15))
+        chances = (0.1, 0.1, 0.3, 0.1, 0.05, 0.1, 0.1, 0.15)
+        if name == "cleanup":
+            chances = (0.15, 0.1, 0.25, 0.1, 0.05, 0.1, 0.1, 0.05, 0.1)
+        actions = rng.choice(len(chances), size=AGENTS, p=chances)
         before = [tuple(agent.pos) for agent in agents]
         wanted = [
             tuple(agent.return_valid_pos(agent.pos + env.rotate_action(move, agent.get_orientation())))
@@ -127,7 +131,7 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, required=True)
     words = parser.parse_args()
     if words.trace:
-        np.savez_compressed(words.out, **trace(words.seed, growth=words.trace == "growth"))
+        np.savez_compressed(words.out, **trace(words.name, words.seed, growth=words.trace == "growth"))
         sys.exit()
     rows = list(episodes(words.name, words.episodes, words.seed))
     table = {measure: [row[measure] for row in rows] for measure in rows[0]}

@@ -63,11 +63,13 @@ def experiments(module):
 def shortened(value):
     """A table in which maps are checksums, and an agent like the one before it says so.
 
-    A map without spawn places has the checksum that it had before maps could have some.
+    A map without spawn places and river has the checksum that it had before maps could have them.
     """
     if isinstance(value, dict):
         if value.get("kind") == "Map":
-            value = {name: part for name, part in value.items() if name != "spawns" or part}
+            value = {
+                name: part for name, part in value.items() if name not in ("spawns", "river", "waste") or part
+            }
             return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
         return {name: shortened(part) for name, part in value.items()}
     if not isinstance(value, list | tuple):

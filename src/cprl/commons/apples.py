@@ -15,6 +15,7 @@ from cprl.commons.chance import (
     draw,
 )
 from cprl.commons.moves import cell_of
+from cprl.commons.river import growth_share
 from cprl.commons.tables import FURTHER, Tables
 from cprl.commons.world import Actions, Scratch, Worlds
 from cprl.institutions import Law
@@ -126,7 +127,10 @@ def has_sprouted(world: Worlds, tables: Tables, scratch: Scratch, k: int) -> boo
     first_byte = (scratch.words[k >> 2] >> (8 * (k & 3))) & LOW_BYTE
     rest = np.int64(draw(world, REGROWTH_REST + k)[0]) >> BYTE_BITS
     row = tables.regrow_row[k] if FURTHER and tables.regrow_by_share else 0
-    return ((first_byte << REST_BITS) | rest) < tables.regrow_below[row + world.near[k]]
+    below = tables.regrow_below[row + world.near[k]]
+    if FURTHER and world.waste.shape[0] > 0:
+        below = int(below * growth_share(world, tables))
+    return ((first_byte << REST_BITS) | rest) < below
 
 
 def is_stood_on(world: Worlds, tables: Tables, k: int) -> bool:

@@ -70,7 +70,9 @@ class Batch:
         self.driver: Driver = driver or CpuThreads(game, worlds, threads=threads)
         self.has_begun = False
         """Whether the worlds have begun an episode, so that there is something to show."""
-        host = empty_worlds(worlds=worlds, agents=game.agents, sites=len(game.map.sites))
+        host = empty_worlds(
+            worlds=worlds, agents=game.agents, sites=len(game.map.sites), river=len(game.map.river)
+        )
         host.number[:, 0] = np.arange(first_world, first_world + worlds, dtype=np.uint64)
         self.now: Worlds = self.driver.place(host)
         """The current state of the worlds, in the driver's arrays."""

@@ -36,6 +36,7 @@ SPAWNS = 5 << 28
 FIRST_STOCK = 6 << 28
 END = 7 << 28
 ORDER = 8 << 28
+POLLUTION = 9 << 28
 """The purpose of a draw: the upper four bits of the first counter word; its lower bits number the draw."""
 
 

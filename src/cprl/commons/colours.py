@@ -9,14 +9,18 @@ protanopia. Only four hues are that far apart: agents 4 to 7 have those of agent
 from colorsys import hsv_to_rgb
 from typing import Final
 
-GROUND, WALL, APPLE, MARK, BEAM, OTHER, SELF, HIDDEN = range(8)
-"""The classes; MARK is a heading mark. Under `agents_apart`, each agent has a class from `FIRST_AGENT` on."""
+GROUND, WALL, APPLE, MARK, BEAM, OTHER, SELF, HIDDEN, WATER, WASTE, CLEANING = range(11)
+"""The classes; MARK is a heading mark, CLEANING the beam that cleans. Under `agents_apart`, each agent has a
+class from `FIRST_AGENT` on."""
 
-FIRST_AGENT: Final = 8
-MAX_AGENTS_APART: Final = 128 - FIRST_AGENT
-"""The largest number of agents under `agents_apart`: a class takes seven bits of a paint."""
+FIRST_AGENT: Final = 11
+MAX_AGENTS_APART: Final = 120
+"""The largest number of agents under `agents_apart`: a class takes eight bits of a paint."""
 
-CLASS_NAMES: Final = ("ground", "wall", "apple", "heading", "beam", "other", "self", "hidden")
+CLASS_NAMES: Final = (
+    *("ground", "wall", "apple", "heading", "beam", "other", "self", "hidden"),
+    *("water", "waste", "cleaning"),
+)
 
 Colour = tuple[int, int, int]
 
@@ -29,8 +33,11 @@ COLOURS: Final[tuple[Colour, ...]] = (
     (255, 0, 0),
     (0, 0, 255),
     (0, 0, 0),
+    (70, 120, 170),
+    (113, 75, 24),
+    (100, 255, 255),
 )
-"""Red, green and blue of each class in windows [W, run]; HIDDEN is ours."""
+"""Red, green and blue of each class in windows [W, run]; from HIDDEN on they are ours."""
 
 ORANGE, BLUE, GREEN = (230, 160, 0), (86, 180, 233), (0, 158, 115)
 VERMILION, PURPLE, GREY = (213, 94, 0), (204, 121, 167), (150, 150, 150)
@@ -41,6 +48,9 @@ PALETTE: Final[dict[int, Colour]] = {
     WALL: (70, 74, 84),
     APPLE: (31, 163, 90),
     BEAM: (200, 200, 200),
+    WATER: (28, 52, 84),
+    WASTE: (124, 88, 40),
+    CLEANING: (150, 220, 220),
 }
 """Red, green and blue of the classes in pictures for people; agents have `agent_colour`."""
 

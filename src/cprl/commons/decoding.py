@@ -19,7 +19,10 @@ def classes_seen(game: Game, windows: Bytes) -> Bytes:
     windows = windows[:, :, : len(game.cell_channels)]
     if game.observation.encoding == "one_hot":
         classes_drawn = classes_shown(
-            game.observation, agents=game.agents, hides=game.rules.walls_block_sight
+            game.observation,
+            agents=game.agents,
+            hides=game.rules.walls_block_sight,
+            river=bool(game.map.river),
         )
         classes: Bytes = np.take(np.array(classes_drawn, np.uint8), windows.argmax(2))
         return classes

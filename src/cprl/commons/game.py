@@ -59,6 +59,8 @@ class Game(Value):
             raise ValueError(
                 "Rules.respawn_at_spawns is True and Map.spawns is empty; allowed: a map with spawn places"
             )
+        if rules.may_clean and not self.map.river:
+            raise ValueError("Rules.may_clean is True and Map.river is empty; allowed: a map with a river")
         if round(rules.first_stock_share * len(self.map.sites)) == 0 and rules.regrow_prob[0] == 0:
             raise ValueError(
                 f"Rules.first_stock_share is {rules.first_stock_share} of {len(self.map.sites)} sites, and "
@@ -104,7 +106,8 @@ class Game(Value):
     def cell_channels(self) -> tuple[str, ...]:
         """The channels that show the board: all but those of institutions."""
         hides = self.rules.walls_block_sight
-        return channel_names(self.observation, agents=self.agents, hides=hides)
+        river = bool(self.map.river)
+        return channel_names(self.observation, agents=self.agents, hides=hides, river=river)
 
     @property
     def _institution_channels(self) -> tuple[str, ...]:
@@ -201,6 +204,7 @@ def output_forms(game: Game, worlds: int) -> dict[str, Form]:
     sizes = {"B": worlds, "N": game.agents}
     vectors = dict(game.spaces.vectors)
     turn = {"C": channels, "X": rows, "Y": columns}
+    turn |= {"P": int(bool(game.map.river))}
     turn |= {"S": vectors.get("scoreboard", 0), "G": vectors.get("stock_gauge", 0)}
     forms = forms_of(StepOutput, **sizes, **turn)
     if game.institutions:
@@ -214,7 +218,9 @@ OUTPUTS_HELD: Final = 3
 
 def bytes_of_worlds(game: Game, worlds: int) -> int:
     """The bytes that B worlds take at least: their state, and `OUTPUTS_HELD` step outputs."""
-    arrays: list[NDArray[Any]] = [*empty_worlds(worlds=1, agents=game.agents, sites=len(game.map.sites))]
+    arrays: list[NDArray[Any]] = [
+        *empty_worlds(worlds=1, agents=game.agents, sites=len(game.map.sites), river=len(game.map.river))
+    ]
     if game.institutions:
         changed(law.new_law(game, 1), lambda array, is_of_worlds: arrays.append(array) if is_of_worlds else 0)
     outputs = sum(prod(shape) * np.dtype(dtype).itemsize for shape, dtype in output_forms(game, 1).values())

@@ -90,6 +90,34 @@ _HARVEST: Final = """
 @@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@
 """
 
+_CLEANUP: Final = """
+@@@@@@@@@@@@@@@@@@
+@RRRRRR     BBBBB@
+@HHHHHH      BBBB@
+@RRRRRR     BBBBB@
+@RRRRR  P    BBBB@
+@RRRRR    P BBBBB@
+@HHHHH       BBBB@
+@RRRRR      BBBBB@
+@HHHHHHSSSSSSBBBB@
+@HHHHHHSSSSSSBBBB@
+@RRRRR   P P BBBB@
+@HHHHH   P  BBBBB@
+@RRRRRR    P BBBB@
+@HHHHHH P   BBBBB@
+@RRRRR       BBBB@
+@HHHH    P  BBBBB@
+@RRRRR       BBBB@
+@HHHHH  P P BBBBB@
+@RRRRR       BBBB@
+@HHHH       BBBBB@
+@RRRRR       BBBB@
+@HHHHH      BBBBB@
+@RRRRR       BBBB@
+@HHHH       BBBBB@
+@@@@@@@@@@@@@@@@@@
+"""
+
 _MELTING_POT: Final[dict[str, Any]] = {
     "regrow_prob": (0.0, 0.001, 0.005, 0.025),
     "regrow_before_bites": True,
@@ -132,6 +160,13 @@ _SSD: Final[dict[str, Any]] = {
     "window_rows_behind": 7,
     "window_columns": 15,
     "plays_on_when_empty": True,
+}
+_CLEANUP_RULES: Final[dict[str, Any]] = _SSD | {
+    "regrow_prob": (0.05,),
+    "regrow_radius_cells": 0,
+    "first_stock_share": 0.0,
+    "may_clean": True,
+    "pollution_prob": 0.5,
 }
 _SOCIALJAX: Final[dict[str, Any]] = {
     "regrow_prob": (0.0, 0.001, 0.005, 0.025),
@@ -201,6 +236,11 @@ SOURCES: Final[dict[str, Source]] = {
         "https://github.com/eugenevinitsky/sequential_social_dilemma_games",
         _SSD,
     ),
+    "ssd/cleanup-v1": Source(
+        "sequential_social_dilemma_games, CleanupEnv",
+        "https://github.com/eugenevinitsky/sequential_social_dilemma_games",
+        _CLEANUP_RULES,
+    ),
     "socialjax/harvest_open-v1": Source(
         "SocialJax, harvest_open", "https://github.com/cooperativex/SocialJax", _SOCIALJAX
     ),
@@ -234,8 +274,10 @@ def game(name: str) -> "Game":
         lines = [line[1:-1] for line in _OPEN.strip("\n").splitlines()[1:-1]]
         return Game(map=maps.parse("\n".join(lines), legend="socialjax", agents=7), rules=rules)
     if family == "ssd":
+        drawing, legend = (_HARVEST, "ssd") if called == "harvest" else (_CLEANUP, "ssd_cleanup")
+        board = maps.parse(drawing, legend=legend, agents=5)
         fines = Punishment(fine=50.0, cost=0.0, shot_cost=1.0)
-        return Game(map=maps.parse(_HARVEST, legend="ssd", agents=5), rules=rules, institutions=(fines,))
+        return Game(map=board, rules=rules, institutions=(fines,))
     if family == "perolat":
         if called == "open":
             board = maps.random(20, 40, agents=12, density=246 / 800, clustering=0.8, seed=1)

@@ -1,9 +1,9 @@
 """Boards: a Map is drawn (`parse`, `read`), known by name (`named`), or generated (`crosses`, `rooms`,
 `random`).
 
-A drawing is rows of signs: `A` an apple site, `.` open ground, `#` an inner wall, `P` a spawn place,
-`> ^ < v` an agent with its heading. Drawings of others are read by their own signs, see `LEGENDS`. Everything
-outside the board is wall.
+A drawing is rows of signs: `A` an apple site, `.` open ground, `#` an inner wall, `P` a spawn place, `~` and
+`H` a river's water and waste, `> ^ < v` an agent with its heading. Drawings of others are read by their own
+signs, see `LEGENDS`. Everything outside the board is wall.
 """
 
 from bisect import bisect_left, insort
@@ -18,30 +18,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.world import DOWN, LEFT, RIGHT, UP
-from cprl.values import PositiveShare, Range, Seed, Share, Value, Where, checked, refusal
+from cprl.values import Natural, PositiveShare, Range, Seed, Share, Value, Where, checked, refusal
 
 Cell = tuple[int, int]
 Start = tuple[int, int, int]
 
 SIGN_OF_HEADING: Final = {UP: "^", RIGHT: ">", DOWN: "v", LEFT: "<"}
 HEADING_OF_SIGN: Final = {sign: heading for heading, sign in SIGN_OF_HEADING.items()}
-SITE, GROUND, WALL, SPAWN = "A", ".", "#", "P"
+SITE, GROUND, WALL, SPAWN, WATER, WASTE = "A", ".", "#", "P", "~", "H"
 
-Meaning = Literal["site", "ground", "wall", "spawn", "up", "right", "down", "left"]
-"""What a sign stands for: a cell, or an agent's start with its heading."""
+Meaning = Literal["site", "ground", "wall", "spawn", "water", "waste", "up", "right", "down", "left"]
+"""What a sign stands for: a cell, of the river with or without waste, or an agent's start with its
+heading."""
 _HEADINGS: Final = {"up": UP, "right": RIGHT, "down": DOWN, "left": LEFT}
 _SPACES: Final[dict[str, Meaning]] = {"A": "site", " ": "ground", "P": "spawn"}
 LEGENDS: Final[dict[str, dict[str, Meaning]]] = {
     "cprl": {
-        **{SITE: "site", GROUND: "ground", WALL: "wall", SPAWN: "spawn"},
+        **{SITE: "site", GROUND: "ground", WALL: "wall", SPAWN: "spawn", WATER: "water", WASTE: "waste"},
         **{"^": "up", ">": "right", "v": "down", "<": "left"},
     },
     "melting_pot": {**_SPACES, "W": "wall", "Q": "up", "I": "ground"},
     "ssd": {**_SPACES, "@": "wall"},
+    "ssd_cleanup": {**_SPACES, "@": "wall", "B": "site", "S": "ground", "R": "water", "H": "waste"},
     "socialjax": {**_SPACES, "W": "wall", "Q": "up"},
 }
 """The signs of drawings by name: our own; Melting Pot's commons_harvest, whose tiles `I` of hidden rewards
-are ground here; sequential_social_dilemma_games' harvest; SocialJax' harvest."""
+are ground here; sequential_social_dilemma_games' harvest, and its cleanup, whose stream `S` is ground here;
+SocialJax' harvest."""
 
 LONGEST_SIDE_CELLS: Final = 10_000
 LARGEST_BOARD_CELLS: Final = 2**20
@@ -73,6 +76,12 @@ class Map(Value):
     """(row, col) of each spawn place: agents whose start is one of them begin each episode at another one,
     drawn by chance, no two at the same; agents with another start begin there."""
 
+    river: tuple[Cell, ...] = ()
+    """(row, col) of each of the R cells of a river, which can have waste, see `Rules.pollution_prob`; agents
+    walk over them."""
+    waste: tuple[Natural, ...] = ()
+    """The indices of the river's cells that have waste when an episode begins."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
         check_cells("Map", self.height, self.width)
@@ -94,6 +103,8 @@ class Map(Value):
             signs[row][col] = SITE
         for row, col in self.spawns:
             signs[row][col] = SPAWN
+        for index, (row, col) in enumerate(self.river):
+            signs[row][col] = WASTE if index in self.waste else WATER
         for row, col in self.walls:
             signs[row][col] = WALL
         for row, col, heading in self.starts:
@@ -113,7 +124,13 @@ def _check_cells(board: Map) -> None:
     """Raise a ValueError for a cell outside the board, on a wall, or named twice."""
     walls = set(board.walls)
     starts = [(row, col) for row, col, _ in board.starts]
-    kinds = {"site": board.sites, "start": starts, "spawn place": board.spawns, "wall": board.walls}
+    kinds = {
+        "site": board.sites,
+        "start": starts,
+        "spawn place": board.spawns,
+        "river": board.river,
+        "wall": board.walls,
+    }
     for name, cells in kinds.items():
         seen: set[Cell] = set()
         for row, col in cells:
@@ -154,6 +171,7 @@ def parse(drawing: str, *, legend: str | Mapping[str, Meaning] = "cprl", agents:
 
     starts = [(r, c, _HEADINGS[meaning]) for r, c, meaning in cells if meaning in _HEADINGS]
     spawns, drawn = places("spawn"), len(starts)
+    river = [cell for cell in cells if cell[2] in ("water", "waste")]
     if agents is None and not starts and spawns:
         raise refusal("agents", agents, f"1 to {len(spawns)}: the drawing has spawn places, and no agent")
     if agents is not None:
@@ -166,6 +184,8 @@ def parse(drawing: str, *, legend: str | Mapping[str, Meaning] = "cprl", agents:
         starts=tuple(starts),
         walls=places("wall"),
         spawns=spawns,
+        river=tuple((r, c) for r, c, meaning in river),
+        waste=tuple(index for index, (*_, meaning) in enumerate(river) if meaning == "waste"),
     )
 
 

@@ -51,6 +51,8 @@ def act_one(world: Worlds, tables: Tables, actions: Actions, scratch: Scratch, i
     scratch.start_row[i] = world.row[i]
     scratch.start_col[i] = world.col[i]
     world.fired[i] = False
+    if FURTHER:
+        world.cleans[i] = world.in_play[i] and actions[i] == tables.clean_number
     if not world.in_play[i]:
         return
     is_hot = FURTHER and world.cooldown[i] > 0
@@ -259,6 +261,7 @@ def place_at_starts(world: Worlds, tables: Tables) -> None:
         world.fired[i] = False
         world.moved_after_firing[i] = False
         world.cooldown[i] = 0
+        world.cleans[i] = False
         world.hits[i] = 0
         world.tagged_step[i] = 0
         world.offences[i] = 0

@@ -11,7 +11,19 @@ from typing import Annotated, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.commons.colours import APPLE, BEAM, GROUND, PALETTE, WALL, Colour, agent_colour, agent_mark
+from cprl.commons.colours import (
+    APPLE,
+    BEAM,
+    CLEANING,
+    GROUND,
+    PALETTE,
+    WALL,
+    WASTE,
+    WATER,
+    Colour,
+    agent_colour,
+    agent_mark,
+)
 from cprl.commons.maps import Map
 from cprl.commons.world import Bytes, Shown
 from cprl.system.memory import check_memory
@@ -38,10 +50,15 @@ def world_image(board: Map, world: Shown, *, cell_pixels: int = 24) -> Bytes:
             _fill(image, r, c, size, 0, PALETTE[GROUND])
     for r, c in board.walls:
         _fill(image, r, c, size, 0, PALETTE[WALL])
+    for r, c in board.river:
+        kind = int(world.board[r, c])
+        _fill(image, r, c, size, 0, PALETTE[kind if kind in (WATER, WASTE) else WATER])
     for (r, c), apple in zip(board.sites, world.stock, strict=True):
         _fill(image, r, c, size, size // 6, PALETTE[APPLE] if apple else EMPTY_SITE_COLOUR)
     for r, c in np.argwhere(world.board == BEAM):
         _fill(image, r, c, size, 2 * size // 5, PALETTE[BEAM])
+    for r, c in np.argwhere(world.board == CLEANING):
+        _fill(image, r, c, size, 2 * size // 5, PALETTE[CLEANING])
     for i in np.flatnonzero(world.in_play):
         _draw_agent(image, int(world.row[i]), int(world.col[i]), int(world.heading[i]), size, int(i))
     return image

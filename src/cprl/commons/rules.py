@@ -2,8 +2,8 @@
 
 Sources: [W] M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement Learning" (2019);
 [P] Perolat et al. (2017); [run] the program that produced the results of [W], where it differs from the text;
-[J] Janssen, Holahan, Lee and Ostrom (2010); [MP] Melting Pot 2.0, commons_harvest; [SSD]
-sequential_social_dilemma_games, harvest; [SJ] SocialJax, harvest_open; see `docs/games.md`.
+[J] Janssen, Holahan, Lee and Ostrom (2010); [MP] Melting Pot 2.4, commons_harvest; [SSD]
+sequential_social_dilemma_games, harvest, [C] its cleanup; [SJ] SocialJax, harvest_open; see `docs/games.md`.
 `docs/game.md` describes the game in words.
 """
 
@@ -15,8 +15,8 @@ from cprl.values import MOST_INT32, Natural, Odd, Positive, Range, Value, Where
 ACTIONS: Final = ("forward", "backward", "left", "right", "turn_left", "turn_right", "beam", "stay")
 """The actions by index. If no agent may fire, there is no "beam", and 6 is "stay"."""
 
-HARVEST: Final = "harvest"
-"""The last action under `Rules.harvest_action`."""
+HARVEST, CLEAN = "harvest", "clean"
+"""Further actions, the last ones, under `Rules.harvest_action` and `Rules.may_clean`."""
 
 Norm = Literal["euclidean", "manhattan", "chebyshev"]
 
@@ -118,6 +118,20 @@ class Rules(Value):
     """Whether agents may fire; if not, there is no beam action. For some agents alone:
     `cprl.institutions.Sanctioner`."""
 
+    may_clean: bool = False
+    """[C] Whether agents may clean the river, `Map.river`: a further action "clean", a beam of the size of
+    the other one that removes the waste of the first cell of each column that has some, and ends there."""
+
+    pollution_prob: Probability = 0.0
+    """[C] The probability per turn with which a clean cell of the river gets waste, tried cell by cell in an
+    order drawn by chance until one gets some; so it is one cell a turn at most."""
+
+    pollution_limit: Annotated[float, Range(0, 1)] = 0.4
+    """[C] The share of the river's cells with waste from which on no apple grows, and no waste comes."""
+
+    pollution_free: Annotated[float, Range(0, 1)] = 0.0
+    """[C] The share up to which apples grow with `regrow_prob`; between the two it falls linearly to 0."""
+
     window_rows: Window = 6
     """The rows of a window: the agent's own and those ahead of it [W]."""
 
@@ -211,6 +225,11 @@ class Rules(Value):
                 raise ValueError(
                     f"Rules.{name} is {getattr(self, name)!r} and Rules.{other} is True; allowed: one of them"
                 )
+        if self.pollution_free >= self.pollution_limit:
+            raise ValueError(
+                f"Rules.pollution_free is {self.pollution_free} and Rules.pollution_limit is "
+                f"{self.pollution_limit}; allowed: a smaller share of waste than that"
+            )
 
     def __repr__(self) -> str:
         return f"Rules({', '.join(f'{name}={value!r}' for name, value in self.changed.items())})"
@@ -229,6 +248,7 @@ class Rules(Value):
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """The names of the actions, by index: 8 of them, or 7 without a beam, and then perhaps "harvest"."""
-        last = (HARVEST,) if self.harvest_action else ()
+        """The names of the actions, by index: 8 of them, or 7 without a beam, and then perhaps "harvest" and
+        "clean"."""
+        last = (*((HARVEST,) if self.harvest_action else ()), *((CLEAN,) if self.may_clean else ()))
         return *(name for name in ACTIONS if self.may_fire or name != "beam"), *last

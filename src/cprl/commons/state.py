@@ -14,17 +14,18 @@ from cprl.values import shown
 
 State = dict[str, NDArray[Any]]
 
-DERIVED: Final = ("near", "stock_left")
+DERIVED: Final = ("near", "stock_left", "waste_left")
 """Entries of `Worlds` that are computed from the others."""
 
 OF_A_RULE: Final = {
     "moved_after_firing": "agent_1_right_moves_agent_0",
     "cooldown": "cooldown_steps",
+    "cleans": "may_clean",
 }
 """Entries of `Worlds` that only games with a rule have in their state, by the rule: so the states of others
 are those that earlier versions kept."""
 
-NAMES: Final = tuple(name for name in Worlds._fields if name not in (*DERIVED, *OF_A_RULE))
+NAMES: Final = tuple(name for name in Worlds._fields if name not in (*DERIVED, *OF_A_RULE, "waste"))
 """Entries of every state; those of a game are `names`."""
 
 _MAX_INT32: Final = 2**31 - 1
@@ -32,12 +33,15 @@ _MAX_INT32: Final = 2**31 - 1
 
 def names(game: Game) -> tuple[str, ...]:
     """Entries of a state without institutions; with the game they determine the future completely."""
-    return NAMES + tuple(name for name, rule in OF_A_RULE.items() if getattr(game.rules, rule))
+    of_rules = tuple(name for name, rule in OF_A_RULE.items() if getattr(game.rules, rule))
+    return NAMES + of_rules + (("waste",) if game.map.river else ())
 
 
 def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
     """Returns a state as arrays, after checking that the game can be in it."""
-    empty = empty_worlds(worlds=worlds, agents=game.agents, sites=len(game.map.sites))
+    empty = empty_worlds(
+        worlds=worlds, agents=game.agents, sites=len(game.map.sites), river=len(game.map.river)
+    )
     expected = {name: getattr(empty, name) for name in names(game)}
     law = new_law(game, worlds) if game.institutions else None
     if law is not None:
@@ -78,6 +82,7 @@ def _check_ranges(arrays: State, game: Game) -> None:
         "number": (0, 2**32 - 1),
         "stock": (0, 1),
         "stock_before": (0, 1),
+        "waste": (0, 1),
         "row": (0, board.height - 1),
         "col": (0, board.width - 1),
         "heading": (0, 3),

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.chance import REST_BITS
-from cprl.commons.colours import FIRST_AGENT, GROUND, WALL, class_colour
+from cprl.commons.colours import FIRST_AGENT, GROUND, WALL, WATER, class_colour
 from cprl.commons.maps import Map
 from cprl.commons.near import growth, neighbours
 from cprl.commons.observation import Observation, classes_shown
-from cprl.commons.rules import HARVEST, Rules
-from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Indices, Ints
+from cprl.commons.rules import CLEAN, HARVEST, Rules
+from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Bytes, Indices, Ints
 from cprl.institutions.base import threshold
 
 FURTHER: Final = True
@@ -19,12 +19,13 @@ FURTHER: Final = True
 FURTHER_RULES: Final = (
     *("regrow_by", "regrow_under_agents", "regrow_after_bites", "first_stock_share", "harvest_action"),
     *("beam_tapers", "beam_from_beside", "beam_stops_at_agents", "cooldown_steps", "end_prob"),
-    *("random_headings", "respawn_at_spawns", "clashes"),
+    *("random_headings", "respawn_at_spawns", "clashes", "may_clean", "pollution_prob"),
 )
-"""Rules that the study does not have: a game in which all of them are off, on a map without spawn places, is
-played as fast as if there were none."""
+"""Rules that the study does not have: a game in which all of them are off, on a map without spawn places or
+a river, is played as fast as if there were none."""
 CLASS_SHIFT: Final = 24
 """A paint is a colour in 24 bits, and its class from this bit on."""
+LARGEST_CLASS: Final = 255
 
 LARGEST_TABLE: Final = 2**27
 """The largest number of pairs of near sites, or of lines of sight; takes some seconds to build."""
@@ -58,6 +59,15 @@ class Tables(NamedTuple):
     """[N, 3], row, column and heading of each agent at the start of an episode."""
     spawns: Ints
     """[S, 2], row and column of each spawn place."""
+    river_cell: Indices
+    """uint32 [R], the cell of each cell of the river."""
+    river_at: Ints
+    """[cells], the index of each cell in the river, or -1."""
+    first_waste: Bytes
+    """uint8 [R], 1 where a cell of the river has waste when an episode begins."""
+    pollute_below: NDArray[np.int64]
+    """int64 [R + 1], by the number of clean cells: one of them gets waste if a uniform 32-bit word is below
+    this threshold."""
     beam_length: Ints
     """[4], in cells, by heading."""
     paints: Ints
@@ -88,7 +98,7 @@ class Tables(NamedTuple):
     """Whether agents observe the whole board."""
     walls_block_sight: bool
     further: bool
-    """Whether the game has any of `FURTHER_RULES`, or spawn places."""
+    """Whether the game has any of `FURTHER_RULES`, spawn places or a river."""
     shuffle_starts: bool
     never_from_nothing: bool
     """Whether an empty board stays empty, which ends an episode."""
@@ -109,6 +119,10 @@ class Tables(NamedTuple):
     end_every_steps: int
     random_headings: bool
     respawn_at_spawns: bool
+    pollution_limit: float
+    pollution_free: float
+    clean_number: int
+    """The action that cleans; -1 where there is none."""
     moves_in_turn: bool
     one_moves: bool
     pairwise_clashes: bool
@@ -232,9 +246,9 @@ def build_tables(board: Map, rules: Rules, observation: Observation, *, highest:
     def cells(places: tuple[tuple[int, ...], ...]) -> list[int]:
         return [(place[0] + rim) * stride + place[1] + rim for place in places]
 
-    drawn = classes_shown(observation, agents=agents, hides=rules.walls_block_sight)
+    drawn = classes_shown(observation, agents=agents, hides=rules.walls_block_sight, river=bool(board.river))
     classes = range(FIRST_AGENT + (agents if observation.agents_apart else 0))
-    paints = np.array(list(map(_paint, classes)), np.int32)
+    paints = np.array(list(map(_paint, classes)), np.uint32).view(np.int32)
     channel_of = np.full(len(classes), -1, np.int32)
     channel_of[list(drawn)] = range(len(drawn))
     background = np.full((board.height + 2 * rim, stride), paints[WALL], np.int32)
@@ -242,6 +256,10 @@ def build_tables(board: Map, rules: Rules, observation: Observation, *, highest:
     background.reshape(-1)[cells(board.walls)] = paints[WALL]
     site_at = np.full(background.size, -1, np.int32)
     site_at[cells(board.sites)] = range(len(board.sites))
+    river_at = np.full(background.size, -1, np.int32)
+    river_at[cells(board.river)] = range(len(board.river))
+    background.reshape(-1)[cells(board.river)] = paints[WATER]
+    clean_cells = np.arange(len(board.river) + 1)
     near_first, near_sites = neighbours(board, rules)
     places = _window_places(rules)
     window_cells = [[_offset(*place, heading, stride) for place in places] for heading in range(4)]
@@ -258,6 +276,12 @@ def build_tables(board: Map, rules: Rules, observation: Observation, *, highest:
         regrow_first_byte=((below - 1) >> REST_BITS).astype(np.int32),
         regrow_row=(of_site * probs.shape[1]).astype(np.uint32),
         start=np.array(board.starts, np.int32),
+        river_cell=np.array(cells(board.river), np.uint32),
+        river_at=river_at,
+        first_waste=np.isin(np.arange(len(board.river)), board.waste).astype(np.uint8),
+        pollute_below=np.array(
+            [threshold(1 - (1 - rules.pollution_prob) ** n) for n in clean_cells.tolist()], np.int64
+        ),
         spawns=np.array(board.spawns, np.int32).reshape(-1, 2),
         beam_length=np.array(rules.beam_lengths_cells, np.int32),
         paints=paints,
@@ -273,10 +297,11 @@ def build_tables(board: Map, rules: Rules, observation: Observation, *, highest:
         one_hot_value=highest,
         sees_all=sees_all,
         never_from_nothing=rules.regrow_prob[0] == 0 and not rules.plays_on_when_empty,
-        further=bool(board.spawns) or any(name in rules.changed for name in FURTHER_RULES),
+        further=bool(board.spawns or board.river) or any(name in rules.changed for name in FURTHER_RULES),
         regrow_by_share=rules.regrow_by != "count",
         first_stock=round(rules.first_stock_share * len(board.sites)),
         harvest_number=rules.actions.index(HARVEST) if rules.harvest_action else -1,
+        clean_number=rules.actions.index(CLEAN) if rules.may_clean else -1,
         end_below=threshold(rules.end_prob),
         moves_in_turn=rules.clashes == "in_turn",
         one_moves=rules.clashes == "one_moves",

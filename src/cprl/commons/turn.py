@@ -16,6 +16,7 @@ from cprl.commons.moves import (
     settle_clashes,
     settle_pairwise,
 )
+from cprl.commons.river import begin_river, clean, count_waste, pollute
 from cprl.commons.tables import FURTHER, Tables
 from cprl.commons.views import draw_institutions, draw_windows
 from cprl.commons.world import PLAYING, TERMINATED, TRUNCATED, Actions, Scratch, StepOutput, Worlds
@@ -59,7 +60,11 @@ def play_turn(
     note_moved_shooters(world, tables, scratch)
     if FURTHER and tables.regrow_after_bites:
         bite(world, tables, law, actions, output.harvest)
+    if FURTHER and world.waste.shape[0] > 0:
+        clean(world, tables, scratch, output.cleaned)
     sprouts = find_sprouts(world, tables, scratch)
+    if FURTHER and world.waste.shape[0] > 0:
+        pollute(world, tables)
     if tables.regrow_before_bites:
         grow(world, tables, scratch, sprouts)
     if not (FURTHER and tables.regrow_after_bites):
@@ -104,6 +109,8 @@ def begin_episode(
     world.step[0] = 0
     world.ended[0] = PLAYING
     fill(world, tables)
+    if FURTHER:
+        begin_river(world, tables)
     place_at_starts(world, tables)
     if tables.shuffle_starts:
         shuffle_starts(world)
@@ -122,6 +129,8 @@ def refresh_output(
     """Writes the output for a state that was set from outside, with no harvest, shots, hits, growth or
     payments."""
     recount(world, tables)
+    if FURTHER:
+        count_waste(world)
     clear_events(output)
     write_state(world, tables, output, scratch)
     if law is not None:
@@ -159,6 +168,8 @@ def clear_events(output: StepOutput) -> None:
     for i in range(agents):
         output.harvest[i] = 0.0
         output.fired[i] = False
+        for part in range(output.cleaned.shape[1]):
+            output.cleaned[i, part] = 0.0
         for j in range(agents):
             output.hit_by[i, j] = False
             output.tagged_by[i, j] = False
@@ -174,6 +185,8 @@ def write_state(world: Worlds, tables: Tables, output: StepOutput, scratch: Scra
         if output.stock_gauge.shape[1] > 0:
             output.stock_gauge[i, 0] = world.stock_left[0] / world.stock.shape[0]
     output.stock[0] = world.stock_left[0]
+    if output.waste.shape[0] > 0:
+        output.waste[0] = world.waste_left[0]
     output.terminated[0] = world.ended[0] == TERMINATED
     output.truncated[0] = world.ended[0] == TRUNCATED
     output.done[0] = world.ended[0] != PLAYING

@@ -12,9 +12,22 @@ beside a board.
 import numpy as np
 
 from cprl.commons.beam import beam_begin, beam_cell, beam_reach
-from cprl.commons.colours import APPLE, BEAM, FIRST_AGENT, GROUND, HIDDEN, MARK, OTHER, SELF, WALL
+from cprl.commons.colours import (
+    APPLE,
+    BEAM,
+    CLEANING,
+    FIRST_AGENT,
+    GROUND,
+    HIDDEN,
+    MARK,
+    OTHER,
+    SELF,
+    WALL,
+    WASTE,
+    WATER,
+)
 from cprl.commons.moves import cell_of
-from cprl.commons.tables import CLASS_SHIFT, Tables
+from cprl.commons.tables import CLASS_SHIFT, FURTHER, LARGEST_CLASS, Tables
 from cprl.commons.world import COL_STEP, DOWN, ROW_STEP, UP, Bytes, Ints, Scratch, Worlds
 from cprl.institutions import Law
 from cprl.institutions.law import forbids, shown
@@ -22,13 +35,17 @@ from cprl.institutions.law import forbids, shown
 
 def class_of(paint: int) -> int:
     """The class of a paint."""
-    return paint >> CLASS_SHIFT
+    return (paint >> CLASS_SHIFT) & LARGEST_CLASS
 
 
 def paint_apples(world: Worlds, tables: Tables, picture: Ints) -> None:
-    """Paints ground, walls and apples; `picture`: int32 [cells], paints."""
+    """Paints ground, walls, the river and apples; `picture`: int32 [cells], paints."""
     for cell in range(picture.shape[0]):
         picture[cell] = tables.background[cell]
+    if FURTHER:
+        for r in range(world.waste.shape[0]):
+            if world.waste[r] == 1:
+                picture[tables.river_cell[r]] = tables.paints[WASTE]
     stock = world.stock_before if tables.picture_shows_old_stock else world.stock
     apple, ground = tables.paints[APPLE], tables.paints[GROUND]
     for k in range(stock.shape[0]):
@@ -44,23 +61,29 @@ def mark_cell(world: Worlds, tables: Tables, i: int) -> int:
     return cell_of(row, col, tables)
 
 
+def is_open_ground(kind: int) -> bool:
+    """Whether a class is ground that marks and beams cover: ground, or clean water."""
+    return kind == GROUND or (FURTHER and kind == WATER)
+
+
 def paint_mark(world: Worlds, tables: Tables, i: int, picture: Ints) -> None:
     """Paints the heading mark of agent i: on ground only, under `paint_over` on anything but a wall."""
     cell = mark_cell(world, tables, i)
     kind = class_of(picture[cell])
-    if kind == GROUND or (tables.paint_over and kind != WALL):
+    if is_open_ground(kind) or (tables.paint_over and kind != WALL):
         picture[cell] = tables.paints[MARK]
 
 
-def paint_beam(world: Worlds, tables: Tables, shooter: int, picture: Ints) -> None:
-    """Paints the beam of a shooter: over ground and marks only, under `paint_over` over everything."""
+def paint_beam(world: Worlds, tables: Tables, shooter: int, kind_of_beam: int, picture: Ints) -> None:
+    """Paints the beam of a shooter, BEAM or CLEANING: over ground and marks only, under `paint_over` over
+    everything."""
     for side in range(-tables.beam_half_width, tables.beam_half_width + 1):
         last = beam_reach(world, tables, shooter, side, world.on_board)
         for ahead in range(beam_begin(tables, side), last + 1):
             cell = beam_cell(world, tables, shooter, ahead, side)
             kind = class_of(picture[cell])
-            if tables.paint_over or kind in (GROUND, MARK):
-                picture[cell] = tables.paints[BEAM]
+            if tables.paint_over or kind == MARK or is_open_ground(kind):
+                picture[cell] = tables.paints[kind_of_beam]
 
 
 def paint_of(tables: Tables, i: int) -> int:
@@ -76,7 +99,9 @@ def paint_agents(world: Worlds, tables: Tables, picture: Ints) -> None:
             paint_mark(world, tables, i, picture)
     for i in range(agents):
         if world.fired[i]:
-            paint_beam(world, tables, i, picture)
+            paint_beam(world, tables, i, BEAM, picture)
+        if FURTHER and world.cleans[i]:
+            paint_beam(world, tables, i, CLEANING, picture)
     for i in range(agents):
         if world.on_board[i]:
             picture[cell_of(world.row[i], world.col[i], tables)] = paint_of(tables, i)
@@ -91,7 +116,9 @@ def paint_agents_over(world: Worlds, tables: Tables, picture: Ints) -> None:
             picture[cell_of(world.row[i], world.col[i], tables)] = paint_of(tables, i)
     for i in range(agents):
         if world.fired[i]:
-            paint_beam(world, tables, i, picture)
+            paint_beam(world, tables, i, BEAM, picture)
+        if FURTHER and world.cleans[i]:
+            paint_beam(world, tables, i, CLEANING, picture)
 
 
 def paint(world: Worlds, tables: Tables, picture: Ints) -> None:

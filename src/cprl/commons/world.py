@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cprl.commons.chance import SITES_PER_DRAW
 from cprl.institutions.arrays import Bools as Bools
 from cprl.institutions.arrays import Bytes as Bytes
+from cprl.institutions.arrays import Floats as Floats
 from cprl.institutions.arrays import Ints as Ints
 from cprl.institutions.arrays import filled, forms_of
 from cprl.institutions.ledger import Payments
@@ -65,6 +66,12 @@ class Worlds(NamedTuple):
     left; only under `agent_1_right_moves_agent_0`, else all false."""
     cooldown: Annotated[Ints, "B N"]
     """The number of turns in play in which the agent cannot fire; only under `cooldown_steps`, else all 0."""
+    cleans: Annotated[Bools, "B N"]
+    """Whether the agent cleaned in the last turn; only under `may_clean`, else all false."""
+    waste: Annotated[Bytes, "B R"]
+    """1 where a cell of the river has waste."""
+    waste_left: Annotated[Ints, "B 1"]
+    """The sum of `waste`; derived from it."""
     hits: Annotated[Ints, "B N"]
     """Hits since the last tag."""
     tagged_step: Annotated[Ints, "B N"]
@@ -100,6 +107,10 @@ class StepOutput(NamedTuple):
     following agent indices, cyclically; S is N, or 0 without a scoreboard."""
     stock_gauge: Annotated[NDArray[np.float32], "B N G"]
     """The share of all sites that hold an apple; G is 1, or 0 without a stock gauge."""
+    waste: Annotated[NDArray[np.int64], "B P"]
+    """Cells of the river with waste; P is 1, or 0 without a river."""
+    cleaned: Annotated[Floats, "B N P"]
+    """Cells of the river that the agent cleaned in this turn."""
     stock: Annotated[NDArray[np.int64], "B 1"]
     """Apples on the board."""
     regrown: Annotated[NDArray[np.int64], "B 1"]
@@ -161,9 +172,9 @@ class Shown(NamedTuple):
     """int32 [N], apples harvested in this episode."""
 
 
-def empty_worlds(*, worlds: int, agents: int, sites: int) -> Worlds:
+def empty_worlds(*, worlds: int, agents: int, sites: int, river: int = 0) -> Worlds:
     """Memory for B worlds, all zero except `episode`, which is -1; `Batch.begin` starts the first episode."""
-    empty = filled(Worlds, {}, B=worlds, N=agents, K=sites)
+    empty = filled(Worlds, {}, B=worlds, N=agents, K=sites, R=river)
     empty.episode[:] = -1
     return empty
 

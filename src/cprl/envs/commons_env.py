@@ -83,8 +83,14 @@ class CommonsEnv(LeanStepEnv):
         self._size = worlds
         self._agents_size = torch.Size([worlds, game.agents])
         paid = _PAID_ENTRIES if game.institutions else ()
-        self._agent_entries = (*_AGENT_ENTRIES, *paid, *(name for name, _ in game.spaces.vectors))
-        self._world_entries = (*WORLD_ENTRIES, *(_BALLOT_ENTRIES if game.ballots else ()))
+        of_river = ((), ()) if not game.map.river else (("waste",), ("cleaned",))
+        self._agent_entries = (
+            *_AGENT_ENTRIES,
+            *of_river[1],
+            *paid,
+            *(name for name, _ in game.spaces.vectors),
+        )
+        self._world_entries = (*WORLD_ENTRIES, *of_river[0], *(_BALLOT_ENTRIES if game.ballots else ()))
         self._decides, self._is_governed = game.decisions > 0, bool(game.institutions)
         self._with_state = state
         self._forms = {
@@ -105,7 +111,8 @@ class CommonsEnv(LeanStepEnv):
         game, worlds, per_agent = self.game, self._size, self._agents_size
         highest = {"observation": game.observation_highest, "harvest": 1, "stock_gauge": 1}
         highest |= {"scoreboard": game.rules.episode_steps}
-        highest |= dict.fromkeys(WORLD_ENTRIES, len(game.map.sites))
+        highest |= dict.fromkeys(WORLD_ENTRIES, len(game.map.sites)) | {"waste": len(game.map.river)}
+        highest |= {"cleaned": game.rules.beam_width_cells}
 
         def specs(names: Iterable[str]) -> dict[str, TensorSpec]:
             return {name: spec(name, *self._forms[name]) for name in names}

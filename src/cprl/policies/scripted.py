@@ -197,7 +197,8 @@ def _frame(game: Game) -> tuple[int, Frame]:
 def _roles() -> Bytes:
     """The role of each class of cell, uint8 [256]."""
     roles = np.full(256, AGENT, np.uint8)
-    roles[[colours.GROUND, colours.MARK, colours.BEAM]] = OPEN
+    open_ground = (colours.GROUND, colours.MARK, colours.BEAM)
+    roles[[*open_ground, colours.WATER, colours.WASTE, colours.CLEANING]] = OPEN
     roles[colours.APPLE], roles[colours.WALL] = APPLE, WALL
     roles[[colours.HIDDEN, UNSEEN]] = UNKNOWN
     return roles
