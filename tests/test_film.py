@@ -1,10 +1,12 @@
 """Episodes of stored agents, side by side, as a GIF or an MP4."""
 
+import csv
 import subprocess
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 
+import minari
 import numpy as np
 import pytest
 import torch
@@ -17,6 +19,7 @@ from cprl.commands import main as cli
 from cprl.commons.colours import APPLE, GROUND, PALETTE, agent_colour
 from cprl.commons.picture import EMPTY_SITE_COLOUR
 from cprl.evaluation import film_pictures
+from cprl.evaluation.export import export_episodes
 from cprl.evaluation.film import Style, film, film_video, fresh_episode
 from cprl.evaluation.film import _titles as titles_of
 from cprl.evaluation.film_pictures import EpisodePicture, nice
@@ -290,3 +293,45 @@ def test_boards_that_are_larger_than_the_picture_are_drawn_smaller():
 @pytest.mark.parametrize(("number", "top"), [(0, 10), (10, 10), (11, 20), (201, 500), (1001, 2000)])
 def test_axes_end_at_round_numbers(number, top):
     assert nice(number) == top
+
+
+def test_fresh_episodes_are_written_as_csv(runs, tmp_path, monkeypatch, capsys):
+    path = tmp_path / "deep" / "episodes.csv"
+    words = ["export", str(runs / "greedy"), str(path), "--format", "csv", "--episodes", "2"]
+    monkeypatch.setattr("sys.argv", ["cprl", *words])
+    cli.main()
+    assert capsys.readouterr().out == f"{path}\n"
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    episode = film(runs / "greedy", tmp_path / "film.rrd", episode=1)[1]
+    second = [row for row in rows if row["episode"] == "1"]
+    assert len(second) == episode.steps * 2
+    harvest = [sum(float(row["harvest"]) for row in second if row["agent"] == agent) for agent in "01"]
+    assert harvest == episode.harvest.tolist()
+    assert {row["action"] for row in rows} <= set(CORRIDORS.actions)
+    with pytest.raises(FileExistsError):
+        export_episodes(runs / "greedy", path)
+
+
+def test_fresh_episodes_are_written_as_minari_data_sets(runs, tmp_path, monkeypatch):
+    written = export_episodes(runs / "random", tmp_path / "random", format="minari", episodes=2)
+    assert written == [tmp_path / "random" / f"agent_{agent}-v0" for agent in range(2)]
+    export_episodes(runs / "random", tmp_path / "episodes.csv", episodes=2)
+    with (tmp_path / "episodes.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    for agent in range(2):
+        read = minari.load_dataset(f"random/agent_{agent}-v0")
+        of_agent = [row for row in rows if row["agent"] == str(agent)]
+        assert (read.total_episodes, read.total_steps) == (2, len(of_agent))
+        assert read.observation_space.shape == CORRIDORS.observation_shape
+        episodes = list(read.iterate_episodes())
+        actions = [CORRIDORS.actions[action] for one in episodes for action in one.actions]
+        assert actions == [row["action"] for row in of_agent]
+        assert [float(reward) for one in episodes for reward in one.rewards] == [
+            float(row["reward"]) for row in of_agent
+        ]
+        for one in episodes:
+            assert (one.terminations | one.truncations).tolist() == [False] * (len(one.actions) - 1) + [True]
+            assert one.infos["joint_action"][1:, agent].tolist() == one.actions.tolist()
+            assert len(one.observations) == len(one.actions) + 1

@@ -11,7 +11,7 @@ from dataclasses import replace
 from importlib import import_module
 from inspect import getdoc
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 import tyro
 
@@ -24,6 +24,7 @@ from cprl.commands.recipe import (
     run_with,
     trusting,
 )
+from cprl.system.defaults import FILM_SEED
 from cprl.system.output import OUT, printed, say
 from cprl.system.process import obey_parent
 from cprl.system.shipped import PROGRAM, is_shipped, recipe_named, recipe_names, run_shipped, shipped_recipes
@@ -227,17 +228,40 @@ def _serve(files: Sequence[Path], *, why: str) -> None:
             time.sleep(1)
 
 
-def export(run: Path, folder: Path, /, *, weights: bool = True) -> None:
-    """Copies what a report needs of a finished run, small enough to be committed.
+def export(
+    run: Path,
+    out: Path,
+    /,
+    *,
+    weights: bool = True,
+    format: Literal["results", "csv", "minari"] = "results",
+    episodes: int = 20,
+    replica: int = 0,
+    seed: int = FILM_SEED,
+) -> None:
+    """Copies what a report needs of a finished run, small enough to be committed, or plays fresh episodes of
+    its agents and writes them for other programs.
 
     Args:
-        folder: where to.
+        out: the folder of the results, the file of "csv", or the directory of the Minari data sets.
         weights: also the trained weights. Without them a report tells of the training alone, and nothing can
             play the agents.
+        format: "results"; "csv", a row for each episode, turn and agent; or "minari", a data set for each
+            agent, of the extra "minari".
+        episodes: of "csv" and "minari": fresh episodes that are played.
+        replica: likewise: whose agents.
+        seed: likewise: of the worlds and all chance, see cprl film.
     """
     from cprl.runs.recipe import read_recipe
 
     read_recipe(run)
-    from cprl.runs.export import export_results
+    if format == "results":
+        from cprl.runs.export import export_results
 
-    say(export_results(run, folder, weights=weights))
+        say(export_results(run, out, weights=weights))
+        return
+    from cprl.evaluation.export import export_episodes
+
+    written = export_episodes(run, out, format=format, episodes=episodes, replica=replica, seed=seed)
+    for path in written:
+        say(path)
