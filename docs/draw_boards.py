@@ -23,7 +23,7 @@ BY_RULE = {
 
 def first_image(game: Game, cell_pixels: int = 24) -> np.ndarray:
     """The board at the start of an episode."""
-    env = CommonsEnv(game)
+    env = CommonsEnv(game, seed=0)
     env.reset()
     return env.render(world=0, cell_pixels=cell_pixels)
 

@@ -161,6 +161,23 @@ def stopped() -> None:
     play(replace(EVERYTHING, rules=rules, institutions=own), turns=6)
 
 
+def literature() -> None:
+    """Every rule that the study does not have: two small games have them all between them."""
+    plain = {"regrow_prob": (0.1, 0.5), "freeze_steps": 2, "window_rows": 3, "window_columns": 5}
+    beams = dict.fromkeys(("beam_tapers", "beam_from_beside", "beam_stops_at_agents"), True)
+    both_begin = {"random_headings": True, "respawn_at_spawns": True, "first_stock_share": 0.5}
+    first = Rules(**plain, **beams, **both_begin, clashes="in_turn", cooldown_steps=2, end_prob=0.1)
+    second = Rules(
+        **(plain | {"window_rows_behind": 1, "regrow_under_agents": False, "regrow_after_bites": True}),
+        **(both_begin | {"clashes": "one_moves", "harvest_action": True, "regrow_by": "share"}),
+        **{"may_clean": True, "pollution_prob": 0.5, "pollution_limit": 0.9, "plays_on_when_empty": True},
+    )
+    play(Game(map=maps.parse("A>AP.<.\n.AP#A.A\nPP#P.v.", agents=5), rules=first), turns=16)
+    fines = (law.Punishment(fine=2.0, cost=1.0, shot_cost=0.5),)
+    river = maps.parse("A>AP~<.\n.AP~H.A\nPPHP.v.", agents=5)
+    play(Game(map=river, rules=second, institutions=fines), turns=16)
+
+
 CHECKS: dict[str, Callable[[], None]] = {
     **{
         name: (lambda name=name: published(name))
@@ -172,6 +189,7 @@ CHECKS: dict[str, Callable[[], None]] = {
     "unknown": unknown,
     "institutions": institutions,
     "stopped": stopped,
+    "literature": literature,
 }
 
 if __name__ == "__main__":

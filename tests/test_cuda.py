@@ -15,6 +15,7 @@ from governed import EVERYTHING, random_decisions
 
 from cprl import CommonsEnv, keys, presets
 from cprl.algorithms import DQN
+from cprl.commons.literature import SOURCES
 from cprl.learners.settings import DQNSettings
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.assignment import AgentPolicies
@@ -24,7 +25,7 @@ from cprl.training import train
 SCRIPT = Path(__file__).with_name("cuda_in_simulator.py")
 GAMES = [f"{board}:{variant}" for board, variant in presets.GAMES]
 
-GOVERNED = ["institutions", "stopped"]
+GOVERNED = ["institutions", "stopped", "literature"]
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +57,12 @@ def test_the_simulator_exits_without_an_error(simulated):
 @pytest.mark.parametrize(("board", "variant"), presets.GAMES)
 def test_the_gpu_plays_the_same_game_as_the_cpu(board, variant):
     check_gpu(presets.game(board, variant=variant))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", SOURCES)
+def test_the_gpu_plays_the_games_of_the_literature(name):
+    check_gpu(presets.game(name), turns=60)
 
 
 @pytest.mark.gpu

@@ -9,25 +9,14 @@ episodes takes 1.8 core hours at most, and its process 3.1 GB of memory.
 from typing import Final
 
 import cprl
-from cprl import Game, Rules, maps
+from cprl import presets
 from cprl.algorithms import DQN, DQNSettings
 from cprl.population import Learning
 
 BEAMS: Final = (10, 20)
 """The two lengths of the beam in cells; the first one is the reference."""
-OPEN: Final = maps.random(20, 40, agents=12, density=246 / 800, clustering=0.8, seed=1)
-"""The open map: size and number of sites of the paper's, at places of our own."""
-
-RULES: Final = Rules(
-    regrow_prob=(0.0, 0.01, 0.01, 0.05, 0.05, 0.1),
-    beam_length_cells=BEAMS[0],
-    beam_width_cells=5,
-    hits_to_tag=1,
-    freeze_steps=25,
-    window_rows=20,
-    window_columns=21,
-    episode_steps=1000,
-)
+GAME: Final = presets.game("perolat/open-v1")
+"""Its map has the size and number of sites of the paper's, at places of our own."""
 SETTINGS: Final = DQNSettings(
     gamma=0.99,
     hidden_cells=(32, 32),
@@ -43,7 +32,7 @@ SETTINGS: Final = DQNSettings(
 
 EXPERIMENT: Final = cprl.Experiment(
     name="perolat",
-    game=Game(map=OPEN, rules=RULES),
+    game=GAME,
     agents=(Learning(DQN(settings=SETTINGS)),) * 12,
     episodes=1000,
     replicas=4,
