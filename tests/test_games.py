@@ -334,6 +334,7 @@ def test_a_fine_costs_the_one_who_fines():
     [
         ({"regrow_after_bites": True, "regrow_before_bites": True}, "regrow_after_bites"),
         ({"clashes": "in_turn", "pairwise_clashes": True}, "clashes"),
+        ({"clashes": "one_moves", "agent_1_right_moves_agent_0": True}, "clashes"),
         ({"first_stock_share": 1.5}, "first_stock_share"),
         ({"first_stock_share": 0.1}, "first_stock_share"),  # no apple, and none can grow
         ({"respawn_at_spawns": True}, "respawn_at_spawns"),

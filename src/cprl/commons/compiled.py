@@ -143,7 +143,7 @@ def rules_for_cpu(*, further: bool = False) -> Compiled:
     """The rules compiled for CPU threads: about ten seconds the first time, for a game with institutions half
     a minute; then cached on disk.
 
-    With `further` they hold what `FURTHER_RULES` need, which would slow games without them by some 7 %.
+    With `further` they hold what `FURTHER_RULES` need, which would slow games without them.
 
     Numba's own cache checks only the file of the called function and would miss a change in a rule that this
     function calls; so the cache folder is named after the text of all rules.

@@ -4,12 +4,13 @@ An id never changes its meaning: other rules are another version. Layouts and nu
 sources, the rules that play them are ours.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 if TYPE_CHECKING:
     from cprl.commons.game import Game
-    from cprl.commons.maps import Entrances
+    from cprl.commons.maps import Entrances, Map
 
 _OPEN: Final = """
 WWWWWWWWWWWWWWWWWWWWWWWW
@@ -208,48 +209,102 @@ class Source(NamedTuple):
     """What a game of the literature is after."""
 
     work: str
-    """Authors, title and year, or the name of a program with its version and file."""
+    """Authors, title and year, or the name of a program."""
     url: str
+    board: Callable[[], "Map"]
     rules: Mapping[str, Any]
     """What differs from the defaults of `Rules`."""
+    fines: Mapping[str, Any] | None = None
+    """The numbers of `Punishment`; None without fines."""
+    sees_all: bool = False
+    """Whether agents observe the whole board."""
 
 
-_MP, _MP_URL = "Melting Pot 2.4, commons_harvest__{}", "https://github.com/google-deepmind/meltingpot"
-_PEROLAT_WORK = (
+def _drawn(drawing: str, legend: str, agents: int) -> "Map":
+    from cprl.commons import maps
+
+    return maps.parse(drawing, legend=legend, agents=agents)
+
+
+def _rooms(entrances: "Entrances") -> "Map":
+    from cprl.commons import maps
+
+    return maps.rooms(entrances)
+
+
+def _open_field() -> "Map":
+    """A board of the size and number of sites of Perolat's open map, at places of our own."""
+    from cprl.commons import maps
+
+    return maps.random(20, 40, agents=12, density=246 / 800, clustering=0.8, seed=1)
+
+
+def _lab() -> "Map":
+    """Every cell is a site; people begin in the middle row."""
+    from cprl.commons.maps import Map
+    from cprl.commons.world import UP
+
+    cells = tuple((row, col) for row in range(29) for col in range(29))
+    return Map(height=29, width=29, sites=cells, starts=tuple((14, 4 + 5 * i, UP) for i in range(5)))
+
+
+def _without_walls(drawing: str) -> str:
+    """A drawing without the ring of walls around it."""
+    return "\n".join(line[1:-1] for line in drawing.strip("\n").splitlines()[1:-1])
+
+
+_MELTING_POT_URL: Final = "https://github.com/google-deepmind/meltingpot"
+_SSD_URL: Final = "https://github.com/eugenevinitsky/sequential_social_dilemma_games"
+_SSD_FINES: Final = {"fine": 50.0, "cost": 0.0, "shot_cost": 1.0}
+_PEROLAT_SOURCE: Final = (
     "J. Perolat et al., A multi-agent reinforcement learning model of common-pool resource appropriation, "
-    "NeurIPS 2017"
+    "NeurIPS 2017",
+    "https://arxiv.org/abs/1707.06600",
 )
-_PEROLAT_URL = "https://arxiv.org/abs/1707.06600"
-_ENTRANCES: "Final[dict[str, Entrances]]" = {
-    "rooms": "single",
-    "rooms_many_entrances": "multiple",
-    "rooms_unequal": "unequal",
-    "rooms_without_walls": "none",
-}
+
+
+def _melting_pot(name: str, drawing: str, rules: Mapping[str, Any]) -> Source:
+    work = f"Melting Pot 2.4, commons_harvest__{name}"
+    return Source(work, _MELTING_POT_URL, partial(_drawn, drawing, "melting_pot", 7), rules)
+
 
 SOURCES: Final[dict[str, Source]] = {
-    "melting_pot/commons_harvest__open-v1": Source(_MP.format("open"), _MP_URL, _OPEN_RULES),
-    "melting_pot/commons_harvest__closed-v1": Source(_MP.format("closed"), _MP_URL, _MELTING_POT),
-    "melting_pot/commons_harvest__partnership-v1": Source(_MP.format("partnership"), _MP_URL, _MELTING_POT),
+    "melting_pot/commons_harvest__open-v1": _melting_pot("open", _OPEN, _OPEN_RULES),
+    "melting_pot/commons_harvest__closed-v1": _melting_pot("closed", _CLOSED, _MELTING_POT),
+    "melting_pot/commons_harvest__partnership-v1": _melting_pot("partnership", _PARTNERSHIP, _MELTING_POT),
     "ssd/harvest-v1": Source(
         "sequential_social_dilemma_games, HarvestEnv",
-        "https://github.com/eugenevinitsky/sequential_social_dilemma_games",
+        _SSD_URL,
+        partial(_drawn, _HARVEST, "ssd", 5),
         _SSD,
+        _SSD_FINES,
     ),
     "ssd/cleanup-v1": Source(
         "sequential_social_dilemma_games, CleanupEnv",
-        "https://github.com/eugenevinitsky/sequential_social_dilemma_games",
+        _SSD_URL,
+        partial(_drawn, _CLEANUP, "ssd_cleanup", 5),
         _CLEANUP_RULES,
+        _SSD_FINES,
     ),
     "socialjax/harvest_open-v1": Source(
-        "SocialJax, harvest_open", "https://github.com/cooperativex/SocialJax", _SOCIALJAX
+        "SocialJax, harvest_open",
+        "https://github.com/cooperativex/SocialJax",
+        partial(_drawn, _without_walls(_OPEN), "socialjax", 7),
+        _SOCIALJAX,
     ),
-    **{f"perolat/{name}-v1": Source(_PEROLAT_WORK, _PEROLAT_URL, _PEROLAT) for name in ("open", *_ENTRANCES)},
+    "perolat/open-v1": Source(*_PEROLAT_SOURCE, _open_field, _PEROLAT),
+    "perolat/rooms-v1": Source(*_PEROLAT_SOURCE, partial(_rooms, "single"), _PEROLAT),
+    "perolat/rooms_many_entrances-v1": Source(*_PEROLAT_SOURCE, partial(_rooms, "multiple"), _PEROLAT),
+    "perolat/rooms_unequal-v1": Source(*_PEROLAT_SOURCE, partial(_rooms, "unequal"), _PEROLAT),
+    "perolat/rooms_without_walls-v1": Source(*_PEROLAT_SOURCE, partial(_rooms, "none"), _PEROLAT),
     "janssen/foraging-v1": Source(
         "M. A. Janssen, R. Holahan, A. Lee and E. Ostrom, Lab experiments for the study of social-ecological "
         "systems, Science 328, 2010",
         "https://doi.org/10.1126/science.1183532",
+        _lab,
         _JANSSEN,
+        {"fine": 2.0, "cost": 1.0},
+        sees_all=True,
     ),
 }
 """Every game by its id."""
@@ -257,38 +312,15 @@ SOURCES: Final[dict[str, Source]] = {
 
 def game(name: str) -> "Game":
     """Return a game of the literature, by one of the ids of `SOURCES`."""
-    from cprl.commons import maps
     from cprl.commons.game import Game
     from cprl.commons.observation import Observation
     from cprl.commons.rules import Rules
-    from cprl.commons.world import UP
     from cprl.institutions import Punishment
 
-    family, _, version = name.partition("/")
-    called = version.rpartition("-v")[0]
-    rules = Rules(**SOURCES[name].rules)
-    if family == "melting_pot":
-        drawing = {"open": _OPEN, "closed": _CLOSED, "partnership": _PARTNERSHIP}[called.rpartition("__")[2]]
-        return Game(map=maps.parse(drawing, legend="melting_pot", agents=7), rules=rules)
-    if family == "socialjax":
-        lines = [line[1:-1] for line in _OPEN.strip("\n").splitlines()[1:-1]]
-        return Game(map=maps.parse("\n".join(lines), legend="socialjax", agents=7), rules=rules)
-    if family == "ssd":
-        drawing, legend = (_HARVEST, "ssd") if called == "harvest" else (_CLEANUP, "ssd_cleanup")
-        board = maps.parse(drawing, legend=legend, agents=5)
-        fines = Punishment(fine=50.0, cost=0.0, shot_cost=1.0)
-        return Game(map=board, rules=rules, institutions=(fines,))
-    if family == "perolat":
-        if called == "open":
-            board = maps.random(20, 40, agents=12, density=246 / 800, clustering=0.8, seed=1)
-        else:
-            board = maps.rooms(_ENTRANCES[called])
-        return Game(map=board, rules=rules)
-    cells = tuple((row, col) for row in range(29) for col in range(29))
-    starts = tuple((14, 4 + 5 * agent, UP) for agent in range(5))
+    source = SOURCES[name]
     return Game(
-        map=maps.Map(height=29, width=29, sites=cells, starts=starts),
-        rules=rules,
-        observation=Observation(area="full"),
-        institutions=(Punishment(fine=2.0, cost=1.0),),
+        map=source.board(),
+        rules=Rules(**source.rules),
+        observation=Observation(area="full" if source.sees_all else "window"),
+        institutions=(Punishment(**source.fines),) if source.fines else (),
     )

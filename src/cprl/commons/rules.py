@@ -218,7 +218,10 @@ class Rules(Value):
         super().__post_init__()
         both = (
             ("regrow_after_bites", self.regrow_after_bites, "regrow_before_bites", self.regrow_before_bites),
-            ("clashes", self.clashes != "all_back", "pairwise_clashes", self.pairwise_clashes),
+            *(
+                ("clashes", self.clashes != "all_back", other, getattr(self, other))
+                for other in ("pairwise_clashes", "agent_1_right_moves_agent_0")
+            ),
         )
         for name, is_set, other, is_other_set in both:
             if is_set and is_other_set:
