@@ -7,13 +7,15 @@ import gymnasium
 import numpy as np
 import pettingzoo
 import pytest
+import torch
 from boards import Play, random_actions
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_worlds import check_apples, check_no_beam_passes_a_wall, check_places, check_worlds_are_independent
 from test_worlds import games as plain_games
+from torchrl.envs.utils import check_env_specs
 
-from cprl import Game, Observation, Rules, maps, presets
+from cprl import CommonsEnv, Game, Observation, Rules, maps, presets
 from cprl.commons.batch import Batch, turn_of
 from cprl.commons.literature import SOURCES
 from cprl.commons.near import growth
@@ -150,6 +152,21 @@ def test_a_game_of_the_literature_is_made_everywhere_by_its_id(name):
     assert alone.game.agents == 1
     assert alone.game.rules == game.rules
     check_worlds_are_independent(game, 3)
+
+
+@pytest.mark.parametrize("name", ["melting_pot/commons_harvest__open-v1", "ssd/cleanup-v1"])
+def test_an_environment_keeps_its_specs_and_steps_alike_both_ways(name):
+    game = presets.game(name)
+    game = replace(game, rules=replace(game.rules, episode_steps=4, end_prob=0.0))
+    check_env_specs(CommonsEnv(game, 2, seed=0))
+    plain, lean = (CommonsEnv(game, 3, seed=1) for _ in range(2))
+    now, other = plain.reset(), lean.reset()
+    for actions in random_actions(10, 3, game):
+        now["agents", "action"] = other["agents", "action"] = torch.as_tensor(actions)
+        (step, now), (lean_step, other) = plain.step_and_maybe_reset(now), lean.lean_step(other)
+        assert (step == lean_step).all()
+        assert (now == other).all()
+        assert set(now.keys(True, True)) == set(other.keys(True, True))
 
 
 def test_other_names_and_variants_are_refused():
@@ -361,9 +378,9 @@ def test_cleaning_removes_the_first_waste_ahead_and_apples_grow_the_less_waste_t
     assert (play.game.map.waste, play.output.waste[0].tolist()) == ((1, 3), [2])
     play.turn("turn_left", "stay")
     play.turn("clean", "stay")
-    assert (play.output.cleaned[0].tolist(), play.output.waste[0, 0]) == ([[0], [0]], 2)
+    assert (play.output.cleaned[0].tolist(), play.output.waste[0, 0]) == ([0, 0], 2)
     play.turn("turn_right", "stay").turn("clean", "stay")
-    assert (play.output.cleaned[0].tolist(), play.output.waste[0, 0]) == ([[1], [0]], 1)
+    assert (play.output.cleaned[0].tolist(), play.output.waste[0, 0]) == ([1, 0], 1)
 
 
 def test_apples_grow_by_the_share_of_clean_water():
@@ -408,6 +425,8 @@ def test_a_river_needs_a_map_with_one_and_shares_in_order():
         Play(">A", may_clean=True)
     with pytest.raises(ValueError, match=r"Rules\.pollution_free"):
         Rules(pollution_free=0.5, pollution_limit=0.5)
+    with pytest.raises(ValueError, match=r"Map\.waste"):
+        replace(maps.parse(">A~"), waste=(1,))
 
 
 # Maps

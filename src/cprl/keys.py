@@ -20,7 +20,7 @@ OBSERVATION: Final = (AGENTS, "observation")
 with C = 3 channels, 0..255."""
 
 ACTION: Final = (AGENTS, "action")
-"""int64 [B, N]: each agent's action, an index into `cprl.commons.rules.ACTIONS`."""
+"""int64 [B, N]: each agent's action, an index into `Game.actions`."""
 
 REWARD: Final = (AGENTS, "reward")
 """float32 [B, N, 1]: the reward of the turn, harvest - fines + transfers."""
@@ -84,6 +84,12 @@ STOCK: Final = "stock"
 
 REGROWN: Final = "regrown"
 """int64 [B, 1]: apples grown this turn."""
+
+WASTE: Final = "waste"
+"""int64 [B, 1]: cells of the river with waste; only with `Map.river`, as is the next."""
+
+CLEANED: Final = (AGENTS, "cleaned")
+"""float32 [B, N]: cells of the river that the agent cleaned this turn."""
 
 STATE: Final = "state"
 """uint8 [B, 3, H, W]: the whole board as RGB; only with `CommonsEnv(state=True)`."""

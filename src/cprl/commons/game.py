@@ -204,7 +204,8 @@ def output_forms(game: Game, worlds: int) -> dict[str, Form]:
     sizes = {"B": worlds, "N": game.agents}
     vectors = dict(game.spaces.vectors)
     turn = {"C": channels, "X": rows, "Y": columns}
-    turn |= {"P": int(bool(game.map.river))}
+    has_river = bool(game.map.river)
+    turn |= {"P": int(has_river), "M": game.agents if has_river else 0}
     turn |= {"S": vectors.get("scoreboard", 0), "G": vectors.get("stock_gauge", 0)}
     forms = forms_of(StepOutput, **sizes, **turn)
     if game.institutions:

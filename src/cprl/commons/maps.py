@@ -84,6 +84,8 @@ class Map(Value):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if any(index >= len(self.river) for index in self.waste):
+            raise refusal("Map.waste", self.waste, f"indices of Map.river, which has {len(self.river)} cells")
         check_cells("Map", self.height, self.width)
         _check_cells(self)
 

@@ -25,15 +25,15 @@ def count_waste(world: Worlds) -> None:
 
 
 def clean(world: Worlds, tables: Tables, scratch: Scratch, cleaned: Floats) -> None:
-    """Agents that clean do so one after another, in an order drawn by chance; `cleaned`: float32 [N, 1],
+    """Agents that clean do so one after another, in an order drawn by chance; `cleaned`: float32 [N],
     cells cleaned."""
     draw_order(world, scratch)
     for n in range(world.row.shape[0]):
         i = scratch.order[n]
-        cleaned[i, 0] = 0.0
+        cleaned[i] = 0.0
         if world.cleans[i]:
             for side in range(-tables.beam_half_width, tables.beam_half_width + 1):
-                cleaned[i, 0] += clean_column(world, tables, i, side)
+                cleaned[i] += clean_column(world, tables, i, side)
 
 
 def clean_column(world: Worlds, tables: Tables, i: int, side: int) -> int:

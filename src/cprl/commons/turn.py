@@ -168,8 +168,8 @@ def clear_events(output: StepOutput) -> None:
     for i in range(agents):
         output.harvest[i] = 0.0
         output.fired[i] = False
-        for part in range(output.cleaned.shape[1]):
-            output.cleaned[i, part] = 0.0
+        if output.cleaned.shape[0] > 0:
+            output.cleaned[i] = 0.0
         for j in range(agents):
             output.hit_by[i, j] = False
             output.tagged_by[i, j] = False

@@ -109,8 +109,8 @@ class StepOutput(NamedTuple):
     """The share of all sites that hold an apple; G is 1, or 0 without a stock gauge."""
     waste: Annotated[NDArray[np.int64], "B P"]
     """Cells of the river with waste; P is 1, or 0 without a river."""
-    cleaned: Annotated[Floats, "B N P"]
-    """Cells of the river that the agent cleaned in this turn."""
+    cleaned: Annotated[Floats, "B M"]
+    """Cells of the river that the agent cleaned in this turn; M is N, or 0 without a river."""
     stock: Annotated[NDArray[np.int64], "B 1"]
     """Apples on the board."""
     regrown: Annotated[NDArray[np.int64], "B 1"]
