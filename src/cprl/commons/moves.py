@@ -134,19 +134,24 @@ def shares_a_cell(world: Worlds, i: int) -> bool:
     return False
 
 
-def settle_by_lot(world: Worlds, scratch: Scratch) -> None:
-    """Of the agents that want a cell, leaves the one that comes first in `scratch.order`, and moves the rest
-    back; all of them if an agent stays there. Agents that swap go back, too.
+def settle_clashes(world: Worlds, tables: Tables, scratch: Scratch) -> None:
+    """Moves all agents back, at once, that moved into a clash, or under "one_moves" those of them that lose
+    their cell, and repeats this until no agents clash.
 
-    An agent that went back stays on its cell, which may cancel another move.
+    An agent that went back keeps its cell, which may cancel another move. The result does not depend on the
+    order of the agents, but for the order that "one_moves" draws by chance.
     """
-    draw_order(world, scratch)
+    by_lot = FURTHER and tables.one_moves
+    if by_lot:
+        draw_order(world, scratch)
     unsettled = True
     while unsettled:
         unsettled = False
         for i in range(world.row.shape[0]):
             scratch.blocked[i] = (
-                world.in_play[i] and has_moved(world, scratch, i) and loses_its_cell(world, scratch, i)
+                world.in_play[i]
+                and has_moved(world, scratch, i)
+                and (loses_its_cell(world, scratch, i) if by_lot else is_in_a_clash(world, scratch, i))
             )
             unsettled = unsettled or scratch.blocked[i]
         for i in range(world.row.shape[0]):
@@ -155,32 +160,14 @@ def settle_by_lot(world: Worlds, scratch: Scratch) -> None:
 
 
 def loses_its_cell(world: Worlds, scratch: Scratch, i: int) -> bool:
-    """Whether agent i, which has moved, swaps cells with another agent in play, or loses its cell to one."""
+    """Whether agent i, which has moved, swaps cells with another agent in play, or loses its cell to one that
+    stays there, or comes first in `scratch.order`."""
     for j in range(world.row.shape[0]):
         if j != i and world.in_play[j]:
             is_first = not has_moved(world, scratch, j) or scratch.order[j] < scratch.order[i]
             if have_swapped(world, scratch, i, j) or (is_first and share_a_cell(world, i, j)):
                 return True
     return False
-
-
-def settle_clashes(world: Worlds, scratch: Scratch) -> None:
-    """Moves all agents back, at once, that moved into a clash, and repeats this until no agents clash.
-
-    An agent that went back keeps its cell, which may cancel another move. The result does not depend on the
-    order of the agents.
-    """
-    unsettled = True
-    while unsettled:
-        unsettled = False
-        for i in range(world.row.shape[0]):
-            scratch.blocked[i] = (
-                world.in_play[i] and has_moved(world, scratch, i) and is_in_a_clash(world, scratch, i)
-            )
-            unsettled = unsettled or scratch.blocked[i]
-        for i in range(world.row.shape[0]):
-            if scratch.blocked[i]:
-                go_back(world, scratch, i)
 
 
 def is_in_a_clash(world: Worlds, scratch: Scratch, i: int) -> bool:

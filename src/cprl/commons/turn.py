@@ -12,7 +12,6 @@ from cprl.commons.moves import (
     note_moved_shooters,
     place_at_starts,
     return_to_play,
-    settle_by_lot,
     settle_clashes,
     settle_pairwise,
 )
@@ -53,10 +52,8 @@ def play_turn(
         hold_fire(world, law)
     if tables.pairwise_clashes:
         settle_pairwise(world, scratch)
-    elif FURTHER and tables.one_moves:
-        settle_by_lot(world, scratch)
     elif not (FURTHER and tables.moves_in_turn):
-        settle_clashes(world, scratch)
+        settle_clashes(world, tables, scratch)
     note_moved_shooters(world, tables, scratch)
     if FURTHER and tables.regrow_after_bites:
         bite(world, tables, law, actions, output.harvest)
