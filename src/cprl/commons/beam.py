@@ -89,10 +89,15 @@ def side_of(world: Worlds, tables: Tables, i: int, shooter: int) -> int:
 
 def is_hit(world: Worlds, tables: Tables, target: int, shooter: int) -> bool:
     """Whether the shooter's beam covers the target's cell."""
-    ahead, side = ahead_of(world, tables, target, shooter), side_of(world, tables, target, shooter)
+    heading = world.heading[shooter]
+    right = (heading + 1) % 4
+    rows = world.row[target] - beam_row(world, tables, shooter)
+    cols = world.col[target] - beam_col(world, tables, shooter)
+    ahead = rows * ROW_STEP[heading] + cols * COL_STEP[heading]
+    side = rows * ROW_STEP[right] + cols * COL_STEP[right]
     return (
         ahead >= beam_begin(tables, side)
-        and ahead <= tables.beam_length[world.heading[shooter]]
+        and ahead <= tables.beam_length[heading]
         and abs(side) <= tables.beam_half_width
         and ahead <= beam_reach(world, tables, shooter, side, world.in_play)
     )

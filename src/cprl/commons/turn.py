@@ -165,7 +165,7 @@ def clear_events(output: StepOutput) -> None:
     for i in range(agents):
         output.harvest[i] = 0.0
         output.fired[i] = False
-        if output.cleaned.shape[0] > 0:
+        if FURTHER and output.cleaned.shape[0] > 0:
             output.cleaned[i] = 0.0
         for j in range(agents):
             output.hit_by[i, j] = False
@@ -182,7 +182,7 @@ def write_state(world: Worlds, tables: Tables, output: StepOutput, scratch: Scra
         if output.stock_gauge.shape[1] > 0:
             output.stock_gauge[i, 0] = world.stock_left[0] / world.stock.shape[0]
     output.stock[0] = world.stock_left[0]
-    if output.waste.shape[0] > 0:
+    if FURTHER and output.waste.shape[0] > 0:
         output.waste[0] = world.waste_left[0]
     output.terminated[0] = world.ended[0] == TERMINATED
     output.truncated[0] = world.ended[0] == TRUNCATED
