@@ -20,8 +20,7 @@ from cprl.commons.colours import APPLE, GROUND, PALETTE, agent_colour
 from cprl.commons.picture import EMPTY_SITE_COLOUR
 from cprl.evaluation import film_pictures
 from cprl.evaluation.export import export_episodes
-from cprl.evaluation.film import Style, film, film_video, fresh_episode
-from cprl.evaluation.film import _titles as titles_of
+from cprl.evaluation.film import Style, film, film_video, fresh_episode, titles_of
 from cprl.evaluation.film_pictures import EpisodePicture, nice
 from cprl.institutions import Monitoring, Quota
 

@@ -35,6 +35,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     "recipe": "main:recipe",
     "watch": "main:watch",
     "film": "play_stored:film",
+    "show": "play_stored:show",
     "play": "play_stored:play",
     "export": "main:export",
     "evaluate": "play_stored:evaluate",

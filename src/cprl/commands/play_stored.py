@@ -127,6 +127,41 @@ def film(
     say(f"{path}: {path.stat().st_size / 1000:.0f} kB")
 
 
+def show(
+    runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [RUN ...]")],
+    /,
+    *,
+    out: Path | None = None,
+    titles: tuple[str, ...] = (),
+    replica: int = 0,
+    episode: int = 0,
+    seed: int = FILM_SEED,
+) -> None:
+    """Lets the agents of runs play a fresh episode side by side, and writes it as one page for any browser.
+
+    Args:
+        runs: one to six directories of runs, or their results.
+        out: the page, an .html, which opens from the disk without a network; by default
+            show-<replica>-<episode>.html in the directory of the first run.
+        titles: one for each run; by default their institutions, or the names of their experiments.
+        replica: whose agents.
+        episode: which of the fresh episodes, as of cprl film.
+        seed: of the worlds and all chance, as of cprl film.
+    """
+    if not runs:
+        raise ValueError("no run is named; allowed: one to six")
+    _begin(seed, *runs)
+
+    from cprl.evaluation.show import show as show_runs
+
+    run, *beside = runs
+    which: dict[str, Any] = {"replica": replica, "episode": episode, "seed": seed}
+    path, episodes = show_runs(run, out, beside=beside, titles=titles, **which)
+    for path_of_run, played in zip(runs, episodes, strict=True):
+        say(f"{path_of_run}: {played.steps} steps, {played.outcome}")
+    say(f"{path}: {path.stat().st_size / 1000:.0f} kB; open it in a browser")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Session:
     """Who plays among whom, see `cprl.evaluation.play.open_session`."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
@@ -237,15 +238,14 @@ def film_video(
     most_runs = LARGEST_WIDTH // SMALLEST_WIDTH
     if len(runs) > most_runs:
         raise refusal("beside", f"{len(runs) - 1} runs", f"at most {most_runs - 1}")
-    if style.titles and (len(style.titles) != len(runs) or not all(map(str.isprintable, style.titles))):
-        raise refusal("titles", style.titles, f"a line of text for each of {len(runs)} runs")
+    check_titles(style.titles, len(runs))
     width = style.width_of_each(len(runs))
     refuse_to_write_over(path)
     if path.suffix == ".mp4":
         check_can_write_mp4(path)
     fresh = [fresh_episode(one, replica=replica, episode=episode, seed=seed, allow=allow) for one in runs]
-    panels = _panels(fresh, style.titles or _titles(fresh), width)
-    length = max(len(panel.moments) for panel in panels)
+    panels = _panels(fresh, style.titles or titles_of(fresh), width)
+    length = max(len(panel.filmed.moments) for panel in panels)
     every = style.every or (1 if path.suffix == ".mp4" else ceil(length / GIF_FRAMES))
     chosen = sorted({*range(0, length, every), length - 1})
 
@@ -268,10 +268,16 @@ def film_video(
         )
         samples = chosen[:: ceil(len(chosen) / _SAMPLES)]
         write_gif(path, draw(chosen), list(draw(samples)), fps=style.fps)
-    return path, tuple(panel.played for panel in panels)
+    return path, tuple(panel.filmed.episode for panel in panels)
 
 
-def _titles(fresh: Sequence[FreshEpisode]) -> Sequence[str]:
+def check_titles(titles: Sequence[str], runs: int) -> None:
+    """Refuse titles that are not one printable line for each run; none are fine."""
+    if titles and (len(titles) != runs or not all(map(str.isprintable, titles))):
+        raise refusal("titles", titles, f"a line of text for each of {runs} runs")
+
+
+def titles_of(fresh: Sequence[FreshEpisode]) -> Sequence[str]:
     """Return what tells runs apart: their institutions, their names, or the names of their directories."""
     kinds = [
         [type(kind).__name__ for kind in commons_game(population.run).institutions] for population in fresh
@@ -285,16 +291,56 @@ def _titles(fresh: Sequence[FreshEpisode]) -> Sequence[str]:
     return [legible(population.run.path.resolve().name) for population in fresh]
 
 
+class Filmed(NamedTuple):
+    """An episode, as it is shown to people."""
+
+    moments: list[Shown]
+    """The board as the episode began, then after each turn; without what agents observe."""
+    violators: list[set[int]]
+    """The agents that broke a rule in the turn that led to each moment."""
+    fines: NDArray[np.float64]
+    """[moments], what all agents paid in fines so far."""
+    episode: Episode
+
+    @property
+    def left(self) -> int:
+        """Apples on the board at the end."""
+        return int(self.moments[-1].stock.sum())
+
+    @property
+    def apples(self) -> int:
+        """What all agents harvested."""
+        return int(self.moments[-1].harvested.sum())
+
+    @property
+    def is_dead(self) -> bool:
+        """Whether the board died, since no apple was left and none could grow."""
+        return self.episode.terminated and self.left == 0
+
+
+def play_to_show(fresh: FreshEpisode) -> Filmed:
+    """Play an episode."""
+    commons = commons_of(fresh.env)
+    assert commons is not None
+    tracker, turns = tracker_of(fresh.env, fresh.run.metrics), Turns(fresh.env, fresh.policies)
+    ended: list[Episode] = []
+    moments, violators, fines = [board_now(commons)], [set[int]()], [0.0]
+    while not ended:
+        batch = turns.play()
+        ended = tracker.add(batch)
+        moments.append(board_now(commons))
+        violated, fined = (batch.get(("next", *key), None) for key in (keys.VIOLATED, keys.FINES))
+        violators.append(set() if violated is None else set(violated[0].nonzero()[:, 0].tolist()))
+        fines.append(0.0 if fined is None else float(fined.sum()))
+    return Filmed(moments, violators, np.cumsum(fines), ended[0])
+
+
 class _Panel(NamedTuple):
     """What a film shows of one population."""
 
     title: str
     picture: EpisodePicture
-    moments: list[Shown]
-    """The board as the episode began, then after each turn."""
-    violators: list[set[int]]
-    """The agents that broke a rule in the turn that led to each moment."""
-    played: Episode
+    filmed: Filmed
 
     def draw(self, turn: int, *, since: int, card: bool = False) -> Bytes:
         """The population after a turn of the film's clock, or at its end if that was before.
@@ -302,43 +348,25 @@ class _Panel(NamedTuple):
         Args:
             card: whether to say what came of the episode.
         """
-        last, sites = len(self.moments) - 1, len(self.picture.board.sites)
-        left, apples = int(self.moments[last].stock.sum()), int(self.moments[last].harvested.sum())
-        is_dead = self.played.terminated and left == 0
-        dead = f"dead at turn {last:,} of {self.picture.steps:,}" if is_dead else ""
-        outcome = dead or f"{left:,} of {sites:,} apples left"
+        filmed, sites = self.filmed, len(self.picture.board.sites)
+        last = len(filmed.moments) - 1
+        dead = f"dead at turn {last:,} of {self.picture.steps:,}" if filmed.is_dead else ""
+        outcome = dead or f"{filmed.left:,} of {sites:,} apples left"
         return self.picture.draw(
-            self.moments[: turn + 1],
+            filmed.moments[: turn + 1],
             self.title,
             end=dead if turn >= last else "",
-            card=f"{outcome} · {apples:,} apple{'' if apples == 1 else 's'}" if card else "",
-            violators=sorted(set().union(*self.violators[since : turn + 1])),
+            card=f"{outcome} · {filmed.apples:,} apple{'' if filmed.apples == 1 else 's'}" if card else "",
+            violators=sorted(set().union(*filmed.violators[since : turn + 1])),
         )
 
 
 def _panels(fresh: Sequence[FreshEpisode], titles: Sequence[str], width: int) -> list[_Panel]:
     """Play the episodes; return what is shown of each, in panels of one size with one axis of harvests."""
     games = [commons_game(population.run) for population in fresh]
-    episodes = [_play(population) for population in fresh]
-    most = max(int(moments[-1].harvested.max()) for moments, _, _ in episodes)
+    episodes = [play_to_show(population) for population in fresh]
+    most = max(int(filmed.moments[-1].harvested.max()) for filmed in episodes)
     height = max(EpisodePicture(game.map, steps=1, width=width).size[1] for game in games)
     sizes = {"width": width, "height": height, "most_harvested": most}
     pictures = [EpisodePicture(game.map, steps=game.rules.episode_steps, **sizes) for game in games]
-    return [_Panel(*shown) for shown in zip(titles, pictures, *zip(*episodes, strict=True), strict=True)]
-
-
-def _play(fresh: FreshEpisode) -> tuple[list[Shown], list[set[int]], Episode]:
-    """All boards of the episode, that at its start first, without what agents observe; the agents that broke
-    a rule in the turn that led to each; and the episode."""
-    commons = commons_of(fresh.env)
-    assert commons is not None
-    tracker, turns = tracker_of(fresh.env, fresh.run.metrics), Turns(fresh.env, fresh.policies)
-    ended: list[Episode] = []
-    moments, violators = [board_now(commons)], [set[int]()]
-    while not ended:
-        batch = turns.play()
-        ended = tracker.add(batch)
-        moments.append(board_now(commons))
-        violated = batch.get(("next", *keys.VIOLATED), None)
-        violators.append(set() if violated is None else set(violated[0].nonzero()[:, 0].tolist()))
-    return moments, violators, ended[0]
+    return [_Panel(*shown) for shown in zip(titles, pictures, episodes, strict=True)]

@@ -1,0 +1,228 @@
+"""One HTML page that shows episodes of stored agents side by side: it opens from the disk, without a network.
+
+`show.html`, beside this module, draws what is handed to it here.
+"""
+
+import json
+import re
+import zlib
+from base64 import b64encode
+from collections.abc import Sequence
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from cprl.commons.colours import (
+    APPLE,
+    BEAM,
+    CLEANING,
+    GREY,
+    PALETTE,
+    WALL,
+    WASTE,
+    WATER,
+    agent_colour,
+    agent_mark,
+    line_colour,
+)
+from cprl.commons.game import Game
+from cprl.commons.picture import EMPTY_SITE_COLOUR
+from cprl.envs.unwrap import commons_of
+from cprl.evaluation.film import Filmed, FreshEpisode, check_titles, fresh_episode, play_to_show, titles_of
+from cprl.evaluation.film_pictures import nice
+from cprl.evaluation.lanes import commons_game
+from cprl.measuring.episodes import Episode
+from cprl.measuring.social import equality_of
+from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.runs.files import refuse_to_write_over, write_atomically
+from cprl.system.defaults import FILM_SEED as SEED
+from cprl.training.agents import LoadedRun
+from cprl.values import refusal
+from cprl.viewer.pictures import regions_of
+from cprl.viewer.story import rules_of
+
+MOST_RUNS: Final = 6
+_COLOURS: Final = {
+    **{name: PALETTE[kind] for name, kind in (("wall", WALL), ("apple", APPLE), ("beam", BEAM))},
+    **{name: PALETTE[kind] for name, kind in (("water", WATER), ("waste", WASTE), ("cleaning", CLEANING))},
+    "empty": EMPTY_SITE_COLOUR,
+}
+_IN_PLAY, _VIOLATED = 4, 8
+"""Bits of a pose, beside the heading of 0 to 3."""
+
+
+def show(
+    run: str | Path,
+    out: str | Path | None = None,
+    *,
+    beside: Sequence[str | Path] = (),
+    titles: Sequence[str] = (),
+    replica: int = 0,
+    episode: int = 0,
+    seed: int = SEED,
+    allow: Sequence[str] = (),
+) -> tuple[Path, tuple[Episode, ...]]:
+    """Show an episode of a run's agents, beside those of other runs if there are any, as one HTML page.
+
+    It is the episode that `cprl.evaluation.film.film` records with the same numbers.
+
+    Args:
+        out: the page, an .html, complete or absent; by default `show-<replica>-<episode>.html` in the
+            directory of the first run.
+        beside: at most five more runs. Games may differ; where they do not, all play the same fresh world.
+        titles: one for each run; by default what `cprl.evaluation.film.Style` says.
+
+    Returns:
+        The page, and the episode of each run.
+
+    Raises:
+        FileExistsError: if the page exists.
+    """
+    path = Path(run) / f"show-{replica}-{episode}.html" if out is None else Path(out)
+    runs = (run, *beside)
+    if path.suffix != ".html":
+        raise refusal("out", str(path), "a file whose name ends in .html")
+    if len(runs) > MOST_RUNS:
+        raise refusal("beside", f"{len(runs) - 1} runs", f"at most {MOST_RUNS - 1}")
+    check_titles(tuple(titles), len(runs))
+    refuse_to_write_over(path)
+    fresh = [fresh_episode(one, replica=replica, episode=episode, seed=seed, allow=allow) for one in runs]
+    data, filmed = shown(fresh, titles)
+    title = "Same learners, different rules" if len(runs) > 1 else data["populations"][0]["title"]
+    game = commons_game(fresh[0].run)
+    text = page(title, f"<p>{escape(growth_of(game))}</p>", data)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, lambda file: file.write(text.encode()))
+    return path, tuple(one.episode for one in filmed)
+
+
+def page(title: str, before: str, data: dict[str, Any], after: str = "") -> str:
+    """The text of a page.
+
+    Args:
+        before, after: HTML above and below the episode.
+        data: of `shown`; without populations no episode is shown.
+    """
+    template = files("cprl.evaluation").joinpath("show.html").read_text(encoding="utf-8")
+    encoded = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+    parts = {"title": escape(title), "before": before, "after": after, "data": encoded}
+    return re.sub(r"\$(title|before|after|data)\b", lambda found: parts[found[1]], template)
+
+
+def shown(
+    fresh: Sequence[FreshEpisode], titles: Sequence[str] = ()
+) -> tuple[dict[str, Any], Sequence[Filmed]]:
+    """What `show.html` is told of the episodes of these populations, and the episodes."""
+    filmed = [play_to_show(population) for population in fresh]
+    most = max(int(one.moments[-1].harvested.max()) for one in filmed)
+    populations = [_population(*each) for each in zip(titles or titles_of(fresh), fresh, filmed, strict=True)]
+    axis = max(commons_game(population.run).rules.episode_steps for population in fresh)
+    return {"populations": populations, "palette": _COLOURS, "axis": axis, "most": nice(most)}, filmed
+
+
+def growth_of(game: Game) -> str:
+    """How apples grow back, for readers who see the game for the first time."""
+    if game.map.river:
+        return "Agents pick apples. Apples grow only while the river is clean; who cleans it picks nothing."
+    probs = game.rules.regrow_prob
+    if probs[0] > 0 or len(probs) < 2:
+        return "Agents pick apples, which grow back."
+    return (
+        "Agents pick apples. Apples grow back only near other apples, faster where there are more: "
+        "a place that is picked bare stays bare."
+    )
+
+
+def learned(run: LoadedRun) -> str:
+    """Who plays and how they learned, e.g. "4 agents learned by DQN for 200 episodes"."""
+    experiment, names = run.experiment, []
+    for spec in run.specs:
+        match spec:
+            case Learning() | Team():
+                names.append(f"learned by {type(spec.algorithm).__name__}")
+            case Scripted():
+                names.append(f"scripted ({spec.policy})")
+            case Frozen():
+                names.append("trained before")
+            case _:
+                names.append(type(spec).__name__.lower())
+    counts = {name: names.count(name) for name in names}
+    who = ", ".join(f"{count} agent{'s' * (count > 1)} {name}" for name, count in counts.items())
+    length = f"{experiment.steps:,} turns" if experiment.steps else f"{experiment.episodes:,} episodes"
+    return f"{who}; trained for {length}"
+
+
+def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, Any]:
+    game, commons, moments = commons_game(fresh.run), commons_of(fresh.env), filmed.moments
+    assert commons is not None
+    board, agents = game.map, range(game.agents)
+
+    def cells(places: Sequence[Sequence[int]]) -> list[int]:
+        return [row * board.width + col for row, col, *_ in places]
+
+    harvested = np.stack([moment.harvested for moment in moments])
+    stock = np.stack([moment.stock for moment in moments])
+    violated = np.array([[agent in broke for agent in agents] for broke in filmed.violators])
+    pose = np.stack([moment.heading + _IN_PLAY * moment.in_play for moment in moments]) + _VIOLATED * violated
+    boards = np.stack([moment.board.reshape(-1) for moment in moments])
+    beams = [np.flatnonzero(one == BEAM) for one in boards]
+    cleaning = [np.flatnonzero(one == CLEANING) + board.width * board.height for one in boards]
+    lit = [np.concatenate(pair) for pair in zip(beams, cleaning, strict=True)]
+    arrays = {
+        "stock": np.packbits(stock, axis=1),
+        "waste": np.packbits(boards[:, cells(board.river)] == WASTE, axis=1),
+        "stocked": stock.sum(1, dtype=np.uint32),
+        "cell": np.stack([moment.row * board.width + moment.col for moment in moments]).astype(np.uint32),
+        "pose": pose.astype(np.uint8),
+        "harvested": harvested.astype(np.uint32),
+        "totals": harvested.sum(1, dtype=np.uint32),
+        "equality": equality_of(torch.as_tensor(harvested, dtype=torch.float64)).numpy().astype(np.float32),
+        "beam_first": np.cumsum([0, *map(len, lit)]).astype(np.uint32),
+        "beams": np.concatenate(lit).astype(np.uint32),
+    }
+    counted = ["apples on the board", "harvested by all", "equality"]
+    if game.institutions:
+        arrays["fined"] = filmed.fines.astype(np.float32)
+        counted.append("paid in fines")
+    ended = (
+        f"dead at turn {len(moments) - 1:,}" if filmed.is_dead else f"lives after {len(moments) - 1:,} turns"
+    )
+    return {
+        "title": title,
+        "about": f"{learned(fresh.run)}. Rules: {rules_of(game) or 'none beyond the game'}.",
+        "outcome": ended,
+        "isDead": filmed.is_dead,
+        "counted": counted,
+        "turns": len(moments),
+        "agents": game.agents,
+        "width": board.width,
+        "height": board.height,
+        "walls": cells(board.walls),
+        "river": cells(board.river),
+        "sites": cells(board.sites),
+        "regions": [
+            {
+                "colour": agent_colour(owners[0]) if len(owners) == 1 else GREY,
+                "cells": np.flatnonzero(inside).tolist(),
+            }
+            for owners, inside in regions_of(commons)
+        ],
+        "colours": [agent_colour(agent) for agent in agents],
+        "lines": [line_colour(agent) for agent in agents],
+        "marks": [agent_mark(agent) for agent in agents],
+        **_packed(arrays),
+    }
+
+
+def _packed(arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    """Arrays one after the other as deflated bytes, and the name, type and length of each."""
+    raw = b"".join(values.astype(values.dtype.newbyteorder("<")).tobytes() for values in arrays.values())
+    lengths = [
+        (name, f"{values.dtype.kind}{values.itemsize}", values.size) for name, values in arrays.items()
+    ]
+    return {"arrays": lengths, "data": b64encode(zlib.compress(raw, 9)).decode("ascii")}

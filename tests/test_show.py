@@ -1,0 +1,183 @@
+"""The page that shows episodes of stored agents in a browser."""
+
+import json
+import re
+import zlib
+from base64 import b64decode
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from stored_runs import CORRIDORS, stored
+from viewers import browser, wait_until
+
+from cprl import presets
+from cprl.commands import main as cli
+from cprl.commons.colours import BEAM
+from cprl.evaluation.film import fresh_episode, play_to_show
+from cprl.evaluation.show import growth_of, show
+from cprl.institutions import Boundaries, Monitoring
+from cprl.measuring.social import SOCIAL
+
+COMMONS = presets.game("commons")
+GOVERNED = replace(
+    COMMONS,
+    institutions=(
+        Boundaries.strips(
+            height=COMMONS.map.height, width=COMMONS.map.width, agents=COMMONS.agents, bite_fine=0.5
+        ),
+        Monitoring(prob=1.0),
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Greedy agents on the corridors, and agents that act at random under institutions."""
+    folder = tmp_path_factory.mktemp("runs")
+    stored(folder / "greedy", policy="greedy")
+    stored(folder / "governed", GOVERNED, "random")
+    return folder
+
+
+def told(path):
+    """What a page is told, its arrays unpacked."""
+    text = path.read_text(encoding="utf-8")
+    data = json.loads(re.search(r'<script id="data" type="application/json">(.*?)</script>', text)[1])
+    for population in data["populations"]:
+        raw = zlib.decompress(b64decode(population["data"]))
+        for name, kind, length in population["arrays"]:
+            values = np.frombuffer(raw, f"<{kind}", length)
+            raw = raw[values.nbytes :]
+            population[name] = (
+                values.reshape(population["turns"] + (name == "beam_first"), -1)
+                if (name != "beams")
+                else values
+            )
+        assert raw == b""
+    return data
+
+
+def test_a_page_holds_the_episode_that_a_film_shows(runs, tmp_path):
+    path, (first, second) = show(
+        runs / "greedy", tmp_path / "own.html", beside=[runs / "governed"], episode=1
+    )
+    data = told(path)
+    greedy, governed = data["populations"]
+    filmed = play_to_show(fresh_episode(runs / "governed", episode=1))
+    cells = [moment.row * governed["width"] + moment.col for moment in filmed.moments]
+    assert governed["cell"].tolist() == [row.tolist() for row in cells]
+    assert governed["harvested"].tolist() == [moment.harvested.tolist() for moment in filmed.moments]
+    stock = np.unpackbits(governed["stock"], axis=1)[:, : len(governed["sites"])]
+    assert stock.tolist() == [moment.stock.tolist() for moment in filmed.moments]
+    assert governed["stocked"][:, 0].tolist() == stock.sum(1).tolist()
+    violators = [set(np.flatnonzero(row & 8).tolist()) for row in governed["pose"]]
+    assert violators == filmed.violators
+    assert any(violators)
+    assert (governed["pose"] & 3).tolist() == [moment.heading.tolist() for moment in filmed.moments]
+    assert (governed["pose"] & 4 > 0).tolist() == [moment.in_play.tolist() for moment in filmed.moments]
+    ends = governed["beam_first"][:, 0]
+    lit = [set(governed["beams"][first:last].tolist()) for first, last in pairwise(ends)]
+    assert lit == [
+        set(np.flatnonzero(moment.board.reshape(-1) == BEAM).tolist()) for moment in filmed.moments
+    ]
+    assert any(lit)
+    assert governed["fined"][-1, 0] == pytest.approx(second.fines.sum(), rel=1e-6)
+    assert second.fines.sum() > 0
+    assert governed["equality"][-1, 0] == pytest.approx(second.metrics["equality"], abs=1e-6)
+    assert "equality" in SOCIAL
+    assert len(governed["regions"]) == 4
+    assert "fined" not in greedy
+    assert (greedy["isDead"], governed["isDead"]) == (True, False)
+    assert greedy["outcome"] == f"dead at turn {first.steps}"
+    assert data["axis"] == GOVERNED.rules.episode_steps
+
+
+def test_a_page_opens_without_a_network_and_is_small(runs, tmp_path):
+    path, _ = show(runs / "governed", tmp_path / "own.html", beside=[runs / "governed"], titles=["a", "b"])
+    text = path.read_text(encoding="utf-8")
+    assert not re.search(r"(?:src|href|url)\s*[=(]|https?://|@import", text)
+    assert path.stat().st_size < 400_000
+
+
+def test_titles_are_text_and_not_html(runs, tmp_path):
+    title = "</script><script>alert(1)</script> $data"
+    path, _ = show(runs / "greedy", tmp_path / "own.html", titles=[title])
+    text = path.read_text(encoding="utf-8")
+    assert "<script>alert" not in text
+    assert told(path)["populations"][0]["title"] == title
+
+
+def test_what_readers_are_told_of_growth():
+    assert "stays bare" in growth_of(presets.game("commons"))
+    assert "river" in growth_of(presets.game("ssd/cleanup-v1"))
+    lush = replace(CORRIDORS, rules=replace(CORRIDORS.rules, regrow_prob=(0.1, 0.2)))
+    assert growth_of(lush) == "Agents pick apples, which grow back."
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--out", "own.gif"], "own.gif"),
+        (["--titles", "a", "b"], "titles"),
+        (["--replica", "9"], "replica is 9"),
+        (["greedy"] * 6, "at most 5"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused_before_anything_is_written(runs, monkeypatch, words, said):
+    monkeypatch.chdir(runs)
+    before = sorted(runs.rglob("*"))
+    monkeypatch.setattr("sys.argv", ["cprl", "show", "greedy", *words])
+    with pytest.raises(SystemExit) as refused:
+        cli.main()
+    assert said in str(refused.value)
+    assert sorted(runs.rglob("*")) == before
+
+
+def test_the_command_writes_into_the_run_and_nothing_over(runs, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["cprl", "show", str(runs / "greedy")])
+    cli.main()
+    out = capsys.readouterr().out
+    assert "3 steps, apples: 2, 3; 0 left" in out
+    assert (runs / "greedy" / "show-0-0.html").is_file()
+    with pytest.raises(SystemExit):
+        cli.main()
+    (runs / "greedy" / "show-0-0.html").unlink()
+
+
+@pytest.mark.viewer
+@pytest.mark.parametrize("width", [1440, 400])
+def test_chromium_plays_a_page_from_the_disk(runs, tmp_path, width):
+    path, (greedy, governed) = show(runs / "greedy", tmp_path / "own.html", beside=[runs / "governed"])
+    with browser(f"{path.as_uri()}#turn=2", size=(width, 900)) as page:
+        page.resize(width, 900)
+        wait_until(lambda: page.run("return document.body.dataset.ready"), 20.0, "the page is not ready")
+
+        def numbers():
+            return page.run(
+                "return [...document.querySelectorAll('.numbers b')].map((own) => own.textContent)"
+            )
+
+        def press(key):
+            page.run(f"dispatchEvent(new KeyboardEvent('keydown', {{key: {json.dumps(key)}}}))")
+
+        assert page.run("return document.documentElement.scrollWidth <= innerWidth")
+        assert page.run("return document.getElementById('now').textContent") == "turn 2"
+        press("ArrowRight")
+        assert page.run("return document.getElementById('now').textContent") == "turn 3"
+        press("End")
+        assert numbers()[1] == f"{greedy.harvest.sum():.0f}"
+        assert numbers()[4] == f"{governed.harvest.sum():,.0f}"
+        assert numbers()[-1] == f"{governed.fines.sum():.1f}"
+        press("Home")
+        press(" ")
+        wait_until(
+            lambda: page.run("return Number(document.getElementById('turn').value) > 5"), 20.0, "still"
+        )
+        lit = "const own = document.querySelectorAll('canvas')[2]; return [...own.getContext('2d')"
+        colours = page.run(
+            f"{lit}.getImageData(0, 0, own.width, own.height).data].filter((v) => v > 200).length"
+        )
+        assert colours > 1000, "the board is drawn"
+        (tmp_path / "page.png").write_bytes(page())
