@@ -36,6 +36,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     "watch": "main:watch",
     "film": "play_stored:film",
     "show": "play_stored:show",
+    "report": "play_stored:report",
     "play": "play_stored:play",
     "export": "main:export",
     "evaluate": "play_stored:evaluate",

@@ -162,6 +162,25 @@ def show(
     say(f"{path}: {path.stat().st_size / 1000:.0f} kB; open it in a browser")
 
 
+def report(run: Path, /, *, out: Path | None = None, episodes: int = 20, seed: int = SEED) -> None:
+    """Writes a page for any browser about a run or a study: what came of it, an episode, how to run it again.
+
+    Args:
+        run: the directory of a run or of a study, or their results.
+        out: the page, an .html, which opens from the disk without a network; by default report.html in that
+            directory.
+        episodes: of a run, how many fresh ones each replica plays, as of cprl evaluate.
+        seed: likewise: of their worlds and all chance.
+    """
+    is_study = (run / "table.parquet").is_file()
+    _begin(seed, *([] if is_study else [run]))
+
+    from cprl.evaluation.report import report as report_on
+
+    path = report_on(run, out, episodes=episodes, seed=seed)
+    say(f"{path}: {path.stat().st_size / 1000:.0f} kB; open it in a browser")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Session:
     """Who plays among whom, see `cprl.evaluation.play.open_session`."""

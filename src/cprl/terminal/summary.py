@@ -14,6 +14,8 @@ from rich.text import Text
 from cprl.measuring.episodes import Episode
 from cprl.measuring.metrics import DIGITS, INSTITUTIONAL, is_own, left_out, with_unit
 from cprl.measuring.metrics import title as metric_title
+from cprl.runs.curves import as_curves, curves_of, running_mean
+from cprl.runs.episodes import read_table
 from cprl.system.output import console as safe_console
 from cprl.system.output import printed
 from cprl.system.shipped import cprl_here
@@ -56,6 +58,43 @@ def summarise(
         lines.append(f"Watch again: {printed([*cprl_here(), 'watch', str(run)])}")
     for line in filter(None, lines):
         console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+
+def course_of(run: Path) -> str:
+    """What happened in sentences: the peak, what came after it, how long boards last, and what that means.
+
+    A tragedy, here: the last 30 episodes yield at most 95 % of random play, the best ten at least 1.5 times
+    as much as it, and boards last at most 70 % of the turns that they could.
+    """
+    curves = curves_of(run)
+    if lacking := sorted({"collective_return", "survival_steps"} - set(curves)):
+        raise ValueError(f"the episodes of {run} lack {', '.join(lacking)}; allowed: games that report them")
+    returns, survival = curves["collective_return"].mean(0), curves["survival_steps"]
+    tens, last, lasts = running_mean(returns, 10), returns[-30:].mean(), survival[:, -30:].mean()
+    by_chance = as_curves(read_table(run / "evaluation" / "random.parquet"))["collective_return"]
+    random, error = by_chance.mean(), by_chance.std(ddof=1) / by_chance.size**0.5
+    peak, times, shares = tens.max(), "where random play gets none", []
+    if peak:
+        shares.append(f"{1 - last / peak:.0%} below that peak")
+    if random:
+        times = f"{peak / random:.1f} times the {random:.0f} ± {error:.0f} of random play"
+        more = "less" if last < random else "more"
+        shares.append(f"{abs(last / random - 1):.0%} {more} than random play gets")
+    if random > 0 and last <= 0.95 * random and peak >= 1.5 * random and lasts <= 0.7 * survival.max():
+        meaning = (
+            "Each agent learned to take what pays now, and all of them, trained, end worse off than agents "
+            "who never learned: the tragedy of the commons."
+        )
+    elif last > random:
+        meaning = "They end better off than agents who never learned: no tragedy so far."
+    else:
+        meaning = "They end no better off than agents who never learned."
+    return (
+        f"The agents began at {tens[0]:.0f} apples an episode, all together, and reached {peak:.0f} "
+        f"around episode {tens.argmax() + 5}, {times}. In the last {len(returns[-30:])} episodes they got "
+        f"{last:.0f}{', ' * bool(shares)}{' and '.join(shares)}. "
+        f"Boards that can last {survival.max():.0f} steps now last {lasts:.0f}. {meaning}"
+    )
 
 
 def _verdict(played: Played) -> str:

@@ -113,17 +113,18 @@ class Header:
 def rules_of(game: Game | None) -> str:
     """The institutions of a game, each with its first number and all that are not the defaults, e.g.
     "quota (share 0.25, fine 2), monitoring (prob 0.5)"."""
-    return ", ".join(_rule(institution) for institution in (game.institutions if game else ()))
+    return ", ".join(rule_of(institution) for institution in (game.institutions if game else ()))
 
 
-def _rule(institution: Institution) -> str:
+def rule_of(institution: Institution) -> str:
+    """An institution with its first number and all that are not the defaults."""
     words = re.sub("(?<!^)(?=[A-Z])", " ", type(institution).__name__).lower()
     settings: list[str] = []
     for field in fields(institution):
         value = getattr(institution, field.name)
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if isinstance(value, Institution):
-            settings.append(f"on {_rule(value)}")
+            settings.append(f"on {rule_of(value)}")
         elif is_number and (not settings or value != field.default):
             settings.append(f"{field.name.replace('_', ' ')} {value:g}")
     return f"{words} ({', '.join(settings)})" if settings else words

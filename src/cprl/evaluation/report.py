@@ -1,0 +1,181 @@
+"""One HTML page about a run or a study: what came of it, with intervals, and how to run it again."""
+
+import json
+import re
+from base64 import b64encode
+from collections.abc import Sequence
+from html import escape
+from inspect import getdoc
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+from markdown_it import MarkdownIt
+
+from cprl.commons.game import Game
+from cprl.evaluation.evaluate import evaluate_run, run_table
+from cprl.evaluation.film import fresh_episode
+from cprl.evaluation.show import growth_of, learned, page, shown
+from cprl.measuring.metrics import with_unit
+from cprl.runs.curves import curves_of
+from cprl.runs.files import refuse_to_write_over, write_atomically
+from cprl.studies.results import SUMMARY, TABLE
+from cprl.studies.tables.comparing import compare, differing, metrics_of
+from cprl.studies.tables.table import EVALUATION, StudyTable
+from cprl.system.defaults import SEED
+from cprl.system.output import legible
+from cprl.terminal.figures import training_curve
+from cprl.terminal.summary import course_of
+from cprl.terminal.tables import markdown
+from cprl.training.agents import LoadedRun, load
+from cprl.values import refusal
+from cprl.viewer.story import rule_of
+
+_EPISODES: Final = ("episodes.parquet", "episodes.arrows")
+_LARGEST_SVG_BYTES: Final = 300_000
+_NOTHING: Final[dict[str, Any]] = {"populations": [], "palette": {}, "axis": 0, "most": 0}
+
+
+def report(
+    path: str | Path,
+    out: str | Path | None = None,
+    *,
+    episodes: int = 20,
+    seed: int = SEED,
+    allow: Sequence[str] = (),
+) -> Path:
+    """Write one HTML page about a run or a study, which opens from the disk without a network.
+
+    Of a run: what happened in sentences; its numbers beside those of random play, which are those of
+    `evaluate_run` with the same episodes and seed; the course of its training; an episode to play; its rules
+    and institutions; and its recipe. Of a study: question, expectation, answer, and its summary.
+
+    Args:
+        path: the directory of a run or of a study, or their results.
+        out: the page, an .html, complete or absent; by default `report.html` in that directory.
+        episodes: of a run, fresh ones of each replica.
+        seed: likewise: of their worlds and all chance.
+
+    Raises:
+        FileExistsError: if the page exists.
+    """
+    folder = Path(path)
+    page_path = folder / "report.html" if out is None else Path(out)
+    if page_path.suffix != ".html":
+        raise refusal("out", str(page_path), "a file whose name ends in .html")
+    refuse_to_write_over(page_path)
+    is_study = (folder / TABLE).is_file()
+    text = _of_study(folder) if is_study else _of_run(load(folder, allow=allow), episodes, seed, allow)
+    page_path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(page_path, lambda file: file.write(text.encode("utf-8", "replace")))
+    return page_path
+
+
+def _of_run(run: LoadedRun, episodes: int, seed: int, allow: Sequence[str]) -> str:
+    game, name = run.game, legible(run.experiment.name.replace("_", " "))
+    evaluation = evaluate_run(run, episodes=episodes, seed=seed)
+    is_commons = isinstance(game, Game)
+    data = (
+        shown([fresh_episode(run.path, replica=run.replicas[0], allow=allow)])[0] if is_commons else _NOTHING
+    )
+    before = [growth_of(game)] if is_commons else []
+    has_trained = any((run.path / name).is_file() for name in _EPISODES)
+    has_course = has_trained and {"collective_return", "survival_steps"} <= set(curves_of(run.path))
+    if has_course and (run.path / "evaluation" / "random.parquet").is_file():
+        before.append(f"**{course_of(run.path)}**")
+    before.append(f"{learned(run)}, {run.experiment.replicas} replicas.")
+    after = ["## Fresh episodes, beside random play", "", *markdown(run_table(evaluation))]
+    after += [f"The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`."]
+    sections = [
+        _html("\n".join(after)),
+        *([f"<h2>Training</h2>{_training_figure(run)}"] if has_trained else []),
+        *([_html("\n".join(_rules(game)))] if is_commons else []),
+        _recipe(run),
+    ]
+    after_it = "".join(f"<section>{section}</section>" for section in sections)
+    return page(name, _html("\n\n".join(before)), data, after_it)
+
+
+def _rules(game: Game) -> list[str]:
+    """The institutions and the rules that differ from the defaults, in Markdown."""
+    lines = [
+        "## Rules",
+        "",
+        f"{game.agents} agents on a board of {game.map.height} x {game.map.width} cells.",
+    ]
+    lines += ["", *(f"- **{rule_of(one)}**: {_first_paragraph(one)}" for one in game.institutions)]
+    changed = game.rules.changed
+    lines += ["", "Rules that differ from those of `Rules()`:" if changed else "All other rules: `Rules()`."]
+    return [*lines, "", *(f"- `{name}`: `{value}`" for name, value in changed.items())]
+
+
+def _first_paragraph(value: object) -> str:
+    return " ".join((getdoc(value) or "").partition("\n\n")[0].split())
+
+
+def _recipe(run: LoadedRun) -> str:
+    recipe = json.dumps(run.recipe["experiment"], separators=(", ", ": "))
+    began = escape(str(run.recipe.get("command", "")))
+    return (
+        "<h2>Run it again</h2><p>It was begun by this command line:</p>"
+        f"<pre>{began}</pre>"
+        "<p>Its directory alone is enough, too, or the recipe below as the <code>experiment</code> of a "
+        "<code>recipe.json</code>:</p><pre>cprl run RUN --out AGAIN</pre>"
+        f"<details><summary>The whole recipe</summary><pre>{escape(recipe)}</pre></details>"
+    )
+
+
+def _training_figure(run: LoadedRun) -> str:
+    """As SVG, or as PNG where so many lines make an SVG large."""
+    with TemporaryDirectory() as folder:
+        content = training_curve(run.path, title="", path=Path(folder, "course.svg")).read_bytes()
+        is_large = len(content) > _LARGEST_SVG_BYTES
+        if is_large:
+            content = training_curve(run.path, title="", path=Path(folder, "course.png")).read_bytes()
+    kind = "png" if is_large else "svg+xml"
+    return _figure(content, kind, "The course of the training")
+
+
+def _of_study(folder: Path) -> str:
+    table = StudyTable.read(folder / TABLE)
+    summary = (folder / SUMMARY).read_text(encoding="utf-8")
+    title, _, rest = summary.partition("\n")
+    answer = _answer(table)
+    head, found, tail = rest.partition("\n## ")
+    text = f"{head}\n\n**Answer.** {answer}\n{found}{tail}" if answer else rest
+
+    def picture(image: re.Match[str]) -> str:
+        path = folder / image[1]
+        is_ours = path.resolve().parent == (folder / "figures").resolve() and path.suffix == ".png"
+        return _figure(path.read_bytes(), "png", image[2]) if is_ours and path.is_file() else ""
+
+    body = re.sub(r'<p><img src="([^"]*)" alt="([^"]*)"\s*/?></p>', picture, _html(text))
+    return page(legible(title.lstrip("# ")), body, _NOTHING)
+
+
+def _answer(table: StudyTable) -> str:
+    """Which conditions differ from the reference in the first metric, in a sentence; "" without any."""
+    if not table.metrics or len(table.design.conditions) < 2:
+        return ""
+    comparison = compare(table, metrics_of(table)[0], part=EVALUATION)
+    differ = {condition for _, condition in differing([comparison])}
+    said: dict[str, list[str]] = {"more": [], "less": [], "no difference shown": []}
+    for one in comparison.conditions:
+        if one.difference is not None:
+            kind = "more" if one.difference.value > 0 else "less"
+            kind = kind if one.condition in differ else "no difference shown"
+            said[kind].append(f"{one.condition} ({one.difference.value:+,.3g})")
+    parts = [f"{kind}: {', '.join(names)}" for kind, names in said.items() if names]
+    what = f"{with_unit(comparison.metric)} in {comparison.episodes_text}, beside {comparison.reference}"
+    return f"{what[0].upper()}{what[1:]}: {'; '.join(parts)} (Holm's method over all conditions)."
+
+
+def _html(text: str) -> str:
+    """Markdown as HTML; HTML in it is text."""
+    html: str = MarkdownIt("commonmark", {"html": False}).enable("table").render(text)
+    return html.replace("<table>", '<div class="wide"><table>').replace("</table>", "</table></div>")
+
+
+def _figure(content: bytes, kind: str, words: str) -> str:
+    encoded = b64encode(content).decode("ascii")
+    return f'<figure><img src="data:image/{kind};base64,{encoded}" alt="{words}"></figure>'
