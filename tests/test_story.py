@@ -17,6 +17,7 @@ from test_watch import connected, fake
 
 from cprl import CommonsEnv, Game, Rules, maps, presets
 from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, agent_colour
+from cprl.commons.readable import rules_of
 from cprl.envs import make_env
 from cprl.envs.matrix import MatrixGame, chicken, matching_pennies, prisoners_dilemma
 from cprl.institutions import Quota, Tax, Vote
@@ -31,7 +32,7 @@ from cprl.viewer.layout import Curves, Panels, curves_of, joint_actions, layout
 from cprl.viewer.live import LiveStream, Stream
 from cprl.viewer.logger import RerunLogger, as_table, send_waiting
 from cprl.viewer.pictures import Turns, Visits, Wall, gini, lorenz_curve
-from cprl.viewer.story import CLOCK, CompilingNotice, Header, played, published_phases, rules_of
+from cprl.viewer.story import CLOCK, CompilingNotice, Header, played, published_phases
 
 __all__ = ["strict_rerun"]
 

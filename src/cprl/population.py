@@ -138,6 +138,25 @@ class Scripted(Value):
 AgentSpec: TypeAlias = Learning | Team | Scripted | Frozen
 
 
+def learned(by_agent: Sequence[AgentSpec]) -> str:
+    """Who plays and how they learned, of `specs_by_agent`, e.g. "4 agents by DQN"."""
+    names = [_kind(spec) for spec in by_agent]
+    counts = {name: names.count(name) for name in names}
+    return ", ".join(f"{count} agent{'s' * (count > 1)} {name}" for name, count in counts.items())
+
+
+def _kind(spec: AgentSpec) -> str:
+    match spec:
+        case Learning() | Team():
+            team = " as a team" if isinstance(spec, Team) else ""
+            return f"by {type(spec.algorithm).__name__}{team}"
+        case Scripted():
+            return f"by the script {spec.policy!r}"
+        case Frozen():
+            return "of an earlier run"
+    return f"by {type(spec).__name__}"
+
+
 def specs_by_agent(specs: Sequence[AgentSpec], agents: int) -> list[AgentSpec]:
     """The specification of each of N agents; that of a team for each of its members."""
     by_agent: dict[int, AgentSpec] = {}

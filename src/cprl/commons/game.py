@@ -15,6 +15,7 @@ from cprl.commons.maps import Map
 from cprl.commons.near import patches, sites_around
 from cprl.commons.observation import Observation, channel_names
 from cprl.commons.reach import why_out_of_reach
+from cprl.commons.readable import game_html
 from cprl.commons.rules import Rules
 from cprl.commons.spaces import Spaces
 from cprl.commons.tables import Tables, build_tables, check_sizes
@@ -40,6 +41,9 @@ class Game(Value):
     rules: Rules
     observation: Observation = field(default_factory=Observation)
     institutions: tuple[Institution, ...] = ()
+
+    def _repr_html_(self) -> str:
+        return game_html(self)
 
     def __post_init__(self) -> None:
         super().__post_init__()

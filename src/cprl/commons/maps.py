@@ -17,6 +17,7 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from cprl.commons.svg import board_svg
 from cprl.commons.world import DOWN, LEFT, RIGHT, UP
 from cprl.values import Natural, PositiveShare, Range, Seed, Share, Value, Where, checked, refusal
 
@@ -91,6 +92,9 @@ class Map(Value):
 
     def __repr__(self) -> str:
         return f"Map({self.height} x {self.width}, {len(self.sites)} sites, {self.agents} agents)"
+
+    def _repr_html_(self) -> str:
+        return board_svg(self)
 
     @property
     def agents(self) -> int:

@@ -13,10 +13,12 @@ from typing import Any, Final
 from markdown_it import MarkdownIt
 
 from cprl.commons.game import Game
+from cprl.commons.readable import growth_of, rule_of
 from cprl.evaluation.evaluate import evaluate_run, run_table
 from cprl.evaluation.film import fresh_episode
-from cprl.evaluation.show import growth_of, learned, page, shown
+from cprl.evaluation.show import Page, page, shown
 from cprl.measuring.metrics import with_unit
+from cprl.population import learned
 from cprl.runs.curves import curves_of
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.studies.results import SUMMARY, TABLE
@@ -29,7 +31,6 @@ from cprl.terminal.summary import course_of
 from cprl.terminal.tables import markdown
 from cprl.training.agents import LoadedRun, load
 from cprl.values import refusal
-from cprl.viewer.story import rule_of
 
 _EPISODES: Final = ("episodes.parquet", "episodes.arrows")
 _LARGEST_SVG_BYTES: Final = 300_000
@@ -43,7 +44,7 @@ def report(
     episodes: int = 20,
     seed: int = SEED,
     allow: Sequence[str] = (),
-) -> Path:
+) -> Page:
     """Write one HTML page about a run or a study, which opens from the disk without a network.
 
     Of a run: what happened in sentences; its numbers beside those of random play, which are those of
@@ -60,7 +61,7 @@ def report(
         FileExistsError: if the page exists.
     """
     folder = Path(path)
-    page_path = folder / "report.html" if out is None else Path(out)
+    page_path = Page(folder / "report.html" if out is None else out)
     if page_path.suffix != ".html":
         raise refusal("out", str(page_path), "a file whose name ends in .html")
     refuse_to_write_over(page_path)
@@ -83,7 +84,7 @@ def _of_run(run: LoadedRun, episodes: int, seed: int, allow: Sequence[str]) -> s
     has_course = has_trained and {"collective_return", "survival_steps"} <= set(curves_of(run.path))
     if has_course and (run.path / "evaluation" / "random.parquet").is_file():
         before.append(f"**{course_of(run.path)}**")
-    before.append(f"{learned(run)}, {run.experiment.replicas} replicas.")
+    before.append(f"{learned(run.specs)}, {run.experiment.trained_for}.")
     after = ["## Fresh episodes, beside random play", "", *markdown(run_table(evaluation))]
     after += [f"The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`."]
     sections = [

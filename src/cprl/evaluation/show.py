@@ -30,21 +30,19 @@ from cprl.commons.colours import (
     agent_mark,
     line_colour,
 )
-from cprl.commons.game import Game
 from cprl.commons.picture import EMPTY_SITE_COLOUR
+from cprl.commons.readable import NO_RULES, growth_of, rules_of
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.film import Filmed, FreshEpisode, check_titles, fresh_episode, play_to_show, titles_of
 from cprl.evaluation.film_pictures import nice
 from cprl.evaluation.lanes import commons_game
 from cprl.measuring.episodes import Episode
 from cprl.measuring.social import equality_of
-from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.population import learned
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.system.defaults import FILM_SEED as SEED
-from cprl.training.agents import LoadedRun
 from cprl.values import refusal
 from cprl.viewer.pictures import regions_of
-from cprl.viewer.story import rules_of
 
 MOST_RUNS: Final = 6
 _COLOURS: Final = {
@@ -66,7 +64,7 @@ def show(
     episode: int = 0,
     seed: int = SEED,
     allow: Sequence[str] = (),
-) -> tuple[Path, tuple[Episode, ...]]:
+) -> tuple["Page", tuple[Episode, ...]]:
     """Show an episode of a run's agents, beside those of other runs if there are any, as one HTML page.
 
     It is the episode that `cprl.evaluation.film.film` records with the same numbers.
@@ -78,12 +76,12 @@ def show(
         titles: one for each run; by default what `cprl.evaluation.film.Style` says.
 
     Returns:
-        The page, and the episode of each run.
+        The page, which a notebook shows, and the episode of each run.
 
     Raises:
         FileExistsError: if the page exists.
     """
-    path = Path(run) / f"show-{replica}-{episode}.html" if out is None else Path(out)
+    path = Page(Path(run) / f"show-{replica}-{episode}.html" if out is None else out)
     runs = (run, *beside)
     if path.suffix != ".html":
         raise refusal("out", str(path), "a file whose name ends in .html")
@@ -99,6 +97,17 @@ def show(
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda file: file.write(text.encode()))
     return path, tuple(one.episode for one in filmed)
+
+
+class Page(type(Path())):  # type: ignore[misc]
+    """The path of a page, which draws itself in a notebook."""
+
+    HEIGHT = 900
+    """Pixels in a notebook."""
+
+    def _repr_html_(self) -> str:
+        text = escape(self.read_text(encoding="utf-8"))
+        return f'<iframe srcdoc="{text}" style="width:100%;height:{self.HEIGHT}px;border:0"></iframe>'
 
 
 def page(title: str, before: str, data: dict[str, Any], after: str = "") -> str:
@@ -123,38 +132,6 @@ def shown(
     populations = [_population(*each) for each in zip(titles or titles_of(fresh), fresh, filmed, strict=True)]
     axis = max(commons_game(population.run).rules.episode_steps for population in fresh)
     return {"populations": populations, "palette": _COLOURS, "axis": axis, "most": nice(most)}, filmed
-
-
-def growth_of(game: Game) -> str:
-    """How apples grow back, for readers who see the game for the first time."""
-    if game.map.river:
-        return "Agents pick apples. Apples grow only while the river is clean; who cleans it picks nothing."
-    probs = game.rules.regrow_prob
-    if probs[0] > 0 or len(probs) < 2:
-        return "Agents pick apples, which grow back."
-    return (
-        "Agents pick apples. Apples grow back only near other apples, faster where there are more: "
-        "a place that is picked bare stays bare."
-    )
-
-
-def learned(run: LoadedRun) -> str:
-    """Who plays and how they learned, e.g. "4 agents learned by DQN for 200 episodes"."""
-    experiment, names = run.experiment, []
-    for spec in run.specs:
-        match spec:
-            case Learning() | Team():
-                names.append(f"learned by {type(spec.algorithm).__name__}")
-            case Scripted():
-                names.append(f"scripted ({spec.policy})")
-            case Frozen():
-                names.append("trained before")
-            case _:
-                names.append(type(spec).__name__.lower())
-    counts = {name: names.count(name) for name in names}
-    who = ", ".join(f"{count} agent{'s' * (count > 1)} {name}" for name, count in counts.items())
-    length = f"{experiment.steps:,} turns" if experiment.steps else f"{experiment.episodes:,} episodes"
-    return f"{who}; trained for {length}"
 
 
 def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, Any]:
@@ -192,9 +169,10 @@ def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, An
     ended = (
         f"dead at turn {len(moments) - 1:,}" if filmed.is_dead else f"lives after {len(moments) - 1:,} turns"
     )
+    who = f"{learned(fresh.run.specs)}, {fresh.run.experiment.trained_for}"
     return {
         "title": title,
-        "about": f"{learned(fresh.run)}. Rules: {rules_of(game) or 'none beyond the game'}.",
+        "about": f"{who}. Rules: {rules_of(game) or NO_RULES}.",
         "outcome": ended,
         "isDead": filmed.is_dead,
         "counted": counted,

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from html import escape
 from math import ceil
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -9,10 +10,20 @@ from typing import Annotated, Any, Final, Literal
 from cprl.algorithms import Tabular
 from cprl.algorithms.base import TeamAlgorithm, TrainingEngine
 from cprl.commons.game import Game
+from cprl.commons.readable import game_html
 from cprl.envs.make_env import PlayableGame, game_of, stored_game
 from cprl.measuring.episodes import check_own_metrics
 from cprl.objectives.preferences import check_preference
-from cprl.population import AgentSpec, Frozen, Learning, Team, refuse_undecided, specs_by_agent, stored_of
+from cprl.population import (
+    AgentSpec,
+    Frozen,
+    Learning,
+    Team,
+    learned,
+    refuse_undecided,
+    specs_by_agent,
+    stored_of,
+)
 from cprl.runs.files import RECIPE_FORMAT, written_by_another
 from cprl.runs.recipe import recipe_config, with_runs_moved
 from cprl.system.memory import Device
@@ -92,6 +103,19 @@ class Experiment(Value, stored=False, called="experiment"):
             f"Experiment({self.name!r}, {self.game!r}, {self.length} {self.unit}, {self.replicas} replicas, "
             f"seed={self.seed})"
         )
+
+    def _repr_html_(self) -> str:
+        who, game = "", f"<p>{escape(repr(self.game))}</p>"
+        if isinstance(self.game, Game):
+            who = f"{learned(specs_by_agent(self.agents, self.game.agents))}, "
+            game = game_html(self.game)
+        return f"<p><b>{escape(self.name)}</b>: {escape(who + self.trained_for)}.</p>{game}"
+
+    @property
+    def trained_for(self) -> str:
+        """How long it trains, in words."""
+        worlds = f" of {self.worlds:,} worlds" if self.worlds > 1 else ""
+        return f"trained for {self.length:,} {self.unit} in {self.replicas} replicas{worlds}"
 
     @property
     def unit(self) -> Literal["episodes", "steps"]:

@@ -1,8 +1,7 @@
 """Story: the header, the live label, events, and at the end the phases of a training."""
 
-import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from math import isfinite, isnan
 from statistics import fmean, stdev
 from threading import Event, Thread
@@ -13,7 +12,7 @@ import numpy as np
 from cprl.commons.game import Game
 from cprl.commons.published import GAMES
 from cprl.commons.published import game as published_game
-from cprl.institutions import Institution
+from cprl.commons.readable import rules_of
 from cprl.measuring import phases
 from cprl.measuring.episodes import Episode
 from cprl.measuring.now import BEGINS, EXPLORING, Now
@@ -108,26 +107,6 @@ class Header:
         if boards == 1:
             return "the board died early" if died else ""
         return f"{died:,} of {boards:,} boards died early"
-
-
-def rules_of(game: Game | None) -> str:
-    """The institutions of a game, each with its first number and all that are not the defaults, e.g.
-    "quota (share 0.25, fine 2), monitoring (prob 0.5)"."""
-    return ", ".join(rule_of(institution) for institution in (game.institutions if game else ()))
-
-
-def rule_of(institution: Institution) -> str:
-    """An institution with its first number and all that are not the defaults."""
-    words = re.sub("(?<!^)(?=[A-Z])", " ", type(institution).__name__).lower()
-    settings: list[str] = []
-    for field in fields(institution):
-        value = getattr(institution, field.name)
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if isinstance(value, Institution):
-            settings.append(f"on {rule_of(value)}")
-        elif is_number and (not settings or value != field.default):
-            settings.append(f"{field.name.replace('_', ' ')} {value:g}")
-    return f"{words} ({', '.join(settings)})" if settings else words
 
 
 def _number(value: float) -> str:

@@ -1,0 +1,74 @@
+"""Games, boards and experiments draw themselves; the notebook of `examples` runs from the first cell on."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+import cprl
+from cprl import maps, presets
+from cprl.algorithms import DQN
+from cprl.commons.colours import APPLE, PALETTE, WASTE, agent_colour
+from cprl.institutions import Quota
+from cprl.population import Learning, Scripted
+
+NOTEBOOK = Path(__file__).parents[1] / "examples" / "notebook.ipynb"
+
+
+def squares(svg):
+    """How many squares of each colour a picture has."""
+    fills = [one.get("fill") for one in ElementTree.fromstring(svg).iter() if one.tag.endswith("rect")]
+    return {fill: fills.count(fill) for fill in fills}
+
+
+def hexed(colour):
+    return "#" + bytes(colour).hex()
+
+
+def test_a_board_draws_its_apples_and_agents():
+    drawn = squares(maps.parse("A>A\n.#A\n^.A")._repr_html_())
+    assert drawn[hexed(PALETTE[APPLE])] == 4
+    assert drawn[hexed(agent_colour(0))] == drawn[hexed(agent_colour(1))] == 1
+    cleanup = presets.game("ssd/cleanup-v1").map
+    assert squares(cleanup._repr_html_())[hexed(PALETTE[WASTE])] == len(cleanup.waste)
+
+
+def test_a_game_and_an_experiment_say_what_they_are():
+    game = presets.game("commons", variant="as_run")
+    assert "Rules: none beyond the game." in game._repr_html_()
+    learning = Learning(DQN(settings=presets.dqn_settings("commons")))
+    agents = (learning, learning, Scripted("greedy"), Scripted("greedy"))
+    game = cprl.Game(map=game.map, rules=game.rules, institutions=(Quota(share=0.25, window_steps=50),))
+    experiment = cprl.Experiment(name="a<b", game=game, agents=agents, episodes=3, replicas=2, worlds=4)
+    html = experiment._repr_html_()
+    assert html.startswith(
+        "<p><b>a&lt;b</b>: 2 agents by DQN, 2 agents by the script &#x27;greedy&#x27;, "
+        "trained for 3 episodes in 2 replicas of 4 worlds.</p>"
+    )
+    assert "Rules: quota (share 0.25" in html
+    assert "<svg" in html
+
+
+@pytest.mark.integration
+def test_the_notebook_runs(tmp_path):
+    notebook = nbformat.read(NOTEBOOK, 4)
+    first = notebook.cells[1]
+    assert "EPISODES = 300" in first.source
+    first.source = first.source.replace("EPISODES = 300", "EPISODES = 1")
+    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": tmp_path}}).execute()
+    shown = [
+        output.data.get("text/html", "")
+        for cell in notebook.cells
+        for output in cell.get("outputs", ())
+        if output.output_type == "execute_result"
+    ]
+    assert [("<svg" in html, "<iframe" in html) for html in shown] == [
+        (True, False),
+        (True, False),
+        (False, True),
+        (False, True),
+    ]
+    assert "A quota" in shown[2]
+    assert (tmp_path / "notebook" / "no_rule" / "report.html").is_file()
