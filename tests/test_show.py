@@ -91,6 +91,7 @@ def test_a_page_holds_the_episode_that_a_film_shows(runs, tmp_path):
     assert "fined" not in greedy
     assert (greedy["isDead"], governed["isDead"]) == (True, False)
     assert greedy["outcome"] == f"dead at turn {first.steps}"
+    assert "<h1>Different learners, different rules</h1>" in path.read_text(encoding="utf-8")
     assert data["axis"] == GOVERNED.rules.episode_steps
 
 
@@ -104,8 +105,7 @@ def test_a_page_opens_without_a_network_and_is_small(runs, tmp_path):
 def test_titles_are_text_and_not_html(runs, tmp_path):
     title = "</script><script>alert(1)</script> $data"
     path, _ = show(runs / "greedy", tmp_path / "own.html", titles=[title])
-    text = path.read_text(encoding="utf-8")
-    assert "<script>alert" not in text
+    assert "<script>alert" not in path.read_text(encoding="utf-8")
     assert told(path)["populations"][0]["title"] == title
 
 

@@ -91,12 +91,20 @@ def show(
     refuse_to_write_over(path)
     fresh = [fresh_episode(one, replica=replica, episode=episode, seed=seed, allow=allow) for one in runs]
     data, filmed = shown(fresh, titles)
-    title = "Same learners, different rules" if len(runs) > 1 else data["populations"][0]["title"]
-    game = commons_game(fresh[0].run)
-    text = page(title, f"<p>{escape(growth_of(game))}</p>", data)
+    text = page(_heading(fresh, data), f"<p>{escape(growth_of(commons_game(fresh[0].run)))}</p>", data)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda file: file.write(text.encode()))
     return path, tuple(one.episode for one in filmed)
+
+
+def _heading(fresh: Sequence[FreshEpisode], data: dict[str, Any]) -> str:
+    """The title of the population, or what differs between several."""
+    if len(fresh) == 1:
+        return str(data["populations"][0]["title"])
+    learners = {learned(population.run.specs) for population in fresh}
+    rules = {rules_of(commons_game(population.run)) for population in fresh}
+    alike = "Same" if len(learners) == 1 else "Different"
+    return f"{alike} learners, {'the same rules' if len(rules) == 1 else 'different rules'}"
 
 
 class Page(type(Path())):  # type: ignore[misc]
