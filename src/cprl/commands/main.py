@@ -38,6 +38,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     "show": "play_stored:show",
     "report": "play_stored:report",
     "play": "play_stored:play",
+    "sandbox": "play_stored:sandbox",
     "export": "main:export",
     "evaluate": "play_stored:evaluate",
     "visits": "play_stored:visits",

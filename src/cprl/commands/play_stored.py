@@ -181,6 +181,28 @@ def report(run: Path, /, *, out: Path | None = None, episodes: int = 20, seed: i
     say(f"{path}: {path.stat().st_size / 1000:.0f} kB; open it in a browser")
 
 
+def sandbox(*, port: int = 0, out: Path | None = None, episodes: int = 150) -> None:
+    """Opens a page with sliders for people who do not program: rules, boards, scripted agents, trainings.
+
+    Args:
+        port: of the page, which is on 127.0.0.1 alone; 0 for any that is free.
+        out: where trainings are kept; by default they are gone when the sandbox is closed.
+        episodes: of a training.
+    """
+    prepare_process(0)
+
+    from cprl.evaluation.sandbox import Sandbox
+
+    served = Sandbox(out, port=port, episodes=episodes)
+    say(f"{served.address} is open until Ctrl-C")
+    try:
+        served.server.serve_forever()
+    except KeyboardInterrupt:
+        say("closed")
+    finally:
+        served.close()
+
+
 @dataclass(frozen=True, kw_only=True)
 class Session:
     """Who plays among whom, see `cprl.evaluation.play.open_session`."""

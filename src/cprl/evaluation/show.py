@@ -118,17 +118,18 @@ class Page(type(Path())):  # type: ignore[misc]
         return f'<iframe srcdoc="{text}" style="width:100%;height:{self.HEIGHT}px;border:0"></iframe>'
 
 
-def page(title: str, before: str, data: dict[str, Any], after: str = "") -> str:
+def page(title: str, before: str, data: dict[str, Any], after: str = "", *, live: str = "") -> str:
     """The text of a page.
 
     Args:
         before, after: HTML above and below the episode.
         data: of `shown`; without populations no episode is shown.
+        live: JavaScript that runs after the page's own.
     """
     template = files("cprl.evaluation").joinpath("show.html").read_text(encoding="utf-8")
     encoded = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
-    parts = {"title": escape(title), "before": before, "after": after, "data": encoded}
-    return re.sub(r"\$(title|before|after|data)\b", lambda found: parts[found[1]], template)
+    parts = {"title": escape(title), "before": before, "after": after, "data": encoded, "live": live}
+    return re.sub(r"\$(title|before|after|data|live)\b", lambda found: parts[found[1]], template)
 
 
 def shown(
@@ -177,7 +178,8 @@ def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, An
     ended = (
         f"dead at turn {len(moments) - 1:,}" if filmed.is_dead else f"lives after {len(moments) - 1:,} turns"
     )
-    who = f"{learned(fresh.run.specs)}, {fresh.run.experiment.trained_for}"
+    has_learned = bool(fresh.run.networks)
+    who = learned(fresh.run.specs) + f", {fresh.run.experiment.trained_for}" * has_learned
     return {
         "title": title,
         "about": f"{who}. Rules: {rules_of(game) or NO_RULES}.",

@@ -1,0 +1,288 @@
+"""Sliders in a browser for people who do not program: scripted agents play at once, and can be trained.
+
+A page on 127.0.0.1 that asks for an episode whenever a slider has moved, and nothing while nobody moves one.
+What is played and trained is the recipe that the page hands out.
+"""
+
+import json
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from html import escape
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Lock
+from typing import Annotated, Any, Final, Literal, Self, get_args
+from urllib.parse import parse_qsl, urlsplit
+
+from cprl.commons.game import Game
+from cprl.commons.published import game as published_game
+from cprl.evaluation.film import fresh_episode
+from cprl.evaluation.show import page, shown
+from cprl.experiment import Experiment
+from cprl.population import Scripted
+from cprl.runs.recipe import start_run
+from cprl.runs.weights import save_weights
+from cprl.values import Natural, Range, Value, checked
+
+Board = Literal["commons", "two_complex", "single_complex", "single_basic"]
+_EPISODES: Final = 150
+_RECIPE: Final = '''\
+"""A commons from the sandbox of cprl."""
+
+from dataclasses import replace
+
+import cprl
+from cprl import maps, presets
+from cprl.algorithms import DQN
+from cprl.institutions import {imports}
+from cprl.population import Learning
+
+
+def game() -> cprl.Game:
+    base = presets.game("{board}")
+    rules = replace(base.rules, regrow_prob={regrow_prob}, window_rows={sight}, window_columns={columns})
+    institutions = ({institutions})
+    return replace(base, map=maps.with_agents(base.map, {agents}), rules=rules, institutions=institutions)
+
+
+def experiment() -> cprl.Experiment:
+    """{agents} DQN agents that learn from 16 worlds at once, on a short schedule."""
+    settings = replace(
+        presets.dqn_settings("commons"),
+        learning_rate=1e-3,
+        epsilon_decay_steps=100_000,
+        gamma=0.97,
+        steps_per_update=16,
+        batch_size=64,
+    )
+    agents = (Learning(DQN(settings=settings)),) * {agents}
+    return cprl.Experiment(
+        name="sandbox", game=game(), agents=agents, episodes={episodes}, replicas=1, worlds=16
+    )
+
+
+if __name__ == "__main__":
+    cprl.recipe_main(experiment)
+'''
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sliders(Value, stored=False):
+    """What the page lets people choose."""
+
+    board: Board = "commons"
+    agents: Annotated[int, Range(1, 12)] = 4
+    regrowth: Annotated[float, Range(0, 5)] = 1.0
+    """By which the board's probabilities that apples grow are multiplied."""
+    greedy: Natural = 4
+    """How many of the agents take every apple; the others leave some near each that they take."""
+    sight: Annotated[int, Range(3, 15)] = 7
+    """How many cells ahead agents see, and as many to each side."""
+    quota: Annotated[float, Range(0, 1)] = 0.0
+    """The share of what the board can bear, of each agent in 50 turns, see `Quota`; 0 for no quota."""
+    tax: Annotated[float, Range(0, 1)] = 0.0
+    """The share of each harvest that is shared equally; 0 for none."""
+    sanctions: Annotated[int, Range(0, 1)] = 0
+    """Whether who tags others is sanctioned, more with each offence."""
+
+    @classmethod
+    def of(cls, query: Mapping[str, str]) -> Self:
+        """The sliders of a query; raises a ValueError that names what is wrong."""
+        kinds = {name: type(value) for name, value in vars(cls()).items()}
+        if unknown := sorted(set(query) - set(kinds)):
+            raise ValueError(f"{', '.join(unknown)}: no slider; allowed: {', '.join(kinds)}")
+        return cls(**{name: kinds[name](text) for name, text in query.items()})
+
+    def recipe(self, episodes: int = _EPISODES) -> str:
+        """The recipe of the game, with agents that learn."""
+        base = published_game(self.board)
+        institutions = {
+            "Quota": f"Quota(share={self.quota!r}, window_steps=50)" if self.quota else "",
+            "Tax": f'Tax(rate={self.tax!r}, redistribution="equal")' if self.tax else "",
+            "GraduatedSanctions": 'GraduatedSanctions(on="tags")' if self.sanctions else "",
+        }
+        used = [name for name, text in institutions.items() if text]
+        probs = tuple(round(min(1.0, prob * self.regrowth), 6) for prob in base.rules.regrow_prob)
+        text = _RECIPE.format(
+            imports=", ".join(sorted(used)),
+            board=self.board,
+            regrow_prob=probs,
+            sight=self.sight,
+            columns=2 * self.sight + 1,
+            institutions="".join(f"{institutions[name]}, " for name in used).rstrip(),
+            agents=self.agents,
+            episodes=episodes,
+        )
+        return text if used else text.replace("from cprl.institutions import \n", "")
+
+    def game(self) -> Game:
+        """The game of the recipe."""
+        namespace: dict[str, Any] = {"__name__": "sandbox"}
+        exec(self.recipe(), namespace)
+        game: Game = namespace["game"]()
+        return game
+
+
+class Sandbox:
+    """Serves the page on 127.0.0.1 until `close`; trains one population at a time.
+
+    Args:
+        folder: where runs are written; by default a temporary one.
+        port: of the page; 0 for any that is free.
+        episodes: of a training.
+    """
+
+    def __init__(self, folder: Path | None = None, *, port: int = 0, episodes: int = _EPISODES) -> None:
+        self._temporary = TemporaryDirectory()
+        self.folder = Path(self._temporary.name) if folder is None else folder
+        self.episodes = checked("episodes", episodes, Annotated[int, Range(1, 2**31)])
+        self._lock, self._training = Lock(), None
+        self._trained: Path | None = None
+        self._number = 0
+        self.server = ThreadingHTTPServer(("127.0.0.1", port), partial(_Handler, self))
+        self.address = f"http://127.0.0.1:{self.server.server_port}/"
+
+    _training: "subprocess.Popen[bytes] | None"
+
+    def close(self) -> None:
+        """End a training that runs, and stop serving."""
+        if self._training is not None:
+            self._training.terminate()
+            self._training.wait()
+        self.server.server_close()
+        self._temporary.cleanup()
+
+    def play(self, sliders: Sliders, *, trained: bool) -> dict[str, Any]:
+        """What `show.html` is told of an episode of scripted agents, and beside it one of trained ones."""
+        with self._lock:
+            game, greedy = sliders.game(), min(sliders.greedy, sliders.agents)
+            agents = (Scripted("greedy"),) * greedy + (Scripted("sustainable"),) * (game.agents - greedy)
+            experiment = Experiment(name="scripted", game=game, agents=agents, episodes=1, replicas=1)
+            with TemporaryDirectory() as folder:
+                run = Path(folder, "scripted")
+                save_weights(start_run(run, "scripted", experiment.to_recipe), {})
+                runs = {f"{greedy} greedy, {game.agents - greedy} restrained": run}
+                if trained and self._trained is not None:
+                    runs["Trained"] = self._trained
+                data, _ = shown([fresh_episode(run) for run in runs.values()], list(runs))
+        return data
+
+    def train(self, sliders: Sliders) -> None:
+        """Begin to train; raises a ValueError while a training runs."""
+        if self.state()["state"] == "training":
+            raise ValueError("a training runs; wait until it has ended")
+        self._number += 1
+        self.folder.mkdir(parents=True, exist_ok=True)
+        recipe = self.folder / f"sandbox-{self._number}.py"
+        recipe.write_text(sliders.recipe(self.episodes), encoding="utf-8")
+        run = recipe.with_suffix("")
+        with open(f"{run}.log", "wb") as log:
+            words = [sys.executable, str(recipe), "--watch", "off", "--no-keep-checkpoint", "--out", str(run)]
+            self._training = subprocess.Popen(words, stdout=log, stderr=log, stdin=subprocess.DEVNULL)
+
+    def state(self) -> dict[str, str]:
+        """How the training is: "none", "training", "trained" or "failed", and its last line."""
+        if self._training is None:
+            return {"state": "none", "line": ""}
+        run = self.folder / f"sandbox-{self._number}"
+        lines = Path(f"{run}.log").read_text(encoding="utf-8", errors="replace").split("\n")
+        line = next((text.strip() for text in reversed(lines) if text.strip()), "it begins")
+        code = self._training.poll()
+        if code is None:
+            return {"state": "training", "line": line}
+        if code == 0:
+            self._trained = run
+        return {"state": "failed" if code else "trained", "line": line}
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers the page's questions, if the page is ours."""
+
+    def __init__(self, sandbox: Sandbox, *arguments: Any) -> None:
+        self._sandbox = sandbox
+        super().__init__(*arguments)
+
+    def do_GET(self) -> None:
+        self._answer({"/": self._page, "/data": self._data, "/recipe": self._recipe, "/state": self._state})
+
+    def do_POST(self) -> None:
+        self._answer({"/train": self._train})
+
+    def _answer(self, answers: Mapping[str, Any]) -> None:
+        port = self._sandbox.server.server_port
+        ours = {f"127.0.0.1:{port}", f"localhost:{port}"}
+        origin = self.headers.get("Origin")
+        is_ours = self.headers.get("Host") in ours and origin in (None, *(f"http://{host}" for host in ours))
+        address = urlsplit(self.path)
+        if not is_ours or address.path not in answers:
+            self._send("not here", "text/plain", HTTPStatus.NOT_FOUND if is_ours else HTTPStatus.FORBIDDEN)
+            return
+        query = dict(parse_qsl(address.query))
+        trained = query.pop("trained", "") == "yes"
+        try:
+            text, kind = answers[address.path](Sliders.of(query), trained)
+        except ValueError as error:
+            self._send(str(error), "text/plain", HTTPStatus.BAD_REQUEST)
+            return
+        self._send(text, kind, HTTPStatus.OK)
+
+    def _page(self, sliders: Sliders, trained: bool) -> tuple[str, str]:
+        return sandbox_page(), "text/html"
+
+    def _data(self, sliders: Sliders, trained: bool) -> tuple[str, str]:
+        return json.dumps(self._sandbox.play(sliders, trained=trained)), "application/json"
+
+    def _recipe(self, sliders: Sliders, trained: bool) -> tuple[str, str]:
+        return sliders.recipe(self._sandbox.episodes), "text/plain"
+
+    def _state(self, sliders: Sliders, trained: bool) -> tuple[str, str]:
+        return json.dumps(self._sandbox.state()), "application/json"
+
+    def _train(self, sliders: Sliders, trained: bool) -> tuple[str, str]:
+        self._sandbox.train(sliders)
+        return self._state(sliders, trained)
+
+    def _send(self, text: str, kind: str, status: HTTPStatus) -> None:
+        content = text.encode()
+        self.send_response(status)
+        self.send_header("Content-Type", f"{kind}; charset=utf-8")
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, *arguments: Any) -> None:
+        """Say nothing."""
+
+
+def sandbox_page() -> str:
+    """The page, without an episode yet."""
+    boards = "".join(f"<option>{board}</option>" for board in get_args(Board))
+    sliders = "".join(
+        f'<label>{escape(words)} <span></span><input type="range" name="{name}" min="{low}" max="{high}" '
+        f'step="{step}" value="{getattr(Sliders(), name)}"></label>'
+        for name, words, low, high, step in (
+            ("agents", "agents", 1, 12, 1),
+            ("greedy", "of them greedy; the others restrained", 0, 12, 1),
+            ("regrowth", "apples grow, times as fast", 0, 5, 0.25),
+            ("sight", "cells that agents see ahead", 3, 15, 1),
+            ("quota", "quota, share of a sustainable harvest", 0, 1, 0.05),
+            ("tax", "tax, shared equally", 0, 1, 0.05),
+            ("sanctions", "graduated sanctions for tagging", 0, 1, 1),
+        )
+    )
+    before = (
+        "<p>Move a slider: an episode is played by your rules at once. "
+        "Scripted agents do not mind what rules cost them; agents that are trained do.</p>"
+        f'<div class="controls"><label>board <select name="board">{boards}</select></label>{sliders}</div>'
+        '<button id="train">Train these</button> <button id="recipe">Copy as recipe</button> '
+        '<span id="said" class="faint" role="status"></span>'
+    )
+    script = files("cprl.evaluation").joinpath("sandbox.js").read_text(encoding="utf-8")
+    nothing = {"populations": [], "palette": {}, "axis": 0, "most": 0}
+    return page("A commons to play with", before, nothing, live=script)

@@ -1,0 +1,117 @@
+"""The page with sliders: what it plays, trains, hands out and refuses."""
+
+import json
+import runpy
+import threading
+import time
+from http.client import HTTPConnection
+
+import pytest
+from viewers import browser, wait_until
+
+from cprl import maps, presets
+from cprl.evaluation.sandbox import Sandbox, Sliders
+from cprl.institutions import GraduatedSanctions, Quota, Tax
+
+
+@pytest.fixture
+def sandbox(tmp_path):
+    served = Sandbox(tmp_path / "runs", episodes=1)
+    thread = threading.Thread(target=served.server.serve_forever, daemon=True)
+    thread.start()
+    yield served
+    served.server.shutdown()
+    served.close()
+    thread.join()
+
+
+def asked(sandbox, path, method="GET", **headers):
+    """The status and the text of an answer."""
+    connection = HTTPConnection("127.0.0.1", sandbox.server.server_port, timeout=60)
+    connection.request(method, path, headers=headers)
+    answer = connection.getresponse()
+    text = answer.read().decode()
+    connection.close()
+    return answer.status, text
+
+
+def test_the_recipe_is_the_game_that_is_played(tmp_path):
+    sliders = Sliders(agents=6, regrowth=2, sight=5, quota=0.25, tax=0.5, sanctions=1)
+    path = tmp_path / "mine.py"
+    path.write_text(sliders.recipe(), encoding="utf-8")
+    experiment = runpy.run_path(str(path))["experiment"]()
+    game, base = experiment.game, presets.game("commons")
+    assert game == sliders.game()
+    assert game.map == maps.with_agents(base.map, 6)
+    assert game.rules.regrow_prob == tuple(2 * prob for prob in base.rules.regrow_prob)
+    assert (game.rules.window_rows, game.rules.window_columns) == (5, 11)
+    assert [type(one) for one in game.institutions] == [Quota, Tax, GraduatedSanctions]
+    assert len(experiment.agents) == 6
+    assert Sliders().game() == presets.game("commons"), "sliders begin at the published game"
+
+
+def test_an_episode_has_the_agents_of_the_sliders(sandbox):
+    status, text = asked(sandbox, "/data?agents=3&greedy=1&quota=0.25")
+    [population] = json.loads(text)["populations"]
+    assert status == 200
+    assert population["title"] == "1 greedy, 2 restrained"
+    assert population["agents"] == 3
+    assert "quota (share 0.25" in population["about"]
+    assert "trained" not in population["about"]
+
+
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        ("/data?agents=99", "agents is 99"),
+        ("/data?agents=x", "x"),
+        ("/data?tax=nan", "tax is nan"),
+        ("/data?board=../mine", "board"),
+        ("/data?own=1", "no slider"),
+    ],
+)
+def test_what_no_slider_can_be_is_refused_in_a_sentence(sandbox, path, said):
+    status, text = asked(sandbox, path)
+    assert (status, said in text) == (400, True), text
+
+
+def test_pages_of_others_are_not_answered(sandbox):
+    port = sandbox.server.server_port
+    assert asked(sandbox, "/")[0] == 200
+    assert asked(sandbox, "/", Host=f"localhost:{port}")[0] == 200
+    assert asked(sandbox, "/", Host="evil.example")[0] == 403
+    assert asked(sandbox, "/train", "POST", Origin="http://evil.example")[0] == 403
+    assert asked(sandbox, "/train")[0] == 404, "nobody trains by a link"
+    assert sandbox.state()["state"] == "none"
+
+
+@pytest.mark.integration
+def test_agents_are_trained_and_play_beside_the_scripted_ones(sandbox):
+    assert asked(sandbox, "/train?agents=2", "POST")[0] == 200
+    assert asked(sandbox, "/train?agents=2", "POST") == (400, "a training runs; wait until it has ended")
+    deadline = time.monotonic() + 300
+    while json.loads(asked(sandbox, "/state")[1])["state"] == "training" and time.monotonic() < deadline:
+        time.sleep(0.5)
+    assert sandbox.state()["state"] == "trained", (sandbox.folder / "sandbox-1.log").read_text()
+    populations = json.loads(asked(sandbox, "/data?agents=2&trained=yes")[1])["populations"]
+    assert [one["title"] for one in populations] == ["2 greedy, 0 restrained", "Trained"]
+    assert "2 agents by DQN, trained for 1 episodes" in populations[1]["about"]
+
+
+@pytest.mark.viewer
+@pytest.mark.parametrize("width", [1440, 400])
+def test_chromium_plays_by_the_sliders(sandbox, tmp_path, width):
+    with browser(sandbox.address, size=(width, 1000)) as page:
+        page.resize(width, 1000)
+
+        def title():
+            return page.run("return document.querySelector('.population h2')?.firstChild.textContent.trim()")
+
+        wait_until(lambda: title() == "4 greedy, 0 restrained", 60.0, "nothing is played")
+        page.run(
+            "const own = document.querySelector('[name=greedy]'); own.value = 1;"
+            "own.dispatchEvent(new Event('input'))"
+        )
+        wait_until(lambda: title() == "1 greedy, 3 restrained", 60.0, "the slider does nothing")
+        assert page.run("return document.documentElement.scrollWidth <= innerWidth")
+        (tmp_path / "sandbox.png").write_bytes(page())
