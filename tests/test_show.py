@@ -90,7 +90,7 @@ def test_a_page_holds_the_episode_that_a_film_shows(runs, tmp_path):
     assert len(governed["regions"]) == 4
     assert "fined" not in greedy
     assert (greedy["isDead"], governed["isDead"]) == (True, False)
-    assert greedy["outcome"] == f"dead at turn {first.steps}"
+    assert greedy["outcome"] == f"dead at turn {first.steps}: no apple is left"
     assert "<h1>Different learners, different rules</h1>" in path.read_text(encoding="utf-8")
     assert data["axis"] == GOVERNED.rules.episode_steps
 

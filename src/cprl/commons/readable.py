@@ -3,6 +3,7 @@
 import re
 from dataclasses import fields
 from html import escape
+from inspect import getdoc
 from typing import TYPE_CHECKING, Final
 
 from cprl.commons.svg import board_svg
@@ -53,3 +54,8 @@ def rule_of(institution: Institution) -> str:
         elif is_number and (not settings or value != field.default):
             settings.append(f"{field.name.replace('_', ' ')} {value:g}")
     return f"{words} ({', '.join(settings)})" if settings else words
+
+
+def meaning_of(institution: Institution) -> str:
+    """What an institution does, in a sentence."""
+    return " ".join((getdoc(institution) or "").partition("\n\n")[0].split())

@@ -5,7 +5,6 @@ import re
 from base64 import b64encode
 from collections.abc import Sequence
 from html import escape
-from inspect import getdoc
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -13,7 +12,7 @@ from typing import Any, Final
 from markdown_it import MarkdownIt
 
 from cprl.commons.game import Game
-from cprl.commons.readable import growth_of, rule_of
+from cprl.commons.readable import growth_of, meaning_of, rule_of
 from cprl.evaluation.evaluate import evaluate_run, run_table
 from cprl.evaluation.film import fresh_episode
 from cprl.evaluation.show import Page, page, shown
@@ -104,14 +103,10 @@ def _rules(game: Game) -> list[str]:
         "",
         f"{game.agents} agents on a board of {game.map.height} x {game.map.width} cells.",
     ]
-    lines += ["", *(f"- **{rule_of(one)}**: {_first_paragraph(one)}" for one in game.institutions)]
+    lines += ["", *(f"- **{rule_of(one)}**: {meaning_of(one)}" for one in game.institutions)]
     changed = game.rules.changed
     lines += ["", "Rules that differ from those of `Rules()`:" if changed else "All other rules: `Rules()`."]
     return [*lines, "", *(f"- `{name}`: `{value}`" for name, value in changed.items())]
-
-
-def _first_paragraph(value: object) -> str:
-    return " ".join((getdoc(value) or "").partition("\n\n")[0].split())
 
 
 def _recipe(run: LoadedRun) -> str:

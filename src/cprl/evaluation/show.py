@@ -31,7 +31,7 @@ from cprl.commons.colours import (
     line_colour,
 )
 from cprl.commons.picture import EMPTY_SITE_COLOUR
-from cprl.commons.readable import NO_RULES, growth_of, rules_of
+from cprl.commons.readable import NO_RULES, growth_of, meaning_of, rules_of
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.film import Filmed, FreshEpisode, check_titles, fresh_episode, play_to_show, titles_of
 from cprl.evaluation.film_pictures import nice
@@ -171,18 +171,21 @@ def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, An
         "beam_first": np.cumsum([0, *map(len, lit)]).astype(np.uint32),
         "beams": np.concatenate(lit).astype(np.uint32),
     }
-    counted = ["apples on the board", "harvested by all", "equality"]
+    counted = ["apples on the board", "harvested by all", "equality, 1: all got the same"]
     if game.institutions:
         arrays["fined"] = filmed.fines.astype(np.float32)
         counted.append("paid in fines")
     ended = (
-        f"dead at turn {len(moments) - 1:,}" if filmed.is_dead else f"lives after {len(moments) - 1:,} turns"
+        f"dead at turn {len(moments) - 1:,}: no apple is left"
+        if filmed.is_dead
+        else f"lives after {len(moments) - 1:,} turns"
     )
     has_learned = bool(fresh.run.networks)
+    meanings = " ".join(map(meaning_of, game.institutions))
     who = learned(fresh.run.specs) + f", {fresh.run.experiment.trained_for}" * has_learned
     return {
         "title": title,
-        "about": f"{who}. Rules: {rules_of(game) or NO_RULES}.",
+        "about": f"{who}. Rules: {rules_of(game) or NO_RULES}. {meanings}".strip(),
         "outcome": ended,
         "isDead": filmed.is_dead,
         "counted": counted,
