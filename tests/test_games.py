@@ -114,6 +114,7 @@ def games(draw):
     return replace(game, map=replace(board, spawns=spawns), rules=rules)
 
 
+@pytest.mark.filterwarnings("ignore:no agent can harvest:UserWarning")
 @settings(max_examples=80, deadline=None)
 @given(games(), st.integers(0, 2**32))
 def test_the_invariants_hold_under_the_rules_of_the_literature(game, seed):
@@ -122,6 +123,7 @@ def test_the_invariants_hold_under_the_rules_of_the_literature(game, seed):
     check_no_beam_passes_a_wall(game, seed)
 
 
+@pytest.mark.filterwarnings("ignore:no agent can harvest:UserWarning")
 @settings(max_examples=20, deadline=None)
 @given(games(), st.integers(0, 2**32))
 def test_a_state_under_these_rules_determines_the_future(game, seed):
