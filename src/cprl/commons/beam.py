@@ -64,40 +64,28 @@ def beam_reach(world: Worlds, tables: Tables, shooter: int, side: int, present: 
 def first_agent(world: Worlds, tables: Tables, shooter: int, side: int, reach: int, present: Bools) -> int:
     """How many cells ahead the first agent is in a column of a beam, or its reach if there is none."""
     for i in range(present.shape[0]):
-        if present[i] and side_of(world, tables, i, shooter) == side:
-            ahead = ahead_of(world, tables, i, shooter)
-            if ahead >= beam_begin(tables, side):
-                reach = min(reach, ahead)
+        ahead, aside = place_in_beam(world, tables, i, shooter)
+        if present[i] and aside == side and ahead >= beam_begin(tables, side):
+            reach = min(reach, ahead)
     return reach
 
 
-def ahead_of(world: Worlds, tables: Tables, i: int, shooter: int) -> int:
-    """How many cells ahead of where a shooter fired agent i is."""
+def place_in_beam(world: Worlds, tables: Tables, i: int, shooter: int) -> tuple[int, int]:
+    """How many cells ahead of where a shooter fired, and how many to its right, agent i is."""
     heading = world.heading[shooter]
+    right = (heading + 1) % 4
     rows = world.row[i] - beam_row(world, tables, shooter)
     cols = world.col[i] - beam_col(world, tables, shooter)
-    return rows * ROW_STEP[heading] + cols * COL_STEP[heading]
-
-
-def side_of(world: Worlds, tables: Tables, i: int, shooter: int) -> int:
-    """How many cells to the right of where a shooter fired agent i is."""
-    right = (world.heading[shooter] + 1) % 4
-    rows = world.row[i] - beam_row(world, tables, shooter)
-    cols = world.col[i] - beam_col(world, tables, shooter)
-    return rows * ROW_STEP[right] + cols * COL_STEP[right]
+    ahead = rows * ROW_STEP[heading] + cols * COL_STEP[heading]
+    return ahead, rows * ROW_STEP[right] + cols * COL_STEP[right]
 
 
 def is_hit(world: Worlds, tables: Tables, target: int, shooter: int) -> bool:
     """Whether the shooter's beam covers the target's cell."""
-    heading = world.heading[shooter]
-    right = (heading + 1) % 4
-    rows = world.row[target] - beam_row(world, tables, shooter)
-    cols = world.col[target] - beam_col(world, tables, shooter)
-    ahead = rows * ROW_STEP[heading] + cols * COL_STEP[heading]
-    side = rows * ROW_STEP[right] + cols * COL_STEP[right]
+    ahead, side = place_in_beam(world, tables, target, shooter)
     return (
         ahead >= beam_begin(tables, side)
-        and ahead <= tables.beam_length[heading]
+        and ahead <= tables.beam_length[world.heading[shooter]]
         and abs(side) <= tables.beam_half_width
         and ahead <= beam_reach(world, tables, shooter, side, world.in_play)
     )
