@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from cprl.commons.published import Variant, check_board
-from cprl.system.defaults import EGTA_RESAMPLES, FILM_SEED, FILM_SUFFIXES, PLAY_SEED, SEED, Diagonal
+from cprl.system.defaults import (
+    EGTA_RESAMPLES,
+    FILM_SEED,
+    FILM_SUFFIXES,
+    PLAY_SEED,
+    SANDBOX_EPISODES,
+    SEED,
+    STUDY_TABLE,
+    Diagonal,
+)
 from cprl.system.output import printed, say
 from cprl.system.process import prepare_process
 
@@ -172,8 +181,7 @@ def report(run: Path, /, *, out: Path | None = None, episodes: int = 20, seed: i
         episodes: of a run, how many fresh ones each replica plays, as of cprl evaluate.
         seed: likewise: of their worlds and all chance.
     """
-    is_study = (run / "table.parquet").is_file()
-    _begin(seed, *([] if is_study else [run]))
+    _begin(seed, *([] if (run / STUDY_TABLE).is_file() else [run]))
 
     from cprl.evaluation.report import report as report_on
 
@@ -181,7 +189,7 @@ def report(run: Path, /, *, out: Path | None = None, episodes: int = 20, seed: i
     say(f"{path}: {path.stat().st_size / 1000:.0f} kB; open it in a browser")
 
 
-def sandbox(*, port: int = 0, out: Path | None = None, episodes: int = 150) -> None:
+def sandbox(*, port: int = 0, out: Path | None = None, episodes: int = SANDBOX_EPISODES) -> None:
     """Opens a page with sliders for people who do not program: rules, boards, scripted agents, trainings.
 
     Args:

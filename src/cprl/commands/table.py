@@ -9,7 +9,7 @@ import tyro
 
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.runs.recipe import runs_in
-from cprl.system.defaults import LAST, WINDOW
+from cprl.system.defaults import LAST, STUDY_TABLE, WINDOW
 from cprl.system.output import OUT, say
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def table(
 
 
 def _table_in(runs: Sequence[Path], reference: str | None, window: int | None) -> "StudyTable":
-    path = runs[0] / "table.parquet"
+    path = runs[0] / STUDY_TABLE
     if len(runs) > 1 or not path.exists():
         raise ValueError(
             "cprl table wants a field that tells runs apart: cprl table RUN... --by game.rules.freeze-steps; "

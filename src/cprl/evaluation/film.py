@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 from cprl import keys
 from cprl.commons.world import Bytes, Shown
 from cprl.envs.unwrap import commons_of
+from cprl.evaluation.evaluate import opened
 from cprl.evaluation.film_pictures import (
     DEFAULT_WIDTH,
     LARGEST_WIDTH,
@@ -33,7 +34,7 @@ from cprl.system.defaults import FILM_SUFFIXES as SUFFIXES
 from cprl.system.memory import check_memory
 from cprl.system.output import legible
 from cprl.training import train
-from cprl.training.agents import LoadedRun, load
+from cprl.training.agents import LoadedRun
 from cprl.values import Natural, Positive, Range, Seed, Value, Where, checked, refusal
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.replay import Decisions, Offences, events
@@ -50,16 +51,21 @@ class FreshEpisode:
 
 
 def fresh_episode(
-    run: str | Path, *, replica: int = 0, episode: int = 0, seed: int = SEED, allow: Sequence[str] = ()
+    run: str | Path | LoadedRun,
+    *,
+    replica: int = 0,
+    episode: int = 0,
+    seed: int = SEED,
+    allow: Sequence[str] = (),
 ) -> FreshEpisode:
     """The world and the agents of an episode that is filmed; equal numbers give equal episodes."""
     episode = checked("episode", episode, Annotated[int, Range(0, 2**32 - 1)])
     replica = checked("replica", replica, Natural)
     seed = checked("seed", seed, Seed)
-    loaded = load(run, allow=allow)
+    loaded = opened(run, allow)
     if replica not in loaded.replicas:
         replicas = ", ".join(map(str, loaded.replicas))
-        raise ValueError(f"replica is {replica}; allowed: {replicas}, those of {run}")
+        raise ValueError(f"replica is {replica}; allowed: {replicas}, those of {loaded.path}")
     return FreshEpisode(
         run=loaded,
         env=loaded.env(1, seed=seed, first_world=episode),

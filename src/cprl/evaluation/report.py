@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Final
 
 from markdown_it import MarkdownIt
 
@@ -17,23 +17,20 @@ from cprl.evaluation.evaluate import evaluate_run, run_table
 from cprl.evaluation.film import fresh_episode
 from cprl.evaluation.show import Page, page, shown
 from cprl.measuring.metrics import with_unit
+from cprl.measuring.series import Values
 from cprl.population import learned
 from cprl.runs.curves import curves_of
-from cprl.runs.files import refuse_to_write_over, write_atomically
-from cprl.studies.results import SUMMARY, TABLE
+from cprl.studies.results import SUMMARY
 from cprl.studies.tables.comparing import compare, differing, metrics_of
 from cprl.studies.tables.table import EVALUATION, StudyTable
-from cprl.system.defaults import SEED
+from cprl.system.defaults import SEED, STUDY_TABLE
 from cprl.system.output import legible
 from cprl.terminal.figures import training_curve
 from cprl.terminal.summary import course_of
 from cprl.terminal.tables import markdown
 from cprl.training.agents import LoadedRun, load
-from cprl.values import refusal
 
-_EPISODES: Final = ("episodes.parquet", "episodes.arrows")
 _LARGEST_SVG_BYTES: Final = 300_000
-_NOTHING: Final[dict[str, Any]] = {"populations": [], "palette": {}, "axis": 0, "most": 0}
 
 
 def report(
@@ -61,26 +58,21 @@ def report(
     """
     folder = Path(path)
     page_path = Page(folder / "report.html" if out is None else out)
-    if page_path.suffix != ".html":
-        raise refusal("out", str(page_path), "a file whose name ends in .html")
-    refuse_to_write_over(page_path)
-    is_study = (folder / TABLE).is_file()
-    text = _of_study(folder) if is_study else _of_run(load(folder, allow=allow), episodes, seed, allow)
-    page_path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(page_path, lambda file: file.write(text.encode("utf-8", "replace")))
+    page_path.refuse()
+    is_study = (folder / STUDY_TABLE).is_file()
+    text = _of_study(folder) if is_study else _of_run(load(folder, allow=allow), episodes, seed)
+    page_path.write(text)
     return page_path
 
 
-def _of_run(run: LoadedRun, episodes: int, seed: int, allow: Sequence[str]) -> str:
+def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
     game, name = run.game, legible(run.experiment.name.replace("_", " "))
     evaluation = evaluate_run(run, episodes=episodes, seed=seed)
     is_commons = isinstance(game, Game)
-    data = (
-        shown([fresh_episode(run.path, replica=run.replicas[0], allow=allow)])[0] if is_commons else _NOTHING
-    )
+    data = shown([fresh_episode(run, replica=run.replicas[0])])[0] if is_commons else None
     before = [growth_of(game)] if is_commons else []
-    has_trained = any((run.path / name).is_file() for name in _EPISODES)
-    has_course = has_trained and {"collective_return", "survival_steps"} <= set(curves_of(run.path))
+    curves = _curves(run)
+    has_course = {"collective_return", "survival_steps"} <= set(curves)
     if has_course and (run.path / "evaluation" / "random.parquet").is_file():
         before.append(f"**{course_of(run.path)}**")
     before.append(f"{learned(run.specs)}, {run.experiment.trained_for}.")
@@ -88,12 +80,20 @@ def _of_run(run: LoadedRun, episodes: int, seed: int, allow: Sequence[str]) -> s
     after += [f"The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`."]
     sections = [
         _html("\n".join(after)),
-        *([f"<h2>Training</h2>{_training_figure(run)}"] if has_trained else []),
+        *([f"<h2>Training</h2>{_training_figure(run)}"] if curves else []),
         *([_html("\n".join(_rules(game)))] if is_commons else []),
         _recipe(run),
     ]
     after_it = "".join(f"<section>{section}</section>" for section in sections)
     return page(name, _html("\n\n".join(before)), data, after_it)
+
+
+def _curves(run: LoadedRun) -> dict[str, Values]:
+    """The curves of the training; none of a run that has played no episode."""
+    try:
+        return curves_of(run.path)
+    except FileNotFoundError:
+        return {}
 
 
 def _rules(game: Game) -> list[str]:
@@ -128,12 +128,11 @@ def _training_figure(run: LoadedRun) -> str:
         is_large = len(content) > _LARGEST_SVG_BYTES
         if is_large:
             content = training_curve(run.path, title="", path=Path(folder, "course.png")).read_bytes()
-    kind = "png" if is_large else "svg+xml"
-    return _figure(content, kind, "The course of the training")
+    return _figure(content, "png" if is_large else "svg+xml", "The course of the training")
 
 
 def _of_study(folder: Path) -> str:
-    table = StudyTable.read(folder / TABLE)
+    table = StudyTable.read(folder / STUDY_TABLE)
     summary = (folder / SUMMARY).read_text(encoding="utf-8")
     title, _, rest = summary.partition("\n")
     answer = _answer(table)
@@ -146,7 +145,7 @@ def _of_study(folder: Path) -> str:
         return _figure(path.read_bytes(), "png", image[2]) if is_ours and path.is_file() else ""
 
     body = re.sub(r'<p><img src="([^"]*)" alt="([^"]*)"\s*/?></p>', picture, _html(text))
-    return page(legible(title.lstrip("# ")), body, _NOTHING)
+    return page(legible(title.lstrip("# ")), body)
 
 
 def _answer(table: StudyTable) -> str:

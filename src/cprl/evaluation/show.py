@@ -30,6 +30,7 @@ from cprl.commons.colours import (
     agent_mark,
     line_colour,
 )
+from cprl.commons.maps import Map
 from cprl.commons.picture import EMPTY_SITE_COLOUR
 from cprl.commons.readable import NO_RULES, growth_of, meaning_of, rules_of
 from cprl.envs.unwrap import commons_of
@@ -83,17 +84,14 @@ def show(
     """
     path = Page(Path(run) / f"show-{replica}-{episode}.html" if out is None else out)
     runs = (run, *beside)
-    if path.suffix != ".html":
-        raise refusal("out", str(path), "a file whose name ends in .html")
     if len(runs) > MOST_RUNS:
         raise refusal("beside", f"{len(runs) - 1} runs", f"at most {MOST_RUNS - 1}")
     check_titles(tuple(titles), len(runs))
-    refuse_to_write_over(path)
+    path.refuse()
     fresh = [fresh_episode(one, replica=replica, episode=episode, seed=seed, allow=allow) for one in runs]
     data, filmed = shown(fresh, titles)
     text = page(_heading(fresh, data), f"<p>{escape(growth_of(commons_game(fresh[0].run)))}</p>", data)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda file: file.write(text.encode()))
+    path.write(text)
     return path, tuple(one.episode for one in filmed)
 
 
@@ -113,21 +111,34 @@ class Page(type(Path())):  # type: ignore[misc]
     HEIGHT = 900
     """Pixels in a notebook."""
 
+    def refuse(self) -> None:
+        """Refuse names of other files than pages, and to write over one."""
+        if self.suffix != ".html":
+            raise refusal("out", str(self), "a file whose name ends in .html")
+        refuse_to_write_over(self)
+
+    def write(self, text: str) -> None:
+        """Write the page, complete or not at all."""
+        self.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(self, lambda file: file.write(text.encode("utf-8", "replace")))
+
     def _repr_html_(self) -> str:
         text = escape(self.read_text(encoding="utf-8"))
         return f'<iframe srcdoc="{text}" style="width:100%;height:{self.HEIGHT}px;border:0"></iframe>'
 
 
-def page(title: str, before: str, data: dict[str, Any], after: str = "", *, live: str = "") -> str:
+def page(
+    title: str, before: str, data: dict[str, Any] | None = None, after: str = "", *, live: str = ""
+) -> str:
     """The text of a page.
 
     Args:
         before, after: HTML above and below the episode.
-        data: of `shown`; without populations no episode is shown.
+        data: of `shown`; None to show no episode.
         live: JavaScript that runs after the page's own.
     """
     template = files("cprl.evaluation").joinpath("show.html").read_text(encoding="utf-8")
-    encoded = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+    encoded = json.dumps(data or {"populations": []}, separators=(",", ":")).replace("<", "\\u003c")
     parts = {"title": escape(title), "before": before, "after": after, "data": encoded, "live": live}
     return re.sub(r"\$(title|before|after|data|live)\b", lambda found: parts[found[1]], template)
 
@@ -144,58 +155,31 @@ def shown(
 
 
 def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, Any]:
-    game, commons, moments = commons_game(fresh.run), commons_of(fresh.env), filmed.moments
+    """What the page is told of one population."""
+    game, commons = commons_game(fresh.run), commons_of(fresh.env)
     assert commons is not None
-    board, agents = game.map, range(game.agents)
-
-    def cells(places: Sequence[Sequence[int]]) -> list[int]:
-        return [row * board.width + col for row, col, *_ in places]
-
-    harvested = np.stack([moment.harvested for moment in moments])
-    stock = np.stack([moment.stock for moment in moments])
-    violated = np.array([[agent in broke for agent in agents] for broke in filmed.violators])
-    pose = np.stack([moment.heading + _IN_PLAY * moment.in_play for moment in moments]) + _VIOLATED * violated
-    boards = np.stack([moment.board.reshape(-1) for moment in moments])
-    beams = [np.flatnonzero(one == BEAM) for one in boards]
-    cleaning = [np.flatnonzero(one == CLEANING) + board.width * board.height for one in boards]
-    lit = [np.concatenate(pair) for pair in zip(beams, cleaning, strict=True)]
-    arrays = {
-        "stock": np.packbits(stock, axis=1),
-        "waste": np.packbits(boards[:, cells(board.river)] == WASTE, axis=1),
-        "stocked": stock.sum(1, dtype=np.uint32),
-        "cell": np.stack([moment.row * board.width + moment.col for moment in moments]).astype(np.uint32),
-        "pose": pose.astype(np.uint8),
-        "harvested": harvested.astype(np.uint32),
-        "totals": harvested.sum(1, dtype=np.uint32),
-        "equality": equality_of(torch.as_tensor(harvested, dtype=torch.float64)).numpy().astype(np.float32),
-        "beam_first": np.cumsum([0, *map(len, lit)]).astype(np.uint32),
-        "beams": np.concatenate(lit).astype(np.uint32),
-    }
+    board, agents, last = game.map, range(game.agents), len(filmed.moments) - 1
+    arrays = _turns(board, filmed)
     counted = ["apples on the board", "harvested by all", "equality, 1: all got the same"]
     if game.institutions:
         arrays["fined"] = filmed.fines.astype(np.float32)
         counted.append("paid in fines")
-    ended = (
-        f"dead at turn {len(moments) - 1:,}: no apple is left"
-        if filmed.is_dead
-        else f"lives after {len(moments) - 1:,} turns"
-    )
-    has_learned = bool(fresh.run.networks)
+    dead, lives = f"dead at turn {last:,}: no apple is left", f"lives after {last:,} turns"
     meanings = " ".join(map(meaning_of, game.institutions))
-    who = learned(fresh.run.specs) + f", {fresh.run.experiment.trained_for}" * has_learned
+    who = learned(fresh.run.specs) + f", {fresh.run.experiment.trained_for}" * bool(fresh.run.networks)
     return {
         "title": title,
         "about": f"{who}. Rules: {rules_of(game) or NO_RULES}. {meanings}".strip(),
-        "outcome": ended,
+        "outcome": dead if filmed.is_dead else lives,
         "isDead": filmed.is_dead,
         "counted": counted,
-        "turns": len(moments),
+        "turns": last + 1,
         "agents": game.agents,
         "width": board.width,
         "height": board.height,
-        "walls": cells(board.walls),
-        "river": cells(board.river),
-        "sites": cells(board.sites),
+        "walls": _cells(board, board.walls),
+        "river": _cells(board, board.river),
+        "sites": _cells(board, board.sites),
         "regions": [
             {
                 "colour": agent_colour(owners[0]) if len(owners) == 1 else GREY,
@@ -207,6 +191,38 @@ def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, An
         "lines": [line_colour(agent) for agent in agents],
         "marks": [agent_mark(agent) for agent in agents],
         **_packed(arrays),
+    }
+
+
+def _cells(board: Map, places: Sequence[Sequence[int]]) -> list[int]:
+    """The indices of cells, row by row."""
+    return [row * board.width + col for row, col, *_ in places]
+
+
+def _turns(board: Map, filmed: Filmed) -> dict[str, NDArray[Any]]:
+    """What changes from turn to turn: arrays [turns, ...], bits packed.
+
+    `beams` has the cells of all turns one after the other, those of turn t from `beam_first[t]` on and before
+    `beam_first[t + 1]`; the number of cells is added to those of a beam that cleans.
+    """
+    moments = filmed.moments
+    harvested = np.stack([moment.harvested for moment in moments])
+    stock = np.stack([moment.stock for moment in moments])
+    agents = range(harvested.shape[1])
+    violated = np.array([[agent in broke for agent in agents] for broke in filmed.violators])
+    pose = np.stack([moment.heading + _IN_PLAY * moment.in_play for moment in moments]) + _VIOLATED * violated
+    boards = np.stack([moment.board.reshape(-1) for moment in moments])
+    turns, lit = np.nonzero(np.concatenate([boards == BEAM, boards == CLEANING], 1))
+    return {
+        "stock": np.packbits(stock, axis=1),
+        "waste": np.packbits(boards[:, _cells(board, board.river)] == WASTE, axis=1),
+        "stocked": stock.sum(1, dtype=np.uint32),
+        "cell": np.stack([moment.row * board.width + moment.col for moment in moments]).astype(np.uint32),
+        "pose": pose.astype(np.uint8),
+        "harvested": harvested.astype(np.uint32),
+        "equality": equality_of(torch.as_tensor(harvested, dtype=torch.float64)).numpy().astype(np.float32),
+        "beam_first": np.searchsorted(turns, np.arange(len(moments) + 1)).astype(np.uint32),
+        "beams": lit.astype(np.uint32),
     }
 
 

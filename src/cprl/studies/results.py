@@ -12,9 +12,9 @@ from cprl.studies.study import STATUS, Study
 from cprl.studies.tables.comparing import LAST, cells, compare, metrics_of
 from cprl.studies.tables.sources import study_table
 from cprl.studies.tables.table import EVALUATION, RANDOM, TRAINING, WINDOW, StudyTable
+from cprl.system.defaults import STUDY_TABLE
 from cprl.terminal.tables import Cells, cell, markdown
 
-TABLE: Final = "table.parquet"
 SUMMARY: Final = "summary.md"
 FIGURES: Final = "figures"
 
@@ -42,7 +42,7 @@ def write_results(
     table = study_table(study, runs, window=window, status=out / STATUS)
     for metric in metrics_of(table)[:1]:
         compare(table, metric, last=last)  # refuses before anything is written
-    table.write(out / TABLE)
+    table.write(out / STUDY_TABLE)
     figures = {name: draw for name, _, draw in figures_of(table, last)}
     for name, draw in figures.items():
         draw(out / FIGURES / name)

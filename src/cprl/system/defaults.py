@@ -16,6 +16,10 @@ LAST: Final = 30
 """Episodes at the end of a training that are compared, unless something else is asked for."""
 WINDOW: Final = 10
 """Episodes of a window of a study's table, unless something else is asked for."""
+STUDY_TABLE: Final = "table.parquet"
+"""The file of a study's table, in its directory."""
+SANDBOX_EPISODES: Final = 150
+"""Of a training in the sandbox."""
 EGTA_RESAMPLES: Final = 200
 """Resamples of the replicas for intervals of an empirical game."""
 
