@@ -85,6 +85,16 @@ def test_pages_of_others_are_not_answered(sandbox):
     assert sandbox.state()["state"] == "none"
 
 
+def test_trainings_of_an_earlier_sandbox_are_kept(tmp_path):
+    kept = tmp_path / "sandbox-1.py"
+    kept.write_text("mine")
+    served = Sandbox(tmp_path, episodes=1)
+    served.train(Sliders(agents=2))
+    served.close()
+    assert kept.read_text() == "mine"
+    assert (tmp_path / "sandbox-2.py").read_text() == Sliders(agents=2).recipe(1)
+
+
 @pytest.mark.integration
 def test_agents_are_trained_and_play_beside_the_scripted_ones(sandbox):
     assert asked(sandbox, "/train?agents=2", "POST")[0] == 200

@@ -14,6 +14,7 @@ from html import escape
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
+from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
@@ -28,10 +29,10 @@ from cprl.experiment import Experiment
 from cprl.population import Scripted
 from cprl.runs.recipe import start_run
 from cprl.runs.weights import save_weights
-from cprl.values import Natural, Range, Value, checked
+from cprl.system.defaults import SANDBOX_EPISODES as EPISODES
+from cprl.values import Positive, Range, Value, checked, hints_of
 
 Board = Literal["commons", "two_complex", "single_complex", "single_basic"]
-_EPISODES: Final = 150
 _RECIPE: Final = '''\
 """A commons from the sandbox of cprl."""
 
@@ -80,7 +81,7 @@ class Sliders(Value, stored=False):
     agents: Annotated[int, Range(1, 12)] = 4
     regrowth: Annotated[float, Range(0, 5)] = 1.0
     """By which the board's probabilities that apples grow are multiplied."""
-    greedy: Natural = 4
+    greedy: Annotated[int, Range(0, 12)] = 4
     """How many of the agents take every apple; the others leave some near each that they take."""
     sight: Annotated[int, Range(3, 15)] = 7
     """How many cells ahead agents see, and as many to each side."""
@@ -99,7 +100,7 @@ class Sliders(Value, stored=False):
             raise ValueError(f"{', '.join(unknown)}: no slider; allowed: {', '.join(kinds)}")
         return cls(**{name: kinds[name](text) for name, text in query.items()})
 
-    def recipe(self, episodes: int = _EPISODES) -> str:
+    def recipe(self, episodes: int = EPISODES) -> str:
         """The recipe of the game, with agents that learn."""
         base = published_game(self.board)
         institutions = {
@@ -138,23 +139,23 @@ class Sandbox:
         episodes: of a training.
     """
 
-    def __init__(self, folder: Path | None = None, *, port: int = 0, episodes: int = _EPISODES) -> None:
+    def __init__(self, folder: Path | None = None, *, port: int = 0, episodes: int = EPISODES) -> None:
         self._temporary = TemporaryDirectory()
         self.folder = Path(self._temporary.name) if folder is None else folder
-        self.episodes = checked("episodes", episodes, Annotated[int, Range(1, 2**31)])
-        self._lock, self._training = Lock(), None
+        self.episodes = checked("episodes", episodes, Positive)
+        self._lock = Lock()
+        self._training: tuple[Path, subprocess.Popen[bytes]] | None = None
         self._trained: Path | None = None
-        self._number = 0
+        """The last run that ended well."""
         self.server = ThreadingHTTPServer(("127.0.0.1", port), partial(_Handler, self))
         self.address = f"http://127.0.0.1:{self.server.server_port}/"
-
-    _training: "subprocess.Popen[bytes] | None"
 
     def close(self) -> None:
         """End a training that runs, and stop serving."""
         if self._training is not None:
-            self._training.terminate()
-            self._training.wait()
+            _, process = self._training
+            process.terminate()
+            process.wait()
         self.server.server_close()
         self._temporary.cleanup()
 
@@ -177,23 +178,24 @@ class Sandbox:
         """Begin to train; raises a ValueError while a training runs."""
         if self.state()["state"] == "training":
             raise ValueError("a training runs; wait until it has ended")
-        self._number += 1
         self.folder.mkdir(parents=True, exist_ok=True)
-        recipe = self.folder / f"sandbox-{self._number}.py"
+        names = (self.folder / f"sandbox-{number}" for number in count(1))
+        run = next(name for name in names if not name.with_suffix(".py").exists())
+        recipe = run.with_suffix(".py")
         recipe.write_text(sliders.recipe(self.episodes), encoding="utf-8")
-        run = recipe.with_suffix("")
-        with open(f"{run}.log", "wb") as log:
+        with run.with_suffix(".log").open("wb") as log:
             words = [sys.executable, str(recipe), "--watch", "off", "--no-keep-checkpoint", "--out", str(run)]
-            self._training = subprocess.Popen(words, stdout=log, stderr=log, stdin=subprocess.DEVNULL)
+            process = subprocess.Popen(words, stdout=log, stderr=log, stdin=subprocess.DEVNULL)
+        self._training = run, process
 
     def state(self) -> dict[str, str]:
         """How the training is: "none", "training", "trained" or "failed", and its last line."""
         if self._training is None:
             return {"state": "none", "line": ""}
-        run = self.folder / f"sandbox-{self._number}"
-        lines = Path(f"{run}.log").read_text(encoding="utf-8", errors="replace").split("\n")
+        run, process = self._training
+        lines = run.with_suffix(".log").read_text(encoding="utf-8", errors="replace").split("\n")
         line = next((text.strip() for text in reversed(lines) if text.strip()), "it begins")
-        code = self._training.poll()
+        code = process.poll()
         if code is None:
             return {"state": "training", "line": line}
         if code == 0:
@@ -264,17 +266,16 @@ def sandbox_page() -> str:
     """The page, without an episode yet."""
     boards = "".join(f"<option>{board}</option>" for board in get_args(Board))
     sliders = "".join(
-        f'<label>{escape(words)} <span></span><input type="range" name="{name}" min="{low}" max="{high}" '
-        f'step="{step}" value="{getattr(Sliders(), name)}"></label>'
-        for name, words, low, high, step in (
-            ("agents", "agents", 1, 12, 1),
-            ("greedy", "of them greedy; the others restrained", 0, 12, 1),
-            ("regrowth", "apples grow, times as fast", 0, 5, 0.25),
-            ("sight", "cells that agents see ahead", 3, 15, 1),
-            ("quota", "quota, share of a sustainable harvest", 0, 1, 0.05),
-            ("tax", "tax, shared equally", 0, 1, 0.05),
-            ("sanctions", "graduated sanctions for tagging", 0, 1, 1),
-        )
+        _slider(name, *shown)
+        for name, shown in {
+            "agents": ("agents", 1),
+            "greedy": ("of them greedy; the others restrained", 1),
+            "regrowth": ("apples grow, times as fast", 0.25),
+            "sight": ("cells that agents see ahead", 1),
+            "quota": ("quota, share of a sustainable harvest", 0.05),
+            "tax": ("tax, shared equally", 0.05),
+            "sanctions": ("graduated sanctions for tagging", 1),
+        }.items()
     )
     before = (
         "<p>Move a slider: an episode is played by your rules at once. "
@@ -284,5 +285,13 @@ def sandbox_page() -> str:
         '<span id="said" class="faint" role="status"></span>'
     )
     script = files("cprl.evaluation").joinpath("sandbox.js").read_text(encoding="utf-8")
-    nothing = {"populations": [], "palette": {}, "axis": 0, "most": 0}
-    return page("A commons to play with", before, nothing, live=script)
+    return page("A commons to play with", before, live=script)
+
+
+def _slider(name: str, words: str, step: float) -> str:
+    """A slider over the range of a field of `Sliders`."""
+    (bounds,) = hints_of(Sliders)[name].__metadata__
+    return (
+        f'<label>{escape(words)} <span></span><input type="range" name="{name}" min="{bounds.low}" '
+        f'max="{bounds.high}" step="{step}" value="{getattr(Sliders(), name)}"></label>'
+    )
