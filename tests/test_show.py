@@ -15,9 +15,10 @@ from viewers import browser, wait_until
 from cprl import presets
 from cprl.commands import main as cli
 from cprl.commons.colours import BEAM
+from cprl.commons.readable import growth_of, legend_of, meaning_of
 from cprl.evaluation.film import fresh_episode, play_to_show
-from cprl.evaluation.show import growth_of, show
-from cprl.institutions import Boundaries, Monitoring
+from cprl.evaluation.show import show
+from cprl.institutions import Boundaries, Monitoring, Quota, Tax
 from cprl.measuring.social import SOCIAL
 
 COMMONS = presets.game("commons")
@@ -90,7 +91,7 @@ def test_a_page_holds_the_episode_that_a_film_shows(runs, tmp_path):
     assert len(governed["regions"]) == 4
     assert "fined" not in greedy
     assert (greedy["isDead"], governed["isDead"]) == (True, False)
-    assert greedy["outcome"] == f"dead at turn {first.steps}: no apple is left"
+    assert greedy["outcome"] == f"gone for good at turn {first.steps}: no apple is left"
     assert "<h1>Different learners, different rules</h1>" in path.read_text(encoding="utf-8")
     assert data["axis"] == GOVERNED.rules.episode_steps
 
@@ -181,3 +182,27 @@ def test_chromium_plays_a_page_from_the_disk(runs, tmp_path, width):
         )
         assert colours > 1000, "the board is drawn"
         (tmp_path / "page.png").write_bytes(page())
+
+
+def test_institutions_say_what_they_do_in_numbers_that_hold_in_the_game():
+    quota = Quota(share=0.25, window_steps=50)
+    game = replace(presets.game("commons"), institutions=(quota,))
+    apples = int(re.search(r"at most (\d+) apples in 50 turns", meaning_of(quota, game))[1])
+    assert apples == int(0.25 * game.sustainable_yield * 50 / 4)
+    fined = replace(quota, fine=2.0)
+    watched = replace(game, institutions=(fined, Monitoring(prob=0.5)))
+    assert "cannot" in meaning_of(quota, game)
+    assert "costs 2 apples." in meaning_of(fined, replace(game, institutions=(fined,)))
+    assert "costs 2 apples if it is noticed" in meaning_of(fined, watched)
+    assert "50%" in meaning_of(Monitoring(prob=0.5), watched)
+    assert "30% of what each agent picks is taken and lost" in meaning_of(
+        Tax(rate=0.3, redistribution="none"), game
+    )
+
+
+def test_the_legend_names_only_signs_that_can_appear():
+    peaceful = replace(CORRIDORS, rules=replace(CORRIDORS.rules, may_fire=False))
+    assert not re.search("beam|diamond|river|Frames", legend_of([peaceful]))
+    walled = replace(presets.game("two_complex"), institutions=(Quota(fine=1.0),))
+    assert re.search("wall.*hit leaves the board for 25 turns.*diamond", legend_of([peaceful, walled]))
+    assert legend_of([walled, walled]) == legend_of([walled])

@@ -1,13 +1,24 @@
 """A game for readers: its rules and institutions in words, beside its board."""
 
 import re
+from collections.abc import Iterable
 from dataclasses import fields
 from html import escape
 from inspect import getdoc
 from typing import TYPE_CHECKING, Final
 
 from cprl.commons.svg import board_svg
-from cprl.institutions import Institution
+from cprl.institutions import (
+    Boundaries,
+    ClosedSeason,
+    Institution,
+    Monitoring,
+    Punishment,
+    Quota,
+    Rotation,
+    Tax,
+)
+from cprl.institutions.base import Limit
 
 if TYPE_CHECKING:
     from cprl.commons.game import Game
@@ -56,6 +67,58 @@ def rule_of(institution: Institution) -> str:
     return f"{words} ({', '.join(settings)})" if settings else words
 
 
-def meaning_of(institution: Institution) -> str:
-    """What an institution does, in a sentence."""
-    return " ".join((getdoc(institution) or "").partition("\n\n")[0].split())
+def meaning_of(institution: Institution, game: "Game") -> str:
+    """What an institution does in this game, in sentences for readers who do not know its settings."""
+    match institution:
+        case Quota(window_steps=window):
+            apples = int(institution.share * game.sustainable_yield * window / game.agents + 1e-9)
+            fewer = ", and fewer as the board empties" if institution.by_stock else ""
+            words = f"Each agent may pick at most {apples:,} apples in {window:,} turns{fewer}. "
+            return words + _breach(institution, game)
+        case ClosedSeason(period_steps=period, closed_steps=closed):
+            words = f"Nobody may pick in the last {closed:,} of every {period:,} turns. "
+            return words + _breach(institution, game)
+        case Rotation(window_steps=window):
+            words = f"Only one agent may pick; every {window:,} turns it is another one. "
+            return words + _breach(institution, game)
+        case Tax(brackets=(), rate=rate):
+            goes = "shared equally among all" if institution.redistribution == "equal" else "lost"
+            return f"{rate:.0%} of what each agent picks is taken and {goes}."
+        case Monitoring(prob=prob):
+            return f"Of the turns in which an agent breaks a rule, {prob:.0%} are noticed."
+        case Punishment(fine=fine, cost=cost):
+            return f"A hit costs the agent that is hit {fine:g} apples and the shooter {cost:g}."
+    sentence = " ".join((getdoc(institution) or "").partition("\n\n")[0].split())
+    return re.sub(r" \(.*\)\.$", ".", sentence)
+
+
+def _breach(limit: Limit, game: "Game") -> str:
+    """What happens to who picks against a limit."""
+    if limit.fine is None:
+        return "More cannot be picked."
+    noticed = " if it is noticed" * any(isinstance(one, Monitoring) for one in game.institutions)
+    return f"Each apple picked against this rule costs {limit.fine:g} apples{noticed}." if limit.fine else ""
+
+
+def legend_of(games: Iterable["Game"]) -> str:
+    """What the signs on the boards of these games mean, in sentences; only signs that can appear."""
+    return " ".join(dict.fromkeys(sign for game in games for sign in _signs(game)))
+
+
+def _signs(game: "Game") -> list[str]:
+    signs = [
+        "A number on a colour is an agent, its triangle points where it looks.",
+        "Green is an apple, dim a place without one.",
+    ]
+    if game.map.walls:
+        signs.append("Grey is a wall.")
+    if game.map.river:
+        signs.append("Blue is the river, brown its waste.")
+    if game.rules.may_fire:
+        turns = f"{game.rules.freeze_steps:,} turns"
+        signs.append(f"Light dots are a beam: an agent that is hit leaves the board for {turns}.")
+    if any(isinstance(institution, Boundaries) for institution in game.institutions):
+        signs.append("Frames are regions with owners.")
+    if any(institution.can_be_broken for institution in game.institutions):
+        signs.append("A white diamond marks an agent that breaks a rule.")
+    return signs

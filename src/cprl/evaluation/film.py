@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import keys
+from cprl.commons.readable import growth_of, legend_of
 from cprl.commons.world import Bytes, Shown
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.evaluate import opened
@@ -22,6 +23,7 @@ from cprl.evaluation.film_pictures import (
     SMALLEST_WIDTH,
     EpisodePicture,
     check_can_write_mp4,
+    note,
     write_gif,
     write_mp4,
 )
@@ -217,10 +219,10 @@ def film_video(
 ) -> tuple[Path, tuple[Episode, ...]]:
     """Film an episode of a run's agents, beside those of other runs if there are any.
 
-    A film shows the board, the apples on it and each agent's harvest so far, turn by turn, and ends with a
-    card of two seconds that says what came of it; under institutions, agents that broke a rule since the last
-    picture have a white diamond around them. Populations side by side play on one clock; one whose board is
-    dead waits for the others.
+    A film shows the board, the apples on it and what each agent picked so far, turn by turn, and ends with a
+    card of two seconds that says how it ended; a note below says what the signs mean. Agents that broke a
+    rule since the last picture have a white diamond around them. Populations side by side play on one clock;
+    one whose board is dead waits for the others.
 
     It is the episode that `cprl.evaluation.film.film` records with the same numbers; the first and the last
     board are always in the film.
@@ -259,10 +261,16 @@ def film_video(
         """The pictures after these turns, and the end card."""
         for turn in turns:
             since = max((other for other in chosen if other < turn), default=-1) + 1
-            yield np.concatenate([panel.draw(turn, since=since) for panel in panels], 1)
-        yield np.concatenate([panel.draw(length, since=length, card=True) for panel in panels], 1)
+            yield joined([panel.draw(turn, since=since) for panel in panels])
+        yield joined([panel.draw(length, since=length, card=True) for panel in panels])
 
-    wide, high = sum(panel.picture.size[0] for panel in panels), panels[0].picture.size[1]
+    def joined(pictures: Sequence[Bytes]) -> Bytes:
+        return np.concatenate([np.concatenate(pictures, 1), words], 0)
+
+    wide = sum(panel.picture.size[0] for panel in panels)
+    games = [commons_game(population.run) for population in fresh]
+    words = note(f"{growth_of(games[0])} {legend_of(games)}", wide)
+    high = panels[0].picture.size[1] + len(words)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".mp4":
         write_mp4(path, draw(chosen), (wide, high), fps=style.fps)
@@ -356,13 +364,14 @@ class _Panel(NamedTuple):
         """
         filmed, sites = self.filmed, len(self.picture.board.sites)
         last = len(filmed.moments) - 1
-        dead = f"dead at turn {last:,} of {self.picture.steps:,}" if filmed.is_dead else ""
-        outcome = dead or f"{filmed.left:,} of {sites:,} apples left"
+        dead = f"gone for good at turn {last:,} of {self.picture.steps:,}" if filmed.is_dead else ""
+        outcome = dead or f"{filmed.left:,} of {sites:,} still on the board"
+        apples = f"{filmed.apples:,} apple{'' if filmed.apples == 1 else 's'} picked"
         return self.picture.draw(
             filmed.moments[: turn + 1],
             self.title,
             end=dead if turn >= last else "",
-            card=f"{outcome} · {filmed.apples:,} apple{'' if filmed.apples == 1 else 's'}" if card else "",
+            card=f"{apples} · {outcome}" if card else "",
             violators=sorted(set().union(*filmed.violators[since : turn + 1])),
         )
 

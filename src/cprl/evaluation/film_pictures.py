@@ -71,7 +71,7 @@ class EpisodePicture:
         shrink = min(1.0, room / wide, highest / high)
         self._board_size = max(1, int(wide * shrink)), max(1, int(high * shrink))
         self._half = (width - 3 * unit) // 2
-        self._item = int(self._font.getlength("00:0000  "))
+        self._item = int(self._font.getlength("00 0000  "))
         self._in_a_row = max(1, self._half // self._item)
         rows = ceil(len(board.starts) / self._in_a_row)
         self._line = line = unit + unit // 2
@@ -168,7 +168,7 @@ class EpisodePicture:
         """Each agent's harvest so far, [T, N], as lines in their colours, which a legend repeats."""
         left = 2 * self._unit + self._half
         most = nice(int(harvests.max(initial=0)) if self._most is None else self._most)
-        self._axes(draw, left, f"{harvests[-1].sum():,}", "apples harvested")
+        self._axes(draw, left, f"{harvests[-1].sum():,}", "apples picked")
         for agent in range(harvests.shape[1]):
             path = self._points(left, harvests[:, agent], most)
             draw.line(path, agent_colour(agent), max(1, self._unit // 6))
@@ -176,8 +176,12 @@ class EpisodePicture:
         line = int(self._font.getbbox("0")[3] * 1.3) + 1
         for agent, apples in enumerate(harvests[-1]):
             row, place = divmod(agent, self._in_a_row)
-            at = left + place * self._item, top + row * line
-            draw.text(at, f"{agent}:{apples}", agent_colour(agent), self._font)
+            across, down, unit = left + place * self._item, top + row * line, self._unit
+            wide = max(unit, int(self._font.getlength(f"{agent}")) + 4)
+            draw.rectangle((across, down, across + wide, down + unit + 1), agent_colour(agent))
+            middle = across + wide / 2, down + unit / 2 + 1
+            draw.text(middle, f"{agent}", PALETTE[GROUND], self._font, anchor="mm")
+            draw.text((across + wide + unit // 3, middle[1]), f"{apples}", _TEXT, self._font, anchor="lm")
 
     def _axes(self, draw: ImageDraw.ImageDraw, left: int, number: str, words: str) -> None:
         """The frame of a plot over turns; above it a large number and what it counts."""
@@ -209,6 +213,20 @@ def _fitting(text: str, room: float, largest: int) -> ImageFont.FreeTypeFont:
     """The font in the largest size, in pixels, in which a text has room."""
     wide = _font(largest).getlength(text)
     return _font(largest if wide <= room else max(1, int(largest * room / wide)))
+
+
+def note(text: str, width: int) -> Bytes:
+    """A text in small type below pictures: uint8 [height, width, 3], the height even."""
+    edge, font = max(10, width // 96), _font(max(10, min(14, width // 60)))
+    lines, room = [""], width - 2 * edge
+    for word in text.split():
+        longer = f"{lines[-1]} {word}".strip()
+        lines[-1:] = [longer] if font.getlength(longer) <= room else [lines[-1], word]
+    line = int(font.size * 1.4)
+    high = line * len(lines) + edge
+    image = Image.new("RGB", (width, high + high % 2), PALETTE[GROUND])
+    ImageDraw.Draw(image).multiline_text((edge, 0), "\n".join(lines), _FAINT, font, spacing=line - font.size)
+    return np.asarray(image)
 
 
 def nice(number: int) -> int:

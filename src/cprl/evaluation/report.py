@@ -103,7 +103,7 @@ def _rules(game: Game) -> list[str]:
         "",
         f"{game.agents} agents on a board of {game.map.height} x {game.map.width} cells.",
     ]
-    lines += ["", *(f"- **{rule_of(one)}**: {meaning_of(one)}" for one in game.institutions)]
+    lines += ["", *(f"- **{rule_of(one)}**: {meaning_of(one, game)}" for one in game.institutions)]
     changed = game.rules.changed
     lines += ["", "Rules that differ from those of `Rules()`:" if changed else "All other rules: `Rules()`."]
     return [*lines, "", *(f"- `{name}`: `{value}`" for name, value in changed.items())]

@@ -30,9 +30,10 @@ from cprl.commons.colours import (
     agent_mark,
     line_colour,
 )
+from cprl.commons.game import Game
 from cprl.commons.maps import Map
 from cprl.commons.picture import EMPTY_SITE_COLOUR
-from cprl.commons.readable import NO_RULES, growth_of, meaning_of, rules_of
+from cprl.commons.readable import NO_RULES, growth_of, legend_of, meaning_of, rules_of
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.film import Filmed, FreshEpisode, check_titles, fresh_episode, play_to_show, titles_of
 from cprl.evaluation.film_pictures import nice
@@ -42,6 +43,7 @@ from cprl.measuring.social import equality_of
 from cprl.population import learned
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.system.defaults import FILM_SEED as SEED
+from cprl.training.agents import LoadedRun
 from cprl.values import refusal
 from cprl.viewer.pictures import regions_of
 
@@ -149,9 +151,16 @@ def shown(
     """What `show.html` is told of the episodes of these populations, and the episodes."""
     filmed = [play_to_show(population) for population in fresh]
     most = max(int(one.moments[-1].harvested.max()) for one in filmed)
+    games = [commons_game(population.run) for population in fresh]
     populations = [_population(*each) for each in zip(titles or titles_of(fresh), fresh, filmed, strict=True)]
-    axis = max(commons_game(population.run).rules.episode_steps for population in fresh)
-    return {"populations": populations, "palette": _COLOURS, "axis": axis, "most": nice(most)}, filmed
+    axis = max(game.rules.episode_steps for game in games)
+    return {
+        "populations": populations,
+        "palette": _COLOURS,
+        "axis": axis,
+        "most": nice(most),
+        "legend": legend_of(games),
+    }, filmed
 
 
 def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, Any]:
@@ -160,16 +169,15 @@ def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, An
     assert commons is not None
     board, agents, last = game.map, range(game.agents), len(filmed.moments) - 1
     arrays = _turns(board, filmed)
-    counted = ["apples on the board", "harvested by all", "equality, 1: all got the same"]
-    if game.institutions:
+    counted = ["apples on the board", "picked by all", "how evenly shared (1: all alike)"]
+    if filmed.fines.any() or any(institution.can_be_broken for institution in game.institutions):
         arrays["fined"] = filmed.fines.astype(np.float32)
-        counted.append("paid in fines")
-    dead, lives = f"dead at turn {last:,}: no apple is left", f"lives after {last:,} turns"
-    meanings = " ".join(map(meaning_of, game.institutions))
-    who = learned(fresh.run.specs) + f", {fresh.run.experiment.trained_for}" * bool(fresh.run.networks)
+        counted.append("apples paid as fines")
+    dead = f"gone for good at turn {last:,}: no apple is left"
+    lives = f"apples still grow after {last:,} turns"
     return {
         "title": title,
-        "about": f"{who}. Rules: {rules_of(game) or NO_RULES}. {meanings}".strip(),
+        "about": f"{_players(fresh.run)} {_rules(game)}",
         "outcome": dead if filmed.is_dead else lives,
         "isDead": filmed.is_dead,
         "counted": counted,
@@ -192,6 +200,20 @@ def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, An
         "marks": [agent_mark(agent) for agent in agents],
         **_packed(arrays),
     }
+
+
+def _players(run: LoadedRun) -> str:
+    """Who plays, for readers who do not know what a learner is."""
+    who = learned(run.specs)
+    if not run.networks:
+        return f"Computer players: {who}."
+    return f"Computer players that learned by practice: {who}, {run.experiment.trained_for}."
+
+
+def _rules(game: Game) -> str:
+    if not game.institutions:
+        return f"Rules: {NO_RULES}."
+    return " ".join([*(meaning_of(own, game) for own in game.institutions), f"Settings: {rules_of(game)}."])
 
 
 def _cells(board: Map, places: Sequence[Sequence[int]]) -> list[int]:
