@@ -172,3 +172,14 @@ def test_walls_that_block_sight_need_windows():
     rules, form = Rules(walls_block_sight=True), Observation(area="full")
     with pytest.raises(ValueError, match=r"Observation\.area"):
         Game(map=maps.parse(BOARD), rules=rules, observation=form)
+
+
+def test_under_paint_over_an_entry_says_whether_an_apple_is_ahead_of_an_agent():
+    play = Play(">A.\n.^A\nA.<", paint_over=True)
+    assert play.output.apple_ahead[0].tolist() == [[True], [True], [False]]
+    play.turn("forward", "turn_left", "turn_right")
+    assert play.output.apple_ahead[0].tolist() == [[False], [False], [True]]
+    assert check_env_specs(CommonsEnv(play.game, 2)) is None
+    for variant in ("published", "as_run"):
+        moment = CommonsEnv(presets.game("commons", variant=variant)).reset()
+        assert (keys.APPLE_AHEAD in moment.keys(True)) == (variant == "as_run")

@@ -82,17 +82,19 @@ CROSS = """
 """
 
 
+@pytest.mark.parametrize("paint_over", [False, True])
 @pytest.mark.parametrize(
     ("policy", "spare", "left"), [("sustainable", 3, 3), ("sustainable", 1, 1), ("greedy", 3, 0)]
 )
-def test_sustainable_leaves_spare_apples_of_a_patch(policy, spare, left):
-    scene = Scene(CROSS, policy, worlds=8, spare=spare, may_fire=False)
+def test_sustainable_leaves_spare_apples_of_a_patch(policy, spare, left, paint_over):
+    scene = Scene(CROSS, policy, worlds=8, spare=spare, may_fire=False, paint_over=paint_over)
     scene.go(200)
     assert scene.env.output.stock[:, 0].tolist() == [left] * 8
 
 
-def test_sustainable_does_not_walk_over_an_apple_that_it_spares():
-    scene = Scene(">.A..", "sustainable", worlds=8, may_fire=False)
+@pytest.mark.parametrize("paint_over", [False, True])
+def test_sustainable_does_not_walk_over_an_apple_that_it_spares_not_even_under_its_own_mark(paint_over):
+    scene = Scene(">.A..", "sustainable", worlds=8, may_fire=False, paint_over=paint_over)
     scene.go(100)
     assert scene.bitten == 0
     assert scene.env.worlds.now.col[:, 0].max() == 1

@@ -48,6 +48,10 @@ those of the following indices, cyclically. Only with `Observation.scoreboard`."
 STOCK_GAUGE: Final = (AGENTS, "stock_gauge")
 """float32 [B, N, 1]: the fraction of sites with an apple, 0..1. Only with `Observation.stock_gauge`."""
 
+APPLE_AHEAD: Final = (AGENTS, "apple_ahead")
+"""bool [B, N, 1]: whether the cell ahead of the agent holds an apple. Only with `Rules.paint_over`, where its
+own heading mark covers the cell; scripted policies read it, networks do not."""
+
 RECURRENT_STATE: Final = (AGENTS, "recurrent_state")
 """float32 [B, N, M]: the states of recurrent networks after this turn's observation, zeros beyond an agent's
 own. Policies write it, if an agent has such a network, and the next turn's policies read it; where it is

@@ -211,6 +211,7 @@ def output_forms(game: Game, worlds: int) -> dict[str, Form]:
     has_river = bool(game.map.river)
     turn |= {"P": int(has_river), "M": game.agents if has_river else 0}
     turn |= {"S": vectors.get("scoreboard", 0), "G": vectors.get("stock_gauge", 0)}
+    turn["U"] = int(game.rules.paint_over)
     forms = forms_of(StepOutput, **sizes, **turn)
     if game.institutions:
         forms |= forms_of(Payments, **sizes, C=len(COUNTS), V=len(game.ballots))

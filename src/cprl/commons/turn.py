@@ -17,7 +17,7 @@ from cprl.commons.moves import (
 )
 from cprl.commons.river import begin_river, clean, count_waste, pollute
 from cprl.commons.tables import FURTHER, Tables
-from cprl.commons.views import draw_institutions, draw_windows
+from cprl.commons.views import draw_institutions, draw_windows, has_apple_ahead
 from cprl.commons.world import PLAYING, TERMINATED, TRUNCATED, Actions, Scratch, StepOutput, Worlds
 from cprl.institutions import Law
 from cprl.institutions.law import begin, note_growth, open_turn, refresh, settle
@@ -181,6 +181,8 @@ def write_state(world: Worlds, tables: Tables, output: StepOutput, scratch: Scra
             output.scoreboard[i, j] = world.harvested[(i + j) % world.row.shape[0]]
         if output.stock_gauge.shape[1] > 0:
             output.stock_gauge[i, 0] = world.stock_left[0] / world.stock.shape[0]
+        if output.apple_ahead.shape[1] > 0:
+            output.apple_ahead[i, 0] = has_apple_ahead(world, tables, i)
     output.stock[0] = world.stock_left[0]
     if FURTHER and output.waste.shape[0] > 0:
         output.waste[0] = world.waste_left[0]

@@ -52,6 +52,15 @@ def paint_apples(world: Worlds, tables: Tables, picture: Ints) -> None:
         picture[tables.site_cell[k]] = apple if stock[k] == 1 else ground
 
 
+def has_apple_ahead(world: Worlds, tables: Tables, i: int) -> bool:
+    """Whether the cell ahead of agent i holds an apple in the picture, under whatever covers it."""
+    heading = world.heading[i]
+    cell = cell_of(world.row[i] + ROW_STEP[heading], world.col[i] + COL_STEP[heading], tables)
+    site = tables.site_at[cell]
+    stock = world.stock_before if tables.picture_shows_old_stock else world.stock
+    return site >= 0 and stock[site] == 1
+
+
 def mark_cell(world: Worlds, tables: Tables, i: int) -> int:
     """The cell of agent i's heading mark: ahead of it, or behind it under `mark_behind_if_vertical`."""
     heading = world.heading[i]

@@ -107,6 +107,9 @@ class StepOutput(NamedTuple):
     following agent indices, cyclically; S is N, or 0 without a scoreboard."""
     stock_gauge: Annotated[NDArray[np.float32], "B N G"]
     """The share of all sites that hold an apple; G is 1, or 0 without a stock gauge."""
+    apple_ahead: Annotated[Bools, "B N U"]
+    """Whether the cell ahead of the agent, which its own mark may cover, holds an apple in the picture; U is
+    1 with `Rules.paint_over`, else 0."""
     waste: Annotated[NDArray[np.int64], "B P"]
     """Cells of the river with waste; P is 1, or 0 without a river."""
     cleaned: Annotated[Floats, "B M"]

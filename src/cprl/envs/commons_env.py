@@ -33,6 +33,7 @@ _PAID_ENTRIES = ("fines", "transfers", "violated", "counts")
 """Entries of agents in games with institutions."""
 _REPLACED = frozenset((*WORLD_ENTRIES, *DONE_ENTRIES, *_BALLOT_ENTRIES, *_AGENT_ENTRIES, *_PAID_ENTRIES)) | {
     *(keys.STATE, keys.AGENTS, "next", "_reset", "scoreboard", "stock_gauge", "reward"),
+    keys.APPLE_AHEAD[1],
     *(keys.WASTE, *keys.CLEANED[1:]),
 }
 """The entries that the environment writes anew in each turn."""
@@ -84,9 +85,10 @@ class CommonsEnv(LeanStepEnv):
         self._size = worlds
         self._agents_size = torch.Size([worlds, game.agents])
         paid = _PAID_ENTRIES if game.institutions else ()
+        covered = keys.APPLE_AHEAD[1:] if game.rules.paint_over else ()
         of_agents, of_worlds = (keys.CLEANED[1:], (keys.WASTE,)) if game.map.river else ((), ())
         vectors = (name for name, _ in game.spaces.vectors)
-        self._agent_entries = (*_AGENT_ENTRIES, *of_agents, *paid, *vectors)
+        self._agent_entries = (*_AGENT_ENTRIES, *of_agents, *covered, *paid, *vectors)
         self._world_entries = (*WORLD_ENTRIES, *of_worlds, *(_BALLOT_ENTRIES if game.ballots else ()))
         self._decides, self._is_governed = game.decisions > 0, bool(game.institutions)
         self._with_state = state

@@ -1,6 +1,7 @@
 """ScriptedActor: agents that follow a scripted policy and do not learn.
 
-They see what a learning agent sees: their observation window.
+They see what a learning agent sees: their observation window. Under `Rules.paint_over`, where an agent's own
+heading mark covers the cell ahead of it, they also see whether this cell holds an apple.
 
 | policy | behaviour |
 |---|---|
@@ -44,6 +45,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from cprl import keys
 from cprl.commons import colours
 from cprl.commons.compiled import CPU_OPTIONS, compiled, kept_on_disk
 from cprl.commons.decoding import UNSEEN, classes_seen
@@ -101,22 +103,29 @@ class ScriptedActor(ActorOfLanes):
                 "no window shows what is under an agent"
             )
         self.policy, self.game, self.epsilon = policy, game, 0.0
+        if game.rules.paint_over:
+            self.in_keys = ("observation", keys.APPLE_AHEAD[1])
         self._settings, self._role_of_class = _settings(game, spare), _roles()
         self._rim, self._frame = _frame(game)
         size = self._frame.stride * (game.rules.window_rows + 2 * self._rim)
         self._scratch = Scratch(*np.zeros((2, size), np.bool_), *np.zeros((3, size), np.int32))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set("action", self.choose(tensordict.get("observation")))
+        return tensordict.set("action", self.choose(*map(tensordict.get, self.in_keys)))
 
-    def choose(self, observation: Tensor) -> Tensor:
-        """Chooses actions, int64 [replicas x k, S], for observations, uint8 [replicas x k, S, C, X, Y]."""
+    def choose(self, observation: Tensor, apple_ahead: Tensor | None = None) -> Tensor:
+        """Choose actions, int64 [replicas x k, S].
+
+        Args:
+            observation: uint8 [replicas x k, S, C, X, Y].
+            apple_ahead: `cprl.keys.APPLE_AHEAD`, bool [replicas x k, S, 1], under `Rules.paint_over`.
+        """
         explores = exploration_type() in (ExplorationType.RANDOM, None)
         chosen = np.empty(observation.shape[:2], np.int64)
         _choose_all()(
             SCRIPTED_POLICIES.index(self.policy),
             float(self.epsilon) if explores else 0.0,
-            self._framed(observation.numpy(force=True)),
+            self._framed(observation, apple_ahead),
             self._frame,
             self._numbers(),
             self._settings,
@@ -125,14 +134,18 @@ class ScriptedActor(ActorOfLanes):
         )
         return torch.from_numpy(chosen).to(observation.device)
 
-    def _framed(self, observation: Bytes) -> Bytes:
+    def _framed(self, observation: Tensor, apple_ahead: Tensor | None) -> Bytes:
         """The roles of the cells each agent sees, in a frame of wall: uint8 [replicas x k x S, cells]."""
-        ahead = observation[..., : self.game.rules.window_rows, :]
+        ahead = observation.numpy(force=True)[..., : self.game.rules.window_rows, :]
         seen, rim = classes_seen(self.game, ahead), self._rim
         count, (rows, columns) = seen.shape[0] * seen.shape[1], seen.shape[2:]
         roles = np.full((count, rows + 2 * rim, columns + 2 * rim), WALL, np.uint8)
         roles[:, rim:-rim, rim:-rim] = self._role_of_class[seen].reshape(count, rows, columns)
-        roles[:, rim + rows - 1, rim + columns // 2] = OPEN
+        row, middle = rim + rows - 1, rim + columns // 2
+        roles[:, row, middle] = OPEN
+        if apple_ahead is not None:
+            before = roles[:, row - 1, middle]  # of one row, the frame of wall
+            before[apple_ahead.numpy(force=True).reshape(-1) & (before == OPEN)] = APPLE
         return roles.reshape(count, -1)
 
     def _numbers(self) -> Any:
