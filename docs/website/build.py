@@ -46,10 +46,10 @@ def _navigation(reference: dict[str, str]) -> list[Any]:
     """The pages by section, as MkDocs wants them."""
     found: list[Any] = [{"Home": "index.md"}]
     for section, pages in sections().items():
-        if section == "Results":
+        if section == "Study":
             pages = {**pages, "Replays": REPLAYS}
-        elif section == "Project":
-            found.append(_section("Reference", reference))
+        elif section == "Reference":
+            pages = {**reference, **pages}
         found.append(_section(section, pages))
     return found
 

@@ -18,7 +18,8 @@ from website.replays import recordings
 ROOT: Final = Path(__file__).parents[2]
 DOCS: Final = ROOT / "docs"
 
-IMAGES: Final = {".png", ".gif", ".svg"}
+COPIED: Final = {".png", ".gif", ".svg", ".html"}
+"""Files that stay as they are."""
 LANGUAGES: Final = {
     ".py": "python",
     ".toml": "toml",
@@ -60,7 +61,7 @@ def place(path: Path) -> str:
         return f"{name}/index.md"
     if path.name == "README.md":  # MkDocs takes it for its folder's page, which is a list
         return f"{name.removesuffix(path.name)}about.md"
-    if path.suffix == ".md" or path.suffix in IMAGES:
+    if path.suffix == ".md" or path.suffix in COPIED:
         return name
     if path.suffix == ".rrd":
         names = {own: replay for replay, own in recordings().items()}
@@ -72,7 +73,7 @@ def _stage(path: Path, folder: Path) -> list[Path]:
     """Writes one of them; what it links to."""
     target = folder / place(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix in IMAGES:
+    if path.suffix in COPIED:
         shutil.copyfile(path, target)
         return []
     found: list[Path] = []

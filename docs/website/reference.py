@@ -59,13 +59,39 @@ INTERNAL: Final = {"system", "runs", "terminal", "commands", "__main__"}
 def stage_reference(folder: Path) -> dict[str, str]:
     """Writes the pages; the title and the file of each."""
     (folder / FOLDER).mkdir(parents=True, exist_ok=True)
-    pages = {"Commands": f"{FOLDER}/commands.md"}
+    pages = {"API": f"{FOLDER}/api.md", "Commands": f"{FOLDER}/commands.md"}
+    (folder / pages["API"]).write_text(_landing_page(), encoding="utf-8")
     (folder / pages["Commands"]).write_text(_commands_page(), encoding="utf-8")
     for name in REFERENCE:
         package = name if name == "cprl" else f"cprl.{name}"
         pages[package] = f"{FOLDER}/{package}.md"
         (folder / pages[package]).write_text(_package_page(package), encoding="utf-8")
     return pages
+
+
+def _landing_page() -> str:
+    """The values that a user writes, and all packages with what they are about."""
+    text = f"# API\n\n{_LANDING}\n\n## All packages\n\n| package | what it is about |\n|---|---|\n"
+    for name, about in REFERENCE.items():
+        package = name if name == "cprl" else f"cprl.{name}"
+        text += f"| [{package}]({package}.md) | {about} |\n"
+    return text
+
+
+_LANDING: Final = """Four values describe everything that you run. They are frozen: `dataclasses.replace` makes a
+changed copy.
+
+| value | what it says | to see it | page |
+|---|---|---|---|
+| `cprl.Game` | a map, its rules, what agents observe, its institutions | `cprl.CommonsEnv(game, worlds=1000)` | \
+[cprl](cprl.md) |
+| `cprl.institutions.Institution` | a rule that people make, such as `Quota` or `Tax` | \
+`replace(game, institutions=(Quota(),))` | [cprl.institutions](cprl.institutions.md) |
+| `cprl.Experiment` | a game, who plays, how long, how many replicas | `run = cprl.run(experiment)`, \
+`cprl.load(run)` | [cprl](cprl.md) |
+| `cprl.Study` | one experiment under many conditions | `cprl.run_study(study)` | [cprl](cprl.md) |
+
+`cprl.presets` has the published games and settings by name, [Commands](commands.md) what the terminal offers."""
 
 
 def _package_page(package: str) -> str:
