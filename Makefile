@@ -34,7 +34,7 @@ test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest -m slow
 
 # The oldest and the newest versions that pyproject.toml allows, each in an environment of its own; see
-# docs/upgrading.md.
+# docs/install.md.
 MORE_TORCH := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 test-oldest test-newest: test-%: .venv-%/.installed
 	.venv-$*/bin/$(PYTEST) -m "$(NOT_HERE)" $(ARGS)

@@ -1,4 +1,4 @@
-"""`commons` as a task of BenchMARL, learned by its IPPO; docs/trainers.md says how to install BenchMARL."""
+"""`commons` as a task of BenchMARL, learned by its IPPO; docs/algorithms.md says how to install BenchMARL."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,6 +1,6 @@
 """Prints the oldest versions that `pyproject.toml` allows, as constraints for pip.
 
-`make test-oldest` installs them into an environment of its own; see docs/upgrading.md.
+`make test-oldest` installs them into an environment of its own; see docs/install.md.
 """
 
 import sys

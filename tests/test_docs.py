@@ -139,7 +139,7 @@ def test_python_in_the_docs_runs(code, modules, tmp_path, monkeypatch):
 
 @pytest.mark.integration
 def test_the_collector_of_several_processes_runs_as_a_script(tmp_path):
-    (code,) = (code for code in codes(ROOT / "docs/workers.md") if '__name__ == "__main__"' in code)
+    (code,) = (code for code in codes(ROOT / "docs/studies.md") if '__name__ == "__main__"' in code)
     (tmp_path / "collect.py").write_text(code)
     done = subprocess.run([sys.executable, "collect.py"], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -185,13 +185,24 @@ def test_links_between_pages_lead_somewhere():
 
 
 def test_every_interval_of_the_reproduction_stands_in_a_report_or_is_printed_by_the_page_itself(capsys):
-    page = "".join((ROOT / "docs" / name).read_text() for name in ("results.md", "explanations.md"))
+    page = (ROOT / "docs" / "results.md").read_text()
     reports = "experiment_3", "dip", "combat"
-    written = "tables.md", *(f"studies/{name}/report/tables.md" for name in reports)
+    written = "tables.md", "studies/perolat.md", *(f"studies/{name}/report/tables.md" for name in reports)
     tables = "".join((ROOT / "docs/results" / own).read_text() for own in written)
     for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
-        exec(compile(code, "docs/explanations.md", "exec"), {"__name__": "docs"})
+        exec(compile(code, "docs/results.md", "exec"), {"__name__": "docs"})
     tables += capsys.readouterr().out
     told = re.findall(INTERVAL, page)
     assert len(told) > 90
     assert [one for one in told if one not in tables] == []
+
+
+@pytest.mark.integration
+def test_what_governs_is_made_of_the_committed_tables_and_the_page_has_its_numbers(tmp_path):
+    command = [sys.executable, ROOT / "recipes" / "study" / "governs.py", "--out", tmp_path]
+    subprocess.run(command, check=True)
+    committed = (ROOT / "docs" / "results" / "governs" / "table.md").read_text()
+    assert (tmp_path / "table.md").read_text() == committed
+    intervals = re.findall(r"\[[\d., ]+\]", (ROOT / "docs" / "governs.md").read_text())
+    assert len(intervals) > 10
+    assert [one for one in intervals if one not in committed] == []

@@ -183,7 +183,7 @@ class TestRLlib:
 @pytest.mark.filterwarnings("ignore")
 def test_benchmarl_learns_the_task(example, shorter_episodes, tmp_path):
     if importlib.util.find_spec("benchmarl") is None:
-        pytest.skip("needs BenchMARL, installed as docs/trainers.md says")
+        pytest.skip("needs BenchMARL, installed as docs/algorithms.md says")
     harvest = example("benchmarl_task").main(iterations=2, worlds=2, out=str(tmp_path))
     assert harvest >= 0
     assert list(tmp_path.glob("ippo_commons_*/config.pkl"))

@@ -28,7 +28,7 @@ REPORTS = {
         *(TARGETS_10, "commons_targets_10_decay_500k"),
     ],
 }
-"""The runs of each committed report, as docs/results.md and docs/explanations.md say, by its folder."""
+"""The runs of each committed report, as docs/results.md and docs/results.md say, by its folder."""
 
 pytestmark = [
     pytest.mark.integration,

@@ -1,7 +1,7 @@
 """The game and the agents that all recipes of this folder share: twelve on a commons, after Perolat et al.
 
 J. Perolat et al., "A multi-agent reinforcement learning model of common-pool resource appropriation" (2017).
-docs/perolat.md says which numbers are the paper's, which it leaves open, how these recipes depart from it,
+docs/results.md says which numbers are the paper's, which it leaves open, how these recipes depart from it,
 and how the cost was measured: with 4 replicas a step takes 6.3 ms of a core, so a condition of 1,000
 episodes takes 1.8 core hours at most, and its process 3.1 GB of memory.
 """

@@ -452,7 +452,7 @@ class Responses:
     """Indices of the agents that are replaced, one at a time; each costs as many trainings."""
     algorithms: tuple[str, ...] = ()
     """What responses learn by: own, the algorithm of the replaced agent, DQN, PPO; by default own and PPO, or
-    DQN if that is PPO; see docs/exploitability.md."""
+    DQN if that is PPO; see docs/evaluation.md."""
     seeds: int = 3
     """Trainings by each algorithm."""
     training_episodes: int | None = None

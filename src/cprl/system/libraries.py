@@ -29,7 +29,7 @@ def relying_on(library: str, part: str) -> Iterator[None]:
         allowed = f"{library}{versions}" if versions else "the versions in pyproject.toml of cprl"
         raise ImportError(
             f"{library} {_installed(library)} has no {part}, on which cprl {_installed('cprl')} relies; "
-            f"allowed: {allowed} (docs/upgrading.md)"
+            f"allowed: {allowed} (docs/install.md)"
         ) from error
 
 

@@ -118,9 +118,8 @@ AgentIndices = Annotated[
 class Value:
     """The base of frozen dataclasses whose fields are checked by their annotations when they are made.
 
-    Args:
-        stored: whether a table can hold values of the class; of cprl's classes only.
-        called: what the class is called in messages; by default its name.
+    A subclass may be given, as arguments of the class, `stored`: whether a table can hold its values, of
+    cprl's classes only; and `called`: what it is called in messages, by default its name.
 
     Raises:
         ValueError: for a field that its annotation does not allow; names the field and what is allowed.
