@@ -1,11 +1,11 @@
-"""The committed populations in all scenarios of their games: estimates, figures, and tables for scenarios.md.
+"""The committed populations in all scenarios of their games: estimates, figures, and docs/results/scenarios/table.md.
 
     nice -n 10 python docs/scenarios_baseline.py
     python docs/scenarios_baseline.py --tables
 
 The first one writes NAME.csv and NAME.png for each population into docs/results/scenarios, and leaves out
 those whose NAME.csv is there, so that it can be stopped and started again. The second one plays nothing and
-prints the tables of the page.
+prints the tables.
 """
 
 import csv

@@ -50,10 +50,10 @@ def example(monkeypatch):
 
 
 def test_an_example_has_less_than_sixty_lines_and_a_row_in_the_docs():
-    page = (EXAMPLES.parent / "docs" / "trainers.md").read_text()
+    page = (EXAMPLES.parent / "docs" / "algorithms.md").read_text()
     for name in NAMES:
         assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) < 60, name
-        assert f"| [`{name}.py`](../examples/{name}.py) |" in page
+        assert f"| `examples/{name}.py " in page
 
 
 @pytest.mark.integration

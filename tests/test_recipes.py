@@ -159,7 +159,7 @@ def test_the_table_of_where_learners_end_follows_from_what_was_measured(monkeypa
         sharing = own.sharing_of(*condition[:2])
         assert found["gain"].max() <= sharing.surplus(sharing.optimum_total) * (1 + 1e-5)
     own.print_table(measured)
-    page = (RECIPES.parent / "docs" / "theory.md").read_text()
+    page = (RECIPES.parent / "docs" / "results" / "theory" / "table.md").read_text()
     assert capsys.readouterr().out in page
 
 

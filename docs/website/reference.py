@@ -78,20 +78,21 @@ def _landing_page() -> str:
     return text
 
 
-_LANDING: Final = """Four values describe everything that you run. They are frozen: `dataclasses.replace` makes a
-changed copy.
+_LANDING: Final = """Four values describe everything that you run.
+They are frozen: `dataclasses.replace` makes a changed copy.
 
 | value | what it says | to see it | page |
 |---|---|---|---|
-| `cprl.Game` | a map, its rules, what agents observe, its institutions | `cprl.CommonsEnv(game, worlds=1000)` | \
-[cprl](cprl.md) |
+| `cprl.Game` | a map, its rules, what agents observe, its institutions | \
+`cprl.CommonsEnv(game, worlds=1000)` | [cprl](cprl.md) |
 | `cprl.institutions.Institution` | a rule that people make, such as `Quota` or `Tax` | \
 `replace(game, institutions=(Quota(),))` | [cprl.institutions](cprl.institutions.md) |
 | `cprl.Experiment` | a game, who plays, how long, how many replicas | `run = cprl.run(experiment)`, \
 `cprl.load(run)` | [cprl](cprl.md) |
 | `cprl.Study` | one experiment under many conditions | `cprl.run_study(study)` | [cprl](cprl.md) |
 
-`cprl.presets` has the published games and settings by name, [Commands](commands.md) what the terminal offers."""
+`cprl.presets` has the published games and settings by name.
+[Commands](commands.md) are what the terminal offers."""
 
 
 def _package_page(package: str) -> str:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from golden import assert_held, checksum
 
-from cprl import CommonsEnv, Game, Observation, Rules, maps, presets
+from cprl import CommonsEnv, Game, Observation, Rules, keys, maps, presets
 from cprl.institutions import (
     Boundaries,
     ClosedPatches,
@@ -97,7 +97,8 @@ def played(game):
     def take(step):
         for key in step.keys(True, True):
             name = key if isinstance(key, str) else "/".join(key)
-            entries.setdefault(name, []).append(step[key].numpy().copy())
+            if key != keys.APPLE_AHEAD:  # which is younger than the checksums, and changed none of the others
+                entries.setdefault(name, []).append(step[key].numpy().copy())
 
     take(now)
     for _ in range(TURNS):

@@ -115,7 +115,8 @@ class Experiment(Value, stored=False, called="experiment"):
     def trained_for(self) -> str:
         """How long it trains, in words."""
         worlds = f" of {self.worlds:,} worlds" if self.worlds > 1 else ""
-        return f"trained for {self.length:,} {self.unit} in {self.replicas} replica{'s' * (self.replicas > 1)}{worlds}"
+        replicas = f"{self.replicas} replica{'s' * (self.replicas > 1)}"
+        return f"trained for {self.length:,} {self.unit} in {replicas}{worlds}"
 
     @property
     def unit(self) -> Literal["episodes", "steps"]:
