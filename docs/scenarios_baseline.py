@@ -1,4 +1,4 @@
-"""The committed populations in all scenarios of their games: estimates, figures, and docs/results/scenarios/table.md.
+"""The committed populations in all scenarios of their games: estimates, figures and tables.
 
     nice -n 10 python docs/scenarios_baseline.py
     python docs/scenarios_baseline.py --tables
