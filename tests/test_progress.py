@@ -51,6 +51,20 @@ def test_the_bar_is_one_line_of_80_columns(monkeypatch):
     assert all("steps/s" in line and len(line) <= 80 for line in lines[1:])
 
 
+def test_a_notebook_has_one_line_with_a_bar_that_fills(monkeypatch):
+    monkeypatch.setattr(progress, "_NOTEBOOK_PERIOD_S", 0.0)
+    told = io.StringIO()
+    walker = LaneActor(None, 8, seeds=[(0,)], agents=1)
+    with ProgressBar(GAME, episodes=4, console=Console(file=told, force_jupyter=True)) as bar:
+        train(CommonsEnv(GAME, 1), {}, others={(0,): walker}, episodes=4, callbacks=[bar])
+    shown = told.getvalue()
+    assert shown.count("\n") == 1
+    assert shown.endswith("\n")
+    full = [line.count("█") for line in shown.split("\r")[1:]]
+    assert full == sorted(full)
+    assert (full[0], full[-1]) == (1, 20)
+
+
 def test_lines_count_episodes_from_where_a_stopped_training_was(monkeypatch):
     shown = [int(number) for number in re.findall(r"episode (\d+)/9", lines(monkeypatch, before=0))]
     assert (shown[0], shown[-1]) == (0, 5)

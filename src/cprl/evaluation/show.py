@@ -213,7 +213,7 @@ def _players(run: LoadedRun) -> str:
 def _rules(game: Game) -> str:
     if not game.institutions:
         return f"Rules: {NO_RULES}."
-    return " ".join([*(meaning_of(own, game) for own in game.institutions), f"Settings: {rules_of(game)}."])
+    return " ".join([*(meaning_of(kind, game) for kind in game.institutions), f"Settings: {rules_of(game)}."])
 
 
 def _cells(board: Map, places: Sequence[Sequence[int]]) -> list[int]:

@@ -17,8 +17,11 @@ from cprl.system.output import console as safe_console
 from cprl.system.times import CLOCK
 
 _BAR_PERIOD_S: Final = 0.25
+_NOTEBOOK_PERIOD_S: Final = 1.0
 _LINE_PERIOD_S: Final = 10.0
-"""Seconds between updates of the bar, and between lines if the output is not a terminal."""
+"""Seconds between updates of the bar, in a terminal and in a notebook, and between lines elsewhere."""
+_NOTEBOOK_CELLS: Final = 20, 100
+"""The width of a notebook's bar and of its line, in characters."""
 COMPILING_PERIOD_S: Final = 2.0
 """Seconds of compiling after which a line says so, and between such lines, which come ever more slowly."""
 TIMED_STEPS: Final = 20
@@ -36,9 +39,9 @@ def in_words(seconds: float) -> str:
 class ProgressBar:
     """A bar with the return of the last episode, epsilon, steps per second and the time left.
 
-    While code is compiled it says so, and for how long; that time does not count for the rest. If the output
-    is not a terminal, it prints a plain line every ten seconds. A callback of `cprl.training`, and a context
-    manager.
+    While code is compiled it says so, and for how long; that time does not count for the rest. In a notebook
+    the bar is one line of text; elsewhere, without a terminal, a plain line is printed every ten seconds. A
+    callback of `cprl.training`, and a context manager.
 
     Args:
         game: a game or its environment. The length of an episode is `episode_steps` of its `rules`, if it has
@@ -70,6 +73,8 @@ class ProgressBar:
             expand=True,
             disable=not self.console.is_terminal,
         )
+        elsewhere_s = _NOTEBOOK_PERIOD_S if self.console.is_jupyter else _LINE_PERIOD_S
+        self._period_s = _BAR_PERIOD_S if self.console.is_terminal else elsewhere_s
         self._all_steps = steps
         self._task = self._progress.add_task(title, total=steps or episodes, values="")
         self._latest = {"return": "-", "epsilon": ""}
@@ -102,7 +107,7 @@ class ProgressBar:
         self._steps += batch.numel()
         self._steps_this_episode += batch.numel()
         waited = _running_s() - self._then
-        if waited > (_BAR_PERIOD_S if self.console.is_terminal else _LINE_PERIOD_S):
+        if waited > self._period_s:
             self._show(waited)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
@@ -128,7 +133,17 @@ class ProgressBar:
             at = f"episode {self._episodes // self._replicas}/{self._left_of}"
             if self._all_steps is not None:
                 at = f"step {done:,.0f}/{self._left_of:,}"
-            self.console.print(f"{self._title}: {at}  {values}", soft_wrap=True)
+            self._print(f"{self._title}: {at}  {values}", done)
+
+    def _print(self, words: str, done: float) -> None:
+        """Print a line; in a notebook over the one before, behind a bar."""
+        if not self.console.is_jupyter:
+            self.console.print(words, soft_wrap=True)
+            return
+        wide, all_cells = _NOTEBOOK_CELLS
+        full = int(wide * min(1.0, done / max(1, self._left_of)))
+        self.console.file.write(f"\r{'█' * full}{'░' * (wide - full)} {words}".ljust(all_cells))
+        self.console.file.flush()
 
     def _done(self) -> float:
         """Episodes of each replica so far, or steps."""
@@ -153,7 +168,7 @@ class ProgressBar:
             spent_s = CLOCK.total_s - self._compiled_before_s
             if CLOCK.is_running and spent_s - said_s >= period_s:
                 said_s, period_s = spent_s, 1.5 * period_s
-                self.console.print(f"{self._title}: compiling, {spent_s:.0f} s so far", soft_wrap=True)
+                self._print(f"{self._title}: compiling, {spent_s:.0f} s so far", self._done())
 
     def state_dict(self) -> dict[str, int]:
         return {"episodes": self._episodes}
@@ -177,6 +192,9 @@ class ProgressBar:
         self._steps_this_episode = 0
         self._progress.update(self._task, completed=self._done())
         self._progress.stop()
+        if self.console.is_jupyter:
+            self._print(f"{self._title}: {self._episodes // self._replicas} episodes", self._done())
+            self.console.file.write("\n")
 
 
 class _Now(ProgressColumn):
