@@ -95,6 +95,9 @@ def test_the_page_of_replays_names_every_committed_one(tmp_path):
     assert sorted(re.findall(r'href="\?replay=([^"]+)"', text)) == committed
     for path in re.findall(r'data-recording="([^"]+)"', text):
         assert (tmp_path / path).stat().st_size > 100_000
+    thumbnails = re.findall(r'<img src="([^"]+)"', text)
+    assert len(thumbnails) == len(committed)
+    assert all((tmp_path / path).is_file() for path in thumbnails)
 
 
 def test_the_page_of_replays_has_all_that_its_script_fills():

@@ -85,7 +85,7 @@ They are frozen: `dataclasses.replace` makes a changed copy.
 |---|---|---|---|
 | `cprl.Game` | a map, its rules, what agents observe, its institutions | \
 `cprl.CommonsEnv(game, worlds=1000)` | [cprl](cprl.md) |
-| `cprl.institutions.Institution` | a rule that people make, such as `Quota` or `Tax` | \
+| `Institution` | a rule that people make, such as `Quota` or `Tax` | \
 `replace(game, institutions=(Quota(),))` | [cprl.institutions](cprl.institutions.md) |
 | `cprl.Experiment` | a game, who plays, how long, how many replicas | `run = cprl.run(experiment)`, \
 `cprl.load(run)` | [cprl](cprl.md) |

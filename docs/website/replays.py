@@ -13,6 +13,8 @@ from urllib.request import ProxyHandler, build_opener
 from cprl.viewer.page import LOCALHOST, WebViewer
 
 RESULTS: Final = Path(__file__).parents[1] / "results"
+BOARDS: Final = RESULTS.with_name("boards")
+"""Pictures of the boards by their names, which runs have, too."""
 PAGE: Final = "replays.md"
 FOLDER: Final = "recordings"
 VIEWER: Final = "viewer"
@@ -40,10 +42,16 @@ def stage_replays(folder: Path) -> None:
         target = folder / FOLDER / f"{name}.rrd"
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
-    links = "\n".join(
-        f'<a href="?replay={quote(name)}" data-recording="{FOLDER}/{quote(name)}.rrd">{escape(name)}</a>'
-        for name in recordings()
-    )
+    (folder / BOARDS.name).mkdir(exist_ok=True)
+    links = ""
+    for name in recordings():
+        board = BOARDS / f"{name.split('/')[0]}.png"
+        picture = ""
+        if board.is_file():
+            shutil.copyfile(board, folder / BOARDS.name / board.name)
+            picture = f'<img src="{BOARDS.name}/{quote(board.name)}" alt="">'
+        recording = f"{FOLDER}/{quote(name)}.rrd"
+        links += f'<a href="?replay={quote(name)}" data-recording="{recording}">{picture}{escape(name)}</a>\n'
     text = _TEMPLATE.read_text(encoding="utf-8").replace("{links}", links)
     (folder / PAGE).write_text(text, encoding="utf-8")
 
