@@ -462,3 +462,20 @@ def test_a_drawing_that_cannot_be_read_is_refused_with_its_place(drawing, argume
     path.write_text(drawing)
     with pytest.raises(ValueError, match=message):
         maps.read(path, **arguments)
+
+
+def test_with_a_radius_that_spans_the_board_growth_is_logistic():
+    """Each of the K - s empty sites grows with probability r s / K: r s (1 - s / K) apples on average."""
+    rate, sites, worlds = 0.4, 24, 4096
+    rules = Rules(regrow_prob=tuple(rate * s / sites for s in range(sites + 1)), regrow_radius_cells=1000)
+    board = maps.parse("\n".join([">.......", *["AAAAAAAA"] * 3]))
+    env = CommonsEnv(Game(map=board, rules=rules), worlds=worlds, seed=0)
+    env.reset()
+    state, chosen = env.worlds.state(), np.random.default_rng(0)
+    for stock in (6, 12, 18):
+        order = chosen.random(state["stock"].shape).argsort(1)
+        state["stock"] = state["stock_before"] = (order < stock).astype(np.uint8)
+        now = env.load(state)
+        now["agents", "action"] = torch.full((worlds, 1), 7)
+        grown = env.step(now)["next", "regrown"].double().mean()
+        assert abs(grown - rate * stock * (1 - stock / sites)) < 0.1
