@@ -200,7 +200,7 @@ def test_every_interval_of_the_reproduction_stands_in_a_report_or_is_printed_by_
 @pytest.mark.integration
 def test_what_governs_is_made_of_the_committed_tables_and_the_page_has_its_numbers(tmp_path):
     command = [sys.executable, ROOT / "recipes" / "study" / "governs.py", "--out", tmp_path]
-    subprocess.run(command, check=True)
+    subprocess.run(command, check=True, cwd=ROOT)
     committed = (ROOT / "docs" / "results" / "governs" / "table.md").read_text()
     assert (tmp_path / "table.md").read_text() == committed
     intervals = re.findall(r"\[[\d., ]+\]", (ROOT / "docs" / "governs.md").read_text())

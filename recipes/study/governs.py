@@ -2,9 +2,10 @@
 
     python recipes/study/governs.py
 
-Reads the tables in docs/results, and writes table.md and governs.png into docs/results/governs. In each
-condition four DQN agents play `commons` as run, 200 episodes on the short schedule of base.py, with one thing
-changed; numbers are means of the last 30 episodes of each replica, then over replicas.
+To be run in the root of the repository: reads the tables in docs/results, and writes table.md and governs.png
+into docs/results/governs. In each condition four DQN agents play `commons` as run, 200 episodes on the short
+schedule of base.py, with one thing changed; numbers are means of the last 30 episodes of each replica, then
+over replicas.
 """
 
 from pathlib import Path
@@ -23,7 +24,7 @@ from cprl.runs.curves import curves_of
 from cprl.terminal import style
 from cprl.terminal.style import RANDOM_LINE
 
-RESULTS: Final = Path(__file__).parents[2] / "docs" / "results"
+RESULTS: Final = Path("docs", "results")
 LAST: Final = 30
 """Episodes at the end of each replica."""
 BEST: Final = KNOWN["commons", "as_run"].best_known
