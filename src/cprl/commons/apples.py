@@ -14,7 +14,7 @@ from cprl.commons.chance import (
     WORD_SIZE,
     draw,
 )
-from cprl.commons.moves import cell_of
+from cprl.commons.moves import cell_of, without_signal
 from cprl.commons.river import growth_share
 from cprl.commons.tables import FURTHER, Tables
 from cprl.commons.world import Actions, Scratch, Worlds
@@ -169,7 +169,7 @@ def bite(
             if (
                 k >= 0
                 and world.stock[k] == 1
-                and (not FURTHER or tables.harvest_number in (-1, actions[i]))
+                and (not FURTHER or tables.harvest_number in (-1, without_signal(tables, actions[i])))
                 and may_bite(law, i, cell, k, world.step[0])
             ):
                 remove_apple(world, tables, k)

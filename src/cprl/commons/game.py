@@ -103,12 +103,13 @@ class Game(Value):
     @property
     def channels(self) -> tuple[str, ...]:
         """The name of each channel of an observation: "red", "green", "blue", or the classes of cells, then
-        those of institutions, see `cprl.commons.views`."""
-        return *self.cell_channels, *self._institution_channels
+        one for each signal, then those of institutions, see `cprl.commons.views`."""
+        signals = (f"signal {number + 1}" for number in range(self.rules.signals))
+        return *self.cell_channels, *signals, *self._institution_channels
 
     @property
     def cell_channels(self) -> tuple[str, ...]:
-        """The channels that show the board: all but those of institutions."""
+        """The channels that show the board: all but those of signals and institutions."""
         hides = self.rules.walls_block_sight
         river = bool(self.map.river)
         return channel_names(self.observation, agents=self.agents, hides=hides, river=river)

@@ -52,13 +52,14 @@ def act_one(world: Worlds, tables: Tables, actions: Actions, scratch: Scratch, i
     scratch.start_col[i] = world.col[i]
     world.fired[i] = False
     if FURTHER:
-        world.cleans[i] = world.in_play[i] and actions[i] == tables.clean_number
+        world.signal[i] = actions[i] // tables.silent_actions if world.in_play[i] else 0
+        world.cleans[i] = world.in_play[i] and without_signal(tables, actions[i]) == tables.clean_number
     if not world.in_play[i]:
         return
     is_hot = FURTHER and world.cooldown[i] > 0
     if is_hot:
         world.cooldown[i] -= 1
-    action = actions[i]
+    action = without_signal(tables, actions[i])
     if action < TURN_LEFT:
         mover = moved_by(tables, i, action)
         walk(world, tables, mover, (world.heading[mover] + WALK_TURN[action]) % 4)
@@ -70,6 +71,11 @@ def act_one(world: Worlds, tables: Tables, actions: Actions, scratch: Scratch, i
         world.fired[i] = True
         if FURTHER:
             world.cooldown[i] = tables.cooldown_steps
+
+
+def without_signal(tables: Tables, action: int) -> int:
+    """The action without the signal that is sent with it."""
+    return action % tables.silent_actions if FURTHER else action
 
 
 def draw_order(world: Worlds, scratch: Scratch) -> None:
@@ -248,6 +254,7 @@ def place_at_starts(world: Worlds, tables: Tables) -> None:
         world.fired[i] = False
         world.moved_after_firing[i] = False
         world.cooldown[i] = 0
+        world.signal[i] = 0
         world.cleans[i] = False
         world.hits[i] = 0
         world.tagged_step[i] = 0

@@ -118,6 +118,11 @@ class Rules(Value):
     """Whether agents may fire; if not, there is no beam action. For some agents alone:
     `cprl.institutions.Sanctioner`."""
 
+    signals: Annotated[int, Range(0, 15)] = 0
+    """How many signals an agent can send (ours). With each action it sends one of them or none, so there are
+    1 + `signals` times as many actions. An observation has a plane for each signal, with its largest value on
+    the cells of agents that sent it in the last turn. Signals have no other effect."""
+
     may_clean: bool = False
     """[C] Whether agents may clean the river, `Map.river`: a further action "clean", a beam of the size of
     the other one that removes the waste of the first cell of each column that has some, and ends there."""
@@ -252,6 +257,8 @@ class Rules(Value):
     @property
     def actions(self) -> tuple[str, ...]:
         """The names of the actions, by index: 8 of them, or 7 without a beam, and then perhaps "harvest" and
-        "clean"."""
+        "clean"; with signals all of them again for each signal, e.g. "forward 1"."""
         last = (*((HARVEST,) if self.harvest_action else ()), *((CLEAN,) if self.may_clean else ()))
-        return *(name for name in ACTIONS if self.may_fire or name != "beam"), *last
+        silent = *(name for name in ACTIONS if self.may_fire or name != "beam"), *last
+        spoken = (f"{name} {signal + 1}" for signal in range(self.signals) for name in silent)
+        return *silent, *spoken

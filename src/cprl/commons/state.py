@@ -20,6 +20,7 @@ DERIVED: Final = ("near", "stock_left", "waste_left")
 OF_A_RULE: Final = {
     "moved_after_firing": "agent_1_right_moves_agent_0",
     "cooldown": "cooldown_steps",
+    "signal": "signals",
     "cleans": "may_clean",
 }
 """Entries of `Worlds` that only games with a rule have in their state, by the rule: so the states of others
@@ -88,6 +89,7 @@ def _check_ranges(arrays: State, game: Game) -> None:
         "heading": (0, 3),
         "out_steps": (0, _MAX_INT32),
         "cooldown": (0, rules.cooldown_steps),
+        "signal": (0, rules.signals),
         "hits": (0, rules.hits_to_tag - 1),
         "tagged_step": (0, rules.episode_steps),
         "offences": (0, _MAX_INT32),

@@ -9,7 +9,7 @@ from cprl.commons.chance import REST_BITS
 from cprl.commons.colours import FIRST_AGENT, GROUND, WALL, WATER, class_colour
 from cprl.commons.maps import Map
 from cprl.commons.near import growth, neighbours
-from cprl.commons.observation import Observation, classes_shown
+from cprl.commons.observation import RGB_NAMES, Observation, classes_shown
 from cprl.commons.rules import CLEAN, HARVEST, Rules
 from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Bytes, Indices, Ints
 from cprl.institutions.base import threshold
@@ -19,7 +19,7 @@ FURTHER: Final = True
 FURTHER_RULES: Final = (
     *("regrow_by", "regrow_under_agents", "regrow_after_bites", "first_stock_share", "harvest_action"),
     *("beam_tapers", "beam_from_beside", "beam_stops_at_agents", "cooldown_steps", "end_prob"),
-    *("random_headings", "respawn_at_spawns", "clashes", "may_clean", "pollution_prob"),
+    *("random_headings", "respawn_at_spawns", "clashes", "signals", "may_clean", "pollution_prob"),
 )
 """Rules that the study does not have: a game in which all of them are off, on a map without spawn places or
 a river, is played as fast as if there were none."""
@@ -91,9 +91,9 @@ class Tables(NamedTuple):
     has_beam: bool
     agents_apart: bool
     one_hot: bool
-    one_hot_value: int
-    """The value of a cell in the channel of its class: 1, or 255 where institutions have planes of their
-    own."""
+    highest: int
+    """The largest value of an observation: 1 under "one_hot" where institutions have no planes of their own,
+    else 255."""
     sees_all: bool
     """Whether agents observe the whole board."""
     walls_block_sight: bool
@@ -107,6 +107,11 @@ class Tables(NamedTuple):
     regrow_after_bites: bool
     first_stock: int
     """Sites that hold an apple when an episode begins."""
+    signals: int
+    first_signal_plane: int
+    """The channel of observations that shows the first signal."""
+    silent_actions: int
+    """The number of actions without a signal."""
     harvest_number: int
     """The action that harvests; -1 where none is needed."""
     beam_tapers: bool
@@ -294,12 +299,14 @@ def build_tables(board: Map, rules: Rules, observation: Observation, *, highest:
         has_beam=rules.may_fire,
         agents_apart=observation.agents_apart,
         one_hot=observation.encoding == "one_hot",
-        one_hot_value=highest,
+        highest=highest,
         sees_all=sees_all,
         never_from_nothing=rules.regrow_prob[0] == 0 and not rules.plays_on_when_empty,
         further=bool(board.spawns or board.river) or any(name in rules.changed for name in FURTHER_RULES),
         regrow_by_share=rules.regrow_by != "count",
         first_stock=round(rules.first_stock_share * len(board.sites)),
+        first_signal_plane=len(drawn) if observation.encoding == "one_hot" else len(RGB_NAMES),
+        silent_actions=len(rules.actions) // (1 + rules.signals),
         harvest_number=rules.actions.index(HARVEST) if rules.harvest_action else -1,
         clean_number=rules.actions.index(CLEAN) if rules.may_clean else -1,
         end_below=threshold(rules.end_prob),

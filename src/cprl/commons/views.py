@@ -167,7 +167,7 @@ def cut_window(world: Worlds, tables: Tables, i: int, scratch: Scratch, window: 
             scratch.seen[n] = tables.channel_of[class_of(scratch.seen[n])]
         for channel in range(window.shape[0]):
             for n in range(cells):
-                planes[channel * cells + n] = (scratch.seen[n] == channel) * tables.one_hot_value
+                planes[channel * cells + n] = (scratch.seen[n] == channel) * tables.highest
     else:
         for n in range(cells):
             paint = scratch.seen[n]
@@ -195,6 +195,28 @@ def draw_board(world: Worlds, tables: Tables, scratch: Scratch, board: Bytes) ->
     for row in range(board.shape[0]):
         for col in range(board.shape[1]):
             board[row, col] = class_of(scratch.picture[cell_of(row, col, tables)])
+
+
+def draw_signals(world: Worlds, tables: Tables, scratch: Scratch, observation: Bytes) -> None:
+    """Writes who sent which signal in the last turn, after `draw_windows`, whose picture it takes;
+    `observation`: uint8 [N, C, X, Y]."""
+    picture = scratch.picture
+    for cell in range(picture.shape[0]):
+        picture[cell] = 0
+    for i in range(world.row.shape[0]):
+        if world.on_board[i] and world.signal[i] > 0:
+            picture[cell_of(world.row[i], world.col[i], tables)] = world.signal[i]
+    cells = tables.window_cells.shape[1]
+    for i in range(world.row.shape[0]):
+        planes = observation[i].reshape(-1)
+        heading = world.heading[i]
+        origin = 0 if tables.sees_all else cell_of(world.row[i], world.col[i], tables)
+        for n in range(cells):
+            sent = picture[origin + tables.window_cells[heading, n]]
+            if tables.walls_block_sight and not tables.in_sight[origin, heading, n]:
+                sent = 0
+            for s in range(tables.signals):
+                planes[(tables.first_signal_plane + s) * cells + n] = (sent == s + 1) * tables.highest
 
 
 HIGHEST = 255

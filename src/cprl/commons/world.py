@@ -66,6 +66,8 @@ class Worlds(NamedTuple):
     left; only under `agent_1_right_moves_agent_0`, else all false."""
     cooldown: Annotated[Ints, "B N"]
     """The number of turns in play in which the agent cannot fire; only under `cooldown_steps`, else all 0."""
+    signal: Annotated[Ints, "B N"]
+    """The signal that the agent sent in the last turn; 0 for none."""
     cleans: Annotated[Bools, "B N"]
     """Whether the agent cleaned in the last turn; only under `may_clean`, else all false."""
     waste: Annotated[Bytes, "B R"]

@@ -144,7 +144,7 @@ class Settings(NamedTuple):
     """The properties of the game that an agent's choice depends on, besides its window."""
 
     actions: int
-    """The number of actions."""
+    """The number of actions without a signal: these agents are silent."""
     has_beam: bool
     """Whether there is a beam action."""
     beam_length: int

@@ -1,0 +1,100 @@
+"""Signals: cheap talk, an action's second part, seen by others in the next turn and else without effect."""
+
+import numpy as np
+import pytest
+from boards import Play
+
+from cprl import Game, Observation, Rules, maps, presets
+from cprl.commons.batch import Batch
+from cprl.institutions import Quota
+
+BOARD = """
+.....
+.>A<.
+.....
+"""
+
+
+def planes(play, agent):
+    """The cells of each signal's plane that are not 0, with their value."""
+    first = len(play.game.cell_channels)
+    seen = play.output.observation[0, agent, first : first + play.game.rules.signals]
+    return [[(int(x), int(y), int(plane[x, y])) for x, y in np.argwhere(plane)] for plane in seen]
+
+
+def test_a_signal_is_seen_at_its_sender_in_the_next_turn_and_then_no_more():
+    play = Play(BOARD, signals=2, window_rows=4, window_columns=3).turn("stay 2", "stay")
+    assert planes(play, 0) == [[], [(3, 1, 255)]], "its own, at its place in the window"
+    assert planes(play, 1) == [[], [(1, 1, 255)]], "two cells ahead"
+    play.turn("stay", "stay 1")
+    assert planes(play, 0) == [[(1, 1, 255)], []]
+    play.turn("stay")
+    assert planes(play, 0) == planes(play, 1) == [[], []]
+
+
+def test_an_agent_out_of_play_sends_nothing():
+    play = Play(BOARD, signals=1, window_rows=4, window_columns=3).turn("beam 1", "stay 1")
+    assert planes(play, 0) == [[(3, 1, 255)]]
+    play.turn("stay", "stay 1")
+    assert planes(play, 0) == [[]]
+
+
+def test_a_new_episode_begins_in_silence():
+    play = Play(BOARD, signals=1, window_rows=4, window_columns=3, episode_steps=1).turn("stay 1").again()
+    assert planes(play, 0) == [[]]
+
+
+@pytest.mark.parametrize("encoding", ["rgb", "one_hot"])
+@pytest.mark.parametrize("area", ["window", "full"])
+@pytest.mark.parametrize("governed", [False, True])
+def test_signals_change_nothing_but_their_planes(encoding, area, governed):
+    seen = Observation(encoding=encoding, area=area)
+    institutions = (Quota(fine=1.0),) if governed else ()
+    board, rng = maps.named("two_complex"), np.random.default_rng(0)
+    silent = Game(map=board, rules=Rules(cooldown_steps=1), observation=seen, institutions=institutions)
+    rules = Rules(cooldown_steps=1, signals=3)
+    spoken = Game(map=board, rules=rules, observation=seen, institutions=institutions)
+    kinds, cells = len(silent.actions), len(silent.cell_channels)
+    assert spoken.actions[:kinds] == silent.actions
+    assert spoken.actions[kinds] == "forward 1"
+    assert len(spoken.actions) == 4 * kinds
+    assert spoken.channels[cells : cells + 3] == ("signal 1", "signal 2", "signal 3")
+    batches = [Batch(game, 4, seed=1) for game in (silent, spoken)]
+    outputs = [batch.begin(batch.new_output()) for batch in batches]
+    for _ in range(60):
+        actions = rng.integers(kinds, size=(4, 2))
+        signals = rng.integers(4, size=(4, 2))
+        batches[0].play(actions, outputs[0])
+        batches[1].play(actions + kinds * signals, outputs[1])
+        one, other = (output.turn if governed else output for output in outputs)
+        for name in one._fields:
+            if name != "observation":
+                np.testing.assert_array_equal(getattr(one, name), getattr(other, name), name)
+        spoken_planes = other.observation[:, :, cells : cells + 3]
+        others = np.delete(other.observation, range(cells, cells + 3), axis=2)
+        np.testing.assert_array_equal(one.observation, others)
+        highest = spoken.observation_highest
+        own = (spoken_planes == highest).any((-2, -1))
+        heard = own if area == "full" else own[..., np.newaxis][..., 0]
+        assert set(np.unique(spoken_planes)) <= {0, highest}
+        for world in range(4):
+            for agent in np.flatnonzero(batches[1].now.on_board[world] & (signals[world] > 0)):
+                assert heard[world, agent, signals[world, agent] - 1]
+
+
+def test_the_state_holds_what_was_said():
+    play = Play(BOARD, signals=2, window_rows=4, window_columns=3).turn("stay 2", "stay 1")
+    state = play.batch.state()
+    assert state["signal"].tolist() == [[2, 1]]
+    copy = Play(BOARD, signals=2, window_rows=4, window_columns=3)
+    copy.batch.load(state, copy.whole)
+    np.testing.assert_array_equal(copy.output.observation, play.output.observation)
+    with pytest.raises(ValueError, match="allowed: 0 to 2"):
+        copy.batch.load({**state, "signal": state["signal"] + 1}, copy.whole)
+
+
+def test_games_without_signals_have_none_in_their_state():
+    game = presets.game("two_complex")
+    batch = Batch(game, 1)
+    batch.begin(batch.new_output())
+    assert "signal" not in batch.state()
