@@ -4,6 +4,8 @@ for name in none quota boundaries graduated_sanctions monitoring vote mediation 
     python recipes/institutions.py --institution $name --replicas 1 --watch off --out runs/$name
 done
 python docs/draw_gallery.py --runs runs
+
+The committed pictures of none and quota are replica 0 of runs with 16 replicas, without `--replicas 1`.
 """
 
 from pathlib import Path

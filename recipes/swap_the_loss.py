@@ -3,7 +3,7 @@
     python recipes/swap_the_loss.py --loss dqn              5 replicas of 1000 episodes
     python recipes/swap_the_loss.py --loss ppo
 
-A loss of your own is a line too: docs/algorithms.md has one of twenty lines.
+docs/algorithms.md shows how to write a loss of your own.
 """
 
 from dataclasses import replace

@@ -48,7 +48,7 @@ def test_rows_have_units_and_say_whose_return_is_the_measure(tmp_path):
     rows, _ = told_of(tmp_path, random=random, trained=trained)
     assert rows[""] == ["random (baseline)", "trained"]
     assert rows["collective return, apples"] == ["3.0 ± 1.0", "9.0 ± 3.0"]
-    assert rows["times that of random play"] == ["1.0", "3.0"]
+    assert rows["times random play"] == ["1.0", "3.0"]
     assert rows["survival, steps"] == ["900.0", "900.0"]
     assert rows["equality (1 - Gini), 0 to 1"] == ["0.88", "0.62"]
     assert rows["stock left at the end, apples"] == ["1.0", "1.0"]
@@ -60,11 +60,11 @@ def test_a_policy_that_harvests_nothing_has_words_instead_of_nan(tmp_path):
     idle = [episode(number, [0, 0], equality=nan, sustainability=nan) for number in range(2)]
     busy = [episode(0, [2, 2], equality=1.0), episode(1, [0, 0], equality=nan, sustainability=nan)]
     rows, text = told_of(tmp_path, random=idle, trained=busy)
-    assert rows["times that of random play"] == ["undefined", "undefined"]
+    assert rows["times random play"] == ["undefined", "undefined"]
     assert rows["equality (1 - Gini), 0 to 1"] == ["undefined", "1.00, undefined in 1 of 2"]
     assert "nan" not in text
     assert "random: nobody harvested anything, so equality and sustainability are undefined" in text
-    assert "times that of random play: undefined, because it is not above 0" in text
+    assert "times random play: undefined, because it is not above 0" in text
 
 
 def test_episodes_with_an_undefined_net_equality_are_counted(tmp_path):
@@ -88,9 +88,7 @@ def test_the_outcome_comes_first_and_what_institutions_never_did_has_no_table(tm
 
     idle, busy = (governed(0, harvest, [0, 0]) for harvest in ([1, 1], [90, 30]))
     _, text = told_of(tmp_path, random=[idle], trained=[busy])
-    first = (
-        "trained 120, 60.0 times that of random play; random play 2.0: apples an episode, all agents together"
-    )
+    first = "trained 120, 60.0 times random play; random play 2.0: apples an episode, all agents together"
     assert text.splitlines()[0] == first
     assert "institutions" not in text
     rows, text = told_of(tmp_path, random=[idle], trained=[governed(0, [9, 3], [2, 0])])

@@ -1,4 +1,4 @@
-"""What apples can bear on a board of a few sites, exactly, for whoever can visit so many cells a turn.
+"""What apples can bear on a board of a few sites, exactly, if a harvester visits so many cells a turn.
 
 `cprl.theory.yield_bounds` has bounds for any board.
 """
@@ -46,8 +46,8 @@ def exact_yield(
     Before each turn a set of sites is chosen by the stock, and every apple there is bitten, also one that
     grows in this turn where the rules let it be (`regrow_before_bites`). An isolated cross under the
     published probabilities bears 0.1 apples a turn as run, 3 of its 5 being kept; with one bite a turn
-    0.0975, or 0.09987 for whoever chooses when it has seen what grew. Ways, clashes and beams are left
-    out: whoever harvests is where it wants to be. The policy found is evaluated exactly, and proven to be
+    0.0975, or 0.09987 if the harvester chooses once it has seen what grew. Ways, clashes and beams are
+    left out: the harvester is where it wants to be. The policy found is evaluated exactly, and proven to be
     within `TOLERANCE` of the best by the largest gain of a round (Odoni 1969, for value iteration).
 
     Args:

@@ -235,7 +235,7 @@ class Planner(Value):
     """The numbers that a planner weighs by.
 
     Raises:
-        ValueError: names the field, what came and what is allowed.
+        ValueError: names the field, its value and what is allowed.
     """
 
     patience_steps: Annotated[float, Range(1, 1e9)] = 160.0

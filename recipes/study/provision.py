@@ -4,8 +4,8 @@
 
 The cleanup of sequential_social_dilemma_games: apples grow only while somebody cleans the river, which pays
 nobody. Five PPO agents learn from half a million steps of 16 worlds, without institutions, and under those
-that help on the commons: a quota, a tax shared equally, graduated sanctions of whoever is tagged, the fines
-of the original; and, for what is possible, with the reward of the whole team.
+that help on the commons: a quota, a tax shared equally, graduated sanctions for being tagged, the fines of
+the original; and, for what is possible, with the reward of the whole team.
 """
 
 from dataclasses import replace

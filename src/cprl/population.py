@@ -55,8 +55,8 @@ class Frozen(Value):
             return replica if self.replica is None else self.replica
         if replica >= len(self.replica):
             raise ValueError(
-                f"{self} names a replica for each of {len(self.replica)} replicas, none for that of index "
-                f"{replica}; allowed: as many as play"
+                f"{self} names {len(self.replica)} replicas, and none for the replica of index {replica}; "
+                "allowed: one for each replica that plays"
             )
         return self.replica[replica]
 

@@ -1,7 +1,7 @@
 """The base classes of algorithms: frozen dataclasses that make the networks, loss and learner of agents.
 
 To write an algorithm, subclass `OffPolicy` or `OnPolicy` as a frozen dataclass with a field `settings`, and
-define `make_network` and `make_loss`; docs/algorithms.md has an example of twenty lines.
+define `make_network` and `make_loss`; docs/algorithms.md has an example.
 """
 
 from collections.abc import Sequence

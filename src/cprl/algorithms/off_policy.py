@@ -48,9 +48,9 @@ Return = Annotated[float, Range(-1e9, 1e9)]
 class DQN(OffPolicy):
     """Deep Q-learning with a target network, TorchRL's `DQNLoss`; the algorithm of the study.
 
-    With a recurrent network, and `sequence_steps` of the settings, it is that of Hausknecht and Stone, "Deep
-    Recurrent Q-Learning for Partially Observable MDPs" (2015), but that sequences begin with the states by
-    which the agent acted, not with zeros: those are the stored states of Kapturowski et al., "Recurrent
+    With a recurrent network, and `sequence_steps` of the settings, it follows Hausknecht and Stone, "Deep
+    Recurrent Q-Learning for Partially Observable MDPs" (2015), except that sequences begin with the states by
+    which the agent acted, not with zeros: the stored states of Kapturowski et al., "Recurrent
     Experience Replay in Distributed Reinforcement Learning" (2019), without a burn-in.
 
     Source: Mnih et al., "Human-level control through deep reinforcement learning" (2015).
@@ -61,7 +61,7 @@ class DQN(OffPolicy):
     Guez and Silver, "Deep Reinforcement Learning with Double Q-learning", 2016)."""
     loss_function: str = "l2"
     """The loss of the temporal-difference error d: "l2", d^2; "smooth_l1" (Huber); "l1"; or "log_cosh",
-    ln cosh d, that of some versions of the study's program (`cprl.objectives.LogCoshDQNLoss`)."""
+    ln cosh d, as in some versions of the study's program (`cprl.objectives.LogCoshDQNLoss`)."""
     loss_functions: ClassVar[tuple[str, ...]] = DISTANCES
     can_be_recurrent: ClassVar[bool] = True
     batching: ClassVar[Batching | None] = "lane_axis"

@@ -145,7 +145,7 @@ class MADDPG(TeamAlgorithm, OffPolicy):
     training and in evaluation.
 
     Source: Lowe et al., "Multi-Agent Actor-Critic for Mixed Cooperative-Competitive Environments" (2017); how
-    this differs is listed in docs/algorithms.md.
+    this differs is listed in docs/opponents.md.
     """
 
     logit_penalty: Weight = 1e-3
@@ -213,7 +213,7 @@ class LOLA(TeamAlgorithm):
     compiles acting alone.
 
     Source: Foerster et al., "Learning with Opponent-Learning Awareness" (2018), and "DiCE: The Infinitely
-    Differentiable Monte Carlo Estimator" (2018); docs/algorithms.md lists the departures.
+    Differentiable Monte Carlo Estimator" (2018); docs/opponents.md lists the departures.
     """
 
     settings: LOLASettings

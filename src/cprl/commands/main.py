@@ -1,4 +1,4 @@
-"""The command `cprl`: what can be done with recipes and with runs that are there."""
+"""The command `cprl`: trains agents by recipes, and watches, measures and compares stored runs."""
 
 import os
 import subprocess
@@ -123,7 +123,7 @@ def run(
     Args:
         recipe: a recipe.json, or the directory of a run.
         options: --out is with --resume the run itself.
-        episodes: instead of those of the recipe; with --resume more of them extend the run.
+        episodes: how many, instead of the recipe's number; with --resume more of them extend the run.
         steps: likewise, of a recipe that trains so many steps.
     """
     trial = _TRIAL.get()

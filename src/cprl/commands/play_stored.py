@@ -33,13 +33,13 @@ class Fresh:
     """Which fresh worlds are played, and how."""
 
     episodes: int = 20
-    """Of each replica, in each choice of who plays where."""
+    """Episodes of each replica, in each choice of who plays where."""
     greedy: bool = False
-    """Whether stored agents play what they hold best, without exploring or drawing."""
+    """Whether stored agents take their best action, without exploring or drawing."""
     seed: int = SEED
     """Of the worlds and all chance; the same one gives the same numbers."""
     replicas: tuple[int, ...] = ()
-    """Their numbers; by default all that every run has."""
+    """Which replicas, by number; by default all that every run has."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,9 +47,9 @@ class Files:
     """Which files are written; none is written over."""
 
     out: Path | None = None
-    """A parquet file to be, with every episode."""
+    """A new parquet file, for every episode."""
     figure: Path | None = None
-    """A .png, .pdf or .svg to be, see docs/evaluation.md."""
+    """A new .png, .pdf or .svg, see docs/evaluation.md."""
     figure_width: Literal["page", "column"] = "page"
     """Of the figure: a page, or a column of a paper, 3.3 inches, with its caption in a file beside it."""
 
@@ -172,7 +172,7 @@ def show(
 
 
 def report(run: Path, /, *, out: Path | None = None, episodes: int = 20, seed: int = SEED) -> None:
-    """Writes a page for any browser about a run or a study: what came of it, an episode, how to run it again.
+    """Writes a page for any browser about a run or a study: its results, an episode, how to run it again.
 
     Args:
         run: the directory of a run or of a study, or their results.
@@ -225,7 +225,7 @@ class Session:
     variant: Variant = "published"
     """Of the boards with a name: published, as_run or, of two_complex, as_run_10_april; see docs/game.md."""
     steps: int | None = None
-    """Turns of the episode at most; by default those of the game."""
+    """Turns of the episode at most; by default as many as the game has."""
     seed: int = PLAY_SEED
     """Of all chance; the same seed and the same keys play the same again."""
     decision: int | None = None
@@ -236,8 +236,8 @@ def play(board: str, /, *, session: Annotated[Session, tyro.conf.arg(name="")] =
     """Lets you play in the terminal among trained or scripted agents, and measures the episode.
 
     Args:
-        board: commons, two_complex, single_complex or single_basic; or the directory of a run, whose game it
-            is then; or a file with a drawing.
+        board: commons, two_complex, single_complex or single_basic; or the directory of a run, whose game
+            is played; or a file with a drawing.
     """
     check_board(board)
     _begin(session.seed)
@@ -252,7 +252,7 @@ def evaluate(run: Path, /, *, fresh: FreshFlags = Fresh(), out: Path | None = No
 
     Args:
         run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
-        out: a parquet file to be, with every episode.
+        out: a new parquet file, for every episode.
     """
     files = Files(out=out)
     _begin(fresh.seed, run, files=files)
@@ -270,7 +270,7 @@ def visits(
 
     Args:
         run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
-        figure: a .png, .pdf or .svg to be: a map for each agent of where it spends its time, in the first of
+        figure: a new .png, .pdf or .svg: a map for each agent of where it spends its time, in the first of
             the replicas.
         random: draw random agents in the same worlds instead.
     """
@@ -295,14 +295,14 @@ def crossplay(
     diagonal: Diagonal = "self",
     files: FileFlags = Files(),
 ) -> None:
-    """Lets agents of each run play among those of each other run, and prints how all fare.
+    """Lets agents of each run play among agents of each other run, and prints how all fare.
 
     The figure shows what focal agents gain, and what it costs the background agents.
 
     Args:
         runs: directories of runs of the same game, or their results; NAME=PATH gives one another name.
-        diagonal: whom a run's agents meet there: "self", those they were trained with, or "cross_seed", those
-            of the run's next replica.
+        diagonal: whom a run's agents meet on the diagonal: "self", the agents that they were trained with,
+            or "cross_seed", agents of the run's next replica.
     """
     named = runs_by_name(runs)
     _begin(fresh.seed, *_paths(named), files=files)
@@ -350,8 +350,8 @@ def schelling(
     The figure is the Schelling diagram.
 
     Args:
-        board: commons, two_complex, single_complex or single_basic; or the directory of a run, whose game it
-            is then; or a file with a drawing.
+        board: commons, two_complex, single_complex or single_basic; or the directory of a run, whose game
+            is played; or a file with a drawing.
         variant: of the boards with a name: published, as_run or, of two_complex, as_run_10_april; see
             docs/game.md.
     """
@@ -383,8 +383,8 @@ def egta(
 
     Args:
         runs: directories of runs of the same game, or their results; NAME=PATH gives one another name.
-        pairwise: play one agent of each run among those of each other, as `cprl crossplay` does: cheaper,
-            and a reduction where there are more than two agents.
+        pairwise: play one agent of each run among agents of each other run, as `cprl crossplay` does. This is
+            cheaper, but leaves out other mixes if there are more than two agents.
         resamples: of the replicas, for intervals.
     """
     named = runs_by_name(runs)
@@ -456,13 +456,13 @@ class Responses:
     seeds: int = 3
     """Trainings by each algorithm."""
     training_episodes: int | None = None
-    """Of each; by default a quarter of those of the run."""
+    """Episodes of each training; by default a quarter of the run's."""
     replicas: int | None = None
     """How many of the run's replicas are responded to, the first ones; by default all."""
     episodes: int = 20
-    """Fresh episodes of each replica to choose a response by, and as many to tell its gain by."""
+    """Fresh episodes of each replica to choose a response by, and as many to measure its gain by."""
     seed: int = SEED
-    """Of the worlds of the latter; the former have the next one."""
+    """Of the worlds in which gains are measured; responses are chosen by the next seed."""
     device: str = "cpu"
     """Where responses learn, e.g. cpu or cuda:0."""
 
@@ -478,7 +478,7 @@ def exploit(
 ) -> None:
     """Trains best responses to the agents of a run, and prints what they gain: how exploitable the run is.
 
-    May be stopped; the same line continues, and plays again what is trained.
+    You can stop it; the same command continues, and plays again with what is trained.
 
     Args:
         run: the directory of a run that has ended, or its results.

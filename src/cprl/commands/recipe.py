@@ -94,7 +94,7 @@ def recipe_main(
     Args:
         make_experiment: gives the experiment; its arguments become flags, so each has a type and a default,
             and a line under "Args:".
-        argv: the command line, script first; by default that of this process.
+        argv: the command line, script first; by default this process's.
         at_end: called with the directory of a run that has just finished, when all is written and said.
 
     Returns:

@@ -35,7 +35,7 @@ _NOTE: Final = (
     "agents.*.PATH means every agent that learns, agents.0.PATH one. Values may also be True, False, None, "
     "names, and boards by their names. In a search and with --draws a range may stand in their place: "
     "uniform(LOW,HIGH), loguniform(LOW,HIGH) or integers(LOW,HIGH). Every other flag below is the same in "
-    "all conditions; --replicas are those of each condition."
+    "all conditions; --replicas is the number in each condition."
 )
 _ABOUT: Final = {
     "cprl sweep": "Runs a recipe under several conditions.",
@@ -86,11 +86,11 @@ class MainOptions(StudyOptions):
     """How the study of a recipe is run."""
 
     episodes: int | None = None
-    """Of each condition; by default those of the study."""
+    """Of each condition; by default as many as the study says."""
     steps: int | None = None
-    """Of each condition of a study that counts them; by default those of the study."""
+    """Of each condition of a study that counts steps; by default as many as the study says."""
     replicas: int | None = None
-    """Of each condition; by default those of the study."""
+    """Of each condition; by default as many as the study says."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,9 +118,9 @@ class SearchOptions(TrialOptions):
     metric: str = "collective_return"
     """The metric whose best value is searched."""
     direction: Literal["maximise", "minimise"] = "maximise"
-    """Whether it shall be high or low."""
+    """Whether it should be high or low."""
     over: Literal["evaluation", "training"] = "evaluation"
-    """The episodes that count, those of the evaluation or the last 30 of the training."""
+    """Which episodes count: the evaluation, or the last 30 of the training."""
     sampler: Literal["tpe", "random", "gp"] = "tpe"
     """How points are proposed."""
     at_once: int = 4
@@ -135,7 +135,7 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
     """Runs a study as the command line asks for it; a recipe of a study ends with it.
 
     Args:
-        argv: the command line, script first; by default that of this process.
+        argv: the command line, script first; by default this process's.
 
     Returns:
         The study's directory.
@@ -318,7 +318,7 @@ def executor_of(options: TrialOptions) -> "Executor":
 
 
 def carry_out(study: "Study", options: StudyOptions, command: Sequence[str]) -> Path:
-    """Run a study as the command line, script first, asks for it, say what came of it, and return its
+    """Run a study as the command line, script first, asks for it, print its results, and return its
     directory."""
     from cprl.studies import run_study
 
@@ -377,7 +377,7 @@ def _say_best(result: "SearchResult") -> None:
 
 
 def _say_result(result: "StudyResult", command: Sequence[str], last: int) -> None:
-    """Says what came out of a study, and where it is; of trials that failed why, where to look and what to
+    """Prints the results of a study, and where they are; of trials that failed why, where to look and what to
     do, and exits."""
     from cprl.studies.results import FIGURES
     from cprl.studies.status import Status

@@ -1,4 +1,4 @@
-"""`cprl table`: any runs, or those of a study, compared."""
+"""`cprl table`: compares any runs, or the runs of a study."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -56,10 +56,10 @@ def table(
         by: the path of a field, e.g. game.rules.freeze-steps, agents.*.algorithm.settings.gamma or name; may
             be repeated.
         reference: the name of the condition that others are compared with, e.g. freeze_steps=25; by default
-            the first, or that of the study.
+            the first, or the reference of the study.
         window: episodes of a row of the table, of which --last compares whole ones, 10 by default; 1 for
             episodes one by one; with --by.
-        out: a file to be: .parquet or .csv with every window of episodes, replica and metric, or .md with
+        out: a new file: .parquet or .csv with every window of episodes, replica and metric, or .md with
             what is printed.
         csv: print every window of episodes, replica and metric as CSV, and nothing else.
         summary: write summary.md of a study again, from its table alone.
@@ -69,7 +69,7 @@ def table(
             raise ValueError(f"--out is {out}; allowed: a name that ends in {', '.join(_SUFFIXES)}")
         refuse_to_write_over(out)
     if not runs:
-        raise ValueError("cprl table wants at least one run: cprl table RUN... --by FIELD")
+        raise ValueError("cprl table needs at least one run: cprl table RUN... --by FIELD")
     if summary and by:
         raise ValueError("--summary is of a study; allowed: without --by, cprl table STUDY --summary")
     if by:
@@ -105,7 +105,7 @@ def _table_in(runs: Sequence[Path], reference: str | None, window: int | None) -
     path = runs[0] / STUDY_TABLE
     if len(runs) > 1 or not path.exists():
         raise ValueError(
-            "cprl table wants a field that tells runs apart: cprl table RUN... --by game.rules.freeze-steps; "
+            "cprl table needs a field in which runs differ: cprl table RUN... --by game.rules.freeze-steps; "
             "or the directory of one study with its table.parquet: cprl table STUDY"
         )
     if window is not None:

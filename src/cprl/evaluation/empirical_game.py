@@ -280,7 +280,7 @@ def _payoff_table(game: EmpiricalGame) -> Cells:
     """By the runs of both of two agents, else by how many agents play as each."""
     if game.agents == 2:
         others = "the other" if game.of_agents == 2 else f"all other {game.of_agents - 1}"
-        title = f"return of an agent, by its run and that of {others}"
+        title = f"return of an agent, by its run and the run of {others}"
         cells = {
             (name, other): estimate(game.pairs[:, row, column])
             for row, name in enumerate(game.names)

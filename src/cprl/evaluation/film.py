@@ -67,7 +67,7 @@ def fresh_episode(
     loaded = opened(run, allow)
     if replica not in loaded.replicas:
         replicas = ", ".join(map(str, loaded.replicas))
-        raise ValueError(f"replica is {replica}; allowed: {replicas}, those of {loaded.path}")
+        raise ValueError(f"replica is {replica}; allowed: {replicas}, the replicas of {loaded.path}")
     return FreshEpisode(
         run=loaded,
         env=loaded.env(1, seed=seed, first_world=episode),
@@ -217,7 +217,7 @@ def film_video(
     style: Style = _USUAL,
     allow: Sequence[str] = (),
 ) -> tuple[Path, tuple[Episode, ...]]:
-    """Film an episode of a run's agents, beside those of other runs if there are any.
+    """Film an episode of a run's agents, beside the agents of other runs if there are any.
 
     A film shows the board, the apples on it and what each agent picked so far, turn by turn, and ends with a
     card of two seconds that says how it ended; a note below says what the signs mean. Agents that broke a
@@ -360,7 +360,7 @@ class _Panel(NamedTuple):
         """The population after a turn of the film's clock, or at its end if that was before.
 
         Args:
-            card: whether to say what came of the episode.
+            card: whether to say how the episode ended.
         """
         filmed, sites = self.filmed, len(self.picture.board.sites)
         last = len(filmed.moments) - 1

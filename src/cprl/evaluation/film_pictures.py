@@ -100,7 +100,7 @@ class EpisodePicture:
             moments: the episode so far: the board as it began, then after each turn.
             title: what is shown, in large type; smaller where the room ends.
             end: how the episode ended, beside the title and in orange; the turn while this is empty.
-            card: what came of the episode, in large type across the board.
+            card: how the episode ended, in large type across the board.
             violators: the indices of agents that get a white diamond, since they broke a rule.
 
         Returns:

@@ -1,4 +1,4 @@
-"""Plays labelled populations of stored agents in the same fresh worlds; `Results` is what came of it.
+"""Plays labelled populations of stored agents in the same fresh worlds; `Results` has the outcome.
 
 All replicas play at once, as lanes: a step of all takes as long as a step of one, and each lane's random
 numbers depend on (seed, replica, agent) alone.

@@ -231,7 +231,7 @@ def board_named(
     """A game, and the run that has it.
 
     Args:
-        board: the name of a published board, the directory of a run, whose game it is then, or a file with a
+        board: the name of a published board, the directory of a run, whose game is played, or a file with a
             drawing, see `cprl.maps.parse`, played by the published rules.
     """
     checked("variant", variant, Variant)

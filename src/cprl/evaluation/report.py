@@ -1,4 +1,4 @@
-"""One HTML page about a run or a study: what came of it, with intervals, and how to run it again."""
+"""One HTML page about a run or a study: its results, with intervals, and how to run it again."""
 
 import json
 import re
@@ -105,7 +105,7 @@ def _rules(game: Game) -> list[str]:
     ]
     lines += ["", *(f"- **{rule_of(one)}**: {meaning_of(one, game)}" for one in game.institutions)]
     changed = game.rules.changed
-    lines += ["", "Rules that differ from those of `Rules()`:" if changed else "All other rules: `Rules()`."]
+    lines += ["", "Rules that differ from `Rules()`:" if changed else "All other rules: `Rules()`."]
     return [*lines, "", *(f"- `{name}`: `{value}`" for name, value in changed.items())]
 
 

@@ -160,7 +160,7 @@ class Sandbox:
         self._temporary.cleanup()
 
     def play(self, sliders: Sliders, *, trained: bool) -> dict[str, Any]:
-        """What `show.html` is told of an episode of scripted agents, and beside it one of trained ones."""
+        """The data of `show.html` about an episode of scripted agents, and beside it one of trained ones."""
         with self._lock:
             game, greedy = sliders.game(), min(sliders.greedy, sliders.agents)
             agents = (Scripted("greedy"),) * greedy + (Scripted("sustainable"),) * (game.agents - greedy)

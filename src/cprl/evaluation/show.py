@@ -68,7 +68,7 @@ def show(
     seed: int = SEED,
     allow: Sequence[str] = (),
 ) -> tuple["Page", tuple[Episode, ...]]:
-    """Show an episode of a run's agents, beside those of other runs if there are any, as one HTML page.
+    """Show an episode of a run's agents, beside the agents of other runs if there are any, as one HTML page.
 
     It is the episode that `cprl.evaluation.film.film` records with the same numbers.
 
@@ -148,7 +148,7 @@ def page(
 def shown(
     fresh: Sequence[FreshEpisode], titles: Sequence[str] = ()
 ) -> tuple[dict[str, Any], Sequence[Filmed]]:
-    """What `show.html` is told of the episodes of these populations, and the episodes."""
+    """The data of `show.html` about the episodes of these populations, and the episodes."""
     filmed = [play_to_show(population) for population in fresh]
     most = max(int(one.moments[-1].harvested.max()) for one in filmed)
     games = [commons_game(population.run) for population in fresh]
@@ -164,7 +164,7 @@ def shown(
 
 
 def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, Any]:
-    """What the page is told of one population."""
+    """The data of the page about one population."""
     game, commons = commons_game(fresh.run), commons_of(fresh.env)
     assert commons is not None
     board, agents, last = game.map, range(game.agents), len(filmed.moments) - 1

@@ -66,7 +66,7 @@ class Experiment(Value, stored=False, called="experiment"):
     agents: tuple[AgentSpec, ...]
     """How each agent is specified; see `cprl.population`."""
     episodes: Positive | None = None
-    """Episodes that each replica trains, those of all its worlds together; or say `steps`."""
+    """Episodes that each replica trains, in all its worlds together; or say `steps`."""
     steps: Annotated[int, Range(1, MOST_INT64)] | None = None
     """Steps that each replica trains, a turn of W worlds being W; or say `episodes`."""
     replicas: Annotated[int, Range(1, 2**20)] = 1

@@ -136,7 +136,7 @@ class _OfRollouts(Value, stored=False):
     gamma: Share = 0.995
     """Discount factor per step."""
     optimizer: Optimizer = "adam"
-    """See `cprl.learners.settings.Optimizer`; that of LOLA's papers is "sgd"."""
+    """See `cprl.learners.settings.Optimizer`; LOLA's papers have "sgd"."""
     learning_rate: LearningRate = 3e-4
     """The optimiser's step size."""
     adam_eps: OptimizerEps = 1e-5

@@ -28,7 +28,7 @@ class PR2Loss(TDLoss):
     (0.676, 0.324), not the equilibrium (0.5, 0.5).
 
     Source: Wen, Yang, Luo, Wang and Pan, "Probabilistic Recursive Reasoning for Multi-Agent Reinforcement
-    Learning" (ICLR 2019), algorithm PR2-Q; departures are numbered in docs/algorithms.md.
+    Learning" (ICLR 2019), algorithm PR2-Q; departures are numbered in docs/opponents.md.
 
     Args:
         value_network: maps observations to the values of pairs, float [..., N - 1, A, A]: a

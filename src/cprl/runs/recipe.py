@@ -239,7 +239,7 @@ def write_circumstances(run: Path) -> list[str]:
 
     Returns:
         What differs now from when the run was started, a sentence for each, so that its numbers may differ
-        from those of an undisturbed run.
+        from an uninterrupted run.
     """
     recipe = read_recipe(run)
     now = _circumstances(recipe)
@@ -256,8 +256,8 @@ def say_changes(run: Path, changes: Sequence[str]) -> None:
     """Warn on standard error where a run is used under other circumstances than those it was made under."""
     if changes:
         console(ERR).print(
-            f"Warning: {run} was begun under other versions or other code, so that numbers may differ from "
-            f"those of an undisturbed run: {'; '.join(changes)}",
+            f"Warning: {run} was begun under other versions or other code, so its numbers may differ from "
+            f"an uninterrupted run: {'; '.join(changes)}",
             soft_wrap=True,
             markup=False,
         )

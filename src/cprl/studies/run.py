@@ -59,7 +59,7 @@ def run_study(
     Another study in the same directory is refused until they end.
 
     Args:
-        out: the study's directory, new or that of an earlier call; by default `studies/<name>`. A study that
+        out: the study's directory, new or of an earlier call; by default `studies/<name>`. A study that
             was changed keeps the runs that are there.
         on: where trials are run, see `cprl.studies.executors`; by default in this process.
         runs: the directory of the runs, which several studies may share; by default `runs` in `out`.
@@ -184,5 +184,5 @@ def _outcomes(tasks: Sequence[Task], executor: Executor) -> Generator[Outcome, N
 def _others(out: Path) -> str:
     return (
         f"{out} is run by somebody else too, {holder_of(out)}, or was when its host went down: each trial is "
-        "run by whoever begins it first, the other goes on with the rest"
+        "run by the one that begins it first; the other continues with the rest"
     )

@@ -37,7 +37,7 @@ class Status:
     """The files in which a trial says how far it is.
 
     Args:
-        folder: in which they are; made by whoever writes first.
+        folder: in which they are; the first that writes makes it.
     """
 
     def __init__(self, folder: Path, name: str) -> None:

@@ -95,11 +95,11 @@ class Study(Value, stored=False):
         draws: so many random combinations of the factors' levels instead of their grid.
         design: how they are drawn: "random", each by itself; "latin_hypercube", the range of each factor
             evenly; or "sobol", all ranges together evenly, however many are drawn.
-        replicas: of each condition; by default those of the experiment.
+        replicas: of each condition; by default as many as in the experiment.
         block: replicas that one run trains side by side; fewer can be spread over more processes.
         reference: the name of the condition that others are compared with; by default the first one that
             changes nothing, else the first.
-        name: by default that of the experiment.
+        name: by default the experiment's.
         question: what the study asks, for its report.
         expectation: what was expected before it was run, for its report.
     """
@@ -349,7 +349,7 @@ RUNS, STATUS = "runs", "status"
 def directory_of(study: Study, out: Path | str | None) -> Path:
     """Return the directory of a study, by default `studies/<name>`."""
     directory = Path("studies") / study.name if out is None else Path(out)
-    allowed = "a new directory, or that of an earlier study"
+    allowed = "a new directory, or the directory of an earlier study"
     if directory.exists() and not directory.is_dir():
         raise ValueError(f"out is {directory}, a file; allowed: {allowed}")
     if (directory / RECIPE_FILE).exists():

@@ -61,7 +61,7 @@ def summarise(
 
 
 def course_of(run: Path) -> str:
-    """What happened in sentences: the peak, what came after it, how long boards last, and what that means.
+    """What happened in sentences: the peak, what followed, how long boards last, and what that means.
 
     A tragedy, here: the last 30 episodes yield at most 95 % of random play, the best ten at least 1.5 times
     as much as it, and boards last at most 70 % of the turns that they could.
@@ -98,7 +98,7 @@ def course_of(run: Path) -> str:
 
 
 def _verdict(played: Played) -> str:
-    """What each policy gets, and how many times that of the first."""
+    """What each policy gets, and how many times as much as the first."""
     is_harvest = all(map(_harvests, played.values()))
     means = {name: fmean(_gains(episodes)) for name, episodes in played.items()}
     baseline, first = next(iter(means.items()))
@@ -106,9 +106,7 @@ def _verdict(played: Played) -> str:
     parts = [f"{_called(name)} {mean:,.{1 if abs(mean) < 100 else 0}f}" for name, mean in means.items()]
     if len(means) > 1 and first > 0:
         parts = [
-            part
-            if name == baseline
-            else f"{part}, {means[name] / first:.1f} times that of {_called(baseline)}"
+            part if name == baseline else f"{part}, {means[name] / first:.1f} times {_called(baseline)}"
             for part, name in zip(parts, means, strict=True)
         ]
     return f"{parts[-1]}; {'; '.join(parts[:-1])}: {what}" if parts[1:] else f"{parts[0]}: {what}"
@@ -145,7 +143,7 @@ def _returns(name: str, played: Played, values: Sequence[Sequence[float]]) -> li
     rows = [(name, *(f"{mean:.1f}{error}" for mean, error in zip(means, errors, strict=True)))]
     if len(played) > 1:
         times = [f"{mean / means[0]:.1f}" if means[0] > 0 else UNDEFINED for mean in means]
-        rows.append((f"  times that of {_called(next(iter(played)))}", *times))
+        rows.append((f"  times {_called(next(iter(played)))}", *times))
     return rows
 
 
@@ -177,7 +175,7 @@ def _notes(played: Played) -> Iterator[str]:
             yield f"{policy}: nobody harvested anything, so equality and sustainability are undefined"
     baseline = next(iter(played))
     if len(played) > 1 and fmean(_gains(played[baseline])) <= 0:
-        yield f"times that of {_called(baseline)}: undefined, because it is not above 0"
+        yield f"times {_called(baseline)}: undefined, because it is not above 0"
 
 
 def institutions_table(played: Played) -> Cells | None:

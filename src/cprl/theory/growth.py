@@ -5,7 +5,7 @@ of apples near it. So no policy gets more in the long run than the largest growt
 
     max over s of  sum over k empty in s of  p(apples of s near k).
 
-The same stock tells how to harvest: whoever takes an apple as soon as it grows, and nothing else, keeps s.
+The same stock tells how to harvest: take each apple as soon as it grows, and nothing else, and s stays.
 Where apples grow before bites this gives all that grows, so that both bounds meet if p never falls with the
 number of apples; else a harvested site is full in the turn in which it is bitten, and gives p / (1 + p)
 instead of p. The stock is found by integer programming (HiGHS, by scipy), whose own bound is a proof, too,

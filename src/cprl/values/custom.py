@@ -26,7 +26,7 @@ class Custom:
 
     An `Experiment` holds values only, so that its recipe says all of it: a transform, callback, logger,
     network, algorithm or game that is not one of cprl's is handed over like this. Nothing is imported before
-    `make` is called; whoever loads a stored run names what it may import (`allow`).
+    `make` is called; the caller that loads a stored run names what it may import (`allow`).
 
     Args:
         target: "module:Class" or "module:function".

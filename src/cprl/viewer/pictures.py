@@ -334,7 +334,7 @@ class Picture(View):
         self._logged = self._ended
 
     def log(self, episodes: str) -> None:
-        """Log what came since the last time, "episodes 51 to 100"; since a resume where that is later."""
+        """Log what is new since the last time, "episodes 51 to 100"; since a resume where that is later."""
 
 
 class Sampled(Picture):

@@ -158,7 +158,7 @@ _NOW, _EXPLORING, _FOUND, _PUBLISHED = STRIPS
 
 
 class Story(View):
-    """Logs what people read first: where the run is, what the group does, and what came of it.
+    """Logs what people read first: where the run is, what the group does, and what it achieved.
 
     Args:
         filming: which episodes are recorded; that after a new best is.
