@@ -1,15 +1,27 @@
 """The study's claims on its five experiments: the measure of each, its interval over replicas, a verdict."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 import verdicts
 from numpy.typing import NDArray
+from possible import possible
 from published import curve
-from results import NEARNESS, OVERLAP, ROUNDS, TOO_FEW, Result, dip_depth, falls, returns_by_chance
-from tragedies import combat_of
+from results import (
+    LAST,
+    NEARNESS,
+    OVERLAP,
+    ROUNDS,
+    TOO_FEW,
+    Result,
+    dip_depth,
+    falls,
+    returns_by_chance,
+    with_interval,
+)
+from tragedies import Definition, by_definition, shares_by_definition
 from verdicts import prediction, share
 
 from cprl.commons.game import Game
@@ -111,14 +123,22 @@ def rule(claim: str, measure: str, shown: NDArray[Any]) -> Claim:
     )
 
 
+def rule_by_definition(claim: str, measure: str, shown: Mapping[Definition, NDArray[Any]]) -> Claim:
+    """The same by each definition of what is shown, bool [R] each, the main one first; see
+    `verdicts.of_definitions`."""
+    main, *_ = each = [share(int(own.sum()), len(own)) for own in shown.values()]
+    return Claim(
+        claim=claim,
+        measure=f"{measure}; share of replicas, and by other windows and falls",
+        published="",
+        ours=f"{main}, {shares_by_definition(each)}",
+        verdict=verdicts.of_definitions([verdicts.of_share(one) for one in each]),
+    )
+
+
 def where(is_long: bool, claim: Claim) -> Claim:
     """A claim; its verdict says so where the training is too short for it."""
     return claim if is_long else replace(claim, verdict=TOO_FEW)
-
-
-def with_interval(values: Values) -> str:
-    """The mean of replicas, [R], with its 95 % interval by Student's t."""
-    return f"{estimate(values):.4g}"
 
 
 def undefined_in(values: Values) -> str:
@@ -137,13 +157,14 @@ HEAD = ["claim", "measure", "published", "ours", "verdict"]
 
 EARLY = 600
 """The dip of experiment 1 is looked for before this episode."""
-LAST = 500
-"""The episodes at the end of a training that stand for what was learned."""
+OPTIMAL: Final = 0.9
+"""The least share of the best known harvest that counts as an optimal strategy. What is best may be more than
+what is best known, so that a smaller share contradicts the claim, and a larger one is no proof of it."""
 GREEDY_WORLDS = 1_000
 
 
 def of_experiment_1(result: Result) -> Iterator[Claim]:
-    """It learns where the apples are, strips them near episode 300, and recovers."""
+    """It learns where the apples are, strips them near episode 300, recovers, and ends at its optimum."""
     early = running_mean(result.curves["collective_return"], result.window)[:, :EARLY]
     published, is_long = _published_returns(result, EARLY), early.shape[1] >= EARLY
     depth, at = dip_depth(published)[0], _dip_at(published)[0]
@@ -153,10 +174,12 @@ def of_experiment_1(result: Result) -> Iterator[Claim]:
     measure = "return of the last 500 episodes, and lowest in the dip"
     recovers = more("then it recovers", measure, late, _dip_bottom(early), paired=True)
     yield where(result.is_whole, recovers)
+    yield from _lasts(result, "it manages the resource sustainably in the end")
+    yield from _is_optimal(result)
 
 
 def of_experiment_2(result: Result) -> Iterator[Claim]:
-    """No dip, since depletion pays as much as random play; a policy that circles."""
+    """No dip, since depletion pays as much as random play; a policy that circles, sustains and is optimal."""
     early = running_mean(result.curves["collective_return"], result.window)[:, :EARLY]
     depth = dip_depth(_published_returns(result, EARLY))[0]
     yield where(early.shape[1] >= EARLY, number("no dip", _DIP, dip_depth(early), published=depth))
@@ -167,6 +190,8 @@ def of_experiment_2(result: Result) -> Iterator[Claim]:
         claim = "greedy depletion earns about what random play does"
         yield alike(claim, measure, ratio, within=(0.8, 1.2))
     yield from _circles(result)
+    yield from _lasts(result, "it manages the resource sustainably in the end")
+    yield from _is_optimal(result)
 
 
 def of_experiment_3(result: Result, others: Sequence[Result]) -> Iterator[Claim]:
@@ -292,7 +317,24 @@ def _lasts(result: Result, claim: str) -> Iterator[Claim]:
         yield where(result.is_whole, side(claim, measure, empty, below=0.5))
 
 
-LAST: Final = 500
+def _is_optimal(result: Result) -> Iterator[Claim]:
+    """The share of the best known harvest at the end of training, and of what was learned in new worlds."""
+    game = result.experiment.game
+    if not isinstance(game, Game):
+        return
+    best = possible(game).best_known
+    late = result.curves["collective_return"][:, -LAST:].mean(1)
+    claim = "it converges to the optimal strategy"
+    measure = f"harvest of the last {LAST} episodes over the best known, {best:.0f} apples"
+    of_training = side(claim, f"{measure}; optimal if above {OPTIMAL:g}", late / best, above=OPTIMAL)
+    yield where(result.is_whole, of_training)
+    played = result.evaluated("trained")
+    if played is not None:
+        measure = f"the same of trained agents in new worlds; optimal if above {OPTIMAL:g}"
+        share_of_best = played["collective_return"] / best
+        yield where(result.is_whole, side(claim, measure, share_of_best, above=OPTIMAL))
+
+
 EXPLORED, TRAGIC, FOUGHT = PHASES_BEGIN
 """The episodes at which the study's phases of exploration, tragedy and combat end."""
 
@@ -321,10 +363,11 @@ def of_experiment_5(result: Result) -> Iterator[Claim]:
         "survival falls to 612 steps", "lowest running mean", survival, published=float(values.min())
     )
     yield where(episodes > at[values.argmin()], falls)
-    found = combat_of(result)
-    if found is not None:
-        yield rule("tragedy", "return, survival and peacefulness fall together", found.tragedy)
-        yield rule("combat follows", "return rises again, peacefulness below its peak", found.combat)
+    if each := by_definition(result):
+        measure = "return, survival and peacefulness fall together"
+        yield rule_by_definition("tragedy", measure, {name: own.tragedy for name, own in each.items()})
+        measure = "return rises again, peacefulness below its peak"
+        yield rule_by_definition("combat follows", measure, {name: own.combat for name, own in each.items()})
     if episodes >= FOUGHT + LAST:
         ratio = _unrest(returns[:, TRAGIC:FOUGHT]) / _unrest(returns[:, FOUGHT:])
         at, values = _published_curve(result, "collective_return")
@@ -346,6 +389,7 @@ def of_experiment_5(result: Result) -> Iterator[Claim]:
             published=late,
         )
     yield from _tagging(result)
+    yield from _lasts(result, "four manage the resource sustainably in the end")
 
 
 def _tagging(result: Result) -> Iterator[Claim]:

@@ -7,10 +7,17 @@ from typing import Final
 
 import numpy as np
 import verdicts
-from claims import with_interval
 from numpy.typing import NDArray
 from published import EXPERIMENTS, agreement, curve, estimate_window, published_experiment
-from results import EPISODES, PUBLISHED_EPISODES, TOO_FEW, Result, returns_by_chance, table
+from results import (
+    EPISODES,
+    PUBLISHED_EPISODES,
+    TOO_FEW,
+    Result,
+    returns_by_chance,
+    table,
+    with_interval,
+)
 from verdicts import curve_prediction, prediction
 
 from cprl.measuring import phases

@@ -30,7 +30,7 @@ import tyro
 from curves import appendix, phases_of, returns_of_others, turning_points_of
 from figures import axis_title, draw_figures
 from possible import shares_of
-from results import PooledResult, Result, pooled, read_result, table, told
+from results import PooledResult, Result, pooled, read_result, table, told, with_interval
 from tragedies import combat_section
 
 from cprl.commands.recipe import in_a_sentence, trusting
@@ -176,9 +176,9 @@ def _measures(results: Sequence[Result]) -> list[str]:
     lines = ["## Measures", ""]
     for result in results:
         own = result.measures
-        rows = [[name, claims.with_interval(values), ""] for name, values in own.training.items()]
+        rows = [[name, with_interval(values), ""] for name, values in own.training.items()]
         rows += [
-            [name, claims.with_interval(values), f"{np.nanmean(own.random[name]):.4g}"]
+            [name, with_interval(values), f"{np.nanmean(own.random[name]):.4g}"]
             for name, values in own.trained.items()
         ]
         agents = "trained" if result.learns else "agents"

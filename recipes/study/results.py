@@ -28,6 +28,7 @@ from cprl.evaluation.lanes import Agent, Fresh, agents_of, scripted
 from cprl.experiment import Experiment
 from cprl.measuring.movement import Trace, overlap, trace
 from cprl.measuring.phases import Phase
+from cprl.measuring.statistics import estimate
 from cprl.population import Learning, Scripted, Team, exploration_steps
 from cprl.runs.curves import (
     SMOOTHED_EPISODES,
@@ -49,6 +50,8 @@ Values = NDArray[np.float64]
 PUBLISHED_GAMMA: Final = 0.995
 """The discount of the text; titles name others."""
 TOO_FEW: Final = "too few episodes"
+LAST: Final = 500
+"""The episodes at the end of a training that stand for what was learned."""
 WORLDS: Final = 64
 """The number of new worlds per replica in which trained agents play one episode each, as in evaluation."""
 NEARNESS: Final = "steps to the nearest other when firing, over that in all steps"
@@ -142,6 +145,11 @@ def of_training(curves: dict[str, Values], *, window: int = SMOOTHED_EPISODES) -
             name = f"return of the poorest agent over that of the richest, {when}"
             found[name] = _share(means.min(0), means.max(0))
     return found
+
+
+def with_interval(values: Values) -> str:
+    """The mean of replicas, [R], with its 95 % interval by Student's t."""
+    return f"{estimate(values):.4g}"
 
 
 def dip_depth(curves: Values) -> Values:

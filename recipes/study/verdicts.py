@@ -27,7 +27,10 @@ published curve is held against the same remaining replicas, the median over the
 A claim that something is larger or smaller than something else is contradicted if the 95 % interval of the
 mean difference (Student's t) lies on the other side, not contradicted if it lies on the side claimed, and
 cannot be told else. A claim that runs show something as a rule is judged likewise by the interval of the
-share of replicas that do (`share`), against a half."""
+share of replicas that do (`share`), against a half.
+
+A claim that can be measured by several definitions has their verdict where all give the same; where they do
+not, it says so, "depends on the definition" (`of_definitions`)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -48,6 +51,7 @@ READ: Final = 0.01
 as 1002, half a percent. Where our replicas are all equal, nothing else is left to measure a distance by."""
 NOT_CONTRADICTED: Final = "not contradicted"
 CONTRADICTED: Final = "contradicted"
+DEPENDS: Final = "depends on the definition"
 
 
 # Where further runs would lie. A confidence interval says where the mean of endlessly many runs lies. A
@@ -212,6 +216,13 @@ def of_likeness(low: float, high: float, *, within: tuple[float, float], replica
 def of_share(found: Share) -> str:
     """The verdict on the claim that runs show something as a rule, more than half of them."""
     return of_claim(found.low, found.high, above=0.5, replicas=found.replicas)
+
+
+def of_definitions(each: Sequence[str]) -> str:
+    """The verdict on a claim that is measured by several definitions, from the verdict by each: theirs if it
+    is one, else that it depends on the definition."""
+    first, *others = each
+    return first if set(others) <= {first} else DEPENDS
 
 
 @dataclass(frozen=True, kw_only=True)
