@@ -4,8 +4,11 @@ import json
 import sys
 from dataclasses import replace
 from importlib import import_module
+from itertools import product
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -498,6 +501,29 @@ def test_a_shipped_study_asks_a_question_and_says_what_is_expected(shipped):
         assert len(study.expectation) > 100, name
         assert len(study.all_conditions) >= 2, name
         assert Condition(study.experiment).checksum in checksums(study), name
+
+
+def test_the_effects_of_rules_together_are_those_of_which_a_table_was_made(shipped, tmp_path, capsys):
+    assert len(shipped("together").all_conditions) == 16
+    effects, rows = import_module("effects"), []
+    for levels in effects.design():
+        apples = 100 + 10 * levels["quota"] + 6 * (levels["quota"] == levels["sanctions"])
+        for replica, episode in product(range(3), (160, 170, 180, 190)):
+            noise = (-1, 0, 1)[replica] * levels["sight"] + (1000 if episode == 160 else 0)
+            row = {"condition": effects.name(levels), "replica": replica, "part": "training"}
+            rows += [
+                row | {"episode": episode, "metric": metric, "value": float(apples + noise)}
+                for metric in effects.METRICS
+            ]
+    pq.write_table(pa.Table.from_pylist(rows), tmp_path / "table.parquet")
+    effects.main(tmp_path)
+    lines = dict(line[2:-2].split(" | ", 1) for line in capsys.readouterr().out.splitlines()[2:])
+    assert len(lines) == 14
+    assert lines["quota"] == "+10.0 [+10.0, +10.0]* | +10.0 [+10.0, +10.0]*"
+    assert lines["sight"].startswith("+0.00 [-2.48, +2.48] | ")
+    assert lines["vote"] == "+0 [+0, +0] | +0 [+0, +0]"
+    together = "quota x sanctions = monitoring x few = vote x sight"
+    assert lines[together].startswith("+6.00 [+6.00, +6.00]* | ")
 
 
 @pytest.mark.integration
