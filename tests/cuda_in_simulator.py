@@ -85,6 +85,8 @@ def forms() -> None:
                     area=area, encoding=encoding, agents_apart=others, scoreboard=others, stock_gauge=others
                 )
                 play(Game(map=WALLS, rules=rules, observation=form), turns=12)
+    planes = Observation(scoreboard="planes", stock_gauge="planes")
+    play(Game(map=WALLS, rules=rules, observation=planes), turns=12)
     hidden = Rules(regrow_prob=(0.1, 0.5), walls_block_sight=True, window_rows=3, window_columns=5)
     play(Game(map=WALLS, rules=hidden), turns=12)
 

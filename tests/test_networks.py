@@ -9,7 +9,7 @@ from dqn_parts import learner_of_parts, make_learner, played
 from tensordict import TensorDict
 from torch import nn
 
-from cprl import CommonsEnv, keys, presets
+from cprl import CommonsEnv, Observation, keys, presets
 from cprl.algorithms import (
     A2C,
     CQL,
@@ -127,13 +127,13 @@ def test_without_a_network_the_settings_say_the_hidden_layers():
         DQN(settings=replace(REPLAY, hidden_cells=(16,)), network=CONV).make_network(SPACES)
 
 
-def learner_of(kind, network, **how):
+def learner_of(kind, network, *, spaces=SPACES, **how):
     settings = REPLAY if kind in OF_REPLAY else ROLLOUTS
     if issubclass(kind, TeamAlgorithm):
         how |= {"reward_kind": "team"}
     algorithm = kind(settings=settings, network=network)
     how = {"agents": (0, 1), "replicas": 2, "engine": "eager", "seed": 4, **how}
-    return algorithm, make_learner(algorithm, SPACES, **how)
+    return algorithm, make_learner(algorithm, spaces, **how)
 
 
 @pytest.mark.integration
@@ -180,6 +180,34 @@ def test_lanes_learn_with_any_network_what_each_would_alone(kind, network, monke
     for fast, plain in zip(*ends, strict=True):
         for name, value in plain.items():
             torch.testing.assert_close(fast[name], value, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", [*OF_REPLAY, *OF_ROLLOUTS])
+def test_every_algorithm_learns_from_planes(kind):
+    game = replace(GAME, observation=Observation(scoreboard="planes", stock_gauge="planes"))
+    _, learner = learner_of(kind, None, spaces=game.spaces)
+    losses = [loss for loss in played(learner, CommonsEnv(game, 2, seed=3), 24) if loss is not None]
+    assert torch.isfinite(torch.stack(losses)).all()
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("kind", [DQN, PPO])
+def test_the_compiled_engine_learns_from_planes_what_the_eager_one_does(kind):
+    game = replace(GAME, observation=Observation(scoreboard="planes", stock_gauge="planes"))
+    ends = []
+    for engine in ("compiled", "eager"):
+        _, learner = learner_of(kind, None, spaces=game.spaces, engine=engine)
+        seen = []
+        losses = played(learner, CommonsEnv(game, 2, seed=3), 60, seen)
+        assert any(loss is not None for loss in losses)
+        assert learner.engine._compiled.enabled == (engine == "compiled")
+        ends.append((torch.stack([turn[keys.OBSERVATION] for turn in seen]), learner.networks()))
+    (seen, fast), (also_seen, plain) = ends
+    assert torch.equal(seen, also_seen), "the same course"
+    assert len(seen[:, :, :, 3].unique()) > 3, "harvests were seen"
+    for name, network in plain.items():
+        for parameter, value in network.state_dict().items():
+            torch.testing.assert_close(fast[name].state_dict()[parameter], value, rtol=1e-3, atol=1e-5)
 
 
 def test_a_network_whose_buffers_do_not_stack_is_vmapped():

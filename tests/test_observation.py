@@ -1,14 +1,19 @@
 """The forms of observations, and walls that block sight."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 from boards import Play, drawn, random_actions
 from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Observation, Rules, keys, maps, presets
-from cprl.commons.batch import Batch
+from cprl.commons.batch import Batch, turn_of
 from cprl.commons.colours import COLOURS, FIRST_AGENT, MAX_AGENTS_APART, class_colour
 from cprl.commons.tables import cells_between
+from cprl.institutions import Quota
+from cprl.policies.scripted import scripted_lanes
 
 BOARD = """
     A..#.A
@@ -91,6 +96,96 @@ def test_a_scoreboard_shows_the_observers_harvest_first_then_those_of_the_next_i
     assert play.output.stock_gauge[0].tolist() == [[0.25]] * 3
     play.batch.begin(play.output)
     assert not play.output.scoreboard.any()
+
+
+PLANES = Observation(scoreboard="planes", stock_gauge="planes")
+
+
+def test_planes_hold_the_scoreboard_and_the_stock_gauge_scaled():
+    play = Play("A>A.A<.>A", observation=PLANES, window_rows=2, window_columns=3)
+    assert play.game.channels == ("red", "green", "blue", "scoreboard", "stock_gauge")
+    play.turn("forward", "forward", "stay")
+    play.turn("backward", "stay", "stay")
+    play.turn("backward", "stay", "stay")
+    two, one = 85, 51  # 255 x 2 / (2 + 4 sites), 255 x 1 / (1 + 4)
+    for seen, board in zip(
+        play.output.observation[0], ([two, one, 0], [one, 0, two], [0, two, one]), strict=True
+    ):
+        assert seen[3].tolist() == [board, board], "by row: the observer, the next index, the one after"
+        assert (seen[4] == 64).all(), "255 x 1 / 4, rounded"
+    assert not play.output.scoreboard.size
+    assert not play.output.stock_gauge.size
+    play.again()
+    assert not play.output.observation[0, :, 3].any()
+    assert (play.output.observation[0, :, 4] == 255).all()
+
+
+def test_a_scoreboard_of_more_agents_than_cells_takes_several_planes():
+    form = Observation(area="full", scoreboard="planes")
+    play = Play(">A\n<v", observation=form)
+    assert play.game.channels == ("red", "green", "blue", "scoreboard")
+    form = Observation(scoreboard="planes")
+    play = Play(">A\n<v", observation=form, window_rows=1, window_columns=1)
+    assert play.game.channels == ("red", "green", "blue", *["scoreboard"] * 3)
+    play.turn("forward", "stay", "stay")
+    assert play.output.observation[0, :, 3:].reshape(3, 3).tolist() == [
+        [128, 0, 0],
+        [0, 0, 128],
+        [0, 128, 0],
+    ], "255 x 1 / (1 + 1 site), rounded"
+
+
+@pytest.mark.parametrize("institutions", [(), (Quota(share=0.25, window_steps=20),)], ids=["free", "quota"])
+@pytest.mark.parametrize("encoding", ["rgb", "one_hot"])
+@pytest.mark.parametrize("area", ["window", "full"])
+def test_planes_show_what_vectors_do_and_change_nothing_else(area, encoding, institutions):
+    form, game = Observation(area=area, encoding=encoding), presets.game("commons")
+    vectors, planes = (
+        replace(game, observation=form, institutions=institutions)
+        for form in (
+            replace(form, scoreboard=True, stock_gauge=True),
+            replace(form, scoreboard="planes", stock_gauge="planes"),
+        )
+    )
+    check_env_specs(CommonsEnv(planes, 2, seed=1))
+    assert planes.spaces.vectors == ()
+    assert planes.spaces.observation_scale == 255, "networks divide by it"
+    assert not vectors.tables.further, "compiled without planes"
+    batches = [Batch(game, 2, seed=3) for game in (vectors, planes)]
+    outputs = [batch.begin(batch.new_output()) for batch in batches]
+    first, sites = len(planes.cell_channels), len(game.map.sites)
+    seen = 0
+    for turn in random_actions(60, 2, game):
+        shown, drawn = (turn_of(batch.play(turn, out)) for batch, out in zip(batches, outputs, strict=True))
+        scores = drawn.observation[:, :, first].reshape(2, 4, -1)
+        harvest = shown.scoreboard.astype(np.float64)
+        expected = np.floor(255 * harvest / (harvest + sites) + 0.5)
+        for entry in range(4):
+            assert (scores[:, :, entry::4] == expected[:, :, entry, None]).all()
+        stock = np.floor(255 * shown.stock / sites + 0.5)
+        assert (drawn.observation[:, :, first + 1] == stock[..., None, None]).all()
+        rest = np.delete(drawn.observation, [first, first + 1], axis=2)
+        scale = planes.observation_highest // vectors.observation_highest
+        assert np.array_equal(rest, shown.observation * scale)
+        assert np.array_equal(drawn.harvest, shown.harvest)
+        seen = max(seen, int(scores.max()))
+    assert seen > 0
+
+
+def test_scripted_agents_play_the_same_beside_planes():
+    game = presets.game("commons")
+    moves = []
+    for form in (Observation(), PLANES):
+        playing = replace(game, observation=form)
+        env = CommonsEnv(playing, 2, seed=1)
+        actor = scripted_lanes("greedy", playing, seeds=[[n] for n in range(8)], agents=4)
+        moment, chosen = env.reset(), []
+        for _ in range(30):
+            moment[keys.ACTION] = actor.choose(moment[keys.OBSERVATION])
+            chosen.append(moment[keys.ACTION].clone())
+            _, moment = env.step_and_maybe_reset(moment)
+        moves.append(chosen)
+    assert all(map(torch.equal, *moves))
 
 
 @pytest.mark.parametrize("form", FORMS, ids=str)

@@ -8,12 +8,12 @@ import pytest
 from one_road_parts import Dilemma
 
 import cprl
-from cprl import Custom, Experiment, Game, Rules, maps
-from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
+from cprl import Custom, Experiment, Game, Observation, Rules, maps
+from cprl.algorithms import DQN, PPO, QMIX, DQNSettings, RolloutSettings
 from cprl.commands import main as cli
 from cprl.evaluation.film import film
-from cprl.networks import Conv
-from cprl.population import Learning, Scripted
+from cprl.networks import GRU, Conv
+from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.checkpoints import checkpoints_in
 from cprl.runs.episodes import read_episodes
 from cprl.runs.weights import load_weights
@@ -219,6 +219,44 @@ def test_normalised_observations_are_floats_from_the_environment_to_the_stored_p
         assert loaded.spaces.observation_dtype == "float32"
         assert loaded.spaces.observation_scale == 1.0
         assert cprl.evaluate_run(loaded, episodes=1).trained
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("of_agent", ["convolutions", "memory", "team"])
+def test_planes_are_learned_from_through_stop_resume_and_evaluation(of_agent, tmp_path, stopped, monkeypatch):
+    rollouts = RolloutSettings(rollout_steps=10, minibatch_size=5)
+    agents = {
+        "convolutions": MEADOW.agents,
+        "memory": [Learning(PPO(settings=rollouts, network=GRU(recurrent_cells=4)))] * 2,
+        "team": [Team(QMIX(settings=REPLAY), (0, 1))],
+    }
+    planes = Observation(scoreboard="planes", stock_gauge="planes")
+    experiment = replace(
+        MEADOW,
+        game=replace(MEADOW.game, observation=planes),
+        agents=agents[of_agent],
+        transforms=(),
+        callbacks=[Custom("one_road_parts:Bored", arguments={"from_episode": 99, "epsilon": 0.4})],
+        episodes=4,
+    )
+    whole = cprl.run(experiment, tmp_path / "whole", watch="off")
+    stopped(experiment, tmp_path / "parts", 33)
+    parts = cprl.run(experiment, tmp_path / "parts", watch="off", resume=True)
+    assert_same_training(parts, whole)
+    loaded = cprl.load(parts, allow=ALLOW)
+    assert loaded.experiment == experiment
+    assert loaded.spaces.observation_shape == (5, 3, 5)
+    assert cprl.evaluate_run(loaded, episodes=1).trained.keys() == {0, 1}
+    monkeypatch.chdir(tmp_path)
+    three = replace(experiment.game, map=maps.with_agents(MEADOW.game.map, 3))
+    others = {"have observations": MEADOW.game, "have a scoreboard of so many agents: 2": three}
+    for message, game in others.items():
+        with pytest.raises(ValueError, match=message):
+            cprl.run(
+                replace(experiment, game=game, agents=[Frozen("whole", 1)] * game.agents),
+                "other",
+                allow=ALLOW,
+            )
 
 
 @pytest.mark.integration

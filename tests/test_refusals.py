@@ -173,11 +173,17 @@ def test_what_no_network_sees_is_refused_but_tables_read_it(observed):
     for algorithm in (DQN(settings=REPLAY), PPO(settings=ROLLOUTS)):
         with pytest.raises(ValueError, match=rf'agents observe \("agents", "{name}"\); allowed for networks'):
             algorithm.make_network(spaces)
+        with pytest.raises(ValueError, match=rf'Observation\({name}="planes"\)'):
+            algorithm.make_network(spaces)
         with pytest.raises(ValueError, match=rf'agents observe \("agents", "{name}"\); allowed for networks'):
             make_learner(algorithm, spaces, agents=(0,), replicas=1)
     with pytest.raises(ValueError, match="allowed for networks"):
         make_learner(QMIX(settings=REPLAY), spaces, agents=(0, 1), replicas=1, reward_kind="team")
     TabularLearner(LearningAgents(spaces, agents=(0,), replicas=1), TabularSettings())
+    with pytest.raises(
+        ValueError, match=rf"Observation\.{name} is 'plane'; allowed: True or False or 'planes'"
+    ):
+        Observation(**{name: "plane"})
 
 
 class OnlyTheCritics(ClipPPOLoss):

@@ -48,7 +48,7 @@ def test_a_new_episode_begins_in_silence():
 @pytest.mark.parametrize("area", ["window", "full"])
 @pytest.mark.parametrize("governed", [False, True])
 def test_signals_change_nothing_but_their_planes(encoding, area, governed):
-    seen = Observation(encoding=encoding, area=area)
+    seen = Observation(encoding=encoding, area=area, stock_gauge="planes" if governed else False)
     institutions = (Quota(fine=1.0),) if governed else ()
     board, rng = maps.named("two_complex"), np.random.default_rng(0)
     silent = Game(map=board, rules=Rules(cooldown_steps=1), observation=seen, institutions=institutions)

@@ -43,10 +43,11 @@ TAGGED_BY: Final = (AGENTS, "tagged_by")
 
 SCOREBOARD: Final = (AGENTS, "scoreboard")
 """float32 [B, N, N]: apples harvested so far in this episode, a row per observing agent: its own first, then
-those of the following indices, cyclically. Only with `Observation.scoreboard`."""
+those of the following indices, cyclically. Only with `Observation(scoreboard=True)`."""
 
 STOCK_GAUGE: Final = (AGENTS, "stock_gauge")
-"""float32 [B, N, 1]: the fraction of sites with an apple, 0..1. Only with `Observation.stock_gauge`."""
+"""float32 [B, N, 1]: the fraction of sites with an apple, 0..1. Only with
+`Observation(stock_gauge=True)`."""
 
 APPLE_AHEAD: Final = (AGENTS, "apple_ahead")
 """bool [B, N, 1]: whether the cell ahead of the agent holds an apple. Only with `Rules.paint_over`, where its

@@ -103,23 +103,34 @@ class Game(Value):
     @property
     def channels(self) -> tuple[str, ...]:
         """The name of each channel of an observation: "red", "green", "blue", or the classes of cells, then
-        one for each signal, then those of institutions, see `cprl.commons.views`."""
+        one for each signal, then the planes of `Observation`, then those of institutions, see
+        `cprl.commons.views`."""
         signals = (f"signal {number + 1}" for number in range(self.rules.signals))
-        return *self.cell_channels, *signals, *self._institution_channels
+        return *self.cell_channels, *signals, *self.score_channels, *self._institution_channels
 
     @property
     def cell_channels(self) -> tuple[str, ...]:
-        """The channels that show the board: all but those of signals and institutions."""
+        """The channels that show the board, which come first."""
         hides = self.rules.walls_block_sight
         river = bool(self.map.river)
         return channel_names(self.observation, agents=self.agents, hides=hides, river=river)
 
     @property
+    def score_channels(self) -> tuple[str, ...]:
+        """The channels "scoreboard" and "stock_gauge", for those that are "planes"."""
+        planes = {"scoreboard": -(-self.agents // prod(self._seen)), "stock_gauge": 1}
+        return tuple(
+            name
+            for name, count in planes.items()
+            if getattr(self.observation, name) == "planes"
+            for _ in range(count)
+        )
+
+    @property
     def _institution_channels(self) -> tuple[str, ...]:
-        rows, columns = self._seen
         entries = len(self.entries_shown)
         places = ("forbidden",) if law.shows_places(self) else ()
-        return *places, *("institutions",) * -(-entries // (rows * columns))
+        return *places, *("institutions",) * -(-entries // prod(self._seen))
 
     @property
     def entries_shown(self) -> tuple[str, ...]:
@@ -136,9 +147,8 @@ class Game(Value):
 
     @property
     def observation_highest(self) -> int:
-        """The largest value of an entry of observations: 255, or 1 for "one_hot" without planes of
-        institutions."""
-        return 255 if self._institution_channels else self.observation.highest
+        """The largest value of an entry of observations: 255, or 1 for "one_hot" without planes."""
+        return 255 if self.score_channels or self._institution_channels else self.observation.highest
 
     @property
     def observation_shape(self) -> tuple[int, int, int]:
@@ -164,7 +174,9 @@ class Game(Value):
             observation_shape=self.observation_shape,
             observation_scale=float(self.observation_highest),
             actions=len(self.actions),
-            vectors=tuple((name, size) for name, size in vectors.items() if getattr(self.observation, name)),
+            vectors=tuple(
+                (name, size) for name, size in vectors.items() if getattr(self.observation, name) is True
+            ),
         )
 
     def make(self, worlds: int, seed: int, device: Any = "cpu") -> Any:
@@ -181,7 +193,13 @@ class Game(Value):
     @cached_property
     def tables(self) -> Tables:
         """The lookup tables that the compiled rules read; computed once and cached."""
-        return build_tables(self.map, self.rules, self.observation, highest=self.observation_highest)
+        return build_tables(
+            self.map,
+            self.rules,
+            self.observation,
+            highest=self.observation_highest,
+            score_channels=self.score_channels,
+        )
 
     @cached_property
     def law_parameters(self) -> dict[str, dict[str, Any]]:

@@ -22,7 +22,7 @@ FURTHER_RULES: Final = (
     *("random_headings", "respawn_at_spawns", "clashes", "signals", "may_clean", "pollution_prob"),
 )
 """Rules that the study does not have: a game in which all of them are off, on a map without spawn places or
-a river, is played as fast as if there were none."""
+a river, and without planes of `Observation`, is played as fast as if there were none."""
 CLASS_SHIFT: Final = 24
 """A paint is a colour in 24 bits, and its class from this bit on."""
 LARGEST_CLASS: Final = 255
@@ -92,13 +92,19 @@ class Tables(NamedTuple):
     agents_apart: bool
     one_hot: bool
     highest: int
-    """The largest value of an observation: 1 under "one_hot" where institutions have no planes of their own,
-    else 255."""
+    """The largest value of an observation: 1 under "one_hot" where there are no planes of other kinds, else
+    255."""
+    score_begin: int
+    """The first entry of the planes of `Observation` in an agent's observation, channel by channel."""
+    scoreboard_cells: int
+    """The entries of the planes of the scoreboard, which come first; 0 if it has none."""
+    stock_gauge_cells: int
+    """Likewise of the stock gauge, which follow."""
     sees_all: bool
     """Whether agents observe the whole board."""
     walls_block_sight: bool
     further: bool
-    """Whether the game has any of `FURTHER_RULES`, spawn places or a river."""
+    """Whether the game has any of `FURTHER_RULES`, spawn places, a river or planes of `Observation`."""
     shuffle_starts: bool
     never_from_nothing: bool
     """Whether an empty board stays empty, which ends an episode."""
@@ -241,8 +247,15 @@ def _in_sight(board: Map, rules: Rules, walls: Bools, rim: int, stride: int) -> 
     return seen
 
 
-def build_tables(board: Map, rules: Rules, observation: Observation, *, highest: int) -> Tables:
-    """Builds the tables of a game; `highest`: the largest value of an observation."""
+def build_tables(
+    board: Map, rules: Rules, observation: Observation, *, highest: int, score_channels: tuple[str, ...]
+) -> Tables:
+    """Builds the tables of a game.
+
+    Args:
+        highest: the largest value of an observation.
+        score_channels: see `Game.score_channels`.
+    """
     agents, half_width = board.agents, _beam_half_width(board, rules)
     sees_all = observation.area == "full"
     rim = _rim(board, rules, sees_all=sees_all)
@@ -267,7 +280,10 @@ def build_tables(board: Map, rules: Rules, observation: Observation, *, highest:
     clean_cells = np.arange(len(board.river) + 1)
     near_first, near_sites = neighbours(board, rules)
     places = _window_places(rules)
-    window_cells = [[_offset(*place, heading, stride) for place in places] for heading in range(4)]
+    offsets = [[_offset(*place, heading, stride) for place in places] for heading in range(4)]
+    window_cells = _board_cells(board, rim, stride) if sees_all else np.array(offsets, np.int32)
+    seen, one_hot = window_cells.shape[1], observation.encoding == "one_hot"
+    board_planes = len(drawn) if one_hot else len(RGB_NAMES)
     of_site, probs = growth(rules, np.diff(near_first))
     below = np.array([threshold(p) for p in probs.reshape(-1)], np.int64)
     of_rules: dict[str, Any] = {name: getattr(rules, name) for name in Tables._fields if hasattr(rules, name)}
@@ -291,21 +307,25 @@ def build_tables(board: Map, rules: Rules, observation: Observation, *, highest:
         beam_length=np.array(rules.beam_lengths_cells, np.int32),
         paints=paints,
         channel_of=channel_of,
-        window_cells=_board_cells(board, rim, stride) if sees_all else np.array(window_cells, np.int32),
+        window_cells=window_cells,
         in_sight=_in_sight(board, rules, background.reshape(-1) == paints[WALL], rim, stride),
         rim=rim,
         stride=stride,
         beam_half_width=half_width,
         has_beam=rules.may_fire,
         agents_apart=observation.agents_apart,
-        one_hot=observation.encoding == "one_hot",
+        one_hot=one_hot,
         highest=highest,
+        first_signal_plane=board_planes,
+        score_begin=seen * (board_planes + rules.signals),
+        scoreboard_cells=seen * score_channels.count("scoreboard"),
+        stock_gauge_cells=seen * score_channels.count("stock_gauge"),
         sees_all=sees_all,
         never_from_nothing=rules.regrow_prob[0] == 0 and not rules.plays_on_when_empty,
-        further=bool(board.spawns or board.river) or any(name in rules.changed for name in FURTHER_RULES),
+        further=bool(board.spawns or board.river or score_channels)
+        or any(name in rules.changed for name in FURTHER_RULES),
         regrow_by_share=rules.regrow_by != "count",
         first_stock=round(rules.first_stock_share * len(board.sites)),
-        first_signal_plane=len(drawn) if observation.encoding == "one_hot" else len(RGB_NAMES),
         silent_actions=len(rules.actions) // (1 + rules.signals),
         harvest_number=rules.actions.index(HARVEST) if rules.harvest_action else -1,
         clean_number=rules.actions.index(CLEAN) if rules.may_clean else -1,

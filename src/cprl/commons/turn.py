@@ -17,7 +17,13 @@ from cprl.commons.moves import (
 )
 from cprl.commons.river import begin_river, clean, count_waste, pollute
 from cprl.commons.tables import FURTHER, Tables
-from cprl.commons.views import draw_institutions, draw_signals, draw_windows, has_apple_ahead
+from cprl.commons.views import (
+    draw_institutions,
+    draw_scores,
+    draw_signals,
+    draw_windows,
+    has_apple_ahead,
+)
 from cprl.commons.world import PLAYING, TERMINATED, TRUNCATED, Actions, Scratch, StepOutput, Worlds
 from cprl.institutions import Law
 from cprl.institutions.law import begin, note_growth, open_turn, refresh, settle
@@ -192,6 +198,8 @@ def write_state(world: Worlds, tables: Tables, output: StepOutput, scratch: Scra
     draw_windows(world, tables, scratch, output.observation)
     if FURTHER and tables.signals > 0:
         draw_signals(world, tables, scratch, output.observation)
+    if FURTHER and tables.scoreboard_cells + tables.stock_gauge_cells > 0:
+        draw_scores(world, tables, output.observation)
 
 
 def begin_turn(world: Worlds, law: Law) -> None:

@@ -6,7 +6,7 @@ Institutions add planes to agents' observations, after the channels of cells. A 
 the cells of the window where a bite of the agent would break a rule about places. Planes "institutions" hold
 what each module's `shown` gives, in 0..255: with S entries, cell n of the planes, row by row, shows
 entry n modulo S. So a single entry fills a plane evenly, as is usual for numbers that convolutions read
-beside a board.
+beside a board. Planes "scoreboard" and "stock_gauge" of `Observation` do the same, before them.
 """
 
 import numpy as np
@@ -220,6 +220,28 @@ def draw_signals(world: Worlds, tables: Tables, scratch: Scratch, observation: B
 
 
 HIGHEST = 255
+
+
+def draw_scores(world: Worlds, tables: Tables, observation: Bytes) -> None:
+    """Writes the scoreboard and the stock gauge as planes, see `Observation`; `observation`: uint8
+    [N, C, X, Y]."""
+    agents, sites = world.row.shape[0], world.stock.shape[0]
+    end = tables.score_begin + tables.scoreboard_cells
+    stock = in_bytes(world.stock_left[0], sites)
+    for i in range(agents):
+        planes = observation[i].reshape(-1)
+        for entry in range(agents):
+            harvest = world.harvested[(i + entry) % agents]
+            value = in_bytes(harvest, harvest + sites)
+            for n in range(tables.score_begin + entry, end, agents):
+                planes[n] = value
+        for n in range(end, end + tables.stock_gauge_cells):
+            planes[n] = stock
+
+
+def in_bytes(part: int, whole: int) -> int:
+    """A share as 0..255, rounded half up, in integers alone: the same on every device."""
+    return (2 * HIGHEST * part + whole) // (2 * whole)
 
 
 def draw_institutions(world: Worlds, tables: Tables, law: Law, observation: Bytes) -> None:

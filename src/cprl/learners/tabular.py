@@ -163,8 +163,10 @@ class TabularLearner(Learner):
 def table_network(spaces: Spaces) -> TableNetwork:
     names = observed_entries(spaces)
     if names != ("observation",):
+        planes = ", ".join(f'{name}="planes"' for name in names[1:])
         raise ValueError(
             f"agents of this game observe {', '.join(names)}; allowed for agents of a population: "
-            "observation alone; leave the others out of Observation, or pass a TabularLearner to train"
+            f"observation alone, of which Observation({planes}) makes them a part; a TabularLearner that is "
+            "passed to train reads them as they are"
         )
     return TableNetwork(spaces.observation_shape, spaces.actions, observation_dtype=spaces.observation_dtype)

@@ -54,10 +54,10 @@ def refuse_unseen(spaces: Spaces) -> None:
     """Raises a ValueError if agents observe entries other than "observation", which networks do not read."""
     if spaces.vectors:
         names = " and ".join(f'("agents", "{name}")' for name, _ in spaces.vectors)
+        planes = ", ".join(f'{name}="planes"' for name, _ in spaces.vectors)
         raise ValueError(
-            f'agents observe {names}; allowed for networks: ("agents", "observation") alone: leave the entry '
-            "out of Observation, merge it into the observation with a transform that deletes it "
-            "(torchrl.envs.CatTensors), or use a TabularLearner, which reads it"
+            f'agents observe {names}; allowed for networks: ("agents", "observation") alone, of which '
+            f"Observation({planes}) makes it a part; a TabularLearner reads the entry as it is"
         )
 
 

@@ -580,6 +580,8 @@ def _refuse_unfitting(
             "channels": (run.game.channels, game.channels),
             "institutions that show": (run.game.entries_shown, game.entries_shown),
         }
+        if "scoreboard" in game.score_channels:
+            pairs["a scoreboard of so many agents:"] = run.game.agents, game.agents
     for name, (there, here) in pairs.items():
         if there != here:
             raise ValueError(f"the agents of {run.path} have {name} {there}; this game has {here}")
