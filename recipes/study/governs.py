@@ -40,8 +40,18 @@ GROUPS: Final = {
 }
 """The colour and the name of each group of factors."""
 
+SPACE: Final = (
+    *("half the apples, scattered", "as many apples, scattered", "twice the apples, scattered"),
+    *("as many apples, in patches", "half the board", "twice the board", "four times the board"),
+    *("quarters, open", "quarters, walls with a door", "quarters, walls"),
+)
+"""Conditions of recipes/study/space.py, which are their names here."""
+
 STUDIES: Final = {
-    "resource": [("regrowth", f"regrowth={k}", f"regrowth x {k}") for k in ("0.25", "0.5", "2", "4")],
+    "resource": [
+        *(("regrowth", f"regrowth={k}", f"regrowth x {k}") for k in ("0.25", "0.5", "2", "4")),
+        *(("space", condition, condition) for condition in SPACE),
+    ],
     "people": [("agents", f"{n}, same board", f"{n} agents") for n in (2, 8, 12)],
     "minds": [
         *(("discount", f"gamma={gamma}", f"discount {gamma}") for gamma in ("0", "0.8", "0.99", "0.995")),
@@ -59,6 +69,14 @@ STUDIES: Final = {
         *(("time_out", f"freeze_steps={n}", f"time-out {n}") for n in (1, 5, 100, 400)),
         ("beam_size", "beam_length_cells=2, beam_width_cells=1", "beam 2 x 1"),
         ("beam_size", "beam_length_cells=12, beam_width_cells=5", "beam 12 x 5"),
+    ],
+    "institutions": [
+        ("rules", "automatic penalty", "penalty that is certain (5)"),
+        ("rules", "fines for regions", "fines for regions (1)"),
+        ("rules", "one may punish, harshly", "one agent may punish (5)"),
+        ("talk", "talk", "cheap talk"),
+        ("talk", "quota", "quota that may be broken (2)"),
+        ("talk", "quota, talk", "the same quota, and talk"),
     ],
 }
 """By group: the study, its condition, and the name here."""
@@ -106,7 +124,8 @@ def of_study(group: str, study: str, condition: str, name: str) -> Row:
         values = np.array(ours["value"].to_pylist(), float)
         return np.array([np.nanmean(values[replicas == replica]) for replica in np.unique(replicas)])
 
-    return row(group, name, of("collective_return"), of("survival_steps"), of("equality"))
+    net = "net" if "net" in found["metric"].to_pylist() else "collective_return"  # without fines the same
+    return row(group, name, of(net), of("survival_steps"), of("equality"))
 
 
 def of_run(group: str, folder: str, name: str) -> Row:
@@ -185,7 +204,7 @@ def draw(found: list[Row], path: Path) -> None:
         sheet.title = "What governs the commons"
         sheet.caption = (
             f"Four learners, last {LAST} of 200 episodes; 95 % intervals by Student's t over replicas; "
-            f"best: the best known policy, {BEST:,.0f} apples; regrowth x 4 is off the scale; "
+            f"best: the best known policy, {BEST:,.0f} apples; rows of more than 75 % are off the scale; "
             "(1) to (8): Ostrom's principles."
         )
 
