@@ -1,5 +1,4 @@
-"""Which rules need each other? Rules of Ostrom, sight and the number of agents, in a fraction of all
-combinations.
+"""Which rules need each other? Ostrom's rules, sight and number of agents, in a fraction of all cases.
 
     python recipes/study/together.py --jobs 2
 
