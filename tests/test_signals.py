@@ -74,8 +74,7 @@ def test_signals_change_nothing_but_their_planes(encoding, area, governed):
         others = np.delete(other.observation, range(cells, cells + 3), axis=2)
         np.testing.assert_array_equal(one.observation, others)
         highest = spoken.observation_highest
-        own = (spoken_planes == highest).any((-2, -1))
-        heard = own if area == "full" else own[..., np.newaxis][..., 0]
+        heard = (spoken_planes == highest).any((-2, -1))
         assert set(np.unique(spoken_planes)) <= {0, highest}
         for world in range(4):
             for agent in np.flatnonzero(batches[1].now.on_board[world] & (signals[world] > 0)):

@@ -8,7 +8,6 @@ from itertools import product
 from pathlib import Path
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -22,9 +21,10 @@ from cprl.institutions import Quota, Sanctioner
 from cprl.learners.settings import RolloutSettings
 from cprl.networks import MLP
 from cprl.population import Frozen, Learning, Scripted, Team, stored_of
-from cprl.studies import Integers, LogUniform, Uniform
+from cprl.studies import Integers, LogUniform, StudyTable, Uniform
 from cprl.studies.factors import changed, drawn, factors_of, values_at
 from cprl.studies.study import CONDITION_FORMAT, Condition, apart, level_text, named, short_names
+from cprl.studies.tables.table import Design
 from cprl.studies.trials import trials_of
 from cprl.values import KINDS, defaults_of
 
@@ -511,11 +511,12 @@ def test_the_effects_of_rules_together_are_those_of_which_a_table_was_made(shipp
         for replica, episode in product(range(3), (160, 170, 180, 190)):
             noise = (-1, 0, 1)[replica] * levels["sight"] + (1000 if episode == 160 else 0)
             row = {"condition": effects.name(levels), "replica": replica, "part": "training"}
-            rows += [
-                row | {"episode": episode, "metric": metric, "value": float(apples + noise)}
-                for metric in effects.METRICS
-            ]
-    pq.write_table(pa.Table.from_pylist(rows), tmp_path / "table.parquet")
+            row |= {"episode": episode, "window_episodes": 10, "undefined": 0, "value": float(apples + noise)}
+            rows += [row | {"metric": metric} for metric in effects.METRICS]
+    conditions = {condition.name: {} for condition in shipped("together").all_conditions}
+    design = Design(name="together", conditions=conditions, reference="none", is_paired=True)
+    table = StudyTable(design=design, rows=pa.Table.from_pylist(rows), window=10)
+    table.write(tmp_path / "table.parquet")
     effects.main(tmp_path)
     lines = dict(line[2:-2].split(" | ", 1) for line in capsys.readouterr().out.splitlines()[2:])
     assert len(lines) == 14

@@ -14,29 +14,21 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
 import tyro
 from numpy.typing import NDArray
 from together import FACTORS, design, name
 
 from cprl.measuring.statistics import Estimate, estimate, holm
+from cprl.studies import StudyTable
+from cprl.studies.tables.comparing import compare
 
-LAST: Final = 30
-"""Episodes at the end of each training."""
-METRICS: Final = {"collective_return": "harvest after fines, apples", "survival_steps": "survival, turns"}
+METRICS: Final = {"net": "harvest after fines, apples", "survival_steps": "survival, turns"}
 
 
-def measured(study: Path, metric: str) -> NDArray[np.float64]:
-    """The mean of each replica over its last episodes, float [conditions, R], in the order of `design`."""
-    table = pq.read_table(study / "table.parquet")
-    table = table.filter((pc.field("part") == "training") & (pc.field("metric") == metric))
-    first = max(table["episode"].to_pylist()) + 10 - LAST
-    found: dict[tuple[str, int], list[float]] = defaultdict(list)
-    for row in table.filter(pc.field("episode") >= first).to_pylist():
-        found[row["condition"], row["replica"]].append(row["value"])
-    replicas = sorted({replica for _, replica in found})
-    return np.array([[np.mean(found[name(levels), r]) for r in replicas] for levels in design()])
+def measured(table: StudyTable, metric: str) -> NDArray[np.float64]:
+    """The mean of each replica at the end of its training, float [conditions, R], as in `design`."""
+    found = compare(table, metric).by_name
+    return np.array([found[name(levels)].defined for levels in design()])
 
 
 def effects(values: NDArray[np.float64]) -> dict[str, Estimate]:
@@ -60,9 +52,9 @@ def main(study: Annotated[Path, tyro.conf.Positional], /) -> None:
     Args:
         study: the study's directory.
     """
-    columns = []
+    table, columns = StudyTable.read(study / "table.parquet"), []
     for metric in METRICS:
-        found = effects(measured(study, metric))
+        found = effects(measured(table, metric))
         stars = holm([one.p_value for one in found.values()])
         columns.append(
             {k: f"{one:+}{'*' if star else ''}" for (k, one), star in zip(found.items(), stars, strict=True)}

@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
 import tyro
 from numpy.typing import NDArray
 from possible import KNOWN
@@ -21,6 +19,8 @@ from possible import KNOWN
 from cprl.commons.colours import BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION
 from cprl.measuring.statistics import Estimate, estimate
 from cprl.runs.curves import curves_of
+from cprl.studies import StudyTable
+from cprl.studies.tables.comparing import compare
 from cprl.terminal import style
 from cprl.terminal.style import RANDOM_LINE
 
@@ -113,19 +113,12 @@ class Row(NamedTuple):
 
 def of_study(group: str, study: str, condition: str, name: str) -> Row:
     """A condition of a study."""
-    table = pq.read_table(RESULTS / "studies" / study / "table.parquet")
-    found = table.filter((pc.field("condition") == condition) & (pc.field("part") == "training"))
-    last = max(found["episode"].to_pylist()) + 10 - LAST
-
-    def of(metric: str) -> NDArray[np.float64]:
-        """The mean at the end, [replicas]."""
-        ours = found.filter((pc.field("metric") == metric) & (pc.field("episode") >= last))
-        replicas = np.array(ours["replica"].to_pylist())
-        values = np.array(ours["value"].to_pylist(), float)
-        return np.array([np.nanmean(values[replicas == replica]) for replica in np.unique(replicas)])
-
-    net = "net" if "net" in found["metric"].to_pylist() else "collective_return"  # without fines the same
-    return row(group, name, of(net), of("survival_steps"), of("equality"))
+    table = StudyTable.read(RESULTS / "studies" / study / "table.parquet")
+    net = "net" if "net" in table.metrics else "collective_return"  # without fines the same
+    metrics = (net, "survival_steps", "equality")
+    return row(
+        group, name, *(compare(table, metric, last=LAST).by_name[condition].defined for metric in metrics)
+    )
 
 
 def of_run(group: str, folder: str, name: str) -> Row:

@@ -3,6 +3,8 @@
 python recipes/study/space.py --jobs 2
 """
 
+from typing import Literal
+
 from base import EXPERIMENT
 
 import cprl
@@ -39,11 +41,11 @@ def half() -> Map:
     return Map(height=BOARD.height, width=width, sites=sites, starts=BOARD.starts)
 
 
-def quarters(doors: int | None) -> Map:
+def quarters(between: Literal["ground", "doors", "walls"]) -> Map:
     """The quarters of commons apart by a row and a column, with an agent in each.
 
     Args:
-        doors: openings in each of the four walls between them; None for open ground instead of walls.
+        between: what lies there: open ground, walls with a door in each of the four, or walls.
     """
     row, col = BOARD.height // 2, BOARD.width // 2
 
@@ -52,13 +54,13 @@ def quarters(doors: int | None) -> Map:
 
     lines = {(row, at) for at in range(BOARD.width + 1)} | {(at, col) for at in range(BOARD.height + 1)}
     openings = {(row, col // 2), (row, col + 1 + col // 2), (row // 2, col), (row + 1 + row // 2, col)}
-    walls = () if doors is None else tuple(sorted(lines - (openings if doors else set())))
+    walls = {"ground": set(), "doors": lines - openings, "walls": lines}[between]
     return Map(
         height=BOARD.height + 1,
         width=BOARD.width + 1,
         sites=tuple(moved(site) for site in BOARD.sites),
         starts=tuple(moved(start) for start in CORNERS),
-        walls=walls,
+        walls=tuple(sorted(walls)),
     )
 
 
@@ -75,9 +77,9 @@ STUDY = cprl.Study(
             "half the board": half(),
             "twice the board": boards(2),
             "four times the board": boards(4),
-            "quarters, open": quarters(None),
-            "quarters, walls with a door": quarters(1),
-            "quarters, walls": quarters(0),
+            "quarters, open": quarters("ground"),
+            "quarters, walls with a door": quarters("doors"),
+            "quarters, walls": quarters("walls"),
         }.items()
     },
     name="space",

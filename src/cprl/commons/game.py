@@ -105,8 +105,13 @@ class Game(Value):
         """The name of each channel of an observation: "red", "green", "blue", or the classes of cells, then
         one for each signal, then the planes of `Observation`, then those of institutions, see
         `cprl.commons.views`."""
+        return *self.own_channels, *self._institution_channels
+
+    @property
+    def own_channels(self) -> tuple[str, ...]:
+        """All channels but those of institutions, which come last."""
         signals = (f"signal {number + 1}" for number in range(self.rules.signals))
-        return *self.cell_channels, *signals, *self.score_channels, *self._institution_channels
+        return *self.cell_channels, *signals, *self.score_channels
 
     @property
     def cell_channels(self) -> tuple[str, ...]:

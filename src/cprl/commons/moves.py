@@ -51,15 +51,15 @@ def act_one(world: Worlds, tables: Tables, actions: Actions, scratch: Scratch, i
     scratch.start_row[i] = world.row[i]
     scratch.start_col[i] = world.col[i]
     world.fired[i] = False
+    action = without_signal(tables, actions[i])
     if FURTHER:
         world.signal[i] = actions[i] // tables.silent_actions if world.in_play[i] else 0
-        world.cleans[i] = world.in_play[i] and without_signal(tables, actions[i]) == tables.clean_number
+        world.cleans[i] = world.in_play[i] and action == tables.clean_number
     if not world.in_play[i]:
         return
     is_hot = FURTHER and world.cooldown[i] > 0
     if is_hot:
         world.cooldown[i] -= 1
-    action = without_signal(tables, actions[i])
     if action < TURN_LEFT:
         mover = moved_by(tables, i, action)
         walk(world, tables, mover, (world.heading[mover] + WALK_TURN[action]) % 4)

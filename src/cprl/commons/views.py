@@ -140,7 +140,7 @@ def paint(world: Worlds, tables: Tables, picture: Ints) -> None:
 
 
 def look(world: Worlds, tables: Tables, i: int, scratch: Scratch) -> None:
-    """Writes the paints that agent i sees into `scratch.seen`: farthest row first, leftmost column first."""
+    """Writes what agent i sees of the picture into `scratch.seen`: farthest row and leftmost column first."""
     heading = world.heading[i]
     origin = 0 if tables.sees_all else cell_of(world.row[i], world.col[i], tables)
     to_cell = tables.window_cells[heading]
@@ -208,15 +208,12 @@ def draw_signals(world: Worlds, tables: Tables, scratch: Scratch, observation: B
             picture[cell_of(world.row[i], world.col[i], tables)] = world.signal[i]
     cells = tables.window_cells.shape[1]
     for i in range(world.row.shape[0]):
+        look(world, tables, i, scratch)
         planes = observation[i].reshape(-1)
-        heading = world.heading[i]
-        origin = 0 if tables.sees_all else cell_of(world.row[i], world.col[i], tables)
-        for n in range(cells):
-            sent = picture[origin + tables.window_cells[heading, n]]
-            if tables.walls_block_sight and not tables.in_sight[origin, heading, n]:
-                sent = 0
-            for s in range(tables.signals):
-                planes[(tables.first_signal_plane + s) * cells + n] = (sent == s + 1) * tables.highest
+        for s in range(tables.signals):
+            first = (tables.first_signal_plane + s) * cells
+            for n in range(cells):
+                planes[first + n] = (scratch.seen[n] == s + 1) * tables.highest
 
 
 HIGHEST = 255

@@ -159,7 +159,7 @@ def parameters(game: Any) -> dict[str, dict[str, Any]]:
         "what": [places[entry][1] for entry, _ in shown_entries],
         "argument": [number for _, number in shown_entries],
         "places": shows_places(game),
-        "first_plane": len(game.cell_channels) + game.rules.signals + len(game.score_channels),
+        "first_plane": len(game.own_channels),
     }
     of_modules = {name: module.parameters(game) for name, module in MODULES.items()}
     return {"entries": entries, **of_modules}

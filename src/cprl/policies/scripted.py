@@ -177,7 +177,7 @@ def scripted_lanes(
 def _settings(game: Game, spare: int) -> Settings:
     rules = game.rules
     return Settings(
-        actions=len(game.actions) // (1 + rules.signals),
+        actions=game.tables.silent_actions,
         has_beam=rules.may_fire,
         beam_length=min(*rules.beam_lengths_cells, rules.window_rows - 1),
         beam_half_width=min(rules.beam_width_cells, rules.window_columns) // 2,
