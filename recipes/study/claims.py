@@ -203,7 +203,13 @@ def of_experiment_3(result: Result, others: Sequence[Result]) -> Iterator[Claim]
         claim = "the sum is about 8 % above experiment 2"
         above = more(claim, measure, own, one.over_training("collective_return"), paired=False)
         yield where(result.is_whole and one.is_whole, above)
-    played = result.measures
+    played, own_rounds = result.measures, [ROUNDS.format(agent=agent) for agent in range(2)]
+    for one in alone:
+        if own_rounds[0] in one.measures.trained and own_rounds[1] in played.trained:
+            measure = f"rounds about the centre per 1000 steps, {one.name}'s and the mean of the two"
+            circling = np.mean([played.trained[name] for name in own_rounds], axis=0)
+            claim = "they do not circle as in experiment 2"
+            yield more(claim, measure, one.measures.trained[own_rounds[0]], circling, paired=False)
     ratio = played.training["return of the poorest agent over that of the richest, whole training"]
     claim, measure = "both earn almost the same", "the lower mean over training over the higher one"
     yield where(result.is_whole, alike(claim, measure, ratio, within=(0.8, 1.2)))
@@ -357,6 +363,15 @@ def of_experiment_5(result: Result) -> Iterator[Claim]:
                 published=_published_climb(result, metric),
                 **{"above" if sign > 0 else "below": 0.0},
             )
+    yield from _stays_healthy(result)
+    if curves["equality"].shape[1] >= TRAGIC:
+        yield side(
+            "tragedy: equality falls",
+            f"climb of its line from episode {EXPLORED} to {TRAGIC}",
+            _climb(curves["equality"][:, EXPLORED:TRAGIC]),
+            published=_published_climb(result, "equality", EXPLORED, TRAGIC),
+            below=0.0,
+        )
     survival = running_mean(curves["survival_steps"], result.window).min(1)
     at, values = _published_curve(result, "survival_steps")
     falls = number(
@@ -390,6 +405,23 @@ def of_experiment_5(result: Result) -> Iterator[Claim]:
         )
     yield from _tagging(result)
     yield from _lasts(result, "four manage the resource sustainably in the end")
+    game, study = result.experiment.game, result.study
+    if isinstance(game, Game) and study is not None and study.random is not None:
+        gains = side(
+            "learning need not raise returns",
+            "mean return over training less random play's; no rise if at most 0",
+            result.over_training("collective_return") - returns_by_chance(game).mean(),
+            published=study.trained - study.random,
+            below=0.0,
+        )
+        yield where(result.is_whole, gains)
+
+
+def _stays_healthy(result: Result) -> Iterator[Claim]:
+    ended = result.of_agents("terminated")
+    if ended is not None and ended.shape[1] >= EXPLORED:
+        measure = f"share of the first {EXPLORED} episodes that end empty, healthy if below a half"
+        yield side("exploration: the stock stays healthy", measure, ended[:, :EXPLORED, 0].mean(1), below=0.5)
 
 
 def _tagging(result: Result) -> Iterator[Claim]:
@@ -415,10 +447,10 @@ def _published_curve(result: Result, metric: str) -> tuple[Values, Values]:
     return curve(result.study.curves[metric])
 
 
-def _published_climb(result: Result, metric: str) -> float:
+def _published_climb(result: Result, metric: str, start: int = 0, end: int = EXPLORED) -> float:
     at, values = _published_curve(result, metric)
-    inside = at <= EXPLORED
-    return float(np.polyfit(at[inside], values[inside], 1)[0] * EXPLORED)
+    inside = (at >= start) & (at <= end)
+    return float(np.polyfit(at[inside], values[inside], 1)[0] * (end - start))
 
 
 def _climb(curves: Values) -> Values:

@@ -18,7 +18,7 @@ from possible import KNOWN
 
 from cprl.commons.colours import BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION
 from cprl.measuring.statistics import Estimate, estimate
-from cprl.runs.curves import curves_of
+from cprl.runs.curves import curves_of, net_of
 from cprl.studies import StudyTable
 from cprl.studies.tables.comparing import compare
 from cprl.terminal import style
@@ -124,7 +124,7 @@ def of_study(group: str, study: str, condition: str, name: str) -> Row:
 def of_run(group: str, folder: str, name: str) -> Row:
     """A run of recipes/institutions.py."""
     curves = curves_of(RESULTS / "institutions" / folder)
-    curves["net"] = np.sum([values for key, values in curves.items() if key.startswith("return_")], axis=0)
+    curves["net"] = net_of(curves)
     metrics = ("net", "survival_steps", "equality")
     return row(group, name, *(np.nanmean(curves[metric][:, -LAST:], 1) for metric in metrics))
 

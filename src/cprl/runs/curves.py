@@ -1,6 +1,6 @@
 """The episodes of a run as curves: a number for each replica and episode, smoothed as in the study."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -53,6 +53,12 @@ def as_curves(table: pa.Table) -> dict[str, Values]:
     returns = values("return")
     curves |= {f"return_{number}": returns[..., number].copy() for number in np.unique(agent)}
     return curves | _of_institutions(table.column_names, values)
+
+
+def net_of(curves: Mapping[str, Values]) -> Values:
+    """Return the sum of the rewards of all agents, [R, E]: the harvest after fines and transfers."""
+    returns = [curve for name, curve in curves.items() if name.startswith("return_")]
+    return np.asarray(np.sum(returns, axis=0))
 
 
 def _of_institutions(names: Sequence[str], values: Callable[[str], Values]) -> dict[str, Values]:

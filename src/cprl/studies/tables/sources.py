@@ -15,7 +15,7 @@ from cprl.measuring import social
 from cprl.measuring.now import LEAST_LOSS, LOST, REGAINED
 from cprl.measuring.phases import FEWEST_EPISODES, UNNAMED
 from cprl.runs.checkpoints import REPORT
-from cprl.runs.curves import Values, as_curves, phases_of, running_mean
+from cprl.runs.curves import Values, as_curves, net_of, phases_of, running_mean
 from cprl.runs.episodes import read_episodes, read_table
 from cprl.runs.files import read_json
 from cprl.runs.recipe import read_recipe
@@ -213,7 +213,7 @@ def _measured(source: Source, window: int) -> _Measured:
         table = read_episodes(source.run) if name is None else read_table(folder / f"{name}.parquet")
         _refuse_gaps(table, source, part)
         curves[part] = as_curves(table)
-        for metric, values in {**curves[part], NET: _net(curves[part])}.items():
+        for metric, values in {**curves[part], NET: net_of(curves[part])}.items():
             length = window if part == TRAINING or window == 1 else values.shape[1]
             windows[part, metric] = _in_windows(values, length)
     phases, rule = _phases(source, curves)
@@ -230,12 +230,6 @@ def _in_windows(values: Values, window: int) -> Windows:
     with np.errstate(invalid="ignore"):
         means = np.add.reduceat(np.where(defined, values, 0.0), firsts, axis=1) / counts
     return firsts, lengths, lengths - counts, means
-
-
-def _net(curves: Mapping[str, Values]) -> Values:
-    """The return of all agents together, [R, E]."""
-    returns = [curve for name, curve in curves.items() if name.startswith("return_")]
-    return np.asarray(np.sum(returns, axis=0))
 
 
 def _refuse_gaps(table: pa.Table, source: Source, part: str) -> None:
@@ -427,4 +421,4 @@ def ending(returns: Values, *, random: float, agents: int) -> str:
 
 def _harvest(curves: Mapping[str, Values]) -> Values:
     """The collective return, [R, E]; of games without a harvest the return of all agents."""
-    return curves["collective_return"] if "collective_return" in curves else _net(curves)
+    return curves["collective_return"] if "collective_return" in curves else net_of(curves)
