@@ -3,9 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import torch
+from tensordict import TensorDict
 
-from cprl import Game, Rules, maps
-from cprl.algorithms import DQN, DQNSettings
+from cprl import Game, Rules, algorithms, maps
+from cprl.algorithms import DQN, DQNSettings, OffPolicy, OnPolicy
 from cprl.learners.base import LearningAgents
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.transitions import LaneTurn
@@ -15,6 +17,12 @@ MEADOW = Game(
     rules=Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=12, freeze_steps=2),
 )
 """A small board for two agents."""
+KINDS = [
+    kind
+    for kind in map(vars(algorithms).get, algorithms.__all__)
+    if issubclass(kind, OffPolicy | OnPolicy) and kind not in (OffPolicy, OnPolicy)
+]
+"""All algorithms whose lanes an engine updates."""
 
 
 def make_learner(algorithm, spaces, *, engine="compiled", **who):
@@ -51,6 +59,18 @@ def played(learner, env, steps, seen=None):
         if seen is not None:
             seen.append(turn)
     return losses
+
+
+def transitions(observation, action, next_observation, reward, ends, **entries):
+    """Transitions under TorchRL's default keys, of tensors or lists; `ends` are "done" and "terminated"."""
+    after = {"observation": next_observation, "reward": reward, "done": ends, "terminated": ends}
+    before = {"observation": observation, "action": action, **entries}
+    size = [len(action)]
+    made, made_after = (
+        TensorDict({name: torch.as_tensor(entry) for name, entry in entries.items()}, size)
+        for entries in (before, after)
+    )
+    return made.set("next", made_after)
 
 
 def write(ring, transitions):

@@ -366,9 +366,7 @@ def test_the_loss_has_lolas_gradient_under_backward_under_func_grad_and_vmapped(
         [[own.detach() for own in of] for of in parameters],
         rate=2.0,
     )
-    for of, slopes in zip(parameters, wanted, strict=True):
-        for own, slope in zip(of, slopes, strict=True):
-            torch.testing.assert_close(own.grad, slope)
+    torch.testing.assert_close([[own.grad for own in of] for of in parameters], wanted)
     functional, weights = FunctionalLoss(loss), weights_of(LOLALoss(actors))
     slopes = torch.func.grad(lambda own: functional(own, {}, rollouts))(weights)
     torch.testing.assert_close(slopes["actors_params:1.module.0.module.weight"], parameters[1][0].grad)

@@ -6,15 +6,15 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
-from dqn_parts import make_learner, played
+from dqn_parts import MEADOW, make_learner, played, transitions
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from test_population import GAME, REPLAY, population, trained
-from test_teams import first_turn
+from test_population import GAME, REPLAY
 from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 
+from cprl import CommonsEnv
 from cprl.algorithms import DQN, MADDPG, DQNSettings
 from cprl.algorithms.base import q_actor
 from cprl.envs import make_env
@@ -24,11 +24,10 @@ from cprl.learners.transitions import LaneTurn
 from cprl.networks import MLP
 from cprl.objectives import MADDPGLoss
 from cprl.objectives.maddpg import sampled_one_hot, straight_through
-from cprl.population import Learning, Scripted, Team
+from cprl.population import Team
 from cprl.training.agents import Population
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater:UserWarning")
-TEAM = MADDPG(settings=REPLAY)
 
 
 class Linear(nn.Module):
@@ -64,14 +63,8 @@ VALUES = [[[1.0], [2.0], [3.0], [4.0]], [[10.0], [20.0], [30.0], [40.0]]]
 
 
 def two_transitions(**entries):
-    after = {
-        "observation": torch.tensor([[[1.0], [1.0]], [[1.0], [-1.0]]]),
-        "reward": torch.tensor([[[5.0], [6.0]], [[7.0], [8.0]]]),
-        "done": torch.tensor([[False], [True]]),
-        "terminated": torch.tensor([[False], [True]]),
-    }
-    before = {"observation": torch.ones(2, 2, 1), "action": torch.tensor([[0, 1], [1, 0]])}
-    return TensorDict({**before, "next": TensorDict(after, [2]), **entries}, [2])
+    seen_next, reward = [[[1.0], [1.0]], [[1.0], [-1.0]]], [[[5.0], [6.0]], [[7.0], [8.0]]]
+    return transitions(torch.ones(2, 2, 1), [[0, 1], [1, 0]], seen_next, reward, [[False], [True]], **entries)
 
 
 def test_targets_are_those_of_the_target_policies_and_target_critics():
@@ -89,16 +82,14 @@ def test_targets_are_those_of_the_target_policies_and_target_critics():
 
 def test_critics_judge_the_actions_that_were_taken_and_several_steps_are_discounted():
     loss = loss_of(Linear(*SURE), LinearCritics(*VALUES), reduction="none")
-    batch = two_transitions(steps_to_next_obs=torch.tensor([[2], [1]]))
+    batch = two_transitions(steps_to_next_obs=[[2], [1]])
     out = loss(batch)
     # (0, 1) is worth 1 + 4 to member 0 and 10 + 40 to member 1; (1, 0) is worth 2 + 3 and 20 + 30.
     assert out["pred_value"].squeeze(-1).tolist() == [[5.0, 50.0], [5.0, 50.0]]
     # 5 + 0.25 * 5 = 6.25 and 6 + 0.25 * 50 = 18.5.
     assert out["target_value"].squeeze(-1).tolist() == [[6.25, 18.5], [7.0, 8.0]]
     assert out["loss_value"].tolist() == [1.25**2 + 31.5**2, 2.0**2 + 42.0**2]
-    assert set(batch.keys()) == set(two_transitions(steps_to_next_obs=torch.ones(2, 1)).keys()), (
-        "not written to"
-    )
+    assert set(batch.keys()) == {"observation", "action", "next", "steps_to_next_obs"}, "not written to"
 
 
 def test_an_actors_own_action_is_a_new_one_and_the_others_are_those_of_the_batch():
@@ -135,12 +126,8 @@ def test_where_a_critic_is_linear_in_the_action_the_gradient_is_that_of_the_expe
     actors = Linear(*torch.randn(2, 3, 4, generator=chance).tolist())
     critics = LinearCritics(*torch.randn(2, 8, 1, generator=chance).tolist())
     loss = loss_of(actors, critics)
-    no = torch.zeros(1, 1, dtype=torch.bool)
     seen = torch.randn(1, 2, 3, generator=chance)
-    after = TensorDict(
-        {"observation": seen, "reward": torch.zeros(1, 2, 1), "done": no, "terminated": no}, [1]
-    )
-    batch = TensorDict({"observation": seen, "action": torch.tensor([[2, 0]]), "next": after}, [1])
+    batch = transitions(seen, [[2, 0]], seen, torch.zeros(1, 2, 1), [[False]])
     weight = loss.actor_network_params.get(("module", "weight"))
     probs = torch.einsum("si,sio->so", seen[0], weight).softmax(-1)
     # E Q of a member over its own actions; the other's value is a constant.
@@ -224,26 +211,6 @@ def test_another_estimator_than_td0_is_refused():
 # ---- in the library
 
 
-def learner_of(specs, **how):
-    agents = population(specs, **how)
-    (learner,) = agents.learners.values()
-    return agents, learner
-
-
-@pytest.mark.parametrize(("reward", "paid"), [("individual", [1.0, 2.0]), ("team", [6.0, 6.0])])
-def test_members_are_paid_what_each_wants_also_with_others_outside_the_team(reward, paid):
-    _, learner = learner_of([Scripted(), Team(TEAM, (1, 2), reward=reward), Scripted()])
-    learner.store(first_turn(2))
-    fields = learner.buffer.fields
-    assert fields["reward"][0].tolist() == [paid, paid]
-    assert fields["action"][0].tolist() == [[1, 2], [1, 2]]
-    assert learner.engine.weights(0)["critic_network_params:module.heads.members.weights.0"].shape == (
-        2,
-        2 * 45 + 2 * 8,
-        8,
-    ), "the critics see the members' observations and actions alone"
-
-
 def test_the_critic_of_a_member_sees_what_all_members_do_and_observe_the_actor_only_its_own():
     algorithm = MADDPG(settings=REPLAY)
     team = algorithm.make_team([algorithm.make_network(GAME.spaces) for _ in range(3)], GAME.spaces)
@@ -265,11 +232,8 @@ def test_the_layers_of_critics_are_those_of_the_settings_or_of_the_network(netwo
         settings=replace(REPLAY, hidden_cells=(32, 32) if network else (5, 4)), network=network
     )
     team = algorithm.make_team([algorithm.make_network(GAME.spaces) for _ in range(2)], GAME.spaces)
-    assert [tuple(own.shape[1:]) for own in team["critic"].heads.members.weights] == [
-        (106, 5),
-        (5, 4),
-        (4, 1),
-    ]
+    layers = [tuple(own.shape[1:]) for own in team["critic"].heads.members.weights]
+    assert layers == [(106, 5), (5, 4), (4, 1)]
 
 
 def test_returns_of_several_steps_are_those_of_each_member():
@@ -278,13 +242,9 @@ def test_returns_of_several_steps_are_those_of_each_member():
         observation_shape=(2, 1), action_shape=(2,), reward_shape=(2,), horizon=Horizon(3, 0.5)
     )
     buffer = Ring(form, seeds=[(0,), (1,)], transitions=10, batch_size=4)
+    see, act = np.zeros((2, 2, 1), np.uint8), np.zeros((2, 2), np.int64)
     for step in range(6):
-        ends = torch.full((2,), step == 2).numpy()
-        see, act = (
-            torch.zeros(2, 2, 1, dtype=torch.uint8).numpy(),
-            torch.zeros(2, 2, dtype=torch.int64).numpy(),
-        )
-        paid = (2.0**step * torch.tensor([[1.0, 10.0], [3.0, 30.0]])).numpy()
+        paid, ends = 2.0**step * np.array([[1.0, 10.0], [3.0, 30.0]], np.float32), np.full(2, step == 2)
         buffer.write(LaneTurn(see, act, see, paid, ends, ends))
     got = buffer.get(torch.tensor([[0, 1, 3], [0, 2, 3]]))
     # 1 + 2/2 + 4/4 = 3; 2 + 4/2 = 4, since the episode ends; 4; 8 + 16/2 + 32/4 = 24.
@@ -297,17 +257,13 @@ def test_returns_of_several_steps_are_those_of_each_member():
 
 
 class NoisyLoss(DQNLoss):
-    """Learns from the transitions whose first uniform number is below a half, and keeps what it was given."""
+    """Keeps the uniform numbers that it is given."""
 
     given: ClassVar[list] = []
 
     def forward(self, tensordict):
-        noise, asked = tensordict["noise"], self.reduction
-        self.given.append(noise)
-        self.reduction = "none"
-        each = super().forward(tensordict)["loss"] * (noise[..., 0] < 0.5)
-        self.reduction = asked
-        return TensorDict({"loss": each if asked == "none" else each.mean()}, [])
+        self.given.append(tensordict["noise"])
+        return super().forward(tensordict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -326,20 +282,11 @@ def test_each_lane_has_uniform_numbers_of_its_own_whatever_trains_beside_it(engi
     given = []
     for replicas, first in ((3, 0), (1, 2)):
         how = {"agents": (0, 1), "replicas": replicas, "first_replica": first, "seed": 3, "engine": engine}
-        learner = make_learner(Noisy(settings=REPLAY), GAME.spaces, reward_kind="individual", **how)
+        learner = make_learner(Noisy(settings=REPLAY), MEADOW.spaces, **how)
         NoisyLoss.given.clear()
-        agents = population([*[Learning(DQN(settings=REPLAY))] * 2, *[Scripted()] * 2], replicas=replicas)
-        agents.learners = {(0, 1): learner}
-        trained(agents, first=first, episodes=3 * replicas)
-        seen = torch.stack(NoisyLoss.given)
-        lanes = 2 * replicas
-        if engine == "torchrl":  # one agent after the other
-            seen = seen.view(-1, lanes, *seen.shape[1:])
-        assert seen.shape[1:] == (lanes, REPLAY.batch_size, 3)
-        given.append(seen)
-    least = min(map(len, given))
-    assert least > 5
-    torch.testing.assert_close(given[0][:least, 4:], given[1][:least], rtol=0, atol=0)
+        played(learner, CommonsEnv(MEADOW, replicas, seed=3), 30)
+        given.append(torch.stack(NoisyLoss.given).view(15, 2 * replicas, REPLAY.batch_size, 3))
+    assert torch.equal(given[0][:, 4:], given[1])
     numbers = given[0].flatten()
     assert len(numbers.unique()) > 0.99 * len(numbers)
     assert 0.45 < float(numbers.mean()) < 0.55

@@ -2,26 +2,16 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from dqn_parts import MEADOW, make_learner
-from torch.nn import functional
 
 import cprl
-from cprl import CommonsEnv, Experiment, Game, Rules, Study, maps
-from cprl.algorithms import (
-    DQN,
-    LOLA,
-    PPO,
-    QMIX,
-    DQNSettings,
-    LOLASettings,
-    RolloutSettings,
-    Tabular,
-    TabularSettings,
-)
+from cprl import CommonsEnv, Experiment, Game, Rules, Study, algorithms, maps
+from cprl.algorithms import DQN, PPO, DQNSettings, LOLASettings, RolloutSettings
 from cprl.commands.recipe import parse
 from cprl.envs.make_env import make_env
 from cprl.learners.ring import Horizon, Ring, TransitionForm
@@ -57,9 +47,10 @@ AGENTS = {
         Learning(PPO(settings=replace(ROLLOUTS, minibatch_size=30, hidden_cells=(32, 32)), network=CELLS)),
     )
     * 2,
-    "QMIX": (Team(QMIX(settings=SETTINGS), agents=(0, 1), reward="team"),),
-    "LOLA": (Team(LOLA(settings=LOLASettings(rollout_steps=10, critic_epochs=2)), agents=(0, 1)),),
-    "tabular": (Learning(Tabular(settings=TabularSettings(epsilon_decay_steps=100))),) * 2,
+    "QMIX": (Team(algorithms.QMIX(settings=SETTINGS), agents=(0, 1), reward="team"),),
+    "LOLA": (Team(algorithms.LOLA(settings=LOLASettings(rollout_steps=10, critic_epochs=2)), agents=(0, 1)),),
+    "tabular": (Learning(algorithms.Tabular(settings=algorithms.TabularSettings(epsilon_decay_steps=100))),)
+    * 2,
 }
 EXACT = {"DQN", "DQN, three steps", "QMIX", "tabular"}
 """Those whose products do not depend on how many replicas are beside them."""
@@ -81,8 +72,8 @@ def training(agents, *, replicas=2, first=0, worlds=WORLDS, game=MEADOW, **how):
     return population, made
 
 
-def weights(population):
-    states = [learner.state_dict()["networks"] for learner in population.learners.values()]
+def weights(learners):
+    states = [learner.state_dict()["networks"] for learner in learners]
     return {
         f"{lane}/{name}": value.clone()
         for state in states
@@ -95,14 +86,13 @@ def weights(population):
 @pytest.mark.parametrize("name", AGENTS)
 def test_a_replica_of_many_worlds_is_what_it_would_be_alone(name):
     both, alone = training(AGENTS[name]), training(AGENTS[name], replicas=1, first=1)
-    before = weights(both[0])
+    before = weights(both[0].learners.values())
     for _, run in (both, alone):
         run.run()
-    after, of_one = weights(both[0]), weights(alone[0])
+    after, of_one = (weights(population.learners.values()) for population, _ in (both, alone))
     assert set(of_one) == {lane for lane in after if lane.startswith("replica_1")}
     tolerance = {"rtol": 0, "atol": 0} if name in EXACT else {"rtol": 1e-4, "atol": 1e-5}
-    for lane, value in of_one.items():
-        torch.testing.assert_close(after[lane], value, **tolerance)
+    torch.testing.assert_close({lane: after[lane] for lane in of_one}, of_one, **tolerance)
     assert any(not torch.equal(after[lane], before.get(lane)) for lane in of_one)
 
 
@@ -115,10 +105,8 @@ def test_a_training_goes_on_from_its_state_bit_for_bit(name):
         stopped[1].step()
     resumed[1].load_state_dict(stopped[1].state_dict())
     resumed[1].run()
-    wanted, found = weights(whole[0]), weights(resumed[0])
-    assert {lane: torch.equal(found[lane], value) for lane, value in wanted.items()} == dict.fromkeys(
-        wanted, True
-    )
+    found, wanted = (weights(population.learners.values()) for population, _ in (resumed, whole))
+    torch.testing.assert_close(found, wanted, rtol=0, atol=0)
     assert whole[1].steps == resumed[1].steps == 40 * WORLDS
 
 
@@ -224,16 +212,9 @@ def test_a_ring_samples_every_transition_of_every_world_evenly(horizon):
     assert counts[0] != counts[1]
 
 
-def turns_of(agents, worlds, count, game=MEADOW, seed=3):
+def turns_of(worlds, count, game=MEADOW):
     """So many turns of random play, each a batch [B]."""
-    env, moment = CommonsEnv(game, worlds, seed=seed), None
-    chance, played = torch.Generator().manual_seed(seed), []
-    moment = env.reset()
-    for _ in range(count):
-        moment["agents", "action"] = torch.randint(8, (worlds, agents), generator=chance)
-        turn, moment = env.step_and_maybe_reset(moment)
-        played.append(turn.clone())
-    return played
+    return CommonsEnv(game, worlds, seed=3).rollout(count, break_when_any_done=False).unbind(1)
 
 
 def learner_of(algorithm, worlds, **how):
@@ -242,125 +223,27 @@ def learner_of(algorithm, worlds, **how):
     )
 
 
-def linear(network, seen):
-    """The outputs of a network without hidden layers for observations [n, C, X, Y]."""
-    (layer,) = network.linears
-    return functional.linear(seen.flatten(1).float() / 255, layer.weight, layer.bias)
-
-
-def test_an_update_of_dqn_in_two_worlds_is_the_one_by_hand():
-    settings = DQNSettings(
-        buffer_size=40, batch_size=6, hidden_cells=(), learning_rate=0.5, optimizer="sgd", gamma=0.9,
-        learning_starts=10, steps_per_update=22,
-    )  # fmt: skip
-    learner, played = learner_of(DQN(settings=settings), 2), turns_of(2, 2, 15)
-    networks = learner.networks()
-    for turn in played:
-        learner.store(turn)
-    numbers = learner.buffer.rng.next().clone()  # by which the update would draw
-    learner.buffer.rng._used -= 1
-    losses = learner.update()
-    for agent in range(2):
-        network = networks[f"replica_0/agent_{agent}"]
-        # The numbers count through the 15 transitions of world 0, then those of world 1.
-        drawn = [divmod(int(number * 30), 15) for number in numbers[agent]]
-        assert len({world for world, _ in drawn}) == 2
-        errors = []
-        for world, step in drawn:
-            turn = played[step][world]
-            after = turn["next"]
-            with torch.no_grad():
-                best = linear(network, after["agents", "observation"][agent][None]).max()
-            reward, goes_on = after["agents", "reward"][agent, 0], ~after["terminated"][0]
-            value = linear(network, turn["agents", "observation"][agent][None])[
-                0, turn["agents", "action"][agent]
-            ]
-            errors.append((reward + 0.9 * goes_on * best - value) ** 2)
-        loss = torch.stack(errors).mean()
-        loss.backward()
-        torch.testing.assert_close(losses[0, agent], loss.detach())
-        found = learner.networks()[f"replica_0/agent_{agent}"]
-        for own, wanted in zip(found.parameters(), network.parameters(), strict=True):
-            torch.testing.assert_close(
-                own.detach(), wanted.detach() - 0.5 * wanted.grad, rtol=1e-5, atol=1e-6
-            )
-
-
-def test_an_update_of_ppo_in_two_worlds_is_the_one_by_hand():
-    settings = RolloutSettings(
-        rollout_steps=14, minibatch_size=28, epochs=1, hidden_cells=(), learning_rate=0.5, optimizer="sgd",
-        gamma=0.9, gae_lambda=0.8, max_grad_norm=None,
-    )  # fmt: skip
-    algorithm = PPO(settings=settings, entropy_coeff=0.0, critic_coeff=0.5)
-    learner, played = learner_of(algorithm, 2), turns_of(2, 2, 14)
-    actors = learner.networks()
-    critics = [
-        {name: value.clone() for name, value in learner.engine.weights(agent).items() if "critic" in name}
-        for agent in range(2)
-    ]
-    for turn in played:
-        learner.store(turn)
-    learner.update()
-    for agent in range(2):
-        actor = actors[f"replica_0/agent_{agent}"]
-        weight, bias = (
-            next(value for name, value in critics[agent].items() if name.endswith(part))
-            for part in ("weights.0", "biases.0")
-        )
-
-        def value_of(seen, weight=weight, bias=bias):
-            return (seen.flatten().float() / 255 @ weight + bias.flatten())[0]
-
-        advantages, chances = [], []
-        for world in range(2):
-            gain = 0.0
-            for turn in reversed(played):
-                now, after = turn[world], turn[world]["next"]
-                value = value_of(now["agents", "observation"][agent])
-                following = value_of(after["agents", "observation"][agent])
-                reward = after["agents", "reward"][agent, 0]
-                delta = reward + 0.9 * following * ~after["terminated"][0] - value
-                gain = delta + 0.9 * 0.8 * ~after["done"][0] * gain
-                logits = linear(actor, now["agents", "observation"][agent][None])[0]
-                chances.append(logits.log_softmax(-1)[now["agents", "action"][agent]])
-                advantages.append(gain)
-        gains = torch.stack(advantages)
-        gains = (gains - gains.mean()) / (gains.std() + 1e-8)
-        chances = torch.stack(chances)
-        (-gains.detach() * (chances - chances.detach()).exp()).mean().backward()
-        found = learner.networks()[f"replica_0/agent_{agent}"]
-        for own, wanted in zip(found.parameters(), actor.parameters(), strict=True):
-            torch.testing.assert_close(
-                own.detach(), wanted.detach() - 0.5 * wanted.grad, rtol=1e-4, atol=1e-6
-            )
-
-
-def permuted(turn):
-    return turn[torch.tensor([2, 0, 1])]
+def in_two_orders(algorithm):
+    """Two learners that have stored the same turns of three worlds, the second with its worlds permuted."""
+    one, other = (learner_of(algorithm, 3) for _ in range(2))
+    for turn in turns_of(3, 14):
+        one.store(turn)
+        other.store(turn[torch.tensor([2, 0, 1])])
+    return one, other
 
 
 def test_the_same_experience_in_another_order_of_worlds_gives_the_same_update():
     whole = RolloutSettings(rollout_steps=14, minibatch_size=42, epochs=2, hidden_cells=(8,))
-    one, other = (learner_of(PPO(settings=whole), 3) for _ in range(2))
-    for turn in turns_of(2, 3, 14):
-        one.store(turn)
-        other.store(permuted(turn))
+    one, other = in_two_orders(PPO(settings=whole))
     torch.testing.assert_close(one.update(), other.update(), rtol=1e-5, atol=1e-5)
-    for lane, network in one.networks().items():
-        for value, same in zip(network.parameters(), other.networks()[lane].parameters(), strict=True):
-            torch.testing.assert_close(value, same, rtol=0, atol=1e-5)
+    torch.testing.assert_close(weights([one]), weights([other]), rtol=0, atol=1e-5)
 
-    one, other = (learner_of(DQN(settings=replace(SETTINGS, learning_starts=30)), 3) for _ in range(2))
-    for turn in turns_of(2, 3, 14):
-        one.store(turn)
-        other.store(permuted(turn))
+    one, other = in_two_orders(DQN(settings=replace(SETTINGS, learning_starts=30)))
     places = torch.arange(14).repeat(2, 3)
     for learner in (one, other):  # of all that is stored
         worlds = learner.buffer.columns.repeat_interleave(14, 1)
         learner.engine.update_from(learner.buffer.get(places, worlds))
-    for lane, network in one.networks().items():
-        for value, same in zip(network.parameters(), other.networks()[lane].parameters(), strict=True):
-            torch.testing.assert_close(value, same, rtol=0, atol=1e-5)
+    torch.testing.assert_close(weights([one]), weights([other]), rtol=0, atol=1e-5)
 
 
 def test_worlds_that_settings_do_not_fit_are_refused_by_name():
@@ -388,25 +271,23 @@ def test_what_compiled_pieces_of_a_rollout_say_is_what_the_networks_say():
         ),
     )
     settings = RolloutSettings(rollout_steps=20, minibatch_size=10, hidden_cells=(8,))
-    learner = make_learner(PPO(settings=settings), short.spaces, agents=(0, 1), replicas=1, worlds=4)
-    ends = set()
-    for turn in turns_of(2, 4, 20, game=short):
-        learner.store(turn)
-        ends.add(tuple(turn["next", "done"].flatten().tolist()))
-    assert len(ends) > 2, "they end at times of their own"
-    columns = learner._rollout.fields
-    logits, value, next_value = learner._evaluated(columns)
-    seen, following = columns["observation"], columns["next_observation"]
-    torch.testing.assert_close(logits, learner.engine.outputs(seen, part=0), rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(value, learner.engine.outputs(seen, part=1), rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(next_value, learner.engine.outputs(following, part=1), rtol=1e-4, atol=1e-5)
-    compiled = learner.update()
-    eager = make_learner(
-        PPO(settings=settings), short.spaces, agents=(0, 1), replicas=1, worlds=4, engine="eager"
+    compiled, eager = (
+        make_learner(PPO(settings=settings), short.spaces, agents=(0, 1), replicas=1, worlds=4, engine=engine)
+        for engine in ("compiled", "eager")
     )
-    for turn in turns_of(2, 4, 20, game=short):
+    turns = turns_of(4, 20, short)
+    for turn in turns:
+        compiled.store(turn)
         eager.store(turn)
-    torch.testing.assert_close(compiled, eager.update(), rtol=1e-4, atol=1e-5)
+    ends = {tuple(turn["next", "done"].flatten().tolist()) for turn in turns}
+    assert len(ends) > 2, "they end at times of their own"
+    columns = compiled._rollout.fields
+    seen, following = columns["observation"], columns["next_observation"]
+    assert torch.equal(seen[1, 2], torch.stack([turn["agents", "observation"][2, 1] for turn in turns]))
+    actors, critics = (partial(compiled.engine.outputs, part=part) for part in (0, 1))
+    by_networks = actors(seen), critics(seen), critics(following)
+    torch.testing.assert_close(compiled._evaluated(columns), by_networks, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(compiled.update(), eager.update(), rtol=1e-4, atol=1e-5)
 
 
 # A whole run
@@ -531,10 +412,10 @@ def test_several_threads_change_the_last_bits_at_most(tmp_path):
         cprl.run(experiment(**alike), tmp_path / f"{threads}", threads=threads, watch="off", figures=False)
         for threads in (1, 2)
     ]
-    one, two = (cprl.load(run).networks for run in runs)
-    for lane, network in one.items():
-        for value, same in zip(network.parameters(), two[lane].parameters(), strict=True):
-            torch.testing.assert_close(value, same, rtol=0, atol=1e-5)
+    one, two = (
+        {lane: network.state_dict() for lane, network in cprl.load(run).networks.items()} for run in runs
+    )
+    torch.testing.assert_close(one, two, rtol=0, atol=1e-5)
     reports = [json.loads((run / "report.json").read_text()) for run in runs]
     assert [report["threads"] for report in reports] == [1, 2]
     with pytest.raises(ValueError, match="threads is 0"):

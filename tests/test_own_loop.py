@@ -31,7 +31,7 @@ def run_in_miniature(tmp_path, capsys, **arguments):
 
 
 @pytest.mark.integration
-def test_the_loop_leaves_a_run_directory(tmp_path, capsys):
+def test_the_loop_leaves_a_run_directory_and_does_not_write_over_one(tmp_path, capsys):
     run, told = run_in_miniature(tmp_path, capsys, seed=3)
     kept = json.loads((run / "recipe.json").read_text())
     assert kept["recipe"] == "own_loop"
@@ -47,6 +47,9 @@ def test_the_loop_leaves_a_run_directory(tmp_path, capsys):
     assert set(load_weights(run / "checkpoints" / "final.pt")) == {"agent_0"}
     assert "random" in told
     assert "greedy" in told
+    with pytest.raises(FileExistsError):
+        run_in_miniature(tmp_path, capsys)
+    assert read_episodes(run).num_rows == 11
 
 
 @pytest.mark.integration
@@ -57,14 +60,6 @@ def test_the_loop_says_that_it_is_short_and_names_the_published_schedule(tmp_pat
     assert f"The published one, with 8 replicas: {shlex.join(cprl_here())} run single_basic\n" in told
     (agent,) = Experiment.from_recipe(read_recipe(run)).agents
     assert agent.algorithm.settings.epsilon_decay_steps == 30_000
-
-
-@pytest.mark.integration
-def test_a_directory_with_a_run_in_it_is_not_written_over(tmp_path, capsys):
-    run, _ = run_in_miniature(tmp_path, capsys)
-    with pytest.raises(FileExistsError):
-        run_in_miniature(tmp_path, capsys)
-    assert read_episodes(run).num_rows == 11
 
 
 @pytest.mark.slow

@@ -6,8 +6,7 @@ from typing import ClassVar
 
 import pytest
 import torch
-from dqn_parts import make_learner
-from tensordict import TensorDict
+from dqn_parts import make_learner, transitions
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SoftUpdate, ValueEstimators
@@ -80,21 +79,9 @@ def loss_of(values, *, gamma=0.5, **how):
     return loss.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
 
 
-def transition(**changes):
-    entries = {
-        "observation": torch.zeros(1, 2),
-        "action": torch.tensor([[1, 0]]),
-        "next": {
-            "observation": torch.full((1, 2), 2.0),
-            "reward": torch.tensor([[0.5]]),
-            "done": torch.tensor([[False]]),
-            "terminated": torch.tensor([[False]]),
-        },
-    }
-    batch = TensorDict(entries, [1])
-    for key, value in changes.items():
-        batch[tuple(key.split("__"))] = value
-    return batch
+def transition(*, reward=0.5, ends=False, **entries):
+    seen = torch.zeros(1, 2)
+    return transitions(seen, [[1, 0]], seen + 2, [[reward]], [[ends]], **entries)
 
 
 def test_the_loss_is_the_squared_error_of_the_joint_action_taken_against_the_soft_target():
@@ -112,16 +99,18 @@ def test_the_loss_is_the_squared_error_of_the_joint_action_taken_against_the_sof
 
 
 def test_nothing_comes_after_a_terminated_state_and_the_discount_counts_the_steps_of_a_return():
-    ended = transition(next__terminated=torch.tensor([[True]]))
-    torch.testing.assert_close(loss_of(OPTIMISM)(ended)["loss"], torch.tensor(0.25))  # (1 - 0.5)^2
+    # (1 - 0.5)^2 and ln cosh(1 - 0.5)
+    for name, expected in (("l2", 0.25), ("log_cosh", 0.1201145)):
+        found = loss_of(OPTIMISM, loss_function=name)(transition(ends=True))["loss"]
+        torch.testing.assert_close(found, torch.tensor(expected))
     # After three steps the discount is 0.125: y = 0.5 + 0.125 * 5.4402 = 1.1800.
-    later = transition(steps_to_next_obs=torch.tensor([[3]]))
+    later = transition(steps_to_next_obs=[[3]])
     torch.testing.assert_close(loss_of(OPTIMISM)(later)["loss"], torch.tensor(0.0324), rtol=0, atol=1e-3)
 
 
 def test_without_the_entropy_bonus_uniform_play_is_worth_what_it_is_paid():
     # Values that do not differ: V = 2 + 2 log 2 with the bonus, 2 without.
-    flat, batch = torch.zeros(1, 2, 2), transition(next__reward=torch.zeros(1, 1))
+    flat, batch = torch.zeros(1, 2, 2), transition(reward=0.0)
     for entropy_bonus, value in ((True, 2 + 2 * torch.log(torch.tensor(2.0))), (False, torch.tensor(2.0))):
         loss = loss_of(flat, entropy_bonus=entropy_bonus)
         torch.testing.assert_close(loss(batch)["loss"], (0.5 * value).square())

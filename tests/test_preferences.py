@@ -66,51 +66,55 @@ def close(*numbers):
     return pytest.approx(list(numbers), abs=1e-5)
 
 
-class TestWorkedNumbers:
-    def test_an_agent_that_is_ahead_loses_beta_times_its_lead_and_one_behind_alpha_times_its_lag(self):
-        # own 3, other 0: 3 - 0.05 x (3 - 0) = 2.85; own 0, other 3: 0 - 5 x (3 - 0) = -15
-        assert wanted(InequityAversion(alpha=5, beta=0.05, smoothing=0), 3, 0) == close(2.85, -15)
-        assert wanted(InequityAversion(alpha=0, beta=0.05, smoothing=0), 3, 0) == close(2.85, 0)
+def averse(alpha, beta):
+    return InequityAversion(alpha=alpha, beta=beta, smoothing=0)
 
-    def test_inequity_is_a_mean_over_the_others(self):
+
+def orientation(angle, weight):
+    return SocialValueOrientation(angle=angle, weight=weight)
+
+
+@pytest.mark.parametrize(
+    ("preference", "rewards", "expected"),
+    [
+        # own 3, other 0: 3 - 0.05 x (3 - 0) = 2.85; own 0, other 3: 0 - 5 x (3 - 0) = -15
+        (averse(5, 0.05), (3, 0), (2.85, -15)),
+        (averse(0, 0.05), (3, 0), (2.85, 0)),
         # of 4, 1, 1: the first leads by 3 and 3: 4 - 0.5 x (3 + 3) / 2 = 2.5; the others lag by 3 behind one
         # of two: 1 - 2 x 3 / 2 = -2
-        assert wanted(InequityAversion(alpha=2, beta=0.5, smoothing=0), 4, 1, 1) == close(2.5, -2, -2)
-
-    def test_smoothed_rewards_last_into_the_next_turn(self):
-        # smoothing 0.5; rewards 2, 0, then 0, 0. Smoothed: 2, 0, then 1, 0.
-        # first turn: 2 - 0.5 x 2 = 1 and 0 - 1 x 2 = -2; second: 0 - 0.5 x 1 = -0.5 and 0 - 1 x 1 = -1
-        wants = WantedRewards(InequityAversion(alpha=1, beta=0.5, smoothing=0.5))
-        going_on = np.array([False])
-        assert wants.add(np.array([[2.0, 0.0]]), going_on)[0].tolist() == close(1, -2)
-        assert wants.add(np.array([[0.0, 0.0]]), going_on)[0].tolist() == close(-0.5, -1)
-
-    def test_an_orientation_loses_by_its_distance_in_radians(self):
+        (averse(2, 0.5), (4, 1, 1), (2.5, -2, -2)),
         # own 1, mean of the others (0 + 2) / 2 = 1: the angle is pi / 4. Selfish, weight 0.5: 1 - 0.5 pi / 4.
-        selfish = SocialValueOrientation(angle=0, weight=0.5)
-        assert wanted(selfish, 1, 0, 2)[0] == pytest.approx(1 - math.pi / 8)
+        # own 0, mean 1.5: pi / 2. own 2, mean 0.5: atan(1 / 4).
+        (orientation(0, 0.5), (1, 0, 2), (1 - math.pi / 8, -math.pi / 4, 2 - 0.5 * math.atan(0.25))),
         # own 3, others 0: the angle is 0, and pi / 4 is liked: 3 - 0.5 pi / 4; the others see 0 and 1.5,
         # an angle of pi / 2, likewise pi / 4 away
-        assert wanted(FAIR, 3, 0, 0) == close(3 - math.pi / 8, -math.pi / 8, -math.pi / 8)
-        assert wanted(FAIR, 1, 1) == close(1, 1)
-
-    def test_an_angle_is_measured_the_shorter_way_around(self):
-        # both lose 1: atan2(-1, -1) = -3 pi / 4; from pi / 2 that is 5 pi / 4, or 3 pi / 4 the other way
-        altruist = SocialValueOrientation(angle=math.pi / 2, weight=1)
-        assert wanted(altruist, -1, -1) == close(*[-1 - 3 * math.pi / 4] * 2)
-
-    def test_an_exchange_mixes_the_own_reward_with_the_mean_of_the_others(self):
+        (FAIR, (3, 0, 0), (3 - math.pi / 8, -math.pi / 8, -math.pi / 8)),
+        (FAIR, (1, 1), (1, 1)),
+        # both lose 1: atan2(-1, -1) = -3 pi / 4; from pi / 2 that is 5 pi / 4, or 3 pi / 4 the shorter way
+        (orientation(math.pi / 2, 1), (-1, -1), [-1 - 3 * math.pi / 4] * 2),
         # 3, 0, 1 with half: 1.5 + 0.5 x 0.5 = 1.75; 0 + 0.5 x 2 = 1; 0.5 + 0.5 x 1.5 = 1.25
-        assert wanted(Exchange(0.5), 3, 0, 1) == close(1.75, 1, 1.25)
+        (Exchange(0.5), (3, 0, 1), (1.75, 1, 1.25)),
+        ("team", (3, 0, 1), (4, 4, 4)),
+    ],
+)
+def test_what_is_wanted_in_a_turn_is_as_worked_by_hand(preference, rewards, expected):
+    assert wanted(preference, *rewards) == close(*expected)
 
-    def test_a_team_gets_the_sum(self):
-        assert wanted("team", 3, 0, 1) == [4, 4, 4]
 
-    @pytest.mark.parametrize("preference", WANTS.values(), ids=WANTS)
-    def test_when_nobody_eats_nobody_wants_anything_else(self, preference):
-        # other programs punish all by the angle of (0, 0), taken as 0, or by a difference of nothing
-        assert wanted(preference, 0, 0, 0) == [0, 0, 0]
-        assert wanted(preference, -0.0, 0, -0.0) == [0, 0, 0]
+def test_smoothed_rewards_last_into_the_next_turn():
+    # smoothing 0.5; rewards 2, 0, then 0, 0. Smoothed: 2, 0, then 1, 0.
+    # first turn: 2 - 0.5 x 2 = 1 and 0 - 1 x 2 = -2; second: 0 - 0.5 x 1 = -0.5 and 0 - 1 x 1 = -1
+    wants = WantedRewards(InequityAversion(alpha=1, beta=0.5, smoothing=0.5))
+    going_on = np.array([False])
+    assert wants.add(np.array([[2.0, 0.0]]), going_on)[0].tolist() == close(1, -2)
+    assert wants.add(np.array([[0.0, 0.0]]), going_on)[0].tolist() == close(-0.5, -1)
+
+
+@pytest.mark.parametrize("preference", WANTS.values(), ids=WANTS)
+def test_when_nobody_eats_nobody_wants_anything_else(preference):
+    # other programs punish all by the angle of (0, 0), taken as 0, or by a difference of nothing
+    assert wanted(preference, 0, 0, 0) == [0, 0, 0]
+    assert wanted(preference, -0.0, 0, -0.0) == [0, 0, 0]
 
 
 @settings(deadline=None)
@@ -173,9 +177,7 @@ def test_a_state_goes_on_bit_for_bit(turns, of_each, data):
     resumed.load_state_dict(stopped.state_dict())
     found += [resumed.add(*turn) for turn in turns[stop:]]
     assert np.array_equal(np.stack(expected), np.stack(found))
-    last, again = whole.state_dict(), resumed.state_dict()
-    assert last.keys() == again.keys()
-    assert all(torch.equal(last[name], again[name]) for name in last)
+    torch.testing.assert_close(whole.state_dict(), resumed.state_dict(), rtol=0, atol=0)
 
 
 def test_each_agent_may_want_something_else():

@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from dqn_parts import make_learner
-from tensordict import TensorDict
+from dqn_parts import make_learner, transitions
 from torch import nn
 from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss, ValueEstimators
@@ -14,8 +13,7 @@ from torchrl.objectives import DQNLoss, ValueEstimators
 from cprl import presets
 from cprl.algorithms import CQL, DQN, IQL, MADDPG, PR2, SAC, DQNSettings
 from cprl.learners.engine import UpdateRule, torch_optimizer
-from cprl.networks.agent import JointNetwork, OtherOutputs
-from cprl.objectives import LogCoshDQNLoss, PR2Loss, log_cosh
+from cprl.objectives import LogCoshDQNLoss, log_cosh
 from cprl.objectives.td import DISTANCES, distance
 from cprl.system.compat import promise_targets
 
@@ -86,14 +84,8 @@ def dqn_of_a_table(**how):
 
 
 def two_turns():
-    after = {
-        "observation": torch.zeros(2, 1, dtype=torch.float64),
-        "reward": torch.tensor([[1.0], [-0.5]], dtype=torch.float64),
-        "done": torch.tensor([[False], [True]]),
-        "terminated": torch.tensor([[False], [True]]),
-    }
-    before = {"observation": torch.zeros(2, 1, dtype=torch.float64), "action": torch.tensor([0, 1])}
-    return TensorDict({**before, "next": TensorDict(after, [2])}, [2])
+    seen, reward = torch.zeros(2, 1).double(), torch.tensor([[1.0], [-0.5]]).double()
+    return transitions(seen, [0, 1], seen, reward, [[False], [True]])
 
 
 @pytest.mark.parametrize("double", [False, True])
@@ -133,42 +125,13 @@ def test_as_run_the_loss_is_that_of_keras_over_all_outputs():
     (loss,), (network,) = engine.losses, engine.parts[0]
     seen, seen_next = torch.randint(256, (2, 8, *spaces.observation_shape), generator=chance).to(torch.uint8)
     action, reward = torch.arange(8) % spaces.actions, torch.rand(8, 1, generator=chance)
-    ends = torch.zeros(8, 1, dtype=torch.bool)
-    after = {"observation": seen_next, "reward": reward, "done": ends, "terminated": ends}
-    batch = TensorDict({"observation": seen, "action": action, "next": TensorDict(after, [8])}, [8])
+    batch = transitions(seen, action, seen_next, reward, [[False]] * 8)
     with loss.target_value_network_params.to_module(loss.value_network):
         following = loss.value_network(batch["next"].select("observation"))["action_value"].amax(-1)
     outputs = network(seen).detach()
     targets = outputs.clone()
     targets[range(8), action] = reward.squeeze(-1) + settings.gamma * following
     assert engine.learn(0, batch).item() == pytest.approx(log_cosh(outputs - targets).mean().item(), rel=1e-5)
-
-
-def test_pr2_takes_log_cosh_too():
-    torch.manual_seed(0)
-    network = JointNetwork(nn.Linear(4, 9), actions=3, peers=1, temperature=1.0)
-    after = {
-        "observation": torch.rand(5, 4),
-        "reward": torch.rand(5, 1),
-        "done": torch.zeros(5, 1, dtype=torch.bool),
-        "terminated": torch.zeros(5, 1, dtype=torch.bool),
-    }
-    batch = TensorDict(
-        {
-            "observation": torch.rand(5, 4),
-            "action": torch.tensor([[0, 1], [1, 2], [2, 0], [1, 1], [0, 2]]),
-            "next": TensorDict(after, [5]),
-        },
-        [5],
-    )
-    found = {}
-    for name in ("l1", "log_cosh"):
-        loss = PR2Loss(
-            OtherOutputs(network, "joint_values"), temperature=1.0, loss_function=name, reduction="none"
-        )
-        promise_targets(loss.make_value_estimator(ValueEstimators.TD0, gamma=0.9))
-        found[name] = loss(batch)["loss"]
-    torch.testing.assert_close(found["log_cosh"], found["l1"].cosh().log())
 
 
 @pytest.mark.parametrize("kind", [DQN, PR2, MADDPG])

@@ -80,17 +80,6 @@ def test_events_of_the_turn_before_are_not_told_but_windows_show_its_beams():
         assert not shown[key].any(), key
 
 
-def test_loading_the_state_from_before_a_rollout_undoes_the_rollout():
-    env = CommonsEnv(GAME, 1, seed=3)
-    moment = env.reset()
-    kept = env.worlds.state()
-    env.rollout(20, auto_reset=False, tensordict=moment.clone())
-    assert env.worlds.now.step[0, 0] == 20
-    again = env.load(kept)
-    assert (again == moment).all()
-    assert all(np.array_equal(array, kept[name]) for name, array in env.worlds.state().items())
-
-
 @pytest.mark.parametrize(
     ("game", "change", "message"),
     [

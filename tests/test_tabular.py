@@ -18,7 +18,7 @@ from cprl.learners.tabular import TabularLearner
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.tabular import NEVER_MET, QTables
-from cprl.training import Training, train
+from cprl.training import train
 
 SEES_ALL = {"window_rows": 4, "window_columns": 7, "may_fire": False}
 GAUGE = Observation(stock_gauge=True)
@@ -267,30 +267,6 @@ def test_the_learned_policy_plays_through_its_evaluation_actor():
     assert [(episode.steps, episode.harvest.sum()) for episode in ends] == [(2, 2.0)] * 6
     explored = evaluate(CommonsEnv(ONCE, 6), AgentPolicies({(0,): learner.evaluation_actor(3)}), explore=True)
     assert len(explored) == 6
-
-
-PAIR = Game(
-    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
-    rules=Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=20),
-    observation=Observation(stock_gauge=True, scoreboard=True),
-)
-
-
-def test_an_agents_course_does_not_depend_on_other_replicas():
-    settings = TabularSettings(epsilon_hold_steps=10, epsilon_decay_steps=200, learning_rate="1/visits")
-    tables = []
-    for first, replicas in ((0, 3), (1, 1)):
-        who = LearningAgents(PAIR.spaces, agents=[0, 1], replicas=replicas, first_replica=first)
-        learner = TabularLearner(who, settings)
-        env = CommonsEnv(PAIR, replicas, seed=0, first_world=first)
-        training = Training(env, {(0, 1): learner}, episodes=100)
-        for _ in range(300):
-            training.step()
-        tables.append(q_table(learner, 3 if replicas == 3 else 1))  # agent 1 of replica 1
-    scoreboards = [np.frombuffer(state, np.float32, 2, offset=len(state) - 8) for state in tables[0]["state"]]
-    assert np.max(scoreboards) > 0
-    for name, array in tables[0].items():
-        assert np.array_equal(array, tables[1][name]), name
 
 
 def test_the_table_of_an_agent_that_observes_floating_point_numbers_is_kept_as_a_network():

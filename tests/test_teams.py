@@ -12,8 +12,8 @@ from test_population import ALGORITHMS, GAME, REPLAY, ROLLOUTS, population, ran,
 from test_recurrent import DQNS
 from test_recurrent import ON_POLICY as RECURRENT
 
-from cprl import CommonsEnv, Custom, Experiment, Game, Rules, maps
-from cprl.algorithms import PPO, Tabular, TabularSettings
+from cprl import CommonsEnv, Custom, Game, Rules, maps
+from cprl.algorithms import Tabular, TabularSettings
 from cprl.algorithms.base import TeamAlgorithm
 from cprl.algorithms.off_policy import DQN
 from cprl.algorithms.teams import IPPO, MADDPG, MAPPO, QMIX, VDN
@@ -57,8 +57,7 @@ def test_a_member_acts_by_its_own_network_and_what_it_sees_itself():
 def test_a_member_begins_with_the_weights_that_it_would_have_alone():
     alone = population([Learning(DQN(settings=REPLAY))] * 4)
     team, _ = team_of("VDN")
-    for key, value in weights(alone).items():
-        assert torch.equal(weights(team)[key], value)
+    torch.testing.assert_close(weights(team), weights(alone), rtol=0, atol=0)
 
 
 def test_the_loss_of_vdn_is_that_of_the_sum_of_its_members_values():
@@ -95,13 +94,17 @@ def first_turn(replicas=1):
     )
 
 
-def test_a_team_is_paid_for_all_agents_also_those_who_are_not_of_it():
-    agents = population([Scripted(), Team(TEAMS["VDN"], (1, 2)), Scripted()])
+@pytest.mark.parametrize(
+    ("name", "reward", "paid"),
+    [("VDN", "team", 6.0), ("MADDPG", "team", [6.0, 6.0]), ("MADDPG", "individual", [1.0, 2.0])],
+)
+def test_members_are_paid_what_each_wants_or_for_all_agents_also_those_outside_the_team(name, reward, paid):
+    agents = population([Scripted(), Team(TEAMS[name], (1, 2), reward=reward), Scripted()])
     ((agents, learner),) = agents.learners.items()
     assert agents == (1, 2)
     learner.store(first_turn(2))
     fields = learner.buffer.fields
-    assert fields["reward"][0].tolist() == [6.0, 6.0]
+    assert fields["reward"][0].tolist() == [paid, paid]
     assert fields["action"][0].tolist() == [[1, 2], [1, 2]]
 
 
@@ -174,12 +177,6 @@ REFUSED = [
             CommonsEnv(GAME, 2, seed=3), [shared(DQN(settings=REPLAY))], seed=3, engine="torchrl"
         ),
         "share_parameters is True",
-    ),
-    (
-        lambda: Experiment(
-            name="shared", game=GAME, agents=(shared(PPO(settings=ROLLOUTS)),), episodes=1, engine="torchrl"
-        ),
-        r"a Team, which engine=\"torchrl\" cannot train",
     ),
 ]
 

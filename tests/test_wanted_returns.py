@@ -8,10 +8,9 @@ import pytest
 import torch
 from dqn_parts import make_learner
 from matrix_game import MatrixGame
-from one_road_parts import Dilemma
 
 import cprl
-from cprl import CommonsEnv, Custom, Experiment, Game, Rules, algorithms, maps
+from cprl import CommonsEnv, Experiment, Game, Rules, algorithms, maps
 from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
 from cprl.commands.recipe import parse
 from cprl.envs import spaces_of
@@ -66,12 +65,7 @@ def learner_of(name, preference, agents=(0, 1)):
 
 def batches(turns):
     """Turns of a dilemma with actions by chance; its worlds end after 5 and 6 turns, again and again."""
-    env, found = MatrixGame(2), []
-    carried = env.reset()
-    for _ in range(turns):
-        batch, carried = env.step_and_maybe_reset(env.rand_action(carried))
-        found.append(batch.clone())
-    return found
+    return MatrixGame(2).rollout(turns, break_when_any_done=False).unbind(1)
 
 
 def on_paper(preference, found):
@@ -268,31 +262,9 @@ def test_where_it_cannot_be_wanted_it_is_refused_by_name(specs, message):
         population(specs, MatrixGame(2))
 
 
-def test_agents_without_others_are_refused_before_anything_is_written(tmp_path):
+def test_agents_without_others_are_refused():
     alone = Game(map=maps.parse("A.>.A"), rules=Rules(may_fire=False))
     with pytest.raises(ValueError, match=r"experiment\.agents\[0\]\.reward is Exchange.* a game of 1 agent"):
         replace(EXPERIMENT, game=alone, agents=[Learning(DQN(settings=REPLAY), reward=Exchange(0.5))])
     with pytest.raises(ValueError, match=r"reward_kind is Exchange, which compares an agent with others"):
         make_learner(DQN(settings=REPLAY), alone.spaces, agents=(0,), replicas=1, reward_kind=Exchange(0.5))
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.integration
-def test_a_game_of_ones_own_has_preferences_too(tmp_path):
-    agents = [
-        Learning(DQN(settings=REPLAY), reward=Exchange(0.25)),
-        Learning(PPO(settings=ROLLOUTS), reward=AVERSE),
-    ]
-    game = Custom("one_road_parts:Dilemma", arguments={"steps": 4})
-    run = cprl.run(
-        replace(EXPERIMENT, game=game, agents=agents),
-        tmp_path / "run",
-        watch="off",
-        allow=["one_road_parts:Dilemma"],
-    )
-    rows = read_episodes(run).to_pylist()
-    assert Dilemma(steps=4).agents == 2
-    # Exchange(0.25): 3 / 4 of the own return and 1 / 4 of the other's
-    pairs = [(rows[place], rows[place + 1]) for place in range(0, len(rows), 2)]
-    for own, other in pairs:
-        assert own["wanted_return"] == pytest.approx(0.75 * own["return"] + 0.25 * other["return"])
