@@ -101,7 +101,7 @@ class Algorithm(Value, stored=False):
         to [..., A]; several networks are `AgentNetworks`, the acting one first."""
         raise NotImplementedError(f"{type(self).__name__} must define make_network(spaces)")
 
-    def make_loss(self, network: nn.Module) -> LossModule:
+    def make_loss(self, network: Any) -> LossModule:
         """TorchRL's loss over networks of `make_network`."""
         raise NotImplementedError(f"{type(self).__name__} must define make_loss(network)")
 
@@ -157,6 +157,14 @@ class OffPolicy(Algorithm, stored=False):
         """Return a loss, with targets that bootstrap after one step by the discount of the settings."""
         loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
         return loss
+
+    def refuse_relu(self) -> None:
+        """Raises a ValueError for `relu_on_outputs`, of algorithms without Q values to act by."""
+        if self.settings.relu_on_outputs:
+            raise ValueError(
+                f"settings.relu_on_outputs is True; allowed for {type(self).__name__}, whose acting network "
+                "does not output Q values: False"
+            )
 
     def method(self, spaces: Spaces) -> Method:
         return replace(
@@ -235,15 +243,6 @@ class TeamAlgorithm(Algorithm, stored=False):
                 f"the team has {members} agents; allowed for {name}: at least {self.fewest_members}; DQN and "
                 "VDN support fewer"
             )
-
-
-def refuse_relu(algorithm: Algorithm) -> None:
-    """Raises a ValueError for `relu_on_outputs` of an algorithm without Q values to act by."""
-    if algorithm.settings.relu_on_outputs:
-        raise ValueError(
-            f"settings.relu_on_outputs is True; allowed for {type(algorithm).__name__}, whose acting network "
-            "does not output Q values: False"
-        )
 
 
 def module_of(network: nn.Module, name: str, *, state: str = "recurrent_state") -> TensorDictModule:

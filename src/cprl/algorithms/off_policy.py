@@ -8,26 +8,11 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import nn
+from torchrl import objectives
 from torchrl.modules import DistributionalQValueActor, QValueActor
-from torchrl.objectives import (
-    DiscreteCQLLoss,
-    DiscreteIQLLoss,
-    DiscreteSACLoss,
-    DistributionalDQNLoss,
-    DQNLoss,
-    LossModule,
-)
+from torchrl.objectives import LossModule
 
-from cprl.algorithms.base import (
-    Algorithm,
-    OffPolicy,
-    TrainingEngine,
-    Weight,
-    module_of,
-    policy,
-    q_actor,
-    refuse_relu,
-)
+from cprl.algorithms.base import Algorithm, OffPolicy, TrainingEngine, Weight, module_of, policy, q_actor
 from cprl.commons.spaces import Spaces
 from cprl.learners.base import Learner, LearningAgents
 from cprl.learners.engine import Batching
@@ -68,7 +53,7 @@ class DQN(OffPolicy):
 
     def make_loss(self, network: nn.Module) -> LossModule:
         is_ours = self.loss_function == LOG_COSH
-        make = LogCoshDQNLoss if is_ours else partial(DQNLoss, loss_function=self.loss_function)
+        make = LogCoshDQNLoss if is_ours else partial(objectives.DQNLoss, loss_function=self.loss_function)
         loss = make(q_actor(network), delay_value=True, double_dqn=self.double, action_space="categorical")
         return self.bootstrapped(loss)
 
@@ -108,16 +93,15 @@ class DistributionalDQN(OffPolicy):
             atoms=self.atoms,
         )
 
-    def make_loss(self, network: nn.Module) -> LossModule:
-        refuse_relu(self)
-        assert isinstance(network, AtomNetwork)
+    def make_loss(self, network: AtomNetwork) -> LossModule:
+        self.refuse_relu()
         actor = DistributionalQValueActor(
             OtherOutputs(network, "atom_logits"),
             support=network.support,
             spec=None,
             action_space="categorical",
         )
-        return DistributionalDQNLoss(actor, gamma=self.settings.gamma, delay_value=True)
+        return objectives.DistributionalDQNLoss(actor, gamma=self.settings.gamma, delay_value=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +130,7 @@ class CQL(OffPolicy):
         return loss
 
 
-class _WeightedCQLLoss(DiscreteCQLLoss):
+class _WeightedCQLLoss(objectives.DiscreteCQLLoss):
     """`DiscreteCQLLoss` with a weight for the conservative term."""
 
     def __init__(self, actor: QValueActor, *, weight: float, **options: Any) -> None:
@@ -178,10 +162,9 @@ class SAC(OffPolicy):
         actions = spaces.actions
         return self.new_networks(spaces, actor=actions, critic_0=actions, critic_1=actions)
 
-    def make_loss(self, network: nn.Module) -> LossModule:
-        refuse_relu(self)
-        assert isinstance(network, AgentNetworks)
-        loss = DiscreteSACLoss(
+    def make_loss(self, network: AgentNetworks) -> LossModule:
+        self.refuse_relu()
+        loss = objectives.DiscreteSACLoss(
             policy(network["actor"]),
             [module_of(network[name], "action_value") for name in ("critic_0", "critic_1")],
             action_space="categorical",
@@ -213,10 +196,9 @@ class IQL(OffPolicy):
         actions = spaces.actions
         return self.new_networks(spaces, actor=actions, critic_0=actions, critic_1=actions, value=1)
 
-    def make_loss(self, network: nn.Module) -> LossModule:
-        refuse_relu(self)
-        assert isinstance(network, AgentNetworks)
-        loss = DiscreteIQLLoss(
+    def make_loss(self, network: AgentNetworks) -> LossModule:
+        self.refuse_relu()
+        loss = objectives.DiscreteIQLLoss(
             policy(network["actor"]),
             [module_of(network[name], "state_action_value") for name in ("critic_0", "critic_1")],
             module_of(network["value"], "state_value"),
@@ -267,8 +249,7 @@ class PR2(OffPolicy):
         values = self.new_network(spaces, peers * actions * actions, **options)
         return JointNetwork(values, actions=actions, peers=peers, temperature=self.temperature)
 
-    def make_loss(self, network: nn.Module) -> LossModule:
-        assert isinstance(network, JointNetwork)
+    def make_loss(self, network: JointNetwork) -> LossModule:
         loss = PR2Loss(
             OtherOutputs(network, "joint_values"),
             temperature=self.temperature,

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from torch import nn
 from torchrl.objectives import A2CLoss, ClipPPOLoss, LossModule, ReinforceLoss
 
 from cprl.algorithms.base import OnPolicy, Weight, module_of, policy
@@ -27,7 +26,7 @@ class Clipped(OnPolicy, stored=False):
     loss_kind: ClassVar[Callable[..., LossModule]]
     """TorchRL's loss."""
 
-    def make_loss(self, network: nn.Module) -> LossModule:
+    def make_loss(self, network: AgentNetworks) -> LossModule:
         return _loss(
             network,
             self.loss_kind,
@@ -62,7 +61,7 @@ class A2C(OnPolicy):
     can_be_recurrent: ClassVar[bool] = True
     batching: ClassVar[Batching | None] = "lane_axis"
 
-    def make_loss(self, network: nn.Module) -> LossModule:
+    def make_loss(self, network: AgentNetworks) -> LossModule:
         return _loss(
             network,
             A2CLoss,
@@ -83,13 +82,12 @@ class Reinforce(OnPolicy):
     can_be_recurrent: ClassVar[bool] = True
     batching: ClassVar[Batching | None] = "lane_axis"
 
-    def make_loss(self, network: nn.Module) -> LossModule:
+    def make_loss(self, network: AgentNetworks) -> LossModule:
         loss = _loss(network, ReinforceLoss, loss_critic_type="l2")
         loss.set_keys(sample_log_prob="action_log_prob")
         return loss
 
 
-def _loss(network: nn.Module, kind: Callable[..., LossModule], **options: object) -> LossModule:
-    assert isinstance(network, AgentNetworks)
+def _loss(network: AgentNetworks, kind: Callable[..., LossModule], **options: object) -> LossModule:
     critic = module_of(network["critic"], "state_value", state="critic_recurrent_state")
     return kind(policy(network["actor"]), critic, **options)

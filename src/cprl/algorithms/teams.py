@@ -47,7 +47,7 @@ class VDN(TeamAlgorithm, OffPolicy):
         mixer = VDNMixer(len(members), device="cpu")
         return AgentNetworks({"actor": _team(members, spaces), "mixer": mixer})
 
-    def make_loss(self, network: nn.Module) -> LossModule:
+    def make_loss(self, network: AgentNetworks) -> LossModule:
         return self.bootstrapped(_mixed(network, [_CHOSEN]))
 
 
@@ -74,7 +74,7 @@ class QMIX(TeamAlgorithm, OffPolicy):
         )
         return AgentNetworks({"actor": _team(members, spaces), "mixer": mixer})
 
-    def make_loss(self, network: nn.Module) -> LossModule:
+    def make_loss(self, network: AgentNetworks) -> LossModule:
         return self.bootstrapped(_mixed(network, [_CHOSEN, "observation"]))
 
 
@@ -122,9 +122,8 @@ def _team(members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
     return Team(members, observation_dims=len(spaces.observation_shape))
 
 
-def _mixed(network: nn.Module, seen_by_mixer: Sequence[str]) -> LossModule:
+def _mixed(network: AgentNetworks, seen_by_mixer: Sequence[str]) -> LossModule:
     """`QMixerLoss` over a team's "actor" and "mixer", with entries at the root of the TensorDict."""
-    assert isinstance(network, AgentNetworks)
     loss = QMixerLoss(
         q_actor(network["actor"]),
         TensorDictModule(network["mixer"], list(seen_by_mixer), [_OF_TEAM]),
@@ -167,9 +166,7 @@ class MADDPG(TeamAlgorithm, OffPolicy):
         return self.new_network(spaces, spaces.actions)
 
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
-        dims = len(spaces.observation_shape)
-        actors = Team(members, observation_dims=dims)
-        return AgentNetworks({"actor": actors, "critic": self._critics(len(members), spaces)})
+        return AgentNetworks({"actor": _team(members, spaces), "critic": self._critics(len(members), spaces)})
 
     def _critics(self, members: int, spaces: Spaces) -> JointCritics:
         everything = members, *spaces.observation_shape
@@ -191,8 +188,7 @@ class MADDPG(TeamAlgorithm, OffPolicy):
             highest=spaces.observation_scale,
         )
 
-    def make_loss(self, network: nn.Module) -> LossModule:
-        assert isinstance(network, AgentNetworks)
+    def make_loss(self, network: AgentNetworks) -> LossModule:
         loss = MADDPGLoss(
             TensorDictModule(network["actor"], ["observation"], ["logits"]),
             TensorDictModule(network["critic"], ["observation", "joint_action"], ["state_action_value"]),
@@ -232,12 +228,8 @@ class LOLA(TeamAlgorithm):
     def make_network(self, spaces: Spaces) -> nn.Module:
         return self.new_networks(spaces, actor=spaces.actions, critic=1)
 
-    def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
-        return nn.ModuleList(members)
-
-    def make_loss(self, network: nn.Module) -> LossModule:
-        of_members: Any = network
-        actors = [policy(member["actor"]) for member in of_members]
+    def make_loss(self, network: Any) -> LossModule:
+        actors = [policy(member["actor"]) for member in network]
         make = LOLADiCELoss if self.estimator == "dice" else LOLALoss
         rate, gamma = self.settings.look_ahead_rate, self.settings.gamma
         return make(actors, look_ahead_rate=rate, gamma=gamma, entropy_coeff=self.entropy_coeff)

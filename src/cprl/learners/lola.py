@@ -239,13 +239,9 @@ class LOLALearner(LaneLearner):
         return -returns.mean((1, 2))
 
     def values(self, batch: TensorDictBase | Turn) -> Tensor:
-        """The value that each member's critic gives to the state after a turn, [B, S]."""
         with torch.no_grad():
             expected = self.engine.critics.outputs(self._lanes.seen_next(Turn.of(batch)))
         return self._lanes.by_world(expected)
-
-    def finite(self) -> Tensor:
-        return self.engine.finite()
 
     def state_dict(self) -> dict[str, Any]:
         rollouts = {"rollouts": self._rollouts.fields, "size": self._rollouts.size, "phase": self._phase}

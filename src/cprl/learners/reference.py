@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler, Sampler, SamplerWithoutReplacement
 from torchrl.objectives.value import GAE
@@ -23,7 +23,6 @@ from cprl.learners.lanes import Lanes, Method
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.ring import Noise
 from cprl.learners.rollouts import ACTOR, CRITIC, RolloutLearner
-from cprl.learners.settings import RolloutSettings
 from cprl.learners.transitions import LaneTurn
 from cprl.policies.rng import NOISE, SAMPLING, seed_of
 from cprl.system.memory import check_memory
@@ -196,7 +195,16 @@ class TorchRLRolloutLearner(RolloutLearner):
                 'the networks are recurrent; allowed with engine="torchrl", whose minibatches are single '
                 'turns: MLP, Conv, Custom; engine="compiled" and "eager" learn from sequences'
             )
-        self.estimators = [_gae(parts[CRITIC], settings) for parts in self.engine.parts]
+        self.estimators = [
+            GAE(
+                gamma=settings.gamma,
+                lmbda=settings.gae_lambda,
+                value_network=TensorDictModule(parts[CRITIC], ["observation"], ["state_value"]),
+                average_gae=settings.normalize_advantage,
+                deactivate_vmap=True,  # a user's network may not support it
+            )
+            for parts in self.engine.parts
+        ]
         make_sampler = make_sampler or (lambda lane: SamplerWithoutReplacement())
         self.buffer = StockBuffers(
             self._lanes,
@@ -240,16 +248,6 @@ def _refuse_sharing(who: LearningAgents) -> None:
         raise ValueError(
             'share_parameters is True; allowed with engine="torchrl", which trains independent agents: False'
         )
-
-
-def _gae(critic: nn.Module, settings: RolloutSettings) -> GAE:
-    return GAE(
-        gamma=settings.gamma,
-        lmbda=settings.gae_lambda,
-        value_network=TensorDictModule(critic, ["observation"], ["state_value"]),
-        average_gae=settings.normalize_advantage,
-        deactivate_vmap=True,  # a user's network may not support it
-    )
 
 
 def _transitions(turn: Mapping[str, Any], size: list[int]) -> TensorDict:

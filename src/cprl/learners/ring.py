@@ -234,21 +234,16 @@ class Ring:
         noise_seeds: Sequence[Sequence[int]] | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        self.horizon, self.sequence_steps, self.device = (
-            form.horizon,
-            form.sequence_steps,
-            torch.device(device),
-        )
+        self.horizon, self.sequence_steps = form.horizon, form.sequence_steps
+        self.device = torch.device(device)
         columns = torch.arange(len(seeds))[:, None] if columns is None else columns
         self.columns, count = columns.to(self.device), columns.numel()
         lanes, self.worlds = columns.shape
         self.capacity = turns = transitions // self.worlds
         """Turns T that are kept."""
         self.rows, self._ahead = _rows(turns), form.steps_ahead
-        needed, what = (
-            form.stored_bytes(count, turns),
-            f"{lanes} learners x {turns * self.worlds:,} transitions",
-        )
+        needed = form.stored_bytes(count, turns)
+        what = f"{lanes} learners x {turns * self.worlds:,} transitions"
         check_memory(
             f"the replay buffers of {what}",
             needed + form.sampled_bytes(lanes, batch_size),

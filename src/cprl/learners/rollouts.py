@@ -265,7 +265,6 @@ class RolloutLearner(LaneLearner):
         return logits, value, next_value
 
     def values(self, batch: TensorDictBase | Turn) -> Tensor:
-        """The value that each agent's critic gives to the state after a turn, [B, S]."""
         with torch.no_grad():
             seen = self._lanes.seen_next(Turn.of(batch))
             if self._states is None:

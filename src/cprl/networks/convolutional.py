@@ -12,12 +12,7 @@ from cprl.commons.spaces import Spaces
 from cprl.networks.mlp import MOST_CELLS, MOST_LAYERS, Layers, Options, check_size, glorot_uniform_, layers
 from cprl.values import Value, Where
 
-Channels = Annotated[
-    Layers,
-    Where(
-        lambda channels: len(channels) > 0, f"1 to {MOST_LAYERS} layers, each an integer in 1..{MOST_CELLS}"
-    ),
-]
+Channels = Annotated[Layers, Where(bool, f"1 to {MOST_LAYERS} layers, each an integer in 1..{MOST_CELLS}")]
 Kernel = Annotated[int, Where(lambda cells: 1 <= cells <= 999 and cells % 2 == 1, "1, 3, 5 and so on")]
 
 

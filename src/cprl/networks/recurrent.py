@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from cprl.commons.spaces import Spaces
 from cprl.networks.convolutional import Conv
 from cprl.networks.mlp import MLP, Cells, Options, check_size
-from cprl.networks.stacked import lane_state, stack_lanes
+from cprl.networks.stacked import lane_state, refuse_other_forms, stack_lanes
 from cprl.values import Value, Where
 
 Kind = Literal["GRU", "LSTM"]
@@ -135,9 +135,7 @@ class StackedRecurrent(nn.Module):
     def __init__(self, networks: Sequence[RecurrentNetwork]) -> None:
         super().__init__()
         first = networks[0]
-        forms = {tuple(value.shape for value in _layers(network)) for network in networks}
-        if len(forms) != 1:
-            raise ValueError(f"the networks of the lanes have {len(forms)} architectures; allowed: 1")
+        refuse_other_forms(tuple(value.shape for value in _layers(network)) for network in networks)
         self.lanes, self.outputs = len(networks), first.outputs
         self.observation_dims, self.state_shape = first.observation_dims, first.state_shape
         self.encoder = stack_lanes([network.encoder for network in networks])

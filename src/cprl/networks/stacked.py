@@ -1,6 +1,6 @@
 """The networks of many lanes as one, whose parameters carry a lane axis."""
 
-from collections.abc import Sequence, Set
+from collections.abc import Iterable, Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -21,8 +21,10 @@ class StackedMLP(nn.Module):
     def __init__(self, networks: Sequence[MLPNetwork]) -> None:
         super().__init__()
         first = networks[0]
-        forms = {(network.highest, network.relu_on_outputs, *_shapes(network)) for network in networks}
-        _refuse_other_forms(forms)
+        refuse_other_forms(
+            (network.highest, network.relu_on_outputs, *(layer.weight.shape for layer in network.linears))
+            for network in networks
+        )
         self.highest, self.relu_on_outputs = first.highest, first.relu_on_outputs
         self.observation_dims, self.outputs = first.observation_dims, first.outputs
         self._names = [name for name, layer in first.named_modules() if isinstance(layer, nn.Linear)]
@@ -80,8 +82,9 @@ class StackedModules(nn.Module):
         first: Any = networks[0]
         if next(first.buffers(), None) is not None:
             raise ValueError(f"a {type(first).__name__} has buffers; allowed: parameters alone")
-        forms = {tuple((name, value.shape) for name, value in one.named_parameters()) for one in networks}
-        _refuse_other_forms(forms)
+        refuse_other_forms(
+            tuple((name, value.shape) for name, value in network.named_parameters()) for network in networks
+        )
         self.lanes, self.observation_dims = len(networks), int(first.observation_dims)
         self.outputs = getattr(first, "outputs", None)
         self.state_shape = getattr(first, "state_shape", None)
@@ -169,10 +172,7 @@ def _over(network: Any) -> list[str]:
     return [name for name in names if getattr(network, name) is not None]
 
 
-def _refuse_other_forms(forms: Set[object]) -> None:
-    if len(forms) != 1:
-        raise ValueError(f"the networks of the lanes have {len(forms)} architectures; allowed: 1")
-
-
-def _shapes(network: MLPNetwork) -> tuple[tuple[int, ...], ...]:
-    return tuple(tuple(layer.weight.shape) for layer in network.linears)
+def refuse_other_forms(forms: Iterable[object]) -> None:
+    """Raises a ValueError unless all networks of a stack are of one form."""
+    if (count := len(set(forms))) != 1:
+        raise ValueError(f"the networks of the lanes have {count} architectures; allowed: 1")

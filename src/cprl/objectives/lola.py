@@ -30,7 +30,7 @@ Parameters: TypeAlias = Sequence[Sequence[Tensor]]
 """For each of N agents the tensors that it learns, of any shapes."""
 Objective: TypeAlias = Callable[[list[list[Tensor]]], Tensor]
 """Maps the parameters of N agents to their losses [.., N], by operations that torch differentiates twice."""
-_Flat: TypeAlias = tuple[Tensor, ...]
+_Nested: TypeAlias = list[list[Tensor]]
 
 
 def lola_gradients(
@@ -52,28 +52,27 @@ def lola_gradients(
         without a gradient. Where losses have axes before the agents', the gradients are those of the sums
         over them.
     """
-    flat, owners = _flat(parameters)
-    values = tuple(value.detach() for value in flat)
+    values = [[value.detach() for value in of_agent] for of_agent in parameters]
     estimates: list[Any] = [
-        torch.func.vjp(_slopes(objective, owners), *values, has_aux=True) for objective in objectives
+        torch.func.vjp(_slopes(objective), values, has_aux=True) for objective in objectives
     ]
-    slopes: list[list[_Flat]] = [aux[0] for _, _, aux in estimates]
-    gradients = [
-        _mean([of_agents[agent][place] for of_agents in slopes]) for place, agent in enumerate(owners)
-    ]
+    slopes: list[list[_Nested]] = [aux[0] for _, _, aux in estimates]
+    gradients = [_means([each[agent][agent] for each in slopes]) for agent in range(len(values))]
     for number, (_, pull, _) in enumerate(estimates if rate else ()):
         others = slopes[:number] + slopes[number + 1 :] or slopes
-        for agent in range(len(parameters)):
-            steps_matter = tuple(
-                torch.zeros_like(value)
+        for agent in range(len(values)):
+            steps_matter = [
+                [torch.zeros_like(value) for value in of_agent]
                 if owner == agent
-                else _mean([of_agents[agent][place] for of_agents in others]).detach()
-                for place, (value, owner) in enumerate(zip(values, owners, strict=True))
-            )
-            for place, product in enumerate(pull(steps_matter)):
-                if owners[place] == agent:
-                    gradients[place] = gradients[place] - rate / len(estimates) * product
-    return _by_agent(gradients, owners), _mean([aux[1].detach() for _, _, aux in estimates])
+                else [slope.detach() for slope in _means([each[agent][owner] for each in others])]
+                for owner, of_agent in enumerate(values)
+            ]
+            (products,) = pull(steps_matter)
+            gradients[agent] = [
+                slope - rate / len(estimates) * product
+                for slope, product in zip(gradients[agent], products[agent], strict=True)
+            ]
+    return gradients, _mean([aux[1].detach() for _, _, aux in estimates])
 
 
 def looked_ahead(
@@ -85,13 +84,13 @@ def looked_ahead(
         rate: the step size, 0..1e12.
         still: the index of an agent that does not move.
     """
-    flat, owners = _flat(parameters)
-    slopes: _Flat = _slopes(objective, owners)(*flat)[0]
-    ahead = [
-        value if agent == still else value - rate * slope
-        for value, slope, agent in zip(flat, slopes, owners, strict=True)
+    slopes, _ = _slopes(objective)([list(values) for values in parameters])
+    return [
+        list(values)
+        if agent == still
+        else [value - rate * slope for value, slope in zip(values, of_agent, strict=True)]
+        for agent, (values, of_agent) in enumerate(zip(parameters, slopes, strict=True))
     ]
-    return _by_agent(ahead, owners)
 
 
 def look_ahead_losses(
@@ -116,18 +115,16 @@ def look_ahead_losses(
     return torch.stack(losses, -1)
 
 
-def _slopes(
-    objective: Objective, owners: list[int]
-) -> Callable[..., tuple[_Flat, tuple[list[_Flat], Tensor]]]:
-    """A function of all tensors: the gradient of its own agent's loss by each; beside them those of each
-    agent's loss by each tensor, and the losses."""
+def _slopes(objective: Objective) -> Callable[[_Nested], tuple[_Nested, tuple[list[_Nested], Tensor]]]:
+    """A function of all parameters: the gradient of each agent's loss by its own; beside them those of each
+    agent's loss by the parameters of all, and the losses."""
 
-    def slopes(*flat: Tensor) -> tuple[_Flat, tuple[list[_Flat], Tensor]]:
+    def slopes(parameters: _Nested) -> tuple[_Nested, tuple[list[_Nested], Tensor]]:
         losses: Tensor
-        losses, pull = torch.func.vjp(lambda *values: objective(_by_agent(values, owners)), *flat)[:2]
-        units = torch.eye(owners[-1] + 1, dtype=losses.dtype, device=losses.device)
-        of_agents = [pull(unit.expand_as(losses).contiguous()) for unit in units]
-        return tuple(of_agents[agent][place] for place, agent in enumerate(owners)), (of_agents, losses)
+        losses, pull = torch.func.vjp(objective, parameters)[:2]
+        units = torch.eye(len(parameters), dtype=losses.dtype, device=losses.device)
+        of_agents = [pull(unit.expand_as(losses).contiguous())[0] for unit in units]
+        return [of_agent[agent] for agent, of_agent in enumerate(of_agents)], (of_agents, losses)
 
     return slopes
 
@@ -136,17 +133,9 @@ def _mean(values: Sequence[Tensor]) -> Tensor:
     return values[0] if len(values) == 1 else torch.stack(list(values)).mean(0)
 
 
-def _flat(parameters: Parameters) -> tuple[_Flat, list[int]]:
-    """All tensors, and the agent of each."""
-    pairs = [(value, agent) for agent, values in enumerate(parameters) for value in values]
-    return tuple(value for value, _ in pairs), [agent for _, agent in pairs]
-
-
-def _by_agent(values: Sequence[Tensor], owners: list[int]) -> list[list[Tensor]]:
-    return [
-        [value for value, owner in zip(values, owners, strict=True) if owner == agent]
-        for agent in range(owners[-1] + 1)
-    ]
+def _means(tables: Sequence[Sequence[Tensor]]) -> list[Tensor]:
+    """The mean of each tensor over several lists of them."""
+    return [_mean(values) for values in zip(*tables, strict=True)]
 
 
 def magic_box(log_prob: Tensor) -> Tensor:

@@ -56,9 +56,8 @@ class InequityAversion(Value):
 
     def wanted(self, rewards: Doubles, smoothed: Doubles) -> Doubles:
         """What agents want who get these rewards, [B, N], and have these smoothed ones."""
-        difference = (
-            smoothed[:, None, :] - smoothed[:, :, None]
-        )  # [B, one, other]: above 0 where one is behind
+        # [B, one, other]: above 0 where one is behind
+        difference = smoothed[:, None, :] - smoothed[:, :, None]
         behind, ahead = difference.clip(min=0).sum(-1), (-difference).clip(min=0).sum(-1)
         loss: Doubles = (self.alpha * behind + self.beta * ahead) / (rewards.shape[1] - 1)
         return rewards - loss
