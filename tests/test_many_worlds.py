@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from dqn_parts import MEADOW, make_learner
+from torch.nn import functional
 
 import cprl
 from cprl import CommonsEnv, Experiment, Game, Rules, Study, algorithms, maps
@@ -221,6 +222,99 @@ def learner_of(algorithm, worlds, **how):
     return make_learner(
         algorithm, MEADOW.spaces, engine="eager", agents=(0, 1), replicas=1, worlds=worlds, **how
     )
+
+
+def linear(network, seen):
+    """The outputs of a network without hidden layers for observations [n, C, X, Y]."""
+    (layer,) = network.linears
+    return functional.linear(seen.flatten(1).float() / 255, layer.weight, layer.bias)
+
+
+def test_an_update_of_dqn_in_two_worlds_is_the_one_by_hand():
+    settings = DQNSettings(
+        buffer_size=40, batch_size=6, hidden_cells=(), learning_rate=0.5, optimizer="sgd", gamma=0.9,
+        learning_starts=10, steps_per_update=22,
+    )  # fmt: skip
+    learner, played = learner_of(DQN(settings=settings), 2), turns_of(2, 15)
+    networks = learner.networks()
+    for turn in played:
+        learner.store(turn)
+    numbers = learner.buffer.rng.next().clone()  # by which the update would draw
+    learner.buffer.rng._used -= 1
+    losses = learner.update()
+    for agent in range(2):
+        network = networks[f"replica_0/agent_{agent}"]
+        # The numbers count through the 15 transitions of world 0, then those of world 1.
+        drawn = [divmod(int(number * 30), 15) for number in numbers[agent]]
+        assert len({world for world, _ in drawn}) == 2
+        errors = []
+        for world, step in drawn:
+            turn = played[step][world]
+            after = turn["next"]
+            with torch.no_grad():
+                best = linear(network, after["agents", "observation"][agent][None]).max()
+            reward, goes_on = after["agents", "reward"][agent, 0], ~after["terminated"][0]
+            value = linear(network, turn["agents", "observation"][agent][None])[
+                0, turn["agents", "action"][agent]
+            ]
+            errors.append((reward + 0.9 * goes_on * best - value) ** 2)
+        loss = torch.stack(errors).mean()
+        loss.backward()
+        torch.testing.assert_close(losses[0, agent], loss.detach())
+        found = learner.networks()[f"replica_0/agent_{agent}"]
+        for own, wanted in zip(found.parameters(), network.parameters(), strict=True):
+            torch.testing.assert_close(
+                own.detach(), wanted.detach() - 0.5 * wanted.grad, rtol=1e-5, atol=1e-6
+            )
+
+
+def test_an_update_of_ppo_in_two_worlds_is_the_one_by_hand():
+    settings = RolloutSettings(
+        rollout_steps=14, minibatch_size=28, epochs=1, hidden_cells=(), learning_rate=0.5, optimizer="sgd",
+        gamma=0.9, gae_lambda=0.8, max_grad_norm=None,
+    )  # fmt: skip
+    algorithm = PPO(settings=settings, entropy_coeff=0.0, critic_coeff=0.5)
+    learner, played = learner_of(algorithm, 2), turns_of(2, 14)
+    actors = learner.networks()
+    critics = [
+        {name: value.clone() for name, value in learner.engine.weights(agent).items() if "critic" in name}
+        for agent in range(2)
+    ]
+    for turn in played:
+        learner.store(turn)
+    learner.update()
+    for agent in range(2):
+        actor = actors[f"replica_0/agent_{agent}"]
+        weight, bias = (
+            next(value for name, value in critics[agent].items() if name.endswith(part))
+            for part in ("weights.0", "biases.0")
+        )
+
+        def value_of(seen, weight=weight, bias=bias):
+            return (seen.flatten().float() / 255 @ weight + bias.flatten())[0]
+
+        advantages, chances = [], []
+        for world in range(2):
+            gain = 0.0
+            for turn in reversed(played):
+                now, after = turn[world], turn[world]["next"]
+                value = value_of(now["agents", "observation"][agent])
+                following = value_of(after["agents", "observation"][agent])
+                reward = after["agents", "reward"][agent, 0]
+                delta = reward + 0.9 * following * ~after["terminated"][0] - value
+                gain = delta + 0.9 * 0.8 * ~after["done"][0] * gain
+                logits = linear(actor, now["agents", "observation"][agent][None])[0]
+                chances.append(logits.log_softmax(-1)[now["agents", "action"][agent]])
+                advantages.append(gain)
+        gains = torch.stack(advantages)
+        gains = (gains - gains.mean()) / (gains.std() + 1e-8)
+        chances = torch.stack(chances)
+        (-gains.detach() * (chances - chances.detach()).exp()).mean().backward()
+        found = learner.networks()[f"replica_0/agent_{agent}"]
+        for own, wanted in zip(found.parameters(), actor.parameters(), strict=True):
+            torch.testing.assert_close(
+                own.detach(), wanted.detach() - 0.5 * wanted.grad, rtol=1e-4, atol=1e-6
+            )
 
 
 def in_two_orders(algorithm):

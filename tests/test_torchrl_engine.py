@@ -187,6 +187,29 @@ def test_every_part_is_torchrls_or_torchs_own(name):
         assert all(type(updater) is objectives.HardUpdate for updater in learner.engine.updaters)
 
 
+def stock(algorithm):
+    return make_learner(algorithm, SPACES, engine="torchrl", **HOW)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("adam", torch.optim.Adam),
+        ("adamw", torch.optim.AdamW),
+        ("rmsprop", torch.optim.RMSprop),
+        ("keras_rmsprop", torch.optim.RMSprop),
+        ("sgd", torch.optim.SGD),
+    ],
+)
+def test_the_optimiser_its_rate_and_its_epsilon_are_those_of_the_settings(name, kind):
+    settings = replace(REPLAY, optimizer=name, adam_eps=1e-3)
+    for optimizer in stock(DQN(settings=settings)).engine.optimizers:
+        (group,) = optimizer.param_groups
+        assert type(optimizer) is kind
+        assert group["lr"] == settings.learning_rate
+        assert group.get("eps", 1e-3) == 1e-3
+
+
 RESUMED = {
     **ALGORITHMS,
     "everything of replay": DQN(
@@ -222,7 +245,7 @@ def leaves(state):
     ],
 )
 def test_a_stopped_learner_continues_bit_for_bit(name, steps):
-    whole, stopped, again = (make_learner(RESUMED[name], SPACES, engine="torchrl", **HOW) for _ in range(3))
+    whole, stopped, again = (stock(RESUMED[name]) for _ in range(3))
     played = turns(LaneActor(None, SPACES.actions, seeds=[(r, a) for r in (0, 1) for a in (0, 1)], agents=2))
     before = [next(played).clone() for _ in range(steps)]
     after = [next(played).clone() for _ in range(35)]
@@ -273,6 +296,22 @@ def test_teams_and_tables_are_refused_by_name(name):
     match = f'{name} does not support engine="torchrl", .*"compiled" or "eager"'
     with pytest.raises(ValueError, match=match):
         make_learner(kind(settings=settings), SPACES, engine="torchrl", reward_kind="team", **HOW)
+
+
+def test_other_losses_networks_and_sizes_are_refused():
+    with pytest.raises(ValueError, match="ClipPPOLoss is on-policy and cannot learn from a replay buffer"):
+        learner_of_parts(
+            TorchRLReplayLearner, PPO(settings=ROLLOUT), SPACES, parts={"settings": REPLAY}, **HOW
+        )
+    parts = {"make_network": partial(DQN(settings=REPLAY).make_network, SPACES)}
+    with pytest.raises(ValueError, match="an agent has the networks"):
+        learner_of_parts(TorchRLRolloutLearner, PPO(settings=ROLLOUT), SPACES, parts=parts, **HOW)
+    with pytest.raises(ValueError, match=r"n_steps is 3; allowed with engine=\"torchrl\".*: 1"):
+        stock(DQN(settings=replace(REPLAY, n_steps=3)))
+    with pytest.raises(
+        MemoryError, match=r"4 agents x 1,000,000,000,000 transitions take .* smaller buffer_size"
+    ):
+        stock(DQN(settings=replace(REPLAY, buffer_size=10**12)))
 
 
 @pytest.mark.parametrize("kind", [TorchRLReplayLearner, ReplayLearner])
