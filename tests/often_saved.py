@@ -29,6 +29,3 @@ class OftenSaved:
         if self.steps == DIES_AT_STEP and path.is_file() and (deaths := int(path.read_text())):
             path.write_text(str(deaths - 1))
             os.kill(os.getpid(), signal.SIGKILL)
-
-    def on_episode(self, episode, learning):
-        """Nothing."""

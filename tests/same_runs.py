@@ -3,6 +3,7 @@
 import json
 import re
 import time
+from pathlib import Path
 
 import psutil
 import pyarrow.parquet as pq
@@ -55,6 +56,11 @@ def files(run):
     """All files but recordings, of which each process writes one; names without checksums."""
     paths = [path for path in run.rglob("*") if path.is_file() and path.suffix != ".rrd"]
     return {re.sub(r"-[0-9a-f]{32}", "", path.relative_to(run).as_posix()): path for path in paths}
+
+
+def written_at(folder):
+    """When all files of a folder were written."""
+    return {path: path.stat().st_mtime_ns for path in Path(folder).rglob("*")}
 
 
 def reader(name):

@@ -52,6 +52,10 @@ class InterruptionError(Exception):
     """Stands for whatever ends a process."""
 
 
+def interrupted(*_, **__):
+    raise InterruptionError
+
+
 def run(experiment, out, **options):
     return cprl.run(experiment, out, watch="off", **options)
 
@@ -209,9 +213,6 @@ SLOW = ("save_transforms", "training_curve", "write_json", "summarise")
     ["save_weights", "evaluate_population", *(pytest.param(stage, marks=pytest.mark.slow) for stage in SLOW)],
 )
 def test_a_run_interrupted_in_any_stage_is_finished_by_resuming_it(stage, whole, tmp_path, monkeypatch):
-    def interrupted(*_, **__):
-        raise InterruptionError
-
     with monkeypatch.context() as patched:
         patched.setattr(running, stage, interrupted)
         with pytest.raises(InterruptionError) as ended:
@@ -257,10 +258,6 @@ def test_a_finished_run_is_extended_bit_for_bit_and_its_earlier_results_are_kept
 @pytest.mark.slow
 def test_an_extension_that_is_interrupted_is_resumed(whole, longer, tmp_path, monkeypatch):
     extended = shutil.copytree(whole, tmp_path / "extended")
-
-    def interrupted(*_, **__):
-        raise InterruptionError
-
     more = replace(FIELD, episodes=9)
     for stage in ("train", "save_weights", "evaluate_population"):
         with monkeypatch.context() as patched:
@@ -342,9 +339,7 @@ def test_what_cannot_be_extended_bit_for_bit_is_refused_before_anything_is_writt
         resumed(replace(FIELD, episodes=6), bare)
     assert contents(bare) == before
     seeing = run(replace(MEADOW, episodes=2), tmp_path / "seeing")
-    with pytest.raises(
-        ValueError, match="has the callback Bored, whose on_start sees the number of episodes"
-    ):
+    with pytest.raises(ValueError, match="callback Bored, whose on_start sees the number of episodes"):
         resumed(replace(MEADOW, episodes=3), seeing)
     damaged = shutil.copytree(whole, tmp_path / "damaged")
     (ending,) = filter(is_ending, checkpoints_in(damaged / "checkpoints"))
@@ -376,9 +371,7 @@ def test_a_run_that_is_written_is_locked_by_name_until_its_process_dies(tmp_path
             os.write(say, b"locked")
             signal.pause()
     os.read(heard, 6)
-    with pytest.raises(
-        RunLockedError, match=f"being written by process {child} on {socket.gethostname()} since"
-    ):
+    with pytest.raises(RunLockedError, match=f"process {child} on {socket.gethostname()} since"):
         RunLock(tmp_path).__enter__()
     with pytest.raises(RunLockedError), Checkpointer(tmp_path, take_over=True):
         pass

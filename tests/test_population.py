@@ -71,9 +71,6 @@ class Returns:
     def __init__(self):
         self.of = {}
 
-    def on_step(self, batch):
-        """Only whole episodes are of interest."""
-
     def on_episode(self, episode, learning):
         self.of.setdefault(episode.world, []).append(episode.return_.tolist())
 
@@ -326,9 +323,6 @@ def test_a_tabular_agent_is_paid_for_itself_or_for_the_group(reward_kind):
             for replica, reward in enumerate(paid_now.tolist()):
                 seen = batch["agents", "observation"][replica, 1].numpy().tobytes()
                 self.last[replica, seen, int(batch["agents", "action"][replica, 1])] = reward
-
-        def on_episode(self, episode, learning):
-            """Nothing."""
 
     algorithm = Tabular(settings=TabularSettings(gamma=0.0, learning_rate=1.0))
     agents = population(

@@ -61,9 +61,7 @@ def test_a_target_updater_of_torchrls_that_would_have_no_effect_is_refused(updat
         updaters.append(updater(loss))
         return loss
 
-    with pytest.raises(
-        ValueError, match=r"a SoftUpdate or HardUpdate was built on the DQNLoss; .* set tau or"
-    ):
+    with pytest.raises(ValueError, match=r"a SoftUpdate or HardUpdate .* DQNLoss; .* set tau or"):
         dqn_learner(SPACES, agents=(0,), replicas=1, settings=REPLAY, make_loss=make_loss, engine=engine)
 
 
@@ -123,7 +121,6 @@ def test_a_loss_that_reads_steps_in_a_row_is_refused_with_replay():
 
 
 def kl_loss(network):
-
     critic = TensorDictModule(network["critic"], ["observation"], ["state_value"])
     return KLPENPPOLoss(policy(network["actor"]), critic, loss_critic_type="l2", dtarg=0.0001)
 
@@ -160,9 +157,7 @@ def test_a_loss_that_reads_what_batches_do_not_have_is_refused_by_the_name_of_th
         made = PPO(settings=ROLLOUTS).make_loss(network)
         return Demanding(made.actor_network, made.critic_network)
 
-    with pytest.raises(
-        ValueError, match=r"the loss reads an entry that its batches do not have: .*weather.*advantage"
-    ):
+    with pytest.raises(ValueError, match=r"batches do not have: .*weather.*advantage"):
         rollout_learner(make_loss)
 
 
@@ -180,9 +175,7 @@ def test_what_no_network_sees_is_refused_but_tables_read_it(observed):
     with pytest.raises(ValueError, match="allowed for networks"):
         make_learner(QMIX(settings=REPLAY), spaces, agents=(0, 1), replicas=1, reward_kind="team")
     TabularLearner(LearningAgents(spaces, agents=(0,), replicas=1), TabularSettings())
-    with pytest.raises(
-        ValueError, match=rf"Observation\.{name} is 'plane'; allowed: True or False or 'planes'"
-    ):
+    with pytest.raises(ValueError, match=rf"Observation\.{name} is 'plane'"):
         Observation(**{name: "plane"})
 
 

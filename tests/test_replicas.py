@@ -6,13 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from dqn_parts import MEADOW as GAME
 from dqn_parts import dqn_learner, make_learner
 from tensordict import TensorDict, assert_close
 from test_torchrl_env import ByWindow
+from test_train import Witness
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cprl import CommonsEnv, Game, Rules, keys, maps
+from cprl import CommonsEnv, keys
 from cprl.algorithms import DQN
 from cprl.commons.spaces import Spaces
 from cprl.learners.settings import DQNSettings
@@ -23,10 +25,6 @@ from cprl.runs.episodes import EpisodeTable, read_episodes
 from cprl.training import train
 from cprl.training.training import StepCollector
 
-GAME = Game(
-    map=maps.parse(".A>.A\n.A.A.\n..<.A"),
-    rules=Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=12, freeze_steps=2),
-)
 SETTINGS = DQNSettings(
     buffer_size=150,
     batch_size=4,
@@ -37,26 +35,6 @@ SETTINGS = DQNSettings(
     target_every_episodes=2,
 )
 ENGINES = ["list", "vmapped", "lane_axis"]
-
-
-class Witness:
-    def __init__(self):
-        self.episodes, self.learning = [], []
-
-    def on_step(self, batch):
-        """Only whole episodes are of interest."""
-
-    def on_episode(self, episode, learning):
-        self.episodes.append(episode)
-        self.learning.append(learning)
-
-    def course(self, replica):
-        """Returns and losses of one replica, episode by episode."""
-        mine = [at for at, episode in enumerate(self.episodes) if episode.world == replica]
-        returns = [self.episodes[at].return_.tolist() for at in mine]
-        return returns, [
-            [value for name, value in self.learning[at].items() if "loss" in name] for at in mine
-        ]
 
 
 def learner(engine="lane_axis", *, game=GAME, agents=(0, 1), settings=SETTINGS, **how):
@@ -74,8 +52,9 @@ def test_every_replica_is_told_of_so_many_episodes_and_of_its_losses(tmp_path):
         told = zip(rows["replica"], rows["agent"], rows["episode"], strict=True)
         episodes = [episode for number, agent, episode in told if (number, agent) == (replica, 1)]
         assert episodes == [0, 1, 2, 3, 4]
-        _, losses = witness.course(replica)
-        assert np.isfinite(losses[-1]).all()
+        learning = zip(witness.episodes, witness.learning, strict=True)
+        *_, last = (learned for episode, learned in learning if episode.world == replica)
+        assert np.isfinite([last["agent_0/loss"], last["agent_1/loss"]]).all()
     assert set(witness.learning[0]) == {
         f"agent_{i}/{name}" for i in (0, 1) for name in ("loss", "epsilon", "q")
     }
@@ -186,22 +165,6 @@ def test_the_first_replica_alone_acts_with_the_weights_of_the_moment(engine):
     with set_exploration_type(ExplorationType.RANDOM):
         for _ in range(20):
             assert torch.equal(alone.choose(windows[:1]), of_all.choose(windows)[:1])
-
-
-@pytest.mark.parametrize(
-    ("learners", "others", "message"),
-    [
-        ({(0, 1): {"replicas": 3}}, {}, r"has 2 replicas of 1 worlds; the learner of \(0, 1\) has 3"),
-        ({(0,): {"replicas": 2}}, {}, r"made for the agents \(0, 1\) is given for \(0,\)"),
-        ({(0, 1): {"replicas": 2}}, {1: RandomActor(8)}, r"control the agents \[0, 1, 1\]"),
-    ],
-)
-def test_learners_that_do_not_fit_are_refused(learners, others, message):
-    made = {agent: learner(**how) for agent, how in learners.items()}
-    if (0,) in made:
-        others = {1: RandomActor(8)}
-    with pytest.raises(ValueError, match=message):
-        train(CommonsEnv(GAME, 2), made, others=others, episodes=1)
 
 
 def test_seats_take_every_agent_once():

@@ -172,7 +172,8 @@ def test_where_nothing_can_be_resumed_that_is_said(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             resume(directory)
-    for text in ("{", "[]", '{"arguments": 3}', '{"experiment": []}'):
+    texts = ["{", "[]", "[" * 100_000, '{"arguments": 3}', '{"experiment": []}', '{"experiment": {}}\0']
+    for text in (*texts, '{"experiment": ' + "9" * 5000 + "}"):
         (tmp_path / "recipe.json").write_text(text)
         with pytest.raises(ValueError, match=r"recipe\.json is not the recipe of a run: "):
             read_recipe(tmp_path)

@@ -234,13 +234,3 @@ def test_weights_that_are_not_finite_are_no_start(stored, tmp_path):
     save_weights(tmp_path / "alone", networks)
     with pytest.raises(ValueError, match="weights of replica_0/agent_0 are NaN or infinite; leave that rep"):
         population([spec, *[Scripted()] * 3])
-
-
-def test_a_frozen_agent_can_be_that_of_its_own_replica(stored):
-    own = population([Frozen(f"{stored}/alone", 0, replica=None), *[Scripted()] * 3])
-    each = [population([Frozen(f"{stored}/alone", 0, replica), *[Scripted()] * 3]) for replica in (0, 1)]
-    seen = torch.randint(256, (2, 1, *FOUR.spaces.observation_shape), dtype=torch.uint8)
-    values = own.others[0,].values(seen)
-    torch.testing.assert_close(values[0], each[0].others[0,].values(seen)[0])
-    torch.testing.assert_close(values[1], each[1].others[0,].values(seen)[1])
-    assert not torch.allclose(values[1], each[0].others[0,].values(seen)[1])

@@ -337,24 +337,6 @@ def test_reproduce_runs_what_is_missing_and_reports(tmp_path, monkeypatch, short
         reproduce.main(runs=tmp_path, only=("fishery",))
 
 
-def test_reproduce_refuses_a_finished_run_of_another_recipe_with_the_words_of_its_recipe(
-    tmp_path, monkeypatch
-):
-    finished = tmp_path / "single_basic"
-    finished.mkdir()
-    for name in ("recipe.json", "report.json"):
-        (finished / name).write_text("{}")
-
-    def refuse(command, *, stdout, **options):
-        assert command[-1] == "--resume"
-        stdout.write("single_basic.py: it was started with another recipe: episodes 9 and 5\n")
-        return SimpleNamespace(returncode=1)
-
-    monkeypatch.setattr(reproduce, "subprocess", SimpleNamespace(run=refuse, STDOUT=None))
-    with pytest.raises(ChildProcessError, match=r"single_basic ended with 1 .*: episodes 9 and 5$"):
-        reproduce.run("single_basic", [], runs=tmp_path, results=tmp_path / "results")
-
-
 @pytest.mark.parametrize("reason", [ChildProcessError, KeyboardInterrupt])
 def test_reproduce_begins_nothing_more_once_an_experiment_has_failed_or_after_ctrl_c(
     reason, tmp_path, monkeypatch

@@ -456,24 +456,6 @@ def drawn(monkeypatch):
     return made
 
 
-@pytest.mark.integration
-def test_figures_of_a_grid_are_drawn_with_a_condition_that_has_no_run(grid_runs, tmp_path):
-    table = study_table(GRID, grid_runs)
-    (pair,) = figures.grids(table.design)
-    assert pair == (TIME_OUT, SEES)
-    for name, draw in {
-        "factor": lambda path: figures.by_factor(table, TIME_OUT, path),
-        "levels": lambda path: figures.by_condition(table, path),
-        "differences": lambda path: figures.by_condition(table, path, kind="differences"),
-        "courses": lambda path: figures.courses(table, path),
-        "map": lambda path: figures.heat_map(table, pair, path),
-        "phases": lambda path: figures.phase_diagram(table, pair, path),
-    }.items():
-        assert_drawn(draw(tmp_path / f"{name}.png"))
-        with pytest.raises(ValueError, match=r"path is '.*\.jpg'"):
-            draw(tmp_path / f"{name}.jpg")
-
-
 LONG = "agents.*.algorithm.settings"
 
 
@@ -644,6 +626,8 @@ def test_other_factors_are_held_at_the_levels_of_the_reference():
 def test_the_results_of_a_study_are_a_table_a_summary_and_figures(grid_runs, tmp_path):
     table = results.write_results(GRID, tmp_path, grid_runs, again="cprl sweep grid.py")
     drawn = {path.name for path in (tmp_path / "figures").iterdir()}
+    for name in drawn:
+        assert_drawn(tmp_path / "figures" / name)
     pair = "game_rules_freeze_steps_game_rules_window_rows"
     assert drawn == {
         "by_game_rules_freeze_steps.png", "by_game_rules_window_rows.png", "levels.png", "courses.png",

@@ -72,12 +72,14 @@ def test_observers_see_every_turn_and_every_episode_and_each_learner_stores_its_
         (1, {"others": {0: RandomActor(8), **OTHER}}, r"control the agents \[0, 0, 1\]"),
         (1, {"episodes": 0}, "episodes is 0"),
         (1, {"callbacks": [7]}, "callback 7"),
+        (1, {"agent": 1}, r"made for the agents \(1,\) is given for \(0,\)"),
         (2, {}, r"has 2 replicas of 1 worlds; the learner of \(0,\) has 1 of 1"),
     ],
 )
 def test_what_cannot_be_trained_is_refused(worlds, arguments, message):
+    given = {"agent": 0, "others": OTHER, "episodes": 1, **arguments}
     with pytest.raises(ValueError, match=message):
-        train(CommonsEnv(GAME, worlds), {(0,): learner()}, **{"others": OTHER, "episodes": 1, **arguments})
+        train(CommonsEnv(GAME, worlds), {(0,): learner(given.pop("agent"))}, **given)
 
 
 def test_learning_may_wait_for_several_steps_and_then_catches_up():
@@ -115,9 +117,7 @@ def test_checkpoints_of_what_keeps_no_state_are_refused_before_anything_is_playe
     env, witness = CommonsEnv(GAME), Witness()
     saving = {"episodes": 1, "checkpointer": Checkpointer(tmp_path), "callbacks": [witness]}
     agents = dqn_learner(GAME.spaces, agents=(0, 1), replicas=1, settings=SETTINGS, compile=False)
-    with pytest.raises(
-        ValueError, match="a Collector has no state to resume from; train with a StepCollector"
-    ):
+    with pytest.raises(ValueError, match="a Collector has no state to resume from"):
         train(env, {(0, 1): agents}, make_collector=stock_collector, **saving)
     assert witness.turns == []
 

@@ -19,7 +19,7 @@ import psutil
 import pyarrow.compute as pc
 import pytest
 from rich.console import Console
-from same_runs import assert_same_study, attempts_of, differences, log_of, still_alive
+from same_runs import assert_same_study, attempts_of, differences, log_of, still_alive, written_at
 from study_runs import EXPERIMENT, TIME_OUT, write_run
 from tiny_study import FREEZE, OFTEN_SAVED, TINY
 
@@ -52,11 +52,6 @@ def undisturbed(tmp_path_factory):
     first = task_in(tmp_path_factory.mktemp("undisturbed"))
     assert first.run_here().worked
     return first.directory
-
-
-def written_at(folder):
-    """When all files of a folder were written."""
-    return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
 @pytest.fixture
@@ -647,13 +642,6 @@ def test_a_trial_runs_while_it_says_something_new_whatever_the_clock_says(says, 
     assert look()[1].state == "evaluating", "all are played, and it is not finished yet"
     monkeypatch.setattr(progress, "SILENT_S", 0.0)
     assert look()[1].state == "missing"
-
-
-def test_failures_have_their_reason_and_stand_before_those_that_are_missing(look, tmp_path):
-    Status(tmp_path / "status", TRIALS[2].name).fail("ValueError: of | chance", "trace")
-    snapshot, row = look(2)
-    assert snapshot.rows[0] is row
-    assert row.note == "ValueError: of | chance"
 
 
 @pytest.mark.integration

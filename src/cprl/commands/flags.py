@@ -86,7 +86,8 @@ class ValueFlags(ConstructorRegistry):
             ]
             kind = tuple[tuple(kinds)]  # type: ignore[misc]
         else:
-            kind = _sayable(field.type, value)
+            kind = _simple(field.type)
+            kind = None if kind in (None, NoneType) or not fits(value, kind) else kind
         if kind is None:
             return None
         if self._listed is not None and not any(f"{path}.".startswith(f"{place}.") for path in self._listed):
@@ -99,11 +100,6 @@ def _is_code(value: Any) -> bool:
 
     parts = value if isinstance(value, tuple) else (value,)
     return any(isinstance(part, Custom | Map) for part in parts)
-
-
-def _sayable(hint: Any, value: Any) -> Any:
-    simple = _simple(hint)
-    return None if simple in (None, NoneType) or not fits(value, simple) else simple
 
 
 _WORDS: Final = (bool, int, float, str, NoneType)

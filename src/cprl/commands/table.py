@@ -85,11 +85,11 @@ def table(
         OUT.write(study_table.to_csv())
         return
 
-    from cprl.studies.tables.comparing import of_finished
+    from cprl.studies.tables.comparing import compared_cells, of_finished
     from cprl.terminal.tables import show
 
     last = LAST if compare.last is None else compare.last
-    compared = _compared(study_table, compare.metric, compare.part, last)
+    compared = compared_cells(study_table, compare.metric, part=compare.part, last=last)
     show(map(of_finished, compared))
     say(str(study_table))
     if summary:
@@ -119,16 +119,6 @@ def _table_in(runs: Sequence[Path], reference: str | None, window: int | None) -
         names = ", ".join(list(table.design.conditions)[:10])
         raise ValueError(f"--reference is {reference}; allowed: the name of a condition: {names}")
     return replace(table, design=replace(table.design, reference=reference))
-
-
-def _compared(table: "StudyTable", metrics: Sequence[str], part: Part, last: int) -> "list[Cells]":
-    from cprl.studies.tables.comparing import cells, compare, metrics_of
-
-    comparisons = [compare(table, metric, part=part, last=last) for metric in metrics_of(table, metrics)]
-    if not comparisons:
-        return []
-    several = len(table.design.conditions) > 1
-    return [cells(comparisons), cells(comparisons, "differences")] if several else [cells(comparisons)]
 
 
 def _write(table: "StudyTable", compared: "Sequence[Cells]", out: Path) -> None:

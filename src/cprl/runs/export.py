@@ -4,8 +4,10 @@ import json
 import os
 from collections.abc import Mapping
 from functools import partial
+from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from shutil import copyfileobj
+from typing import Any, Final
 
 import pyarrow as pa
 
@@ -60,15 +62,11 @@ def export_results(run: Path, folder: Path, *, weights: bool = True) -> Path:
     if moved != recipe:
         contents[RECIPE_FILE] = (json.dumps(moved, indent=2) + "\n").encode()
     for name, content in contents.items():
-        write_listed(folder, name, partial(_write_bytes, content))
+        write_listed(folder, name, partial(copyfileobj, BytesIO(content)))
     _write(read_episodes(run), folder, FILE_NAME)
     for path in sorted((run / "evaluation").glob("*.parquet")):
         _write(read_table(path), folder, f"evaluation/{path.name}")
     return folder
-
-
-def _write_bytes(content: bytes, file: BinaryIO) -> None:
-    file.write(content)
 
 
 def _refuse_another(folder: Path, run: Path, recipe: Mapping[str, Any]) -> None:
@@ -88,7 +86,6 @@ def _refuse_another(folder: Path, run: Path, recipe: Mapping[str, Any]) -> None:
 
 def _with_frozen_moved(recipe: Mapping[str, Any], run: Path, folder: Path) -> dict[str, Any]:
     """A recipe whose runs of `Frozen` agents are relative to `folder`, where they were to `run`."""
-
     table: dict[str, Any] = with_runs_moved(recipe, run, folder)
     if FROZEN in table:
         checksums = table[FROZEN].items()

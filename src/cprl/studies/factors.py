@@ -209,9 +209,7 @@ def checked_factors(factors: Mapping[str, Any]) -> dict[str, Factor]:
         if isinstance(factor, Distribution):
             normal[path] = factor
         elif isinstance(values, tuple) and values:
-            is_run = STORED_RUN.fullmatch(
-                path
-            )  # which Frozen keeps like this, so that levels keep their names
+            is_run = STORED_RUN.fullmatch(path)  # which Frozen keeps like this: levels keep their names
             normal[path] = tuple(normpath(run) if run else run for run in values) if is_run else values
         else:
             raise refusal(

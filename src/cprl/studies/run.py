@@ -125,7 +125,10 @@ def shared(study: Study, out: Path, *, progress: bool) -> Iterator[None]:
         if lock.is_alone:
             remove_partial(out, out / STATUS, out / "figures")
         elif progress:
-            say(_others(out))
+            say(
+                f"{out} is run by somebody else too, {holder_of(out)}, or was when its host went down: each "
+                "trial is run by the one that begins it first; the other continues with the rest"
+            )
         write_study(study, out)
         yield
 
@@ -179,10 +182,3 @@ def _outcomes(tasks: Sequence[Task], executor: Executor) -> Generator[Outcome, N
             time.sleep(_POLL_S)
             left = [replace(task, take_over=next(silences[task.name])) for task in left]
             ready = [task for task in left if task.settled() != Outcome(task.name, "elsewhere")]
-
-
-def _others(out: Path) -> str:
-    return (
-        f"{out} is run by somebody else too, {holder_of(out)}, or was when its host went down: each trial is "
-        "run by the one that begins it first; the other continues with the rest"
-    )

@@ -253,9 +253,10 @@ class Task:
                     write_on_nan(run, experiment.on_nan)
         if state_of(run) != "missing":
             return None
-        partners = sorted({spec.run for spec in experiment.agents if isinstance(spec, Frozen)})
         try:
-            start_run(run, experiment.name, lambda run: {**self.recipe, **partners_of(run, partners)})
+            start_run(
+                run, experiment.name, lambda run: {**self.recipe, **partners_of(run, experiment.agents)}
+            )
         except FileExistsError:
             if state_of(run) == "missing" and not (run / LOCK_FILE).exists():
                 raise

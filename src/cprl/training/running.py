@@ -16,7 +16,7 @@ from cprl.envs.state import transforms_state
 from cprl.envs.unwrap import agent_names
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode, own_name, try_own_metrics
-from cprl.population import Frozen, exploration_steps
+from cprl.population import exploration_steps
 from cprl.runs.checkpoints import FOLDER, REPORT, Checkpointer, checkpoints_in, extend, refuse_to_extend
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.files import LOCK_FILE, RunLockedError, refuse_missing, write_json
@@ -30,7 +30,14 @@ from cprl.runs.recipe import (
     write_circumstances,
     write_on_nan,
 )
-from cprl.runs.weights import partners_of, save_decisions, save_transforms, save_weights, weights_of
+from cprl.runs.weights import (
+    partners_in,
+    partners_of,
+    save_decisions,
+    save_transforms,
+    save_weights,
+    weights_of,
+)
 from cprl.system.compiling import cleared_up
 from cprl.system.output import RESUMES, console, say
 from cprl.system.process import prepare_process
@@ -129,7 +136,11 @@ def run(
     if resumed is not None and length >= experiment.length and (resumed / REPORT).exists():
         _tidy_up(resumed, experiment, keep_checkpoint=keep_checkpoint, take_over=take_over)
         return resumed
-    directory = _start(experiment, out) if resumed is None else resumed
+
+    def to_recipe(directory: Path) -> dict[str, Any]:
+        return {**experiment.to_recipe(directory), **partners_of(directory, experiment.agents)}
+
+    directory = start_run(out, experiment.name, to_recipe) if resumed is None else resumed
     if length < experiment.length:
         refuse_to_extend(directory, length if experiment.unit == "episodes" else None, observers)
     checkpointer = Checkpointer(directory, keep_ending=keep_checkpoint, take_over=take_over)
@@ -163,13 +174,6 @@ class _Work(NamedTuple):
     env: EnvBase
     population: Population
     viewer: "ViewerCallback | None"
-
-
-def _start(experiment: Experiment, out: Path | None) -> Path:
-    def recipe_in(directory: Path) -> dict[str, Any]:
-        return {**experiment.to_recipe(directory), **partners_of(directory, _partners(experiment))}
-
-    return start_run(out, experiment.name, recipe_in)
 
 
 def _carry_out(
@@ -274,13 +278,9 @@ def _title(experiment: Experiment) -> str:
     return f"{experiment.name}, {experiment.replicas} replicas{worlds}, {length} {experiment.unit}"
 
 
-def _partners(experiment: Experiment) -> list[str]:
-    return sorted({spec.run for spec in experiment.agents if isinstance(spec, Frozen)})
-
-
 def _weights_of_partners(experiment: Experiment, run: Path) -> dict[str, str]:
     """The names of the weights of `Frozen` agents that played when a run began, by their run."""
-    partners = _partners(experiment)
+    partners = partners_in(experiment.agents)
     recipe = read_recipe(run) if partners and (run / RECIPE_FILE).exists() else {}
     names = {partner: weights_of(recipe, run, partner) for partner in partners}
     return {partner: name for partner, name in names.items() if name is not None}

@@ -219,6 +219,16 @@ def cells(comparisons: Sequence[Comparison], kind: Kind = "levels") -> Cells:
     return Cells(heading, head, rows, note)
 
 
+def compared_cells(
+    table: StudyTable, metrics: Sequence[str] = (), *, part: str = TRAINING, last: int = LAST
+) -> list[Cells]:
+    """Return the levels of metrics, see `metrics_of`, and the differences where there are several conditions;
+    nothing of a table without a finished run."""
+    comparisons = [compare(table, metric, part=part, last=last) for metric in metrics_of(table, metrics)]
+    kinds: tuple[Kind, ...] = ("levels", "differences") if len(table.design.conditions) > 1 else ("levels",)
+    return [cells(comparisons, kind) for kind in kinds if comparisons]
+
+
 def of_finished(table: Cells) -> Cells:
     """Return a table of `cells` without the conditions that were not run."""
     return table._replace(rows=[row for row in table.rows if row[1] != "0"])

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import combinations
+from itertools import accumulate, combinations
 from pathlib import Path
 from typing import Any, Final
 
@@ -125,11 +125,8 @@ def _firsts(experiments: Iterable[Experiment]) -> dict[int, int]:
     most: dict[int, int] = {}
     for experiment in experiments:
         most[experiment.seed] = max(most.get(experiment.seed, 0), experiment.replicas)
-    firsts, total = {}, 0
-    for seed, replicas in sorted(most.items()):
-        firsts[seed] = total
-        total += replicas
-    return firsts
+    seeds = sorted(most)
+    return dict(zip(seeds, accumulate((most[seed] for seed in seeds), initial=0), strict=False))
 
 
 def _notes(groups: Mapping[str, Experiments], fields: Sequence[str]) -> Iterator[str]:
