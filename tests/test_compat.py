@@ -30,7 +30,6 @@ from cprl import CommonsEnv, Game, Rules, keys, maps
 from cprl.commons import compiled
 from cprl.objectives.functional import FunctionalLoss, total, weights_of
 from cprl.system import compat
-from cprl.system.compat import losses
 from cprl.system.libraries import fitting_versions, relying_on, require
 
 SOURCE = Path(compat.__file__).parents[1]
@@ -101,7 +100,7 @@ def test_a_part_of_a_class_that_is_gone_is_named_when_cprl_is_imported():
     with pytest.raises(ImportError, match=r"torchrl 0\.\S+ has no \S*LossModule\._reduce_loss, on which"):
         require("torchrl", LossModule, "_has_gone", "_reduce_loss")
     with pytest.raises(ImportError, match=r"has no LossModule\._has_update_associated"):
-        losses.updated_weights(LossModule())
+        compat.updated_weights(LossModule())
 
 
 def test_the_versions_that_fit_are_those_of_the_package():

@@ -27,7 +27,7 @@ from cprl.networks.recurrent import Recurrent, state_shape_of
 from cprl.networks.specification import Network, new_network
 from cprl.objectives.preferences import Preference, named
 from cprl.objectives.td import TORCHRL_DISTANCES
-from cprl.system.compat.losses import LaneCategorical
+from cprl.system.compat import LaneCategorical
 from cprl.values import Custom, Range, Value, Where, checked
 
 TrainingEngine: TypeAlias = Literal["compiled", "eager", "torchrl"]

@@ -167,11 +167,8 @@ _NAMED_CHECKSUM: Final = re.compile(r"-([0-9a-f]{32})\.pt")
 
 def checksum(path: Path) -> str:
     """BLAKE2b of a file's content, 16 bytes in hexadecimal."""
-    digest = hashlib.blake2b(digest_size=16)
     with open(path, "rb") as file:
-        while block := file.read(1 << 24):
-            digest.update(block)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
 
 def digest_of(text: str) -> str:

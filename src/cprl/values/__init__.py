@@ -176,7 +176,7 @@ def _refused(name: str, value: Any, hint: Any) -> ValueError:
     inner = get_args(hint)
     if get_origin(hint) is tuple and inner[-1:] == (Ellipsis,) and isinstance(value, list | tuple):
         options = get_args(inner[0]) or inner[:1]
-        if any(isinstance(option, type) and option not in _CHECKS_OF for option in options):
+        if any(isinstance(option, type) and option not in _PLAIN_TYPES for option in options):
             place = next((place for place, entry in enumerate(value) if not fits(entry, inner[0])), None)
             if place is not None:
                 return _refused(f"{name}[{place}]", value[place], inner[0])
@@ -217,17 +217,22 @@ def _converted(value: Any, hint: Any) -> Any:
         raise _UnfitError
     if origin is tuple:
         return _tuple(_plain(value), inner)
-    if origin is Literal or hint in _CHECKS_OF:
+    if origin is Literal or hint in _PLAIN_TYPES:
         value = _plain(value)
     if origin is Literal:
         if any(value == option and type(value) is type(option) for option in inner):
             return value
         raise _UnfitError
-    if hint in _CHECKS_OF:
-        return _CHECKS_OF[hint](value)
+    if hint is int:
+        return _integer(value)
+    if hint is float:
+        return _number(value)
     if isinstance(value, type) or not isinstance(value, origin or hint):
         raise _UnfitError
     return value
+
+
+_PLAIN_TYPES: Final = frozenset({int, float, bool, str, NoneType})
 
 
 def _tuple(value: Any, inner: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -266,24 +271,6 @@ def _number(value: Any) -> float:
     if number is None or not isfinite(number):
         raise _UnfitError
     return number
-
-
-def _same(kind: type[T]) -> Callable[[Any], T]:
-    def same(value: Any) -> T:
-        if isinstance(value, kind):
-            return value
-        raise _UnfitError
-
-    return same
-
-
-_CHECKS_OF: Final[dict[Any, Callable[[Any], Any]]] = {
-    int: _integer,
-    float: _number,
-    bool: _same(bool),
-    str: _same(str),
-    NoneType: _same(NoneType),
-}
 
 
 def words(hint: Any) -> str:

@@ -12,8 +12,7 @@ Nothing here is for users, and there is no `__all__`.
 
 Modules:
     tensordicts   entries of TensorDicts, read and written past its checks
-    environments  environments and specs of TorchRL
-    losses        losses of TorchRL, their targets and estimators
+    torchrl       environments, specs, losses, targets and estimators of TorchRL
     compiling     torch.compile: what it is asked for, its cache and its guards
     recordings    recordings of Rerun
 """
@@ -28,15 +27,6 @@ from cprl.system.compat.compiling import remember_vector_instructions as remembe
 from cprl.system.compat.compiling import sound_local_buffers as sound_local_buffers
 from cprl.system.compat.compiling import with_own_code as with_own_code
 from cprl.system.compat.compiling import without_lookup as without_lookup
-from cprl.system.compat.environments import LeanStepEnv as LeanStepEnv
-from cprl.system.compat.environments import flag_spec as flag_spec
-from cprl.system.compat.losses import LaneCategorical as LaneCategorical
-from cprl.system.compat.losses import ReshapedLoss as ReshapedLoss
-from cprl.system.compat.losses import bootstrap_from_target as bootstrap_from_target
-from cprl.system.compat.losses import forget_cached_weights as forget_cached_weights
-from cprl.system.compat.losses import promise_targets as promise_targets
-from cprl.system.compat.losses import refuse_updaters as refuse_updaters
-from cprl.system.compat.losses import updated_weights as updated_weights
 from cprl.system.compat.recordings import StoredLayout as StoredLayout
 from cprl.system.compat.recordings import end_recordings as end_recordings
 from cprl.system.compat.recordings import keep_native as keep_native
@@ -45,3 +35,12 @@ from cprl.system.compat.tensordicts import entry as entry
 from cprl.system.compat.tensordicts import put as put
 from cprl.system.compat.tensordicts import put_all as put_all
 from cprl.system.compat.tensordicts import unchecked_tensordict as unchecked_tensordict
+from cprl.system.compat.torchrl import LaneCategorical as LaneCategorical
+from cprl.system.compat.torchrl import LeanStepEnv as LeanStepEnv
+from cprl.system.compat.torchrl import ReshapedLoss as ReshapedLoss
+from cprl.system.compat.torchrl import bootstrap_from_target as bootstrap_from_target
+from cprl.system.compat.torchrl import flag_spec as flag_spec
+from cprl.system.compat.torchrl import forget_cached_weights as forget_cached_weights
+from cprl.system.compat.torchrl import promise_targets as promise_targets
+from cprl.system.compat.torchrl import refuse_updaters as refuse_updaters
+from cprl.system.compat.torchrl import updated_weights as updated_weights
