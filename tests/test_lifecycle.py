@@ -400,14 +400,6 @@ def test_a_run_that_is_written_is_not_resumed_and_a_lock_of_another_host_is_take
     assert_same(stopped, whole)
 
 
-def test_a_lock_file_that_says_nothing_is_taken(tmp_path):
-    lock = tmp_path / "run.lock"
-    lock.write_text("[" * 4000)
-    with RunLock(tmp_path):
-        assert json.loads(lock.read_text())["pid"] == os.getpid(), "and says whose it is now"
-    assert not lock.exists()
-
-
 @pytest.mark.parametrize("again", [False, True], ids=["deleted", "made again"])
 def test_a_deleted_run_ends_within_a_checkpoint_and_nothing_is_recreated(again, tmp_path, monkeypatch):
     monkeypatch.setattr(running, "Checkpointer", _often)

@@ -179,13 +179,6 @@ def test_what_cannot_be_is_refused_before_anything_is_written(here, line, messag
     assert sorted(path.name for path in here.iterdir() if path.name != "__pycache__") == ["mine.py"]
 
 
-def test_flags_of_other_commands_are_unknown(capsys):
-    for command, flag in ((sweep_words, "--resume"), (sweep_words, "--points=3"), (search_words, "--only=a")):
-        with pytest.raises(SystemExit, match="2"):
-            command(["mine.py", "--vary", f"{FREEZE}=2,3", flag])
-        assert flag.partition("=")[0] in "".join(capsys.readouterr())
-
-
 def test_a_search_is_a_command_of_its_own(monkeypatch, capsys, here):
     line = f"mine.py --vary {FREEZE}=integers(1,9) --vary {GAMMA}=0.5,0.9 --turns 7 --points 7 --metric peace"
     words = f"{line} --direction minimise --at-once 2 --block 3".split()

@@ -171,9 +171,9 @@ def checksum(path: Path) -> str:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
 
-def digest_of(text: str) -> str:
-    """BLAKE2b of a text, 16 bytes in hexadecimal."""
-    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+def digest_of(text: str, *, size: int = 16) -> str:
+    """BLAKE2b of a text, so many bytes in hexadecimal."""
+    return hashlib.blake2b(text.encode(), digest_size=size).hexdigest()
 
 
 def verify(path: Path) -> None:

@@ -1,6 +1,5 @@
 """run_study: every trial of a study, wherever an executor runs it."""
 
-import hashlib
 import json
 import time
 from collections import Counter
@@ -10,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Final
 
-from cprl.runs.files import RunLock, holder_of, remove_partial
+from cprl.runs.files import RunLock, digest_of, holder_of, remove_partial
 from cprl.studies.executors import Executor, InProcess
 from cprl.studies.progress import Progress
 from cprl.studies.status import PATIENCE_S, Status, is_silent
@@ -120,8 +119,8 @@ def shared(study: Study, out: Path, *, progress: bool) -> Iterator[None]:
     """Makes a study's directory, and locks it together with all who run the same study; another one is
     refused."""
     out.mkdir(parents=True, exist_ok=True)
-    content = json.dumps(study.to_config(out), sort_keys=True).encode()
-    with RunLock(out, study=hashlib.blake2b(content, digest_size=6).hexdigest()) as lock:
+    content = json.dumps(study.to_config(out), sort_keys=True)
+    with RunLock(out, study=digest_of(content, size=6)) as lock:
         if lock.is_alone:
             remove_partial(out, out / STATUS, out / "figures")
         elif progress:

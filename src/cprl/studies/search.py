@@ -24,7 +24,7 @@ from cprl.measuring import social
 from cprl.measuring.episodes import own_name
 from cprl.runs.curves import as_curves, curves_of, net_of
 from cprl.runs.episodes import read_table
-from cprl.runs.files import RunLock
+from cprl.runs.files import RunLock, digest_of
 from cprl.studies.executors import Executor
 from cprl.studies.factors import Distribution, Factor, Integers, LogUniform, levels_of
 from cprl.studies.run import StudyResult, run_study
@@ -139,7 +139,7 @@ class Search(Value, stored=False):
         sampler = getattr(self.sampler, "__qualname__", str(self.sampler))
         rules = self.metric, self.direction, self.over, self.last, self.at_once, sampler
         text = json.dumps([self._one_point().to_config(out), rules], sort_keys=True)
-        return f"{self.name} {hashlib.blake2b(text.encode(), digest_size=6).hexdigest()}"
+        return f"{self.name} {digest_of(text, size=6)}"
 
 
 @dataclass(frozen=True, eq=False)

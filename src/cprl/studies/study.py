@@ -1,6 +1,5 @@
 """Study: one experiment under several conditions, each repeated by the same replicas; a value."""
 
-import hashlib
 import json
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeAlias
 
 from cprl.experiment.experiment import MOST_SEED, Experiment
-from cprl.runs.files import STUDY_FORMAT, read_json, refuse_newer, write_json
+from cprl.runs.files import STUDY_FORMAT, digest_of, read_json, refuse_newer, write_json
 from cprl.runs.recipe import RECIPE_FILE, with_runs_moved
 from cprl.studies.factors import (
     MOST_CONDITIONS,
@@ -66,7 +65,7 @@ class Condition:
         """
         table = {name: value for name, value in self.experiment.to_config().items() if name not in UNNAMED}
         content = {"format": CONDITION_FORMAT, "experiment": without_defaults(table, Experiment)}
-        return hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=6).hexdigest()
+        return digest_of(json.dumps(content, sort_keys=True), size=6)
 
 
 @dataclass(frozen=True, kw_only=True)
