@@ -52,8 +52,6 @@ def write_run(run, experiment, apples, *, random=4.0, equality=None, is_finished
     """A run whose episodes bring so many apples.
 
     Args:
-        run: its directory.
-        experiment: of it.
         apples: gives the harvest of an episode from its replica and number; in the evaluation from -1.
         random: the harvest of random play.
         equality: gives the equality from replica and episode, 0.5 if None.
@@ -83,8 +81,6 @@ def write_study(study, runs, apples, *, but=(), **options):
     """The runs of a study, but for those of some conditions.
 
     Args:
-        study: the study.
-        runs: the directory of its runs.
         apples: gives the harvest of an episode from condition, replica of the study, and episode.
         but: names of conditions.
         options: see `write_run`.

@@ -329,17 +329,5 @@ def test_shared_code_that_gives_other_numbers_is_given_up(compilations, monkeypa
     assert len(compilations) == 2
 
 
-@pytest.mark.integration
-def test_only_so_many_forms_are_kept(compilations, monkeypatch):
-    monkeypatch.setattr(compiling, "MOST_SHARED", 2)
-    for factor in (1.0, 2.0, 3.0):
-        shared_call(Owner(factor))
-    assert [len(kept) for kept in compiling._shared.values()] == [2]
-    shared_call(Owner(3.0))
-    assert len(compilations) == 3
-    shared_call(Owner(1.0))
-    assert len(compilations) == 4
-
-
 if __name__ == "__main__":
     print(digest(trained(sys.argv[1], seed=int(sys.argv[2]))))

@@ -204,7 +204,7 @@ def test_a_finished_run_has_results_their_checksums_and_the_state_to_extend_it_f
     assert report["acting_storing_updating_s"] + report["compiling_s"] < report["wall_s"]
 
 
-SLOW = ("save_transforms", "training_curve", "write_json", "summarise")
+SLOW = ("save_beside_weights", "training_curve", "write_json", "summarise")
 
 
 @pytest.mark.integration

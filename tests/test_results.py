@@ -19,7 +19,7 @@ import torch
 from study_runs import an_episode as episode_of
 
 from cprl.measuring import social
-from cprl.runs.episodes import COLUMNS, EpisodeTable, read_episodes, read_journal, read_table
+from cprl.runs.episodes import COLUMNS, EpisodeTable, read_episodes, read_journal
 from cprl.runs.files import remove_listed, rename_listed, verify, write_listed
 from cprl.runs.recipe import git_state, start_run
 
@@ -174,13 +174,6 @@ def test_damage_hides_a_batch_with_those_behind_it_or_changes_values_but_nothing
         assert read_journal(table.journal).num_rows <= 8
 
 
-def test_a_stream_that_pyarrow_writes_is_a_journal(tmp_path):
-    path, rows = tmp_path / "episodes.arrows", pa.record_batch({"replica": [1, 1], "equality": [0.5, -1.25]})
-    with pa.OSFile(str(path), "wb") as file, pa.ipc.new_stream(file, rows.schema) as stream:
-        stream.write_batch(rows, custom_metadata={"crc32": "0"})
-    assert read_journal(path).to_batches() == [rows]
-
-
 def test_a_run_that_crashes_closes_its_table(tmp_path):
     with suppress(LeftError), EpisodeTable(tmp_path / "episodes.parquet") as table:
         table.add(an_episode())
@@ -290,14 +283,6 @@ def test_a_listed_file_is_checked_by_its_path_wherever_it_is_moved_to(tmp_path):
     (tmp_path / "manifest.json").write_text("{}")
     with pytest.raises(ValueError, match=r"manifest\.json is not the manifest of a run"):
         verify(path)
-
-
-def test_what_is_no_table_is_refused_by_name(tmp_path):
-    (tmp_path / "a.parquet").write_bytes(b"PAR1 and no more")
-    os.mkfifo(tmp_path / "b.parquet")
-    for name, message in (("a", r"a\.parquet is not a table"), ("b", r"b\.parquet is not a file")):
-        with pytest.raises(ValueError, match=message):
-            read_table(tmp_path / f"{name}.parquet")
 
 
 def begin(out):

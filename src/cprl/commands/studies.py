@@ -146,14 +146,9 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
     """
     command = list(sys.argv if argv is None else argv)
     script = program_of(command[0])
-
-    def read(options: Annotated[MainOptions, tyro.conf.arg(name="")] = MainOptions()) -> MainOptions:
-        return options
-
     with in_a_sentence(script):
-        options = tyro.cli(
-            read, args=trusting(command[1:]), prog=script, description=_about(study), config=_CONFIG
-        )
+        words = trusting(command[1:])
+        options = tyro.cli(MainOptions, args=words, prog=script, description=_about(study), config=_CONFIG)
         changes = _given(options)
         said = {
             unit: number for unit in ("episodes", "steps") if (number := changes.pop(unit, None)) is not None

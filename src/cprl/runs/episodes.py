@@ -55,7 +55,9 @@ def batches_in(path: Path) -> Iterator[tuple[pa.RecordBatch, int]]:
 def read_journal(path: Path) -> pa.Table:
     """The rows of a journal; of one without a whole batch, none of all columns."""
     batches = [batch for batch, _ in batches_in(path)]
-    return pa.Table.from_batches(batches) if batches else whole_schema().empty_table()
+    if batches:
+        return pa.Table.from_batches(batches)
+    return _schema([*COLUMNS, *social.METRICS, "yield_share"]).empty_table()
 
 
 def _message(batch: pa.RecordBatch, *, is_first: bool) -> bytes:
@@ -152,7 +154,6 @@ class EpisodeTable:
         """Do nothing: a table stores whole episodes."""
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Add an episode."""
         self.add(episode)
 
     def close(self) -> None:
@@ -292,11 +293,6 @@ def metrics_in(schema: pa.Schema) -> list[str]:
 
 LEFT_OUT: Final = b"left_out"
 """The key of the schema's metadata whose value says which columns are left out, and why, if any are."""
-
-
-def whole_schema() -> pa.Schema:
-    """All columns and metrics, for a table without an episode."""
-    return _schema([*COLUMNS, *social.METRICS, "yield_share"])
 
 
 def _schema(names: Iterable[str]) -> pa.Schema:

@@ -130,7 +130,6 @@ class LoggerCallback:
         return {"steps": self._steps, "series": self._series.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state."""
         self._steps = self._steps_then = int(state["steps"])
         self._then = time.perf_counter()
         self._series.load_state_dict(state["series"])

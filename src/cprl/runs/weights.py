@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from cprl.population import AgentSpec, Frozen
 from cprl.runs.checkpoints import FOLDER, REPORT, checkpoints_in, read_checkpoint, read_tensors
@@ -28,20 +28,15 @@ def save_weights(run: Path, networks: Mapping[str, nn.Module], *, name: str = "f
     return _save(run, f"{name}.pt", weights)
 
 
-def save_transforms(run: Path, state: Mapping[str, Any]) -> None:
-    """Write the state of an environment's transforms atomically; no file if they have none."""
-    if state:
-        _save(run, TRANSFORMS, state)
-
-
-def save_decisions(run: Path, values: Mapping[str, Tensor]) -> None:
-    """Write the values of agents' decisions atomically; no file if they learn none.
+def save_beside_weights(run: Path, name: str, state: Mapping[str, Any]) -> None:
+    """Write what goes with weights, `TRANSFORMS` or `DECISIONS`, atomically; no file where there is nothing.
 
     Args:
-        values: float64 [C] by the agent's name, see `cprl.policies.decisions.BanditDecider.learned`.
+        state: of `DECISIONS` float64 [C] by the agent's name, see
+            `cprl.policies.decisions.BanditDecider.learned`.
     """
-    if values:
-        _save(run, DECISIONS, values)
+    if state:
+        _save(run, name, state)
 
 
 def _save(run: Path, name: str, content: Mapping[str, Any]) -> Path:

@@ -173,7 +173,8 @@ def _draw_levels(
         for place, name in zip(at, names, strict=True):
             compared = comparison.by_name[name]
             _draw_spread(axes, place, compared.defined, compared.estimate, colours[label])
-        means = [_value(comparison.by_name[name].estimate) for name in names]
+        estimates = [comparison.by_name[name].estimate for name in names]
+        means = [nan if estimate is None else estimate.value for estimate in estimates]
         look: dict[str, Any] = {"marker": "o", "linestyle": style, "linewidth": 1.4, "zorder": 4}
         axes.plot(at, means, color=colours[label], label=label or "mean and interval", **look)
         if is_same or len(lines) > 1:
@@ -629,10 +630,6 @@ def _draw_spread(
     line: dict[str, Any] = {"color": colour, "linewidth": 2.3, "alpha": 0.7, "zorder": 3}
     axes.plot(*((values, points) if across else (points, values)), ".", **dots)
     axes.plot(*((bounds, [place] * len(bounds)) if across else ([place] * len(bounds), bounds)), **line)
-
-
-def _value(estimate: Estimate | None) -> float:
-    return nan if estimate is None else estimate.value
 
 
 def short(factor: str) -> str:

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Final
 
-from cprl.runs.files import RunLock, digest_of, holder_of, remove_partial
+from cprl.runs.files import RunLock, digest_of, holder_of, remove_partial, write_json
 from cprl.studies.executors import Executor, InProcess
 from cprl.studies.progress import Progress
 from cprl.studies.status import PATIENCE_S, Status, is_silent
-from cprl.studies.study import RUNS, STATUS, Study, directory_of, levels_in, write_study
+from cprl.studies.study import FILE_NAME, RUNS, STATUS, Study, directory_of, levels_in
 from cprl.studies.tables.comparing import LAST
 from cprl.studies.tables.table import WINDOW, StudyTable
 from cprl.studies.trials import Outcome, Task, Trial, move_aside, trials_of
@@ -128,7 +128,7 @@ def shared(study: Study, out: Path, *, progress: bool) -> Iterator[None]:
                 f"{out} is run by somebody else too, {holder_of(out)}, or was when its host went down: each "
                 "trial is run by the one that begins it first; the other continues with the rest"
             )
-        write_study(study, out)
+        write_json(out / FILE_NAME, study.to_config(out))
         yield
 
 

@@ -54,7 +54,6 @@ class Status:
         return table if isinstance(table, dict) else {}
 
     def fail(self, reason: str, trace: str) -> None:
-        """Notes why the trial failed."""
         with suppress(OSError):  # of a full disk, say; then the reason is in the outcome alone
             self.folder.mkdir(parents=True, exist_ok=True)
             self.failed.write_text(f"{reason}\n\n{trace}", encoding="utf-8", errors="replace")
@@ -127,7 +126,6 @@ class StatusFile:
             self.write()
 
     def write(self) -> None:
-        """Write how far the trial is now."""
         self._table["beat"] += 1
         running_s, compiling_s = time.monotonic() - self._began, CLOCK.total_s - self._compiled_s
         episodes, work_s = self._first or (self._table["episodes"], 0.0)
@@ -153,7 +151,6 @@ class StatusFile:
         self._table["steps"] += self._worlds
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Counts an episode."""
         self._table["episodes"] += 1
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeAlias
 
 from cprl.experiment.experiment import MOST_SEED, Experiment
-from cprl.runs.files import STUDY_FORMAT, digest_of, read_json, refuse_newer, write_json
+from cprl.runs.files import STUDY_FORMAT, digest_of, read_json, refuse_newer
 from cprl.runs.recipe import RECIPE_FILE, with_runs_moved
 from cprl.studies.factors import (
     MOST_CONDITIONS,
@@ -354,10 +354,6 @@ def directory_of(study: Study, out: Path | str | None) -> Path:
     if (directory / RECIPE_FILE).exists():
         raise ValueError(f"out is {directory}, the directory of a run; allowed: {allowed}")
     return directory
-
-
-def write_study(study: Study, out: Path) -> None:
-    write_json(out / FILE_NAME, study.to_config(out))
 
 
 def read_study(out: Path | str, *, allow: Sequence[str] = ()) -> Study:

@@ -588,7 +588,6 @@ def _refuse_unfitting(
 
 
 def _ballots(game: Game) -> list[tuple[str, tuple[float, ...]]]:
-    """What agents of a game decide on, and the choices."""
     return [(ballot.title, ballot.choices) for ballot in game.ballots]
 
 

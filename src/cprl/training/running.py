@@ -31,10 +31,11 @@ from cprl.runs.recipe import (
     write_on_nan,
 )
 from cprl.runs.weights import (
+    DECISIONS,
+    TRANSFORMS,
     partners_in,
     partners_of,
-    save_decisions,
-    save_transforms,
+    save_beside_weights,
     save_weights,
     weights_of,
 )
@@ -222,9 +223,9 @@ def _train(work: _Work, observers: Sequence[Any], checkpointer: Checkpointer) ->
             metrics=experiment.metrics,
         )
         save_weights(directory, population.networks())
-        save_transforms(directory, transforms_state(env))
+        save_beside_weights(directory, TRANSFORMS, transforms_state(env))
         if population.decisions is not None:
-            save_decisions(directory, population.decisions.learned())
+            save_beside_weights(directory, DECISIONS, population.decisions.learned())
     return training
 
 

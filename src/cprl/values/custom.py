@@ -39,11 +39,8 @@ class Custom:
     arguments: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if (
-            not isinstance(self.target, str)
-            or len(self.target) > _LONGEST_NAME
-            or not _NAMES.fullmatch(self.target)
-        ):
+        is_text = isinstance(self.target, str) and len(self.target) <= _LONGEST_NAME
+        if not is_text or not _NAMES.fullmatch(self.target):
             raise ValueError(f'Custom.target is {shown(self.target)}; allowed: "module:Class"')
         if not isinstance(self.arguments, Mapping):
             came = shown(self.arguments)

@@ -75,7 +75,6 @@ class Comparison:
 
     @cached_property
     def by_name(self) -> dict[str, Compared]:
-        """The conditions by name."""
         return {compared.condition: compared for compared in self.conditions}
 
     @property

@@ -88,7 +88,6 @@ def study_table(
 
 
 def design_of(study: Study) -> Design:
-    """The conditions of a study."""
     conditions: dict[str, dict[str, Any]] = {condition.name: {} for condition in study.all_conditions}
     for factor in study.factors:
         plain: dict[int, Any] = {}  # by the identity of a level, as levels that differ may have equal texts
