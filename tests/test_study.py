@@ -192,8 +192,7 @@ def with_field(run, name, changed):
 @pytest.mark.integration
 def test_runs_that_are_not_the_studys_have_no_columns_for_what_was_published(run, tmp_path):
     fishery = export_results(run, tmp_path / "fishery")
-    content = json.loads((fishery / "recipe.json").read_text())
-    (fishery / "recipe.json").write_text(json.dumps({**content, "recipe": "fishery"}))
+    with_field(fishery, "recipe", lambda name: "fishery")
     text = write_report([fishery], tmp_path).read_text()
     before, after = text.split("## Runs")[0], text.split("## Collective return")[1]
     assert "published" not in before + after, "in between stands the command, which may say anything"

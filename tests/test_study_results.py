@@ -492,12 +492,6 @@ def test_conditions_of_any_name_are_in_the_legend_of_the_courses_and_have_a_pane
     assert titles == names[1:], "beside the first"
 
 
-def test_conditions_that_were_not_run_do_not_count_among_the_replicas_of_a_figure():
-    assert figures.replicas_text({"as run": 8, "no beam": 8, "later": 0}) == "8 replicas each"
-    assert figures.replicas_text({"as run": 16, "no beam": 8, "later": 0}) == "8 to 16 replicas each (n)"
-    assert figures.replicas_text({"later": 0}) == "0 replicas each"
-
-
 def test_figures_call_conditions_by_the_level_and_say_where_replicas_differ(pairs, tmp_path):
     assert figures.names_of(pairs) == {"freeze_steps=5": "5", "freeze_steps=25": "25"}
     write_study(PAIRED, tmp_path, harvest, but=("freeze_steps=25",))

@@ -155,12 +155,10 @@ def _register() -> None:
     from cprl.commons.literature import SOURCES
 
     gymnasium.register("cprl/Commons-v0", entry_point="cprl.envs.gymnasium_env:CommonsGymnasiumEnv")
-    for name, board in (("SingleBasic", "single_basic"), ("SingleComplex", "single_complex")):
-        gymnasium.register(
-            f"cprl/{name}-v0", entry_point=f"{_PRESETS}:gymnasium_env", kwargs={"board": board}
-        )
-    for name in SOURCES:
-        gymnasium.register(name, entry_point=f"{_PRESETS}:gymnasium_env", kwargs={"board": name})
+    boards = {"cprl/SingleBasic-v0": "single_basic", "cprl/SingleComplex-v0": "single_complex"}
+    boards |= {name: name for name in SOURCES}
+    for name, board in boards.items():
+        gymnasium.register(name, entry_point=f"{_PRESETS}:gymnasium_env", kwargs={"board": board})
 
 
 def _register_parallel() -> None:
