@@ -28,7 +28,7 @@ from cprl.population import Learning, Scripted, Team
 from cprl.runs.recipe import resume_command, start_run
 from cprl.system import shipped
 from cprl.system.output import Output, console, printed
-from cprl.system.shipped import command_of, cprl_here, is_shipped, recipe_named, shipped_recipes
+from cprl.system.shipped import command_of, cprl_here, import_from, is_shipped, recipe_named, shipped_recipes
 from cprl.values import Custom, allowed, allowing
 
 ROOT = Path(__file__).parents[1]
@@ -170,10 +170,14 @@ def test_help_lists_what_people_change_and_all_help_every_number_and_equal_agent
     words = help_of(experiment, capsys)
     assert "Two agents that learn alike, one that does otherwise" in words
     flags = [word for word in words.split() if word.startswith("--")]
+    first, second = flags.index("--spare"), flags.index("--episodes")
+    assert first < flags.index("--out") < second < flags.index("--game.rules.freeze-steps")
     assert {"--agents", "--game.map", "--game.institutions", "--seed", "--replicas"} <= set(flags)
     assert len(flags) < 27
+    assert "--help-all lists all flags" in words
     assert "a number of its own. (default: 3)" in words
     words = help_of(experiment, capsys, "--help-all")
+    assert "What is not listed cannot be changed on the command line" in words
     assert "--agents.2.algorithm.clip-epsilon" in words
     assert "--agents.1.reward" not in words
     assert "--callbacks" not in words
@@ -331,7 +335,16 @@ def test_a_recipe_runs_its_experiment(runs):
         assert {"a:B", "c:D"} <= set(allowed())
     ((given, out, how),) = runs
     assert given == replace(experiment(), seed=3)
-    assert {"out": out, **how} == {**vars(RunOptions(out=Path("here"), resume=True)), "callbacks": []}
+    assert out == Path("here")
+    assert how == {
+        "resume": True,
+        "take_over": False,
+        "threads": 1,
+        "keep_checkpoint": True,
+        "watch": "file",
+        "linger": False,
+        "callbacks": [],
+    }
 
 
 def test_cprl_run_trains_the_experiment_of_a_recipe_or_resumes_its_run(runs, tmp_path, monkeypatch):
@@ -553,6 +566,16 @@ def test_no_flag_that_a_recipe_has_is_taken_for_a_mistake(name, monkeypatch, cap
     flags = {word.strip(",") for word in capsys.readouterr().out.split() if re.match("--[a-z]", word)}
     assert {"--episodes", "--out", "--resume", "--no-resume"} < flags
     refuse_mistyped_flags(recipe_named(name), sorted(flags))
+
+
+def test_a_package_without_recipes_says_so(tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="folder is 'x'"):
+        import_from("x")
+    monkeypatch.setattr(shipped, "_PACKAGE", tmp_path / "src" / "cprl")
+    with pytest.raises(FileNotFoundError, match="the recipes of cprl are neither in"):
+        shipped.recipes_folder()
+    (tmp_path / "src" / "cprl" / "recipes").mkdir(parents=True)
+    assert shipped.recipes_folder() == tmp_path / "src" / "cprl" / "recipes", "as in a wheel"
 
 
 # Terminals and shells: another encoding and a tiny terminal end no training

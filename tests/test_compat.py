@@ -30,6 +30,7 @@ from cprl import CommonsEnv, Game, Rules, keys, maps
 from cprl.commons import compiled
 from cprl.objectives.functional import FunctionalLoss, total, weights_of
 from cprl.system import compat
+from cprl.system.compat import torchrl
 from cprl.system.libraries import fitting_versions, relying_on, require
 
 SOURCE = Path(compat.__file__).parents[1]
@@ -45,30 +46,50 @@ def test_every_part_of_compat_has_a_test_that_names_it():
     assert shown - modules - named == set()
 
 
-ENTRIES = "_debug_get_cache_entry_list"
-
-
 def kept_here():
     with compiled.kept_in(Path()):
         pass
 
 
+TORCH, RERUN = r"torch \S+ has no torch\.", r"rerun-sdk \S+ has no rerun_bindings\."
+
+
 @pytest.mark.parametrize(
-    ("part", "use"),
+    ("module", "part", "use", "message"),
     [
-        ("torch._dynamo.config", compat.every_guard),
-        ("torch._inductor.loop_body.LoopBody", compat.sound_local_buffers),
-        (f"torch._C._dynamo.eval_frame.{ENTRIES}", lambda: compat.compiled_code(doubled)),
-        ("torch._dynamo.guards.DeletedGuardManagerWrapper", lambda: compat.fits(doubled, ())),
-        ("torch._inductor.cpu_vec_isa.valid_vec_isa_list", compat.remember_vector_instructions.__wrapped__),
-        ("rerun_bindings.flush_and_cleanup_orphaned_recordings", compat.end_recordings),
-        ("numba.core.config.CACHE_DIR", kept_here),
+        ("torch._dynamo", "config", compat.every_guard, TORCH + r"_dynamo\.config"),
+        ("torch._inductor.loop_body", "LoopBody", compat.sound_local_buffers, TORCH + r".*LoopBody"),
+        (
+            "torch._C._dynamo.eval_frame",
+            "_debug_get_cache_entry_list",
+            lambda: compat.compiled_code(doubled),
+            TORCH + r".*_debug_get_cache_entry_list",
+        ),
+        (
+            "torch._dynamo.guards",
+            "DeletedGuardManagerWrapper",
+            lambda: compat.fits(doubled, ()),
+            TORCH + r".*DeletedGuardManagerWrapper",
+        ),
+        (
+            "torch._inductor.cpu_vec_isa",
+            "valid_vec_isa_list",
+            lambda: compat.remember_vector_instructions.__wrapped__(),
+            TORCH + r"_inductor\.cpu_vec_isa",
+        ),
+        (
+            "rerun_bindings",
+            "flush_and_cleanup_orphaned_recordings",
+            compat.end_recordings,
+            RERUN + "flush_and_cleanup_orphaned_recordings",
+        ),
+        ("numba.core.config", "CACHE_DIR", kept_here, r"numba\.config\.CACHE_DIR"),
     ],
+    ids=lambda value: value if isinstance(value, str) and "." not in value else "",
 )
-def test_a_part_that_an_upgrade_took_away_is_named_where_it_is_used(part, use, monkeypatch):
-    module, _, name = part.rpartition(".")
-    monkeypatch.delattr(importlib.import_module(module), name)
-    with pytest.raises(ImportError, match=rf" has no .*({name}|{module}).*, on which cprl \S+ relies"):
+def test_a_part_that_an_upgrade_took_away_is_named_where_it_is_used(module, part, use, message, monkeypatch):
+    monkeypatch.delattr(importlib.import_module(module), part)
+    with pytest.raises(ImportError, match=rf"{message}.*, on which cprl \S+ relies"):
         use()
 
 
@@ -80,7 +101,7 @@ def test_a_part_of_a_class_that_is_gone_is_named_when_cprl_is_imported():
     with pytest.raises(ImportError, match=r"torchrl 0\.\S+ has no \S*LossModule\._reduce_loss, on which"):
         require("torchrl", LossModule, "_has_gone", "_reduce_loss")
     with pytest.raises(ImportError, match=r"has no LossModule\._has_update_associated"):
-        compat.updated_weights(LossModule())
+        torchrl.updated_weights(LossModule())
 
 
 def test_the_versions_that_fit_are_those_of_the_package():
@@ -546,6 +567,10 @@ def test_torch_is_quiet_about_operations_that_its_code_calls_by_the_dispatcher(c
     assert caplog.messages == ["something else"]
     ir.log.warning("%s is missing a c-shim implementation", "aten.multinomial")
     assert len(caplog.messages) == 2
+
+
+def test_recordings_that_nothing_refers_to_can_be_ended():
+    compat.end_recordings()
 
 
 @pytest.mark.slow

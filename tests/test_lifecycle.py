@@ -674,3 +674,11 @@ def test_few_numbers_of_rollout_learners_are_drawn_ahead():
     for _ in range(70):  # more than are drawn ahead
         assert torch.equal(learner.rng.next(), many.next())
     assert learner.state_dict()["draws"]["numbers"].numel() <= 2 * 2**14
+
+
+def test_a_lock_file_that_says_nothing_is_taken(tmp_path):
+    lock = tmp_path / "run.lock"
+    lock.write_text("[" * 4000)
+    with RunLock(tmp_path):
+        assert json.loads(lock.read_text())["pid"] == os.getpid(), "and says whose it is now"
+    assert not lock.exists()

@@ -21,7 +21,6 @@ from cprl.commands.recipe import parse
 from cprl.measuring.evaluate import evaluate
 from cprl.population import Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, read_checkpoint
-from cprl.runs.curves import curves_of
 from cprl.runs.episodes import EpisodeTable, read_episodes
 from cprl.runs.weights import load_weights, save_weights
 from cprl.studies import StudyTable
@@ -200,6 +199,13 @@ def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, caps
         pairs = sorted(set(zip(played["replica"], played["episode"], strict=True)))
         assert pairs == [(r, e) for r in range(2) for e in range(2)]
     assert json.loads((run / "report.json").read_text())["training_s"] > 0
+    if name == "commons":
+        game, settings = presets.game("commons"), presets.dqn_settings("commons", variant=variant)
+        plain = dqn_learner(game.spaces, agents=[0], replicas=1, settings=settings, compile=False)
+        network = plain.networks()["replica_0/agent_0"]
+        before = next(network.parameters()).clone()
+        network.load_state_dict(weights["replica_1/agent_2"])  # which fit an ordinary network of one agent
+        assert not torch.equal(before, next(network.parameters()))
 
 
 @pytest.mark.integration
@@ -214,6 +220,13 @@ def test_a_version_of_the_program_on_the_command_line_is_a_condition_of_the_stud
     assert Condition(experiment).checksum == study.all_conditions[-1].checksum
     plain, _ = parse(recipe("commons").experiment, words[:-4])
     assert Condition(plain).checksum == study.all_conditions[1].checksum
+
+
+@pytest.mark.integration
+def test_two_agents_without_the_beam_never_fire(tmp_path):
+    run = run_recipe("two_complex", tmp_path / "run", own={"beam": False}, episodes=1, watch="off")
+    assert json.loads((run / "recipe.json").read_text())["recipe"] == "two_complex_no_beam"
+    assert set(read_episodes(run).to_pydict()["shots"]) == {0}
 
 
 @pytest.mark.integration
@@ -259,9 +272,15 @@ def test_unlike_neighbours_train_in_one_loop_are_recorded_and_evaluated(tmp_path
 @pytest.mark.slow
 def test_fifty_episodes_of_commons_in_eight_replicas_are_those_of_each_alone(tmp_path):
     run = run_recipe("commons", tmp_path / "all", replicas=8, engine="compiled", episodes=50, seed=5)
-    courses = curves_of(run)
-    lanes = {tuple(course) for agent in range(4) for course in courses[f"return_{agent}"].tolist()}
-    assert len(lanes) == 32, "all lanes differ"
+    rows = read_episodes(run).to_pydict()
+    returns = {}
+    for replica, agent, episode, value in zip(
+        rows["replica"], rows["agent"], rows["episode"], rows["return"], strict=True
+    ):
+        returns.setdefault((replica, agent), {})[episode] = value
+    courses = {lane: tuple(course[episode] for episode in range(50)) for lane, course in returns.items()}
+    assert len(courses) == 32
+    assert len(set(courses.values())) == 32, "all lanes differ"
     weights = load_weights(run / "checkpoints" / "final.pt")
     game, settings = presets.game("commons"), presets.dqn_settings("commons")
     for replica in (0, 5):
@@ -272,10 +291,10 @@ def test_fifty_episodes_of_commons_in_eight_replicas_are_those_of_each_alone(tmp
         (tmp_path / f"alone_{replica}").mkdir()
         with EpisodeTable(tmp_path / f"alone_{replica}" / "episodes.parquet") as table:
             train(env, {(0, 1, 2, 3): alone}, episodes=50, callbacks=[table])
-        of_alone = curves_of(tmp_path / f"alone_{replica}")
+        told = read_episodes(tmp_path / f"alone_{replica}").to_pydict()
         for agent in range(4):
-            course = of_alone[f"return_{agent}"][0]
-            assert course.tolist() == courses[f"return_{agent}"][replica].tolist()
+            mine = [v for a, v in zip(told["agent"], told["return"], strict=True) if a == agent]
+            assert tuple(mine) == courses[replica, agent]
             state = alone.networks()[f"replica_{replica}/agent_{agent}"].state_dict()
             for name, value in weights[f"replica_{replica}/agent_{agent}"].items():
                 torch.testing.assert_close(state[name], value, rtol=1e-4, atol=1e-6)
@@ -332,7 +351,7 @@ def test_a_run_that_was_stopped_is_loaded_from_its_newest_checkpoint(tmp_path, m
 
 
 @pytest.mark.integration
-def test_the_run_of_a_plain_agent_is_loaded_too_or_says_which_file_cannot_be_read(tmp_path):
+def test_the_run_of_a_plain_agent_is_loaded_too_or_says_which_file_cannot_be_read_and_why(tmp_path):
     run = recipe("own_loop").main(episodes=11, evaluation_episodes=3, out=tmp_path / "run")
     network = cprl.load(run).networks["replica_0/agent_0"]
     save_weights(run, {"agent_0": network}, name="other")
@@ -342,19 +361,28 @@ def test_the_run_of_a_plain_agent_is_loaded_too_or_says_which_file_cannot_be_rea
         assert len(evaluate(loaded.env(2), loaded.policy(worlds=2))) == 2
     weights = run / "checkpoints" / "final.pt"
     content = weights.read_bytes()
-    (run / "manifest.json").unlink()
     for spoilt in (content[:-300], b"something else", b""):
         weights.write_bytes(spoilt)
-        with pytest.raises(ValueError, match=r"final\.pt holds no weights"):
+        with pytest.raises(ValueError, match=r"final\.pt is damaged or was changed: its checksum is"):
             cprl.load(run)
+        manifest = (run / "manifest.json").rename(run / "elsewhere")
+        with pytest.raises(ValueError, match=r"final\.pt holds no weights: "):
+            cprl.load(run)
+        manifest.rename(run / "manifest.json")
+    weights.unlink()
+    with pytest.raises(ValueError, match=r"checkpoints/final\.pt"):
+        cprl.load(run)
+    weights.write_bytes(content)
     (run / "checkpoints" / "best.pt").unlink(missing_ok=True)
-    with pytest.raises(ValueError, match=r"best\.pt holds no weights"):
+    with pytest.raises(ValueError, match=r"best\.pt holds no weights: .*No such file"):
         cprl.load(run, weights="best")
     content = json.loads((run / "recipe.json").read_text())
     content["experiment"]["game"]["rules"]["hits_to_tag"] = 0
     (run / "recipe.json").write_text(json.dumps(content))
     with pytest.raises(ValueError, match=r"recipe\.json: experiment\.game\.rules\.hits_to_tag is 0"):
         cprl.load(run)
+    with pytest.raises(ValueError, match=r"recipe\.json is not the recipe of a run"):
+        cprl.load(tmp_path)
 
 
 @pytest.mark.integration
@@ -369,3 +397,14 @@ def test_the_tragedy_ends_with_what_happened_and_what_to_try_next(tmp_path, caps
     assert "In the last 12 episodes they got" in after
     assert "This was a short schedule. The published one" in after
     assert after.count(str(run)) >= 4, "in the figure's path and in lines to be copied"
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    "name", sorted(path.stem for path in RECIPES.glob("*.py") if path.stem != "own_loop")
+)
+def test_a_way_to_watch_that_is_none_is_refused_before_there_is_a_run(name, tmp_path):
+    for watch in ("telepathy", "connect rerun+http://127.0.0.1:9876/proxy"):
+        with pytest.raises(ValueError, match="watch"):
+            run_recipe(name, out=tmp_path / "run", watch=watch)
+    assert not (tmp_path / "run").exists()

@@ -61,8 +61,16 @@ def test_a_target_updater_of_torchrls_that_would_have_no_effect_is_refused(updat
         updaters.append(updater(loss))
         return loss
 
-    with pytest.raises(ValueError, match=r"a SoftUpdate or HardUpdate .* DQNLoss; .* set tau or"):
+    with pytest.raises(
+        ValueError, match=r"a SoftUpdate or HardUpdate was built on the DQNLoss; .* set tau or"
+    ):
         dqn_learner(SPACES, agents=(0,), replicas=1, settings=REPLAY, make_loss=make_loss, engine=engine)
+
+
+def test_a_target_updater_on_the_loss_of_an_engine_is_refused():
+    learner = make_learner(DQN(settings=REPLAY), SPACES, agents=(0,), replicas=1, engine="eager")
+    with pytest.raises(ValueError, match=r"a SoftUpdate or HardUpdate .* DQNLoss; .* set tau or"):
+        SoftUpdate(learner.engine.loss.module, tau=0.1)
 
 
 ONE = {"agents": (0,), "replicas": 1}
@@ -115,6 +123,7 @@ def test_a_loss_that_reads_steps_in_a_row_is_refused_with_replay():
 
 
 def kl_loss(network):
+
     critic = TensorDictModule(network["critic"], ["observation"], ["state_value"])
     return KLPENPPOLoss(policy(network["actor"]), critic, loss_critic_type="l2", dtarg=0.0001)
 
@@ -151,7 +160,9 @@ def test_a_loss_that_reads_what_batches_do_not_have_is_refused_by_the_name_of_th
         made = PPO(settings=ROLLOUTS).make_loss(network)
         return Demanding(made.actor_network, made.critic_network)
 
-    with pytest.raises(ValueError, match=r"batches do not have: .*weather.*advantage"):
+    with pytest.raises(
+        ValueError, match=r"the loss reads an entry that its batches do not have: .*weather.*advantage"
+    ):
         rollout_learner(make_loss)
 
 
@@ -160,15 +171,36 @@ def test_what_no_network_sees_is_refused_but_tables_read_it(observed):
     spaces = replace(GAME, observation=Observation(**observed)).spaces
     (name,) = observed
     for algorithm in (DQN(settings=REPLAY), PPO(settings=ROLLOUTS)):
-        with pytest.raises(ValueError, match=rf'"agents", "{name}".*Observation\({name}="planes"\)'):
+        with pytest.raises(ValueError, match=rf'agents observe \("agents", "{name}"\); allowed for networks'):
             algorithm.make_network(spaces)
-        with pytest.raises(ValueError, match=rf'"agents", "{name}"'):
+        with pytest.raises(ValueError, match=rf'Observation\({name}="planes"\)'):
+            algorithm.make_network(spaces)
+        with pytest.raises(ValueError, match=rf'agents observe \("agents", "{name}"\); allowed for networks'):
             make_learner(algorithm, spaces, agents=(0,), replicas=1)
     with pytest.raises(ValueError, match="allowed for networks"):
         make_learner(QMIX(settings=REPLAY), spaces, agents=(0, 1), replicas=1, reward_kind="team")
     TabularLearner(LearningAgents(spaces, agents=(0,), replicas=1), TabularSettings())
-    with pytest.raises(ValueError, match=rf"Observation\.{name} is 'plane'"):
+    with pytest.raises(
+        ValueError, match=rf"Observation\.{name} is 'plane'; allowed: True or False or 'planes'"
+    ):
         Observation(**{name: "plane"})
+
+
+class OnlyTheCritics(ClipPPOLoss):
+    """Returns the loss of the critic itself."""
+
+    def forward(self, tensordict):
+        return super().forward(tensordict)["loss_critic"]
+
+
+@pytest.mark.parametrize("kind", [RolloutLearner, TorchRLRolloutLearner])
+def test_a_loss_of_rollouts_that_returns_none_is_refused_too(kind):
+    def make_loss(network):
+        made = PPO(settings=ROLLOUTS).make_loss(network)
+        return OnlyTheCritics(made.actor_network, made.critic_network)
+
+    with pytest.raises(ValueError, match="the loss test_refusals:OnlyTheCritics returns a Tensor; allowed: "):
+        rollout_learner(make_loss, kind=kind)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ import torch
 from study_runs import an_episode as episode_of
 
 from cprl.measuring import social
-from cprl.runs.episodes import COLUMNS, EpisodeTable, read_episodes, read_journal
+from cprl.runs.episodes import COLUMNS, EpisodeTable, read_episodes, read_journal, read_table
 from cprl.runs.files import remove_listed, rename_listed, verify, write_listed
 from cprl.runs.recipe import git_state, start_run
 
@@ -86,8 +86,9 @@ def test_each_agent_of_each_episode_has_a_row(table):
         table.add(first)
         table.add(replace(an_episode(1), terminated=True), an_episode(2), replica=8)
     rows = pq.read_table(table.path)
-    of_trainings = ("wanted_return", "world")
-    columns = [(name, kind) for name, kind in COLUMNS.items() if name not in of_trainings]
+    columns = [
+        (name, kind) for name, kind in COLUMNS.items() if name not in ("wanted_return", "world")
+    ]  # of trainings
     assert rows.schema == pa.schema([*columns, *((name, pa.float64()) for name in social.METRICS)])
     assert rows["replica"].to_pylist() == [3, 3, 8, 8, 8, 8]
     assert rows["terminated"].to_pylist() == [False, False, True, True, False, False]
@@ -172,6 +173,13 @@ def test_damage_hides_a_batch_with_those_behind_it_or_changes_values_but_nothing
         flipped[place] ^= 64
         table.journal.write_bytes(flipped)
         assert read_journal(table.journal).num_rows <= 8
+
+
+def test_a_stream_that_pyarrow_writes_is_a_journal(tmp_path):
+    path, rows = tmp_path / "episodes.arrows", pa.record_batch({"replica": [1, 1], "equality": [0.5, -1.25]})
+    with pa.OSFile(str(path), "wb") as file, pa.ipc.new_stream(file, rows.schema) as stream:
+        stream.write_batch(rows, custom_metadata={"crc32": "0"})
+    assert read_journal(path).to_batches() == [rows]
 
 
 def test_a_run_that_crashes_closes_its_table(tmp_path):
@@ -285,6 +293,14 @@ def test_a_listed_file_is_checked_by_its_path_wherever_it_is_moved_to(tmp_path):
         verify(path)
 
 
+def test_what_is_no_table_is_refused_by_name(tmp_path):
+    (tmp_path / "a.parquet").write_bytes(b"PAR1 and no more")
+    os.mkfifo(tmp_path / "b.parquet")
+    for name, message in (("a", r"a\.parquet is not a table"), ("b", r"b\.parquet is not a file")):
+        with pytest.raises(ValueError, match=message):
+            read_table(tmp_path / f"{name}.parquet")
+
+
 def begin(out):
     def recipe(directory):
         return {"format": 2, "recipe": "tragedy", "experiment": {"seed": 3, "in": directory.name}}
@@ -331,10 +347,14 @@ def test_runs_without_a_place_get_one_each(tmp_path, monkeypatch):
     assert all(run.parent == Path("runs") and run.name.startswith("tragedy-20") for run in runs)
 
 
-def test_a_name_that_is_none_of_a_directory_is_refused_before_there_is_one(tmp_path):
+def test_a_directory_that_holds_something_and_a_name_that_is_none_are_refused(tmp_path):
     with pytest.raises(ValueError, match="name"):
         start_run(tmp_path / "run", "../tragedy", dict)
     assert list(tmp_path.iterdir()) == []
+    (tmp_path / "thesis.txt").touch()
+    with pytest.raises(FileExistsError, match="is not empty"):
+        begin(tmp_path)
+    assert names_in(tmp_path) == ["thesis.txt"]
 
 
 def a_checkout(folder, *names):

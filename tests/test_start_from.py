@@ -192,7 +192,10 @@ def test_what_cannot_be_started_from_is_refused_by_name(stored, tmp_path):
     wider = DQN(settings=replace(REPLAY, hidden_cells=(9,)))
     relu = DQN(settings=replace(REPLAY, relu_on_outputs=True))
     for algorithm, start, message in (
+        (dqn, Frozen(run, 4), r"agent is 4; .*alone has the agents 0 to 3"),
+        (dqn, Frozen(run, 0, replica=2), "keeps no network of replica_2/agent_0"),
         (dqn, Frozen(f"{stored}/frozen", 1), "agent_1 of .*frozen is scripted"),
+        (dqn, Frozen(f"{stored}/nowhere", 0), "nowhere"),
         (dqn, Frozen(run, 1), "agent_1 of .*alone outputs the logits of a policy; DQN learns action values"),
         (ppo, Frozen(run, 0), "outputs action values; PPO learns the logits of a policy"),
         (wider, Frozen(run, 0), "agent_0 of .* has another network than DQN here: .*siz"),
@@ -212,6 +215,8 @@ def test_what_cannot_be_started_from_is_refused_by_name(stored, tmp_path):
     taller = replace(FOUR, rules=replace(FOUR.rules, window_rows=4))
     with pytest.raises(ValueError, match=r"have observations .*; this game has"):
         Population(CommonsEnv(taller, 2), [spec, *[Scripted()] * 3], engine="eager")
+    with pytest.raises(ValueError, match=r"experiment\.agents\[0\]\.start_from\.run is /x, an absolute path"):
+        experiment((replace(dqn, start_from=Frozen("/x", 0)), *[Scripted()] * 3))
     broken = experiment((replace(dqn, start_from=Frozen(run, 7)), *[Scripted()] * 3))
     with pytest.raises(ValueError, match="agent is 7"):
         cprl.run(broken, tmp_path / "never", watch="off")
@@ -229,3 +234,13 @@ def test_weights_that_are_not_finite_are_no_start(stored, tmp_path):
     save_weights(tmp_path / "alone", networks)
     with pytest.raises(ValueError, match="weights of replica_0/agent_0 are NaN or infinite; leave that rep"):
         population([spec, *[Scripted()] * 3])
+
+
+def test_a_frozen_agent_can_be_that_of_its_own_replica(stored):
+    own = population([Frozen(f"{stored}/alone", 0, replica=None), *[Scripted()] * 3])
+    each = [population([Frozen(f"{stored}/alone", 0, replica), *[Scripted()] * 3]) for replica in (0, 1)]
+    seen = torch.randint(256, (2, 1, *FOUR.spaces.observation_shape), dtype=torch.uint8)
+    values = own.others[0,].values(seen)
+    torch.testing.assert_close(values[0], each[0].others[0,].values(seen)[0])
+    torch.testing.assert_close(values[1], each[1].others[0,].values(seen)[1])
+    assert not torch.allclose(values[1], each[0].others[0,].values(seen)[1])

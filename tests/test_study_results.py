@@ -16,11 +16,11 @@ from test_figures import see_that_it_can_be_read
 from cprl import Study
 from cprl.commands import main as cli
 from cprl.measuring.statistics import difference
-from cprl.runs.recipe import write_circumstances
+from cprl.runs.recipe import runs_in, write_circumstances
 from cprl.studies import figures, results
 from cprl.studies.factors import Uniform
 from cprl.studies.status import Status
-from cprl.studies.tables.comparing import Cells, cells, compare, markdown
+from cprl.studies.tables.comparing import Cells, cells, compare, markdown, metrics_of
 from cprl.studies.tables.pooled import pooled_table
 from cprl.studies.tables.sources import circumstances_of, design_of, ending, study_table
 from cprl.studies.tables.table import METADATA, StudyTable
@@ -305,17 +305,18 @@ def test_what_pooled_runs_and_conditions_differ_in_beside_is_said(tmp_path):
 def test_runs_are_not_pooled_by_what_does_not_fit(tmp_path):
     write_runs(tmp_path, a=EXPERIMENT)
     (tmp_path / "none").mkdir()
-    for paths, options, message in (
-        (["a"], {"by": ["game.rules.freez_steps"]}, "freez_steps"),
-        (["a"], {"by": ["seed"]}, "by is 'seed'"),
-        (["a"], {"by": ["name", "name"]}, "each once"),
-        (["a"], {"by": ["name"], "reference": "x"}, "reference is 'x'"),
-        (["a"], {"by": ["name"], "window": 0}, "window is 0"),
-        (["none"], {"by": ["name"]}, "none is no run"),
-        (["a", "."], {"by": ["name"]}, "a is there twice"),
+    for options, message in (
+        ({"by": ["game.rules.freez_steps"]}, "did you mean 'freeze_steps'"),
+        ({"by": ["seed"]}, "by is 'seed'"),
+        ({"by": ["name", "name"]}, "each once"),
+        ({"by": ["name"], "reference": "x"}, "reference is 'x'"),
+        ({"by": ["name"], "window": 0}, "window is 0"),
     ):
         with pytest.raises(ValueError, match=message):
-            pooled_table([tmp_path / path for path in paths], **options)
+            pooled_table([tmp_path / "a"], **options)
+    for paths, message in ((["none"], "none is no run"), (["a", "."], "a is there twice")):
+        with pytest.raises(ValueError, match=message):
+            runs_in([tmp_path / path for path in paths])
 
 
 # Comparisons
@@ -368,6 +369,17 @@ def test_replicas_without_a_value_are_counted_and_pairs_are_those_that_both_have
     text = "\n".join(markdown(cells([compared])))
     assert "| freeze_steps=25 | 3 | 0.250 [0.250, 0.250], undefined in 32 of 90 episodes |" in text
     assert "(of 2)" in "\n".join(markdown(cells([compared], "differences")))
+
+
+def test_a_table_in_markdown_has_replicas_intervals_and_differences(pairs):
+    compared = [compare(pairs, metric) for metric in metrics_of(pairs, ["collective_return"])]
+    levels, differences = cells(compared), cells(compared, "differences")
+    assert levels.head == ["condition", "replicas", "collective return, apples"]
+    assert levels.heading == (
+        "The last 30 episodes of training; means over replicas; 95% intervals over replicas by Student's t."
+    )
+    assert [row[:2] for row in levels.rows] == [["freeze_steps=5", "3"], ["freeze_steps=25", "3"]]
+    assert differences.rows == [["freeze_steps=25", "3", "+5.0 [-1.6, +11.6]"]]
 
 
 def test_differences_are_bold_that_differ_among_all_of_their_table(tmp_path):
@@ -444,6 +456,24 @@ def drawn(monkeypatch):
     return made
 
 
+@pytest.mark.integration
+def test_figures_of_a_grid_are_drawn_with_a_condition_that_has_no_run(grid_runs, tmp_path):
+    table = study_table(GRID, grid_runs)
+    (pair,) = figures.grids(table.design)
+    assert pair == (TIME_OUT, SEES)
+    for name, draw in {
+        "factor": lambda path: figures.by_factor(table, TIME_OUT, path),
+        "levels": lambda path: figures.by_condition(table, path),
+        "differences": lambda path: figures.by_condition(table, path, kind="differences"),
+        "courses": lambda path: figures.courses(table, path),
+        "map": lambda path: figures.heat_map(table, pair, path),
+        "phases": lambda path: figures.phase_diagram(table, pair, path),
+    }.items():
+        assert_drawn(draw(tmp_path / f"{name}.png"))
+        with pytest.raises(ValueError, match=r"path is '.*\.jpg'"):
+            draw(tmp_path / f"{name}.jpg")
+
+
 LONG = "agents.*.algorithm.settings"
 
 
@@ -490,6 +520,12 @@ def test_conditions_of_any_name_are_in_the_legend_of_the_courses_and_have_a_pane
     assert all(any(name in text for text in texts) for name in names[:4])
     titles = [axes.get_title("left") for axes in apart.axes if axes.get_visible()]
     assert titles == names[1:], "beside the first"
+
+
+def test_conditions_that_were_not_run_do_not_count_among_the_replicas_of_a_figure():
+    assert figures.replicas_text({"as run": 8, "no beam": 8, "later": 0}) == "8 replicas each"
+    assert figures.replicas_text({"as run": 16, "no beam": 8, "later": 0}) == "8 to 16 replicas each (n)"
+    assert figures.replicas_text({"later": 0}) == "0 replicas each"
 
 
 def test_figures_call_conditions_by_the_level_and_say_where_replicas_differ(pairs, tmp_path):
@@ -608,8 +644,6 @@ def test_other_factors_are_held_at_the_levels_of_the_reference():
 def test_the_results_of_a_study_are_a_table_a_summary_and_figures(grid_runs, tmp_path):
     table = results.write_results(GRID, tmp_path, grid_runs, again="cprl sweep grid.py")
     drawn = {path.name for path in (tmp_path / "figures").iterdir()}
-    for name in drawn:
-        assert_drawn(tmp_path / "figures" / name)
     pair = "game_rules_freeze_steps_game_rules_window_rows"
     assert drawn == {
         "by_game_rules_freeze_steps.png", "by_game_rules_window_rows.png", "levels.png", "courses.png",

@@ -11,10 +11,10 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from same_runs import written_at
 from tiny_study import FREEZE, GAMMA, TINY
 
 from cprl import Study
+from cprl.commands import main as cli
 from cprl.commands.studies import StudyOptions, carry_out, executor_of, recipe_of, study_main
 from cprl.commands.studies import search as search_words
 from cprl.commands.studies import sweep as sweep_words
@@ -57,6 +57,11 @@ def here(tmp_path, monkeypatch):
 
 def sweep(line):
     sweep_words(shlex.split(line))
+
+
+def written_at(folder):
+    """When all files of a folder were written."""
+    return {path: path.stat().st_mtime_ns for path in Path(folder).rglob("*")}
 
 
 @pytest.mark.integration
@@ -179,6 +184,13 @@ def test_what_cannot_be_is_refused_before_anything_is_written(here, line, messag
     assert sorted(path.name for path in here.iterdir() if path.name != "__pycache__") == ["mine.py"]
 
 
+def test_flags_of_other_commands_are_unknown(capsys):
+    for command, flag in ((sweep_words, "--resume"), (sweep_words, "--points=3"), (search_words, "--only=a")):
+        with pytest.raises(SystemExit, match="2"):
+            command(["mine.py", "--vary", f"{FREEZE}=2,3", flag])
+        assert flag.partition("=")[0] in "".join(capsys.readouterr())
+
+
 def test_a_search_is_a_command_of_its_own(monkeypatch, capsys, here):
     line = f"mine.py --vary {FREEZE}=integers(1,9) --vary {GAMMA}=0.5,0.9 --turns 7 --points 7 --metric peace"
     words = f"{line} --direction minimise --at-once 2 --block 3".split()
@@ -209,13 +221,17 @@ def test_a_search_says_its_best_points(capsys):
 
 @pytest.mark.parametrize("command", [sweep_words, search_words])
 @pytest.mark.parametrize("words", ["", "--help", "mine.py --help-all"])
-def test_help_says_how_values_are_written_and_has_the_flags_of_a_recipe(command, words, capsys):
+def test_help_says_how_values_are_written_and_what_a_command_line_cannot_change(command, words, capsys):
     with pytest.raises(SystemExit) as ended:
         command(shlex.split(words))
     assert ended.value.code == 0
     said = " ".join(capsys.readouterr().out.split())
+    assert "commas stand between values" in said
     assert "loguniform(LOW,HIGH)" in said
-    assert ("--turns INT" in said) == words.startswith("mine")
+    if words.startswith("mine"):
+        assert "--turns INT" in said
+        assert "cannot be changed on the command line" in said
+        assert "the kind of an agent (Learning, Team, Scripted, Frozen), of its algorithm" in said
 
 
 def test_stored_and_shipped_recipes_are_varied_too_and_a_study_is_not(tmp_path, capsys):
@@ -230,6 +246,22 @@ def test_stored_and_shipped_recipes_are_varied_too_and_a_study_is_not(tmp_path, 
     Path("study.py").write_text("STUDY = 1")
     with pytest.raises(ValueError, match=r"describes a study"):
         sweep(f"study.py --vary {FREEZE}=1")
+
+
+def test_cprl_lists_sweep_among_its_commands(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["cprl", "--help"])
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert "sweep" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", ["cprl", "run", "--help"])
+    with pytest.raises(SystemExit):
+        cli.main()
+    said = capsys.readouterr().out
+    assert "--trial" not in said, "by which a study starts its runs"
+    assert "--allow module:Class" in said
+    monkeypatch.setattr(sys, "argv", ["cprl", "sweep", "mine.py"])
+    with pytest.raises(SystemExit, match="cprl sweep: nothing is varied"):
+        cli.main()
 
 
 STUDY = Study(TINY, {FREEZE: [2, 5]}, name="tiny_study", question="What if?", expectation="Nothing.")

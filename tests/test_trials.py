@@ -815,3 +815,10 @@ def test_a_copy_that_was_cut_off_is_made_anew(tmp_path, monkeypatch):
     assert len(list(pool.iterdir())) == 2
     ran(long, tmp_path / "long", pool)
     assert (run_of(long, pool) / "evaluation-2").is_dir()
+
+
+def test_failures_have_their_reason_and_stand_before_those_that_are_missing(look, tmp_path):
+    Status(tmp_path / "status", TRIALS[2].name).fail("ValueError: of | chance", "trace")
+    snapshot, row = look(2)
+    assert snapshot.rows[0] is row
+    assert row.note == "ValueError: of | chance"

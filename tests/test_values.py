@@ -5,14 +5,13 @@ import json
 from collections import UserDict
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from dqn_parts import make_learner
 from my_game import Callback, Dilemma
-from test_hostile_inputs import nested, within_itself
 from valid_values import EVERY
 
 from cprl import Custom, Experiment, Game, Observation, Rules, institutions, maps, presets
@@ -40,6 +39,8 @@ from cprl.objectives.preferences import SocialValueOrientation
 from cprl.policies.decisions import Bandit
 from cprl.policies.rng import LaneRng
 from cprl.population import Frozen, Learning, Scripted, Team
+from cprl.runs.files import read_json
+from cprl.runs.recipe import read_recipe
 from cprl.system.memory import TooLargeError
 from cprl.theory import appropriation, herders
 from cprl.training.running import run
@@ -56,8 +57,20 @@ FIELDS = [
     for own in fields(value)
 ]
 NAN, INF = float("nan"), float("inf")
-NUMBERS = (NAN, 2**70, 10**5000, np.float64(NAN))
-NEVER = (*NUMBERS, object(), b"3", {3: 4}, {"a"}, torch.nn.ReLU(), int, "a\0b", [NAN])
+NEVER = (
+    NAN,
+    2**70,
+    10**5000,
+    object(),
+    b"3",
+    {3: 4},
+    {"a"},
+    torch.nn.ReLU(),
+    int,
+    np.float64(NAN),
+    "a\0b",
+    [NAN],
+)
 """What fits no field."""
 
 
@@ -151,16 +164,54 @@ def test_a_custom_has_a_module_a_name_and_a_table_that_json_can_hold(target, arg
         Custom(target, arguments=arguments)
 
 
-@pytest.mark.parametrize("deep", [nested(100_000), within_itself()], ids=["deep", "in itself"])
+def nested(depth):
+    """A list in a list, and so on."""
+    value = []
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
+def itself():
+    value = {}
+    value["again"] = [value] * 3
+    return value
+
+
+@pytest.mark.parametrize("deep", [nested(100_000), itself()], ids=["deep", "in itself"])
 def test_what_is_nested_without_end_is_refused_in_a_sentence(deep):
+    own = r"^(DQNSettings\.hidden_cells|Rules\.regrow_prob) is "
     for refuses in (
         lambda: Custom("a:b", arguments={"x": deep}),
         lambda: to_config(deep),
         lambda: from_config({**to_config(REPLAY), "hidden_cells": deep}),
         lambda: Experiment.from_recipe({"format": 2, "experiment": {"name": deep}}),
+        lambda: DQNSettings(hidden_cells=deep),
+        lambda: Rules(regrow_prob=deep),
     ):
-        with pytest.raises(ValueError, match=r"nested|recursion|cannot hold"):
+        with pytest.raises(ValueError, match=rf"nested|recursion|cannot hold|{own}"):
             refuses()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 100_000 + "]" * 100_000,
+        '{"experiment": ' + '{"a":' * 100_000 + "1" + "}" * 100_001,
+        '{"experiment": {"a": ' + "9" * 5000 + "}}",
+        '{"experiment": ',
+        "3",
+        "null",
+        '{"experiment": {}}\0',
+    ],
+    ids=len,
+)
+def test_a_recipe_that_cannot_be_read_is_refused_with_its_path(text, tmp_path):
+    path = tmp_path / "recipe.json"
+    path.write_text(text)
+    for read in (read_recipe, read_json):
+        with pytest.raises(ValueError, match=r"recipe\.json (is not|holds)"):
+            read(path)
 
 
 def changed(table, place, value):
@@ -172,6 +223,25 @@ def changed(table, place, value):
         inner = inner[step]
     inner[last] = value
     return table
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        *((("seed",), 1e400), (("seed",), 10**30), (("game", "rules", "episode_steps"), 10**400)),
+        *((("agents",), {}), (("agents", 0), []), (("agents", 0, "policy"), "\ud800")),
+        *((("agents", 0, "kind"), {}), (("game",), None), (("game", "map"), 3), (("device",), "\0")),
+    ],
+)
+def test_hostile_tables_are_refused_by_the_place(place, value):
+    with pytest.raises(ValueError, match=str(place[0])):
+        Experiment.from_config(changed(EXPERIMENT.to_config(), place, value))
+
+
+def test_recipes_of_another_form_are_refused():
+    for recipe in ({}, {"recipe": "old", "arguments": {}}, {"format": [2]}, {"format": 2, "experiment": []}):
+        with pytest.raises(ValueError, match="format"):
+            Experiment.from_recipe(recipe)
 
 
 NAMES = ["", ".", "..", "a/b", "a\\b", "a\nb", "a\0b", "\ud800", "a" * 201, "ä" * 101, "a ", "a."]
@@ -186,6 +256,18 @@ def test_a_name_is_that_of_a_directory_anywhere_and_a_device_one_that_torch_take
         assert replace(EXPERIMENT, name=name).name == name
     with pytest.raises(ValueError, match=rf"^experiment\.{field} is "):
         replace(EXPERIMENT, **{field: value})
+
+
+def test_games_that_cannot_be_played_or_that_no_recipe_can_name_are_refused_in_a_sentence():
+    class Local(Dilemma):
+        pass
+
+    for game, message in (
+        *((type(GAME), "is the class Game"), (Dilemma, "the class"), (Local(), ".*Local")),
+        (SimpleNamespace(agents=1.5, to_config=dict, make=print), r"agents is 1\.5"),
+    ):
+        with pytest.raises(ValueError, match=rf"^experiment\.game.*{message}"):
+            replace(EXPERIMENT, game=game)
 
 
 HOW = {"agents": (0, 1), "replicas": 1, "engine": "eager"}
@@ -312,7 +394,11 @@ TABLE = to_config([Learning(DQN(settings=DQNSettings()))], "agents")
         ((0, "algorithm", "settings", "hidden_cells"), [8, "x"], r"hidden_cells is \(8, 'x'\)"),
         ((0, "algorithm", "settings"), {"kind": "RolloutSettings"}, r"allowed: a DQNSettings"),
         ((0, "algorithm"), {"kind": "DQN"}, r"\.algorithm lacks settings"),
-        ((0, "algorithm"), {"kind": "QMIX", "settings": {"kind": "DQNSettings"}}, "QMIX is learned by a te"),
+        (
+            (0, "algorithm"),
+            {"kind": "QMIX", "settings": {"kind": "DQNSettings"}},
+            r": QMIX is learned by a team",
+        ),
         ((0, "reward"), "own", r"\.reward is 'own'"),
     ],
 )
@@ -368,7 +454,6 @@ def test_two_tables_are_told_apart_by_place_and_what_one_leaves_out_takes_its_de
 
 
 DQN_AGENT = Learning(DQN(settings=DQNSettings()))
-THREE = [DQN_AGENT] * 3
 MIXED = Experiment(
     name="mixed",
     game=presets.game("commons"),
@@ -407,10 +492,22 @@ def test_an_experiment_equals_what_its_recipe_holds():
         ({"engine": "torchrl"}, r"experiment\.agents\[1\] is a Team"),
         ({"agents": [DQN_AGENT]}, r"experiment\.agents: 1 agents are specified for a game of 4 agents"),
         ({"agents": [DQN(settings=DQNSettings())]}, r"agents\[0\] is a DQN"),
-        ({"agents": [*THREE, Frozen("/somewhere/run", 0)]}, r"agents\[3\]\.run is /somewhere/run"),
-        ({"agents": [*THREE, Learning(PPO(settings=ROLLOUTS))], "update_every": 3}, "update_every is 3"),
-        ({"agents": [*THREE, Team(QMIX(settings=REPLAY), agents=(3,))]}, "the team has 1 agents"),
-        ({"agents": [Learning(Tabular(settings=TABLES))] * 4, "engine": "torchrl"}, r"agents\[0\] is Tab"),
+        (
+            {"agents": [DQN_AGENT] * 3 + [Frozen("/somewhere/run", 0)]},
+            r"experiment\.agents\[3\]\.run is /somewhere/run, an absolute path",
+        ),
+        (
+            {"agents": [DQN_AGENT] * 3 + [Learning(PPO(settings=RolloutSettings()))], "update_every": 3},
+            r"update_every is 3",
+        ),
+        (
+            {"agents": [DQN_AGENT] * 3 + [Team(QMIX(settings=DQNSettings()), agents=(3,))]},
+            r"the team has 1 agents",
+        ),
+        (
+            {"agents": [Learning(Tabular(settings=TabularSettings()))] * 4, "engine": "torchrl"},
+            r"agents\[0\] is Tabular, which",
+        ),
         ({"callbacks": [Callback()]}, r"callbacks\[0\] is a Callback, .*Custom\(\"my_game:Callback\", arg"),
         ({"loggers": ["csv"]}, "loggers"),
         ({"transforms": [Custom("__main__:Mine")]}, r"__main__:Mine, of the script that runs"),
