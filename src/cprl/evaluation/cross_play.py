@@ -28,7 +28,6 @@ from cprl.evaluation.evaluate import (
     opened,
     refuse_other_games,
     says_nothing,
-    table_of,
     unit_of_rewards,
 )
 from cprl.evaluation.lanes import Part, Played, Results, Whose, agents_of, fresh_of, more
@@ -294,7 +293,7 @@ def crossplay_tables(played: CrossPlay) -> Iterator[Cells]:
         for agent in cell.by_agent:
             measures = cell.measures(agent)
             rows.append((*pair, str(agent), *(str(measures[name]) for name in returns)))
-    yield table_of("returns by the focal agent's index", headings, rows, texts=3)
+    yield Cells("returns by the focal agent's index", headings, rows, texts=3)
 
 
 def matrix_table(
@@ -302,4 +301,4 @@ def matrix_table(
 ) -> Cells:
     """A row and a column for each name, with the text of each pair, "" where there is none."""
     rows = [(row, *(str(cells.get((row, column), "")) for column in names)) for row in names]
-    return table_of(title, [corner, *names], rows, note=note)
+    return Cells(title, [corner, *names], rows, note)

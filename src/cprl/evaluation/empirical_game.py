@@ -28,7 +28,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from cprl.evaluation.cross_play import CrossPlay, Runs, draw_matrix, matrix_height, matrix_table, named_runs
-from cprl.evaluation.evaluate import SEED, heading, table_of
+from cprl.evaluation.evaluate import SEED, heading
 from cprl.evaluation.lanes import Part, Played, Results, Who, agents_of, fresh_of, shifted
 from cprl.measuring.statistics import CONFIDENCE, HOLM, Estimate, estimate, starred
 from cprl.system.defaults import EGTA_RESAMPLES
@@ -272,8 +272,8 @@ def egta_tables(analysis: Analysis) -> Iterator[Cells]:
             analysis.game.names, analysis.shares, analysis.in_support, strict=True
         )
     ]
-    yield table_of(title, columns, rows)
-    yield table_of("equilibria", ["", "what is played", "how certain"], _ends(analysis), texts=2)
+    yield Cells(title, columns, rows)
+    yield Cells("equilibria", ["", "what is played", "how certain"], list(_ends(analysis)), texts=2)
 
 
 def _payoff_table(game: EmpiricalGame) -> Cells:
@@ -293,7 +293,7 @@ def _payoff_table(game: EmpiricalGame) -> Cells:
         texts = (str(estimate(of_run)) if count else "" for of_run, count in means)
         rows.append((composition_text(counts, game.names), *texts))
     title = "return of an agent of each run, by how many agents play as each"
-    return table_of(title, ["agents", *game.names], rows)
+    return Cells(title, ["agents", *game.names], rows)
 
 
 def _ends(analysis: Analysis) -> Iterator[tuple[str, str, str]]:

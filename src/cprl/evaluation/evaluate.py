@@ -11,9 +11,9 @@ import torch
 
 from cprl.envs.make_env import stored_game
 from cprl.envs.unwrap import agent_names
-from cprl.evaluation.lanes import Fresh, Part, Played, Results, Values, agents_of, fresh_of, scripted
+from cprl.evaluation.lanes import Fresh, Part, Played, Results, agents_of, fresh_of, scripted
 from cprl.measuring.metrics import bounds, left_out, with_unit
-from cprl.measuring.series import OF_AGENTS
+from cprl.measuring.series import OF_AGENTS, Values
 from cprl.measuring.statistics import Estimate, Measured, agents_without_harvest, over_replicas
 from cprl.system.defaults import SEED as SEED
 from cprl.terminal.tables import Cells
@@ -126,13 +126,6 @@ def opened(run: str | Path | LoadedRun, allow: Sequence[str] = ()) -> LoadedRun:
     return run if isinstance(run, LoadedRun) else load(run, allow=allow)
 
 
-def table_of(
-    title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1, note: str = ""
-) -> Cells:
-    """Return a table for the terminal whose first columns are texts and all others numbers."""
-    return Cells(title, columns, list(rows), note, texts)
-
-
 def beyond(measures: Iterable[tuple[str, Measured]]) -> str:
     """A sentence for a table of metrics some of whose intervals reach beyond what the metric can be."""
     for name, measured in measures:
@@ -168,8 +161,9 @@ def run_table(evaluation: Evaluation) -> Cells:
         counts = (f"{count[0]} of {count[1]}" for count in without if count)
         rows.append(("agents without a harvest, not in sustainability", *counts))
     notes = left_out(next(iter(evaluation.trained.values()))[0].reported), zeros, beyond(trained.items())
-    title, columns = heading_beside_random(evaluation.run, evaluation.fresh)
-    return table_of(title, columns, rows, note="\n".join(filter(None, notes)))
+    return Cells(
+        *heading_beside_random(evaluation.run, evaluation.fresh), rows, "\n".join(filter(None, notes))
+    )
 
 
 def heading_beside_random(run: LoadedRun, fresh: Fresh) -> tuple[str, list[str]]:

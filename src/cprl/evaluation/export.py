@@ -92,24 +92,22 @@ def _play(turns: Turns) -> Played:
         batches.append(turns.play().clone())
     agents, last = keys.AGENTS, batches[-1]
 
-    def stacked(*name: str, default: str = "") -> Any:
-        entries = [batch.get(name, None) for batch in batches]
-        if entries[0] is None:
-            shape, dtype = batches[0]["next", agents, "reward"].shape[1:2], np.bool_
-            return np.full((len(batches), *shape), default == "yes", dtype)
-        return np.stack([entry[0].numpy(force=True) for entry in entries])
+    def stacked(*name: str, lacking: Any = None) -> Any:
+        """An entry of all turns; the other value where the game has none."""
+        if batches[0].get(name, None) is None:
+            return lacking
+        return np.stack([batch[name][0].numpy(force=True) for batch in batches])
 
-    observed = stacked(agents, "observation")
-    reward = stacked("next", agents, "reward")[..., 0]
-    harvest = stacked("next", *keys.HARVEST)
+    observed, action = stacked(agents, "observation"), stacked(agents, "action")
+    reward, nobody = stacked("next", agents, "reward")[..., 0], np.zeros(action.shape, np.bool_)
     return Played(
         observation=np.concatenate([observed, last["next", agents, "observation"].numpy(force=True)]),
-        action=stacked(agents, "action"),
+        action=action,
         reward=reward,
-        harvest=reward if harvest.dtype == np.bool_ else harvest,
-        in_play=stacked(agents, "in_play", default="yes"),
-        fired=stacked("next", agents, "fired"),
-        tagged=np.asarray(np.atleast_3d(stacked("next", *keys.TAGGED_BY)).any(-1)),
+        harvest=stacked("next", *keys.HARVEST, lacking=reward),
+        in_play=stacked(agents, "in_play", lacking=~nobody),
+        fired=stacked("next", agents, "fired", lacking=nobody),
+        tagged=stacked("next", *keys.TAGGED_BY, lacking=nobody[..., None]).any(-1),
         terminated=bool(last["next", "terminated"].any()),
     )
 

@@ -13,7 +13,6 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, Self, TypeAlias
 import numpy as np
 import pyarrow as pa
 import torch
-from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
@@ -24,7 +23,8 @@ from cprl.commons.world import Shown
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.make_env import is_playable, make_env, spaces_of
 from cprl.measuring.episodes import Episode
-from cprl.measuring.evaluate import evaluate
+from cprl.measuring.evaluate import Policy, evaluate
+from cprl.measuring.series import Values
 from cprl.measuring.statistics import (
     Estimate,
     Measured,
@@ -41,8 +41,6 @@ from cprl.system.defaults import SEED
 from cprl.system.process import one_thread
 from cprl.training.agents import LoadedRun, Population, StoredAgent, load, stored_policies
 from cprl.values import Custom, Positive, Seed, Value, Where, made, refusal, trust
-
-Values = NDArray[np.float64]
 
 Played: TypeAlias = dict[int, list[Episode]]
 """Episodes by the number of the replica."""
@@ -324,9 +322,6 @@ def agent_named(who: str, agent: int, *, replica: int | None = None, name: str) 
     if not Path(who).is_dir():
         raise refusal(name, who, f"{', '.join(SCRIPTED_POLICIES)}, or a run's directory")
     return Frozen(who, agent, replica)
-
-
-Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
 class Turns:

@@ -23,9 +23,10 @@ from cprl.commons.rules import Rules
 from cprl.commons.world import Shown, StepOutput
 from cprl.envs.make_env import make_env
 from cprl.envs.unwrap import commons_of
-from cprl.evaluation.lanes import Policy, Turns, agent_named, board_now, commons_game
+from cprl.evaluation.lanes import Turns, agent_named, board_now, commons_game
 from cprl.experiment import presets
 from cprl.measuring import social
+from cprl.measuring.evaluate import Policy
 from cprl.measuring.metrics import title
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import Scripted

@@ -211,44 +211,40 @@ class _Handler(BaseHTTPRequestHandler):
         super().__init__(*arguments)
 
     def do_GET(self) -> None:
-        self._answer({"/": self._page, "/data": self._data, "/recipe": self._recipe, "/state": self._state})
+        self._answer("/", "/data", "/recipe", "/state")
 
     def do_POST(self) -> None:
-        self._answer({"/train": self._train})
+        self._answer("/train")
 
-    def _answer(self, answers: Mapping[str, Any]) -> None:
+    def _answer(self, *paths: str) -> None:
         port = self._sandbox.server.server_port
         ours = {f"127.0.0.1:{port}", f"localhost:{port}"}
         origin = self.headers.get("Origin")
         is_ours = self.headers.get("Host") in ours and origin in (None, *(f"http://{host}" for host in ours))
         address = urlsplit(self.path)
-        if not is_ours or address.path not in answers:
+        if not is_ours or address.path not in paths:
             self._send("not here", "text/plain", HTTPStatus.NOT_FOUND if is_ours else HTTPStatus.FORBIDDEN)
             return
         query = dict(parse_qsl(address.query))
         trained = query.pop("trained", "") == "yes"
         try:
-            text, kind = answers[address.path](Sliders.of(query), trained)
+            text, kind = self._content(address.path, Sliders.of(query), trained=trained)
         except ValueError as error:
             self._send(str(error), "text/plain", HTTPStatus.BAD_REQUEST)
             return
         self._send(text, kind, HTTPStatus.OK)
 
-    def _page(self, sliders: Sliders, trained: bool) -> tuple[str, str]:
-        return sandbox_page(), "text/html"
-
-    def _data(self, sliders: Sliders, trained: bool) -> tuple[str, str]:
-        return json.dumps(self._sandbox.play(sliders, trained=trained)), "application/json"
-
-    def _recipe(self, sliders: Sliders, trained: bool) -> tuple[str, str]:
-        return sliders.recipe(self._sandbox.episodes), "text/plain"
-
-    def _state(self, sliders: Sliders, trained: bool) -> tuple[str, str]:
+    def _content(self, path: str, sliders: Sliders, *, trained: bool) -> tuple[str, str]:
+        """A text and its type."""
+        if path == "/":
+            return sandbox_page(), "text/html"
+        if path == "/data":
+            return json.dumps(self._sandbox.play(sliders, trained=trained)), "application/json"
+        if path == "/recipe":
+            return sliders.recipe(self._sandbox.episodes), "text/plain"
+        if path == "/train":
+            self._sandbox.train(sliders)
         return json.dumps(self._sandbox.state()), "application/json"
-
-    def _train(self, sliders: Sliders, trained: bool) -> tuple[str, str]:
-        self._sandbox.train(sliders)
-        return self._state(sliders, trained)
 
     def _send(self, text: str, kind: str, status: HTTPStatus) -> None:
         content = text.encode()

@@ -27,7 +27,6 @@ from cprl.evaluation.evaluate import (
     opened,
     refuse_other_games,
     refuse_unlike,
-    table_of,
 )
 from cprl.evaluation.lanes import (
     Agent,
@@ -321,12 +320,12 @@ def scenario_tables(scores: Scores) -> Iterator[Cells]:
     everything = {scenario.name for scenario in scenarios_of(scores.run.game)}
     left_out = left_out_of(scores.run.game) if everything == set(by_scenario) else ""
     note = f"{HOLM} for all {len(ahead)} differences" + f". Left out: {left_out}" * bool(left_out)
-    yield table_of("return per agent, apples", columns, rows, note=note)
+    yield Cells("return per agent, apples", columns, rows, note)
     title = "all agents together, with the run's agents in the focal places"
     measured = {name: score.measures() for name, score in by_scenario.items()}
     social = [(name, *(str(measures[metric]) for metric in SOCIAL)) for name, measures in measured.items()]
     note = beyond((metric, measures[metric]) for measures in measured.values() for metric in SOCIAL)
-    yield table_of(title, ["scenario", *map(with_unit, SOCIAL)], social, note=note)
+    yield Cells(title, ["scenario", *map(with_unit, SOCIAL)], social, note)
 
 
 def estimates(scores: Scores) -> pa.Table:

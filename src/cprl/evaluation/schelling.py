@@ -31,13 +31,12 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from cprl.commons.game import Game
-from cprl.evaluation.evaluate import SEED, bars_of, heading, table_of
+from cprl.evaluation.evaluate import SEED, bars_of, heading
 from cprl.evaluation.lanes import (
     Fresh,
     Part,
     Played,
     Results,
-    Values,
     Who,
     Whose,
     agent_named,
@@ -45,6 +44,7 @@ from cprl.evaluation.lanes import (
     place_of,
     shifted,
 )
+from cprl.measuring.series import Values
 from cprl.measuring.statistics import Estimate, Measured, difference, estimate
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.terminal import style
@@ -262,9 +262,9 @@ def schelling_tables(diagram: SchellingDiagram) -> Iterator[Cells]:
         f"greed, G({last}) - R({last})": dilemma.greed,
     }
     rows = [(name, str(margin)) for name, margin in margins.items()]
-    yield table_of(f"{dilemma.name}, by returns", ["", "difference, paired by replica"], rows)
+    yield Cells(f"{dilemma.name}, by returns", ["", "difference, paired by replica"], rows)
     payoffs = zip(diagram.restrained_payoffs.T, diagram.greedy_payoffs.T, strict=True)
-    yield table_of(
+    yield Cells(
         heading("Schelling diagram", diagram.fresh, (), " for each choice of restrained agents"),
         [
             f"restrained among the other {diagram.agents - 1}",

@@ -13,7 +13,6 @@ visit many cells seldom have hit the same ones by chance: average the visits of 
 compare with other agents, such as random ones, over as many steps from the same starts.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
@@ -21,11 +20,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import keys
 from cprl.envs.commons_env import CommonsEnv
+from cprl.measuring.evaluate import Policy
 from cprl.system.process import one_thread
 
 Array = NDArray[Any]
@@ -53,9 +52,7 @@ class Trace:
         return Trace(**arrays, board=self.board, tags=tags - np.array([0, first, 0, 0]))
 
 
-def trace(
-    env: CommonsEnv, policy: Callable[[TensorDictBase], TensorDictBase], *, explore: bool = True
-) -> Trace:
+def trace(env: CommonsEnv, policy: Policy, *, explore: bool = True) -> Trace:
     """Plays the next episode of each world and records the positions of all agents."""
     steps: list[tuple[Array, ...]] = []
     tags: list[Array] = []

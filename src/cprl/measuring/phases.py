@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Values = NDArray[np.float64]
+from cprl.measuring.series import Values
 
 PHASES: Final = ("exploration", "tragedy", "combat", "cultivation")
 """The study's names of phases, in its order."""

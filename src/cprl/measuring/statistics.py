@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cprl.measuring.episodes import Episode
-
-Values = NDArray[np.float64]
+from cprl.measuring.series import Values
 
 CONFIDENCE: Final = 0.95
 

@@ -211,7 +211,8 @@ def drawing(
         sheet.finish()
         save(sheet.figure, path, colours=colours, title=sheet.title, caption=sheet.caption)
         if width == "column":
-            save_caption(path.with_suffix(".caption.txt"), f"{sheet.title}\n\n{sheet.caption}\n")
+            text = f"{sheet.title}\n\n{sheet.caption}\n".encode("utf-8", "replace")
+            write_atomically(path.with_suffix(".caption.txt"), lambda file: file.write(text))
 
 
 def picture_path(path: str | Path, name: str = "path") -> Path:
@@ -243,11 +244,6 @@ def save(figure: Figure, path: Path, *, colours: int = COLOURS, title: str = "",
         figure.savefig(drawn, format=path.suffix[1:], metadata=about)
     write_atomically(path, lambda file: file.write(drawn.getvalue()))
     return path
-
-
-def save_caption(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda file: file.write(text.encode("utf-8", "replace")))
 
 
 def _with_colours(drawn: BytesIO, colours: int, dpi: float, about: dict[str, str]) -> BytesIO:
