@@ -4,8 +4,6 @@ import json
 import os
 import shutil
 from dataclasses import replace
-from math import isnan
-from pathlib import Path
 
 import matplotlib
 import numpy as np
@@ -49,7 +47,7 @@ from cprl.evaluation.lanes import Fresh, Part, Turns, agents_of
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.metrics import with_unit
 from cprl.measuring.movement import trace
-from cprl.measuring.statistics import agents_without_harvest, over_replicas, social_measures
+from cprl.measuring.statistics import agents_without_harvest, over_replicas
 from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import LaneActor, random_agents
@@ -123,12 +121,11 @@ def test_greedy_agents_play_what_the_policy_of_the_loaded_run_plays(name, learne
     assert values(found.measures())["collective_return"] == pytest.approx(np.mean(means))
 
 
-@pytest.mark.parametrize(("worlds", "of_policy", "plays"), [(4, 1, "1 world"), (2, 4, "4 worlds")])
+@pytest.mark.parametrize(("worlds", "of_policy"), [(4, 1), (2, 4)])
 @pytest.mark.parametrize("name", ["alike", "mixed"])
-def test_a_policy_for_another_number_of_worlds_is_refused(name, worlds, of_policy, plays, learned):
+def test_a_policy_for_another_number_of_worlds_is_refused(name, worlds, of_policy, learned):
     loaded = cprl.load(learned[name])
-    message = f"the policy plays {plays} and the environment has {worlds}; allowed: as many"
-    with pytest.raises(ValueError, match=rf"{message}, e\.g\. run\.policy\(replica, worlds={worlds}\)"):
+    with pytest.raises(ValueError, match=f"the policy plays {of_policy} world.* has {worlds}"):
         loaded.env(worlds=worlds).rollout(3, loaded.policy(0, worlds=of_policy))
     assert loaded.env(worlds=worlds).rollout(3, loaded.policy(0, worlds=worlds)).batch_size[0] == worlds
 
@@ -151,16 +148,6 @@ def test_networks_that_do_not_stack_play_the_same(learned):
         one, other = (cprl.evaluate_run(run, episodes=2, greedy=greedy) for run in (loaded, own))
         for replica in loaded.replicas:
             assert told(one.trained[replica]) == told(other.trained[replica])
-
-
-def test_a_loaded_run_and_what_is_played_with_it_are_printed_in_a_line(learned):
-    loaded = cprl.load(learned["alike"])
-    for fact in (str(loaded.path), "'alike'", "3 episodes", "3 replicas", "2 agents"):
-        assert fact in repr(loaded)
-    played = cprl.evaluate_run(learned["alike"], episodes=1)
-    pairs = cprl.crossplay(learned, episodes=1)
-    for printed in (loaded, played, pairs, loaded.agent(0), played.trained[0][0]):
-        assert len(repr(printed).replace(str(loaded.path), "RUN")) <= 300, printed
 
 
 def test_agents_explore_with_the_runs_epsilon_for_evaluation(learned, tmp_path):
@@ -271,13 +258,11 @@ def test_a_matrix_of_scripted_agents_gives_the_numbers_worked_by_hand(corridors)
     }
     assert set(found.cells) == set(wanted)
     for at, returns in wanted.items():
-        measures = found.cell(*at).measures()
-        assert [measures[f"{who}/return"].estimate.value for who in ("focal", "background", "group")] == list(
-            returns
-        )
+        measures = values(found.cell(*at).measures())
+        assert tuple(measures[f"{who}/return"] for who in ("focal", "background", "group")) == returns
     visit = found.cell("greedy", "sustainable")
-    assert [visit.measures(agent)["focal/return"].estimate.value for agent in (0, 1)] == [2, 3]
-    assert [visit.measures(agent)["stock_left"].estimate.value for agent in (0, 1)] == [3, 2]
+    of_agents = [values(visit.measures(agent)) for agent in (0, 1)]
+    assert [(one["focal/return"], one["stock_left"]) for one in of_agents] == [(2, 3), (3, 2)]
     assert visit.measures()["equality"].estimate.value == 0.5, "one of two has everything"
     assert visit.measures()["collective_return"].episodes == 2 * 2 * 2
     at_home = found.cell("sustainable", "sustainable").measures()
@@ -294,8 +279,7 @@ def test_a_matrix_of_scripted_agents_gives_the_numbers_worked_by_hand(corridors)
 def test_games_are_unlike_in_fields_that_a_refusal_names():
     rules, observation = replace(MEADOW.rules, freeze_steps=7), Observation(agents_apart=True)
     other = replace(MEADOW, rules=rules, observation=observation)
-    fields = r"Game\.rules\.freeze_steps was 2, is 7; Game\.observation\.agents_apart was False, is True;"
-    with pytest.raises(ValueError, match=f"^one and another have different games: {fields}"):
+    with pytest.raises(ValueError, match=r"rules\.freeze_steps was 2, is 7.*observation\.agents_apart"):
         refuse_unlike("one and another", MEADOW, other)
     refuse_unlike("one and another", MEADOW, replace(MEADOW))
 
@@ -414,23 +398,12 @@ def shade(at):
     return np.round(255 * np.array(matplotlib.colormaps["RdBu"](at)[:3]))
 
 
-def test_social_measures_are_those_of_the_docs(corridors):
-    found = cprl.evaluate_run(corridors["greedy"], episodes=1)
-    text = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
-    documented = [line.split("`")[1] for line in text.splitlines() if line.startswith("| `social/")]
-    assert {f"social/{name}" for name in social_measures(found.trained)} == set(documented)
-    (single,) = [one for name, one in social_measures({0: found.trained[0]}).items() if name == "peace"]
-    assert str(single) == "2.00", "one replica alone has no interval"
-    assert isnan(single.estimate.low)
-
-
 def rows_of(text):
     """The cells of the rows of all tables."""
     return [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines() if "│" in line]
 
 
 WRITTEN = [
-    (["evaluate", "{alike}", "--episodes", 2], ["seed 30011, epsilon 0.05"], [], 2 * 3 * 2 * 2, False),
     (
         ["evaluate", "{greedy}", "--episodes", 1],
         ["greedy: 2 replicas, 1 episode each, seed 30011", "Weights: "],
@@ -554,7 +527,6 @@ def test_the_table_of_an_evaluation_has_every_metric_and_its_file_every_episode(
     ("words", "answer"),
     [
         (["crossplay", "bites={greedy}", "bites={sustainable}"], "bites names 2 runs"),
-        (["crossplay", "{greedy}"], "the number of runs is 1"),
         (["visits", "{greedy}", "--random"], "allowed: with --figure"),
     ],
 )
@@ -583,11 +555,9 @@ def test_replicas_play_the_same_alone_and_whoever_drew_before(play, learned):
     assert list(alone.played) == [0, 2]
     replica = np.array(everything["replica"])
     assert repr(alone.table().to_pydict()) == repr(everything.filter(replica != 1).to_pydict())
-    returns = [everything.filter(replica == number)["return"].to_pylist() for number in (0, 1)]
-    assert returns[0] != returns[1], "replicas play different worlds"
-    assert (
-        play(learned, episodes=2, seed=SEED).table()["return"].to_pylist() != everything["return"].to_pylist()
-    )
+    first, second = (everything.filter(replica == number)["return"] for number in (0, 1))
+    assert first != second, "replicas play different worlds"
+    assert play(learned, episodes=2, seed=SEED).table()["return"] != everything["return"]
 
 
 FULL = replace(MEADOW, observation=Observation(area="full"))
@@ -603,10 +573,7 @@ RANDOM = [Scripted("random")] * 2
         (lambda runs: cprl.evaluate_run(runs["alike"], replicas=[1, 9, 3]), r"no replicas \[3, 9\]"),
         (lambda runs: cprl.crossplay([runs["alike"]]), "the number of runs is 1"),
         (lambda runs: cprl.crossplay([runs["alike"], runs["mixed"], runs["alike"]]), "alike is given twice"),
-        (
-            lambda runs: cprl.crossplay([runs["alike"], runs["mixed"], runs["greedy"]]),
-            r"alike and greedy .* different games: Game\.map\.",
-        ),
+        (lambda runs: cprl.crossplay([runs["alike"], runs["greedy"]]), "alike and greedy .* Game.map"),
         (lambda runs: cprl.crossplay([runs["lonely"], runs["alone"]]), "the game has 1 agent"),
         (
             lambda runs: cprl.crossplay([runs["alike"], runs["mixed"]], diagonal="cross_seed", replicas=[1]),
@@ -617,10 +584,7 @@ RANDOM = [Scripted("random")] * 2
         (lambda _: play_population(MEADOW, RANDOM[1:]), "1 agents are specified for a game of 2"),
         (lambda _: play_population(MEADOW, RANDOM, replicas=0), "replicas is"),
         (lambda runs: play_population(MEADOW, among(runs["alike"]), seed=3), "seed is 3, the training seed"),
-        (
-            lambda runs: play_population(MEADOW, among(runs["alike"]), replicas=4),
-            "keeps no network of replica_3/agent_0",
-        ),
+        (lambda runs: play_population(MEADOW, among(runs["alike"]), replicas=4), "network of replica_3"),
         (lambda _: schelling(ALONE), "the game has 1 agent"),
         (lambda _: schelling(CORRIDORS, restrained="kind"), "restrained is 'kind'"),
         (lambda _: schelling(CORRIDORS, greedy="sustainable"), "greedy is 'sustainable'"),
@@ -629,22 +593,10 @@ RANDOM = [Scripted("random")] * 2
             lambda runs: schelling(MEADOW, restrained=str(runs["alike"]), greedy=f"{runs['alike']}/"),
             "greedy is '.*alike/'",
         ),
-        (
-            lambda runs: run_scenarios(runs["greedy"], scenarios=["among_wolves"]),
-            "a scenario is 'among_wolves'",
-        ),
-        (
-            lambda runs: run_scenarios(runs["greedy"], scenarios=["minority_among_greedy"] * 2),
-            "minority_among_greedy is given twice",
-        ),
-        (
-            lambda runs: run_scenarios(runs["alike"], scenarios=scenarios_of(CORRIDORS)[:1]),
-            "have different games: Game.map",
-        ),
-        (
-            lambda runs: run_scenarios(runs["greedy"], scenarios=[its_like(CORRIDORS, runs["alike"])]),
-            "greedy and the background .*alike have",
-        ),
+        (lambda runs: scenes(runs["greedy"], "among_wolves"), "a scenario is 'among_wolves'"),
+        (lambda runs: scenes(runs["greedy"], *["minority_among_greedy"] * 2), "is given twice"),
+        (lambda runs: scenes(runs["alike"], scenarios_of(CORRIDORS)[0]), "different games: Game.map"),
+        (lambda runs: scenes(runs["greedy"], its_like(CORRIDORS, runs["alike"])), "the background .*alike"),
         (lambda _: scenarios_of(prisoners_dilemma(turns=2)), "the game is a MatrixGame"),
         (lambda _: scenarios_of(ALONE), "the game has 1 agent"),
         (lambda _: scenarios_of(FULL), "Observation.area is 'full'"),
@@ -665,6 +617,10 @@ def odd(tmp_path_factory):
         "alone": stored(folder / "alone", lonely),
         "matrix": stored(folder / "matrix", prisoners_dilemma(turns=2), "random"),
     }
+
+
+def scenes(run, *scenarios):
+    return run_scenarios(run, scenarios=scenarios)
 
 
 def among(run):

@@ -2,6 +2,7 @@
 
 import signal
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -98,14 +99,12 @@ def test_a_training_is_the_same_bit_for_bit_with_evaluations_and_without(changes
 
 
 def test_the_table_has_a_row_for_each_evaluation_replica_episode_and_agent(evaluated):
-    table = read_evaluations(evaluated).to_pydict()
-    places = list(
-        zip(*(table[name] for name in ("trained_episodes", "replica", "episode", "agent")), strict=True)
-    )
-    assert sorted(places) == [
-        (t, r, e, a) for t in (2, 4) for r in range(2) for e in range(3) for a in range(4)
+    table = read_evaluations(evaluated)
+    places = [
+        (row["trained_episodes"], row["replica"], row["episode"], row["agent"]) for row in table.to_pylist()
     ]
-    assert set(read_episodes(evaluated).column_names) - {"wanted_return", "world"} <= set(table)
+    assert sorted(places) == list(product((2, 4), range(2), range(3), range(4)))
+    assert set(read_episodes(evaluated).column_names) - {"wanted_return", "world"} <= set(table.column_names)
 
 
 @pytest.mark.integration

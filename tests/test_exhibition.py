@@ -23,7 +23,7 @@ from cprl.training.agents import Population
 from cprl.training.outcome import exhibited, fresh_env
 from cprl.viewer import exhibition
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.exhibition import BATCH_S, BATCH_STEPS, Exhibition, caption_of
+from cprl.viewer.exhibition import BATCH_S, BATCH_STEPS, Exhibition
 from cprl.viewer.layout import curves_of, scene_of
 from cprl.viewer.live import Stream
 
@@ -248,20 +248,6 @@ def test_its_world_is_played_by_no_training_and_no_evaluation():
             stocks.append(each.worlds.state()["stock"])
         courses += [repr(own.tolist()) for own in np.stack(stocks, 1)]
     assert len(set(courses)) == len(courses)
-
-
-@pytest.mark.parametrize(
-    ("epsilons", "is_trained", "episode", "caption"),
-    [
-        ((0.314,), False, 1234, "present policy, episode 1,234, epsilon 0.31"),
-        ((), False, 0, "present policy, episode 0"),
-        ((0.1, 0.5, 1.0), False, 3, "present policy, episode 3, epsilon 0.10 to 1.00"),
-        ((0.05,), True, 4800, "trained policy, episode 4,800, epsilon 0.05"),
-    ],
-)
-def test_the_caption_names_the_episode_and_the_exploration(epsilons, is_trained, episode, caption):
-    policy = SimpleNamespace(epsilons=epsilons, is_trained=is_trained, explore_as_now=lambda: None)
-    assert caption_of(policy, episode) == caption
 
 
 def test_an_exhibition_that_fails_warns_once_and_ends(kept, monkeypatch):

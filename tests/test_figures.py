@@ -156,8 +156,11 @@ def test_what_is_not_over_by_the_last_episode_is_said(tmp_path, drawn):
     assert drawn[0].caption.endswith("Exploration was not over at the last episode.")
 
 
-@pytest.mark.parametrize(("episodes", "has_bands"), [(999, False), (1000, True)])
-def test_phases_are_drawn_from_a_thousand_episodes_on(episodes, has_bands, tmp_path, drawn):
+@pytest.mark.parametrize(("episodes", "has_bands"), [(999, False), (1000, True), (1001, False)])
+def test_phases_are_drawn_from_a_thousand_episodes_to_the_longest(
+    episodes, has_bands, tmp_path, drawn, monkeypatch
+):
+    monkeypatch.setattr(phases, "EPISODES", range(phases.FEWEST_EPISODES, 1001))
     run = a_run(tmp_path / "run", the_tragedy(2, episodes))
     training_curve(run, title="commons")
     (figure,) = drawn
@@ -181,14 +184,6 @@ def test_phases_need_a_group_and_numbers_in_every_window():
     assert phases_of({**curves, "equality": nobody}) is None
     alone = {name: values for name, values in curves.items() if name != "return_1"}
     assert phases_of(alone) is None
-
-
-def test_trainings_too_long_for_the_search_of_phases_are_drawn_without(tmp_path, drawn, monkeypatch):
-    monkeypatch.setattr(phases, "LONGEST", 1000)
-    monkeypatch.setattr(phases, "EPISODES", range(phases.FEWEST_EPISODES, phases.LONGEST + 1))
-    for episodes in (1000, 1001):
-        training_curve(a_run(tmp_path / f"{episodes}", the_tragedy(1, episodes)), title="long")
-    assert [len(figure.axes) for figure in drawn] == [3, 2], "the strip of phases, and the two metrics"
 
 
 def test_the_published_phases_end_with_the_figure():
@@ -273,11 +268,6 @@ def test_names_in_figures_are_no_formulas(name, tmp_path):
     texts = [text for text in figure.findobj(Text) if text.get_text() == name]
     assert len(texts) >= 3, "the title, the tick and the legend"
     assert not any(text.get_parse_math() for text in texts)
-
-
-def test_long_names_break_at_their_signs_and_only_where_they_must():
-    assert style.wrapped("target_every_episodes", 8) == "target_every_\nepisodes"
-    assert style.wrapped("beside a target_network", 10) == "beside a\ntarget_network"
 
 
 @pytest.mark.integration

@@ -43,12 +43,8 @@ def test_a_game_and_an_experiment_say_what_they_are():
     game = cprl.Game(map=game.map, rules=game.rules, institutions=(Quota(share=0.25, window_steps=50),))
     experiment = cprl.Experiment(name="a<b", game=game, agents=agents, episodes=3, replicas=2, worlds=4)
     html = experiment._repr_html_()
-    assert html.startswith(
-        "<p><b>a&lt;b</b>: 2 agents by DQN, 2 agents by the script &#x27;greedy&#x27;, "
-        "trained for 3 episodes in 2 replicas of 4 worlds.</p>"
-    )
-    assert "Rules: quota (share 0.25" in html
-    assert "<svg" in html
+    for part in ("<b>a&lt;b</b>: 2 agents by DQN", "2 replicas of 4 worlds", "quota (share 0.25", "<svg"):
+        assert part in html
 
 
 @pytest.mark.integration
@@ -64,11 +60,7 @@ def test_the_notebook_runs(tmp_path):
         for output in cell.get("outputs", ())
         if output.output_type == "execute_result"
     ]
-    assert [("<svg" in html, "<iframe" in html) for html in shown] == [
-        (True, False),
-        (True, False),
-        (False, True),
-        (False, True),
-    ]
+    assert ["<svg" in html for html in shown] == [True, True, False, False]
+    assert ["<iframe" in html for html in shown] == [False, False, True, True]
     assert "A quota" in shown[2]
     assert (tmp_path / "notebook" / "no_rule" / "report.html").is_file()

@@ -5,11 +5,11 @@ from shutil import copytree
 
 import pytest
 from recordings import column, names
+from stored_runs import command
 from tiny_study import TINY
 
 import cprl
 from cprl import Custom, Study
-from cprl.commands import main as cli
 from cprl.runs.curves import curves_of
 from cprl.runs.episodes import read_episodes, read_evaluations
 from cprl.studies import Search, StudyTable
@@ -60,11 +60,8 @@ def test_it_is_a_curve_of_the_recording_and_of_a_logger_and_a_row_of_what_is_eva
     lines = (run.parent / "own/scalars/social/largest_share.csv").read_text().split()
     assert len(lines) == len(defined)
     assert column(run / "run.rrd", "random_play/largest_share", "Scalars:scalars")[1]
-    monkeypatch.setattr(
-        "sys.argv", ["cprl", "evaluate", str(run), "--episodes", "2", "--allow", SHARE, "--allow", LOGGER]
-    )
-    cli.main()
-    assert "largest_share" in capsys.readouterr().out
+    words = ["evaluate", run, "--episodes", 2, "--allow", SHARE, "--allow", LOGGER]
+    assert "largest_share" in command(monkeypatch, capsys, *words)
 
 
 def test_it_has_a_plot_and_a_line_of_its_own_in_the_viewer():

@@ -19,7 +19,7 @@ from cprl.commons.colours import (
     class_colour,
     picture_colour,
 )
-from cprl.commons.picture import BODY, INK, MARKED, agent_sprite, number_pixels, world_image
+from cprl.commons.picture import INK, agent_sprite, world_image
 from cprl.viewer.board import marks, numbers, numbers_and_headings
 
 SEEN = {
@@ -71,11 +71,6 @@ def test_all_colours_of_pictures_differ_for_people_who_lack_a_cone(kind):
     assert found >= least, f"{nearest} differ by {found:.1f} under {kind}"
 
 
-def test_the_measure_finds_colours_that_look_the_same():
-    old = {"agent 0": (86, 156, 255), "agent 3": (186, 110, 255)}
-    assert differences(SEEN["deuteranopia"][0], old)["agent 0", "agent 3"] < 3
-
-
 def test_twelve_agents_differ_from_each_other_in_hue_or_mark():
     assert len({(agent_colour(agent), agent_mark(agent)) for agent in range(12)}) == 12
     assert agent_colour(4) == agent_colour(0), "no fifth hue is far enough from the others"
@@ -86,12 +81,6 @@ def test_windows_keep_the_colours_of_the_study():
     assert class_colour(SELF) == (0, 0, 255)
     assert class_colour(APPLE) == (0, 255, 0)
     assert class_colour(FIRST_AGENT) == (86, 156, 255), "stored agents learned from these under agents_apart"
-
-
-def test_digits_are_drawn_on_three_by_five_pixels():
-    drawn = ["".join(".#"[int(pixel)] for pixel in row) for row in number_pixels(42)]
-    assert drawn == ["#.#.###", "#.#...#", "###.###", "..#.#..", "..#.###"]
-    assert len({number_pixels(digit).tobytes() for digit in range(10)}) == 10
 
 
 @pytest.mark.parametrize("size", [11, 15, 23, 35])
@@ -107,12 +96,6 @@ def test_the_heading_is_where_the_triangle_is(agent):
         up = np.rot90(ink, heading)
         rows = [row.sum() for row in up if row.any()]
         assert rows[:3] == [1, 3, 5], "it points in the direction of the heading"
-
-
-def test_marks_are_drawn_from_agent_4_on():
-    parts = [set(agent_sprite(agent, 0, 23).ravel().tolist()) for agent in (3, 4, 8, 12)]
-    assert [MARKED in part for part in parts] == [False, True, True, True]
-    assert all({BODY, INK} <= part for part in parts)
 
 
 def test_a_picture_draws_each_agent_in_its_own_cell_alone():
@@ -131,11 +114,3 @@ def test_all_lines_of_agents_stay_in_their_cells():
     for strokes in (numbers_and_headings(120), numbers(120), marks(120)):
         assert np.abs(strokes.shape).max() <= 0.5
     assert set(marks(12).owner) == set(range(4, 12))
-
-
-def test_an_agent_that_is_not_drawn_has_no_lines():
-    centres = np.array([[(1.5, 2.5), (4.5, 2.5)]] * 2, np.float32)
-    heading, drawn = np.array([[1, 0]] * 2), np.array([[True, True], [False, True]])
-    lines, counts = numbers_and_headings(2).placed(centres, heading, drawn)
-    assert counts.tolist() == [4, 2]
-    assert (np.abs(lines[4:] - (4.5, 2.5)) < 0.5).all(), "the second frame has agent 1 alone"

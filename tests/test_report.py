@@ -3,14 +3,14 @@
 import re
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
-from stored_runs import CORRIDORS, stored
+from stored_runs import CORRIDORS, command, stored
 from test_course import LENGTHS, RISE_AND_FALL, told_of
 from viewers import browser, wait_until
 
-from cprl.commands import main as cli
 from cprl.envs.matrix import prisoners_dilemma
 from cprl.evaluation.evaluate import evaluate_run, run_table
 from cprl.evaluation.report import report
@@ -84,14 +84,11 @@ def test_a_game_without_a_board_has_a_report_without_an_episode(tmp_path):
 
 def test_the_command_writes_a_page_once(tmp_path, monkeypatch, capsys):
     run = stored(tmp_path / "greedy")
-    monkeypatch.setattr("sys.argv", ["cprl", "report", str(run), "--episodes", "2"])
-    cli.main()
-    assert f"{run / 'report.html'}: " in capsys.readouterr().out
-    with pytest.raises(SystemExit, match="exists"):
-        cli.main()
-    monkeypatch.setattr("sys.argv", ["cprl", "report", str(run), "--out", "own.pdf"])
-    with pytest.raises(SystemExit, match="html"):
-        cli.main()
+    reported = partial(command, monkeypatch, capsys, "report", run)
+    assert f"{run / 'report.html'}: " in reported("--episodes", 2)
+    for words, said in ([], "exists"), (["--out", "own.pdf"], "html"):
+        with pytest.raises(SystemExit, match=said):
+            reported(*words)
 
 
 @pytest.mark.viewer

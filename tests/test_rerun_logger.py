@@ -25,7 +25,7 @@ from torchrl.trainers import LogScalar, LogValidationReward, Trainer
 from cprl import CommonsEnv, Observation
 from cprl.commons.colours import APPLE, BEAM, COLOURS, FIRST_AGENT, GROUND, OTHER, PALETTE, SELF, WALL
 from cprl.commons.decoding import UNSEEN, classes_seen
-from cprl.viewer.board import boards, mosaic
+from cprl.viewer.board import boards
 from cprl.viewer.layout import Scene, window_corners
 from cprl.viewer.logger import RerunLogger
 
@@ -165,14 +165,6 @@ def test_a_recording_is_never_written_over(tmp_path):
 def test_frames_without_a_scene_are_refused(tmp_path):
     with RerunLogger("run", tmp_path) as logger, pytest.raises(ValueError, match="no scene"):
         logger.log_frames(frames(1)[0])
-
-
-def test_mosaics_put_low_windows_below_each_other_and_high_ones_side_by_side():
-    low = np.array([[[[SELF, BEAM, WALL]], [[GROUND, APPLE, OTHER]]]], np.uint8)
-    assert mosaic(low).tolist() == [[[SELF, BEAM, WALL], [UNSEEN] * 3, [GROUND, APPLE, OTHER]]]
-    assert window_corners(4, (7, 15)) == [(0, 0), (0, 16), (8, 0), (8, 16)]
-    high = np.array([[[[SELF], [BEAM], [WALL]], [[GROUND], [APPLE], [OTHER]]]], np.uint8)
-    assert mosaic(high).tolist() == [[[SELF, UNSEEN, GROUND], [BEAM, UNSEEN, APPLE], [WALL, UNSEEN, OTHER]]]
 
 
 def test_classes_are_known_from_colours_and_foreign_colours_are_marked():

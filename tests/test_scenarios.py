@@ -53,12 +53,6 @@ def returns(played):
     return {replica: [episode.return_.tolist() for episode in own] for replica, own in played.items()}
 
 
-def test_every_agent_is_focal_equally_often():
-    how = {"name": "own", "game": THREE_CORRIDORS, "background": (Scripted("greedy"),) * 3}
-    assert Scenario(focal="minority", **how).placements == ((0,), (1,), (2,))
-    assert Scenario(focal="majority", **how).placements == ((1, 2), (0, 2), (0, 1))
-
-
 @pytest.mark.integration
 def test_scores_are_those_worked_by_hand(runs):
     scores = run_scenarios(runs["greedy"], episodes=2)

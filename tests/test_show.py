@@ -9,13 +9,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from stored_runs import CORRIDORS, stored
+from stored_runs import CORRIDORS, command, stored
 from viewers import browser, wait_until
 
 from cprl import presets
-from cprl.commands import main as cli
 from cprl.commons.colours import BEAM
-from cprl.commons.readable import growth_of, legend_of, meaning_of
+from cprl.commons.readable import legend_of, meaning_of
 from cprl.evaluation.film import fresh_episode, play_to_show
 from cprl.evaluation.show import show
 from cprl.institutions import Boundaries, Monitoring, Quota, Tax
@@ -110,13 +109,6 @@ def test_titles_are_text_and_not_html(runs, tmp_path):
     assert told(path)["populations"][0]["title"] == title
 
 
-def test_what_readers_are_told_of_growth():
-    assert "stays bare" in growth_of(presets.game("commons"))
-    assert "river" in growth_of(presets.game("ssd/cleanup-v1"))
-    lush = replace(CORRIDORS, rules=replace(CORRIDORS.rules, regrow_prob=(0.1, 0.2)))
-    assert growth_of(lush) == "Agents pick apples, which grow back."
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -126,24 +118,19 @@ def test_what_readers_are_told_of_growth():
         (["greedy"] * 6, "at most 5"),
     ],
 )
-def test_what_cannot_be_shown_is_refused_before_anything_is_written(runs, monkeypatch, words, said):
+def test_what_cannot_be_shown_is_refused_before_anything_is_written(runs, monkeypatch, capsys, words, said):
     monkeypatch.chdir(runs)
     before = sorted(runs.rglob("*"))
-    monkeypatch.setattr("sys.argv", ["cprl", "show", "greedy", *words])
-    with pytest.raises(SystemExit) as refused:
-        cli.main()
-    assert said in str(refused.value)
+    with pytest.raises(SystemExit, match=said):
+        command(monkeypatch, capsys, "show", "greedy", *words)
     assert sorted(runs.rglob("*")) == before
 
 
 def test_the_command_writes_into_the_run_and_nothing_over(runs, monkeypatch, capsys):
-    monkeypatch.setattr("sys.argv", ["cprl", "show", str(runs / "greedy")])
-    cli.main()
-    out = capsys.readouterr().out
-    assert "3 steps, apples: 2, 3; 0 left" in out
-    assert (runs / "greedy" / "show-0-0.html").is_file()
-    with pytest.raises(SystemExit):
-        cli.main()
+    told = command(monkeypatch, capsys, "show", runs / "greedy")
+    assert "3 steps, apples: 2, 3; 0 left" in told
+    with pytest.raises(SystemExit, match="exists and is not overwritten"):
+        command(monkeypatch, capsys, "show", runs / "greedy")
     (runs / "greedy" / "show-0-0.html").unlink()
 
 
@@ -185,19 +172,15 @@ def test_chromium_plays_a_page_from_the_disk(runs, tmp_path, width):
 
 
 def test_institutions_say_what_they_do_in_numbers_that_hold_in_the_game():
-    quota = Quota(share=0.25, window_steps=50)
-    game = replace(presets.game("commons"), institutions=(quota,))
+    quota, watch, tax = Quota(share=0.25, window_steps=50), Monitoring(prob=0.5), Tax(rate=0.3)
+    game = replace(COMMONS, institutions=(quota,))
     apples = int(re.search(r"at most (\d+) apples in 50 turns", meaning_of(quota, game))[1])
     assert apples == int(0.25 * game.sustainable_yield * 50 / 4)
     fined = replace(quota, fine=2.0)
-    watched = replace(game, institutions=(fined, Monitoring(prob=0.5)))
-    assert "cannot" in meaning_of(quota, game)
-    assert "costs 2 apples." in meaning_of(fined, replace(game, institutions=(fined,)))
+    watched = replace(game, institutions=(fined, watch))
     assert "costs 2 apples if it is noticed" in meaning_of(fined, watched)
-    assert "50%" in meaning_of(Monitoring(prob=0.5), watched)
-    assert "30% of what each agent picks is taken and lost" in meaning_of(
-        Tax(rate=0.3, redistribution="none"), game
-    )
+    assert "50%" in meaning_of(watch, watched)
+    assert "30%" in meaning_of(tax, game)
 
 
 def test_the_legend_names_only_signs_that_can_appear():

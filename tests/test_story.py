@@ -32,7 +32,7 @@ from cprl.viewer.layout import Curves, Panels, curves_of, joint_actions, layout
 from cprl.viewer.live import LiveStream, Stream
 from cprl.viewer.logger import RerunLogger, as_table, send_waiting
 from cprl.viewer.pictures import Turns, Visits, Wall, gini, lorenz_curve
-from cprl.viewer.story import CLOCK, CompilingNotice, Header, played, published_phases
+from cprl.viewer.story import CLOCK, CompilingNotice, Header, published_phases
 
 __all__ = ["strict_rerun"]
 
@@ -308,23 +308,11 @@ def test_the_file_closes_while_the_live_view_goes_on(tmp_path):
     assert static(tmp_path / "run.rrd", "header", "TextDocument:media_type") == ["text/markdown"]
 
 
-def test_the_numbers_of_an_evaluation_are_means_with_their_error():
-    episodes = [fake(5, 0, returned=apples, tagged=0) for apples in (10.0, 14.0)]
-    assert played(episodes) == (12.0, 2.0, 2, 2)
-    assert np.isnan(played(episodes[:1]).error)
-
-
 def test_the_header_says_where_a_run_is_and_which_institutions_are_in_force():
     institutions = (Quota(share=0.25, window_steps=50, fine=2.0), Vote(on=Tax(), choices=(0.0, 0.5)))
     rules = rules_of(replace(GAME, institutions=institutions))
-    assert rules == "quota (share 0.25, fine 2), vote (on tax (rate 0.1))"
     header = Header(episodes=4800, boards=8, unit="apples", rules=rules)
-    assert header.begins("compiling, 3 s so far") == (
-        f"#### Episode 1 of 4,800 · compiling, 3 s so far · {rules}"
-    )
-    line = header.line(episode=640, label="falling", mean=436.4, random_play=282.1, died=2.0)
-    said = "Episode 640 of 4,800 · falling · 436 apples, random play 282 · 2 of 8 boards died early"
-    assert line == f"#### {said} · {rules}"
+    assert header.begins("compiling") == f"#### Episode 1 of 4,800 · compiling · {rules}"
     alone = Header(episodes=200, boards=1, unit="return")
     for died in (None, float("nan"), 0.0):
         line = alone.line(episode=1, label="steady", mean=4.25, random_play=None, died=died)
@@ -413,15 +401,6 @@ def test_a_bar_below_the_board_is_as_long_as_its_apples_are_many(run):
         assert label.endswith(f" of {sites} apples")
         lengths = [end[0] - start[0] for start, end in (whole, filled)]
         assert lengths == [5, pytest.approx(5 * (apples + covered) / sites, abs=1e-6)]
-
-
-def test_who_tagged_whom_is_a_matrix_of_numbers_of_the_last_fifty_episodes(tmp_path):
-    path = recorded(tmp_path, range(60), episodes=60, tagged=1)
-    episodes, labels = column(path, "tags/counts", "Points2D:labels", "episode")
-    assert episodes == [9, 19, 29, 39, 49, 59]
-    assert labels[0] == ["0", "0", "10", "0", "0", "1", "0", "1"], "agent 1 by agent 0"
-    assert labels[-1][2] == "50"
-    assert len(column(path, "tags", "Image:buffer")[0]) == 6
 
 
 def test_the_line_of_a_replica_is_its_stock_turn_by_turn(run):

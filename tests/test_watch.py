@@ -185,27 +185,6 @@ def test_without_a_display_no_viewer_is_spawned_and_the_addresses_stay(tmp_path,
     assert "Watch live (browser): http://127.0.0.1:" in capsys.readouterr().out
 
 
-@pytest.mark.integration
-def test_several_replicas_are_told_as_their_mean_and_each(tmp_path):
-    returns = {}
-
-    class Witness(Doing):
-        def on_episode(self, episode, learning):
-            returns[episode.world, episode.episode] = episode.metrics["collective_return"]
-
-    course(tmp_path, others=[Witness(-1, None)])
-    episodes, told = column(tmp_path / "run.rrd", "social/collective_return", "Scalars:scalars", "episode")
-    means = []
-    for episode, (first, second, mean, running) in zip(episodes, told, strict=True):
-        assert (first, second) == (returns[0, episode], returns[1, episode])
-        assert mean == pytest.approx((first + second) / 2)
-        means.append(mean)
-        assert running == pytest.approx(np.mean(means[-10:]))
-    names = static(tmp_path / "run.rrd", "social/collective_return", "SeriesLines:names")
-    assert names == ["replicas", "replicas", "episodes", "mean of 10"]
-    assert {len(own) for own in column(tmp_path / "run.rrd", "agent_1/q", "Scalars:scalars")[1]} == {1}
-
-
 def fake(number, world, *, returned, tagged):
     """An episode of two agents with as many apples and tags as are said."""
     values = dict.fromkeys(social.METRICS, 1.0) | {
