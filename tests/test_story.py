@@ -314,7 +314,7 @@ def test_the_header_says_where_a_run_is_and_which_institutions_are_in_force():
     header = Header(episodes=4800, boards=8, unit="apples", rules=rules)
     assert header.begins("compiling") == f"#### Episode 1 of 4,800 · compiling · {rules}"
     alone = Header(episodes=200, boards=1, unit="return")
-    for died in (None, float("nan"), 0.0):
+    for died in (None, 0):
         line = alone.line(episode=1, label="steady", mean=4.25, random_play=None, died=died)
         assert line == "#### Episode 1 of 200 · steady · return 4.25"
 

@@ -22,6 +22,8 @@ from cprl.values import checked, differences, to_config
 
 MOST_DIFFERENCES: Final = 3
 """Of those in which games differ, in a message."""
+BESIDE_RANDOM: Final = ("", "run's agents", "random")
+"""The columns of a table of a run's agents and of random ones."""
 
 
 def refuse_other_games(runs: Mapping[str, LoadedRun]) -> None:
@@ -161,14 +163,8 @@ def run_table(evaluation: Evaluation) -> Cells:
         counts = (f"{count[0]} of {count[1]}" for count in without if count)
         rows.append(("agents without a harvest, not in sustainability", *counts))
     notes = left_out(next(iter(evaluation.trained.values()))[0].reported), zeros, beyond(trained.items())
-    return Cells(
-        *heading_beside_random(evaluation.run, evaluation.fresh), rows, "\n".join(filter(None, notes))
-    )
-
-
-def heading_beside_random(run: LoadedRun, fresh: Fresh) -> tuple[str, list[str]]:
-    """The title and the columns of a table of a run's agents and of random ones."""
-    return heading(run.path.name, fresh, [run]), ["", "run's agents", "random"]
+    title = heading(evaluation.run.path.name, evaluation.fresh, [evaluation.run])
+    return Cells(title, BESIDE_RANDOM, rows, "\n".join(filter(None, notes)))
 
 
 def says_nothing(name: str, measured: Iterable[Measured]) -> bool:

@@ -203,9 +203,6 @@ class Style(Value, stored=False):
         return int(checked("width", width, allowed)) // runs
 
 
-_USUAL: Final = Style()
-
-
 def film_video(
     run: str | Path,
     out: str | Path,
@@ -214,7 +211,7 @@ def film_video(
     replica: int = 0,
     episode: int = 0,
     seed: int = SEED,
-    style: Style = _USUAL,
+    style: Style = Style(),
     allow: Sequence[str] = (),
 ) -> tuple[Path, tuple[Episode, ...]]:
     """Film an episode of a run's agents, beside the agents of other runs if there are any.

@@ -149,7 +149,6 @@ class EpisodePicture:
         draw.text((edge, middle), title, _TEXT, _fitting(title, room, 2 * self._unit), anchor="lm")
 
     def _card(self, draw: ImageDraw.ImageDraw, text: str, colour: Colour) -> None:
-        """A band across the board with a text."""
         middle, deep = self._middle, 2 * self._unit
         left, right = self._unit, self.size[0] - self._unit
         draw.rectangle((left, middle - deep, right, middle + deep), PALETTE[GROUND], colour)

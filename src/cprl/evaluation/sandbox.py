@@ -235,7 +235,6 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(text, kind, HTTPStatus.OK)
 
     def _content(self, path: str, sliders: Sliders, *, trained: bool) -> tuple[str, str]:
-        """A text and its type."""
         if path == "/":
             return sandbox_page(), "text/html"
         if path == "/data":

@@ -263,7 +263,6 @@ def _chosen(run: LoadedRun, scenarios: Sequence[str | Scenario]) -> list[Scenari
 
 
 def _background(spec: Scripted | Frozen, stored: Mapping[str, LoadedRun]) -> Agent:
-    """The agent in a background place; see `Scenario.background`."""
     if isinstance(spec, Scripted):
         return scripted(spec.policy)
     run = stored[spec.run]

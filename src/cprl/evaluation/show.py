@@ -164,7 +164,6 @@ def shown(
 
 
 def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, Any]:
-    """The data of the page about one population."""
     game, commons = commons_game(fresh.run), commons_of(fresh.env)
     assert commons is not None
     board, agents, last = game.map, range(game.agents), len(filmed.moments) - 1

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, agent_colour
 from cprl.commons.maps import Map
-from cprl.evaluation.evaluate import SEED, heading_beside_random, opened
+from cprl.evaluation.evaluate import BESIDE_RANDOM, SEED, heading, opened
 from cprl.evaluation.lanes import Agent, Fresh, agents_of, commons_game, fresh_of, scripted
 from cprl.measuring import movement
 from cprl.measuring.movement import Trace, overlap, owners, trace, visits
@@ -212,4 +212,5 @@ def territory_table(territory: Territory) -> Cells:
         (name, *(str(of_policy.get(name, "-")) for of_policy in (trained, random)))
         for name in territory.trained.by_replica
     ]
-    return Cells(*heading_beside_random(territory.run, territory.fresh), rows)
+    title = heading(territory.run.path.name, territory.fresh, [territory.run])
+    return Cells(title, BESIDE_RANDOM, rows)

@@ -210,18 +210,13 @@ def _check_numbers(experiment: Experiment) -> None:
         raise ValueError(
             f"experiment.episodes is {experiment.episodes} and steps {experiment.steps}; allowed: one of them"
         )
-    if experiment.replicas * experiment.worlds > _MOST_WORLDS:
-        raise ValueError(
-            f"experiment.worlds is {experiment.worlds}; allowed for {experiment.replicas} replicas: up to "
-            f"{_MOST_WORLDS // experiment.replicas}, because all are played at once"
-        )
-    worlds = experiment.replicas * experiment.evaluation_episodes
-    if worlds > _MOST_WORLDS:
-        raise ValueError(
-            f"experiment.evaluation_episodes is {experiment.evaluation_episodes}; allowed for "
-            f"{experiment.replicas} replicas: up to {_MOST_WORLDS // experiment.replicas}, because all are "
-            "played at once"
-        )
+    most = _MOST_WORLDS // experiment.replicas
+    for name in ("worlds", "evaluation_episodes"):
+        if getattr(experiment, name) > most:
+            raise ValueError(
+                f"experiment.{name} is {getattr(experiment, name)}; allowed for {experiment.replicas} "
+                f"replicas: up to {most}, because all are played at once"
+            )
     for target in custom_targets(experiment.to_config()):
         if target.startswith("__main__:"):
             raise ValueError(

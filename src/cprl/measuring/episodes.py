@@ -312,12 +312,10 @@ class EpisodeTracker:
             widths = {name: state[name].shape[-1] for name in ("counts", "in_force") if name in state}
             running = self._running or self._zeros(reported, widths)
         arrays = {"episode": self._episode, **running}
-        if not set(arrays) <= set(state):
-            raise ValueError(f"the state has {sorted(state)}; allowed: at least {sorted(arrays)}")
         for name, array in arrays.items():
-            if state[name].shape != array.shape:
-                allowed = list(array.shape)
-                raise ValueError(f'"{name}" of the state is {list(state[name].shape)}; allowed: {allowed}')
+            shape = list(state[name].shape) if name in state else "missing"
+            if shape != list(array.shape):
+                raise ValueError(f'"{name}" of the state is {shape}; allowed: {list(array.shape)}')
         arrays = {name: state[name].numpy(force=True).copy() for name in arrays}
         self._episode = arrays.pop("episode")
         self._begin(reported, arrays)

@@ -57,7 +57,6 @@ def equality_between(income: Tensor, groups: Groups) -> Tensor:
 
 
 def _total(values: Tensor) -> Tensor:
-    """sum_i x_i."""
     return values.sum(-1, dtype=torch.float64)
 
 

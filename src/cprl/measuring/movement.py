@@ -79,14 +79,9 @@ def trace(env: CommonsEnv, policy: Policy, *, explore: bool = True) -> Trace:
 
 def visits(trace: Trace) -> Array:
     """The share of its steps in play that each agent spent in each cell, float64 [B, N, H, W]."""
-    steps, worlds, agents = trace.row.shape
-    counts = np.zeros((worlds, agents, *trace.board))
-    here = trace.in_play & trace.played[..., None]
-    world, agent = np.broadcast_arrays(np.arange(worlds)[:, None], np.arange(agents))
-    for step in range(steps):
-        at = here[step]
-        place = world[at], agent[at], trace.row[step][at], trace.col[step][at]
-        counts[place] += 1  # an agent is in one cell at a time
+    counts = np.zeros((*trace.row.shape[1:], *trace.board))
+    at = np.nonzero(trace.in_play & trace.played[..., None])
+    np.add.at(counts, (*at[1:], trace.row[at], trace.col[at]), 1)
     shares: Array = counts / np.maximum(counts.sum((-2, -1), keepdims=True), 1)
     return shares
 

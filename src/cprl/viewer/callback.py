@@ -34,7 +34,6 @@ from cprl.viewer.pictures import (
     Visits,
     Wall,
     borders,
-    has_died,
     regions_of,
 )
 from cprl.viewer.story import CompilingNotice, Events, Story
@@ -43,8 +42,6 @@ LONGEST: Final = 50
 """Episodes from one image of visits, stock and Lorenz curve to the next, at most."""
 _IMAGES: Final = 20
 """The images of a short run, about."""
-_DIED: Final = "died"
-"""Among an episode's numbers, whether the board died early."""
 
 
 class ViewerCallback:
@@ -135,7 +132,6 @@ class ViewerCallback:
         is_about: bool,
         is_replay: bool,
     ) -> list[View]:
-        """What the game has to show."""
         logger, commons = self.logger, commons_of(self.env)
         curves, scene, live = logger.curves, logger.scene, logger.live
         every = max(1, min(LONGEST, episodes // _IMAGES))
@@ -218,14 +214,13 @@ class ViewerCallback:
             self._episode = episode.episode + 1
         if episode.world == 0:
             self._filmed, self.filming.shows_next = self._filmed + 1, False
-        numbers, died = numbers_of(episode, learning, self._agents), has_died(episode)
-        of_all = self._series.add(episode, numbers if died is None else {**numbers, _DIED: float(died)})
+        of_all, worlds = (
+            self._series.add(episode, numbers_of(episode, learning, self._agents)),
+            self._series.worlds,
+        )
         if of_all is not None:
-            shares, worlds = of_all.pop(_DIED, None), self._series.worlds
-            deaths = None if shares is None else float(np.nansum(shares)) * worlds
-            last = episode.episode // worlds * worlds + worlds - 1
             for view in self._views:
-                view.on_all(last, of_all, deaths)
+                view.on_all(episode.episode // worlds * worlds + worlds - 1, of_all)
             self._log_speed()
         self.filming.choose(self._filmed)
 

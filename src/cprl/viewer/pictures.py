@@ -57,13 +57,12 @@ class View:
     def on_episode(self, episode: Episode) -> None:
         """Add an episode of a replica."""
 
-    def on_all(self, episode: int, numbers: Mapping[str, Values], died: float | None) -> None:
+    def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
         """Add an episode, counted from 0, that all replicas have ended; of replicas in W worlds the last of W
         whose means these are.
 
         Args:
             numbers: [R] by name.
-            died: how many boards died early in it; None for a game that reports no stock.
         """
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
@@ -111,7 +110,7 @@ class Plots(View):
             if defined:
                 self._random[name] = fmean(defined)
 
-    def on_all(self, episode: int, numbers: Mapping[str, Values], died: float | None) -> None:
+    def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
         curves = self._logger.curves
         if curves.unit == "return":
             numbers = {**numbers, RETURN: np.sum([numbers[f"{name}/return"] for name in curves.agents], 0)}
@@ -151,7 +150,7 @@ class JointActions(View):
             self._shares.setdefault(together, []).append(counts / counts.sum())
         counts[:] = 0
 
-    def on_all(self, episode: int, numbers: Mapping[str, Values], died: float | None) -> None:
+    def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
         if shares := self._shares.pop(episode // self._logger.curves.worlds, None):
             means = zip(self._recent, np.mean(shares, 0), strict=True)
             self._logger.log_lines(JOINT, [recent.add(share) for recent, share in means])
@@ -178,7 +177,7 @@ class Tags(View):
         if episode.tagged_by is not None:
             self._last[-1] += episode.tagged_by
 
-    def on_all(self, episode: int, numbers: Mapping[str, Values], died: float | None) -> None:
+    def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
         if (episode + 1) // self._logger.curves.worlds % self.EVERY == 0:
             tags = np.sum(self._last, 0)
             light = (tags / max(1.0, tags.max()))[..., None]
@@ -190,44 +189,6 @@ class Tags(View):
             ]
             self._logger.log_row("tags/counts", rr.Points2D.from_fields(labels=texts))
             self._last = [*self._last[1 - self.OVER :], np.zeros_like(self._last[0])]
-
-
-class Looks:
-    """Keeps some arrays of the first worlds as they are at some steps.
-
-    A copy takes a microsecond; adding up right away takes twenty, since whatever runs between two steps of a
-    training runs out of cold caches.
-
-    Args:
-        names: the arrays, by their names in `cprl.commons.world.Worlds`.
-        worlds: how many worlds.
-    """
-
-    ROOM = 100
-    """Looks that are kept, at most."""
-
-    def __init__(self, env: CommonsEnv, names: Sequence[str], worlds: int) -> None:
-        self._read = env.worlds.driver.read
-        arrays = [getattr(env.worlds.now, name)[:worlds] for name in names]
-        self._pairs = [(array, np.empty((self.ROOM, *array.shape), array.dtype)) for array in arrays]
-        self._on_cpu = all(isinstance(array, np.ndarray) for array in arrays)
-        self._count = 0
-
-    @property
-    def is_full(self) -> bool:
-        """Whether `take` must be called before `add`."""
-        return self._count == self.ROOM
-
-    def add(self) -> None:
-        """Copies the arrays as they are now."""
-        for array, copies in self._pairs:
-            copies[self._count] = array if self._on_cpu else self._read(array)
-        self._count += 1
-
-    def take(self) -> list[NDArray[Any]]:
-        """The copies [T, ...] of each array, good until the next `add`; there are none afterwards."""
-        count, self._count = self._count, 0
-        return [copies[:count] for _, copies in self._pairs]
 
 
 WALL_BYTES: Final = 4_000_000
@@ -319,7 +280,7 @@ class Picture(View):
         self._every = every
         self._ended = self._logged = 0
 
-    def on_all(self, episode: int, numbers: Mapping[str, Values], died: float | None) -> None:
+    def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
         before, self._ended = self._ended, episode + 1
         if self._ended // self._every > before // self._every:
             self.close()
@@ -338,22 +299,42 @@ class Picture(View):
 
 
 class Sampled(Picture):
-    """A picture of some arrays of the first worlds every `stride` turns."""
+    """A picture of some arrays of the first worlds every `stride` turns.
+
+    They are copied, and added up later: a copy takes a microsecond; adding up right away takes twenty, since
+    whatever runs between two steps of a training runs out of cold caches.
+
+    Args:
+        names: the arrays, by their names in `cprl.commons.world.Worlds`.
+    """
+
+    ROOM = 100
+    """Copies that are kept, at most."""
 
     def __init__(
         self, env: CommonsEnv, names: Sequence[str], *, worlds: int, every: int, stride: int
     ) -> None:
         super().__init__(every)
-        self.stride, self._looks = stride, Looks(env, names, worlds)
+        self.stride, self._count, self._read = stride, 0, env.worlds.driver.read
+        arrays = [getattr(env.worlds.now, name)[:worlds] for name in names]
+        self._pairs = [(array, np.empty((self.ROOM, *array.shape), array.dtype)) for array in arrays]
+        self._on_cpu = all(isinstance(array, np.ndarray) for array in arrays)
 
     def on_step(self, turn: int, episode: int, frame: int | None) -> None:
-        if turn % self.stride == 0:
-            self._looks.add()
-            if self._looks.is_full:
-                self._add(*self._looks.take())
+        if turn % self.stride:
+            return
+        for array, copies in self._pairs:
+            copies[self._count] = array if self._on_cpu else self._read(array)
+        self._count += 1
+        if self._count == self.ROOM:
+            self._add_copies()
+
+    def _add_copies(self) -> None:
+        count, self._count = self._count, 0
+        self._add(*(copies[:count] for _, copies in self._pairs))
 
     def _add(self, *arrays: NDArray[Any]) -> None:
-        """Add the arrays [T, worlds, ...] at T steps."""
+        """Add the arrays [T, worlds, ...] at T steps, which are overwritten afterwards."""
         raise NotImplementedError
 
 
@@ -386,7 +367,7 @@ class Visits(Sampled):
         np.add.at(self.counts, (agent[in_play], row[in_play], col[in_play]), 1)
 
     def log(self, episodes: str) -> None:
-        self._add(*self._looks.take())
+        self._add_copies()
         self._logger.log_row("visits", rr.Image(self._panels.joined(self.maps(), PALETTE[GROUND])))
         texts = [f"{agent}: {episodes}" for agent in range(len(self.counts))]
         self._logger.log_row("visits/labels", rr.Points2D.from_fields(labels=texts))
@@ -479,7 +460,7 @@ class Turns(Sampled):
     def on_episode(self, episode: Episode) -> None:
         if episode.world >= len(self.lines):
             return
-        self._add(*self._looks.take())
+        self._add_copies()
         playing = self._playing[episode.world]
         points = playing[playing[:, 0] < episode.steps]
         end = [] if episode.stock_left is None else [(float(episode.steps), float(episode.stock_left))]

@@ -224,13 +224,11 @@ class Offences:
                 )
         marked, centres = np.stack(self._marked), np.stack(self._centres)
         strips = centres[marked][:, None] + _DIAMOND
-        marks = rr.LineStrips2D.columns(strips=strips, labels=self._labels(marked, paid))
+        # The viewer shows them on request.
+        labels = [fined(agent, -paid[frame, 0, agent]) for frame, agent in np.argwhere(marked).tolist()]
+        marks = rr.LineStrips2D.columns(strips=strips, labels=labels)
         at = steps[:frames], nothing[:frames], np.arange(frames)
         self._logger.log_columns(_VIOLATORS, at, marks.partition(marked.sum(1)))
-
-    def _labels(self, marked: NDArray[np.bool_], paid: NDArray[np.float64]) -> list[str]:
-        """What the viewer shows of a mark on request."""
-        return [fined(agent, -paid[frame, 0, agent]) for frame, agent in np.argwhere(marked).tolist()]
 
 
 def fined(agent: int, fine: float) -> str:

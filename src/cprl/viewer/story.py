@@ -72,11 +72,11 @@ class Header:
         return self._text(f"Episode 1 {self._of}", status)
 
     def line(
-        self, *, episode: int, label: str, mean: float, random_play: float | None, died: float | None
+        self, *, episode: int, label: str, mean: float, random_play: float | None, died: int | None
     ) -> str:
-        """After an episode, in which so many boards died early; None or NaN for a game without stock."""
+        """After an episode, in which so many boards died early; None for a game without stock."""
         beside = "" if random_play is None else f", random play {_number(random_play)}"
-        deaths = "" if died is None or isnan(died) else self._died(round(died), self.boards)
+        deaths = "" if died is None else self._died(died, self.boards)
         return self._text(f"Episode {episode:,} {self._of}", label, f"{self._amount(mean)}{beside}", deaths)
 
     def finished(self, trained: Played, random: Played) -> str:
@@ -189,6 +189,8 @@ class Story(View):
         self._course = Course() if set(phases.METRICS) <= set(self._curves.metrics) else None
         self._random: Played | None = None
         self._ended = 0
+        self._died: dict[int, int] = {}
+        """How many boards died early, by the episode in their world, until all have ended it."""
         self._is_over = False
         # A file of a resumed run must not say so: it is shown with those before it.
         logger.log_states(_NOW, {0: BEGINS}, live_only=True)
@@ -201,8 +203,14 @@ class Story(View):
         self.now.random_play = self._random.mean
         self._logger.log_text(f"random play {self._in_words(self._random)}")
 
-    def on_all(self, episode: int, numbers: Mapping[str, Values], died: float | None) -> None:
+    def on_episode(self, episode: Episode) -> None:
+        if (died := has_died(episode)) is not None:
+            together = episode.episode // self._curves.worlds
+            self._died[together] = self._died.get(together, 0) + died
+
+    def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
         before, self._ended = self._ended, episode + 1
+        died = self._died.pop(episode // self._curves.worlds, None)
         means = {name: mean_of(values) for name, values in numbers.items()}
         events = self._label(episode, means)
         if self._course is not None and (best := self._course.new_best(means)):
@@ -221,7 +229,7 @@ class Story(View):
             self._show_episode(None)
             self._logger.flush()
 
-    def _show_episode(self, died: float | None) -> None:
+    def _show_episode(self, died: int | None) -> None:
         """Says in the header where the run is after an episode."""
         text = self.header.line(
             episode=self._ended,
@@ -350,7 +358,7 @@ class CompilingNotice(View):
         self._before_s = CLOCK.total_s
         Thread(target=self._watch, daemon=True, name="cprl compiling").start()
 
-    def on_all(self, episode: int, numbers: Mapping[str, Values], died: float | None) -> None:
+    def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
         self.close()
 
     def close(self) -> None:
