@@ -27,13 +27,7 @@ from cprl.evaluation.empirical_game import (
     play_empirical_game,
 )
 from cprl.evaluation.evaluate import Evaluation, evaluate_run
-from cprl.evaluation.exploit import (
-    Exploitability,
-    Plan,
-    exploitability,
-    plan_responses,
-    play_responses,
-)
+from cprl.evaluation.exploit import Exploitability, Plan, exploitability, plan_responses, play_responses
 from cprl.evaluation.lanes import play_population
 from cprl.evaluation.scenarios import Scenario, Score, Scores, draw_scenarios, run_scenarios, scenarios_of
 from cprl.evaluation.schelling import SchellingDiagram, draw_schelling, schelling

@@ -128,12 +128,7 @@ def play_empirical_game(
             parts.append(Part({"runs": " ".join(names[run] for run in who)}, played[who]))
         payoffs.append(_payoffs(len(named), played))
     return EmpiricalGame(
-        runs=named,
-        agents=agents,
-        of_agents=agents,
-        payoffs=np.stack(payoffs, 1),
-        fresh=fresh,
-        parts=parts,
+        runs=named, agents=agents, of_agents=agents, payoffs=np.stack(payoffs, 1), fresh=fresh, parts=parts
     )
 
 

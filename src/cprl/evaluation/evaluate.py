@@ -75,8 +75,7 @@ class Evaluation(Results):
 
     def measures(self, policy: str = "trained") -> dict[str, Measured]:
         """The social metrics over replicas by name, those of institutions as `institutions/fines` and so on,
-        then the agents' returns, and what they paid, got and broke, as `agent_0/return` and so on.
-        """
+        then the agents' returns, and what they paid, got and broke, as `agent_0/return` and so on."""
         results = self.where(policy=checked("policy", policy, Literal["trained", "random"]))
         played = results.played
         first = next(iter(played.values()))[0]

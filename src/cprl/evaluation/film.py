@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
@@ -42,14 +42,13 @@ from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.replay import Decisions, Offences, events
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FreshEpisode:
+class FreshEpisode(NamedTuple):
     """A fresh world of a run's game, and who plays in it."""
 
     run: LoadedRun
-    env: EnvBase = field(repr=False)
+    env: EnvBase
     """One world, with the run's transforms."""
-    policies: AgentPolicies = field(repr=False)
+    policies: AgentPolicies
 
 
 def fresh_episode(
@@ -68,11 +67,8 @@ def fresh_episode(
     if replica not in loaded.replicas:
         replicas = ", ".join(map(str, loaded.replicas))
         raise ValueError(f"replica is {replica}; allowed: {replicas}, the replicas of {loaded.path}")
-    return FreshEpisode(
-        run=loaded,
-        env=loaded.env(1, seed=seed, first_world=episode),
-        policies=loaded.policy(replica, seed=seed + episode),
-    )
+    env = loaded.env(1, seed=seed, first_world=episode)
+    return FreshEpisode(loaded, env, loaded.policy(replica, seed=seed + episode))
 
 
 def film(

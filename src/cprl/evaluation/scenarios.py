@@ -19,15 +19,7 @@ import numpy as np
 import pyarrow as pa
 
 from cprl.commons.game import Game
-from cprl.evaluation.evaluate import (
-    SEED,
-    bars_of,
-    beyond,
-    heading,
-    opened,
-    refuse_other_games,
-    refuse_unlike,
-)
+from cprl.evaluation.evaluate import SEED, bars_of, beyond, heading, opened, refuse_other_games, refuse_unlike
 from cprl.evaluation.lanes import (
     Agent,
     Part,
@@ -174,14 +166,12 @@ class Score(Results):
     def measures(self, focal: FocalAgents = "run") -> dict[str, Measured]:
         """focal/return and background/return, the mean return of a focal and of a background agent, then the
         social metrics of all agents together, and those of institutions as `institutions/fines` and so on;
-        intervals by Student's t.
-        """
+        intervals by Student's t."""
         return self.where(focal=focal).estimates("focal", "background")
 
     def advantage(self, over: FocalAgents, *, whose: Whose = "focal") -> Estimate:
         """What the run's agents get more than others would in their places; or what the background gets
-        more among them. Paired by replica, which plays the same worlds; the interval is by Student's t.
-        """
+        more among them. Paired by replica, which plays the same worlds; the interval is by Student's t."""
         return more(self.where(focal="run"), self.where(focal=over), whose)
 
 
@@ -331,8 +321,7 @@ def estimates(scores: Scores) -> pa.Table:
     """Every measure of every scenario as a row: "scenario", "focal" (who takes the focal places), "metric",
     "value", "low" and "high" (null where undefined), and how many "replicas", "episodes" and "undefined"
     episodes there were. Metrics "focal/advantage" and "background/advantage" of "random" and "greedy" are
-    what the run's agents, or the background among them, get more; see `Score.advantage`.
-    """
+    what the run's agents, or the background among them, get more; see `Score.advantage`."""
     rows: list[dict[str, Any]] = []
     for scenario, score in scores.by_scenario.items():
         for who in FOCAL_AGENTS:
@@ -366,8 +355,7 @@ _BAND: Final = 0.16
 
 def draw_scenarios(scores: Scores, path: Path | str, *, width: style.Width = "page") -> Path:
     """Draws the mean return per agent, a row for each scenario: of the run's agents in the focal places, of
-    greedy and of random ones there, and of the background; intervals by Student's t.
-    """
+    greedy and of random ones there, and of the background; intervals by Student's t."""
     by_scenario = scores.by_scenario
     rows = np.arange(len(by_scenario))
     with style.drawing(path, width=width) as sheet:

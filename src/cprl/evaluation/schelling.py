@@ -217,8 +217,7 @@ _GREEDY: Final = "#b2182b"
 
 def draw_schelling(diagram: SchellingDiagram, path: Path | str, *, width: style.Width = "page") -> Path:
     """Draws what an agent gets that is restrained or greedy, by how many of the others are restrained; beside
-    it what all get together.
-    """
+    it what all get together."""
     with style.drawing(path, width=width, is_new=True) as sheet:
         single, group = sheet.panels(2, columns=sheet.fitting(2, 24), high=20)
         for payoffs, who, role, colour, marker in (

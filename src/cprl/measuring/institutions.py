@@ -9,7 +9,6 @@ Sources: Ostrom, "Governing the Commons" (1990), whose principles each metric be
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Final
 
 import torch
@@ -101,53 +100,51 @@ def _of_groups(words: str, of: Callable[[Tensor, Groups], Tensor], *, is_net: bo
     )
 
 
-METRICS: Final[Mapping[str, Metric]] = MappingProxyType(
-    {
-        "fines": _sum("fines of all", "apples", "fines", "fines"),
-        "transfers": _sum("transfers to all", "apples", "transfers", "transfers"),
-        "violations": _sum("violations", "turns", "violated", "violations"),
-        "violations_per_step": Metric(
-            "violations per turn in play",
-            SHARE,
-            ("violated", "in_play"),
-            lambda sums: _ratio(sums.violations, sums.in_play_steps),
+METRICS: Final[Mapping[str, Metric]] = {
+    "fines": _sum("fines of all", "apples", "fines", "fines"),
+    "transfers": _sum("transfers to all", "apples", "transfers", "transfers"),
+    "violations": _sum("violations", "turns", "violated", "violations"),
+    "violations_per_step": Metric(
+        "violations per turn in play",
+        SHARE,
+        ("violated", "in_play"),
+        lambda sums: _ratio(sums.violations, sums.in_play_steps),
+    ),
+    "trespasses": _count("trespasses", "turns", "trespasses"),
+    "excess_bites": _count("taken above a quota", "bites", "excess_bites"),
+    "closed_bites": _count("taken while closed", "bites", "closed_bites"),
+    # Principle 1, boundaries: bites where the agent may bite, places that are open to all included.
+    "own_share_of_bites": Metric(
+        "bites where one may bite",
+        SHARE,
+        ("counts",),
+        lambda sums: _ratio(
+            sums.counts["own_bites"], sums.counts["own_bites"] + sums.counts["foreign_bites"]
         ),
-        "trespasses": _count("trespasses", "turns", "trespasses"),
-        "excess_bites": _count("taken above a quota", "bites", "excess_bites"),
-        "closed_bites": _count("taken while closed", "bites", "closed_bites"),
-        # Principle 1, boundaries: bites where the agent may bite, places that are open to all included.
-        "own_share_of_bites": Metric(
-            "bites where one may bite",
-            SHARE,
-            ("counts",),
-            lambda sums: _ratio(
-                sums.counts["own_bites"], sums.counts["own_bites"] + sums.counts["foreign_bites"]
-            ),
-            counted=("own_bites", "foreign_bites"),
-        ),
-        # Principle 4, monitoring: near p of `Monitoring`.
-        "detection_rate": _per_violation("violations detected", "detections"),
-        # Principle 5, graduated sanctions: violations by agents who were sanctioned before in the episode.
-        "recidivism": _per_violation("violations after a sanction", "returns_to_violation"),
-        # Above 1 where tags are sanctioned too.
-        "sanctions_per_violation": _per_violation("sanctions per violation", "sanctions", unit="ratio"),
-        # Principle 6, conflict resolution; undefined without a tag.
-        "unjust_share_of_tags": Metric(
-            "unjust tags",
-            SHARE,
-            ("counts", "tagged_by"),
-            lambda sums: _ratio(sums.counts["unjust_tags"], sums.tags),
-            counted=("unjust_tags",),
-        ),
-        "net_equality": Metric("equality of net incomes", SHARE, _INCOMES, lambda sums: equality(_net(sums))),
-        "equality_within": _of_groups("equality within groups", _within),
-        "equality_between": _of_groups("equality between groups", equality_between),
-        "net_equality_within": _of_groups("equality of net incomes within groups", _within, is_net=True),
-        "net_equality_between": _of_groups(
-            "equality of net incomes between groups", equality_between, is_net=True
-        ),
-    }
-)
+        counted=("own_bites", "foreign_bites"),
+    ),
+    # Principle 4, monitoring: near p of `Monitoring`.
+    "detection_rate": _per_violation("violations detected", "detections"),
+    # Principle 5, graduated sanctions: violations by agents who were sanctioned before in the episode.
+    "recidivism": _per_violation("violations after a sanction", "returns_to_violation"),
+    # Above 1 where tags are sanctioned too.
+    "sanctions_per_violation": _per_violation("sanctions per violation", "sanctions", unit="ratio"),
+    # Principle 6, conflict resolution; undefined without a tag.
+    "unjust_share_of_tags": Metric(
+        "unjust tags",
+        SHARE,
+        ("counts", "tagged_by"),
+        lambda sums: _ratio(sums.counts["unjust_tags"], sums.tags),
+        counted=("unjust_tags",),
+    ),
+    "net_equality": Metric("equality of net incomes", SHARE, _INCOMES, lambda sums: equality(_net(sums))),
+    "equality_within": _of_groups("equality within groups", _within),
+    "equality_between": _of_groups("equality between groups", equality_between),
+    "net_equality_within": _of_groups("equality of net incomes within groups", _within, is_net=True),
+    "net_equality_between": _of_groups(
+        "equality of net incomes between groups", equality_between, is_net=True
+    ),
+}
 
 
 def metrics_for(institutions: Sequence[Institution]) -> tuple[str, ...]:

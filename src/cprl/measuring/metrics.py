@@ -7,7 +7,6 @@ number needs are named in `cprl.measuring.social.SOCIAL` for metrics, and here f
 
 from collections.abc import Collection, Mapping
 from math import inf
-from types import MappingProxyType
 from typing import Any, Final
 
 from tensordict import TensorDictBase
@@ -98,29 +97,23 @@ def bounds(name: str) -> tuple[float, float]:
 OPTIONAL: Final = ("harvest", "in_play", "fired", "hit_by", "tagged_by", "stock")
 """The optional entries, by the last part of their keys in `cprl.keys`; all but "stock" are in "agents"."""
 
-METRICS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
-    {name: social.SOCIAL[name].needs for name in social.METRICS}
-)
+METRICS: Final[Mapping[str, tuple[str, ...]]] = {name: social.SOCIAL[name].needs for name in social.METRICS}
 """The entries that each metric of an episode needs."""
 
-FIELDS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
-    {
-        **{"harvest": ("harvest",), "in_play_steps": ("in_play",), "shots": ("fired",), "hits": ("hit_by",)},
-        **dict.fromkeys(("tagged", "tagged_by"), ("tagged_by",)),
-        **dict.fromkeys(("stock_left", "depletion_step"), ("stock",)),
-    }
-)
+FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
+    **{"harvest": ("harvest",), "in_play_steps": ("in_play",), "shots": ("fired",), "hits": ("hit_by",)},
+    **dict.fromkeys(("tagged", "tagged_by"), ("tagged_by",)),
+    **dict.fromkeys(("stock_left", "depletion_step"), ("stock",)),
+}
 """The entries that each field of `Episode` needs; other fields need none."""
 
-INSTITUTIONAL: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        "fines": "fines",
-        "transfers": "transfers",
-        "violations": "violated",
-        "counts": "counts",
-        "in_force": "in_force",
-    }
-)
+INSTITUTIONAL: Final[Mapping[str, str]] = {
+    "fines": "fines",
+    "transfers": "transfers",
+    "violations": "violated",
+    "counts": "counts",
+    "in_force": "in_force",
+}
 """The entry that each field of `Episode` about institutions needs."""
 OF_INSTITUTIONS: Final = tuple(INSTITUTIONAL.values())
 """These entries; all but "in_force" are in "agents". A game without institutions has none of them and lacks

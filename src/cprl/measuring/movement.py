@@ -136,8 +136,7 @@ def exclusion(visits: ArrayLike) -> Array:
 
 def owners(visits: ArrayLike) -> Array:
     """The agent that spends the largest share of its time in each cell, int64 [..., H, W]; of equal ones the
-    first, and -1 where nobody was.
-    """
+    first, and -1 where nobody was."""
     shares = np.asarray(visits, np.float64)
     agents: Array = np.where(shares.any(-3), shares.argmax(-3), -1)
     return agents

@@ -10,7 +10,6 @@ Below, R_i is the sum of agent i's harvest over its episode, T the number of ste
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import torch
@@ -124,62 +123,57 @@ def equality_of(incomes: Tensor) -> Tensor:
     return 1 - gaps / (2 * incomes.shape[-1] * incomes.sum(-1))
 
 
-SOCIAL: Final[Mapping[str, Metric]] = MappingProxyType(
-    {
-        # sum_i R_i; what [W] calls "efficiency".
-        "collective_return": Metric(
-            "collective return", "apples", ("harvest",), lambda totals: totals.harvest.sum(-1)
+SOCIAL: Final[Mapping[str, Metric]] = {
+    # sum_i R_i; what [W] calls "efficiency".
+    "collective_return": Metric(
+        "collective return", "apples", ("harvest",), lambda totals: totals.harvest.sum(-1)
+    ),
+    # sum_i R_i / T [P]; undefined for an episode without steps.
+    "efficiency": Metric(
+        "efficiency", "apples per step", ("harvest",), lambda totals: totals.harvest.sum(-1) / totals.steps
+    ),
+    # 1 - sum_ij |R_i - R_j| / (2 N sum_i R_i) [P]; what [W] prints as "inequality".
+    "equality": Metric(
+        "equality (1 - Gini)", SHARE, ("harvest",), lambda totals: equality_of(totals.harvest), digits=2
+    ),
+    # The mean, over the agents with a harvest, of E[t given r_i,t > 0], 1..T [P]: high where apples are
+    # still there late. [P] does not define it for agents without a harvest; here they are left out, and
+    # `cprl.measuring.statistics` counts them.
+    "sustainability": Metric(
+        "sustainability",
+        "steps",
+        ("harvest",),
+        lambda totals: (totals.harvest_time / totals.harvest_steps).nanmean(-1),
+        digits=1,
+    ),
+    # The step at which the episode ended, 0..T; what [W] calls "sustainability".
+    "survival_steps": Metric("survival", "steps", (), lambda totals: totals.steps, digits=1),
+    # (N T - agent-steps out of play) / T, in untagged agents per step, 0..N [P].
+    "peace": Metric(
+        "peace", "agents", ("in_play",), lambda totals: totals.in_play_steps.sum(-1) / totals.steps
+    ),
+    # Agent-steps in play / N, 0..T, as in [W]; it also falls when episodes end early.
+    "peacefulness": Metric(
+        "peacefulness",
+        "steps in play per agent",
+        ("in_play",),
+        lambda totals: totals.in_play_steps.sum(-1) / totals.in_play_steps.shape[-1],
+        digits=1,
+    ),
+    # sum_i R_i / (sustainable_yield x T + first_stock): the harvest relative to what the map can bear in
+    # the T steps that were played. Of two episodes with the same harvest the shorter one has the higher
+    # share, as agents have who take all at once and end the episode. Above 1 where the true yield exceeds
+    # the given lower bound.
+    "yield_share": Metric(
+        "yield share of the steps played",
+        "ratio",
+        ("harvest",),
+        lambda totals: share_of(
+            totals.harvest.sum(-1), totals.sustainable_yield * totals.steps + totals.first_stock
         ),
-        # sum_i R_i / T [P]; undefined for an episode without steps.
-        "efficiency": Metric(
-            "efficiency",
-            "apples per step",
-            ("harvest",),
-            lambda totals: totals.harvest.sum(-1) / totals.steps,
-        ),
-        # 1 - sum_ij |R_i - R_j| / (2 N sum_i R_i) [P]; what [W] prints as "inequality".
-        "equality": Metric(
-            "equality (1 - Gini)", SHARE, ("harvest",), lambda totals: equality_of(totals.harvest), digits=2
-        ),
-        # The mean, over the agents with a harvest, of E[t given r_i,t > 0], 1..T [P]: high where apples are
-        # still there late. [P] does not define it for agents without a harvest; here they are left out, and
-        # `cprl.measuring.statistics` counts them.
-        "sustainability": Metric(
-            "sustainability",
-            "steps",
-            ("harvest",),
-            lambda totals: (totals.harvest_time / totals.harvest_steps).nanmean(-1),
-            digits=1,
-        ),
-        # The step at which the episode ended, 0..T; what [W] calls "sustainability".
-        "survival_steps": Metric("survival", "steps", (), lambda totals: totals.steps, digits=1),
-        # (N T - agent-steps out of play) / T, in untagged agents per step, 0..N [P].
-        "peace": Metric(
-            "peace", "agents", ("in_play",), lambda totals: totals.in_play_steps.sum(-1) / totals.steps
-        ),
-        # Agent-steps in play / N, 0..T, as in [W]; it also falls when episodes end early.
-        "peacefulness": Metric(
-            "peacefulness",
-            "steps in play per agent",
-            ("in_play",),
-            lambda totals: totals.in_play_steps.sum(-1) / totals.in_play_steps.shape[-1],
-            digits=1,
-        ),
-        # sum_i R_i / (sustainable_yield x T + first_stock): the harvest relative to what the map can bear in
-        # the T steps that were played. Of two episodes with the same harvest the shorter one has the higher
-        # share, as agents have who take all at once and end the episode. Above 1 where the true yield exceeds
-        # the given lower bound.
-        "yield_share": Metric(
-            "yield share of the steps played",
-            "ratio",
-            ("harvest",),
-            lambda totals: share_of(
-                totals.harvest.sum(-1), totals.sustainable_yield * totals.steps + totals.first_stock
-            ),
-            of_totals=("sustainable_yield", "first_stock"),
-            digits=2,
-        ),
-    }
-)
+        of_totals=("sustainable_yield", "first_stock"),
+        digits=2,
+    ),
+}
 METRICS: Final = tuple(name for name in SOCIAL if name != "yield_share")
 """Those of every game that reports harvest and in_play, in this order."""

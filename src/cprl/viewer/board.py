@@ -90,8 +90,7 @@ class FrameRecorder:
 
 class Filming:
     """Logs the frames of the first world in every k-th episode, including the first and the last, and in the
-    episode after each new best.
-    """
+    episode after each new best."""
 
     def __init__(
         self, env: CommonsEnv | None, logger: "RerunLogger", scene: Scene | None, *, episodes: int

@@ -202,8 +202,7 @@ _THIN: Final = 0.01
 
 def _send_fixed(recording: Any, *, scene: Scene) -> None:
     """Sends what never changes; formats of images are in each frame instead: a viewer that gets one after a
-    frame, for the first time or again, shows no board until the next frame.
-    """
+    frame, for the first time or again, shows no board until the next frame."""
     for entity, parts in board_styles().items():
         recording.log(f"exhibition/{entity}", *parts, static=True)
     low, wide = scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS

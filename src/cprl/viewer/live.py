@@ -106,8 +106,7 @@ class Stream:
 
 class LiveStream(Stream):
     """A stream to viewers. Its calls are made in a thread of its own, because a viewer that stands still, or
-    accepts a connection and never reads, makes them wait for half a minute.
-    """
+    accepts a connection and never reads, makes them wait for half a minute."""
 
     is_live = True
 

@@ -163,8 +163,7 @@ def check_watch(watch: str, *, linger: bool = False, can_be_off: bool = True) ->
 
 def linger(logger: "RerunLogger", play_on: Callable[[Event], None] | None = None) -> None:
     """Says where the recording stays served, waits for Ctrl-C (SIGINT) or SIGTERM, and closes the recording;
-    a second signal in the meantime changes nothing.
-    """
+    a second signal in the meantime changes nothing."""
     if not logger.is_live:
         console().print("The recording is no longer served.")
         return

@@ -1,6 +1,5 @@
 """What a recording shows of a training beside its frames: lines over episodes, joint actions, tags, the
-boards of all replicas, where agents go, the stock over the turn, the Lorenz curve, and borders of regions.
-"""
+boards of all replicas, where agents go, the stock over the turn, the Lorenz curve, and borders of regions."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -88,8 +87,7 @@ _WITH_MEAN: Final = tuple(f"/{name}" for name in ("return", *OF_AGENTS))
 
 class Plots(View):
     """Logs the lines of each episode: social metrics, those of institutions and what agents get and pay
-    with a running mean, all else as it is.
-    """
+    with a running mean, all else as it is."""
 
     def __init__(self, logger: RerunLogger) -> None:
         self._logger = logger
@@ -432,8 +430,7 @@ def _ticks(end: float) -> list[float]:
 class Turns(Sampled):
     """Logs the apples on the board over the turns of the last episode of each replica, or of each world that
     the wall shows, grey where the board lived until the time was up, in the colour of a tragedy where it
-    died.
-    """
+    died."""
 
     POINTS = 100
     """The points of a line, at most."""

@@ -179,8 +179,7 @@ _RADIUS_CELLS: Final = 0.06
 
 class Offences:
     """Logs a white diamond around each agent in the frame of the turn in which it broke a rule, and lines of
-    fines and transfers per turn; a callback of `cprl.training`.
-    """
+    fines and transfers per turn; a callback of `cprl.training`."""
 
     def __init__(self, logger: RerunLogger, env: CommonsEnv, *, names: Sequence[str]) -> None:
         self._logger, self._env, self._names = logger, env, tuple(names)
