@@ -331,38 +331,28 @@ def test_runs_have_given_names_those_of_their_directories_or_their_paths(corrido
     assert found.cell("waits", "bites").measures()["background/return"].estimate.value == 2.5
 
 
-def with_returns(played, returns):
-    """The same cross-play with other returns: of both agents, by cell, focal agent and replica."""
-
-    def part_of(at, focal, by_agent):
-        played = played_of(at, focal, by_agent)
-        return Part({"focal": at[0], "background": at[1], "focal_agent": focal}, played, ((focal,),))
-
-    def played_of(at, focal, by_agent):
-        episodes = played.cell(*at).by_agent[focal]
-        return {
-            replica: [replace(one, return_=np.array(own, dtype=float)) for one in episodes[replica]]
-            for replica, own in enumerate(by_agent[focal])
-        }
-
-    parts = [part_of(at, focal, by_agent) for at, by_agent in returns.items() for focal in by_agent]
-    return replace(played, parts=parts)
-
-
 def exploited(corridors):
     """A cross-play of two replicas in which greedy agents exploit sustainable ones."""
-    found = cprl.crossplay(list(corridors.values()), episodes=1, replicas=[0, 1])
+    played = cprl.crossplay(list(corridors.values()), episodes=1, replicas=[0, 1])
     among_their_like = {0: [[5, 5], [7, 7]], 1: [[5, 5], [7, 7]]}
-    return with_returns(
-        found,
-        {
-            # focal agents 0 and 1, each in replicas 0 and 1; the focal agent's return stands at its index
-            ("greedy", "sustainable"): {0: [[9, 2], [12, 4]], 1: [[3, 9], [4, 10]]},
-            ("sustainable", "greedy"): {0: [[1, 2], [1, 3]], 1: [[2, 1], [3, 1]]},
-            ("sustainable", "sustainable"): among_their_like,
-            ("greedy", "greedy"): {0: [[2, 2], [2, 2]], 1: [[2, 2], [2, 2]]},
-        },
-    )
+    returns = {
+        # focal agents 0 and 1, each in replicas 0 and 1; the focal agent's return stands at its index
+        ("greedy", "sustainable"): {0: [[9, 2], [12, 4]], 1: [[3, 9], [4, 10]]},
+        ("sustainable", "greedy"): {0: [[1, 2], [1, 3]], 1: [[2, 1], [3, 1]]},
+        ("sustainable", "sustainable"): among_their_like,
+        ("greedy", "greedy"): {0: [[2, 2], [2, 2]], 1: [[2, 2], [2, 2]]},
+    }
+    parts = []
+    for (focal, background), by_agent in returns.items():
+        for agent, of_replicas in by_agent.items():
+            (episode,) = played.cell(focal, background).by_agent[agent][0]
+            episodes = {
+                replica: [replace(episode, replica=replica, return_=np.array(both, dtype=float))]
+                for replica, both in enumerate(of_replicas)
+            }
+            labels = {"focal": focal, "background": background, "focal_agent": agent}
+            parts.append(Part(labels, episodes, ((agent,),)))
+    return replace(played, parts=parts)
 
 
 def test_gains_are_differences_from_the_diagonal_paired_by_replica(corridors):
@@ -399,7 +389,6 @@ def shade(at):
 
 
 def rows_of(text):
-    """The cells of the rows of all tables."""
     return [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines() if "│" in line]
 
 
@@ -628,6 +617,5 @@ def among(run):
 
 
 def its_like(game, run):
-    """A scenario whose background is of a run."""
     background = tuple(Frozen(str(run), agent, replica=None) for agent in range(2))
     return Scenario(name="its_like", game=game, focal="minority", background=background)

@@ -44,17 +44,9 @@ DQNS = (Learning(DQN(settings=REPLAY)), Learning(PPO(settings=ROLLOUT)), Scripte
 
 
 def experiment(**changes):
-    options = {
-        "replicas": 2,
-        "episodes": 5,
-        "evaluation_episodes": 3,
-        "engine": "eager",
-        "seed": 4,
-        **changes,
-    }
-    return cprl.Experiment(
-        **{"name": "evaluated", "game": GAME, "agents": MIXED, "evaluate_every": 2, **options}
-    )
+    options = {"replicas": 2, "episodes": 5, "evaluation_episodes": 3, "engine": "eager", "seed": 4}
+    options |= {"name": "evaluated", "game": GAME, "agents": MIXED, "evaluate_every": 2}
+    return cprl.Experiment(**options | changes)
 
 
 def run(experiment, out, **options):

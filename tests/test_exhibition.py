@@ -1,6 +1,7 @@
 """The present policy plays a world of its own for viewers; the training and its file do not notice."""
 
 import warnings
+from contextlib import ExitStack
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -141,23 +142,16 @@ def test_an_exhibition_changes_nothing_that_is_learned(name, tmp_path, monkeypat
             def on_episode(self, episode, learning):
                 returns.append((episode.world, episode.return_.tolist(), repr(learning)))
 
-        def training(*callbacks):
-            train(
-                env,
-                population.learners,
-                others=population.others,
-                episodes=experiment.episodes,
-                callbacks=[Keeping(), *callbacks],
-            )
-
-        if watched:
-            shown = exhibited(experiment, env, population)
-            how = {"title": "run", "episodes": experiment.episodes, "live": "serve", "exhibited": shown}
-            with ViewerCallback(tmp_path, env, **how) as viewer:
-                training(viewer)
+        episodes, callbacks, agents = experiment.episodes, [Keeping()], population.learners
+        with ExitStack() as viewing:
+            if watched:
+                shown = exhibited(experiment, env, population)
+                how = {"episodes": episodes, "live": "serve", "exhibited": shown}
+                viewer = viewing.enter_context(ViewerCallback(tmp_path, env, title="run", **how))
+                callbacks.append(viewer)
+            train(env, agents, others=population.others, episodes=episodes, callbacks=callbacks)
+            if watched:
                 played.append(viewer.exhibition.steps)
-        else:
-            training()
         weights = [net.state_dict() for net in population.networks().values()]
         return repr((weights, torch.get_rng_state().tolist(), returns))
 

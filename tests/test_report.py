@@ -22,7 +22,6 @@ GOVERNED = replace(CORRIDORS, institutions=(Quota(share=0.5, window_steps=2),))
 
 
 def cells_of(page):
-    """The cells of all tables of a page."""
     return re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", page)
 
 

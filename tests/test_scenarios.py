@@ -35,11 +35,11 @@ THREE_CORRIDORS = replace(
 def runs(alike, tmp_path_factory):
     """Runs of scripted agents in three corridors, two replicas, and two DQN agents on the meadow, three."""
     folder = tmp_path_factory.mktemp("scenarios")
-    policies = ("greedy", "sustainable")
-    scripted_runs = [
-        ran(folder / name, THREE_CORRIDORS, [Scripted(name)] * 3, replicas=2) for name in policies
-    ]
-    return {**dict(zip(policies, scripted_runs, strict=True)), "learned": alike}
+    by_script = {
+        name: ran(folder / name, THREE_CORRIDORS, [Scripted(name)] * 3, replicas=2)
+        for name in ("greedy", "sustainable")
+    }
+    return {**by_script, "learned": alike}
 
 
 FRESH = Fresh(replicas=(0, 1, 2), episodes=2, seed=SEED)
@@ -102,7 +102,6 @@ def test_a_stored_background_is_of_the_next_replica(runs):
 
 
 def keeping(run, *replicas):
-    """A run as if only these replicas had been kept."""
     lanes = {f"replica_{number}" for number in replicas}
     kept = {lane: own for lane, own in run.networks.items() if lane.split("/")[0] in lanes}
     return replace(run, networks=kept)

@@ -1,6 +1,5 @@
 """What people read first in a recording, and its pictures: header, label, phases, recipe and layout; the
-boards of all replicas, where agents go, the stock over the turn, and the Lorenz curve.
-"""
+boards of all replicas, where agents go, the stock over the turn, and the Lorenz curve."""
 
 import time
 from dataclasses import replace

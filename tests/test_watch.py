@@ -13,6 +13,7 @@ import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from subprocess import PIPE
 from types import SimpleNamespace
@@ -29,6 +30,7 @@ import torch
 from dqn_parts import dqn_learner
 from recordings import GAME, SCENE, column, frames, static
 from rerun.chunk import RrdReader
+from study_runs import an_episode
 from test_outcome import EXPERIMENT
 
 import cprl
@@ -36,7 +38,6 @@ from cprl import CommonsEnv
 from cprl.commands import main as cli
 from cprl.commands.recipe import parse
 from cprl.learners.settings import DQNSettings
-from cprl.measuring import Episode, social
 from cprl.training import train
 from cprl.viewer import live as streams
 from cprl.viewer import page
@@ -60,9 +61,6 @@ class Doing:
         if self.left == 0:
             self.what()
 
-    def on_episode(self, episode, learning):
-        """Nothing."""
-
 
 def course(run=None, *, live=None, episodes=8, others=()):
     """Weights, torch's generator and returns after a training of two replicas, watched if a run is given."""
@@ -70,11 +68,11 @@ def course(run=None, *, live=None, episodes=8, others=()):
     agents = dqn_learner(GAME.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=1, compile=False)
     env, returns = CommonsEnv(GAME, 2, seed=1), []
 
-    class Keeping(Doing):
+    class Keeping:
         def on_episode(self, episode, learning):
             returns.append((episode.world, episode.return_.tolist(), learning["agent_0/loss"]))
 
-    callbacks = [Keeping(-1, None), *others]
+    callbacks = [Keeping(), *others]
     if run is None:
         train(env, {(0, 1): agents}, episodes=episodes, callbacks=callbacks)
     else:
@@ -187,27 +185,15 @@ def test_without_a_display_no_viewer_is_spawned_and_the_addresses_stay(tmp_path,
 
 def fake(number, world, *, returned, tagged):
     """An episode of two agents with as many apples and tags as are said."""
-    values = dict.fromkeys(social.METRICS, 1.0) | {
-        "collective_return": returned,
-        "survival_steps": min(1000.0, 2 * returned),
-        "peacefulness": returned,
-    }
-    whole = np.array([returned / 2, returned / 2])
-    return Episode(
-        world=world,
-        episode=number,
-        steps=20,
+    lived = {"survival_steps": min(1000.0, 2 * returned), "peacefulness": returned}
+    both = np.array([returned / 2, returned / 2])
+    return replace(
+        an_episode(number, world, returned, **lived),
         terminated=number == 5,
-        return_=whole,
-        harvest=whole,
-        in_play_steps=np.array([20, 20]),
-        shots=np.array([1, 0]),
-        hits=np.array([1, 0]),
-        tagged=np.array([0, tagged]),
+        return_=both,
+        harvest=both,
         tagged_by=np.array([[0, 0], [tagged, 0]]),
-        stock_left=3,
         depletion_step=7 if number == 5 else -1,
-        metrics=values,
     )
 
 

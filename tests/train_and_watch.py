@@ -23,9 +23,6 @@ class Leisure:
     def on_step(self, batch):
         time.sleep(0.01)
 
-    def on_episode(self, episode, learning):
-        """Nothing."""
-
 
 def main(run: Path, episodes: int) -> None:
     """Trains four agents in two replicas, in short episodes of the commons."""
