@@ -7,21 +7,19 @@ from typing import Any, Final, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
 from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, agent_colour
 from cprl.commons.maps import Map
 from cprl.evaluation.evaluate import BESIDE_RANDOM, SEED, heading, opened
 from cprl.evaluation.lanes import Agent, Fresh, agents_of, commons_game, fresh_of, scripted
 from cprl.measuring import movement
-from cprl.measuring.movement import Trace, overlap, owners, trace, visits
+from cprl.measuring.movement import Array, Trace, overlap, owners, trace, visits
 from cprl.measuring.statistics import Estimate, estimate
 from cprl.terminal import style
 from cprl.terminal.tables import Cells
 from cprl.training.agents import LoadedRun
 from cprl.values import checked, refusal
 
-Array = NDArray[Any]
 Policy = Literal["trained", "random"]
 
 EXCLUSION: Final = "exclusion (0 to 1)"

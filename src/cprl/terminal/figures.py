@@ -9,13 +9,13 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
 from cprl.measuring.episodes import Episode
 from cprl.measuring.metrics import title as metric_title
 from cprl.measuring.metrics import unit
 from cprl.measuring.phases import UNNAMED as UNNAMED
 from cprl.measuring.phases import Phase
+from cprl.measuring.series import Values
 from cprl.runs.curves import SMOOTHED_EPISODES, centres, curves_of, episode_of_turn, phases_of, running_mean
 from cprl.runs.episodes import read_episodes, read_evaluations
 from cprl.terminal import style
@@ -86,8 +86,6 @@ def mark_exploration(panels: Sequence[Axes], episode: float | None) -> None:
         on_the_axis: dict[str, Any] = {"transform": panel.get_xaxis_transform(), "clip_on": False}
         panel.plot(episode, 0, "^", markersize=9, color=MARK, zorder=5, label=label, **on_the_axis)
 
-
-Values = NDArray[np.float64]
 
 PARTS: Final = 20
 """A running mean takes in at most one part in so many of a training, so that short ones keep their course."""
