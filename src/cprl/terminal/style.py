@@ -209,6 +209,7 @@ def drawing(
         sheet = Sheet(width)
         yield sheet
         sheet.finish()
+        path.parent.mkdir(parents=True, exist_ok=True)
         save(sheet.figure, path, colours=colours, title=sheet.title, caption=sheet.caption)
         if width == "column":
             text = f"{sheet.title}\n\n{sheet.caption}\n".encode("utf-8", "replace")
@@ -231,8 +232,7 @@ def check_picture(path: str | Path, name: str = "path") -> Path:
 
 
 def save(figure: Figure, path: Path, *, colours: int = COLOURS, title: str = "", caption: str = "") -> Path:
-    """Write a picture atomically, a PNG of so few colours; its folder is created if missing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Write a picture atomically, a PNG of so few colours."""
     drawn = BytesIO()
     if path.suffix == ".png":
         figure.savefig(drawn, format="png")
