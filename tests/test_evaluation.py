@@ -4,6 +4,8 @@ import json
 import os
 import shutil
 from dataclasses import replace
+from math import isnan
+from pathlib import Path
 
 import matplotlib
 import numpy as np
@@ -47,7 +49,7 @@ from cprl.evaluation.lanes import Fresh, Part, Turns, agents_of
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.metrics import with_unit
 from cprl.measuring.movement import trace
-from cprl.measuring.statistics import agents_without_harvest, over_replicas
+from cprl.measuring.statistics import agents_without_harvest, over_replicas, social_measures
 from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import LaneActor, random_agents
@@ -619,3 +621,13 @@ def among(run):
 def its_like(game, run):
     background = tuple(Frozen(str(run), agent, replica=None) for agent in range(2))
     return Scenario(name="its_like", game=game, focal="minority", background=background)
+
+
+def test_social_measures_are_those_of_the_docs(corridors):
+    found = cprl.evaluate_run(corridors["greedy"], episodes=1)
+    text = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
+    documented = [line.split("`")[1] for line in text.splitlines() if line.startswith("| `social/")]
+    assert {f"social/{name}" for name in social_measures(found.trained)} == set(documented)
+    (single,) = [one for name, one in social_measures({0: found.trained[0]}).items() if name == "peace"]
+    assert str(single) == "2.00", "one replica alone has no interval"
+    assert isnan(single.estimate.low)

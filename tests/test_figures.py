@@ -366,3 +366,8 @@ def test_a_run_marks_where_the_exploration_of_its_agents_ends(tmp_path, drawn):
     )
     cprl.run(experiment, tmp_path / "run", watch="off")
     assert "exploration ends, episode 2" in labels(drawn[0])
+
+
+def test_long_names_break_at_their_signs_and_only_where_they_must():
+    assert style.wrapped("target_every_episodes", 8) == "target_every_\nepisodes"
+    assert style.wrapped("beside a target_network", 10) == "beside a\ntarget_network"

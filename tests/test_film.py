@@ -21,7 +21,7 @@ from cprl.commons.picture import EMPTY_SITE_COLOUR
 from cprl.evaluation import film_pictures
 from cprl.evaluation.export import export_episodes
 from cprl.evaluation.film import Style, film, film_video, fresh_episode, titles_of
-from cprl.evaluation.film_pictures import EpisodePicture
+from cprl.evaluation.film_pictures import EpisodePicture, nice
 from cprl.institutions import Monitoring, Quota
 
 LEFT = [5, 3, 2, 0]
@@ -312,3 +312,23 @@ def test_fresh_episodes_are_written_as_minari_data_sets(runs, tmp_path, monkeypa
             assert (one.terminations | one.truncations).tolist() == [False] * (len(one.actions) - 1) + [True]
             assert one.infos["joint_action"][1:, agent].tolist() == one.actions.tolist()
             assert len(one.observations) == len(one.actions) + 1
+
+
+def test_a_film_of_a_board_that_lives_says_what_is_left(runs, tmp_path, drawn):
+    _, (played,) = film_video(runs / "meadow", tmp_path / "film.gif", style=Style(width=240))
+    apples = int(played.harvest.sum())
+    picked = f"{apples} apple{'s'[: apples != 1]} picked"
+    assert drawn[-1][2:] == ("", f"{picked} · {played.stock_left} of 4 still on the board")
+
+
+def test_an_mp4_has_a_picture_for_each_turn_and_holds_the_card(runs, tmp_path):
+    path, _ = film_video(runs / "greedy", tmp_path / "own.mp4", style=Style(width=240, fps=5))
+    pictures = pictures_of(path, 240)
+    assert len(pictures) == len(LEFT) + 2 * 5, "two seconds"
+    greens = [(np.abs(picture.astype(int) - PALETTE[APPLE]) < 30).all(-1).sum() for picture in pictures]
+    assert greens[0] > 2 * greens[3] > 0, "the area of the plot is left"
+
+
+@pytest.mark.parametrize(("number", "top"), [(0, 10), (10, 10), (11, 20), (201, 500), (1001, 2000)])
+def test_axes_end_at_round_numbers(number, top):
+    assert nice(number) == top

@@ -114,3 +114,8 @@ def test_all_lines_of_agents_stay_in_their_cells():
     for strokes in (numbers_and_headings(120), numbers(120), marks(120)):
         assert np.abs(strokes.shape).max() <= 0.5
     assert set(marks(12).owner) == set(range(4, 12))
+
+
+def test_the_measure_finds_colours_that_look_the_same():
+    old = {"agent 0": (86, 156, 255), "agent 3": (186, 110, 255)}
+    assert differences(SEEN["deuteranopia"][0], old)["agent 0", "agent 3"] < 3

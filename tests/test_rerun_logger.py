@@ -25,7 +25,7 @@ from torchrl.trainers import LogScalar, LogValidationReward, Trainer
 from cprl import CommonsEnv, Observation
 from cprl.commons.colours import APPLE, BEAM, COLOURS, FIRST_AGENT, GROUND, OTHER, PALETTE, SELF, WALL
 from cprl.commons.decoding import UNSEEN, classes_seen
-from cprl.viewer.board import boards
+from cprl.viewer.board import boards, mosaic
 from cprl.viewer.layout import Scene, window_corners
 from cprl.viewer.logger import RerunLogger
 
@@ -346,3 +346,11 @@ def test_a_torchrl_example_that_knows_nothing_of_cprl_is_recorded(tmp_path):
     assert places[:, 0].tolist() == [0, 0, 0]
     filmed = places[:, 1:].mean(1), np.array(evaluated)[:, 0]
     assert filmed[0] == pytest.approx(filmed[1]), "the film shows what was paid: the cell's number"
+
+
+def test_mosaics_put_low_windows_below_each_other_and_high_ones_side_by_side():
+    low = np.array([[[[SELF, BEAM, WALL]], [[GROUND, APPLE, OTHER]]]], np.uint8)
+    assert mosaic(low).tolist() == [[[SELF, BEAM, WALL], [UNSEEN] * 3, [GROUND, APPLE, OTHER]]]
+    assert window_corners(4, (7, 15)) == [(0, 0), (0, 16), (8, 0), (8, 16)]
+    high = np.array([[[[SELF], [BEAM], [WALL]], [[GROUND], [APPLE], [OTHER]]]], np.uint8)
+    assert mosaic(high).tolist() == [[[SELF, UNSEEN, GROUND], [BEAM, UNSEEN, APPLE], [WALL, UNSEEN, OTHER]]]

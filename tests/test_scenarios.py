@@ -210,3 +210,9 @@ def test_the_tables_have_the_numbers_of_the_committed_estimates():
     assert set(played) <= set(baseline.POPULATIONS)
     for name in played:
         assert baseline.table(name) in tables, name
+
+
+def test_every_agent_is_focal_equally_often():
+    how = {"name": "own", "game": THREE_CORRIDORS, "background": (Scripted("greedy"),) * 3}
+    assert Scenario(focal="minority", **how).placements == ((0,), (1,), (2,))
+    assert Scenario(focal="majority", **how).placements == ((1, 2), (0, 2), (0, 1))

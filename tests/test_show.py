@@ -14,7 +14,7 @@ from viewers import browser, wait_until
 
 from cprl import presets
 from cprl.commons.colours import BEAM
-from cprl.commons.readable import legend_of, meaning_of
+from cprl.commons.readable import growth_of, legend_of, meaning_of
 from cprl.evaluation.film import fresh_episode, play_to_show
 from cprl.evaluation.show import show
 from cprl.institutions import Boundaries, Monitoring, Quota, Tax
@@ -189,3 +189,10 @@ def test_the_legend_names_only_signs_that_can_appear():
     walled = replace(presets.game("two_complex"), institutions=(Quota(fine=1.0),))
     assert re.search("wall.*hit leaves the board for 25 turns.*diamond", legend_of([peaceful, walled]))
     assert legend_of([walled, walled]) == legend_of([walled])
+
+
+def test_what_readers_are_told_of_growth():
+    assert "stays bare" in growth_of(presets.game("commons"))
+    assert "river" in growth_of(presets.game("ssd/cleanup-v1"))
+    lush = replace(CORRIDORS, rules=replace(CORRIDORS.rules, regrow_prob=(0.1, 0.2)))
+    assert growth_of(lush) == "Agents pick apples, which grow back."

@@ -31,7 +31,7 @@ from cprl.viewer.layout import Curves, Panels, curves_of, joint_actions, layout
 from cprl.viewer.live import LiveStream, Stream
 from cprl.viewer.logger import RerunLogger, as_table, send_waiting
 from cprl.viewer.pictures import Turns, Visits, Wall, gini, lorenz_curve
-from cprl.viewer.story import CLOCK, CompilingNotice, Header, published_phases
+from cprl.viewer.story import CLOCK, CompilingNotice, Header, played, published_phases
 
 __all__ = ["strict_rerun"]
 
@@ -482,3 +482,18 @@ def test_viewers_get_the_wall_every_two_seconds_and_the_file_does_not(run, monke
     boards_at = [at for name, at in listener.rows if name == "wall/boards"]
     assert boards_at == [{"step": [step], "episode": [3], "frame": [12]} for step in (1, 4, 7)]
     assert listener.live_only == [True] * 3
+
+
+def test_the_numbers_of_an_evaluation_are_means_with_their_error():
+    episodes = [fake(5, 0, returned=apples, tagged=0) for apples in (10.0, 14.0)]
+    assert played(episodes) == (12.0, 2.0, 2, 2)
+    assert np.isnan(played(episodes[:1]).error)
+
+
+def test_who_tagged_whom_is_a_matrix_of_numbers_of_the_last_fifty_episodes(tmp_path):
+    path = recorded(tmp_path, range(60), episodes=60, tagged=1)
+    episodes, labels = column(path, "tags/counts", "Points2D:labels", "episode")
+    assert episodes == [9, 19, 29, 39, 49, 59]
+    assert labels[0] == ["0", "0", "10", "0", "0", "1", "0", "1"], "agent 1 by agent 0"
+    assert labels[-1][2] == "50"
+    assert len(column(path, "tags", "Image:buffer")[0]) == 6

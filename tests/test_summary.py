@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 from test_results import an_episode
 
-from cprl.measuring.metrics import NAMES
+from cprl.measuring.metrics import NAMES, title, with_unit
 from cprl.terminal.summary import summarise
 from cprl.terminal.tables import Cells
 
@@ -125,3 +125,29 @@ def test_units_are_those_of_the_docs():
     assert set(units) == {name for name in NAMES if "/" not in name}
     for name, unit in units.items():
         assert NAMES[name][1].startswith(unit.replace("0..1", "0 to 1"))
+
+
+@pytest.mark.parametrize(
+    ("name", "rewards", "told"),
+    [
+        ("survival_steps", "", "survival, steps"),
+        ("agent_0/return", "apples", "agent 0: return, apples"),
+        ("agent_0/return", "", "agent 0: return"),
+        ("of_ones_own", "apples", "of_ones_own"),
+    ],
+)
+def test_a_metric_is_called_by_the_same_words_with_its_unit_everywhere(name, rewards, told):
+    assert with_unit(name, rewards=rewards) == told
+    assert title("of_ones_own") == "of_ones_own"
+
+
+def test_episodes_with_an_undefined_net_equality_are_counted(tmp_path):
+    fined = [
+        replace(
+            episode(number, [2, 2]), fines=np.ones(2), institutions={"fines": 2.0, "net_equality": equality}
+        )
+        for number, equality in enumerate([0.5, float("nan"), 0.7])
+    ]
+    rows, _ = told_of(tmp_path, trained=fined)
+    (cells,) = (cells for name, cells in rows.items() if "net" in name)
+    assert cells == ["0.60, undefined in 1 of 3"]
