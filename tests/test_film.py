@@ -20,6 +20,7 @@ from cprl.commons.colours import APPLE, GROUND, PALETTE, agent_colour
 from cprl.commons.picture import EMPTY_SITE_COLOUR
 from cprl.evaluation import film_pictures
 from cprl.evaluation.export import export_episodes
+from cprl.envs.matrix import stag_hunt
 from cprl.evaluation.film import Style, film, film_video, fresh_episode, titles_of
 from cprl.evaluation.film_pictures import EpisodePicture, nice
 from cprl.institutions import Monitoring, Quota
@@ -289,6 +290,13 @@ def test_fresh_episodes_are_written_as_csv(runs, tmp_path, monkeypatch, capsys):
     assert {row["action"] for row in rows} <= set(CORRIDORS.actions)
     with pytest.raises(FileExistsError):
         export_episodes(runs / "greedy", path)
+
+
+def test_episodes_of_a_matrix_game_are_written_as_csv_with_actions_by_number(tmp_path):
+    export_episodes(stored(tmp_path / "run", stag_hunt(turns=3), "random"), tmp_path / "episodes.csv")
+    rows = list(csv.DictReader((tmp_path / "episodes.csv").read_text().splitlines()))
+    assert [row["turn"] for row in rows[:6]] == ["1", "1", "2", "2", "3", "3"]
+    assert {row["action"] for row in rows} <= {"0", "1"}
 
 
 def test_fresh_episodes_are_written_as_minari_data_sets(runs, tmp_path, monkeypatch):

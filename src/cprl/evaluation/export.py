@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl import keys
+from cprl.commons.game import Game
 from cprl.evaluation.film import fresh_episode
 from cprl.evaluation.lanes import Turns
 from cprl.runs.files import refuse_to_write_over
@@ -118,7 +119,7 @@ def _write_csv(path: Path, played: Iterator[tuple[Played, Any]]) -> list[Path]:
         rows = csv.writer(file)
         rows.writerow(COLUMNS)
         for episode, (one, game) in enumerate(played):
-            names = getattr(game, "actions", ())
+            names = game.actions if isinstance(game, Game) else ()
             for turn, agent in np.ndindex(one.action.shape):
                 action = int(one.action[turn, agent])
                 numbers = (float(one.reward[turn, agent]), float(one.harvest[turn, agent]))
