@@ -260,9 +260,7 @@ def test_the_rules_play_the_same_game_without_compilation(variant):
     plain = compiled.compiled(loops.ENTRIES, lambda function: function)
     actions = random_actions(25, 2, game, seed=1)
     batch = Batch(game, 2, seed=1)
-    scratch = empty_scratch(
-        agents=2, sites=45, cells=game.tables.background.size, window=game.tables.window_cells.shape[1]
-    )
+    scratch = empty_scratch(game)
     output = batch.new_output()
     arrays = loops.Played(batch.now, game.tables, output, None, None, None)
     plain["begin_worlds"](arrays, np.ones(2, np.bool_), scratch, 0, 2)

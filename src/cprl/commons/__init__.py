@@ -6,7 +6,6 @@ In reading order:
     maps         boards: drawn, named or generated
     published    the published games by name: boards with their rules
     observation  what agents observe, and in which form
-    reach        whether any agent can come to an apple site
     game         Game: a map, its rules and its observations; the memory that worlds of it take
     world        the arrays of B worlds: state, step output, scratch memory
     colours      the classes of cells and their colours

@@ -148,11 +148,7 @@ def grow(world: Worlds, tables: Tables, scratch: Scratch, sprouts: int) -> None:
 
 
 def bite(
-    world: Worlds,
-    tables: Tables,
-    law: Law | None,
-    actions: Actions,
-    harvest: NDArray[np.float32],
+    world: Worlds, tables: Tables, law: Law | None, actions: Actions, harvest: NDArray[np.float32]
 ) -> None:
     """Each agent in play that harvests (`harvest_action`) takes the apple on its cell, unless an institution
     stops it, which notes what the agent breaks; `harvest`: float32 [N], 0 or 1.

@@ -28,12 +28,28 @@ class Driver(Protocol):
     threads: int
     tables: Tables
 
-    def place(self, arrays: Any) -> Any: ...
-    def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]: ...
-    def read(self, array: NDArray[Any]) -> NDArray[Any]: ...
-    def write(self, array: NDArray[Any], values: NDArray[Any]) -> None: ...
-    def first_unknown(self, actions: Actions, known: int) -> int: ...
-    def run(self, loop: Loop, game: tuple[Any, ...], argument: NDArray[Any]) -> None: ...
+    def place(self, arrays: Any) -> Any:
+        """Copy a tuple of numpy arrays, `Worlds`, `Law` or `Tables`, to where the rules run."""
+
+    def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+        """A new array with undefined entries."""
+
+    def read(self, array: NDArray[Any]) -> NDArray[Any]:
+        """A copy as a numpy array."""
+
+    def write(self, array: NDArray[Any], values: NDArray[Any]) -> None:
+        """Copies values of the same shape and dtype into an array."""
+
+    def first_unknown(self, actions: Actions, known: int) -> int:
+        """The index, in row-major order, of the first action outside 0 .. known - 1; -1 if there is none."""
+
+    def run(self, loop: Loop, game: tuple[Any, ...], argument: NDArray[Any]) -> None:
+        """Run a loop over all worlds. Nothing is checked: all arrays are contiguous and have the form that
+        the game gives them.
+
+        Args:
+            game: what `Played` says, as a plain tuple, which takes a third of the time to make.
+        """
 
 
 class Batch:
@@ -70,9 +86,7 @@ class Batch:
         self.driver: Driver = driver or CpuThreads(game, worlds, threads=threads)
         self.has_begun = False
         """Whether the worlds have begun an episode, so that there is something to show."""
-        host = empty_worlds(
-            worlds=worlds, agents=game.agents, sites=len(game.map.sites), river=len(game.map.river)
-        )
+        host = empty_worlds(game, worlds)
         host.number[:, 0] = np.arange(first_world, first_world + worlds, dtype=np.uint64)
         self.now: Worlds = self.driver.place(host)
         """The current state of the worlds, in the driver's arrays."""

@@ -104,12 +104,11 @@ def class_name(kind: int) -> str:
 
 
 def class_colour(kind: int) -> Colour:
-    """The colour of a class in windows; under `agents_apart` each agent has one of its own."""
-    return COLOURS[kind] if kind < FIRST_AGENT else _apart_colour(kind - FIRST_AGENT)
-
-
-def _apart_colour(agent: int) -> Colour:
-    """Eight distinct colours, then hues in between."""
+    """The colour of a class in windows; under `agents_apart` each agent has one of its own: eight distinct
+    ones, then hues in between."""
+    if kind < FIRST_AGENT:
+        return COLOURS[kind]
+    agent = kind - FIRST_AGENT
     if agent < len(_APART_COLOURS):
         return _APART_COLOURS[agent]
     red, green, blue = hsv_to_rgb(agent * 0.618034 % 1, 0.65, 1.0)

@@ -43,19 +43,15 @@ class CudaThreads:
         check_worlds_fit(game, worlds, free=_free_bytes())
         self.threads = worlds
         self.tables: Tables = self.place(game.tables)
-        scratch = empty_scratch(
-            agents=game.agents,
-            sites=len(game.map.sites),
-            cells=game.tables.background.size,
-            window=game.tables.window_cells.shape[1],
-        )
         self._scratch = Scratch(
-            *(cuda.to_device(np.zeros((worlds, *array.shape), array.dtype, order="F")) for array in scratch)
+            *(
+                cuda.to_device(np.zeros((worlds, *array.shape), array.dtype, order="F"))
+                for array in empty_scratch(game)
+            )
         )
         self._unknown = cuda.to_device(np.full(1, NONE_UNKNOWN, np.int64))
 
     def place(self, arrays: Any) -> Any:
-        """Copy a tuple of arrays, `Worlds`, `Law` or `Tables`, to the GPU."""
         return changed(arrays, _placed)
 
     def wrap(self, memory: Any) -> NDArray[Any]:
@@ -64,28 +60,24 @@ class CudaThreads:
         return array
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """A new array with undefined entries."""
         array: NDArray[Any] = cuda.device_array(shape, dtype)
         return array
 
     def read(self, array: Any) -> NDArray[Any]:
-        """A copy as a numpy array."""
         return np.ascontiguousarray(array.copy_to_host())
 
     def write(self, array: Any, values: NDArray[Any]) -> None:
-        """Copies values of the same shape and dtype into an array."""
         array.copy_to_device(np.asfortranarray(values))
 
     def first_unknown(self, actions: Actions, known: int) -> int:
-        """The index, in row-major order, of the first action outside 0 .. known - 1; -1 if there is none."""
         self._unknown.copy_to_device(np.full(1, NONE_UNKNOWN, np.int64))
         kernels()["find_unknown"][_blocks(len(actions)), THREADS_PER_BLOCK](actions, known, self._unknown)
         at = int(self._unknown.copy_to_host()[0])
         return -1 if at == NONE_UNKNOWN else at
 
     def run(self, loop: Loop, game: tuple[Any, ...], argument: NDArray[Any]) -> None:
-        """Start a loop over all worlds on the default stream, as `CpuThreads.run`; returns before it has
-        finished."""
+        """See `cprl.commons.batch.Driver`; the loop starts on the default stream, and this returns before it
+        has finished."""
         launch = _blocks(len(argument)), THREADS_PER_BLOCK
         worlds, tables, output, law, decisions, payments = game
         if law is None:

@@ -5,7 +5,6 @@ from typing import Final
 import numpy as np
 
 from cprl.commons.game import Game
-from cprl.commons.observation import classes_shown
 from cprl.commons.world import Bytes
 
 UNSEEN: Final = 255
@@ -18,13 +17,7 @@ def classes_seen(game: Game, windows: Bytes) -> Bytes:
     """
     windows = windows[:, :, : len(game.cell_channels)]
     if game.observation.encoding == "one_hot":
-        classes_drawn = classes_shown(
-            game.observation,
-            agents=game.agents,
-            hides=game.rules.walls_block_sight,
-            river=bool(game.map.river),
-        )
-        classes: Bytes = np.take(np.array(classes_drawn, np.uint8), windows.argmax(2))
+        classes: Bytes = np.take(np.array(game.cell_classes, np.uint8), windows.argmax(2))
         return classes
     packed = windows.astype(np.uint32)
     keys = packed[:, :, 0] | packed[:, :, 1] << 8 | packed[:, :, 2] << 16

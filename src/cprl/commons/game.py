@@ -10,11 +10,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.commons.colours import FIRST_AGENT, MAX_AGENTS_APART, class_colour
+from cprl.commons import colours
 from cprl.commons.maps import Map
 from cprl.commons.near import patches, sites_around
-from cprl.commons.observation import Observation, channel_names
-from cprl.commons.reach import why_out_of_reach
+from cprl.commons.observation import Observation
 from cprl.commons.readable import game_html
 from cprl.commons.rules import Rules
 from cprl.commons.spaces import Spaces
@@ -47,18 +46,17 @@ class Game(Value):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        agents = self.agents
-        if self.observation.area == "full" and self.rules.walls_block_sight:
+        agents, rules = self.agents, self.rules
+        if self.observation.area == "full" and rules.walls_block_sight:
             raise ValueError(
                 'Observation.area is "full" and Rules.walls_block_sight is True; allowed: area="window" '
                 "where walls block sight"
             )
-        if self.rules.agent_1_right_moves_agent_0 and agents < 2:
+        if rules.agent_1_right_moves_agent_0 and agents < 2:
             raise ValueError(
                 f"Rules.agent_1_right_moves_agent_0 is True and the map has {agents} agent; "
                 "allowed: at least 2"
             )
-        rules = self.rules
         if rules.respawn_at_spawns and not self.map.spawns:
             raise ValueError(
                 "Rules.respawn_at_spawns is True and Map.spawns is empty; allowed: a map with spawn places"
@@ -70,14 +68,14 @@ class Game(Value):
                 f"Rules.first_stock_share is {rules.first_stock_share} of {len(self.map.sites)} sites, and "
                 "regrow_prob[0] is 0, so no apple can ever grow; allowed: a share of at least one site"
             )
-        check_sizes(self.map, self.rules)
-        if self.observation.agents_apart and agents > MAX_AGENTS_APART:
+        check_sizes(self.map, rules)
+        if self.observation.agents_apart and agents > colours.MAX_AGENTS_APART:
             raise ValueError(
                 f"Observation.agents_apart is True and the map has {agents} agents; allowed: at most "
-                f"{MAX_AGENTS_APART}"
+                f"{colours.MAX_AGENTS_APART}"
             )
         law.check_institutions(self)
-        warning = why_out_of_reach(self.map, self.institutions, shuffle_starts=self.rules.shuffle_starts)
+        warning = _why_out_of_reach(self)
         if warning is not None:
             warnings.warn(warning, UserWarning, stacklevel=3)
 
@@ -116,9 +114,19 @@ class Game(Value):
     @property
     def cell_channels(self) -> tuple[str, ...]:
         """The channels that show the board, which come first."""
-        hides = self.rules.walls_block_sight
-        river = bool(self.map.river)
-        return channel_names(self.observation, agents=self.agents, hides=hides, river=river)
+        if self.observation.encoding == "rgb":
+            return "red", "green", "blue"
+        return tuple(map(colours.class_name, self.cell_classes))
+
+    @property
+    def cell_classes(self) -> tuple[int, ...]:
+        """The classes of cells that can occur, in the order of the channels of "one_hot"."""
+        apart = [colours.FIRST_AGENT + agent for agent in range(self.agents)]
+        agents = apart if self.observation.agents_apart else [colours.OTHER]
+        hidden = [colours.HIDDEN] if self.rules.walls_block_sight else []
+        river = [colours.WATER, colours.WASTE, colours.CLEANING] if self.map.river else []
+        always = range(colours.GROUND, colours.BEAM + 1)
+        return *always, *sorted([*agents, colours.SELF, *hidden, *river])
 
     @property
     def score_channels(self) -> tuple[str, ...]:
@@ -192,19 +200,13 @@ class Game(Value):
     @property
     def palette(self) -> Bytes:
         """The colour of each class of cell: uint8 [classes, 3], red, green and blue."""
-        classes = FIRST_AGENT + (self.agents if self.observation.agents_apart else 0)
-        return np.array([class_colour(kind) for kind in range(classes)], np.uint8)
+        classes = colours.FIRST_AGENT + (self.agents if self.observation.agents_apart else 0)
+        return np.array([colours.class_colour(kind) for kind in range(classes)], np.uint8)
 
     @cached_property
     def tables(self) -> Tables:
         """The lookup tables that the compiled rules read; computed once and cached."""
-        return build_tables(
-            self.map,
-            self.rules,
-            self.observation,
-            highest=self.observation_highest,
-            score_channels=self.score_channels,
-        )
+        return build_tables(self)
 
     @cached_property
     def law_parameters(self) -> dict[str, dict[str, Any]]:
@@ -225,18 +227,51 @@ class Game(Value):
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
+def _why_out_of_reach(game: Game) -> str | None:
+    """A sentence that says why no agent can harvest any site, e.g. since a wall parts them; None if one can.
+
+    Agents walk over all cells but walls, also through each other's, since others may move away. `Boundaries`
+    without a fine stop bites, not steps. Under `shuffle_starts` any agent may start at any start.
+    """
+    board = game.map
+    allowed = np.array(
+        [
+            [all(rule.may_harvest(agent, *site) for rule in game.institutions) for site in board.sites]
+            for agent in range(game.agents)
+        ]
+    )
+    if not board.walls and allowed.all():
+        return None
+    from scipy.ndimage import label
+
+    is_open = np.ones((board.height, board.width), np.bool_)
+    for wall in board.walls:
+        is_open[wall] = False
+    part = label(is_open)[0]  # the number of the part of the board around each cell that walls enclose
+    starts = [(row, col) for row, col, _ in board.starts]
+    begins = [board.spawns if start in board.spawns else (start,) for start in starts]
+    of_sites = np.array([part[site] for site in board.sites])
+    walks = np.array([np.isin(of_sites, [part[cell] for cell in cells]) for cells in begins])
+    if game.rules.shuffle_starts:
+        walks[:] = walks.any(0)
+    if (allowed & walks).any():
+        return None
+    first_three = "; ".join(f"row {row}, column {col}" for row, col in starts[:3])
+    return (
+        f"no agent can harvest any of the {len(board.sites)} sites of Game.map: walls "
+        f"{'keep' if allowed.all() else 'and Boundaries keep'} them out of reach of all starts "
+        f"({first_three}{'; ...' if len(starts) > 3 else ''})"
+    )
+
+
 def output_forms(game: Game, worlds: int) -> dict[str, Form]:
     """The shape and dtype of each array of `StepOutput`, for B worlds of a game, and then of `Payments` if it
     has institutions."""
-    channels, rows, columns = game.observation_shape
-    sizes = {"B": worlds, "N": game.agents}
-    vectors = dict(game.spaces.vectors)
-    turn = {"C": channels, "X": rows, "Y": columns}
-    has_river = bool(game.map.river)
-    turn |= {"P": int(has_river), "M": game.agents if has_river else 0}
+    sizes, vectors = {"B": worlds, "N": game.agents}, dict(game.spaces.vectors)
+    turn = dict(zip("CXY", game.observation_shape, strict=True))
     turn |= {"S": vectors.get("scoreboard", 0), "G": vectors.get("stock_gauge", 0)}
-    turn["U"] = int(game.rules.paint_over)
-    forms = forms_of(StepOutput, **sizes, **turn)
+    turn |= {"P": 1, "M": game.agents} if game.map.river else {"P": 0, "M": 0}
+    forms = forms_of(StepOutput, **sizes, **turn, U=int(game.rules.paint_over))
     if game.institutions:
         forms |= forms_of(Payments, **sizes, C=len(COUNTS), V=len(game.ballots))
     return forms
@@ -248,9 +283,7 @@ OUTPUTS_HELD: Final = 3
 
 def bytes_of_worlds(game: Game, worlds: int) -> int:
     """The bytes that B worlds take at least: their state, and `OUTPUTS_HELD` step outputs."""
-    arrays: list[NDArray[Any]] = [
-        *empty_worlds(worlds=1, agents=game.agents, sites=len(game.map.sites), river=len(game.map.river))
-    ]
+    arrays: list[NDArray[Any]] = [*empty_worlds(game, 1)]
     if game.institutions:
         changed(law.new_law(game, 1), lambda array, is_of_worlds: arrays.append(array) if is_of_worlds else 0)
     outputs = sum(prod(shape) * np.dtype(dtype).itemsize for shape, dtype in output_forms(game, 1).values())

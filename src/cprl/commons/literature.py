@@ -5,12 +5,11 @@ sources, the rules that play them are ours.
 """
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 if TYPE_CHECKING:
     from cprl.commons.game import Game
-    from cprl.commons.maps import Entrances, Map
+    from cprl.commons.maps import Map
 
 _OPEN: Final = """
 WWWWWWWWWWWWWWWWWWWWWWWW
@@ -211,7 +210,8 @@ class Source(NamedTuple):
     work: str
     """Authors, title and year, or the name of a program."""
     url: str
-    board: Callable[[], "Map"]
+    board: Callable[[Any], "Map"]
+    """Makes it with `cprl.commons.maps`, which is imported when a game is made."""
     rules: Mapping[str, Any]
     """What differs from the defaults of `Rules`."""
     fines: Mapping[str, Any] | None = None
@@ -220,32 +220,18 @@ class Source(NamedTuple):
     """Whether agents observe the whole board."""
 
 
-def _drawn(drawing: str, legend: str, agents: int) -> "Map":
-    from cprl.commons import maps
-
-    return maps.parse(drawing, legend=legend, agents=agents)
-
-
-def _rooms(entrances: "Entrances") -> "Map":
-    from cprl.commons import maps
-
-    return maps.rooms(entrances)
-
-
-def _open_field() -> "Map":
+def _open_field(maps: Any) -> "Map":
     """A board of the size and number of sites of Perolat's open map, at places of our own."""
-    from cprl.commons import maps
+    board: Map = maps.random(20, 40, agents=12, density=246 / 800, clustering=0.8, seed=1)
+    return board
 
-    return maps.random(20, 40, agents=12, density=246 / 800, clustering=0.8, seed=1)
 
-
-def _lab() -> "Map":
+def _lab(maps: Any) -> "Map":
     """Every cell is a site; people begin in the middle row."""
-    from cprl.commons.maps import Map
-    from cprl.commons.world import UP
-
     cells = tuple((row, col) for row in range(29) for col in range(29))
-    return Map(height=29, width=29, sites=cells, starts=tuple((14, 4 + 5 * i, UP) for i in range(5)))
+    starts = tuple((14, 4 + 5 * i, maps.UP) for i in range(5))
+    board: Map = maps.Map(height=29, width=29, sites=cells, starts=starts)
+    return board
 
 
 def _without_walls(drawing: str) -> str:
@@ -253,7 +239,6 @@ def _without_walls(drawing: str) -> str:
     return "\n".join(line[1:-1] for line in drawing.strip("\n").splitlines()[1:-1])
 
 
-_MELTING_POT_URL: Final = "https://github.com/google-deepmind/meltingpot"
 _SSD_URL: Final = "https://github.com/eugenevinitsky/sequential_social_dilemma_games"
 _SSD_FINES: Final = {"fine": 50.0, "cost": 0.0, "shot_cost": 1.0}
 _PEROLAT_SOURCE: Final = (
@@ -264,8 +249,12 @@ _PEROLAT_SOURCE: Final = (
 
 
 def _melting_pot(name: str, drawing: str, rules: Mapping[str, Any]) -> Source:
-    work = f"Melting Pot 2.4, commons_harvest__{name}"
-    return Source(work, _MELTING_POT_URL, partial(_drawn, drawing, "melting_pot", 7), rules)
+    return Source(
+        f"Melting Pot 2.4, commons_harvest__{name}",
+        "https://github.com/google-deepmind/meltingpot",
+        lambda maps: maps.parse(drawing, legend="melting_pot", agents=7),
+        rules,
+    )
 
 
 SOURCES: Final[dict[str, Source]] = {
@@ -275,28 +264,30 @@ SOURCES: Final[dict[str, Source]] = {
     "ssd/harvest-v1": Source(
         "sequential_social_dilemma_games, HarvestEnv",
         _SSD_URL,
-        partial(_drawn, _HARVEST, "ssd", 5),
+        lambda maps: maps.parse(_HARVEST, legend="ssd", agents=5),
         _SSD,
         _SSD_FINES,
     ),
     "ssd/cleanup-v1": Source(
         "sequential_social_dilemma_games, CleanupEnv",
         _SSD_URL,
-        partial(_drawn, _CLEANUP, "ssd_cleanup", 5),
+        lambda maps: maps.parse(_CLEANUP, legend="ssd_cleanup", agents=5),
         _CLEANUP_RULES,
         _SSD_FINES,
     ),
     "socialjax/harvest_open-v1": Source(
         "SocialJax, harvest_open",
         "https://github.com/cooperativex/SocialJax",
-        partial(_drawn, _without_walls(_OPEN), "socialjax", 7),
+        lambda maps: maps.parse(_without_walls(_OPEN), legend="socialjax", agents=7),
         _SOCIALJAX,
     ),
     "perolat/open-v1": Source(*_PEROLAT_SOURCE, _open_field, _PEROLAT),
-    "perolat/rooms-v1": Source(*_PEROLAT_SOURCE, partial(_rooms, "single"), _PEROLAT),
-    "perolat/rooms_many_entrances-v1": Source(*_PEROLAT_SOURCE, partial(_rooms, "multiple"), _PEROLAT),
-    "perolat/rooms_unequal-v1": Source(*_PEROLAT_SOURCE, partial(_rooms, "unequal"), _PEROLAT),
-    "perolat/rooms_without_walls-v1": Source(*_PEROLAT_SOURCE, partial(_rooms, "none"), _PEROLAT),
+    "perolat/rooms-v1": Source(*_PEROLAT_SOURCE, lambda maps: maps.rooms("single"), _PEROLAT),
+    "perolat/rooms_many_entrances-v1": Source(
+        *_PEROLAT_SOURCE, lambda maps: maps.rooms("multiple"), _PEROLAT
+    ),
+    "perolat/rooms_unequal-v1": Source(*_PEROLAT_SOURCE, lambda maps: maps.rooms("unequal"), _PEROLAT),
+    "perolat/rooms_without_walls-v1": Source(*_PEROLAT_SOURCE, lambda maps: maps.rooms("none"), _PEROLAT),
     "janssen/foraging-v1": Source(
         "M. A. Janssen, R. Holahan, A. Lee and E. Ostrom, Lab experiments for the study of social-ecological "
         "systems, Science 328, 2010",
@@ -312,6 +303,7 @@ SOURCES: Final[dict[str, Source]] = {
 
 def game(name: str) -> "Game":
     """Return a game of the literature, by one of the ids of `SOURCES`."""
+    from cprl.commons import maps
     from cprl.commons.game import Game
     from cprl.commons.observation import Observation
     from cprl.commons.rules import Rules
@@ -319,7 +311,7 @@ def game(name: str) -> "Game":
 
     source = SOURCES[name]
     return Game(
-        map=source.board(),
+        map=source.board(maps),
         rules=Rules(**source.rules),
         observation=Observation(area="full" if source.sees_all else "window"),
         institutions=(Punishment(**source.fines),) if source.fines else (),

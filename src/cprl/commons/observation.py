@@ -1,26 +1,12 @@
 """Observation: what agents observe of the game, and in which form."""
 
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Literal
 
-from cprl.commons.colours import (
-    BEAM,
-    CLEANING,
-    FIRST_AGENT,
-    GROUND,
-    HIDDEN,
-    OTHER,
-    SELF,
-    WASTE,
-    WATER,
-    class_name,
-)
 from cprl.values import Value
 
 Area = Literal["window", "full"]
 Encoding = Literal["rgb", "one_hot"]
-
-RGB_NAMES: Final = ("red", "green", "blue")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,18 +37,3 @@ class Observation(Value):
     def highest(self) -> int:
         """The largest value of an entry: 255 for "rgb", 1 for "one_hot"."""
         return 255 if self.encoding == "rgb" else 1
-
-
-def classes_shown(observation: Observation, *, agents: int, hides: bool, river: bool) -> tuple[int, ...]:
-    """The classes that can occur, in the order of the channels of "one_hot"."""
-    others = [FIRST_AGENT + i for i in range(agents)] if observation.agents_apart else [OTHER]
-    hidden = [HIDDEN] if hides else []
-    of_river = [WATER, WASTE, CLEANING] if river else []
-    return (*range(GROUND, BEAM + 1), *sorted([*others, SELF, *hidden, *of_river]))
-
-
-def channel_names(observation: Observation, *, agents: int, hides: bool, river: bool) -> tuple[str, ...]:
-    """The name of each channel of an observation; see `classes_shown`."""
-    if observation.encoding == "rgb":
-        return RGB_NAMES
-    return tuple(map(class_name, classes_shown(observation, agents=agents, hides=hides, river=river)))

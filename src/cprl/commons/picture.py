@@ -55,26 +55,21 @@ def world_image(board: Map, world: Shown, *, cell_pixels: int = 24) -> Bytes:
         _fill(image, r, c, size, 0, PALETTE[kind if kind in (WATER, WASTE) else WATER])
     for (r, c), apple in zip(board.sites, world.stock, strict=True):
         _fill(image, r, c, size, size // 6, PALETTE[APPLE] if apple else EMPTY_SITE_COLOUR)
-    for r, c in np.argwhere(world.board == BEAM):
-        _fill(image, r, c, size, 2 * size // 5, PALETTE[BEAM])
-    for r, c in np.argwhere(world.board == CLEANING):
-        _fill(image, r, c, size, 2 * size // 5, PALETTE[CLEANING])
-    for i in np.flatnonzero(world.in_play):
-        _draw_agent(image, int(world.row[i]), int(world.col[i]), int(world.heading[i]), size, int(i))
+    for kind in (BEAM, CLEANING):
+        for r, c in np.argwhere(world.board == kind):
+            _fill(image, r, c, size, 2 * size // 5, PALETTE[kind])
+    for agent in np.flatnonzero(world.in_play).tolist():
+        r, c = int(world.row[agent]), int(world.col[agent])
+        sprite = agent_sprite(agent, int(world.heading[agent]), size - 1)
+        cell = image[r * size + 1 : (r + 1) * size, c * size + 1 : (c + 1) * size]
+        for part, colour in ((BODY, agent_colour(agent)), (INK, INK_COLOUR), (MARKED, MARK_COLOUR)):
+            cell[sprite == part] = colour
     return image
 
 
 def _fill(image: Bytes, r: int, c: int, size: int, inset: int, colour: tuple[int, int, int]) -> None:
     top, left = r * size + 1 + inset, c * size + 1 + inset
     image[top : (r + 1) * size - inset, left : (c + 1) * size - inset] = colour
-
-
-def _draw_agent(image: Bytes, r: int, c: int, heading: int, size: int, agent: int) -> None:
-    """Draws an agent's sprite in its hue."""
-    sprite = agent_sprite(agent, heading, size - 1)
-    cell = image[r * size + 1 : (r + 1) * size, c * size + 1 : (c + 1) * size]
-    for part, colour in ((BODY, agent_colour(agent)), (INK, INK_COLOUR), (MARKED, MARK_COLOUR)):
-        cell[sprite == part] = colour
 
 
 NOTHING, BODY, INK, MARKED = range(4)
@@ -173,11 +168,8 @@ def _draw_number(
     if scale < 1:
         return
     pixels = pixels.repeat(scale, 0).repeat(scale, 1)
-    behind = (front + 1 - back) // 2
+    (high, wide), behind = pixels.shape, (front + 1 - back) // 2
     down, right = ((1, 0), (0, -1), (-1, 0), (0, 1))[heading]
-    shift_down, shift_right = behind * down, behind * right
-    top = (body - pixels.shape[0]) // 2 + shift_down
-    left = (body - pixels.shape[1]) // 2 + shift_right
-    top = min(max(top, 0), body - pixels.shape[0])
-    left = min(max(left, 0), body - pixels.shape[1])
-    sprite[top : top + pixels.shape[0], left : left + pixels.shape[1]][pixels] = INK
+    top = min(max((body - high) // 2 + behind * down, 0), body - high)
+    left = min(max((body - wide) // 2 + behind * right, 0), body - wide)
+    sprite[top : top + high, left : left + wide][pixels] = INK

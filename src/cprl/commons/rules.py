@@ -221,15 +221,12 @@ class Rules(Value):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        both = (
-            ("regrow_after_bites", self.regrow_after_bites, "regrow_before_bites", self.regrow_before_bites),
-            *(
-                ("clashes", self.clashes != "all_back", other, getattr(self, other))
-                for other in ("pairwise_clashes", "agent_1_right_moves_agent_0")
-            ),
-        )
-        for name, is_set, other, is_other_set in both:
-            if is_set and is_other_set:
+        for name, other in (
+            ("regrow_after_bites", "regrow_before_bites"),
+            ("clashes", "pairwise_clashes"),
+            ("clashes", "agent_1_right_moves_agent_0"),
+        ):
+            if {name, other} <= set(self.changed):
                 raise ValueError(
                     f"Rules.{name} is {getattr(self, name)!r} and Rules.{other} is True; allowed: one of them"
                 )

@@ -40,9 +40,7 @@ def names(game: Game) -> tuple[str, ...]:
 
 def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
     """Returns a state as arrays, after checking that the game can be in it."""
-    empty = empty_worlds(
-        worlds=worlds, agents=game.agents, sites=len(game.map.sites), river=len(game.map.river)
-    )
+    empty = empty_worlds(game, worlds)
     expected = {name: getattr(empty, name) for name in names(game)}
     law = new_law(game, worlds) if game.institutions else None
     if law is not None:
@@ -99,9 +97,8 @@ def _check_ranges(arrays: State, game: Game) -> None:
         "ended": (PLAYING, TRUNCATED),
     }
     for name, (low, high) in ranges.items():
-        if name not in arrays:
-            continue
-        _refuse(arrays, name, (arrays[name] < low) | (arrays[name] > high), f"{low} to {high}")
+        if name in arrays:
+            _refuse(arrays, name, (arrays[name] < low) | (arrays[name] > high), f"{low} to {high}")
     out = arrays["out_steps"] > 0
     _refuse(arrays, "in_play", arrays["in_play"] & out, "False while out_steps is above 0")
 

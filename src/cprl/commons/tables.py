@@ -1,18 +1,20 @@
 """A game as lookup tables for the compiled rules."""
 
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.chance import REST_BITS
-from cprl.commons.colours import FIRST_AGENT, GROUND, WALL, WATER, class_colour
+from cprl.commons.colours import GROUND, WALL, WATER
 from cprl.commons.maps import Map
 from cprl.commons.near import growth, neighbours
-from cprl.commons.observation import RGB_NAMES, Observation, classes_shown
 from cprl.commons.rules import CLEAN, HARVEST, Rules
 from cprl.commons.world import COL_STEP, ROW_STEP, Bools, Bytes, Indices, Ints
 from cprl.institutions.base import threshold
+
+if TYPE_CHECKING:
+    from cprl.commons.game import Game
 
 FURTHER: Final = True
 """Whether rules are compiled with what only `FURTHER_RULES` need; see `cprl.commons.compiled`."""
@@ -173,16 +175,8 @@ def _beam_half_width(board: Map, rules: Rules) -> int:
 
 
 def _rim(board: Map, rules: Rules, *, sees_all: bool = False) -> int:
-    window_reach = (
-        (0,)
-        if sees_all
-        else (
-            rules.window_rows - 1,
-            rules.window_rows_behind,
-            rules.window_columns // 2,
-        )
-    )
-    return max(1, *window_reach, _beam_half_width(board, rules))
+    window = (rules.window_rows - 1, rules.window_rows_behind, rules.window_columns // 2)
+    return max(1, _beam_half_width(board, rules), *(() if sees_all else window))
 
 
 def _window_places(rules: Rules) -> list[tuple[int, int]]:
@@ -201,12 +195,6 @@ def _offset(ahead: int, side: int, heading: int, stride: int) -> int:
     rows = ahead * ROW_STEP[heading] + side * ROW_STEP[right]
     cols = ahead * COL_STEP[heading] + side * COL_STEP[right]
     return rows * stride + cols
-
-
-def _paint(kind: int) -> int:
-    """A class and its colour as one number; see `Tables.paints`."""
-    red, green, blue = class_colour(kind)
-    return red | green << 8 | blue << 16 | kind << CLASS_SHIFT
 
 
 def _board_cells(board: Map, rim: int, stride: int) -> Ints:
@@ -247,16 +235,9 @@ def _in_sight(board: Map, rules: Rules, walls: Bools, rim: int, stride: int) -> 
     return seen
 
 
-def build_tables(
-    board: Map, rules: Rules, observation: Observation, *, highest: int, score_channels: tuple[str, ...]
-) -> Tables:
-    """Builds the tables of a game.
-
-    Args:
-        highest: the largest value of an observation.
-        score_channels: see `Game.score_channels`.
-    """
-    agents, half_width = board.agents, _beam_half_width(board, rules)
+def build_tables(game: "Game") -> Tables:
+    """Builds the tables of a game."""
+    board, rules, observation = game.map, game.rules, game.observation
     sees_all = observation.area == "full"
     rim = _rim(board, rules, sees_all=sees_all)
     stride = board.width + 2 * rim
@@ -264,33 +245,32 @@ def build_tables(
     def cells(places: tuple[tuple[int, ...], ...]) -> list[int]:
         return [(place[0] + rim) * stride + place[1] + rim for place in places]
 
-    drawn = classes_shown(observation, agents=agents, hides=rules.walls_block_sight, river=bool(board.river))
-    classes = range(FIRST_AGENT + (agents if observation.agents_apart else 0))
-    paints = np.array(list(map(_paint, classes)), np.uint32).view(np.int32)
-    channel_of = np.full(len(classes), -1, np.int32)
-    channel_of[list(drawn)] = range(len(drawn))
+    def index_at(places: tuple[tuple[int, ...], ...]) -> Ints:
+        index = np.full(background.size, -1, np.int32)
+        index[cells(places)] = range(len(places))
+        return index
+
+    red, green, blue = game.palette.astype(np.uint32).T
+    kinds = np.arange(len(red), dtype=np.uint32)
+    paints = (red | green << 8 | blue << 16 | kinds << CLASS_SHIFT).view(np.int32)
+    channel_of = np.full(len(paints), -1, np.int32)
+    channel_of[list(game.cell_classes)] = range(len(game.cell_classes))
     background = np.full((board.height + 2 * rim, stride), paints[WALL], np.int32)
     background[rim:-rim, rim:-rim] = paints[GROUND]
     background.reshape(-1)[cells(board.walls)] = paints[WALL]
-    site_at = np.full(background.size, -1, np.int32)
-    site_at[cells(board.sites)] = range(len(board.sites))
-    river_at = np.full(background.size, -1, np.int32)
-    river_at[cells(board.river)] = range(len(board.river))
     background.reshape(-1)[cells(board.river)] = paints[WATER]
-    clean_cells = np.arange(len(board.river) + 1)
     near_first, near_sites = neighbours(board, rules)
     places = _window_places(rules)
     offsets = [[_offset(*place, heading, stride) for place in places] for heading in range(4)]
     window_cells = _board_cells(board, rim, stride) if sees_all else np.array(offsets, np.int32)
-    seen, one_hot = window_cells.shape[1], observation.encoding == "one_hot"
-    board_planes = len(drawn) if one_hot else len(RGB_NAMES)
+    seen, board_planes = window_cells.shape[1], len(game.cell_channels)
     of_site, probs = growth(rules, np.diff(near_first))
     below = np.array([threshold(p) for p in probs.reshape(-1)], np.int64)
     of_rules: dict[str, Any] = {name: getattr(rules, name) for name in Tables._fields if hasattr(rules, name)}
     return Tables(
         background=background.reshape(-1),
         site_cell=np.array(cells(board.sites), np.uint32),
-        site_at=site_at,
+        site_at=index_at(board.sites),
         near_first=near_first,
         near_sites=near_sites,
         regrow_below=below,
@@ -298,10 +278,10 @@ def build_tables(
         regrow_row=(of_site * probs.shape[1]).astype(np.uint32),
         start=np.array(board.starts, np.int32),
         river_cell=np.array(cells(board.river), np.uint32),
-        river_at=river_at,
+        river_at=index_at(board.river),
         first_waste=np.isin(np.arange(len(board.river)), board.waste).astype(np.uint8),
         pollute_below=np.array(
-            [threshold(1 - (1 - rules.pollution_prob) ** n) for n in clean_cells.tolist()], np.int64
+            [threshold(1 - (1 - rules.pollution_prob) ** n) for n in range(len(board.river) + 1)], np.int64
         ),
         spawns=np.array(board.spawns, np.int32).reshape(-1, 2),
         beam_length=np.array(rules.beam_lengths_cells, np.int32),
@@ -311,18 +291,18 @@ def build_tables(
         in_sight=_in_sight(board, rules, background.reshape(-1) == paints[WALL], rim, stride),
         rim=rim,
         stride=stride,
-        beam_half_width=half_width,
+        beam_half_width=_beam_half_width(board, rules),
         has_beam=rules.may_fire,
         agents_apart=observation.agents_apart,
-        one_hot=one_hot,
-        highest=highest,
+        one_hot=observation.encoding == "one_hot",
+        highest=game.observation_highest,
         first_signal_plane=board_planes,
         score_begin=seen * (board_planes + rules.signals),
-        scoreboard_cells=seen * score_channels.count("scoreboard"),
-        stock_gauge_cells=seen * score_channels.count("stock_gauge"),
+        scoreboard_cells=seen * game.score_channels.count("scoreboard"),
+        stock_gauge_cells=seen * game.score_channels.count("stock_gauge"),
         sees_all=sees_all,
         never_from_nothing=rules.regrow_prob[0] == 0 and not rules.plays_on_when_empty,
-        further=bool(board.spawns or board.river or score_channels)
+        further=bool(board.spawns or board.river or game.score_channels)
         or any(name in rules.changed for name in FURTHER_RULES),
         regrow_by_share=rules.regrow_by != "count",
         first_stock=round(rules.first_stock_share * len(board.sites)),

@@ -36,44 +36,25 @@ class CpuThreads:
         limit = threads or os.cpu_count() or 1
         self.threads = min(limit, worlds if threads else -(-worlds // WORLDS_PER_THREAD))
         self.tables: Tables = game.tables
-        self._scratch = [
-            empty_scratch(
-                agents=game.agents,
-                sites=len(game.map.sites),
-                cells=self.tables.background.size,
-                window=self.tables.window_cells.shape[1],
-            )
-            for _ in range(self.threads)
-        ]
+        self._scratch = [empty_scratch(game) for _ in range(self.threads)]
 
     def place(self, arrays: Any) -> Any:
-        """Return a tuple of arrays, `Worlds` or `Law`, unchanged: this driver uses numpy arrays."""
         return arrays
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """A new array with undefined entries."""
         return np.empty(shape, dtype)
 
     def read(self, array: NDArray[Any]) -> NDArray[Any]:
-        """A copy as a numpy array."""
         return array.copy()
 
     def write(self, array: NDArray[Any], values: NDArray[Any]) -> None:
-        """Copies values of the same shape and dtype into an array."""
         array[...] = values
 
     def first_unknown(self, actions: Actions, known: int) -> int:
-        """The index, in row-major order, of the first action outside 0 .. known - 1; -1 if there is none."""
         return int(rules_for_cpu()["first_unknown"](actions.reshape(-1), known))
 
     def run(self, loop: Loop, game: tuple[Any, ...], argument: NDArray[Any]) -> None:
-        """Run a loop over all worlds; the calling thread takes the last share.
-
-        Nothing is checked: all arrays are contiguous and have the form that the game gives them.
-
-        Args:
-            game: what `Played` says, as a plain tuple, which takes a third of the time to make.
-        """
+        """See `cprl.commons.batch.Driver`; the calling thread takes the last share."""
         size = len(argument)
         entry = ENTRIES[self.tables.further, game[3] is not None].get(loop)
         if entry is None:

@@ -17,13 +17,7 @@ from cprl.commons.moves import (
 )
 from cprl.commons.river import begin_river, clean, count_waste, pollute
 from cprl.commons.tables import FURTHER, Tables
-from cprl.commons.views import (
-    draw_institutions,
-    draw_scores,
-    draw_signals,
-    draw_windows,
-    has_apple_ahead,
-)
+from cprl.commons.views import draw_institutions, draw_scores, draw_signals, draw_windows, has_apple_ahead
 from cprl.commons.world import PLAYING, TERMINATED, TRUNCATED, Actions, Scratch, StepOutput, Worlds
 from cprl.institutions import Law
 from cprl.institutions.law import begin, note_growth, open_turn, refresh, settle

@@ -3,7 +3,7 @@
 The rules are written for one world: they receive these tuples without the axis B.
 """
 
-from typing import Annotated, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from cprl.institutions.arrays import Floats as Floats
 from cprl.institutions.arrays import Ints as Ints
 from cprl.institutions.arrays import filled, forms_of
 from cprl.institutions.ledger import Payments
+
+if TYPE_CHECKING:
+    from cprl.commons.game import Game
 
 Indices: TypeAlias = NDArray[np.uint32]
 """Unsigned: Numba then skips its check for negative indices."""
@@ -91,41 +94,30 @@ class Worlds(NamedTuple):
 
 
 class StepOutput(NamedTuple):
-    """The output of a turn, written into arrays that the caller provides (usually torch memory)."""
+    """The output of a turn, written into arrays that the caller provides (usually torch memory): the entries
+    of these names in `cprl.keys`, which says what each means."""
 
     observation: Annotated[Bytes, "B N C X Y"]
-    harvest: Annotated[NDArray[np.float32], "B N"]
-    """Apples harvested in this turn."""
+    harvest: Annotated[Floats, "B N"]
     in_play: Annotated[Bools, "B N"]
-    """Whether the agent acts in the coming turn."""
     fired: Annotated[Bools, "B N"]
-    """Whether the agent fired in this turn."""
     hit_by: Annotated[Bools, "B N N"]
-    """Whom a beam hit: row the agent hit, column the shooter."""
     tagged_by: Annotated[Bools, "B N N"]
-    """Whom a beam tagged: row the agent tagged, column the shooter."""
-    scoreboard: Annotated[NDArray[np.float32], "B N S"]
-    """One row per observer: the harvest of every agent in this episode, the observer's own first, then of the
-    following agent indices, cyclically; S is N, or 0 without a scoreboard."""
-    stock_gauge: Annotated[NDArray[np.float32], "B N G"]
-    """The share of all sites that hold an apple; G is 1, or 0 without a stock gauge."""
+    scoreboard: Annotated[Floats, "B N S"]
+    """S is N, or 0 without a scoreboard."""
+    stock_gauge: Annotated[Floats, "B N G"]
+    """G is 1, or 0 without a stock gauge."""
     apple_ahead: Annotated[Bools, "B N U"]
-    """Whether the cell ahead of the agent, which its own mark may cover, holds an apple in the picture; U is
-    1 with `Rules.paint_over`, else 0."""
+    """U is 1 with `Rules.paint_over`, else 0."""
     waste: Annotated[NDArray[np.int64], "B P"]
-    """Cells of the river with waste; P is 1, or 0 without a river."""
+    """P is 1, or 0 without a river."""
     cleaned: Annotated[Floats, "B M"]
-    """Cells of the river that the agent cleaned in this turn; M is N, or 0 without a river."""
+    """M is N, or 0 without a river."""
     stock: Annotated[NDArray[np.int64], "B 1"]
-    """Apples on the board."""
     regrown: Annotated[NDArray[np.int64], "B 1"]
-    """Apples that grew in this turn."""
     terminated: Annotated[Bools, "B 1"]
-    """No apple is left and none can grow."""
     truncated: Annotated[Bools, "B 1"]
-    """The episode ran out of time."""
     done: Annotated[Bools, "B 1"]
-    """Terminated or truncated."""
 
 
 class GovernedOutput(NamedTuple):
@@ -157,29 +149,23 @@ class Scratch(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """One world for display: copies, as numpy arrays."""
+    """One world for display: copies, as numpy arrays. Entries without a docstring are those of `Worlds`."""
 
     observation: Bytes
     """uint8 [N, C, X, Y], what each agent observes."""
     board: Bytes
     """uint8 [H, W], classes of `cprl.commons.colours`."""
     stock: Bytes
-    """uint8 [K], 1 where a site holds an apple."""
     row: Ints
-    """int32 [N]."""
     col: Ints
-    """int32 [N]."""
     heading: Ints
-    """int32 [N], 0 up, 1 right, 2 down, 3 left."""
     in_play: Bools
-    """bool [N]."""
     harvested: Ints
-    """int32 [N], apples harvested in this episode."""
 
 
-def empty_worlds(*, worlds: int, agents: int, sites: int, river: int = 0) -> Worlds:
+def empty_worlds(game: "Game", worlds: int) -> Worlds:
     """Memory for B worlds, all zero except `episode`, which is -1; `Batch.begin` starts the first episode."""
-    empty = filled(Worlds, {}, B=worlds, N=agents, K=sites, R=river)
+    empty = filled(Worlds, {}, B=worlds, N=game.agents, K=len(game.map.sites), R=len(game.map.river))
     empty.episode[:] = -1
     return empty
 
@@ -188,10 +174,11 @@ CACHE_LINE_BYTES = 128
 """Padding after each array of a Scratch, in entries: threads that share a cache line slow each other down."""
 
 
-def empty_scratch(*, agents: int, sites: int, cells: int, window: int) -> Scratch:
-    """The working memory of one thread; `window`: cells X * Y of a window."""
+def empty_scratch(game: "Game") -> Scratch:
+    """The working memory of one thread."""
+    sites, cells, window = len(game.map.sites), game.tables.background.size, game.tables.window_cells.shape[1]
     words = 4 * -(-sites // SITES_PER_DRAW)
-    forms = forms_of(Scratch, N=agents, K=sites, words=words, cells=cells, window=window)
+    forms = forms_of(Scratch, N=game.agents, K=sites, words=words, cells=cells, window=window)
     arrays: list[Any] = [
         np.zeros(length + CACHE_LINE_BYTES, dtype)[:length] for (length,), dtype in forms.values()
     ]

@@ -60,22 +60,16 @@ class Entries(NamedTuple):
 
 
 class Payments(NamedTuple):
-    """What institutions output in a turn, written into arrays that the caller provides."""
+    """What institutions output in a turn, written into arrays that the caller provides: the entries of these
+    names in `cprl.keys`."""
 
     reward: Annotated[Floats, "B N"]
-    """Harvest - fines + transfers."""
     fines: Annotated[Floats, "B N"]
-    """Apples taken."""
     transfers: Annotated[Floats, "B N"]
-    """Apples given."""
     violated: Annotated[Bools, "B N"]
-    """Whether the agent broke a rule in this turn, detected or not."""
     counts: Annotated[Ints, "B N C"]
-    """The `COUNTS` of this episode so far."""
     in_force: Annotated[Floats, "B V"]
-    """What each ballot decided."""
     ballots_due: Annotated[Bools, "B V"]
-    """Whether the ballot is held in the coming turn."""
 
 
 def forget_episode(ledger: Ledger) -> None:
