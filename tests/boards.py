@@ -11,31 +11,20 @@ import numpy as np
 
 from cprl import Game, Map, Observation, Rules, maps
 from cprl.commons.batch import Batch, turn_of
-from cprl.commons.colours import CLASS_NAMES, FIRST_AGENT, class_colour
+from cprl.commons.colours import CLASS_NAMES, COLOURS, FIRST_AGENT, class_colour
 from cprl.commons.maps import SIGN_OF_HEADING
 from cprl.commons.world import StepOutput, Worlds
 from cprl.institutions import COUNTS, Institution
 from cprl.institutions.arrays import DERIVED, STATE, STEPS, lasting
 from cprl.institutions.ledger import Payments
 
-RGB_SIGN = {
-    (10, 10, 10): ".",
-    (125, 125, 125): "#",
-    (0, 255, 0): "A",
-    (50, 50, 50): "m",
-    (255, 204, 51): "b",
-    (255, 0, 0): "o",
-    (0, 0, 255): "S",
-    (0, 0, 0): "?",
-    (70, 120, 170): "~",
-    (113, 75, 24): "H",
-    (100, 255, 255): "c",
-}
-SIGN_OF_NAME = dict(zip(CLASS_NAMES, ".#AmboS?~Hc", strict=True))
+SIGNS = ".#AmboS?~Hc"
+RGB_SIGN, SIGN_OF_NAME = (dict(zip(kinds, SIGNS, strict=True)) for kinds in (COLOURS, CLASS_NAMES))
 
 
 class Play:
-    """One world of a board, played by the names of actions; apples regrow only if `rules` says so.
+    """Worlds of a board, in which all do the same, played by the names of actions; apples regrow only if
+    `rules` says so. What is shown is the first world.
 
     The agents of a drawing are numbered in reading order; `order` gives them other indices.
     """
@@ -44,6 +33,7 @@ class Play:
         self,
         board: str | Map,
         *,
+        worlds: int = 1,
         seed: int = 0,
         order: Sequence[int] | None = None,
         observation: Observation | None = None,
@@ -60,16 +50,21 @@ class Play:
             observation=observation or Observation(),
             institutions=tuple(institutions),
         )
-        self.batch = Batch(self.game, 1, seed=seed)
+        self.batch = Batch(self.game, worlds, seed=seed)
         self.whole = self.batch.begin(self.batch.new_output())
         self.output: StepOutput = turn_of(self.whole)
 
     def turn(self, *names: str, decisions: Sequence[int] | None = None) -> "Play":
         """Plays one turn: one action per agent, or one for all agents."""
         names = names * self.game.agents if len(names) == 1 else names
-        actions = np.array([[self.game.actions.index(name) for name in names]], np.int64)
-        decided = None if decisions is None else np.array([decisions], np.int64)
-        self.batch.play(actions, self.whole, decided)
+        everywhere = (self.batch.size, 1)
+        actions = np.tile([self.game.actions.index(name) for name in names], everywhere)
+        self.batch.play(actions, self.whole, None if decisions is None else np.tile(decisions, everywhere))
+        return self
+
+    def put(self, **changes: Any) -> "Play":
+        """Loads the state of all worlds with other entries."""
+        self.batch.load({**self.batch.state(), **changes}, self.whole)
         return self
 
     def shown(self, count: int) -> list[list[int]]:

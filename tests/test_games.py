@@ -7,15 +7,13 @@ import gymnasium
 import numpy as np
 import pettingzoo
 import pytest
-import torch
-from boards import Play, random_actions
+from boards import Play, assert_same, play_on, random_actions
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_worlds import check_apples, check_no_beam_passes_a_wall, check_places, check_worlds_are_independent
 from test_worlds import games as plain_games
-from torchrl.envs.utils import check_env_specs
 
-from cprl import CommonsEnv, Game, Observation, Rules, maps, presets
+from cprl import Observation, Rules, maps, presets
 from cprl.commons.batch import Batch, turn_of
 from cprl.commons.literature import SOURCES
 from cprl.commons.near import growth
@@ -129,16 +127,11 @@ def test_the_invariants_hold_under_the_rules_of_the_literature(game, seed):
 def test_a_state_under_these_rules_determines_the_future(game, seed):
     batch, actions = Batch(game, 3, seed=seed), random_actions(30, 3, game, seed=seed)
     output = batch.begin(batch.new_output())
-    for chosen in actions[:10]:
-        batch.play(chosen, output)
+    play_on(batch, output, actions[:10])
     other = Batch(game, 3)
-    again = other.load(batch.state(), other.new_output())
-    for chosen in actions[10:]:
-        one, two = batch.play(chosen, output), other.play(chosen, again)
-        for name, array in batch.state().items():
-            assert np.array_equal(array, other.state()[name]), name
-        for name, array in turn_of(one)._asdict().items():
-            assert np.array_equal(array, getattr(turn_of(two), name)), name
+    again, rest = other.load(batch.state(), other.new_output()), actions[10:]
+    for one, two in zip(play_on(batch, output, rest), play_on(other, again, rest), strict=True):
+        assert_same(one, two)
 
 
 @pytest.mark.parametrize("name", SOURCES)
@@ -154,28 +147,6 @@ def test_a_game_of_the_literature_is_made_everywhere_by_its_id(name):
     assert alone.game.agents == 1
     assert alone.game.rules == game.rules
     check_worlds_are_independent(game, 3)
-
-
-@pytest.mark.parametrize("name", ["melting_pot/commons_harvest__open-v1", "ssd/cleanup-v1"])
-def test_an_environment_keeps_its_specs_and_steps_alike_both_ways(name):
-    game = presets.game(name)
-    game = replace(game, rules=replace(game.rules, episode_steps=4, end_prob=0.0))
-    check_env_specs(CommonsEnv(game, 2, seed=0))
-    plain, lean = (CommonsEnv(game, 3, seed=1) for _ in range(2))
-    now, other = plain.reset(), lean.reset()
-    for actions in random_actions(10, 3, game):
-        now["agents", "action"] = other["agents", "action"] = torch.as_tensor(actions)
-        (step, now), (lean_step, other) = plain.step_and_maybe_reset(now), lean.lean_step(other)
-        assert (step == lean_step).all()
-        assert (now == other).all()
-        assert set(now.keys(True, True)) == set(other.keys(True, True))
-
-
-def test_other_names_and_variants_are_refused():
-    with pytest.raises(ValueError, match=r"board is 'harvest'.*ssd/harvest-v1"):
-        presets.game("harvest")
-    with pytest.raises(ValueError, match="variant is 'as_run'"):
-        presets.game("ssd/harvest-v1", variant="as_run")
 
 
 # One rule at a time
@@ -213,30 +184,19 @@ def test_growth_by_count_and_by_share(by, rows):
 
 def test_sites_grow_as_often_as_the_share_of_full_sites_near_them_says():
     """The corner has two sites near it, one with an apple; the middle one has four, one with an apple."""
-    board = maps.parse("AAA.\nAAA.\nAAA>")
-    rules = Rules(regrow_prob=(0.0, 0.8), regrow_by="share", regrow_radius_cells=1)
-    batch = Batch(Game(map=board, rules=rules), 4000)
-    output = batch.begin(batch.new_output())
-    state = batch.state()
-    state["stock"][:] = 0
-    state["stock"][:, 1] = 1
-    batch.load(state, output)
-    batch.play(np.full((4000, 1), 7), output)
-    grown = batch.state()["stock"].mean(0)
-    assert grown[[0, 4]] == pytest.approx([0.4, 0.2], abs=0.03)
-    assert grown[[3, 8]].tolist() == [0, 0]
+    rules = {"regrow_prob": (0.0, 0.8), "regrow_by": "share", "regrow_radius_cells": 1}
+    play = Play("AAA.\nAAA.\nAAA>", worlds=4000, **rules)
+    grown = play.put(stock=np.tile(np.eye(9, dtype=np.uint8)[1], (4000, 1))).turn("stay").batch.now.stock
+    assert grown.mean(0)[[0, 4]] == pytest.approx([0.4, 0.2], abs=0.03)
+    assert not grown[:, [3, 8]].any()
 
 
 def test_an_episode_begins_with_a_share_of_the_apples_drawn_anew_each_time():
-    game = Game(map=maps.named("commons"), rules=Rules(first_stock_share=0.25))
-    batch = Batch(game, 2000)
-    output = batch.begin(batch.new_output())
-    sites = len(game.map.sites)
-    first = batch.state()["stock"]
-    assert (first.sum(1) == round(sites / 4)).all()
+    play = Play(maps.named("commons"), worlds=2000, first_stock_share=0.25)
+    first = play.batch.state()["stock"]
+    assert (first.sum(1) == round(len(play.game.map.sites) / 4)).all()
     assert np.abs(first.mean(0) - 0.25).max() < 0.06
-    batch.begin(output)
-    assert (first != batch.state()["stock"]).any(1).all()
+    assert (first != play.again().batch.now.stock).any(1).all()
 
 
 def test_harvest_is_an_action_of_its_own():
@@ -272,10 +232,8 @@ def test_an_agent_cannot_fire_again_before_it_has_cooled_down():
 def test_agents_begin_at_spawn_places_and_return_to_them():
     board = maps.parse("PPPPP\n.....\nA>A..", agents=4)
     assert (board.agents, board.starts[1:]) == (4, ((0, 0, maps.UP), (0, 1, maps.UP), (0, 2, maps.UP)))
-    game = Game(map=board, rules=Rules(random_headings=True, respawn_at_spawns=True, freeze_steps=1))
-    batch = Batch(game, 600)
-    output = batch.begin(batch.new_output())
-    state = batch.state()
+    play = Play(board, worlds=600, random_headings=True, respawn_at_spawns=True, freeze_steps=1)
+    state = play.batch.state()
     assert (state["row"] == [2, 0, 0, 0]).all()
     assert (state["col"][:, 0] == 1).all()
     assert all(len({*row}) == 3 for row in state["col"][:, 1:].tolist())
@@ -284,51 +242,38 @@ def test_agents_begin_at_spawn_places_and_return_to_them():
     assert np.abs(headings / 1800 - 1 / 4).max() < 0.04
     state["row"][:, 0], state["heading"][:, 0] = 1, 0
     state["col"][:, 0] = state["col"][:, 1]  # right below agent 1
-    batch.load(state, output)
-    batch.play(np.tile([6, 7, 7, 7], (600, 1)), output)
-    assert turn_of(output).tagged_by[:, 1, 0].all()
-    batch.play(np.full((600, 4), 7), output)
-    after = batch.state()
-    assert after["in_play"].all()
+    assert play.put(**state).turn("beam", "stay", "stay", "stay").output.tagged_by[:, 1, 0].all()
+    after = play.turn("stay").batch.now
+    assert after.in_play.all()
     free = {*range(5)} - {*state["col"][0, 1:].tolist()} | {int(state["col"][0, 1])}
-    assert int(after["col"][0, 1]) in free
-    assert len({*after["col"][:, 1].tolist()}) > 1
+    assert int(after.col[0, 1]) in free
+    assert len({*after.col[:, 1].tolist()}) > 1
 
 
 def test_of_two_agents_that_want_a_cell_one_gets_it_by_lot():
     gets = {}
     for clashes in ("all_back", "one_moves", "in_turn"):
-        rules = Rules(clashes=clashes, regrow_prob=(0.0,), may_fire=False)
-        batch = Batch(Game(map=maps.parse(">A<\nA.."), rules=rules), 2000)
-        output = batch.begin(batch.new_output())
-        batch.play(np.zeros((2000, 2), np.int64), output)
-        gets[clashes] = turn_of(output).harvest.mean(0)
+        play = Play(">A<\nA..", worlds=2000, clashes=clashes).turn("forward")
+        gets[clashes] = play.output.harvest.mean(0)
     assert gets["all_back"].tolist() == [0, 0]
     for clashes in ("one_moves", "in_turn"):
         assert gets[clashes].sum() == 1
         assert abs(gets[clashes][0] - 0.5) < 0.05
 
 
-def test_whoever_follows_another_agent_moves_always_or_if_it_comes_later():
-    follows = {}
-    for clashes in ("one_moves", "in_turn"):
-        batch = Batch(Game(map=maps.parse(">>.A"), rules=Rules(clashes=clashes)), 2000)
-        output = batch.begin(batch.new_output())
-        batch.play(np.zeros((2000, 2), np.int64), output)
-        follows[clashes] = (batch.state()["col"][:, 0] == 1).mean()
-    assert follows["one_moves"] == 1
-    assert abs(follows["in_turn"] - 0.5) < 0.05
+@pytest.mark.parametrize(("clashes", "share", "tolerance"), [("one_moves", 1, 0), ("in_turn", 0.5, 0.05)])
+def test_whoever_follows_another_agent_moves_always_or_if_it_comes_later(clashes, share, tolerance):
+    play = Play(">>.A", worlds=2000, clashes=clashes).turn("forward")
+    assert (play.batch.now.col[:, 0] == 1).mean() == pytest.approx(share, abs=tolerance)
 
 
 def test_an_episode_ends_by_chance_and_is_truncated():
-    rules = Rules(end_prob=0.25, end_from_step=5, end_every_steps=3, plays_on_when_empty=True)
-    batch = Batch(Game(map=maps.named("single_basic"), rules=rules), 3000)
-    output = batch.begin(batch.new_output())
+    rules = {"end_prob": 0.25, "end_from_step": 5, "end_every_steps": 3, "plays_on_when_empty": True}
+    play = Play(maps.named("single_basic"), worlds=3000, **rules)
     lengths, is_over = np.zeros(3000), np.zeros(3000, np.bool_)
     while not is_over.all():
-        batch.play(np.full((3000, 1), 4), output)
         lengths += ~is_over
-        is_over |= turn_of(output).truncated[:, 0]
+        is_over |= play.turn("turn_left").output.truncated[:, 0]
     assert {*lengths % 3} == {2}
     assert lengths.min() == 5
     assert lengths.mean() == pytest.approx(5 + 3 * 3, abs=0.8)
@@ -388,29 +333,22 @@ def test_cleaning_removes_the_first_waste_ahead_and_apples_grow_the_less_waste_t
 def test_apples_grow_by_the_share_of_clean_water():
     grown = {}
     for limit in (0.5, 1.0):
-        rules = Rules(regrow_prob=(0.8,), first_stock_share=0.0, pollution_limit=limit)
-        game = Game(map=maps.parse("v..A\n~H~.\nH..v"), rules=rules)
-        batch = Batch(game, 4000)
-        output = batch.begin(batch.new_output())
-        batch.play(np.full((4000, 2), 7), output)
-        grown[limit] = turn_of(output).regrown.mean()
+        play = river(worlds=4000, regrow_prob=(0.8,), pollution_limit=limit).turn("stay")
+        grown[limit] = play.output.regrown.mean()
     assert grown[0.5] == 0
     assert grown[1.0] == pytest.approx(0.8 * 0.5, abs=0.03)
 
 
 def test_waste_comes_to_one_clean_cell_a_turn_up_to_the_limit():
-    rules = Rules(regrow_prob=(0.5,), pollution_prob=0.5, pollution_limit=0.75)
-    game = Game(map=maps.parse(">A.\n~~~~".replace(".", "..")), rules=rules)
-    batch = Batch(game, 4000)
-    output = batch.begin(batch.new_output())
-    batch.play(np.full((4000, 1), 7), output)
-    waste = batch.state()["waste"]
+    rules = {"regrow_prob": (0.5,), "pollution_prob": 0.5, "pollution_limit": 0.75}
+    play = Play(">A..\n~~~~", worlds=4000, **rules).turn("stay")
+    waste = play.batch.state()["waste"]
     assert waste.sum(1).max() == 1
     assert waste.sum(1).mean() == pytest.approx(1 - 0.5**4, abs=0.02)
     assert np.abs(waste.mean(0) - (1 - 0.5**4) / 4).max() < 0.03
     for _ in range(30):
-        batch.play(np.full((4000, 1), 7), output)
-    assert (turn_of(output).waste == 3).all()
+        play.turn("stay")
+    assert (play.output.waste == 3).all()
 
 
 def test_agents_see_water_waste_and_the_cleaning_beam():
@@ -466,16 +404,11 @@ def test_a_drawing_that_cannot_be_read_is_refused_with_its_place(drawing, argume
 
 def test_with_a_radius_that_spans_the_board_growth_is_logistic():
     """Each of the K - s empty sites grows with probability r s / K: r s (1 - s / K) apples on average."""
-    rate, sites, worlds = 0.4, 24, 4096
-    rules = Rules(regrow_prob=tuple(rate * s / sites for s in range(sites + 1)), regrow_radius_cells=1000)
-    board = maps.parse("\n".join([">.......", *["AAAAAAAA"] * 3]))
-    env = CommonsEnv(Game(map=board, rules=rules), worlds=worlds, seed=0)
-    env.reset()
-    state, chosen = env.worlds.state(), np.random.default_rng(0)
+    rate, sites, rng = 0.4, 24, np.random.default_rng(0)
+    probs = tuple(rate * s / sites for s in range(sites + 1))
+    board = "\n".join([">.......", *["AAAAAAAA"] * 3])
+    play = Play(board, worlds=4096, regrow_prob=probs, regrow_radius_cells=1000)
     for stock in (6, 12, 18):
-        order = chosen.random(state["stock"].shape).argsort(1)
-        state["stock"] = state["stock_before"] = (order < stock).astype(np.uint8)
-        now = env.load(state)
-        now["agents", "action"] = torch.full((worlds, 1), 7)
-        grown = env.step(now)["next", "regrown"].double().mean()
+        full = (rng.random((4096, sites)).argsort(1) < stock).astype(np.uint8)
+        grown = play.put(stock=full).turn("stay").output.regrown.mean()
         assert abs(grown - rate * stock * (1 - stock / sites)) < 0.1

@@ -1,16 +1,14 @@
 """What a turn does: moves and clashes, beams and time-outs, harvest and regrowth, and the end."""
 
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from boards import Play
+from boards import Play, assert_same, copied
 
-from cprl import Game, Rules, maps
+from cprl import Rules, maps
 from cprl.commons.batch import Batch
 from cprl.commons.near import distance, neighbours
-from cprl.institutions import Sanctioner
 
 
 def test_each_walk_is_relative_to_the_heading():
@@ -28,26 +26,20 @@ def test_each_walk_is_relative_to_the_heading():
 def test_agents_begin_at_their_starts_or_at_a_random_permutation_of_them():
     board = "A>...\n.....\nv...<\n"
     orders, fixed = Counter(), Play(board)
-    at = fixed.places
-    headings = dict(zip(at, fixed.batch.now.heading[0].tolist(), strict=True))
-    game = replace(fixed.game, rules=replace(fixed.game.rules, shuffle_starts=True))
-    batch = Batch(game, 100, seed=4)
-    output = batch.new_output()
-    for _ in range(12):
-        batch.begin(output)
-        places = [list(zip(*world, strict=True)) for world in zip(batch.now.row, batch.now.col, strict=True)]
-        orders.update(tuple(at.index(place) for place in world) for world in places)
-        for world, facing in zip(places, batch.now.heading.tolist(), strict=True):
-            assert [headings[place] for place in world] == facing, "a place keeps its heading"
-        fixed.batch.begin(fixed.output)
-        assert fixed.places == at
+    shuffled = Play(board, worlds=100, seed=4, shuffle_starts=True)
+    alone = Batch(shuffled.game, 1, seed=4, first_world=37)
+    starts = fixed.game.map.starts
+    for episode in range(12):
+        now = (shuffled if episode == 0 else shuffled.again()).batch.now
+        for row, col, heading in zip(now.row, now.col, now.heading, strict=True):
+            agents = zip(row, col, heading, strict=True)
+            orders[tuple(starts.index(start) for start in agents)] += 1  # a place keeps its heading
+        alone.begin(alone.new_output())
+        assert fixed.again().places == [start[:2] for start in starts]
     assert len(orders) == 6
     assert all(140 < count < 260 for count in orders.values()), orders
-    alone = Batch(game, 1, seed=4, first_world=37)
-    for _ in range(12):
-        alone.begin(alone.new_output())
-    assert (alone.now.row[0] == batch.now.row[37]).all()
-    assert (alone.now.col[0] == batch.now.col[37]).all()
+    assert (alone.now.row[0] == now.row[37]).all()
+    assert (alone.now.col[0] == now.col[37]).all()
 
 
 def test_turning_left_and_right_turns_the_heading_by_a_quarter():
@@ -178,16 +170,12 @@ def test_a_wall_stops_each_column_of_a_beam_on_its_own():
     assert play.window(1).splitlines() == ["#####", "..b.#", ".obo#", "..b.#", ".#b##", "..S.#"]
 
 
-def test_an_agent_tagged_as_it_fires_still_hits_another():
+def test_an_agent_tagged_in_a_turn_still_hits_another_or_harvests_in_that_turn():
     play = Play("A.......\n.>.^.^..", beam_length_cells=2)
     play.turn("stay", "turn_right", "stay").turn("beam", "beam", "stay")
     assert play.in_play == [True, False, False]
-
-
-def test_an_agent_tagged_in_a_turn_still_harvests_in_that_turn():
     play = Play("..A..\n.>^..").turn("beam", "forward")
-    assert play.harvest == [0, 1]
-    assert play.in_play == [True, False]
+    assert (play.harvest, play.in_play) == ([0, 1], [True, False])
 
 
 def test_an_agent_in_two_beams_takes_one_hit_per_turn():
@@ -211,19 +199,6 @@ def test_hits_are_kept_between_turns_and_a_tag_or_a_new_episode_clears_them():
     assert play.turn("beam", "stay").in_play == [True, True], "one hit since the tag"
     play.again()
     assert play.turn("beam", "stay").in_play == [True, True], "one hit in this episode"
-
-
-def test_the_beam_action_of_an_agent_that_may_not_fire_does_nothing():
-    play = Play("A...\n.>.^", institutions=[Sanctioner(agents=(1,))]).turn("beam", "stay")
-    assert not play.output.fired.any()
-    assert play.in_play == [True, True]
-
-
-def test_an_agent_harvests_the_apple_that_it_steps_on():
-    play = Play(">A.A\n....").turn("forward")
-    assert play.harvest == [1]
-    assert play.output.stock[0, 0] == 1
-    assert play.turn("stay").harvest == [0], "the site is empty"
 
 
 def test_every_site_is_full_at_the_start_of_an_episode_also_the_one_on_which_an_agent_starts():
@@ -265,60 +240,44 @@ def test_the_episode_ends_in_the_turn_that_takes_the_last_apple_and_as_run_one_l
         assert bool(play.turn("stay").output.terminated[0, 0])
 
 
-def test_the_episode_continues_on_an_empty_board_if_apples_can_grow_without_apples_near():
+def ends(play):
+    return play.output.terminated[0, 0], play.output.truncated[0, 0], play.output.done[0, 0]
+
+
+def test_an_empty_board_truncates_an_episode_if_apples_can_grow_and_terminates_it_even_in_the_last_turn():
     play = Play(">A.\n...", regrow_prob=(0.001,), episode_steps=3).turn("forward")
-    assert not play.output.done[0, 0]
-    play.turn("stay").turn("stay")
-    assert play.output.truncated[0, 0]
-    assert not play.output.terminated[0, 0]
-
-
-def test_an_episode_that_loses_its_last_apple_in_the_last_turn_is_terminated_not_truncated():
-    play = Play(">A.\n...", episode_steps=1).turn("forward")
-    assert play.output.terminated[0, 0]
-    assert not play.output.truncated[0, 0]
+    assert ends(play) == (False, False, False)
+    assert ends(play.turn("stay").turn("stay")) == (False, True, True)
+    assert ends(Play(">A.\n...", episode_steps=1).turn("forward")) == (True, False, True)
 
 
 def test_a_world_that_has_ended_does_not_change_and_pays_nothing():
     play = Play(">AA\n..<", episode_steps=1, regrow_prob=(1.0,)).turn("forward", "beam")
-    before = {name: array.copy() for name, array in play.batch.now._asdict().items()}
-    windows = play.output.observation.copy()
+    before, windows = copied(play.batch.now), play.output.observation.copy()
     play.turn("forward", "beam")
     assert play.harvest == [0, 0]
     assert not play.output.fired.any()
-    assert play.output.done[0, 0]
-    assert play.output.truncated[0, 0]
+    assert ends(play) == (False, True, True)
     assert np.array_equal(play.output.observation, windows)
-    for name, array in play.batch.now._asdict().items():
-        assert np.array_equal(array, before[name]), name
+    assert_same(play.batch.now, before)
 
 
-@pytest.mark.parametrize(("norm", "near"), [("euclidean", 12), ("manhattan", 12), ("chebyshev", 24)])
-def test_the_norm_decides_how_many_cells_are_near(norm, near):
+@pytest.mark.parametrize(
+    ("norm", "near", "knights_move"), [("euclidean", 12, 5**0.5), ("manhattan", 12, 3), ("chebyshev", 24, 2)]
+)
+def test_the_norm_decides_how_many_cells_are_near(norm, near, knights_move):
     full = maps.parse("\n".join(["AAAAAAA"] * 6 + ["AAAAAA>"]))
     middle = full.sites.index((3, 3))
     first, _ = neighbours(full, Rules(regrow_norm=norm))
     assert first[middle + 1] - first[middle] == near
-
-
-def test_each_norm_measures_a_knights_move():
-    assert distance("euclidean", 1, 2) == pytest.approx(5**0.5)
-    assert distance("manhattan", -1, 2) == 3
-    assert distance("chebyshev", 1, -2) == 2
+    assert distance(norm, -1, 2) == distance(norm, 2, 1) == pytest.approx(knights_move)
 
 
 def test_apples_grow_as_often_as_the_rules_say():
     # One site with n apples near, watched over many worlds in its first empty turn.
-    prob = (0.0, 0.1, 0.25, 0.6)
-    board = maps.parse(">A......\n.AAA...A\n........")
-    game = Game(map=board, rules=Rules(regrow_prob=prob, may_fire=False))
-    batch = Batch(game, 40_000, seed=7)
-    output = batch.begin(batch.new_output())
-    forward, stay = np.zeros((40_000, 1), np.int64), np.full((40_000, 1), 6)
-    batch.play(forward, output)
-    assert (output.harvest == 1).all()
-    batch.play(stay, output)
-    grown = Counter(output.regrown[:, 0].tolist())
+    board, prob = ">A......\n.AAA...A\n........", (0.0, 0.1, 0.25, 0.6)
+    play = Play(board, worlds=40_000, seed=7, regrow_prob=prob, may_fire=False).turn("forward")
+    assert (play.output.harvest == 1).all()
     # 3 apples within distance 2 of (0, 1): (1, 1), (1, 2), (1, 3) is sqrt(5) away -> 2 count.
-    share = grown[1] / 40_000
+    share = (play.turn("stay").output.regrown == 1).mean()
     assert share == pytest.approx(0.25, abs=4 * (0.25 * 0.75 / 40_000) ** 0.5)

@@ -2,6 +2,7 @@
 
 from dataclasses import fields
 
+import numba
 import numpy as np
 import pytest
 
@@ -36,23 +37,13 @@ def test_lists_and_arrays_become_tuples_so_that_rules_compare_and_hash():
 
 
 def test_every_quirk_is_off_as_published_and_on_as_run():
-    switches = {field.name for field in fields(Rules) if field.default is False}
-    others = {"walls_block_sight", "shuffle_starts", "agent_1_right_moves_agent_0", "regrow_after_bites"}
-    others |= {
-        "beam_tapers",
-        "beam_from_beside",
-        "beam_stops_at_agents",
-        "plays_on_when_empty",
-        "harvest_action",
-        "may_clean",
-    }
-    quirks = switches - others - {"random_headings", "respawn_at_spawns"}
+    names = [field.name for field in fields(Rules)]
+    quirks = names[names.index("pairwise_clashes") : names.index("agent_1_right_moves_agent_0")]
     assert len(quirks) == 8
     for board in presets.BOARDS:
-        published = presets.game(board).rules
-        as_run = presets.game(board, variant="as_run").rules
-        assert not any(getattr(published, quirk) for quirk in quirks)
-        assert all(getattr(as_run, quirk) for quirk in quirks)
+        for variant in ("published", "as_run"):
+            rules = presets.game(board, variant=variant).rules
+            assert {getattr(rules, quirk) for quirk in quirks} == {variant == "as_run"}
 
 
 @pytest.mark.parametrize(
@@ -70,12 +61,19 @@ def test_without_a_beam_there_are_seven_actions_and_six_is_stay():
     assert presets.game("commons").actions[6:] == ("beam", "stay")
 
 
-@pytest.mark.parametrize(("board", "variant"), [("pond", "published"), ("commons", "as_writen")])
-def test_an_unknown_preset_is_refused_with_what_is_allowed(board, variant):
-    with pytest.raises(ValueError, match="allowed: "):
-        presets.game(board, variant=variant)
-    with pytest.raises(ValueError, match="allowed: "):
-        presets.dqn_settings(board, variant=variant)
+@pytest.mark.parametrize(
+    ("board", "variant", "field"),
+    [
+        ("pond", "published", "board is 'pond'"),
+        ("commons", "as_writen", "variant"),
+        ("ssd/harvest-v1", "as_run", "(board|variant) is "),
+        *((board, "as_run_10_april", f"variant of {board}") for board in ("single_complex", "commons")),
+    ],
+)
+def test_an_unknown_preset_is_refused_with_what_is_allowed(board, variant, field):
+    for preset in (presets.game, presets.dqn_settings, presets.gymnasium_env):
+        with pytest.raises(ValueError, match=rf"{field}.*allowed: "):
+            preset(board, variant=variant)
 
 
 def test_epsilon_is_constant_then_falls_linearly_then_is_constant():
@@ -97,15 +95,9 @@ def words(text):
 
 
 @pytest.mark.parametrize(("counter", "key", "answer"), KNOWN_ANSWERS)
-def test_philox_gives_the_known_answers(counter, key, answer):
-    assert list(philox4x32(*words(counter), *words(key))) == words(answer)
-
-
-@pytest.mark.parametrize(("counter", "key", "answer"), KNOWN_ANSWERS)
-def test_the_compiled_philox_gives_the_known_answers(counter, key, answer):
-    import numba
-
-    assert list(numba.njit(philox4x32)(*words(counter), *words(key))) == words(answer)
+def test_philox_gives_the_known_answers_compiled_or_not(counter, key, answer):
+    for philox in (philox4x32, numba.njit(philox4x32)):
+        assert list(philox(*words(counter), *words(key))) == words(answer)
 
 
 def test_a_threshold_is_the_probability_of_a_word_below_it():

@@ -1,10 +1,12 @@
 """Signals: cheap talk, an action's second part, seen by others in the next turn and else without effect."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from boards import Play
 
-from cprl import Game, Observation, Rules, maps, presets
+from cprl import Game, Observation, Rules, maps
 from cprl.commons.batch import Batch
 from cprl.institutions import Quota
 
@@ -32,16 +34,11 @@ def test_a_signal_is_seen_at_its_sender_in_the_next_turn_and_then_no_more():
     assert planes(play, 0) == planes(play, 1) == [[], []]
 
 
-def test_an_agent_out_of_play_sends_nothing():
+def test_an_agent_out_of_play_sends_nothing_and_a_new_episode_begins_in_silence():
     play = Play(BOARD, signals=1, window_rows=4, window_columns=3).turn("beam 1", "stay 1")
     assert planes(play, 0) == [[(3, 1, 255)]]
-    play.turn("stay", "stay 1")
-    assert planes(play, 0) == [[]]
-
-
-def test_a_new_episode_begins_in_silence():
-    play = Play(BOARD, signals=1, window_rows=4, window_columns=3, episode_steps=1).turn("stay 1").again()
-    assert planes(play, 0) == [[]]
+    assert planes(play.turn("stay", "stay 1"), 0) == [[]]
+    assert planes(play.turn("stay 1").again(), 0) == [[]]
 
 
 @pytest.mark.parametrize("encoding", ["rgb", "one_hot"])
@@ -49,11 +46,10 @@ def test_a_new_episode_begins_in_silence():
 @pytest.mark.parametrize("governed", [False, True])
 def test_signals_change_nothing_but_their_planes(encoding, area, governed):
     seen = Observation(encoding=encoding, area=area, stock_gauge="planes" if governed else False)
-    institutions = (Quota(fine=1.0),) if governed else ()
-    board, rng = maps.named("two_complex"), np.random.default_rng(0)
-    silent = Game(map=board, rules=Rules(cooldown_steps=1), observation=seen, institutions=institutions)
-    rules = Rules(cooldown_steps=1, signals=3)
-    spoken = Game(map=board, rules=rules, observation=seen, institutions=institutions)
+    rng, rules = np.random.default_rng(0), Rules(cooldown_steps=1)
+    own = {"observation": seen, "institutions": (Quota(fine=1.0),) if governed else ()}
+    silent = Game(map=maps.named("two_complex"), rules=rules, **own)
+    spoken = replace(silent, rules=replace(rules, signals=3))
     kinds, cells = len(silent.actions), len(silent.cell_channels)
     assert spoken.actions[:kinds] == silent.actions
     assert spoken.actions[kinds] == "forward 1"
@@ -81,19 +77,12 @@ def test_signals_change_nothing_but_their_planes(encoding, area, governed):
                 assert heard[world, agent, signals[world, agent] - 1]
 
 
-def test_the_state_holds_what_was_said():
+def test_the_state_holds_what_was_said_if_there_are_signals():
     play = Play(BOARD, signals=2, window_rows=4, window_columns=3).turn("stay 2", "stay 1")
     state = play.batch.state()
     assert state["signal"].tolist() == [[2, 1]]
-    copy = Play(BOARD, signals=2, window_rows=4, window_columns=3)
-    copy.batch.load(state, copy.whole)
+    copy = Play(BOARD, signals=2, window_rows=4, window_columns=3).put(**state)
     np.testing.assert_array_equal(copy.output.observation, play.output.observation)
-    with pytest.raises(ValueError, match="allowed: 0 to 2"):
-        copy.batch.load({**state, "signal": state["signal"] + 1}, copy.whole)
-
-
-def test_games_without_signals_have_none_in_their_state():
-    game = presets.game("two_complex")
-    batch = Batch(game, 1)
-    batch.begin(batch.new_output())
-    assert "signal" not in batch.state()
+    with pytest.raises(ValueError, match=r"state\['signal'\]"):
+        copy.put(signal=state["signal"] + 1)
+    assert "signal" not in Play(BOARD).batch.state()

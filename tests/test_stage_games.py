@@ -79,19 +79,35 @@ def number_seen(moment):
     return moment["agents", "observation"].argmax(-1).tolist()
 
 
+EACH_PAIR = ((C, C), (C, D), (D, C), (D, D))
+
+
 @pytest.mark.parametrize(
-    ("game", "cooperate", "exploited", "exploits", "defect"),
+    ("game", "actions", "paid"),
     [
-        (prisoners_dilemma(), [-1, -1], [-3, 0], [0, -3], [-2, -2]),
-        (prisoners_dilemma(reward=3, sucker=0, temptation=4, punishment=1), [3, 3], [0, 4], [4, 0], [1, 1]),
-        (stag_hunt(), [4, 4], [0, 3], [3, 0], [1, 1]),
-        (chicken(), [3, 3], [1, 4], [4, 1], [0, 0]),
-        (matching_pennies(), [1, -1], [-1, 1], [-1, 1], [1, -1]),
+        # What was published.
+        (prisoners_dilemma(), EACH_PAIR, [[-1, -1], [-3, 0], [0, -3], [-2, -2]]),
+        (
+            prisoners_dilemma(reward=3, sucker=0, temptation=4, punishment=1),
+            EACH_PAIR,
+            [[3, 3], [0, 4], [4, 0], [1, 1]],
+        ),
+        (stag_hunt(), EACH_PAIR, [[4, 4], [0, 3], [3, 0], [1, 1]]),
+        (chicken(), EACH_PAIR, [[3, 3], [1, 4], [4, 1], [0, 0]]),
+        (matching_pennies(), EACH_PAIR, [[1, -1], [-1, 1], [-1, 1], [1, -1]]),
+        (THREE, ((1, 0, 1), (0, 1, 0)), [[15, 16, 17], [6, 7, 8]]),  # 3 * (4 + 1), 3 * 2
+        # Animals 0.5 and 1.5: A = 2, v(2) = 10 - 4 = 6, less 1 each. 2 and 2: v(4) = 0, an animal costs 1.
+        (PAIR, ((1, 3), (4, 4), (0, 4)), [[2.5, 7.5], [-2, -2], [0, 10]]),
+        (TakingGame(herders(2, cost=11), levels=3, most=1.0), ((1, 2),), [[-1.625, -3.25]]),
+        # 8 tokens each: F(64) = 23 * 64 - 0.25 * 64^2 = 448, an eighth is 56, and 2 tokens outside pay 10.
+        # None in the resource: 10 tokens outside pay 50. 9 each: X = 72, v = 23 - 18 = 5, as outside.
+        (LAB, ((16,) * 8, (0,) * 8, (18,) * 8), [[66] * 8, [50] * 8, [50] * 8]),
+        # Half put in 4 and half 5: X = 36 is best for all, v = 14, 9 more than outside a token.
+        (LAB, ((8, 10) * 4,), [[86, 95] * 4]),
     ],
 )
-def test_published_games_pay_what_was_published(game, cooperate, exploited, exploits, defect):
-    found = rewards(game, (C, C), (C, D), (D, C), (D, D))
-    assert found == [cooperate, exploited, exploits, defect]
+def test_joint_actions_pay_what_was_published_or_is_worked_by_hand(game, actions, paid):
+    assert rewards(game, *actions) == paid
 
 
 def test_agents_see_the_last_joint_action_from_their_own_side():
@@ -104,8 +120,7 @@ def test_agents_see_the_last_joint_action_from_their_own_side():
     assert number_seen(moment) == [[3, 3]]
 
 
-def test_of_three_agents_each_is_paid_its_own_payoff_and_sees_its_own_action_first():
-    assert rewards(THREE, (1, 0, 1), (0, 1, 0)) == [[15.0, 16.0, 17.0], [6.0, 7.0, 8.0]]  # 3 * (4 + 1), 3 * 2
+def test_of_three_agents_each_sees_its_own_action_first():
     env = make_env(THREE)
     _, moment = step(env, env.reset(), (1, 0, 0))
     assert moment["agents", "observation"].shape == (1, 3, 9)
@@ -169,20 +184,6 @@ def test_lengths_follow_from_seed_and_world_alone():
     assert lengths(env, 4) == whole
 
 
-def test_herders_are_paid_for_their_animals_what_these_are_worth():
-    # Animals 0.5 and 1.5: A = 2, v(2) = 10 - 4 = 6, less 1 each. 2 and 2: v(4) = 0, an animal costs 1.
-    assert rewards(PAIR, (1, 3), (4, 4), (0, 4)) == [[2.5, 7.5], [-2, -2], [0, 10]]
-
-
-def test_appropriators_are_paid_what_the_laboratory_paid():
-    # 8 tokens each: F(64) = 23 * 64 - 0.25 * 64^2 = 448, an eighth is 56, and 2 tokens outside pay 10.
-    # None in the resource: 10 tokens outside pay 50. 9 each: X = 72, v = 23 - 18 = 5, as outside.
-    nash, none, open_access = rewards(LAB, (16,) * 8, (0,) * 8, (18,) * 8)
-    assert (nash, none, open_access) == ([66.0] * 8, [50.0] * 8, [50.0] * 8)
-    # Half put in 4 and half 5: X = 36 is best for all, v = 14, 9 more than outside a token.
-    assert rewards(LAB, (8, 10) * 4) == [[86.0, 95.0] * 4]
-
-
 GAMES = st.builds(
     lambda agents, top, power, cost, levels, cap: TakingGame(
         SharingGame(agents=agents, worth=PowerWorth(top=top, power=power), cost=cost * top, most_each=cap),
@@ -241,10 +242,6 @@ def test_agents_with_other_numbers_see_and_get_the_same_to_the_bit():
     one, other = now["next", "agents"]
     assert torch.equal(one["observation"][order], other["observation"])
     assert torch.equal(one["reward"][order], other["reward"])
-
-
-def test_a_game_without_gain_can_be_played_with_amounts_of_ones_own():
-    assert rewards(TakingGame(herders(2, cost=11), levels=3, most=1.0), (1, 2)) == [[-1.625, -3.25]]
 
 
 def test_a_worth_of_the_users_own_is_a_game_by_the_name_of_the_function_that_makes_it():
@@ -531,15 +528,11 @@ def test_independent_tables_end_at_the_equilibrium_and_one_agent_at_the_optimum(
 @pytest.mark.slow
 def test_dqn_learns_to_defect_in_the_one_shot_dilemma(tmp_path):
     """Defection is dominant, so five of five pairs end there: -2 each (a theorem, not a published figure)."""
-    settings = replace(SMALL, learning_rate=1e-2, buffer_size=1000, epsilon_decay_steps=500)
-    settings = replace(settings, epsilon_evaluation=0.0)
-    experiment = replace(
-        DILEMMA,
-        game=prisoners_dilemma(),
-        agents=[Learning(DQN(settings=settings))] * 2,
-        replicas=5,
-        episodes=2000,
+    settings = replace(
+        SMALL, learning_rate=1e-2, buffer_size=1000, epsilon_decay_steps=500, epsilon_evaluation=0.0
     )
+    agents = [Learning(DQN(settings=settings))] * 2
+    experiment = replace(DILEMMA, game=prisoners_dilemma(), agents=agents, replicas=5, episodes=2000)
     run = cprl.load(cprl.run(experiment, tmp_path / "run", watch="off"))
     episodes = cprl.evaluate_run(run, episodes=5).trained
     assert all(

@@ -15,10 +15,9 @@ from cprl.commons.colours import CLASS_NAMES
 from cprl.commons.state import NAMES
 from cprl.institutions import Sanctioner
 
-TRACES = sorted((Path(__file__).parent / "traces").glob("*.npz"))
+FOLDER = Path(__file__).parent / "traces"
+TRACES = sorted(FOLDER.glob("*.npz"))
 REGROW_PROB = {"none": (0.0,), "all": (0.0, 1.0)}
-
-
 EARLIER, NO_BEAM = "two_complex_10_april", "two_complex_no_beam"
 """Of cba933a and, without a beam, of 65e3bf7: agent 1's action "right" moves agent 0."""
 
@@ -61,8 +60,8 @@ def test_all_twelve_traces_are_there_and_one_ends_by_depletion():
 @pytest.mark.parametrize("board", [EARLIER, NO_BEAM])
 @pytest.mark.parametrize("regrowth", REGROW_PROB)
 def test_the_programs_with_the_fault_play_another_game_without_it(board, regrowth):
-    path = Path(__file__).parent / "traces" / f"{board}_{regrowth}.npz"
-    trace, game = np.load(path), traced_game(path.stem)
+    name = f"{board}_{regrowth}"
+    trace, game = np.load(FOLDER / f"{name}.npz"), traced_game(name)
     batch = Batch(replace(game, rules=replace(game.rules, agent_1_right_moves_agent_0=False)), 1)
     output = batch.begin(batch.new_output())
     shown = trace["obs"].reshape(-1, game.agents, *game.observation_shape)
@@ -75,8 +74,8 @@ def test_the_programs_with_the_fault_play_another_game_without_it(board, regrowt
 def test_the_traces_of_the_earlier_program_hold_what_the_fault_does_at_edges_in_clashes_and_out_of_play():
     seen = Counter()
     for regrowth in REGROW_PROB:
-        path = Path(__file__).parent / "traces" / f"{EARLIER}_{regrowth}.npz"
-        trace, batch = np.load(path), Batch(traced_game(path.stem), 1)
+        name = f"{EARLIER}_{regrowth}"
+        trace, batch = np.load(FOLDER / f"{name}.npz"), Batch(traced_game(name), 1)
         output, now = batch.begin(batch.new_output()), batch.now
         for actions in trace["actions"].astype(np.int64):
             in_play, before = output.in_play[0].copy(), (now.row[0, 0], now.col[0, 0])
@@ -119,26 +118,19 @@ def test_right_of_agent_2_moves_agent_2():
 
 
 @pytest.mark.parametrize("pairwise", [False, True])
-def test_agent_0_goes_back_to_where_it_began_the_turn_if_it_ends_on_agent_1(pairwise):
+def test_agent_0_goes_back_if_it_ends_on_agent_1_and_may_pass_over_it(pairwise):
     played = play("A...\n>...\n.>..", pairwise_clashes=pairwise)
     assert played.turn("forward", "right").places == [(1, 0), (2, 1)], "both of its steps are undone"
     assert played.turn("backward", "right").places == [(2, 0), (2, 1)], "beside 1, after a step off the edge"
-
-
-@pytest.mark.parametrize("pairwise", [False, True])
-def test_agent_0_may_pass_over_agent_1(pairwise):
     # Forward is the cell of 1; from there agent 0 is moved on to its right.
     played = play("A...\n>^..\n....", pairwise_clashes=pairwise)
     assert played.turn("forward", "right").places == [(2, 1), (1, 1)]
 
 
-def test_agent_0_is_moved_while_it_is_out_of_play():
+def test_agent_0_is_moved_while_it_is_out_of_play_and_agent_1_out_of_play_moves_nobody():
     played = play("A....\n>.<..\n.....", freeze_steps=3).turn("stay", "beam")
     assert played.in_play == [False, True]
     assert played.turn("forward", "right").places == [(2, 0), (1, 2)], "its own action does not count"
-
-
-def test_agent_1_moves_nobody_while_it_is_out_of_play():
     played = play("A....\n>.<..\n.....", freeze_steps=3).turn("beam", "stay")
     assert played.turn("stay", "right").places == [(1, 0), (1, 2)]
 
@@ -222,11 +214,3 @@ def test_the_program_of_10_april_is_that_of_later_with_the_fault_and_another_dis
     assert settings.gamma == 0.999
     assert replace(settings, gamma=0.995) == presets.dqn_settings("two_complex", variant="as_run")
     assert presets.variant_of(game) == VARIANT
-
-
-@pytest.mark.parametrize("board", ["single_basic", "single_complex", "commons"])
-def test_other_boards_have_no_such_variant(board):
-    message = f"variant of {board} is 'as_run_10_april'; allowed: 'published', 'as_run'$"
-    for preset in (presets.game, presets.dqn_settings, presets.gymnasium_env):
-        with pytest.raises(ValueError, match=message):
-            preset(board, variant=VARIANT)
