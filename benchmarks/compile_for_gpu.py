@@ -34,15 +34,12 @@ from cprl.institutions.law import new_law
 
 def arguments(game: Game, worlds: int = 4) -> dict[str, tuple[Any, ...]]:
     """Arguments of each kernel with the types and layouts that `CudaThreads` gives them."""
-    agents, sites, tables = game.agents, len(game.map.sites), game.tables
-    state = empty_worlds(worlds=worlds, agents=agents, sites=sites)
-    window = tables.window_cells.shape[1]
-    sheet = empty_scratch(agents=agents, sites=sites, cells=tables.background.size, window=window)
+    tables, sheet = game.tables, empty_scratch(game)
     scratch = Scratch(*(np.zeros((worlds, *each.shape), each.dtype, order="F") for each in sheet))
     told = StepOutput(**{name: np.zeros(*form) for name, form in output_forms(game, worlds).items()})
-    actions, marks = np.zeros((worlds, agents), np.int64), np.zeros(worlds, np.bool_)
+    actions, marks = np.zeros((worlds, game.agents), np.int64), np.zeros(worlds, np.bool_)
     boards = np.zeros((worlds, game.map.height, game.map.width), np.uint8)
-    on_gpu = Worlds(*map(np.asfortranarray, state))
+    on_gpu = Worlds(*map(np.asfortranarray, empty_worlds(game, worlds)))
     loops = {"play_worlds": actions, "begin_worlds": marks, "refresh_worlds": marks, "show_worlds": boards}
     ruled = replace(game, institutions=(Tax(),))
     paid = output_of([np.zeros(*form) for form in output_forms(ruled, worlds).values()])

@@ -52,9 +52,7 @@ class MatrixGame(EnvBase):
 
     def _reset(self, tensordict=None, **kwargs):
         (worlds,) = self.batch_size
-        which = (
-            torch.ones(worlds, 1, dtype=torch.bool) if tensordict is None else tensordict.get("_reset", None)
-        )
+        which = None if tensordict is None else tensordict.get("_reset", None)
         which = torch.ones(worlds, 1, dtype=torch.bool) if which is None else which.reshape(worlds, 1)
         self.turn = torch.where(which, 0, self.turn)
         return self._moment(torch.zeros(worlds, 2, 4), torch.zeros(worlds, 1, dtype=torch.bool))

@@ -321,11 +321,6 @@ def test_the_table_of_an_evaluation_says_what_is_left_out():
     assert [name for name, *_ in table.rows] == ["survival, steps"]
 
 
-def test_bars_know_the_clock_of_a_game_or_of_its_environment():
-    games = (GAME, CommonsEnv(GAME, 1), transformed(1), MatrixGame(1), None)
-    assert [ProgressBar(game, episodes=1)._clock for game in games] == [20, 20, 20, None, None]
-
-
 def test_actions_of_numbers_are_refused_by_the_name_of_their_entry():
     env = CommonsEnv(Game(map=maps.parse(">.A<"), rules=Rules()), 1, seed=0)
     spec = env.full_action_spec.clone()

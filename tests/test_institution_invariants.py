@@ -52,11 +52,8 @@ def check_untouched(game, seed):
     for moment, (worlds, turn, *_) in zip(
         random_play(game, turns=30, seed=seed), played_without(plain, actions, seed=seed), strict=True
     ):
-        for name, array in worlds._asdict().items():
-            assert np.array_equal(array, getattr(moment.worlds, name)), name
-        for name, array in turn._asdict().items():
-            own = getattr(moment.turn, name)
-            assert np.array_equal(array, own[:, :, :cells] if name == "observation" else own), name
+        assert_same(moment.worlds, worlds)
+        assert_same(moment.turn._replace(observation=moment.turn.observation[:, :, :cells]), turn)
 
 
 @pytest.mark.integration
@@ -111,13 +108,9 @@ def sums(game, seed):
     """Of each turn: harvest, fines and transfers [T, B, N] of a whole episode, and the last counts."""
     moments = random_play(game, turns=game.rules.episode_steps, seed=seed)[1:]
     assert (moments[-1].worlds.ended != PLAYING).all()
-    harvest = np.array([moment.turn.harvest for moment in moments], np.float64)
-    fines, transfers = (
-        np.array([getattr(moment.payments, name) for moment in moments], np.float64)
-        for name in ("fines", "transfers")
-    )
+    flows = [(moment.turn.harvest, moment.payments.fines, moment.payments.transfers) for moment in moments]
     counts = {name: moments[-1].payments.counts[..., n] for n, name in enumerate(law.COUNTS)}
-    return harvest, fines, transfers, counts
+    return *np.array(flows, np.float64).swapaxes(0, 1), counts
 
 
 def close(one, other):
@@ -259,8 +252,7 @@ def test_the_order_of_institutions_changes_no_move_and_no_payment(game, seed, or
     order.shuffle(shuffled)
     other = replace(game, institutions=tuple(shuffled))
     for one, two in zip(random_play(game, seed=seed), random_play(other, seed=seed), strict=True):
-        for name, array in one.worlds._asdict().items():
-            assert np.array_equal(array, getattr(two.worlds, name)), name
+        assert_same(one.worlds, two.worlds)
         for name in ("fines", "transfers", "reward", "violated", "counts"):
             mine, theirs = getattr(one.payments, name), getattr(two.payments, name)
             np.testing.assert_allclose(mine, theirs, rtol=1e-5, atol=1e-6, err_msg=name)

@@ -31,13 +31,11 @@ def test_agents_and_sites_are_numbered_in_reading_order_unless_they_are_given():
 
 
 @pytest.mark.parametrize(("name", "size"), BOARDS_OF_THE_STUDY.items())
-def test_the_named_boards_have_the_published_sizes(name, size):
+def test_the_named_boards_have_the_published_sizes_and_numbers_of_agents(name, size):
     board = maps.named(name)
     assert (board.height, board.width, len(board.sites), board.agents) == size
-
-
-def test_commons_numbers_its_agents_as_the_published_program_does():
-    assert maps.named("commons").starts == ((0, 1, 1), (2, 2, 2), (1, 3, 2), (0, 2, 1))
+    if name == "commons":
+        assert board.starts == ((0, 1, 1), (2, 2, 2), (1, 3, 2), (0, 2, 1))
 
 
 def board(**changes):
@@ -143,6 +141,8 @@ def test_all_boards_of_rooms_but_unequal_are_symmetric_under_half_a_turn():
 
 def test_the_cells_of_a_room_hold_its_apples_and_its_agents_and_no_corridor():
     cells = maps.room_cells()
+    four = maps.rooms(agents=4).starts
+    assert all(cells[room][start[:2]] for room, start in enumerate(four)), "fewer agents are spread"
     assert cells.shape == (len(maps.ROOM_NAMES), 19, 53)
     assert cells.sum((1, 2)).tolist() == [7 * 24] * 4
     assert cells.any(0).sum() == 4 * 7 * 24, "no cell is in two rooms"
@@ -154,11 +154,6 @@ def test_the_cells_of_a_room_hold_its_apples_and_its_agents_and_no_corridor():
             assert sum(cells[room][site] for site in board.sites) == 45
         assert all(cells[agent % 4][start[:2]] for agent, start in enumerate(board.starts))
     assert [room for room in range(4) if cells[room, 3, 6]] == [maps.ROOM_NAMES.index("north-west")]
-
-
-def test_fewer_agents_are_spread_over_the_rooms():
-    starts = maps.rooms(agents=4).starts
-    assert {(row > 9, col > 26) for row, col, _ in starts} == set(itertools.product((False, True), repeat=2))
 
 
 def test_crosses_are_centres_with_their_four_neighbours():
@@ -215,19 +210,16 @@ def test_one_is_warned_of_a_wall_between_all_agents_and_all_apples():
     assert told[0].filename == __file__, "it points to where the game is made"
     with pytest.warns(UserWarning, match=WARNING):
         replace(parted, rules=Rules(freeze_steps=3))
+    with warnings.catch_warnings():  # one that is sent to another process does not warn again
+        warnings.simplefilter("error")
+        assert pickle.loads(pickle.dumps(parted)) == parted
 
 
-def test_a_gap_in_the_wall_is_enough_and_so_is_one_agent_on_the_other_side():
+def test_a_gap_or_one_agent_is_enough_but_no_corner_and_agents_are_no_walls():
     without_a_warning("..A..#....\n.AAA...>..\n..A..#..<.")
     without_a_warning("..A..#....\n.AAA.#.>..\n..A.<#....")
-
-
-def test_nobody_passes_between_walls_that_touch_at_a_corner():
     with pytest.warns(UserWarning, match="can harvest any of the 1 sites"):
         game("A.#.\n.#..\n#..<")
-
-
-def test_agents_are_no_walls_for_each_other():
     without_a_warning("A<<", Boundaries.drawn("1.."))
 
 
@@ -240,11 +232,3 @@ def test_boundaries_that_stop_bites_are_reckoned_with_and_fines_are_not():
     without_a_warning(board, Boundaries.drawn(regions, owners=("1", "0#")))
     with pytest.warns(UserWarning, match="of the 1 sites"):
         game("A..>", Boundaries.drawn("-..."))
-
-
-def test_a_game_that_is_sent_to_another_process_does_not_warn_again():
-    with pytest.warns(UserWarning, match=WARNING):
-        parted = game(PARTED)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert pickle.loads(pickle.dumps(parted)) == parted

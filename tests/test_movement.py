@@ -1,13 +1,14 @@
 """Where agents go, when they fire, who keeps to which cells: on boards small enough to count by hand, and of
 stored runs in fresh worlds beside random play."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from matplotlib.image import imread
 from results import distance_to_nearest, rounds, shooting_distance
 from stored_runs import SEED
-from tensordict.nn import TensorDictModuleBase
 
 import cprl
 from cprl import CommonsEnv, Game, Rules, keys, maps
@@ -15,7 +16,7 @@ from cprl.evaluation import territory_of
 from cprl.evaluation.territory import DEFENCE, EXCLUSION, OVERLAP, TAGS, VISITORS, draw_visits
 from cprl.measuring import movement
 
-FORWARD, LEFT, RIGHT, TURN_RIGHT, BEAM, STAY = 0, 2, 3, 5, 6, 7
+FORWARD, BEAM, STAY = 0, 6, 7
 
 
 def drawn(cells, *, fired=(), in_play=None, board=(3, 4)):
@@ -36,28 +37,14 @@ def drawn(cells, *, fired=(), in_play=None, board=(3, 4)):
     )
 
 
-class Doing(TensorDictModuleBase):
-    """Plays the given actions [T, N] in order."""
-
-    in_keys = (keys.OBSERVATION,)
-    out_keys = (keys.ACTION,)
-
-    def __init__(self, actions):
-        super().__init__()
-        self.left = list(actions)
-
-    def forward(self, tensordict):
-        action = torch.tensor([self.left.pop(0)])
-        return tensordict.set(keys.ACTION, action)
-
-
 def test_a_trace_has_the_cells_of_all_agents_at_the_start_of_each_step_and_every_tag_with_who_fired():
     game = Game(
         map=maps.parse("A...A\n>...<\n....."),
         rules=Rules(regrow_prob=(0.0,), episode_steps=4, window_rows=3, window_columns=5, freeze_steps=9),
     )
+    plan = iter([(FORWARD, STAY), (BEAM, FORWARD), (STAY, STAY), (STAY, STAY)])
     played = movement.trace(
-        CommonsEnv(game), Doing([(FORWARD, STAY), (BEAM, FORWARD), (STAY, STAY), (STAY, STAY)])
+        CommonsEnv(game), lambda moment: moment.set(keys.ACTION, torch.tensor([next(plan)]))
     )
     assert played.row[:, 0].tolist() == [[1, 1]] * 4
     assert played.col[:, 0, 0].tolist() == [0, 1, 1, 1]
@@ -127,8 +114,7 @@ HALF = [[[0.5, 0.5, 0, 0]], [[0, 0.5, 0.5, 0]]]
 
 def shot(tags, cells, **more):
     """A trace with these tags: (step, world, tagged, by) each."""
-    played = drawn(cells, **more)
-    return type(played)(**{**vars(played), "tags": np.array(tags, np.int64).reshape(-1, 4)})
+    return replace(drawn(cells, **more), tags=np.array(tags, np.int64).reshape(-1, 4))
 
 
 NOBODY = [[0, 0, 0, 0]]

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from boards import Play, drawn, random_actions
 from torchrl.envs.utils import check_env_specs
 
@@ -13,7 +12,6 @@ from cprl.commons.batch import Batch, turn_of
 from cprl.commons.colours import COLOURS, FIRST_AGENT, MAX_AGENTS_APART, class_colour
 from cprl.commons.tables import cells_between
 from cprl.institutions import Quota
-from cprl.policies.scripted import scripted_lanes
 
 BOARD = """
     A..#.A
@@ -98,11 +96,9 @@ def test_a_scoreboard_shows_the_observers_harvest_first_then_those_of_the_next_i
     assert not play.output.scoreboard.any()
 
 
-PLANES = Observation(scoreboard="planes", stock_gauge="planes")
-
-
 def test_planes_hold_the_scoreboard_and_the_stock_gauge_scaled():
-    play = Play("A>A.A<.>A", observation=PLANES, window_rows=2, window_columns=3)
+    planes = Observation(scoreboard="planes", stock_gauge="planes")
+    play = Play("A>A.A<.>A", observation=planes, window_rows=2, window_columns=3)
     assert play.game.channels == ("red", "green", "blue", "scoreboard", "stock_gauge")
     play.turn("forward", "forward", "stay")
     play.turn("backward", "stay", "stay")
@@ -121,10 +117,8 @@ def test_planes_hold_the_scoreboard_and_the_stock_gauge_scaled():
 
 
 def test_a_scoreboard_of_more_agents_than_cells_takes_several_planes():
-    form = Observation(area="full", scoreboard="planes")
-    play = Play(">A\n<v", observation=form)
-    assert play.game.channels == ("red", "green", "blue", "scoreboard")
-    form = Observation(scoreboard="planes")
+    full, form = Observation(area="full", scoreboard="planes"), Observation(scoreboard="planes")
+    assert Play(">A\n<v", observation=full).game.channels == ("red", "green", "blue", "scoreboard")
     play = Play(">A\n<v", observation=form, window_rows=1, window_columns=1)
     assert play.game.channels == ("red", "green", "blue", *["scoreboard"] * 3)
     play.turn("forward", "stay", "stay")
@@ -135,18 +129,18 @@ def test_a_scoreboard_of_more_agents_than_cells_takes_several_planes():
     ], "255 x 1 / (1 + 1 site), rounded"
 
 
+SCORES = (True, "planes")
+
+
 @pytest.mark.parametrize("institutions", [(), (Quota(share=0.25, window_steps=20),)], ids=["free", "quota"])
 @pytest.mark.parametrize("encoding", ["rgb", "one_hot"])
 @pytest.mark.parametrize("area", ["window", "full"])
 def test_planes_show_what_vectors_do_and_change_nothing_else(area, encoding, institutions):
-    form, game = Observation(area=area, encoding=encoding), presets.game("commons")
-    vectors, planes = (
-        replace(game, observation=form, institutions=institutions)
-        for form in (
-            replace(form, scoreboard=True, stock_gauge=True),
-            replace(form, scoreboard="planes", stock_gauge="planes"),
-        )
+    game = replace(presets.game("commons"), institutions=institutions)
+    forms = (
+        {"area": area, "encoding": encoding, "scoreboard": scores, "stock_gauge": scores} for scores in SCORES
     )
+    vectors, planes = (replace(game, observation=Observation(**form)) for form in forms)
     check_env_specs(CommonsEnv(planes, 2, seed=1))
     assert planes.spaces.vectors == ()
     assert planes.spaces.observation_scale == 255, "networks divide by it"
@@ -172,26 +166,9 @@ def test_planes_show_what_vectors_do_and_change_nothing_else(area, encoding, ins
     assert seen > 0
 
 
-def test_scripted_agents_play_the_same_beside_planes():
-    game = presets.game("commons")
-    moves = []
-    for form in (Observation(), PLANES):
-        playing = replace(game, observation=form)
-        env = CommonsEnv(playing, 2, seed=1)
-        actor = scripted_lanes("greedy", playing, seeds=[[n] for n in range(8)], agents=4)
-        moment, chosen = env.reset(), []
-        for _ in range(30):
-            moment[keys.ACTION] = actor.choose(moment[keys.OBSERVATION])
-            chosen.append(moment[keys.ACTION].clone())
-            _, moment = env.step_and_maybe_reset(moment)
-        moves.append(chosen)
-    assert all(map(torch.equal, *moves))
-
-
 @pytest.mark.parametrize("form", FORMS, ids=str)
 def test_specs_match_the_form_of_the_observation(form):
-    game = presets.game("commons")
-    env = CommonsEnv(Game(map=game.map, rules=game.rules, observation=form), worlds=2, seed=1, state=True)
+    env = CommonsEnv(replace(presets.game("commons"), observation=form), worlds=2, seed=1, state=True)
     check_env_specs(env)
     moment = env.reset()
     channels, rows, columns = env.game.observation_shape
@@ -205,9 +182,7 @@ def test_specs_match_the_form_of_the_observation(form):
 
 def test_the_form_of_the_observation_does_not_change_the_game():
     game = presets.game("commons", variant="as_run")
-    batches = [
-        Batch(Game(map=game.map, rules=game.rules, observation=form), 2) for form in (Observation(), *FORMS)
-    ]
+    batches = [Batch(replace(game, observation=form), 2) for form in (Observation(), *FORMS)]
     outputs = [batch.begin(batch.new_output()) for batch in batches]
     for turn in random_actions(100, 2, game):
         plain, *others = (batch.play(turn, out) for batch, out in zip(batches, outputs, strict=True))

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from cprl import Game, Map, Rules, maps, presets
 from cprl.commons import compiled, loops
 from cprl.commons.batch import Batch
-from cprl.commons.near import neighbours
+from cprl.commons.near import sites_around
 from cprl.commons.world import COL_STEP, ROW_STEP, empty_scratch
 
 # Random walls and boundaries may part all agents from all apples.
@@ -58,11 +58,8 @@ def check_places(game, seed):
     """No two agents in play share a cell, and no agent stands in a wall."""
     for worlds, *_ in played(game, random_actions(40, 3, game, seed=seed), seed=seed):
         for b in range(3):
-            places = [
-                (int(r), int(c))
-                for r, c, playing in zip(worlds.row[b], worlds.col[b], worlds.in_play[b], strict=True)
-                if playing
-            ]
+            in_play = worlds.in_play[b]
+            places = list(zip(worlds.row[b, in_play].tolist(), worlds.col[b, in_play].tolist(), strict=True))
             assert len(set(places)) == len(places)
             assert not set(places) & set(game.map.walls)
             assert all(0 <= r < game.map.height and 0 <= c < game.map.width for r, c in places)
@@ -87,17 +84,15 @@ def check_apples(game, seed):
     """stock + harvest = first stock + regrown, and the apples near each site are counted."""
     moments = played(game, random_actions(40, 3, game, seed=seed), seed=seed)
     first_stock = game.tables.first_stock
-    first, others = neighbours(game.map, game.rules)
-    near = np.split(others, first[1:-1])
-    harvest = np.zeros(3, np.int64)
-    regrown = np.zeros(3, np.int64)
+    near = sites_around(game.map, game.rules)
+    harvest, regrown = np.zeros((2, 3), np.int64)
     for worlds, output, *_ in moments:
         harvest += output.harvest.sum(1).astype(np.int64)
         regrown += output.regrown[:, 0]
         assert np.array_equal(output.stock[:, 0] + harvest, first_stock + regrown)
         assert np.array_equal(worlds.stock.sum(1), output.stock[:, 0])
         assert np.array_equal(worlds.harvested.sum(1), harvest)
-        counted = [[int(stock[own].sum()) for own in near] for stock in worlds.stock]
+        counted = [[stock[others].sum() for others in near] for stock in worlds.stock]
         assert np.array_equal(worlds.near, counted)
 
 
@@ -142,36 +137,40 @@ def check_no_beam_passes_a_wall(game, seed):
     return hits
 
 
-@settings(max_examples=60, deadline=None)
-@given(games(), st.integers(0, 2**32))
+SEEDS = st.integers(0, 2**32)
+SOME = settings(max_examples=60, deadline=None)
+
+
+@SOME
+@given(games(), SEEDS)
 def test_no_two_agents_in_play_share_a_cell_and_no_agent_stands_in_a_wall(game, seed):
     check_places(game, seed)
 
 
 @pytest.mark.integration
-@settings(max_examples=60, deadline=None)
-@given(games(), st.integers(0, 2**32), st.randoms(use_true_random=False))
+@SOME
+@given(games(), SEEDS, st.randoms(use_true_random=False))
 def test_the_game_does_not_depend_on_agent_indices(game, seed, random):
     order = list(range(game.agents))
     random.shuffle(order)
     check_agent_indices_do_not_matter(game, seed, order)
 
 
-@settings(max_examples=60, deadline=None)
-@given(games(), st.booleans(), st.integers(0, 2**32))
+@SOME
+@given(games(), st.booleans(), SEEDS)
 def test_apples_are_conserved_and_counted(game, regrow_before_bites, seed):
     check_apples(replace(game, rules=replace(game.rules, regrow_before_bites=regrow_before_bites)), seed)
 
 
-@settings(max_examples=60, deadline=None)
-@given(games(freeze_steps=3), st.booleans(), st.integers(0, 2**32))
+@SOME
+@given(games(freeze_steps=3), st.booleans(), SEEDS)
 def test_no_agent_out_of_play_acts(game, as_run, seed):
     rules = replace(game.rules, pairwise_clashes=as_run, freeze_counts_tag_turn=as_run)
     check_no_agent_out_of_play_acts(replace(game, rules=rules), seed)
 
 
-@settings(max_examples=60, deadline=None)
-@given(games(beam_width_cells=3), st.integers(0, 2**32))
+@SOME
+@given(games(beam_width_cells=3), SEEDS)
 def test_no_beam_passes_a_wall(game, seed):
     check_no_beam_passes_a_wall(game, seed)
 

@@ -4,12 +4,12 @@ from itertools import product
 
 import numpy as np
 import pytest
+from boards import Play
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cprl import Game, Map, Rules, maps, presets
-from cprl.commons.batch import Batch
-from cprl.commons.near import neighbours
+from cprl import Map, Rules, maps, presets
+from cprl.commons.near import sites_around
 from cprl.commons.yields import sustainable_yield
 
 CROSS = maps.parse(
@@ -66,11 +66,6 @@ RULES = st.builds(
 )
 
 
-def around(board, rules):
-    first, near = neighbours(board, rules)
-    return [near[first[k] : first[k + 1]].tolist() for k in range(len(board.sites))]
-
-
 def bound_of(harvested, near, rules):
     """What these sites bear at least if they are harvested and no others are, worked out site by site."""
     most, total = max(map(len, near)), 0.0
@@ -83,7 +78,7 @@ def bound_of(harvested, near, rules):
 
 def best_set(board, rules):
     """The best of all sets of harvested sites, and its bound."""
-    near = around(board, rules)
+    near = sites_around(board, rules)
     sets = [np.array(chosen, bool) for chosen in product((False, True), repeat=len(near))]
     bounds = [bound_of(chosen, near, rules) for chosen in sets]
     return sets[int(np.argmax(bounds))], max(bounds)
@@ -95,14 +90,14 @@ def best_set(board, rules):
 def test_no_set_of_harvested_sites_bears_less_than_is_claimed(board, rules):
     claimed, (_, best) = sustainable_yield(board, rules), best_set(board, rules)
     assert claimed <= best + 1e-9, "all sets were tried"
-    singles = [bound_of(np.arange(len(board.sites)) == k, around(board, rules), rules) for k in (0, -1)]
-    assert claimed >= max(0.0, singles[0]) - 1e-9, "one site alone is a set, too"
+    first_alone = bound_of(np.arange(len(board.sites)) == 0, sites_around(board, rules), rules)
+    assert claimed >= first_alone - 1e-9, "one site alone is a set, too"
 
 
 def harvested_per_turn(board, rules, harvested, *, worlds=300, turns=300, rng):
     """Apples a turn of a harvest of some sites as soon as they are full, played without the game's code."""
     near = np.zeros((len(board.sites),) * 2)
-    for k, others in enumerate(around(board, rules)):
+    for k, others in enumerate(sites_around(board, rules)):
         near[k, others] = 1
     probs = np.array(rules.regrow_prob)
     full, taken = np.ones((worlds, len(board.sites)), bool), 0
@@ -133,11 +128,7 @@ def test_a_harvest_of_the_best_set_bears_at_least_its_bound(seed, before):
 def test_two_agents_that_stay_on_two_sites_of_a_cross_harvest_its_yield(rules, expected):
     # Agent 0 steps right onto (0, 1), agent 1 down onto (1, 2); three sites stay full, so the chance is 0.05
     # whatever the other harvested site holds.
-    batch = Batch(Game(map=CROSS, rules=rules), 64, seed=1)
-    output, actions = batch.begin(batch.new_output()), np.zeros((64, 2), np.int64)
-    batch.play(actions, output)
-    actions[:], taken = 7, 0.0
-    for _ in range(900):
-        taken += float(batch.play(actions, output).harvest.sum())
+    play = Play(CROSS, worlds=64, seed=1, **vars(rules)).turn("forward")
+    taken = sum(play.turn("stay").output.harvest.sum() for _ in range(900))
     # About 5,600 apples, each by chance: a standard deviation of 75, 1.3 %.
     assert taken / (64 * 900) == pytest.approx(expected, rel=0.05)
