@@ -18,6 +18,7 @@ from cprl.commons.picture import world_image
 from cprl.commons.world import PLAYING, Bytes, StepOutput
 from cprl.envs.drivers import device_of, drawn_seed, driver_for
 from cprl.envs.stepping import begin_states, carry_on, chosen
+from cprl.institutions.ledger import Payments
 from cprl.system.compat import LeanStepEnv, flag_spec, unchecked_tensordict
 from cprl.system.memory import check_memory
 from cprl.values import Range, Seed, checked
@@ -31,11 +32,7 @@ _AHEAD_TURNS = 16
 _BALLOT_ENTRIES = (keys.IN_FORCE, keys.BALLOTS_DUE)
 _PAID_ENTRIES = ("fines", "transfers", "violated", "counts")
 """Entries of agents in games with institutions."""
-_REPLACED = frozenset((*WORLD_ENTRIES, *DONE_ENTRIES, *_BALLOT_ENTRIES, *_AGENT_ENTRIES, *_PAID_ENTRIES)) | {
-    *(keys.STATE, keys.AGENTS, "next", "_reset", "scoreboard", "stock_gauge", "reward"),
-    keys.APPLE_AHEAD[1],
-    *(keys.WASTE, *keys.CLEANED[1:]),
-}
+_REPLACED = frozenset((*StepOutput._fields, *Payments._fields, keys.STATE, keys.AGENTS, "next", "_reset"))
 """The entries that the environment writes anew in each turn."""
 
 

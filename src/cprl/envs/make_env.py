@@ -125,14 +125,15 @@ def check_env(env: EnvBase, worlds: int) -> None:
         raise ValueError(f"the environment has batch size {list(env.batch_size)}; allowed: [{worlds}]")
     spaces = spaces_of(env)
     reward = env.full_reward_spec.get(keys.REWARD, None)
-    if reward is None or tuple(reward.shape) != (worlds, spaces.agents, 1):
-        shape = None if reward is None else list(reward.shape)
-        raise ValueError(f'("agents", "reward") is {shape}; allowed: [{worlds}, {spaces.agents}, 1]')
+    _check_shape('("agents", "reward")', reward, [worlds, spaces.agents, 1])
     for name in (keys.DONE, keys.TERMINATED, keys.TRUNCATED):
-        done = env.full_done_spec.get(name, None)
-        if done is None or tuple(done.shape) != (worlds, 1):
-            shape = None if done is None else list(done.shape)
-            raise ValueError(f'"{name}" at the root is {shape}; allowed: [{worlds}, 1]')
+        _check_shape(f'"{name}" at the root', env.full_done_spec.get(name, None), [worlds, 1])
+
+
+def _check_shape(name: str, spec: Any, allowed: list[int]) -> None:
+    shape = None if spec is None else list(spec.shape)
+    if shape != allowed:
+        raise ValueError(f"{name} is {shape}; allowed: {allowed}")
 
 
 def _spec(env: EnvBase, name: str) -> Any:

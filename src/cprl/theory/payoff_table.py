@@ -10,7 +10,6 @@ Multi-Agent Systems" (2002); for the reduction to pairs, of which it is the case
 "Methods for Empirical Game-Theoretic Analysis" (2006).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -103,17 +102,9 @@ class PayoffTable:
     def deviations(self) -> Values:
         """float64 [C', S]: what an agent gets who plays a strategy, by how many of the other N - 1 play each,
         in the rows of `compositions(N - 1, S)`."""
-        others, _ = self._others
-        steps = np.eye(self.strategies, dtype=np.int64)
-        return np.array(
-            [
-                [
-                    self.payoffs[self.rows[tuple((counts + step).tolist())], strategy]
-                    for strategy, step in enumerate(steps)
-                ]
-                for counts in others
-            ]
-        )
+        rows = [[self.rows[counts] for counts in self._with_one_more(others)] for others in self._others[0]]
+        values: Values = self.payoffs[rows, np.arange(self.strategies)]
+        return values
 
     @cached_property
     def pairs(self) -> Values:
@@ -161,20 +152,17 @@ class PayoffTable:
         """The counts of the compositions in which no agent gains if it alone plays another strategy, but for
         rounding."""
         most = _ROUNDING * float(np.nanmax(self.payoffs) - np.nanmin(self.payoffs))
-        return [counts for counts in self.rows if all(gain <= most for gain in self._gains(counts))]
+        left = {
+            counts
+            for others, payoffs in zip(self._others[0], self.deviations, strict=True)
+            for counts, payoff in zip(self._with_one_more(others), payoffs, strict=True)
+            if payoffs.max() - payoff > most
+        }
+        return [counts for counts in self.rows if counts not in left]
 
-    def _gains(self, counts: Sequence[int]) -> list[float]:
-        """What an agent gains by another strategy, for every strategy that is played."""
-        gains = []
-        for played in np.flatnonzero(counts):
-            for other in range(self.strategies):
-                if other != played:
-                    there = list(counts)
-                    there[played] -= 1
-                    there[other] += 1
-                    got = self.payoffs[self.rows[tuple(there)], other]
-                    gains.append(float(got - self.payoffs[self.rows[tuple(counts)], played]))
-        return gains
+    def _with_one_more(self, others: Counts) -> list[tuple[int, ...]]:
+        """The counts if one more agent plays each strategy in turn."""
+        return list(map(tuple, (others + np.eye(self.strategies, dtype=np.int64)).tolist()))
 
 
 def sharing_table(game: SharingGame, levels: ArrayLike) -> PayoffTable:

@@ -39,15 +39,12 @@ class Worth(Protocol):
     @property
     def most(self) -> float:
         """The total from which on a unit is worth nothing."""
-        ...
 
     def at(self, total: float) -> float:
         """v(A)."""
-        ...
 
     def slope(self, total: float) -> float:
         """v'(A), below `most`."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -205,17 +205,12 @@ def _end(table: PayoffTable, start: Values) -> Values | None:
 
     scaled, flow = table.normalised, extra("open_spiel.python.egt.dynamics").replicator
 
-    def shares_of(cells: Values) -> Values:
-        positive = np.maximum(cells, 0.0)
-        whole: Values = positive / positive.sum()
-        return whole
-
     def speed(_: float, cells: Values) -> Values:
-        shares = shares_of(cells)
+        shares = _shares(cells)
         return np.asarray(flow(shares, scaled.against_shares(shares)), dtype=np.float64)
 
     def is_at_rest(cells: Values) -> bool:
-        shares = shares_of(cells)
+        shares = _shares(cells)
         payoffs = scaled.against_shares(shares)
         gains = payoffs - shares @ payoffs
         return bool(np.abs(shares * gains).max() <= _AT_REST and gains.max() <= _NO_GAIN)
@@ -223,7 +218,7 @@ def _end(table: PayoffTable, start: Values) -> Values | None:
     solver = integrate.LSODA(speed, 0.0, start, np.inf, rtol=1e-4, atol=1e-8)
     for _ in range(_STEPS):
         if is_at_rest(solver.y):
-            return shares_of(solver.y)
+            return _shares(solver.y)
         if solver.status != "running":
             return None
         solver.step()
