@@ -62,15 +62,12 @@ def quotas(fine):
 
 
 def taxes():
-    brackets = st.sampled_from([(), ((0, 0.2), (1, 0.5)), ((0, 0.0), (2.5, 1.0))])
-    kinds = st.sampled_from(["equal", "none"])
-    periods = st.integers(1, 7)
     return st.builds(
         law.Tax,
         rate=st.floats(0, 1, allow_subnormal=False),
-        redistribution=kinds,
-        period_steps=periods,
-        brackets=brackets,
+        redistribution=st.sampled_from(["equal", "none"]),
+        period_steps=st.integers(1, 7),
+        brackets=st.sampled_from([(), ((0, 0.2), (1, 0.5)), ((0, 0.0), (2.5, 1.0))]),
     )
 
 

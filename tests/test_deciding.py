@@ -76,27 +76,12 @@ def learned(decider, *turns):
     return decider
 
 
-def by_chance(game=MEADOW, worlds=1):
-    return random_agents(game.spaces, (0, 1, 2), replicas=worlds, seed=0)
+def by_chance():
+    return random_agents(MEADOW.spaces, (0, 1, 2), replicas=1, seed=0)
 
 
 def due(*rows):
     return torch.tensor(rows, dtype=torch.bool)
-
-
-def trained_for(steps, population, env, **how):
-    training = Training(
-        env,
-        population.learners,
-        others=population.others,
-        decisions=population.decisions,
-        episodes=1000,
-        **how,
-    )
-    training.start()
-    for _ in range(steps):
-        training.step()
-    return training
 
 
 class Noting:
@@ -107,6 +92,18 @@ class Noting:
 
     def on_episode(self, episode, learning):
         self.episodes.append(episode)
+
+
+def trained_for(steps, agents, *, worlds=2, engine="eager", transforms=(), **options):
+    """The population of agents that were trained on the meadow, and the episodes that they played."""
+    env, noting = make_env(MEADOW, worlds=worlds, seed=4, transforms=transforms), Noting()
+    population = Population(env, agents, seed=6, engine=engine)
+    options |= {"others": population.others, "decisions": population.decisions, "callbacks": [noting]}
+    training = Training(env, population.learners, episodes=1000, **options)
+    training.start()
+    for _ in range(steps):
+        training.step()
+    return population, noting.episodes
 
 
 # ---- one number for all ballots
@@ -222,8 +219,7 @@ def test_ballots_are_due_before_the_first_turn_of_every_kth_episode():
 
 def test_a_world_that_is_reset_alone_is_due_alone():
     env = CommonsEnv(MEADOW, 2, seed=1)
-    stepped = env.step(env.rand_action(env.reset()))["next"]
-    stepped["_reset"] = torch.tensor([[False], [True]])
+    stepped = env.step(env.rand_action(env.reset()))["next"].set("_reset", torch.tensor([[False], [True]]))
     assert env.reset(stepped)[keys.BALLOTS_DUE].tolist() == [[False, False], [True, True]]
 
 
@@ -234,10 +230,9 @@ def test_a_world_that_is_reset_alone_is_due_alone():
 @pytest.mark.parametrize(("board", "majority", "choice"), [(ONE_RICH, (1, 2), 1), (TWO_RICH, (0, 1), 0)])
 def test_a_majority_finds_the_tax_that_pays_it_more(board, majority, choice):
     game = Game(map=board, rules=RULES, institutions=(VOTE,))
-    env, noting = CommonsEnv(game, 4, seed=1), Noting()
-    agents = (replace(TABULAR, decisions=Bandit(epsilon_decay_episodes=60)),) * 3
-    population = Population(env, agents, seed=2)
-    train(env, population.learners, decisions=population.decisions, episodes=120, callbacks=[noting])
+    env = CommonsEnv(game, 4, seed=1)
+    population = Population(env, (replace(TABULAR, decisions=Bandit(epsilon_decay_episodes=60)),) * 3, seed=2)
+    train(env, population.learners, decisions=population.decisions, episodes=120)
     best = population.decisions.best()[:, majority, 0]
     assert (best == choice).all(), population.decisions.values
     played = evaluate(CommonsEnv(game, 4, seed=9), population.policy(1), explore=True)
@@ -330,15 +325,13 @@ def test_a_person_who_decides_is_heard():
 
 def test_agents_of_an_earlier_run_decide_as_they_did_there(in_one_go, monkeypatch, tmp_path):
     monkeypatch.chdir(in_one_go.parent)
-    env = make_env(MEADOW, worlds=2, seed=4)
     frozen = [Frozen(in_one_go.name, agent, None) for agent in range(3)]
     loaded = cprl.load(in_one_go, allow=ALLOW)
-    population = Population(env, frozen, seed=6)
-    training = trained_for(13, population, env)
+    population, _ = trained_for(13, frozen)
     for replica in range(2):
         best = loaded.policy(replica).decisions.best()[0, :2].tolist()
         assert population.decisions.best()[replica, :2].tolist() == best
-    assert training.decisions.learned() == {}
+    assert population.decisions.learned() == {}
     other = replace(MEADOW, institutions=(replace(VOTE, choices=(0.0, 0.5)), Sanctioner()))
     with pytest.raises(ValueError, match=r"have ballots \[\('the tax rate', \(0.0, 1.0\)\).*this game has"):
         Population(make_env(other), frozen)
@@ -366,14 +359,13 @@ REPLAY = DQNSettings(
 @pytest.mark.integration
 @pytest.mark.parametrize("engine", ["eager", "torchrl"])
 def test_engines_and_collectors_of_torchrl_have_the_same_decisions(engine):
-    found = []
-    for make_collector in (None, stock_collector, partial(stock_collector, steps=4)):
-        env, noting = make_env(MEADOW, worlds=2, seed=4), Noting()
-        population = Population(env, (Learning(DQN(settings=REPLAY)),) * 3, seed=6, engine=engine)
-        how = {} if make_collector is None else {"make_collector": make_collector}
-        trained_for(6 if "steps" in repr(make_collector) else 24, population, env, callbacks=[noting], **how)
-        assert len(noting.episodes) == 8
-        found.append([episode.decision.tolist() for episode in noting.episodes])
+    found, learning = [], (Learning(DQN(settings=REPLAY)),) * 3
+    four_at_once = partial(stock_collector, steps=4)
+    for steps, collector in ((24, None), (24, stock_collector), (6, four_at_once)):
+        options = {"make_collector": collector} if collector else {}
+        _, episodes = trained_for(steps, learning, engine=engine, **options)
+        assert len(episodes) == 8
+        found.append([episode.decision.tolist() for episode in episodes])
     assert found[0] == found[1], "the collector's first call, which it makes to look, draws nothing"
     assert found[0][:2] == found[2][:2]
 
@@ -384,22 +376,17 @@ def test_transforms_and_teams_decide_too():
         "torchrl.envs.transforms:RewardScaling",
         arguments={"loc": 0.0, "scale": 0.5, "in_keys": [["agents", "reward"]]},
     )
-    env, noting = make_env(MEADOW, worlds=2, seed=4, transforms=[scaled]), Noting()
     team = Team(VDN(settings=REPLAY), agents=(0, 2), decisions=Bandit(step_size=1.0))
-    population = Population(env, (team, Scripted()), seed=6, engine="eager")
-    trained_for(24, population, env, callbacks=[noting])
-    last = noting.episodes[-1]
+    population, (*_, last) = trained_for(24, (team, Scripted()), transforms=[scaled])
     firsts = choices_of(last.decision, (2, 3))[:, 0]
     values = population.decisions.values[last.world, (0, 2), firsts[[0, 2]]]
     assert np.allclose(values, last.return_.sum()), "with a step of 1 the last return, which a team wants"
 
 
 def test_decisions_are_learned_from_what_an_agent_wants():
-    env, noting = make_env(MEADOW, worlds=1, seed=4), Noting()
     at_once = replace(TABULAR, decisions=Bandit(step_size=1.0))
-    population = Population(env, (at_once, replace(at_once, reward="team"), Scripted("greedy")), seed=6)
-    trained_for(12, population, env, callbacks=[noting])
-    last = noting.episodes[-1]
+    agents = (at_once, replace(at_once, reward="team"), Scripted("greedy"))
+    population, (*_, last) = trained_for(12, agents, worlds=1)
     firsts = choices_of(last.decision, (2, 3))[:, 0]
     found = population.decisions.values[0, (0, 1), firsts[:2]]
     assert last.return_[0] != last.return_.sum()

@@ -125,17 +125,6 @@ def test_each_agent_has_lines_of_what_it_paid_got_and_broke(run):
             assert [line[0] for line in logged] == pytest.approx(means)
 
 
-def test_events_are_in_words():
-    curves = Curves(agents=("a", "b"), in_force=("the tax rate",))
-
-    class Episode:
-        violations, fines, in_force = np.array([0, 1]), np.array([0.0, 1.5]), np.array([0.25])
-
-    assert in_words(Episode(), curves) == "the tax rate: 0.25; 1 violation; fined 0, 1.5"
-    Episode.violations, Episode.fines, Episode.in_force = None, None, None
-    assert in_words(Episode(), curves) == ""
-
-
 def test_only_games_with_institutions_have_their_tabs(run):
     _, viewer, _ = run
     curves = viewer.logger.curves

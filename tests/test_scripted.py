@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from boards import Play, drawn
-from tensordict.nn import TensorDictModuleBase
+from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import CommonsEnv, Game, Observation, Rules, maps, presets
@@ -16,11 +16,8 @@ from cprl.policies.assignment import AgentPolicies
 from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedActor
 
 
-class Stays(TensorDictModuleBase):
+class Stays(nn.Module):
     """Never moves."""
-
-    in_keys = ("observation",)
-    out_keys = ("action",)
 
     def __init__(self, actions):
         super().__init__()
@@ -36,9 +33,9 @@ class Scene(Play):
     def __init__(self, drawing, policy, *, worlds=1, seed=0, spare=3, **rules):
         self.game = Game(map=maps.parse(drawing), rules=Rules(**{"regrow_prob": (0.0,), **rules}))
         seeds = [(seed, world) for world in range(worlds)]
-        actors = [ScriptedActor(policy, self.game, seeds=seeds, agents=1, spare=spare)]
-        actors += [Stays(len(self.game.actions)) for _ in range(self.game.agents - 1)]
-        self.policy = AgentPolicies({(0,): actors[0], **dict(enumerate(actors[1:], 1))})
+        actor = ScriptedActor(policy, self.game, seeds=seeds, agents=1, spare=spare)
+        others = {agent: Stays(len(self.game.actions)) for agent in range(1, self.game.agents)}
+        self.policy = AgentPolicies({(0,): actor, **others})
         self.env = CommonsEnv(self.game, worlds, seed=seed)
         self.batch, self.bitten = self.env.worlds, 0.0
 
@@ -190,8 +187,8 @@ def test_on_commons_greedy_agents_deplete_the_stock_and_sustainable_agents_do_no
 
 
 def test_aggressive_agents_tag_more_than_territorial_ones_and_pacifists_never_fire():
-    rules = replace(presets.game("commons").rules, episode_steps=200)
-    game = replace(presets.game("commons"), rules=rules)
+    game = presets.game("commons")
+    game = replace(game, rules=replace(game.rules, episode_steps=200))
     played = {name: population(name, game, 4) for name in ("aggressive", "territorial", "pacifist")}
     tagged = {name: mean(episodes, "tagged") for name, episodes in played.items()}
     assert tagged["aggressive"] > tagged["territorial"] > tagged["pacifist"] == 0
@@ -203,6 +200,7 @@ FORMS = [
     Observation(encoding="one_hot"),
     Observation(agents_apart=True),
     Observation(encoding="one_hot", agents_apart=True, stock_gauge=True),
+    Observation(scoreboard="planes", stock_gauge="planes"),
 ]
 
 
@@ -215,21 +213,17 @@ def test_actions_do_not_depend_on_the_form_of_the_observation(policy, may_fire):
     for form in FORMS:
         game = Game(map=walled, rules=rules, observation=form)
         actor = ScriptedActor(policy, game, seeds=[(1, lane) for lane in range(9)], agents=3)
-        steps = CommonsEnv(game, 3, seed=0).rollout(
-            40, AgentPolicies({(0, 1, 2): actor}), break_when_any_done=False
-        )
-        courses.append(steps["agents", "action"])
+        agents, env = AgentPolicies({(0, 1, 2): actor}), CommonsEnv(game, 3, seed=0)
+        courses.append(env.rollout(40, agents, break_when_any_done=False)["agents", "action"])
     assert courses[0].max() < len(game.actions)
     assert courses[0].unique().numel() > 3
     for course in courses[1:]:
         assert torch.equal(course, courses[0])
 
 
-def windows(game, worlds, turns=15):
+def windows(game, worlds):
     """The observations of B worlds after some turns of random play, [B, N, C, X, Y]."""
-    return (
-        CommonsEnv(game, worlds, seed=0).rollout(turns)["next", "agents", "observation"][:, -1].contiguous()
-    )
+    return CommonsEnv(game, worlds, seed=0).rollout(15)["next", "agents", "observation"][:, -1].contiguous()
 
 
 @pytest.mark.parametrize("policy", SCRIPTED_POLICIES)
