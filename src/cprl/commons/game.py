@@ -24,7 +24,6 @@ from cprl.institutions import COUNTS, Institution, law
 from cprl.institutions.arrays import Form, changed, forms_of
 from cprl.institutions.base import Ballot
 from cprl.institutions.ledger import Payments
-from cprl.institutions.votes import ballots_of, decision_options
 from cprl.system.memory import check_memory
 from cprl.values import Value
 
@@ -170,13 +169,18 @@ class Game(Value):
 
     @property
     def ballots(self) -> tuple[Ballot, ...]:
-        """What agents decide on at an episode's first turn."""
-        return ballots_of(self)
+        """What agents decide on at an episode's first turn, in the order of `institutions`.
+
+        A decision is one number for all ballots: the choice of the first one plus its number of choices times
+        the choice of the second one, and so on.
+        """
+        ballots = (institution.ballot(self.agents) for institution in self.institutions)
+        return tuple(ballot for ballot in ballots if ballot is not None)
 
     @property
     def decisions(self) -> int:
         """The number of options of ("agents", "decision"); 0 where there is nothing to decide."""
-        return decision_options(self)
+        return prod(len(ballot.choices) for ballot in self.ballots) if self.ballots else 0
 
     @property
     def spaces(self) -> Spaces:

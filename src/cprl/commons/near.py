@@ -23,26 +23,25 @@ def distance(norm: Norm, rows: int, cols: int) -> float:
     return max(abs(rows), abs(cols))
 
 
-def near_cells(board: Map, rules: Rules) -> list[tuple[int, int]]:
-    """The (rows, cols) from a cell to each other cell within `regrow_radius_cells`, as far as the board
-    extends."""
+def near_cells(rules: Rules, *, rows: int, cols: int) -> list[tuple[int, int]]:
+    """The (rows, cols) from a cell to each other cell within `regrow_radius_cells`, so many rows and columns
+    away at most."""
     reach = int(rules.regrow_radius_cells)
-    rows, cols = min(reach, board.height - 1), min(reach, board.width - 1)
     return [
         (row, col)
-        for row in range(-rows, rows + 1)
-        for col in range(-cols, cols + 1)
+        for row in range(-min(reach, rows), min(reach, rows) + 1)
+        for col in range(-min(reach, cols), min(reach, cols) + 1)
         if (row, col) != (0, 0) and distance(rules.regrow_norm, row, col) <= rules.regrow_radius_cells
     ]
 
 
 def neighbours(board: Map, rules: Rules) -> tuple[Ints, Indices]:
     """The other sites within `regrow_radius_cells` of each site: `Tables.near_first`, `Tables.near_sites`."""
-    sites, offsets = np.array(board.sites), np.array(near_cells(board, rules), np.int64).reshape(-1, 2)
+    sites, middle = np.array(board.sites), (board.height - 1, board.width - 1)
+    offsets = np.array(near_cells(rules, rows=middle[0], cols=middle[1]), np.int64).reshape(-1, 2)
     on_cell = np.full((board.height, board.width), -1, np.int32)
     on_cell[tuple(sites.T)] = np.arange(len(sites))
     is_near = np.zeros((2 * board.height - 1, 2 * board.width - 1), np.bool_)
-    middle = board.height - 1, board.width - 1
     is_near[tuple((offsets + middle).T)] = True
     counts, sites_near = [], []
     near: NDArray[np.bool_]

@@ -29,7 +29,7 @@ from cprl.institutions import Law
 from cprl.institutions.arrays import filled, slicer
 from cprl.institutions.base import Institution, numbered
 from cprl.institutions.ledger import COUNTS, Ledger, violate
-from cprl.institutions.votes import MOST_DECISIONS, decision_options
+from cprl.institutions.votes import MOST_DECISIONS
 
 MODULES: Final = {
     name: import_module(kind.__module__)
@@ -204,10 +204,9 @@ def check_institutions(game: Any) -> None:
                 "which agents may fire"
             )
         institution.check(game)
-    options = decision_options(game)
-    if options > MOST_DECISIONS:
+    if game.decisions > MOST_DECISIONS:
         raise ValueError(
-            f"Game.institutions lets agents choose from {options:,} options; allowed: at most "
+            f"Game.institutions lets agents choose from {game.decisions:,} options; allowed: at most "
             f"{MOST_DECISIONS:,}"
         )
 

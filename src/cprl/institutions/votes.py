@@ -1,7 +1,6 @@
 """Vote: agents decide on a tax or a quota; and how ballots of all institutions are held."""
 
 from dataclasses import dataclass
-from math import prod
 from typing import Annotated, Any, ClassVar, Final, NamedTuple
 
 import numpy as np
@@ -73,22 +72,6 @@ class Vote(Institution):
         return [("in force", ballot)]
 
 
-def ballots_of(game: Any) -> tuple[Ballot, ...]:
-    """What the agents of a game decide on, in the order of its institutions.
-
-    A decision is one number for all ballots: the choice of the first one plus its number of choices times the
-    choice of the second one, and so on.
-    """
-    ballots = (institution.ballot(game.agents) for institution in game.institutions)
-    return tuple(ballot for ballot in ballots if ballot is not None)
-
-
-def decision_options(game: Any) -> int:
-    """The number of options of ("agents", "decision"); 0 where there is nothing to decide."""
-    sizes = [len(ballot.choices) for ballot in ballots_of(game)]
-    return prod(sizes) if sizes else 0
-
-
 class Arrays(NamedTuple):
     """All ballots of a game, one per index of axis V."""
 
@@ -103,7 +86,7 @@ class Arrays(NamedTuple):
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    ballots = ballots_of(game)
+    ballots = game.ballots
     choices = np.zeros((len(ballots), max((len(ballot.choices) for ballot in ballots), default=1)))
     for number, ballot in enumerate(ballots):
         choices[number, : len(ballot.choices)] = ballot.choices
@@ -122,7 +105,7 @@ def is_due(ballots: Arrays, ballot: int, episode: int) -> bool:
 
 
 def choice_of(ballots: Arrays, ballot: int, decision: int) -> int:
-    """The choice that a decision makes on a ballot; see `ballots_of`."""
+    """The choice that a decision makes on a ballot; see `cprl.Game.ballots`."""
     for before in range(ballot):
         decision //= ballots.options[before]
     return decision % ballots.options[ballot]

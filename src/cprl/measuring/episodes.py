@@ -87,7 +87,7 @@ class Episode:
     counts: Mapping[str, NDArray[np.int64]] | None = None
     """[N] by name, what the game's institutions counted, see `cprl.measuring.institutions.counts_for`."""
     decision: NDArray[np.int64] | None = None
-    """[N], what each agent had decided, see `cprl.institutions.votes.ballots_of`; None in games that ask
+    """[N], what each agent had decided, see `cprl.Game.ballots`; None in games that ask
     nothing."""
     in_force: NDArray[np.float64] | None = None
     """[V], what was decided for this episode: tax rates, quotas, the agent elected."""

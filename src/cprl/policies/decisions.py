@@ -1,8 +1,8 @@
 """Decider: what all agents decide at an episode's begin, ("agents", "decision"), as part of a policy; and
 Bandit, how agents learn it from the returns of episodes.
 
-A decision is one number for all ballots of a game, see `cprl.institutions.votes.ballots_of`. Here each
-ballot's choice is made by itself: V ballots with 5 choices each are V tables of 5 values, not one of 5**V.
+A decision is one number for all ballots of a game, see `cprl.Game.ballots`. Here each ballot's choice is made
+by itself: V ballots with 5 choices each are V tables of 5 values, not one of 5**V.
 """
 
 from collections.abc import Mapping, Sequence

@@ -50,7 +50,7 @@ from cprl.commons import colours
 from cprl.commons.compiled import CPU_OPTIONS, compiled, kept_on_disk
 from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.commons.game import Game
-from cprl.commons.near import distance
+from cprl.commons.near import near_cells
 from cprl.commons.spaces import Spaces
 from cprl.commons.world import Bytes
 from cprl.policies import scripted_rules
@@ -189,14 +189,9 @@ def _frame(game: Game) -> tuple[int, Frame]:
     """The width of the frame on each side, and its layout."""
     rules, rows, columns = game.rules, game.rules.window_rows, game.rules.window_columns
     reach = min(int(rules.regrow_radius_cells), max(rows, columns))
-    rim, around = max(1, reach), range(-reach, reach + 1)
+    rim = max(1, reach)
     stride = columns + 2 * rim
-    near = [
-        r * stride + c
-        for r in around
-        for c in around
-        if (r, c) != (0, 0) and distance(rules.regrow_norm, r, c) <= rules.regrow_radius_cells
-    ]
+    near = [row * stride + col for row, col in near_cells(rules, rows=reach, cols=reach)]
     cells = np.add.outer((np.arange(rows) + rim) * stride, np.arange(columns) + rim)
     return rim, Frame(
         stride=stride,
