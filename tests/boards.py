@@ -11,15 +11,27 @@ import numpy as np
 
 from cprl import Game, Map, Observation, Rules, maps
 from cprl.commons.batch import Batch, turn_of
-from cprl.commons.colours import CLASS_NAMES, COLOURS, FIRST_AGENT, class_colour
+from cprl.commons.colours import CLASS_NAMES, FIRST_AGENT, class_colour
 from cprl.commons.maps import SIGN_OF_HEADING
 from cprl.commons.world import StepOutput, Worlds
 from cprl.institutions import COUNTS, Institution
 from cprl.institutions.arrays import DERIVED, STATE, STEPS, lasting
 from cprl.institutions.ledger import Payments
 
-SIGNS = ".#AmboS?~Hc"
-RGB_SIGN, SIGN_OF_NAME = (dict(zip(kinds, SIGNS, strict=True)) for kinds in (COLOURS, CLASS_NAMES))
+RGB_SIGN = {
+    (10, 10, 10): ".",
+    (125, 125, 125): "#",
+    (0, 255, 0): "A",
+    (50, 50, 50): "m",
+    (255, 204, 51): "b",
+    (255, 0, 0): "o",
+    (0, 0, 255): "S",
+    (0, 0, 0): "?",
+    (70, 120, 170): "~",
+    (113, 75, 24): "H",
+    (100, 255, 255): "c",
+}
+SIGN_OF_NAME = dict(zip(CLASS_NAMES, ".#AmboS?~Hc", strict=True))
 
 
 class Play:

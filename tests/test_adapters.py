@@ -168,20 +168,17 @@ def played(make, step, game, turns, decisions):
             world.reset(options=options(game, decisions[episode]))
 
 
-SHORTER = {
+BY_ALL = {
     f"{board}, {name}": replace(
         (game := presets.game(board)), rules=replace(game.rules, episode_steps=130), observation=form
     )
     for board in presets.BOARDS
     for name, form in (("rgb", Observation()), ("rich", RICH))
 }
+BY_ALL |= {"institutions": EVERYTHING, "institutions, rich": RULED, "institutions, alone": ALONE}
 
 
-@pytest.mark.parametrize(
-    "game",
-    [*SHORTER.values(), EVERYTHING, RULED, ALONE],
-    ids=[*SHORTER, "institutions", "institutions, rich", "institutions, alone"],
-)
+@pytest.mark.parametrize("game", BY_ALL.values(), ids=BY_ALL)
 def test_all_adapters_play_the_same_game_for_the_same_seed(game):
     turns = random_actions(300, 1, game, seed=1)[:, 0]
     decisions = random_decisions(99, 1, game, seed=2)[:, 0]
@@ -204,12 +201,8 @@ def test_all_adapters_play_the_same_game_for_the_same_seed(game):
 def test_decisions_are_those_of_the_reset_in_pettingzoo_and_an_unnamed_agent_takes_the_first_option():
     game = replace(EVERYTHING, institutions=(Vote(on=Tax(redistribution="none"), choices=(0.0, 0.5, 1.0)),))
     adapter = parallel_env(game)
-    for decisions, rate in (
-        ({"agent_0": 2, "agent_2": 1}, 0.5),
-        ({"agent_1": 2}, 0.0),
-        ({}, 0.0),
-        (None, 0.0),
-    ):
+    cases = ({"agent_0": 2, "agent_2": 1}, 0.5), ({"agent_1": 2}, 0.0), ({}, 0.0), (None, 0.0)
+    for decisions, rate in cases:
         adapter.reset(options=None if decisions is None else {"decisions": decisions})
         adapter.step(dict.fromkeys(game.agent_names, 0))
         assert adapter.payments.in_force.tolist() == [[rate]]
