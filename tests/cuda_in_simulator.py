@@ -6,6 +6,7 @@ NUMBA_ENABLE_CUDASIM=1 python tests/cuda_in_simulator.py
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from cprl import institutions as law
 from cprl.commons.batch import Batch, turn_of
 from cprl.commons.cuda import THREADS_PER_BLOCK, CudaThreads
 
+GAMES = presets.GAMES
 WALLS = maps.parse(
     """
     A>A#.<.
@@ -54,9 +56,8 @@ def play(game: Game, *, worlds: int = 2, turns: int = 12) -> Batch:
     output, gpu_output = cpu.begin(cpu.new_output()), gpu.begin(gpu.new_output())
     assert_same(cpu, gpu, output, gpu_output, "at the start")
     decisions = random_decisions(turns, worlds, game)
-    for number, (turn, decided) in enumerate(
-        zip(random_actions(turns, worlds, game), decisions, strict=True)
-    ):
+    actions = random_actions(turns, worlds, game)
+    for number, (turn, decided) in enumerate(zip(actions, decisions, strict=True)):
         cpu.play(turn, output, decided)
         gpu.play(cuda.to_device(turn), gpu_output, cuda.to_device(decided))
         assert_same(cpu, gpu, output, gpu_output, f"turn {number}")
@@ -69,12 +70,6 @@ def play(game: Game, *, worlds: int = 2, turns: int = 12) -> Batch:
     return cpu
 
 
-def published(name: str) -> None:
-    """One of the four boards in one variant."""
-    board, variant = name.split(":")
-    play(presets.game(board, variant=variant))
-
-
 def forms() -> None:
     """Every form of observation, and walls that block sight."""
     rules = Rules(regrow_prob=(0.1, 0.5), freeze_steps=4, episode_steps=20, window_rows=3, window_columns=5)
@@ -84,11 +79,11 @@ def forms() -> None:
                 form = Observation(
                     area=area, encoding=encoding, agents_apart=others, scoreboard=others, stock_gauge=others
                 )
-                play(Game(map=WALLS, rules=rules, observation=form), turns=12)
+                play(Game(map=WALLS, rules=rules, observation=form))
     planes = Observation(scoreboard="planes", stock_gauge="planes")
-    play(Game(map=WALLS, rules=rules, observation=planes), turns=12)
+    play(Game(map=WALLS, rules=rules, observation=planes))
     hidden = Rules(regrow_prob=(0.1, 0.5), walls_block_sight=True, window_rows=3, window_columns=5)
-    play(Game(map=WALLS, rules=hidden), turns=12)
+    play(Game(map=WALLS, rules=hidden))
 
 
 def blocks() -> None:
@@ -153,13 +148,8 @@ def stopped() -> None:
         *(law.Rotation(window_steps=4), law.Sanctioner(agents=(1, 2))),
         law.GraduatedSanctions(freeze_steps=((1,), (2,), (3,)), on="tags"),
     )
-    rules = replace(
-        EVERYTHING.rules,
-        pairwise_clashes=True,
-        regrow_before_bites=True,
-        freeze_counts_tag_turn=True,
-        agent_1_right_moves_agent_0=True,
-    )
+    quirks = ("pairwise_clashes", "regrow_before_bites", "freeze_counts_tag_turn")
+    rules = replace(EVERYTHING.rules, agent_1_right_moves_agent_0=True, **dict.fromkeys(quirks, True))
     play(replace(EVERYTHING, rules=rules, institutions=own), turns=6)
 
 
@@ -180,18 +170,9 @@ def literature() -> None:
     play(Game(map=river, rules=second, institutions=fines), turns=16)
 
 
-CHECKS: dict[str, Callable[[], None]] = {
-    **{
-        name: (lambda name=name: published(name))
-        for name in (f"{board}:{variant}" for board, variant in presets.GAMES)
-    },
-    "forms": forms,
-    "blocks": blocks,
-    "state": state,
-    "unknown": unknown,
-    "institutions": institutions,
-    "stopped": stopped,
-    "literature": literature,
+CHECKS: dict[str, Callable[[], object]] = {
+    **{f"{board}:{variant}": partial(play, presets.game(board, variant=variant)) for board, variant in GAMES},
+    **{check.__name__: check for check in (forms, blocks, state, unknown, institutions, stopped, literature)},
 }
 
 if __name__ == "__main__":
