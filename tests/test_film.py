@@ -18,9 +18,9 @@ from stored_runs import CORRIDORS, command, stored
 from cprl import Game, Rules, load, maps
 from cprl.commons.colours import APPLE, GROUND, PALETTE, agent_colour
 from cprl.commons.picture import EMPTY_SITE_COLOUR
+from cprl.envs.matrix import stag_hunt
 from cprl.evaluation import film_pictures
 from cprl.evaluation.export import export_episodes
-from cprl.envs.matrix import stag_hunt
 from cprl.evaluation.film import Style, film, film_video, fresh_episode, titles_of
 from cprl.evaluation.film_pictures import EpisodePicture, nice
 from cprl.institutions import Monitoring, Quota
