@@ -19,14 +19,21 @@ BELOW: Final = "below random play"
 EXPLORING: Final = "exploring"
 
 FEWEST: Final = 10
+"""Episodes of the running mean at least; before there are as many nothing is judged."""
 SHARE: Final = 0.1
-SHORT: Final = 0.1
-LOST: Final = 1 / 3
-LEAST_LOSS: Final = 0.15
-REGAINED: Final = 1 / 4
-RISEN: Final = 0.1
+"""The share of the episodes so far whose mean is judged."""
 EXPLORES: Final = 0.5
-"""The numbers of `Now`, in the order in which its docstring has them."""
+"""An epsilon above it is exploration even while it does not fall."""
+RISEN: Final = 0.1
+"""The share of its level by which the mean must exceed it to be rising."""
+LOST: Final = 1 / 3
+"""The part of the peak's lead over random play that must be lost to be falling."""
+LEAST_LOSS: Final = 0.15
+"""The share of the peak that must be lost, however small its lead over random play."""
+REGAINED: Final = 1 / 4
+"""The part of the loss that must be regained to be recovering."""
+SHORT: Final = 0.1
+"""The share of random play by which the mean must fall short of it to be below it."""
 
 
 class Now:
@@ -120,6 +127,7 @@ class Now:
         return loss > 0 and loss >= LOST * lead and loss >= LEAST_LOSS * abs(self._top)
 
     def _look(self, epsilons: Mapping[str, float]) -> None:
+        """Judges whether learners explore."""
         came = {name: float(epsilon) for name, epsilon in epsilons.items() if isfinite(epsilon)}
         if any(epsilon > EXPLORES for epsilon in came.values()):
             self.explores = True
