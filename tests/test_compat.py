@@ -569,10 +569,6 @@ def test_torch_is_quiet_about_operations_that_its_code_calls_by_the_dispatcher(c
     assert len(caplog.messages) == 2
 
 
-def test_recordings_that_nothing_refers_to_can_be_ended():
-    compat.end_recordings()
-
-
 @pytest.mark.slow
 def test_recordings_that_nothing_refers_to_end_and_a_closed_logger_leaves_its_layouts_alone(tmp_path):
     command = [sys.executable, "-c", _RECORDINGS, str(tmp_path)]

@@ -197,19 +197,18 @@ def of_experiment_2(result: Result) -> Iterator[Claim]:
 def of_experiment_3(result: Result, others: Sequence[Result]) -> Iterator[Claim]:
     """Two learners get more than one, alike, in territories, use the beam less and less, and sustain."""
     own = result.over_training("collective_return")
+    played, rounds = result.measures, [ROUNDS.format(agent=agent) for agent in range(2)]
     alone = [one for one in others if one.study and one.study.number == 2]
     for one in alone:
         measure = f"mean over training, and that of {one.name}; published 191.7 and 177.4"
         claim = "the sum is about 8 % above experiment 2"
         above = more(claim, measure, own, one.over_training("collective_return"), paired=False)
         yield where(result.is_whole and one.is_whole, above)
-    played, own_rounds = result.measures, [ROUNDS.format(agent=agent) for agent in range(2)]
-    for one in alone:
-        if own_rounds[0] in one.measures.trained and own_rounds[1] in played.trained:
+        if rounds[0] in one.measures.trained and rounds[1] in played.trained:
             measure = f"rounds about the centre per 1000 steps, {one.name}'s and the mean of the two"
-            circling = np.mean([played.trained[name] for name in own_rounds], axis=0)
+            circling = np.mean([played.trained[name] for name in rounds], axis=0)
             claim = "they do not circle as in experiment 2"
-            yield more(claim, measure, one.measures.trained[own_rounds[0]], circling, paired=False)
+            yield more(claim, measure, one.measures.trained[rounds[0]], circling, paired=False)
     ratio = played.training["return of the poorest agent over that of the richest, whole training"]
     claim, measure = "both earn almost the same", "the lower mean over training over the higher one"
     yield where(result.is_whole, alike(claim, measure, ratio, within=(0.8, 1.2)))
@@ -310,10 +309,10 @@ def _circles(result: Result) -> Iterator[Claim]:
         )
 
 
-def _ends_empty(result: Result) -> Values | None:
-    """The share of the last episodes of each replica that end without an apple, [R]."""
+def _ends_empty(result: Result, part: slice = slice(-LAST, None)) -> Values | None:
+    """The share of some episodes of each replica, by default the last, that end without an apple, [R]."""
     ended = result.of_agents("terminated")
-    return None if ended is None else ended[:, -LAST:, 0].mean(1)
+    return None if ended is None else ended[:, part, 0].mean(1)
 
 
 def _lasts(result: Result, claim: str) -> Iterator[Claim]:
@@ -353,25 +352,14 @@ def of_experiment_5(result: Result) -> Iterator[Claim]:
         best, after = returns[:, : int(ends)].max(1), returns[:, int(ends) :].max(1)
         measure = f"highest running mean before and after episode {ends:.0f}, where exploration ends"
         yield more("the highest returns come in exploration", measure, best, after, paired=True)
-    if curves["equality"].shape[1] >= EXPLORED:
-        for metric, claim, sign in (("peacefulness", "rises", 1), ("equality", "falls slowly", -1)):
-            values = _climb(curves[metric][:, :EXPLORED])
-            yield side(
-                f"exploration: {metric} {claim}",
-                f"climb of its line over the first {EXPLORED} episodes",
-                values,
-                published=_published_climb(result, metric),
-                **{"above" if sign > 0 else "below": 0.0},
-            )
+    yield from _climbs(
+        result, "exploration: peacefulness rises", "peacefulness", slice(0, EXPLORED), above=0.0
+    )
+    yield from _climbs(
+        result, "exploration: equality falls slowly", "equality", slice(0, EXPLORED), below=0.0
+    )
     yield from _stays_healthy(result)
-    if curves["equality"].shape[1] >= TRAGIC:
-        yield side(
-            "tragedy: equality falls",
-            f"climb of its line from episode {EXPLORED} to {TRAGIC}",
-            _climb(curves["equality"][:, EXPLORED:TRAGIC]),
-            published=_published_climb(result, "equality", EXPLORED, TRAGIC),
-            below=0.0,
-        )
+    yield from _climbs(result, "tragedy: equality falls", "equality", slice(EXPLORED, TRAGIC), below=0.0)
     survival = running_mean(curves["survival_steps"], result.window).min(1)
     at, values = _published_curve(result, "survival_steps")
     falls = number(
@@ -405,23 +393,37 @@ def of_experiment_5(result: Result) -> Iterator[Claim]:
         )
     yield from _tagging(result)
     yield from _lasts(result, "four manage the resource sustainably in the end")
+    yield from _raises_returns(result)
+
+
+def _climbs(result: Result, claim: str, metric: str, part: slice, **bound: float) -> Iterator[Claim]:
+    """That a metric climbs above or below a bound in a part of the training."""
+    values = result.curves[metric]
+    if values.shape[1] >= part.stop:
+        first, later = f"over the first {part.stop} episodes", f"from episode {part.start} to {part.stop}"
+        measure = f"climb of its line {later if part.start else first}"
+        published = _published_climb(result, metric, part)
+        yield side(claim, measure, _climb(values[:, part]), published=published, **bound)
+
+
+def _stays_healthy(result: Result) -> Iterator[Claim]:
+    empty = _ends_empty(result, slice(EXPLORED))
+    if empty is not None and result.curves["survival_steps"].shape[1] >= EXPLORED:
+        measure = f"share of the first {EXPLORED} episodes that end empty, healthy if below a half"
+        yield side("exploration: the stock stays healthy", measure, empty, below=0.5)
+
+
+def _raises_returns(result: Result) -> Iterator[Claim]:
     game, study = result.experiment.game, result.study
     if isinstance(game, Game) and study is not None and study.random is not None:
-        gains = side(
+        raised = side(
             "learning need not raise returns",
             "mean return over training less random play's; no rise if at most 0",
             result.over_training("collective_return") - returns_by_chance(game).mean(),
             published=study.trained - study.random,
             below=0.0,
         )
-        yield where(result.is_whole, gains)
-
-
-def _stays_healthy(result: Result) -> Iterator[Claim]:
-    ended = result.of_agents("terminated")
-    if ended is not None and ended.shape[1] >= EXPLORED:
-        measure = f"share of the first {EXPLORED} episodes that end empty, healthy if below a half"
-        yield side("exploration: the stock stays healthy", measure, ended[:, :EXPLORED, 0].mean(1), below=0.5)
+        yield where(result.is_whole, raised)
 
 
 def _tagging(result: Result) -> Iterator[Claim]:
@@ -447,10 +449,10 @@ def _published_curve(result: Result, metric: str) -> tuple[Values, Values]:
     return curve(result.study.curves[metric])
 
 
-def _published_climb(result: Result, metric: str, start: int = 0, end: int = EXPLORED) -> float:
+def _published_climb(result: Result, metric: str, part: slice) -> float:
     at, values = _published_curve(result, metric)
-    inside = (at >= start) & (at <= end)
-    return float(np.polyfit(at[inside], values[inside], 1)[0] * (end - start))
+    inside = (at >= part.start) & (at <= part.stop)
+    return float(np.polyfit(at[inside], values[inside], 1)[0] * (part.stop - part.start))
 
 
 def _climb(curves: Values) -> Values:

@@ -5,7 +5,7 @@ remaining agent indices in order.
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from posixpath import normpath
 from typing import Annotated, Any, Final, TypeAlias
@@ -215,6 +215,11 @@ def exploration_steps(specs: Sequence[AgentSpec]) -> int | None:
             if isinstance(settings, Exploring) and settings.epsilon_end < settings.epsilon_start:
                 ends.append(settings.epsilon_hold_steps + settings.epsilon_decay_steps)
     return max(ends, default=None)
+
+
+def partners_in(specs: Iterable[AgentSpec]) -> list[str]:
+    """Return the runs whose agents play among some specifications."""
+    return sorted({spec.run for spec in specs if isinstance(spec, Frozen)})
 
 
 def stored_of(spec: Any) -> Frozen | None:

@@ -8,7 +8,6 @@ from typing import Any, Final, NamedTuple
 import torch
 from torch import nn
 
-from cprl.population import AgentSpec, Frozen
 from cprl.runs.checkpoints import FOLDER, REPORT, checkpoints_in, read_checkpoint, read_tensors
 from cprl.runs.files import checksum, refuse_missing, write_listed
 from cprl.values import refusal
@@ -120,15 +119,14 @@ FIELD: Final = "frozen"
 """Of `recipe.json`: the checksum of the weights of each run whose agents play, by the path of that run."""
 
 
-def partners_in(specs: Iterable[AgentSpec]) -> list[str]:
-    """Return the runs whose agents play among some specifications."""
-    return sorted({spec.run for spec in specs if isinstance(spec, Frozen)})
+def partners_of(run: Path, partners: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Return what the recipe of a run says of which weights of other runs play in it; those that have not
+    ended keep changing, and are left out.
 
-
-def partners_of(run: Path, specs: Iterable[AgentSpec]) -> dict[str, dict[str, str]]:
-    """Return what the recipe of a run that begins in a directory says of which weights of other runs play in
-    it; those that have not ended keep changing, and are left out."""
-    partners = partners_in(specs)
+    Args:
+        run: the directory of the run that begins.
+        partners: see `cprl.population.partners_in`.
+    """
     final = {os.path.relpath(partner, run): Path(partner) / FOLDER / "final.pt" for partner in partners}
     digests = {partner: checksum(path) for partner, path in final.items() if path.exists()}
     return {FIELD: digests} if digests else {}

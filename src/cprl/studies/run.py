@@ -119,8 +119,8 @@ def shared(study: Study, out: Path, *, progress: bool) -> Iterator[None]:
     """Makes a study's directory, and locks it together with all who run the same study; another one is
     refused."""
     out.mkdir(parents=True, exist_ok=True)
-    content = json.dumps(study.to_config(out), sort_keys=True)
-    with RunLock(out, study=digest_of(content, size=6)) as lock:
+    table = study.to_config(out)
+    with RunLock(out, study=digest_of(json.dumps(table, sort_keys=True), size=6)) as lock:
         if lock.is_alone:
             remove_partial(out, out / STATUS, out / "figures")
         elif progress:
@@ -128,7 +128,7 @@ def shared(study: Study, out: Path, *, progress: bool) -> Iterator[None]:
                 f"{out} is run by somebody else too, {holder_of(out)}, or was when its host went down: each "
                 "trial is run by the one that begins it first; the other continues with the rest"
             )
-        write_json(out / FILE_NAME, study.to_config(out))
+        write_json(out / FILE_NAME, table)
         yield
 
 

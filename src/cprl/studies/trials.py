@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 from cprl.experiment import Experiment
-from cprl.population import Frozen, with_stored
+from cprl.population import Frozen, partners_in, with_stored
 from cprl.runs.checkpoints import FOLDER, REPORT, checkpoints_in, depends_on_episodes, is_ending
 from cprl.runs.files import LOCK_FILE, RunLock, RunLockedError, refuse_missing, remove_partial
 from cprl.runs.recipe import (
@@ -253,10 +253,9 @@ class Task:
                     write_on_nan(run, experiment.on_nan)
         if state_of(run) != "missing":
             return None
+        partners = partners_in(experiment.agents)
         try:
-            start_run(
-                run, experiment.name, lambda run: {**self.recipe, **partners_of(run, experiment.agents)}
-            )
+            start_run(run, experiment.name, lambda run: {**self.recipe, **partners_of(run, partners)})
         except FileExistsError:
             if state_of(run) == "missing" and not (run / LOCK_FILE).exists():
                 raise

@@ -16,7 +16,7 @@ from cprl.envs.state import transforms_state
 from cprl.envs.unwrap import agent_names
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode, own_name, try_own_metrics
-from cprl.population import exploration_steps
+from cprl.population import exploration_steps, partners_in
 from cprl.runs.checkpoints import FOLDER, REPORT, Checkpointer, checkpoints_in, extend, refuse_to_extend
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.files import LOCK_FILE, RunLockedError, refuse_missing, write_json
@@ -33,7 +33,6 @@ from cprl.runs.recipe import (
 from cprl.runs.weights import (
     DECISIONS,
     TRANSFORMS,
-    partners_in,
     partners_of,
     save_beside_weights,
     save_weights,
@@ -137,11 +136,7 @@ def run(
     if resumed is not None and length >= experiment.length and (resumed / REPORT).exists():
         _tidy_up(resumed, experiment, keep_checkpoint=keep_checkpoint, take_over=take_over)
         return resumed
-
-    def to_recipe(directory: Path) -> dict[str, Any]:
-        return {**experiment.to_recipe(directory), **partners_of(directory, experiment.agents)}
-
-    directory = start_run(out, experiment.name, to_recipe) if resumed is None else resumed
+    directory = _start(experiment, out) if resumed is None else resumed
     if length < experiment.length:
         refuse_to_extend(directory, length if experiment.unit == "episodes" else None, observers)
     checkpointer = Checkpointer(directory, keep_ending=keep_checkpoint, take_over=take_over)
@@ -175,6 +170,13 @@ class _Work(NamedTuple):
     env: EnvBase
     population: Population
     viewer: "ViewerCallback | None"
+
+
+def _start(experiment: Experiment, out: Path | None) -> Path:
+    def recipe_in(directory: Path) -> dict[str, Any]:
+        return {**experiment.to_recipe(directory), **partners_of(directory, partners_in(experiment.agents))}
+
+    return start_run(out, experiment.name, recipe_in)
 
 
 def _carry_out(
