@@ -525,6 +525,9 @@ def test_the_effects_of_rules_together_are_those_of_which_a_table_was_made(shipp
     assert lines["vote"] == "+0 [+0, +0] | +0 [+0, +0]"
     together = "quota x sanctions = monitoring x few = vote x sight"
     assert lines[together].startswith("+6.00 [+6.00, +6.00]* | ")
+    committed = FOLDER.parents[1] / "docs" / "results" / "studies" / "together"
+    effects.main(committed)
+    assert capsys.readouterr().out == (committed / "effects.md").read_text()
 
 
 @pytest.mark.integration
