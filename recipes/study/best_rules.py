@@ -41,6 +41,15 @@ BY_HAND: Final[dict[Rule, tuple[Institution, ...]]] = {
     "tax": (Tax(rate=0.5),),
 }
 """The settings of recipes/institutions.py; of the tax a rate in the middle of what its votes decide on."""
+BEST: Final[dict[Rule, tuple[Institution, ...]]] = {
+    "quota": (Quota(share=0.385191, window_steps=25),),
+    "sanctions": (
+        BROKEN,
+        GraduatedSanctions(freeze_steps=(5, 25, 100, 100), fines=(0, 0, 0, 0), recovery_steps=50),
+    ),
+    "tax": (Tax(rate=0.770762, period_steps=1),),
+}
+"""What the searches found."""
 
 
 def experiment(*, rule: Rule = "none") -> cprl.Experiment:
@@ -66,3 +75,28 @@ def experiment(*, rule: Rule = "none") -> cprl.Experiment:
         worlds=WORLDS,
         evaluation_episodes=50,
     )
+
+
+STUDY = cprl.Study(
+    experiment(),
+    conditions={
+        "none": {},
+        **{f"{rule}, by hand": {"game.institutions": BY_HAND[rule]} for rule in BEST},
+        **{f"{rule}, best found": {"game.institutions": found} for rule, found in BEST.items()},
+    },
+    replicas=8,
+    name="best_rules",
+    question="How much better are a quota, sanctions and a tax that were searched than those chosen by hand?",
+    expectation=(
+        "Less better in these worlds than in those of the search, where the best was chosen by chance, too. "
+        "The quota gains some tenth, since its share is half as large again; sanctions lose nothing by "
+        "giving up their fines, which only take from the harvest. Before the search no tax was expected to "
+        "do much, since votes on one did not; it found 488 apples for 77 % in every turn where no other tax "
+        "gave more than 301, and a tax of half in every turn, by hand, is expected in between. What all pay "
+        "and all share is nearly equal, so there equality costs nothing; the looser quota is a little less "
+        "equal than the tighter."
+    ),
+)
+
+if __name__ == "__main__":
+    cprl.study_main(STUDY)
