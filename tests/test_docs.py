@@ -199,8 +199,10 @@ def test_what_governs_is_made_of_the_committed_tables_and_the_page_has_its_numbe
     subprocess.run(command, check=True, cwd=ROOT)
     committed = (ROOT / "docs" / "results" / "governs" / "table.md").read_text()
     assert (tmp_path / "table.md").read_text() == committed
+    elsewhere = ROOT / "docs" / "results" / "governs" / "elsewhere.md"
+    assert (tmp_path / "elsewhere.md").read_text() == elsewhere.read_text()
     studies = ROOT / "docs" / "results" / "studies"
-    more = ("together/effects.md", "together/summary.md", "best_rules/summary.md")
+    more = ("together/effects.md", "together/summary.md", "best_rules/summary.md", "elsewhere/summary.md")
     tables = committed + "".join((studies / name).read_text() for name in more)
     intervals = re.findall(r"\[[-+\d., ]+\]", (ROOT / "docs" / "governs.md").read_text())
     assert len(intervals) > 20

@@ -2,10 +2,10 @@
 
     python recipes/study/governs.py
 
-To be run in the root of the repository: reads the tables in docs/results, and writes table.md and governs.png
-into docs/results/governs. In each condition four DQN agents play `commons` as run, 200 episodes on the short
-schedule of base.py, with one thing changed; numbers are means of the last 30 episodes of each replica, then
-over replicas.
+To be run in the root of the repository: reads tables in docs/results, and writes into docs/results/governs
+table.md, governs.png, and elsewhere.md, six of the changes in the settings of elsewhere.py. In the conditions
+of table.md four DQN agents play `commons` as run, 200 episodes on the short schedule of base.py, with one
+thing changed; numbers are means of the last 30 episodes of each replica, then over replicas.
 """
 
 from pathlib import Path
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from possible import KNOWN
 
 from cprl.commons.colours import BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION
-from cprl.measuring.statistics import Estimate, estimate
+from cprl.measuring.statistics import Estimate, difference, estimate, holm
 from cprl.runs.curves import curves_of, net_of
 from cprl.studies import StudyTable
 from cprl.studies.tables.comparing import compare
@@ -93,6 +93,16 @@ INSTITUTIONS: Final = {
 }
 """By the directory of the run: the name, with the number of Ostrom's principle."""
 
+AS_HERE: Final = {
+    "twice the apples": ("space", "twice the apples, scattered", "commons"),
+    "regrowth x 2": ("regrowth", "regrowth=2", "regrowth=1"),
+    "half the agents": ("agents", "2, same board", "4"),
+    "networks of 2 units": ("network_width", "hidden_cells=(2, 2)", "hidden_cells=(32, 32)"),
+    "quota": ("institutions", "quota", "none"),
+    "penalty that is certain": ("rules", "automatic penalty", "none"),
+}
+"""The changes of recipes/study/elsewhere.py: where they are on the short schedule, and what beside."""
+
 RANDOM, RESTRAINT = 282.0, 926.0
 """Apples an episode of random play (docs/institutions.md) and of the scripted "sustainable" agents
 (docs/results/schelling/table.md), on the unchanged game."""
@@ -111,22 +121,28 @@ class Row(NamedTuple):
     equality: Estimate
 
 
+def nets(study: str, condition: str) -> NDArray[np.float64]:
+    """The harvest after fines of each replica, in apples."""
+    if study == "institutions":
+        return np.nanmean(net_of(curves_of(RESULTS / study / condition))[:, -LAST:], 1)
+    table = StudyTable.read(RESULTS / "studies" / study / "table.parquet")
+    net = "net" if "net" in table.metrics else "collective_return"  # without fines the same
+    return compare(table, net, last=LAST).by_name[condition].defined
+
+
 def of_study(group: str, study: str, condition: str, name: str) -> Row:
     """A condition of a study."""
     table = StudyTable.read(RESULTS / "studies" / study / "table.parquet")
-    net = "net" if "net" in table.metrics else "collective_return"  # without fines the same
-    metrics = (net, "survival_steps", "equality")
-    return row(
-        group, name, *(compare(table, metric, last=LAST).by_name[condition].defined for metric in metrics)
-    )
+    others = ("survival_steps", "equality")
+    measured = (compare(table, metric, last=LAST).by_name[condition].defined for metric in others)
+    return row(group, name, nets(study, condition), *measured)
 
 
 def of_run(group: str, folder: str, name: str) -> Row:
     """A run of recipes/institutions.py."""
     curves = curves_of(RESULTS / "institutions" / folder)
-    curves["net"] = net_of(curves)
-    metrics = ("net", "survival_steps", "equality")
-    return row(group, name, *(np.nanmean(curves[metric][:, -LAST:], 1) for metric in metrics))
+    measured = (np.nanmean(curves[metric][:, -LAST:], 1) for metric in ("survival_steps", "equality"))
+    return row(group, name, nets("institutions", folder), *measured)
 
 
 def row(group: str, name: str, *measured: NDArray[np.float64]) -> Row:
@@ -162,6 +178,37 @@ def table(found: list[Row]) -> str:
         numbers = " | ".join(cells)
         lines.append(f"| {one.name} | {GROUPS[one.group][1]} | {one.replicas} | {numbers} |")
     return "\n".join([*lines, ""])
+
+
+def elsewhere() -> str:
+    """A table in Markdown of what each change adds, and how many times the harvest it gives, by setting."""
+    columns = {"DQN, 1 world": [(nets(of, name), nets(of, base)) for of, name, base in AS_HERE.values()]}
+    for setting in ("DQN, 16 worlds", "PPO, 256 worlds"):
+        base = nets("elsewhere", f"{setting}: nothing changed")
+        columns[setting] = [(nets("elsewhere", f"{setting}: {change}"), base) for change in AS_HERE]
+    lines = [f"| apples after fines | {' | '.join(columns)} |", "|---|" + "---:|" * len(columns)]
+    unchanged = " | ".join(text_of(estimate(pairs[0][1])) for pairs in columns.values())
+    cells = {setting: changes(pairs) for setting, pairs in columns.items()}
+    lines.append(f"| nothing changed | {unchanged} |")
+    for at, change in enumerate(AS_HERE):
+        lines.append(f"| {change} | {' | '.join(texts[at] for texts in cells.values())} |")
+    return "\n".join([*lines, ""])
+
+
+def changes(pairs: list[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> list[str]:
+    """The difference of each, paired by replica, and the ratio; stars by Holm's method for all of these.
+
+    A dash stands where it was not run.
+    """
+    found = [difference(value, base, paired=True) for value, base in pairs if len(value)]
+    stars = iter(holm([one.p_value for one in found]))
+    cells = iter(found)
+    return [
+        f"{next(cells):+}{'*' if next(stars) else ''}, x {value.mean() / base.mean():.1f}"
+        if len(value)
+        else "-"
+        for value, base in pairs
+    ]
 
 
 def draw(found: list[Row], path: Path) -> None:
@@ -203,7 +250,7 @@ def draw(found: list[Row], path: Path) -> None:
 
 
 def main(*, out: Path = RESULTS / "governs") -> None:
-    """Write the table and the figure.
+    """Write the tables and the figure.
 
     Args:
         out: the directory.
@@ -211,6 +258,7 @@ def main(*, out: Path = RESULTS / "governs") -> None:
     found = rows()
     out.mkdir(parents=True, exist_ok=True)
     (out / "table.md").write_text(table(found), encoding="utf-8")
+    (out / "elsewhere.md").write_text(elsewhere(), encoding="utf-8")
     draw(found, out / "governs.png")
 
 
