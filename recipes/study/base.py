@@ -1,8 +1,8 @@
-"""The experiments that the studies of this folder vary: the tragedy of the commons, on two schedules.
+"""The experiments that the studies of this folder vary: the tragedy of the commons, on three schedules.
 
 Four independent DQN agents on `commons`, by the rules of the study as run: `EXPERIMENT`, 200 episodes of 8
-replicas in one world each on a schedule twenty times shorter than the published one, and `PUBLISHED`,
-experiment 5 as run.
+replicas in one world each on a schedule twenty times shorter than the published one; `TRAGEDY`, that of
+recipes/tragedy.py, which learns from sixteen worlds; and `PUBLISHED`, experiment 5 as run.
 """
 
 from dataclasses import replace
@@ -28,6 +28,17 @@ EXPERIMENT: Final = cprl.Experiment(
     episodes=200,
     replicas=8,
     evaluation_episodes=50,
+)
+
+WORLDS: Final = 16
+FASTER: Final = replace(SETTINGS, learning_rate=1e-3, gamma=0.97, steps_per_update=WORLDS, batch_size=64)
+TRAGEDY: Final = replace(
+    EXPERIMENT,
+    name="tragedy",
+    agents=(Learning(DQN(settings=FASTER)),) * 4,
+    episodes=300,
+    replicas=4,
+    worlds=WORLDS,
 )
 
 PUBLISHED: Final = replace(

@@ -19,13 +19,11 @@ each kind was found by Optuna on the harvest after fines, in worlds of seeds tha
 from dataclasses import replace
 from typing import Final, Literal
 
-import cprl
-from cprl import presets
-from cprl.algorithms import DQN
-from cprl.institutions import GraduatedSanctions, Institution, Quota, Tax
-from cprl.population import Learning
+from base import TRAGEDY
 
-WORLDS: Final = 16
+import cprl
+from cprl.institutions import GraduatedSanctions, Institution, Quota, Tax
+
 Rule = Literal["none", "quota", "sanctions", "tax"]
 
 QUOTA: Final = Quota(share=0.25, window_steps=50)
@@ -58,23 +56,8 @@ def experiment(*, rule: Rule = "none") -> cprl.Experiment:
     Args:
         rule: which one.
     """
-    settings = replace(
-        presets.dqn_settings("commons", variant="as_run"),
-        learning_rate=1e-3,
-        epsilon_decay_steps=100_000,
-        gamma=0.97,
-        steps_per_update=WORLDS,
-        batch_size=64,
-    )
-    return cprl.Experiment(
-        name=f"best_rules_{rule}",
-        game=replace(presets.game("commons", variant="as_run"), institutions=BY_HAND[rule]),
-        agents=(Learning(DQN(settings=settings)),) * 4,
-        episodes=300,
-        replicas=4,
-        worlds=WORLDS,
-        evaluation_episodes=50,
-    )
+    game = replace(TRAGEDY.game, institutions=BY_HAND[rule])
+    return replace(TRAGEDY, name=f"best_rules_{rule}", game=game)
 
 
 STUDY = cprl.Study(

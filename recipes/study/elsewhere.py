@@ -12,31 +12,22 @@ from typing import Any, Final
 
 import numpy as np
 from agents import crowded
+from base import TRAGEDY
+from best_rules import QUOTA
 from many_worlds import ppo
 from space import scattered
 
 import cprl
 from cprl import Game, Map, presets
 from cprl.algorithms import DQN, PPO
-from cprl.institutions import Quota
 from cprl.population import Learning
 
-COMMONS: Final = presets.game("commons", variant="as_run")
+COMMONS: Final = TRAGEDY.game
 OPEN: Final = presets.game("melting_pot/commons_harvest__open-v1")
-PENALTY: Final = Quota(share=0.25, window_steps=50, fine=2.0)
+PENALTY: Final = replace(QUOTA, fine=2.0)
 """A fine that is certain, and twice what the bite brings."""
 
-SHORT: Final = DQN(
-    settings=replace(
-        presets.dqn_settings("commons", variant="as_run"),
-        learning_rate=1e-3,
-        epsilon_decay_steps=100_000,
-        gamma=0.97,
-        steps_per_update=16,
-        batch_size=64,
-    )
-)
-"""The learner of recipes/tragedy.py."""
+SHORT: Final = TRAGEDY.agents[0].algorithm
 SETTINGS: Final[dict[str, tuple[Game, DQN | PPO, int, int]]] = {
     "DQN, 16 worlds": (COMMONS, SHORT, 16, 400_000),
     "PPO, 256 worlds": (COMMONS, ppo(256), 256, 1_000_000),
@@ -67,7 +58,7 @@ def games(game: Game) -> dict[str, Game]:
         "regrowth x 2": replace(game, rules=replace(game.rules, regrow_prob=regrow)),
         "half the agents": replace(game, map=fewer),
         "networks of 2 units": game,
-        "quota": replace(game, institutions=(replace(PENALTY, fine=None),)),
+        "quota": replace(game, institutions=(QUOTA,)),
         "penalty that is certain": replace(game, institutions=(PENALTY,)),
     }
 
@@ -93,9 +84,9 @@ STUDY = cprl.Study(
     cprl.Experiment(
         name="elsewhere",
         game=COMMONS,
-        agents=(Learning(SHORT),) * 4,
+        agents=TRAGEDY.agents,
         steps=400_000,
-        worlds=16,
+        worlds=TRAGEDY.worlds,
         evaluation_episodes=50,
     ),
     conditions=conditions(),

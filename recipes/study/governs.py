@@ -8,6 +8,7 @@ of table.md four DQN agents play `commons` as run, 200 episodes on the short sch
 thing changed; numbers are means of the last 30 episodes of each replica, then over replicas.
 """
 
+from functools import cache
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -121,20 +122,25 @@ class Row(NamedTuple):
     equality: Estimate
 
 
+@cache
+def table_of(study: str) -> StudyTable:
+    """The committed table of a study."""
+    return StudyTable.read(RESULTS / "studies" / study / "table.parquet")
+
+
 def nets(study: str, condition: str) -> NDArray[np.float64]:
     """The harvest after fines of each replica, in apples."""
     if study == "institutions":
         return np.nanmean(net_of(curves_of(RESULTS / study / condition))[:, -LAST:], 1)
-    table = StudyTable.read(RESULTS / "studies" / study / "table.parquet")
+    table = table_of(study)
     net = "net" if "net" in table.metrics else "collective_return"  # without fines the same
     return compare(table, net, last=LAST).by_name[condition].defined
 
 
 def of_study(group: str, study: str, condition: str, name: str) -> Row:
     """A condition of a study."""
-    table = StudyTable.read(RESULTS / "studies" / study / "table.parquet")
     others = ("survival_steps", "equality")
-    measured = (compare(table, metric, last=LAST).by_name[condition].defined for metric in others)
+    measured = (compare(table_of(study), metric, last=LAST).by_name[condition].defined for metric in others)
     return row(group, name, nets(study, condition), *measured)
 
 
@@ -200,15 +206,13 @@ def changes(pairs: list[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> lis
 
     A dash stands where it was not run.
     """
-    found = [difference(value, base, paired=True) for value, base in pairs if len(value)]
-    stars = iter(holm([one.p_value for one in found]))
-    cells = iter(found)
-    return [
-        f"{next(cells):+}{'*' if next(stars) else ''}, x {value.mean() / base.mean():.1f}"
-        if len(value)
-        else "-"
-        for value, base in pairs
-    ]
+    found = {at: difference(*pair, paired=True) for at, pair in enumerate(pairs) if len(pair[0])}
+    stars = dict(zip(found, holm([one.p_value for one in found.values()]), strict=True))
+    texts = ["-"] * len(pairs)
+    for at, one in found.items():
+        value, base = pairs[at]
+        texts[at] = f"{one:+}{'*' if stars[at] else ''}, x {value.mean() / base.mean():.1f}"
+    return texts
 
 
 def draw(found: list[Row], path: Path) -> None:
