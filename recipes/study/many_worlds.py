@@ -7,6 +7,11 @@ worlds as take about the time of half a million of one; "1e8" is PPO as run, of 
 million steps (`--only "PPO, as run, 256 worlds, 1e8 steps"`). Settings are those that
 recipes/study/learners/tuning_commons.py chose. DQN samples eight transitions a step, as the study's does: in
 W worlds one update a turn of 8 W. PPO has minibatches of 50, 256 and 2,048 steps.
+
+What agents become in a hundred million steps, expected before it was looked at: neither ruin nor restraint.
+The harvest falls, then rises slowly to the end. Each agent keeps to a part of the board more than random ones
+do, with an exclusion below a half. A best response gains some tens of apples, and scripted greed pays among
+these agents: what they spare is not defended.
 """
 
 from typing import Any, Final
