@@ -1,0 +1,139 @@
+"""What has a population become? Restraint, territory or ruin: how it plays, and what others gain by it.
+
+    python recipes/study/ends.py studies/many_worlds/runs/d50737d94dfe-s*-r2 --out ends.md
+
+Takes finished runs of one experiment, whose replicas count together, and writes a table in Markdown: how they
+do in fresh worlds, how far agents keep to cells of their own, in which dilemma they are with scripted agents,
+what trained best responses gain, and the phases of the training. Intervals are over replicas, by Student's t.
+Responses take the time: they are trained in the directory `responses` beside each run, and kept.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import numpy as np
+import tyro
+
+import cprl
+from cprl.evaluation import exploitability, plan_responses, schelling, territory_of
+from cprl.evaluation.schelling import dilemma
+from cprl.measuring.phases import FEWEST_EPISODES, METRICS, UNNAMED, find_phases
+from cprl.measuring.series import Values
+from cprl.measuring.statistics import estimate
+from cprl.runs.curves import curves_of
+from cprl.training.agents import LoadedRun, load
+
+PLAYED: Final = ("collective_return", "equality", "survival_steps", "peacefulness")
+POINTS: Final = 2_000
+"""Of the courses in which phases are found: means of as many blocks of episodes."""
+
+
+def together(values: list[dict[str, Values]]) -> dict[str, str]:
+    """Estimates over the replicas of all runs, from a number for each replica of each run."""
+    return {name: str(estimate(np.concatenate([run[name] for run in values]))) for name in values[0]}
+
+
+def fresh(run: LoadedRun, episodes: int) -> dict[str, Values]:
+    """Harvests and the like in fresh worlds, and where agents are, beside random play."""
+    evaluated = cprl.evaluate_run(run, episodes=episodes)
+    where = territory_of(run, episodes=episodes)
+    numbers = {}
+    for name in PLAYED:
+        for policy in ("trained", "random"):
+            played = getattr(evaluated, policy)
+            means = [np.nanmean([one.metrics[name] for one in ended]) for ended in played.values()]
+            numbers[f"{name}, {policy}"] = np.array(means)
+    for name in where.trained.by_replica:
+        for policy in ("trained", "random"):
+            numbers[f"{name}, {policy}"] = where.of(policy).by_replica[name]
+    return numbers
+
+
+def gains(run: LoadedRun, episodes: int, training_episodes: int) -> dict[str, Values]:
+    """What best responses gain that learn as the agent did whose place they take, three for each replica."""
+    plan = plan_responses(run, algorithms=("own",), training_episodes=training_episodes, episodes=episodes)
+    responses = exploitability(plan, run.path.parent / "responses" / run.path.name, progress=False)
+    own, best = responses.returns_of(0)
+    return {"return of agent 0": own, "gain of the best response in its place": best - own}
+
+
+def mixes(runs: list[LoadedRun], episodes: int, **policies: str) -> dict[str, Values | str]:
+    """Margins of a Schelling diagram whose policies are the runs' where they are not given."""
+    restrained, greedy = [], []
+    for run in runs:
+        both: dict[str, Any] = {"restrained": str(run.path), "greedy": str(run.path)} | policies
+        played = schelling(run, episodes=episodes, replicas=len(run.replicas), **both)
+        restrained.append(played.restrained_payoffs)
+        greedy.append(played.greedy_payoffs)
+    found = dilemma(np.concatenate(restrained), np.concatenate(greedy))
+    margins = {name: getattr(found, name) for name in ("restraint", "company", "fear", "greed")}
+    return {**{name: f"{margin:+}" for name, margin in margins.items()}, "dilemma": found.name}
+
+
+def course(runs: list[LoadedRun]) -> list[str]:
+    """The phases of the mean over all replicas, in millions of steps, with the harvest at each end."""
+    curves = [curves_of(run.path) for run in runs]
+    episodes = min(len(of_run["collective_return"][0]) for of_run in curves)
+    if episodes < FEWEST_EPISODES:
+        return [f"fewer than {FEWEST_EPISODES:,} episodes, in which none are looked for"]
+    block = max(1, episodes // POINTS)
+    whole = episodes // block * block
+    at = np.arange(whole // block)
+    means = {
+        name: np.concatenate(
+            [np.nanmean(of_run[name][:, :whole].reshape(-1, len(at), block), -1) for of_run in curves]
+        )
+        for name in METRICS
+    }
+    steps = np.cumsum(means["survival_steps"].mean(0) * block) / 1e6
+    harvest, lines = means["collective_return"].mean(0), []
+    for phase in find_phases(at, means):
+        first, last = int(phase.first), int(phase.last)
+        ends = [harvest[max(0, place - 10) : place + 10].mean() for place in (first + 10, last - 10)]
+        label = phase.label or UNNAMED
+        lines.append(
+            f"{steps[first]:.0f} to {steps[last]:.0f}: {label}, {ends[0]:.0f} to {ends[1]:.0f} apples"
+        )
+    return lines
+
+
+def main(
+    runs: Annotated[list[Path], tyro.conf.Positional],
+    /,
+    *,
+    out: Path,
+    episodes: int = 20,
+    training_episodes: int = 6_000,
+) -> None:
+    """Write the table.
+
+    Args:
+        runs: directories of finished runs of one experiment.
+        out: the file.
+        episodes: fresh episodes of each replica, in each choice of who plays.
+        training_episodes: of each response.
+    """
+    loaded = [load(run) for run in runs]
+    replicas = sum(len(run.replicas) for run in loaded)
+    rows = together([fresh(run, episodes) for run in loaded])
+    rows |= together([gains(run, episodes, training_episodes) for run in loaded])
+    for who, policies in {
+        "scripted restraint, these agents greedy": {"restrained": "sustainable"},
+        "these agents restrained, scripted greed": {"greedy": "greedy"},
+    }.items():
+        rows |= {f"{name}: {who}": str(value) for name, value in mixes(loaded, episodes, **policies).items()}
+    lines = [
+        f"| over {replicas} replicas | |",
+        "|---|---:|",
+        *(f"| {name} | {rows[name]} |" for name in rows),
+    ]
+    phases = [f"- {line}" for line in course(loaded)]
+    text = "\n".join(
+        [*lines, "", "Phases of the training, in millions of steps of each replica:", "", *phases, ""]
+    )
+    out.write_text(text, encoding="utf-8")
+    print(text)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
