@@ -633,6 +633,25 @@ def test_a_trial_says_its_speed_without_compiling_and_what_it_had_done_before(tm
     assert speed() == pytest.approx(0.5), "2 episodes in 4 s of work"
 
 
+def test_a_trial_of_so_many_steps_is_as_far_as_its_steps_however_short_episodes_are(tmp_path):
+    experiment = replace(TRIALS[0].experiment, episodes=None, steps=400, replicas=2, worlds=4)
+    expected = 2 * experiment.expected_episodes
+    file = StatusFile(Status(tmp_path, "trial"), experiment)
+
+    def played():
+        file.write()
+        return json.loads((tmp_path / "trial.json").read_text())["episodes"]
+
+    file.on_start(SimpleNamespace(steps=200, episodes_played=10**6))
+    assert played() == expected // 2
+    for _ in range(49):
+        file.on_step(None)
+        file.on_episode(None, {})
+    assert played() < expected, "it is not over yet"
+    file.on_step(None)
+    assert played() == expected
+
+
 def test_a_trial_runs_while_it_says_something_new_whatever_the_clock_says(says, look, monkeypatch):
     says(0, beat=500, episodes=4, steps=9)
     assert look()[1].state == "missing", "perhaps the last words of a dead process"

@@ -101,6 +101,7 @@ class StatusFile:
             "beat": 0,
         }
         self._began, self._compiled_s, self._worlds = time.monotonic(), CLOCK.total_s, experiment.worlds
+        self._all_steps = experiment.steps
         self._first: tuple[int, float] | None = None
         """Episodes and seconds of work when this process began to train."""
         self._is_over = Event()
@@ -142,16 +143,22 @@ class StatusFile:
 
     def on_start(self, training: Training) -> None:
         """Continues counting where the training does."""
-        self._table.update(steps=training.steps, episodes=training.episodes_played)
+        self._count(training.steps, training.episodes_played)
         work_s = time.monotonic() - self._began - (CLOCK.total_s - self._compiled_s)
-        self._first = training.episodes_played, work_s
+        self._first = self._table["episodes"], work_s
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Counts the steps of a replica: a turn of each of its worlds."""
-        self._table["steps"] += self._worlds
+        self._count(self._table["steps"] + self._worlds, self._table["episodes"])
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        self._table["episodes"] += 1
+        self._count(self._table["steps"], self._table["episodes"] + 1)
+
+    def _count(self, steps: int, episodes: int) -> None:
+        """Of a training of so many steps, whose episodes can only be expected, the share of these counts."""
+        if self._all_steps is not None:
+            episodes = self._table["of"] * steps // self._all_steps
+        self._table.update(steps=steps, episodes=episodes)
 
 
 def is_silent(status: Status, patience_s: float) -> Iterator[bool]:
