@@ -20,7 +20,7 @@ from cprl.evaluation.schelling import dilemma
 from cprl.measuring.phases import FEWEST_EPISODES, METRICS, UNNAMED, find_phases
 from cprl.measuring.series import Values
 from cprl.measuring.statistics import estimate
-from cprl.runs.curves import curves_of
+from cprl.runs.curves import curves_of, running_mean
 from cprl.training.agents import LoadedRun, load
 
 PLAYED: Final = ("collective_return", "equality", "survival_steps", "peacefulness")
@@ -70,6 +70,13 @@ def mixes(runs: list[LoadedRun], episodes: int, **policies: str) -> dict[str, Va
     return {**{name: f"{margin:+}" for name, margin in margins.items()}, "dilemma": found.name}
 
 
+def training(run: LoadedRun) -> dict[str, Values]:
+    """The lowest harvest of any twentieth of the training, and that of the last."""
+    harvest = curves_of(run.path)["collective_return"]
+    means = running_mean(harvest, max(1, harvest.shape[-1] // 20))
+    return {"harvest in its lowest twentieth": means.min(1), "harvest in the last twentieth": means[:, -1]}
+
+
 def course(runs: list[LoadedRun]) -> list[str]:
     """The phases of the mean over all replicas, in millions of steps, with the harvest at each end."""
     curves = [curves_of(run.path) for run in runs]
@@ -115,7 +122,7 @@ def main(
     """
     loaded = [load(run) for run in runs]
     replicas = sum(len(run.replicas) for run in loaded)
-    rows = together([fresh(run, episodes) for run in loaded])
+    rows = together([training(run) | fresh(run, episodes) for run in loaded])
     rows |= together([gains(run, episodes, training_episodes) for run in loaded])
     for who, policies in {
         "scripted restraint, these agents greedy": {"restrained": "sustainable"},
