@@ -202,7 +202,13 @@ def test_what_governs_is_made_of_the_committed_tables_and_its_pages_have_their_n
     elsewhere = ROOT / "docs" / "results" / "governs" / "elsewhere.md"
     assert (tmp_path / "elsewhere.md").read_text() == elsewhere.read_text()
     studies = ROOT / "docs" / "results" / "studies"
-    more = ("together/effects.md", "together/summary.md", "best_rules/summary.md", "elsewhere/summary.md")
+    of_studies = {
+        "together": ("effects", "summary"),
+        "best_rules": ("summary",),
+        "elsewhere": ("summary",),
+        "many_worlds": ("ends", "summary"),
+    }
+    more = [f"{study}/{name}.md" for study, names in of_studies.items() for name in names]
     tables = committed + "".join((studies / name).read_text() for name in more)
     pages = "".join((ROOT / "docs" / name).read_text() for name in ("governs.md", "governs_more.md"))
     intervals = re.findall(r"\[[-+\d., ]+\]", pages)
