@@ -209,7 +209,7 @@ def test_what_governs_is_made_of_the_committed_tables_and_its_pages_have_their_n
         "many_worlds": ("ends", "summary"),
     }
     more = [f"{study}/{name}.md" for study, names in of_studies.items() for name in names]
-    tables = committed + "".join((studies / name).read_text() for name in more)
+    tables = committed + elsewhere.read_text() + "".join((studies / name).read_text() for name in more)
     pages = "".join((ROOT / "docs" / name).read_text() for name in ("governs.md", "governs_more.md"))
     intervals = re.findall(r"\[[-+\d., ]+\]", pages)
     assert len(intervals) > 40

@@ -189,7 +189,7 @@ def table(found: list[Row]) -> str:
 def elsewhere() -> str:
     """A table in Markdown of what each change adds, and how many times the harvest it gives, by setting."""
     columns = {"DQN, 1 world": [(nets(of, name), nets(of, base)) for of, name, base in AS_HERE.values()]}
-    for setting in ("DQN, 16 worlds", "PPO, 256 worlds"):
+    for setting in ("DQN, 16 worlds", "PPO, 256 worlds", "DQN, Melting Pot"):
         base = nets("elsewhere", f"{setting}: nothing changed")
         columns[setting] = [(nets("elsewhere", f"{setting}: {change}"), base) for change in AS_HERE]
     lines = [f"| apples after fines | {' | '.join(columns)} |", "|---|" + "---:|" * len(columns)]
