@@ -9,6 +9,7 @@ stand together.
 """
 
 from collections import defaultdict
+from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Final
@@ -46,6 +47,12 @@ def effects(values: NDArray[np.float64]) -> dict[str, Estimate]:
     return {label: estimate(column @ values / half) for label, column in contrasts.items()}
 
 
+def marked(differences: Sequence[Estimate]) -> list[str]:
+    """Texts with signs, and with stars by Holm's method for all of them."""
+    stars = holm([difference.p_value for difference in differences])
+    return [f"{one:+}{'*' if star else ''}" for one, star in zip(differences, stars, strict=True)]
+
+
 def main(study: Annotated[Path, tyro.conf.Positional], /) -> None:
     """Print the effects.
 
@@ -55,10 +62,7 @@ def main(study: Annotated[Path, tyro.conf.Positional], /) -> None:
     table, columns = StudyTable.read(study / "table.parquet"), []
     for metric in METRICS:
         found = effects(measured(table, metric))
-        stars = holm([one.p_value for one in found.values()])
-        columns.append(
-            {k: f"{one:+}{'*' if star else ''}" for (k, one), star in zip(found.items(), stars, strict=True)}
-        )
+        columns.append(dict(zip(found, marked(list(found.values())), strict=True)))
     print(f"| effect of | {' | '.join(METRICS.values())} |")
     print("|---|" + "---:|" * len(METRICS))
     for label in columns[0]:

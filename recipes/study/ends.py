@@ -5,7 +5,8 @@
 Takes finished runs of one experiment, whose replicas count together, and writes a table in Markdown: how they
 do in fresh worlds, how far agents keep to cells of their own, in which dilemma they are with scripted agents,
 what trained best responses gain, and the phases of the training. Intervals are over replicas, by Student's t.
-Responses take the time: they are trained in the directory `responses` beside each run, and kept.
+Responses take the time: they are trained in the directory `responses` beside each run, and kept for the next
+call from the same working directory.
 """
 
 from pathlib import Path
@@ -23,7 +24,6 @@ from cprl.measuring.statistics import estimate
 from cprl.runs.curves import curves_of, running_mean
 from cprl.training.agents import LoadedRun, load
 
-PLAYED: Final = ("collective_return", "equality", "survival_steps", "peacefulness")
 POINTS: Final = 2_000
 """Of the courses in which phases are found: means of as many blocks of episodes."""
 
@@ -38,7 +38,7 @@ def fresh(run: LoadedRun, episodes: int) -> dict[str, Values]:
     evaluated = cprl.evaluate_run(run, episodes=episodes)
     where = territory_of(run, episodes=episodes)
     numbers = {}
-    for name in PLAYED:
+    for name in METRICS:
         for policy in ("trained", "random"):
             played = getattr(evaluated, policy)
             means = [np.nanmean([one.metrics[name] for one in ended]) for ended in played.values()]
@@ -57,7 +57,7 @@ def gains(run: LoadedRun, episodes: int, training_episodes: int) -> dict[str, Va
     return {"return of agent 0": own, "gain of the best response in its place": best - own}
 
 
-def mixes(runs: list[LoadedRun], episodes: int, **policies: str) -> dict[str, Values | str]:
+def mixes(runs: list[LoadedRun], episodes: int, **policies: str) -> dict[str, str]:
     """Margins of a Schelling diagram whose policies are the runs' where they are not given."""
     restrained, greedy = [], []
     for run in runs:
@@ -70,16 +70,15 @@ def mixes(runs: list[LoadedRun], episodes: int, **policies: str) -> dict[str, Va
     return {**{name: f"{margin:+}" for name, margin in margins.items()}, "dilemma": found.name}
 
 
-def training(run: LoadedRun) -> dict[str, Values]:
+def training(curves: dict[str, Values]) -> dict[str, Values]:
     """The lowest harvest of any twentieth of the training, and that of the last."""
-    harvest = curves_of(run.path)["collective_return"]
+    harvest = curves["collective_return"]
     means = running_mean(harvest, max(1, harvest.shape[-1] // 20))
     return {"harvest in its lowest twentieth": means.min(1), "harvest in the last twentieth": means[:, -1]}
 
 
-def course(runs: list[LoadedRun]) -> list[str]:
+def course(curves: list[dict[str, Values]]) -> list[str]:
     """The phases of the mean over all replicas, in millions of steps, with the harvest at each end."""
-    curves = [curves_of(run.path) for run in runs]
     episodes = min(len(of_run["collective_return"][0]) for of_run in curves)
     if episodes < FEWEST_EPISODES:
         return [f"fewer than {FEWEST_EPISODES:,} episodes, in which none are looked for"]
@@ -96,7 +95,8 @@ def course(runs: list[LoadedRun]) -> list[str]:
     harvest, lines = means["collective_return"].mean(0), []
     for phase in find_phases(at, means):
         first, last = int(phase.first), int(phase.last)
-        ends = [harvest[max(0, place - 10) : place + 10].mean() for place in (first + 10, last - 10)]
+        inside = harvest[first:last]
+        ends = inside[:20].mean(), inside[-20:].mean()
         label = phase.label or UNNAMED
         lines.append(
             f"{steps[first]:.0f} to {steps[last]:.0f}: {label}, {ends[0]:.0f} to {ends[1]:.0f} apples"
@@ -122,19 +122,20 @@ def main(
     """
     loaded = [load(run) for run in runs]
     replicas = sum(len(run.replicas) for run in loaded)
-    rows = together([training(run) | fresh(run, episodes) for run in loaded])
+    curves = [curves_of(run.path) for run in loaded]
+    rows = together(list(map(training, curves))) | together([fresh(run, episodes) for run in loaded])
     rows |= together([gains(run, episodes, training_episodes) for run in loaded])
     for who, policies in {
         "scripted restraint, these agents greedy": {"restrained": "sustainable"},
         "these agents restrained, scripted greed": {"greedy": "greedy"},
     }.items():
-        rows |= {f"{name}: {who}": str(value) for name, value in mixes(loaded, episodes, **policies).items()}
+        rows |= {f"{name}: {who}": value for name, value in mixes(loaded, episodes, **policies).items()}
     lines = [
         f"| over {replicas} replicas | |",
         "|---|---:|",
         *(f"| {name} | {rows[name]} |" for name in rows),
     ]
-    phases = [f"- {line}" for line in course(loaded)]
+    phases = [f"- {line}" for line in course(curves)]
     text = "\n".join(
         [*lines, "", "Phases of the training, in millions of steps of each replica:", "", *phases, ""]
     )

@@ -14,11 +14,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import tyro
+from effects import marked
 from numpy.typing import NDArray
 from possible import KNOWN
 
 from cprl.commons.colours import BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION
-from cprl.measuring.statistics import Estimate, difference, estimate, holm
+from cprl.measuring.statistics import Estimate, difference, estimate
 from cprl.runs.curves import curves_of, net_of
 from cprl.studies import StudyTable
 from cprl.studies.tables.comparing import compare
@@ -189,7 +190,8 @@ def table(found: list[Row]) -> str:
 def elsewhere() -> str:
     """A table in Markdown of what each change adds, and how many times the harvest it gives, by setting."""
     columns = {"DQN, 1 world": [(nets(of, name), nets(of, base)) for of, name, base in AS_HERE.values()]}
-    for setting in ("DQN, 16 worlds", "PPO, 256 worlds", "DQN, Melting Pot"):
+    conditions = table_of("elsewhere").design.conditions
+    for setting in dict.fromkeys(name.partition(": ")[0] for name in conditions):
         base = nets("elsewhere", f"{setting}: nothing changed")
         columns[setting] = [(nets("elsewhere", f"{setting}: {change}"), base) for change in AS_HERE]
     lines = [f"| apples after fines | {' | '.join(columns)} |", "|---|" + "---:|" * len(columns)]
@@ -202,17 +204,10 @@ def elsewhere() -> str:
 
 
 def changes(pairs: list[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> list[str]:
-    """The difference of each, paired by replica, and the ratio; stars by Holm's method for all of these.
-
-    A dash stands where it was not run.
-    """
-    found = {at: difference(*pair, paired=True) for at, pair in enumerate(pairs) if len(pair[0])}
-    stars = dict(zip(found, holm([one.p_value for one in found.values()]), strict=True))
-    texts = ["-"] * len(pairs)
-    for at, one in found.items():
-        value, base = pairs[at]
-        texts[at] = f"{one:+}{'*' if stars[at] else ''}, x {value.mean() / base.mean():.1f}"
-    return texts
+    """The difference of each, paired by replica, and the ratio; stars by Holm's method for all of these."""
+    texts = marked([difference(*pair, paired=True) for pair in pairs])
+    ratios = [value.mean() / base.mean() for value, base in pairs]
+    return [f"{text}, x {ratio:.1f}" for text, ratio in zip(texts, ratios, strict=True)]
 
 
 def draw(found: list[Row], path: Path) -> None:

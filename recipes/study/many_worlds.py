@@ -8,10 +8,10 @@ million steps (`--only "PPO, as run, 256 worlds, 1e8 steps"`). Settings are thos
 recipes/study/learners/tuning_commons.py chose. DQN samples eight transitions a step, as the study's does: in
 W worlds one update a turn of 8 W. PPO has minibatches of 50, 256 and 2,048 steps.
 
-What agents become in a hundred million steps, expected before it was looked at: neither ruin nor restraint.
-The harvest falls, then rises slowly to the end. Each agent keeps to a part of the board more than random ones
-do, with an exclusion below a half. A best response gains some tens of apples, and scripted greed pays among
-these agents: what they spare is not defended.
+What agents become in a hundred million steps, expected before it was looked at, when the harvests of two
+replicas were known: neither ruin nor restraint. The harvest falls, then rises slowly to the end. Each agent
+keeps to a part of the board more than random ones do, with an exclusion below a half. A best response gains
+some tens of apples, and scripted greed pays among these agents: what they spare is not defended.
 """
 
 from typing import Any, Final

@@ -155,7 +155,7 @@ class StatusFile:
         self._count(self._table["steps"], self._table["episodes"] + 1)
 
     def _count(self, steps: int, episodes: int) -> None:
-        """Of a training of so many steps, whose episodes can only be expected, the share of these counts."""
+        """Of a training of so many steps, the episodes that count are that share of those expected."""
         if self._all_steps is not None:
             episodes = self._table["of"] * steps // self._all_steps
         self._table.update(steps=steps, episodes=episodes)
