@@ -387,6 +387,8 @@ def test_a_part_of_a_study_is_chosen_by_whole_levels_and_not_by_parts_of_them():
     named = trials_of(Study(TINY, conditions={"a (b, c": {}, "d), e": {FREEZE: 3}}))
     assert [trial.condition.name for trial in trials_with(named, ["a (b, c"])] == ["a (b, c"]
     assert [trial.condition.name for trial in trials_with(named, ["e"])] == ["d), e"]
+    longer = trials_of(Study(TINY, conditions={"a, b": {}, "a, b, c": {FREEZE: 3}}))
+    assert [trial.condition.name for trial in trials_with(longer, ["a, b"])] == ["a, b"], "a name is one"
     for part in ("32", "8, 32)", "", ", "):
         with pytest.raises(ValueError, match="allowed: a condition or levels of some"):
             trials_with(trials, [part])

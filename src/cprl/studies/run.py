@@ -102,12 +102,12 @@ def run_study(
 
 
 def trials_with(trials: Sequence[Trial], only: Sequence[str]) -> list[Trial]:
-    """The trials of conditions that have one of some names, or its levels; without any, all of them."""
+    """The trials of conditions that have one of some names, or else its levels; without any, all of them."""
     names = list(dict.fromkeys(trial.condition.name for trial in trials))
     chosen = set()
     for text in only:
         levels = set(levels_in(text))
-        matching = {name for name in names if levels <= set(levels_in(name))}
+        matching = {text} if text in names else {name for name in names if levels <= set(levels_in(name))}
         if not matching:
             raise refusal("only", text, f"a condition or levels of some: {'; '.join(names)}")
         chosen |= matching
