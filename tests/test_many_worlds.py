@@ -464,6 +464,19 @@ def test_a_study_varies_worlds_and_its_table_counts_the_steps_of_replicas(tmp_pa
     assert not table.lacking
 
 
+@pytest.mark.integration
+def test_steps_in_which_no_episode_ends_make_a_finished_run_and_a_table_says_so(tmp_path, capsys):
+    run = cprl.run(experiment(steps=30), tmp_path / "run", watch="off")
+    assert "No training curve: a replica has ended no episode in 30 steps" in capsys.readouterr().out
+    assert json.loads((run / "report.json").read_text())["episodes"] == [0, 0]
+    assert not (run / "figures").exists()
+    study = Study(experiment(steps=30, replicas=1), conditions={"long": {"steps": 90}, "short": {}})
+    table = cprl.run_study(study, tmp_path / "study").table
+    (short,) = table.lacking
+    assert (short.condition, "is too short: replica 0 ended no episode" in short.reason) == ("short", True)
+    assert table.replicas == {"long": 1, "short": 0}
+
+
 def test_words_say_worlds_and_steps_in_place_of_episodes(monkeypatch):
     def of(*words):
         made, _ = parse(lambda: experiment(), ["recipe.py", *words])

@@ -13,7 +13,7 @@ from cprl.policies.lanes import LaneActor
 from cprl.system.times import CLOCK
 from cprl.terminal import progress
 from cprl.terminal.progress import ProgressBar
-from cprl.training import train
+from cprl.training import Training, train
 
 GAME = Game(map=maps.parse(".A>\n..A"), rules=Rules(window_rows=3, window_columns=3, episode_steps=5))
 
@@ -63,6 +63,17 @@ def test_a_notebook_has_one_line_with_a_bar_that_fills(monkeypatch):
     full = [line.count("█") for line in shown.split("\r")[1:]]
     assert full == sorted(full)
     assert (full[0], full[-1]) == (1, 20)
+
+
+def test_the_bar_counts_the_episodes_that_run_in_every_world():
+    with ProgressBar(GAME, episodes=20, replicas=2, worlds=3, console=Console(file=io.StringIO())) as bar:
+        walker = LaneActor(None, 8, seeds=[(0,), (1,)], agents=1, worlds=3)
+        training = Training(
+            CommonsEnv(GAME, 6), {}, others={(0,): walker}, worlds=3, episodes=20, callbacks=[bar]
+        )
+        for _ in range(12):  # 2.4 episodes of each world
+            training.step()
+        assert bar._done() == pytest.approx(3 * 12 / 5)
 
 
 def test_lines_count_episodes_from_where_a_stopped_training_was(monkeypatch):

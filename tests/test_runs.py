@@ -214,6 +214,8 @@ def test_curves_are_those_of_each_replica_and_agent():
     curves = as_curves(pa.table(columns))
     assert curves["return_1"].tolist() == [[4.0], [2.0]], "the episodes that all replicas have ended"
     np.testing.assert_array_equal(curves["equality"], [[np.nan], [0.5]])
+    assert as_curves(pa.table(columns), at_end=True)["return_1"].tolist() == [[6.0], [2.0]], "the latest"
+    assert as_curves(pa.table(columns).slice(0, 0)) == {}
 
 
 def test_running_means_stand_at_their_first_episode_and_leave_out_what_is_undefined():

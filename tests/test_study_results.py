@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
@@ -23,7 +24,7 @@ from cprl.studies.status import Status
 from cprl.studies.tables.comparing import Cells, cells, compare, markdown, metrics_of
 from cprl.studies.tables.pooled import pooled_table
 from cprl.studies.tables.sources import circumstances_of, design_of, ending, study_table
-from cprl.studies.tables.table import METADATA, StudyTable
+from cprl.studies.tables.table import METADATA, Design, StudyTable
 from cprl.studies.trials import trials_of
 from cprl.terminal.style import WIDTH_IN
 
@@ -760,3 +761,23 @@ def test_cprl_table_of_a_study_says_and_writes_what_its_table_alone_gives(table_
     for words in (["--window", "1"], ["--reference", "none"]):
         with pytest.raises(SystemExit, match=words[0]):
             table_command(*words, of="pairs")
+
+
+# Replicas that trained as many steps, and ended different numbers of episodes
+
+
+def test_the_last_episodes_are_those_of_each_replica():
+    windows = {0: [(0, 10, 1.0), (10, 10, 2.0), (20, 4, 3.0)], 1: [(0, 10, 4.0), (10, 3, 5.0)]}
+    rows = [
+        {"condition": "a", "replica": replica, "part": "training", "metric": "net"}
+        | {"episode": episode, "window_episodes": length, "undefined": 0, "value": value}
+        for replica, of_replica in windows.items()
+        for episode, length, value in of_replica
+    ]
+    design = Design(name="small", conditions={"a": {}}, reference="a", is_paired=True)
+    table = StudyTable(design=design, rows=pa.Table.from_pylist(rows), window=10)
+    compared = compare(table, "net", last=10)
+    assert compared.by_name["a"].values == {0: 3.0, 1: 5.0}
+    assert (compared.last, compared.by_name["a"].episodes) == ((3, 4), 7)
+    compared = compare(table, "net", last=14)
+    assert compared.by_name["a"].values == pytest.approx({0: (10 * 2.0 + 4 * 3.0) / 14, 1: 55 / 13})

@@ -68,7 +68,7 @@ def test_a_missing_trial_is_run_and_says_how_far_it_is_and_a_finished_one_is_lef
     missing = task_in(tmp_path)
     assert missing.run_here() == Outcome(missing.name, "finished", worked=True)
     assert capsys.readouterr().out == ""
-    assert "tiny, 1 replicas, 2 episodes" in missing.status.log.read_text()
+    assert "tiny, 1 replica, 2 episodes" in missing.status.log.read_text()
     status = missing.status.read()
     assert (status["episodes"], status["of"], status["steps"], status["pid"]) == (2, 2, 40, os.getpid())
     assert status["peak_bytes"] > 10**7

@@ -169,7 +169,7 @@ class RolloutSettings(_OfRollouts):
     """Passes over each rollout."""
     minibatch_size: Positive = 50
     """Steps in a minibatch, of all worlds of a replica; must divide the `rollout_steps` x W steps of its W
-    worlds."""
+    worlds, and `rollout_steps` or be a multiple of it."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

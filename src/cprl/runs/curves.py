@@ -22,31 +22,38 @@ SMOOTHED_EPISODES: Final = 100
 """The window of running means in episodes, where nothing else is asked for."""
 
 
-def curves_of(run: Path) -> dict[str, Values]:
+def curves_of(run: Path, *, at_end: bool = False) -> dict[str, Values]:
     """Read every metric that a run's game reports, and each agent's return as `return_0` and so on.
 
     Those of institutions are there as `institutions/fines` and so on, but for the share of unjust tags, since
     a table does not say who tagged, and for groups.
 
+    Args:
+        at_end: whether, of replicas that have ended different numbers of episodes, each one's latest E are
+            read rather than its first.
+
     Returns:
-        float64 [R, E] by name, for R replicas and the E episodes that all of them have ended; NaN where a
-        metric is undefined.
+        float64 [R, E] by name, for R replicas and as many episodes as all of them have ended; NaN where a
+        metric is undefined. Nothing of a run that has ended no episode.
     """
-    return as_curves(read_episodes(run))
+    return as_curves(read_episodes(run), at_end=at_end)
 
 
-def as_curves(table: pa.Table) -> dict[str, Values]:
+def as_curves(table: pa.Table, *, at_end: bool = False) -> dict[str, Values]:
     """Like `curves_of`, from a table of `read_episodes`."""
+    if not table.num_rows:
+        return {}
     episode, agent = table["episode"].to_numpy(), table["agent"].to_numpy()
     replicas, replica = np.unique(table["replica"].to_numpy(), return_inverse=True)
-    episodes = min(int(episode[replica == row].max()) for row in range(len(replicas))) + 1
-    ended = episode < episodes
-    cells = replica[ended], episode[ended], agent[ended]
+    counts = np.array([int(episode[replica == row].max()) + 1 for row in range(len(replicas))])
+    place = episode - (counts - counts.min())[replica] if at_end else episode
+    read = (place >= 0) & (place < counts.min())
+    cells = replica[read], place[read], agent[read]
 
     def values(name: str) -> Values:
         """A column as [R, E, N]."""
-        column = np.full((len(replicas), episodes, int(agent.max()) + 1), np.nan)
-        column[cells] = table[name].to_numpy()[ended]
+        column = np.full((len(replicas), counts.min(), int(agent.max()) + 1), np.nan)
+        column[cells] = table[name].to_numpy()[read]
         return column
 
     curves = {name: values(name)[..., 0].copy() for name in metrics_in(table.schema)}

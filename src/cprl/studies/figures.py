@@ -404,10 +404,10 @@ def _draw_courses(
         if grid is None:
             continue
         lengths = grid["window_episodes"]
-        length, episodes = int(lengths.max()), int(lengths.sum())
-        is_whole = lengths == length
+        length, episodes = int(lengths.max()), int(lengths.sum(1).min())
+        is_whole = (lengths == length).all(0)  # those that all replicas have
         count = max(1, min(SMOOTHED_EPISODES, episodes // _PART) // length)
-        middles = (grid["episode"][is_whole] + (length - 1) / 2).astype(np.float64)
+        middles = (grid["episode"][0, is_whole] + (length - 1) / 2).astype(np.float64)
         at = running_mean(middles, count)
         middle, low, high = curve_interval(running_mean(grid["value"][:, is_whole], count))
         axes.fill_between(at, low, high, color=colour, alpha=0.2, linewidth=0)

@@ -114,6 +114,8 @@ def _lengths(table: StudyTable) -> list[str]:
         "played its episodes; those whose episodes are short play and learn on, in episodes that are in no "
         "table."
     )
+    if any(least < most for (least, most), _ in ranges.values()):
+        what += " Where steps are counted, each plays as many as it ends in these."
     rows = [
         [condition, *(f"{least:,}" if least == most else f"{least:,} to {most:,}" for least, most in pairs)]
         for condition, pairs in ranges.items()

@@ -48,6 +48,7 @@ class ProgressBar:
             them; else that of the last episode.
         episodes: of each replica, about.
         steps: of each replica; None for a training of so many episodes. The bar counts what is given.
+        worlds: of each replica.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class ProgressBar:
         steps: int | None = None,
         title: str = "training",
         replicas: int = 1,
+        worlds: int = 1,
         console: Console | None = None,
     ) -> None:
         self.console = console or safe_console()
@@ -78,9 +80,10 @@ class ProgressBar:
         self._all_steps = steps
         self._task = self._progress.add_task(title, total=steps or episodes, values="")
         self._latest = {"return": "-", "epsilon": ""}
-        self._turns = self._steps = self._steps_then = self._steps_this_episode = self._episodes = 0
+        self._turns = self._steps = self._steps_then = self._steps_running = self._episodes = 0
         self._started = self._then = _running_s()
         self._left_of, self._replicas, self._before = steps or episodes, replicas, 0.0
+        self._worlds = replicas * worlds
         self._compiled_before_s = CLOCK.total_s
         self._is_over, self._lines = Event(), Thread(target=self._say_compiling, daemon=True)
 
@@ -92,6 +95,7 @@ class ProgressBar:
             episodes=experiment.expected_episodes,
             steps=experiment.steps,
             replicas=experiment.replicas,
+            worlds=experiment.worlds,
         )
 
     def on_start(self, training: Any) -> None:
@@ -105,18 +109,18 @@ class ProgressBar:
             self._started = self._then = _running_s()
         self._turns += 1
         self._steps += batch.numel()
-        self._steps_this_episode += batch.numel()
+        self._steps_running += batch.numel()
         waited = _running_s() - self._then
         if waited > self._period_s:
             self._show(waited)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         self._episodes += 1
-        self._steps_this_episode = 0
+        self._steps_running = max(0, self._steps_running - episode.steps)
         self._last_steps = episode.steps
         self._latest["return"] = f"{episode.return_.sum():{'.0f' if episode.harvest is not None else '.4g'}}"
         epsilons = [value for name, value in learning.items() if name.endswith("/epsilon")]
-        if epsilons:
+        if any(epsilons):
             self._latest["epsilon"] = f"{max(epsilons):.2f}"
 
     def _show(self, waited: float) -> None:
@@ -150,7 +154,7 @@ class ProgressBar:
         if self._all_steps is not None:
             return self._steps / self._replicas
         episode_steps = self._clock or self._last_steps
-        running = min(self._replicas, self._steps_this_episode / episode_steps) if episode_steps else 0
+        running = min(self._worlds, self._steps_running / episode_steps) if episode_steps else 0
         return (self._episodes + running) / self._replicas
 
     def _time_left(self, done: float) -> str:
@@ -189,7 +193,7 @@ class ProgressBar:
         self._is_over.set()
         if self._lines.is_alive():
             self._lines.join()
-        self._steps_this_episode = 0
+        self._steps_running = 0
         self._progress.update(self._task, completed=self._done())
         self._progress.stop()
         if self.console.is_jupyter:

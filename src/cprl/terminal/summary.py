@@ -66,11 +66,12 @@ def course_of(run: Path) -> str:
     A tragedy, here: the last 30 episodes yield at most 95 % of random play, the best ten at least 1.5 times
     as much as it, and boards last at most 70 % of the turns that they could.
     """
-    curves = curves_of(run)
+    curves, at_end = curves_of(run), curves_of(run, at_end=True)
     if lacking := sorted({"collective_return", "survival_steps"} - set(curves)):
         raise ValueError(f"the episodes of {run} lack {', '.join(lacking)}; allowed: games that report them")
     returns, survival = curves["collective_return"].mean(0), curves["survival_steps"]
-    tens, last, lasts = running_mean(returns, 10), returns[-30:].mean(), survival[:, -30:].mean()
+    last, lasts = (at_end[name][:, -30:].mean() for name in ("collective_return", "survival_steps"))
+    tens = running_mean(returns, 10)
     by_chance = as_curves(read_table(run / "evaluation" / "random.parquet"))["collective_return"]
     random, error = by_chance.mean(), by_chance.std(ddof=1) / by_chance.size**0.5
     peak, times, shares = tens.max(), "where random play gets none", []

@@ -188,7 +188,7 @@ def _carry_out(
         work.viewer.random_play(random)
     training = _train(work, observers, checkpointer)
     played = _evaluate(work, random)
-    figure = _draw(work.experiment, work.directory, played["random"]) if figures else None
+    figure = _draw(work.experiment, work.directory, training, played["random"]) if figures else None
     _write_report(work.directory, training, times)
     _summarise(work, training, played, figure)
     checkpointer.done()
@@ -241,7 +241,10 @@ def _evaluate(work: _Work, random: list[Episode] | None) -> dict[str, list[Episo
     return played
 
 
-def _draw(experiment: Experiment, directory: Path, random: list[Episode]) -> Path:
+def _draw(experiment: Experiment, directory: Path, training: Training, random: list[Episode]) -> Path | None:
+    if not all(training.episodes_by_replica):
+        say(f"No training curve: a replica has ended no episode in {training.steps:,} steps")
+        return None
     steps = exploration_steps(experiment.agents)
     ends = None if steps is None else steps / experiment.worlds
     return training_curve(directory, title=_title(experiment), random=random, exploration_turns=ends)
@@ -253,7 +256,7 @@ def _write_report(directory: Path, training: Training, times: Times) -> None:
         **times.report(training.times),
         "steps": training.steps,
         "finished": datetime.now().astimezone().isoformat(timespec="seconds"),
-        "episodes": training.episodes,
+        "episodes": training.episodes or training.episodes_by_replica,
         "worlds": training.worlds,
         "threads": torch.get_num_threads(),
     }
@@ -278,7 +281,8 @@ def _summarise(
 def _title(experiment: Experiment) -> str:
     worlds = f" of {experiment.worlds:,} worlds" if experiment.worlds > 1 else ""
     length = experiment.length if experiment.unit == "episodes" else f"{experiment.length:,}"
-    return f"{experiment.name}, {experiment.replicas} replicas{worlds}, {length} {experiment.unit}"
+    replicas = f"{experiment.replicas} replica{'s' * (experiment.replicas != 1)}"
+    return f"{experiment.name}, {replicas}{worlds}, {length} {experiment.unit}"
 
 
 def _weights_of_partners(experiment: Experiment, run: Path) -> dict[str, str]:

@@ -188,7 +188,12 @@ class Training:
     @property
     def episodes_played(self) -> int:
         """Episodes that all replicas together have ended so far, those beyond `episodes` left out."""
-        return sum(played if self.episodes is None else min(played, self.episodes) for played in self._played)
+        return sum(self.episodes_by_replica)
+
+    @property
+    def episodes_by_replica(self) -> list[int]:
+        """Likewise, of each replica."""
+        return [played if self.episodes is None else min(played, self.episodes) for played in self._played]
 
     def start(self) -> None:
         """Calls `on_start` of the callbacks; `run` does before the first step."""

@@ -122,7 +122,7 @@ def metrics_of(table: StudyTable, metrics: Sequence[str] = ()) -> tuple[str, ...
 def _compared(table: StudyTable, metric: str, part: str, last: int) -> Comparison:
     reference, is_paired = table.design.reference, table.design.is_paired
     means = {name: _means(table, name, metric, part, last) for name in table.design.conditions}
-    lengths = [length for *_, length in means.values() if length]
+    lengths = [length for *_, of_each in means.values() for length in of_each]
     return Comparison(
         metric=metric,
         part=part,
@@ -133,31 +133,34 @@ def _compared(table: StudyTable, metric: str, part: str, last: int) -> Compariso
             Compared(
                 condition=name,
                 values=values,
-                episodes=length * len(values),
+                episodes=sum(lengths),
                 undefined=undefined,
                 difference=_difference(values, means[reference][0], is_paired) if name != reference else None,
             )
-            for name, (values, undefined, length) in means.items()
+            for name, (values, undefined, lengths) in means.items()
         ),
     )
 
 
 def _means(
     table: StudyTable, condition: str, metric: str, part: str, last: int
-) -> tuple[dict[int, float], int, int]:
+) -> tuple[dict[int, float], int, list[int]]:
     """The value of each replica, undefined episodes of all, and the episodes of each."""
     grid = table.values(condition, metric, part)
     if grid is None:
-        return {}, 0, 0
-    lengths = grid["window_episodes"]
-    ends = int((grid["episode"] + lengths).max())
-    is_last = grid["episode"] >= ends - last if part == TRAINING else np.ones(len(lengths), bool)
-    counts = lengths[is_last] - grid["undefined"][:, is_last]
-    sums = np.where(counts > 0, grid["value"][:, is_last], 0.0) * counts
+        return {}, 0, []
+    ends = (grid["episode"] + grid["window_episodes"]).max(1, keepdims=True)
+    is_last = (grid["episode"] >= ends - last) | (part != TRAINING)
+    some = is_last.any(0)
+    lengths, undefined, values = (
+        np.where(is_last, grid[name], 0)[:, some] for name in ("window_episodes", "undefined", "value")
+    )
+    counts = lengths - undefined
+    sums = np.where(counts > 0, values, 0.0) * counts
     with np.errstate(invalid="ignore"):
         means = sums.sum(1) / counts.sum(1)
-    values = dict(zip(grid["replica"].tolist(), means.tolist(), strict=True))
-    return values, int(grid["undefined"][:, is_last].sum()), int(lengths[is_last].sum())
+    by_replica = dict(zip(grid["replica"].tolist(), means.tolist(), strict=True))
+    return by_replica, int(undefined.sum()), lengths.sum(1).tolist()
 
 
 def _difference(

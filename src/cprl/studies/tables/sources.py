@@ -53,8 +53,13 @@ REASONS: Final[dict[State, str]] = {
 }
 
 Windows = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Values]
-"""A metric of R replicas in W windows: the first episode and the episodes of each, [W], of which the last may
-be shorter; episodes in which it is undefined, and means over the others, NaN where there are none, [R, W]."""
+"""A metric of a replica in W windows, [W]: the first episode of each, and its episodes, of which the last
+window may have fewer; the episodes in which it is undefined, and the mean over the others, NaN where there
+are none."""
+
+
+class TooShortError(ValueError):
+    """A replica has ended no episode in the steps that it trained."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +158,7 @@ def table_of(
         try:
             measured.append(_measured(source, window))
         except (ValueError, OSError, KeyError) as error:
-            reason = f"is damaged: {error}"
+            reason = f"is {'too short' if isinstance(error, TooShortError) else 'damaged'}: {error}"
             damaged.append(Lacking(source.name, source.condition, source.replicas, reason))
     made = {run.source.name: run.circumstances for run in measured}
     by_condition: dict[str, list[_Measured]] = {}
@@ -171,7 +176,10 @@ def table_of(
         },
         ending_rules=tuple(dict.fromkeys(run.rule for run in measured)),
         lengths={
-            name: {"episodes": _range(run.episodes for run in runs), "steps": _range(steps)}
+            name: {
+                "episodes": _range(number for run in runs for number in run.episodes),
+                "steps": _range(steps),
+            }
             for name, runs in by_condition.items()
             if (steps := [run.steps for run in runs if run.steps is not None])
         },
@@ -187,15 +195,15 @@ class _Measured(NamedTuple):
     """What a table takes from a run."""
 
     source: Source
-    windows: Mapping[tuple[str, str], Windows]
-    """By part and metric."""
+    windows: Sequence[Mapping[tuple[str, str], Windows]]
+    """Of each replica, by part and metric."""
     phases: Sequence[str]
     """In which each replica ends."""
     rule: str
     """How these were told."""
     circumstances: Circumstances
-    episodes: int
-    """Those that every replica ended in training."""
+    episodes: Sequence[int]
+    """Those that each replica ended in training."""
     steps: int | None
     """Those that its report says a replica trained."""
 
@@ -206,28 +214,32 @@ def _measured(source: Source, window: int) -> _Measured:
     In training, windows are of so many episodes; evaluation and random play are one window each, but for
     `window=1`.
     """
-    windows, curves = {}, {}
+    windows: list[dict[tuple[str, str], Windows]] = [{} for _ in range(source.replicas)]
+    curves: dict[str, list[dict[str, Values]]] = {}
     for part, name in PARTS.items():
         folder = source.run / "evaluation"
         table = read_episodes(source.run) if name is None else read_table(folder / f"{name}.parquet")
         _refuse_gaps(table, source, part)
-        curves[part] = as_curves(table)
-        for metric, values in {**curves[part], NET: net_of(curves[part])}.items():
-            length = window if part == TRAINING or window == 1 else values.shape[1]
-            windows[part, metric] = _in_windows(values, length)
-    phases, rule = _phases(source, curves)
-    episodes = curves[TRAINING]["return_0"].shape[1]
+        # one by one: in as many steps, each replica ends a number of episodes of its own
+        replica = table["replica"].to_numpy()
+        curves[part] = [as_curves(table.filter(replica == number)) for number in range(source.replicas)]
+        for of_replica, by_name in zip(windows, curves[part], strict=True):
+            for metric, values in {**by_name, NET: net_of(by_name)}.items():
+                length = window if part == TRAINING or window == 1 else values.shape[1]
+                of_replica[part, metric] = _in_windows(values[0], length)
+    phases, rule = _phases(curves)
+    episodes = [by_name["return_0"].shape[1] for by_name in curves[TRAINING]]
     made = circumstances_of(source.run)
     return _Measured(source, windows, phases, rule, made, episodes, _steps_of(source.run))
 
 
 def _in_windows(values: Values, window: int) -> Windows:
-    firsts = np.arange(0, values.shape[1], window)
-    lengths = np.diff(np.append(firsts, values.shape[1]))
+    firsts = np.arange(0, len(values), window)
+    lengths = np.diff(np.append(firsts, len(values)))
     defined = ~np.isnan(values)
-    counts = np.add.reduceat(defined.astype(np.int64), firsts, axis=1)
+    counts = np.add.reduceat(defined.astype(np.int64), firsts)
     with np.errstate(invalid="ignore"):
-        means = np.add.reduceat(np.where(defined, values, 0.0), firsts, axis=1) / counts
+        means = np.add.reduceat(np.where(defined, values, 0.0), firsts) / counts
     return firsts, lengths, lengths - counts, means
 
 
@@ -242,6 +254,9 @@ def _refuse_gaps(table: pa.Table, source: Source, part: str) -> None:
     wanted = source.episodes if part == TRAINING else counts.max(initial=0)
     if wanted is None:  # of so many steps, in which each replica ends a number of its own
         wanted = counts
+        if lacking := sorted(set(range(source.replicas)) - set(replicas.tolist())):
+            steps = _steps_of(source.run) or "its"
+            raise TooShortError(f"replica {lacking[0]} ended no episode in {steps} steps; train longer")
     is_whole = np.all(counts == wanted) and np.all(counts > 0)
     if replicas.tolist() != list(range(source.replicas)) or not is_whole:
         raise ValueError(
@@ -268,14 +283,15 @@ def _rows(design: Design, measured: Sequence[_Measured], marked: Mapping[str, st
     names, parts, metrics = list(design.conditions), list(PARTS), _metrics(measured)
     blocks = []
     for place, run in enumerate(measured):
-        at, replicas = names.index(run.source.condition), run.source.first + np.arange(run.source.replicas)
-        for (part, metric), windows in run.windows.items():
-            if metric in metrics:
-                codes = at, replicas[:, None], parts.index(part), metrics.index(metric)
-                blocks.append([array.reshape(-1) for array in np.broadcast_arrays(*codes, *windows, place)])
+        at = names.index(run.source.condition)
+        for replica, of_replica in enumerate(run.windows, run.source.first):
+            for (part, metric), windows in of_replica.items():
+                if metric in metrics:
+                    codes = at, replica, parts.index(part), metrics.index(metric)
+                    blocks.append(np.broadcast_arrays(*codes, *windows, place))
     columns = [np.concatenate(arrays) for arrays in zip(*blocks, strict=True)] or [np.zeros(0, np.int64)] * 9
     order = np.lexsort(columns[4::-1])  # the first five, the first one first
-    condition, replica, part_code, metric_code, episode, length, undefined, value, place_of_run = (
+    condition, replicas, part_code, metric_code, episode, length, undefined, value, place_of_run = (
         column[order] for column in columns
     )
 
@@ -292,7 +308,7 @@ def _rows(design: Design, measured: Sequence[_Measured], marked: Mapping[str, st
     rows |= {
         "run": texts([source.name for source in sources], place_of_run),
         "marks": texts([marked[source.name] for source in sources], place_of_run),
-        "replica": pa.array(replica, pa.int32()),
+        "replica": pa.array(replicas, pa.int32()),
         "part": texts(parts, part_code),
         "metric": texts(metrics, metric_code),
         "episode": pa.array(episode, pa.int32()),
@@ -308,7 +324,7 @@ def _metrics(measured: Sequence[_Measured]) -> list[str]:
 
     The return of all agents together is among them where it is not the harvest.
     """
-    metrics = {metric for run in measured for _, metric in run.windows}
+    metrics = {metric for run in measured for _, metric in run.windows[0]}
     if "collective_return" in metrics and not any(name.startswith("institutions/") for name in metrics):
         metrics.discard(NET)
     order = [*social.METRICS, "yield_share", NET]
@@ -380,18 +396,17 @@ BY_PHASES: Final = f"the last phase that cprl.measuring.phases finds, from {FEWE
 BY_RETURNS: Final = "its last 30 episodes against its peak and random play, see cprl.studies.tables.sources"
 
 
-def _phases(source: Source, curves: Mapping[str, dict[str, Values]]) -> tuple[list[str], str]:
-    """In which phase each replica ends, and by which rule; `curves` are those of the parts of the run."""
+def _phases(curves: Mapping[str, Sequence[dict[str, Values]]]) -> tuple[list[str], str]:
+    """In which phase each replica ends, and by which rule; `curves` are those of each, by the parts of the
+    run."""
     training = curves[TRAINING]
-    by_phases = [
-        phases_of({name: values[row : row + 1] for name, values in training.items()})
-        for row in range(source.replicas)
-    ]
+    by_phases = [phases_of(by_name) for by_name in training]
     if all(phases is not None for phases in by_phases):
         return [phases[-1].label or UNNAMED for phases in by_phases if phases is not None], BY_PHASES
-    agents = sum(name.startswith("return_") for name in training)
-    random = float(_harvest(curves[RANDOM]).mean())
-    return [ending(returns, random=random, agents=agents) for returns in _harvest(training)], BY_RETURNS
+    agents = sum(name.startswith("return_") for name in training[0])
+    random = float(np.concatenate([_harvest(by_name) for by_name in curves[RANDOM]]).mean())
+    ends = [ending(_harvest(by_name)[0], random=random, agents=agents) for by_name in training]
+    return ends, BY_RETURNS
 
 
 def ending(returns: Values, *, random: float, agents: int) -> str:

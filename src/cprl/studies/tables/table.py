@@ -56,8 +56,9 @@ COLUMNS: Final = (
 """All but those of factors, which follow "checksum"."""
 
 Grid = Mapping[str, NDArray[Any]]
-"""The rows of a metric in one part, for R replicas and W windows: "replica", [R]; "episode" and
-"window_episodes", [W]; "undefined" and "value", [R, W]."""
+"""The rows of a metric in one part, for R replicas and the W windows of the one that has most: "replica",
+[R]; "episode", "window_episodes", "undefined" and "value", [R, W]. A window that a replica does not have is
+of 0 episodes."""
 Circumstances = Mapping[str, str]
 """The version of each package, the checksum of each module of the user's own, the git commit and the type of
 processor, by name. Where a run was resumed under others, all of them in order, with " then " between them."""
@@ -77,7 +78,8 @@ class Design:
     reference: str
     """The condition that others are compared with."""
     is_paired: bool
-    """Whether replicas of the same number have the same seeds and worlds in each condition."""
+    """Whether replicas of the same number have the same seeds in each condition, and, where it has as many
+    worlds, the same worlds."""
     is_grid: bool = True
     """Whether levels are few and repeat; not so for random draws."""
     notes: tuple[str, ...] = ()
@@ -176,10 +178,7 @@ class StudyTable:
         )
 
     def values(self, condition: str, metric: str, part: str) -> Grid | None:
-        """Return the rows of a condition in one part, None if there are none.
-
-        Of windows that not every replica has, those that all have.
-        """
+        """Return the rows of a condition in one part, None if there are none."""
         return self._grids.get((condition, part, metric))
 
     @cached_property
@@ -239,14 +238,13 @@ _HELD: Final = ("window", "made", "endings", "ending_rules", "lengths")
 
 def _grid(columns: Mapping[str, NDArray[Any]]) -> Grid:
     """Columns that are sorted by replica and episode, with a row for each replica."""
-    replicas, counts = np.unique(columns["replica"], return_counts=True)
-    windows = counts.min()
-    places = np.concatenate([np.arange(count) for count in counts])
-    grid = {
-        name: column[places < windows].reshape(len(replicas), windows) for name, column in columns.items()
-    }
-    by_window = {name: grid[name][0] for name in ("episode", "window_episodes")}
-    return {**grid, **by_window, "replica": replicas}
+    replicas, row, counts = np.unique(columns["replica"], return_inverse=True, return_counts=True)
+    place = np.concatenate([np.arange(count) for count in counts])
+    grid: dict[str, NDArray[Any]] = {"replica": replicas}
+    for name in ("episode", "window_episodes", "undefined", "value"):
+        grid[name] = np.zeros((len(replicas), counts.max()), columns[name].dtype)
+        grid[name][row, place] = columns[name]
+    return grid
 
 
 def counted(made: Mapping[str, Circumstances]) -> dict[str, Counter[str]]:
