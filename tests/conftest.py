@@ -1,5 +1,6 @@
 """What the tests share: small boards that are never square, and a quiet, seeded torch."""
 
+import signal
 from dataclasses import replace
 
 import pytest
@@ -24,6 +25,35 @@ def trusted():
     """What a test allows to be imported is not allowed in the next one."""
     with allowing(()):
         yield
+
+
+@pytest.fixture
+def stopped(monkeypatch):
+    """Trains an experiment with a callback of `one_road_parts`, which ends the process at a step."""
+
+    def run_until(at_step, experiment, out, **options):
+        monkeypatch.setenv("STOP_AT_STEP", str(at_step))
+        with pytest.raises(SystemExit) as error:
+            cprl.run(experiment, out, watch="off", **options)
+        monkeypatch.delenv("STOP_AT_STEP")
+        assert error.value.code == 128 + signal.SIGTERM
+        return out
+
+    return run_until
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that are saved, in order, each with its caption; not rendered."""
+    figures = []
+
+    def keep(figure, path, *, caption, **how):
+        figure.caption = caption
+        figures.append(figure)
+        return path
+
+    monkeypatch.setattr("cprl.terminal.style.save", keep)
+    return figures
 
 
 @pytest.fixture

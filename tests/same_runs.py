@@ -9,6 +9,8 @@ import psutil
 import pyarrow.parquet as pq
 import torch
 
+from cprl.runs.episodes import read_episodes
+from cprl.runs.weights import load_weights
 from cprl.studies import study_table
 from cprl.studies.status import Status
 from cprl.studies.study import STATUS
@@ -29,6 +31,14 @@ def differences(run, twin):
         if read is not None and not is_same(read(there[name]), read(wanted[name])):
             lines.append(f"{name} differs")
     return lines
+
+
+def assert_same_training(run, other, names=("final",)):
+    """Episodes and weights are the same bit for bit."""
+    assert read_episodes(run).equals(read_episodes(other))
+    for name in names:
+        mine, theirs = (load_weights(one / "checkpoints" / f"{name}.pt") for one in (run, other))
+        assert repr(mine) == repr(theirs), name
 
 
 def assert_same_study(study, runs, undisturbed):

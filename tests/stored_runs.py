@@ -71,6 +71,10 @@ def values(measures):
     return {name: one.estimate and one.estimate.value for name, one in measures.items()}
 
 
+def returns(played):
+    return {replica: [episode.return_.tolist() for episode in own] for replica, own in played.items()}
+
+
 def told(episodes):
     """What tells episodes apart."""
     return [(one.steps, one.return_.tolist(), one.shots.tolist(), one.stock_left) for one in episodes]

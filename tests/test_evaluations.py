@@ -1,6 +1,5 @@
 """Greedy evaluations while agents are trained: their table, and that the training does not notice."""
 
-import signal
 from dataclasses import replace
 from itertools import product
 
@@ -118,18 +117,14 @@ def test_agents_play_as_a_greedy_evaluation_of_a_run_of_so_many_episodes(tmp_pat
 
 
 @pytest.mark.integration
-def test_a_run_that_is_stopped_and_resumed_has_the_same_evaluations(tmp_path, monkeypatch):
+def test_a_run_that_is_stopped_and_resumed_has_the_same_evaluations(tmp_path, stopped):
     stopping = experiment(callbacks=(Custom("one_road_parts:Stopping"),))
     whole = run(stopping, tmp_path / "whole")
     steps = sum(
         row["steps"] for row in read_episodes(whole).to_pylist() if (row["replica"], row["agent"]) == (0, 0)
     )
     for stop in (steps // 4, steps // 2):
-        monkeypatch.setenv("STOP_AT_STEP", str(stop))
-        with pytest.raises(SystemExit) as stopped:
-            run(stopping, tmp_path / "parts", resume=(tmp_path / "parts").exists())
-        assert stopped.value.code == 128 + signal.SIGTERM
-    monkeypatch.delenv("STOP_AT_STEP")
+        stopped(stop, stopping, tmp_path / "parts", resume=(tmp_path / "parts").exists())
     before = read_evaluations(tmp_path / "parts")
     parts = run(stopping, tmp_path / "parts", resume=True)
     assert rows(read_evaluations(parts)) == rows(read_evaluations(whole))

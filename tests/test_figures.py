@@ -53,20 +53,6 @@ def the_tragedy(replicas, episodes):
     return {name: curves[:, at] for name, curves in course.items()}
 
 
-@pytest.fixture
-def drawn(monkeypatch):
-    """The figures that are saved, in order, each with its caption; not rendered."""
-    figures = []
-
-    def keep(figure, path, *, caption, **how):
-        figure.caption = caption
-        figures.append(figure)
-        return path
-
-    monkeypatch.setattr(style, "save", keep)
-    return figures
-
-
 def labels(figure):
     (legend,) = figure.legends
     return [text.get_text().replace("\n", " ") for text in legend.get_texts()]

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from dqn_parts import make_learner
+from same_runs import assert_same_training
 from test_one_road import MEADOW, REPLAY
 
 import cprl
@@ -66,8 +67,7 @@ def resumed(experiment, out, **options):
 
 def assert_same(run, other):
     """Episodes, weights and evaluation are the same bit for bit."""
-    assert read_episodes(run).equals(read_episodes(other))
-    assert repr(final(run)) == repr(final(other))
+    assert_same_training(run, other)
     for name in ("random", "trained"):
         path = f"evaluation/{name}.parquet"
         assert read_table(run / path).equals(read_table(other / path))
@@ -86,20 +86,6 @@ def copied(run, folder):
 
 def contents(run):
     return {path.relative_to(run).as_posix(): path.read_bytes() for path in run.rglob("*") if path.is_file()}
-
-
-@pytest.fixture
-def stopped_at(monkeypatch):
-    """Runs an experiment until a step, after which a signal stops it."""
-
-    def run_until(step, experiment, out):
-        monkeypatch.setenv("STOP_AT_STEP", str(step))
-        with pytest.raises(SystemExit):
-            run(experiment, out)
-        monkeypatch.delenv("STOP_AT_STEP")
-        return out
-
-    return run_until
 
 
 class Signals:
@@ -297,8 +283,8 @@ class Interrupted:
 
 
 @pytest.mark.integration
-def test_a_stopped_run_is_extended_too(longer, tmp_path, stopped_at, capsys):
-    stopped_at(41, STOPPING, tmp_path / "run")
+def test_a_stopped_run_is_extended_too(longer, tmp_path, stopped, capsys):
+    stopped(41, STOPPING, tmp_path / "run")
     capsys.readouterr()
     resumed(replace(STOPPING, episodes=9), tmp_path / "run")
     said = capsys.readouterr().out
@@ -308,14 +294,14 @@ def test_a_stopped_run_is_extended_too(longer, tmp_path, stopped_at, capsys):
 
 
 @pytest.mark.integration
-def test_stored_agents_play_with_the_weights_they_had_when_the_run_began(tmp_path, monkeypatch, stopped_at):
+def test_stored_agents_play_with_the_weights_they_had_when_the_run_began(tmp_path, monkeypatch, stopped):
     monkeypatch.chdir(tmp_path)
     run(FIELD, Path("earlier"))
     among = replace(STOPPING, agents=[LEARNING, Frozen("earlier", 0)])
     run(among, Path("whole"))
     (played,) = json.loads(Path("whole/recipe.json").read_text())["frozen"].values()
     assert played == checksum(Path("earlier/checkpoints/final.pt"))
-    stopped_at(31, among, Path("stopped"))
+    stopped(31, among, Path("stopped"))
     resumed(replace(FIELD, episodes=9), Path("earlier"))
     assert checksum(Path("earlier/checkpoints/final.pt")) != played
     resumed(among, Path("stopped"))
@@ -415,12 +401,10 @@ def _often(*arguments, **options):
 
 
 @pytest.mark.integration
-def test_a_shorter_journal_falls_back_to_the_checkpoint_before(
-    whole, tmp_path, monkeypatch, stopped_at, capsys
-):
+def test_a_shorter_journal_falls_back_to_the_checkpoint_before(whole, tmp_path, monkeypatch, stopped, capsys):
     with monkeypatch.context() as patched:
         patched.setattr(running, "Checkpointer", _often)
-        path = stopped_at(75, STOPPING, tmp_path / "run")
+        path = stopped(75, STOPPING, tmp_path / "run")
     newest = checkpoints_in(path / "checkpoints")[-1]
     rows = read_episodes(path).num_rows
     state = read_checkpoint(newest)

@@ -18,7 +18,8 @@ RESULTS = Path(__file__).parents[1] / "docs" / "results"
 
 def labels(values, *, random_play=RANDOM):
     """The labels of a course, one after the other, each with the number of episodes that it lasts."""
-    now = Now(random_play=random_play)
+    now = Now()
+    now.random_play = random_play
     return [(label, len(list(same))) for label, same in groupby(map(now.add, values))]
 
 

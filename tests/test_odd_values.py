@@ -11,10 +11,8 @@ from cprl import CommonsEnv, Game, Map, Rules, maps
 from cprl.commons.batch import Batch
 from cprl.commons.near import neighbours
 from cprl.envs import CommonsGymnasiumEnv, parallel_env
-from cprl.evaluation import crossplay
 from cprl.evaluation.film import film
 from cprl.measuring import phases
-from cprl.measuring.episodes import EpisodeTracker
 
 GAME = Game(map=maps.parse(">A.\n.A."), rules=Rules(may_fire=False))
 BOARD = partial(Map, height=3, width=3, sites=((0, 0),), starts=((1, 1, 0),))
@@ -31,13 +29,10 @@ NAN = float("nan")
         (lambda: maps.random(9, 9, agents=1, density=NAN), "density"),
         (lambda: Rules(hits_to_tag=10**5000), "hits_to_tag"),
         (lambda: CommonsEnv(GAME, seed=2**64), "seed"),
-        (lambda: CommonsEnv(GAME, 0), "worlds"),
         (lambda: CommonsEnv(GAME, device="x"), "device"),
         (lambda: CommonsGymnasiumEnv(GAME).step(0), "reset"),
         (lambda: phases.find_phases([0, 1e9], {"a": [1, 2]}), "episodes"),
-        (lambda: crossplay([]), "runs"),
         (lambda: film("run", episode=2**32), "episode"),
-        (lambda: EpisodeTracker(1, 1).load_state_dict({}), "the state"),
     ],
 )
 def test_it_is_refused_by_its_name(call, name):

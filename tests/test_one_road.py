@@ -1,11 +1,11 @@
 """What an experiment names works everywhere: training, stop, resume, evaluation, film, from its recipe."""
 
-import signal
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from one_road_parts import Dilemma
+from same_runs import assert_same_training
 
 import cprl
 from cprl import Custom, Experiment, Game, Observation, Rules, maps
@@ -59,28 +59,6 @@ ALLOW = (
 )
 
 
-def assert_same_training(run, other, names=("final",)):
-    """Episodes and weights are the same bit for bit."""
-    assert read_episodes(run).equals(read_episodes(other))
-    for name in names:
-        mine, theirs = (load_weights(one / "checkpoints" / f"{name}.pt") for one in (run, other))
-        assert repr(mine) == repr(theirs), name
-
-
-@pytest.fixture
-def stopped(monkeypatch):
-    """Runs an experiment in a directory until it is stopped at a step; the exit code."""
-
-    def stop(experiment, run, at_step):
-        monkeypatch.setenv("STOP_AT_STEP", str(at_step))
-        with pytest.raises(SystemExit) as error:
-            cprl.run(experiment, run, watch="off")
-        monkeypatch.delenv("STOP_AT_STEP")
-        return error.value.code
-
-    return stop
-
-
 @pytest.fixture(scope="module")
 def in_one_go(tmp_path_factory):
     return cprl.run(MEADOW, tmp_path_factory.mktemp("whole") / "run", watch="off")
@@ -90,8 +68,7 @@ def in_one_go(tmp_path_factory):
 def test_an_experiment_with_parts_of_its_own_is_stopped_resumed_evaluated_and_filmed(
     in_one_go, stopped, tmp_path, monkeypatch, capsys
 ):
-    run = tmp_path / "run"
-    assert stopped(MEADOW, run, 71) == 128 + signal.SIGTERM
+    run = stopped(71, MEADOW, tmp_path / "run")
     told = capsys.readouterr().out
     flags = " ".join(f"--allow {target}" for target in ALLOW)
     assert f"To resume: {' '.join(cprl_here())} run {run} --resume {flags}" in told
@@ -157,7 +134,7 @@ def test_a_matrix_game_is_trained_stopped_resumed_evaluated_and_cross_played(tmp
     experiment = replace(DILEMMA, callbacks=MEADOW.callbacks)
     whole = cprl.run(experiment, tmp_path / "whole")
     assert "left out" in capsys.readouterr().out
-    stopped(experiment, tmp_path / "parts", 23)
+    stopped(23, experiment, tmp_path / "parts")
     parts = cprl.run(experiment, tmp_path / "parts", resume=True)
     allow = (*DILEMMA_ALLOW, "one_road_parts:Bored")
     assert_same_training(parts, whole)
@@ -238,7 +215,7 @@ def test_planes_are_learned_from_through_stop_resume_and_evaluation(of_agent, tm
         episodes=4,
     )
     whole = cprl.run(experiment, tmp_path / "whole", watch="off")
-    stopped(experiment, tmp_path / "parts", 33)
+    stopped(33, experiment, tmp_path / "parts")
     parts = cprl.run(experiment, tmp_path / "parts", watch="off", resume=True)
     assert_same_training(parts, whole)
     loaded = cprl.load(parts, allow=ALLOW)
@@ -268,6 +245,6 @@ def test_an_experiment_with_torchrls_own_engine_is_stopped_and_resumed(tmp_path,
         episodes=3,
     )
     whole = cprl.run(experiment, tmp_path / "whole", watch="off")
-    stopped(experiment, tmp_path / "parts", 33)
+    stopped(33, experiment, tmp_path / "parts")
     parts = cprl.run(experiment, tmp_path / "parts", watch="off", resume=True)
     assert_same_training(parts, whole)

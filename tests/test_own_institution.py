@@ -2,13 +2,13 @@
 
 import importlib
 import re
-import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from same_runs import assert_same_training
 
 import cprl
 from cprl import Custom, Experiment, Game, Rules, maps
@@ -84,23 +84,16 @@ def experiment(**changes):
 
 @pytest.mark.integration
 def test_a_run_that_is_stopped_and_resumed_equals_the_undisturbed_one_bit_for_bit(
-    licence, tmp_path, monkeypatch, capsys
+    licence, tmp_path, stopped, capsys
 ):
     whole = cprl.run(experiment(), tmp_path / "whole", watch="off")
-    monkeypatch.setenv("STOP_AT_STEP", "51")  # between two turns of the third episode
-    with pytest.raises(SystemExit) as stopped:
-        cprl.run(experiment(), tmp_path / "parts", watch="off")
-    assert stopped.value.code == 128 + signal.SIGTERM
+    stopped(51, experiment(), tmp_path / "parts")  # between two turns of the third episode
     (checkpoint,) = checkpoints_in(tmp_path / "parts" / "checkpoints")
     kept = load_weights(checkpoint)
     assert kept["carried"]["agents"]["licensed"].any(), "licences of the episode that was stopped"
     assert kept["env"]["transforms"]["transforms.0.sold"] > 0, "and all that were sold before"
-    monkeypatch.delenv("STOP_AT_STEP")
     parts = cprl.run(experiment(), tmp_path / "parts", watch="off", resume=True)
-    assert read_episodes(parts).equals(read_episodes(whole))
-    for name in ("final", "transforms"):
-        mine, theirs = (load_weights(run / "checkpoints" / f"{name}.pt") for run in (parts, whole))
-        assert repr(mine) == repr(theirs), name
+    assert_same_training(parts, whole, ("final", "transforms"))
     one, two = (cprl.evaluate_run(run, episodes=2, allow=ALLOW).table() for run in (parts, whole))
     assert repr(one.to_pydict()) == repr(two.to_pydict())
     assert cprl.load(parts, allow=ALLOW).experiment == experiment()

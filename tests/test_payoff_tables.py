@@ -15,7 +15,6 @@ from cprl.theory import (
     herders,
     replicator,
     replicator_ends,
-    sharing_table,
 )
 from cprl.theory import solutions as needed
 
@@ -40,6 +39,16 @@ def nashpy():
 @pytest.fixture
 def open_spiel():
     return pytest.importorskip("open_spiel.python.egt.alpharank")
+
+
+def sharing_table(game, levels):
+    """A game of sharing in which agents choose among a few levels of what they take."""
+    taken, counts = np.array(levels), compositions(game.agents, len(levels))
+    payoffs = np.zeros(counts.shape)
+    for row, players in enumerate(counts):
+        played = np.repeat(np.arange(len(taken)), players)
+        payoffs[row, played] = game.payoffs(taken[played])
+    return PayoffTable(agents=game.agents, payoffs=payoffs)
 
 
 def herders_at_levels(agents):

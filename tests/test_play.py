@@ -5,11 +5,10 @@ import re
 from pathlib import Path
 
 import pytest
-from matrix_game import MatrixGame
 from stored_runs import command, stored
 
 from cprl import Game, Rules, maps, presets
-from cprl.evaluation.play import Session, board_text, help_of, open_session, play_in_terminal
+from cprl.evaluation.play import board_text, help_of, open_session, play_in_terminal
 from cprl.measuring.episodes import EpisodeTracker
 
 DRAWING = """
@@ -156,13 +155,6 @@ def test_what_cannot_be_played_is_refused(tmp_path, monkeypatch, capsys, words, 
         command(monkeypatch, capsys, "play", *words)
 
 
-def test_agents_of_another_game_are_refused(run, monkeypatch):
-    with pytest.raises(ValueError, match=r"the agents of .* have observations \(3, 3"):
-        open_session("two_complex", others=str(run))
+def test_agents_of_no_replica_are_refused(run):
     with pytest.raises(ValueError, match="replica is -1"):
         open_session(str(run), replica=-1)
-
-
-def test_a_session_wants_a_board():
-    with pytest.raises(ValueError, match="env is a MatrixGame"):
-        Session(MatrixGame(), lambda moment: moment)

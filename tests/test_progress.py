@@ -24,10 +24,12 @@ def lines(monkeypatch, *, before):
     told = io.StringIO()
     walker = LaneActor(None, 8, seeds=[(0,), (1,)], agents=1)
     with ProgressBar(GAME, episodes=9, replicas=2, console=Console(file=told, width=200)) as bar:
-        if before:
-            bar.load_state_dict({"episodes": before})
-        train(CommonsEnv(GAME, 2), {}, others={(0,): walker}, episodes=6, callbacks=[bar])
-        assert bar.state_dict() == {"episodes": before + 12}
+        episodes = 6 + before // 2
+        training = Training(
+            CommonsEnv(GAME, 2), {}, others={(0,): walker}, episodes=episodes, callbacks=[bar]
+        )
+        training.steps, training._played = 5 * before // 2, [before // 2] * 2
+        training.run()
     return told.getvalue()
 
 

@@ -84,7 +84,7 @@ def test_each_agent_of_each_episode_has_a_row(table):
     first = replace(episode_of(0, 3, 4.0, equality=float("nan")), **of_agents)
     with table:
         table.add(first)
-        table.add(replace(an_episode(1), terminated=True), an_episode(2), replica=8)
+        table.add(replace(an_episode(1), terminated=True, replica=8), replace(an_episode(2), replica=8))
     rows = pq.read_table(table.path)
     columns = [
         (name, kind) for name, kind in COLUMNS.items() if name not in ("wanted_return", "world")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from boards import module_at
-from stored_runs import CORRIDORS, DQN, MEADOW, SEED, ran
+from stored_runs import CORRIDORS, DQN, MEADOW, SEED, ran, returns
 
 import cprl
 from cprl import Experiment, maps, presets
@@ -47,10 +47,6 @@ FRESH = Fresh(replicas=(0, 1, 2), episodes=2, seed=SEED)
 
 def value(measured):
     return measured.estimate.value
-
-
-def returns(played):
-    return {replica: [episode.return_.tolist() for episode in own] for replica, own in played.items()}
 
 
 @pytest.mark.integration

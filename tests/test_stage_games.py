@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from report import write_report
 from restorable import assert_restorable
+from same_runs import assert_same_training
 from tensordict import TensorDict, assert_close
 from torchrl.envs.utils import check_env_specs
 
@@ -33,8 +34,6 @@ from cprl.envs.matrix import MatrixGame, chicken, matching_pennies, prisoners_di
 from cprl.envs.taking import TakingGame
 from cprl.experiment import changes
 from cprl.population import Learning, Team
-from cprl.runs.episodes import read_episodes
-from cprl.runs.weights import load_weights
 from cprl.studies.trials import trials_of
 from cprl.theory import CallableWorth, PowerWorth, SharingGame, appropriation, herders
 
@@ -434,19 +433,14 @@ def test_its_recipe_holds_it_and_gives_it_back_without_importing_anything(experi
     ids=["matrix", "taking"],
 )
 def test_a_population_trains_stops_resumes_loads_and_meets_another(
-    experiment, third, least, most, differing, tmp_path, monkeypatch, capsys
+    experiment, third, least, most, differing, tmp_path, stopped, capsys
 ):
     stopping = replace(experiment, callbacks=[Custom("one_road_parts:Stopping")])
     whole = cprl.run(stopping, tmp_path / "whole", watch="off")
     assert "left out" in capsys.readouterr().out
-    monkeypatch.setenv("STOP_AT_STEP", "23")
-    with pytest.raises(SystemExit):
-        cprl.run(stopping, tmp_path / "parts", watch="off")
-    monkeypatch.delenv("STOP_AT_STEP")
+    stopped(23, stopping, tmp_path / "parts")
     parts = cprl.run(stopping, tmp_path / "parts", watch="off", resume=True)
-    assert read_episodes(parts).equals(read_episodes(whole))
-    one, other = (load_weights(run / "checkpoints" / "final.pt") for run in (parts, whole))
-    assert repr(one) == repr(other)
+    assert_same_training(parts, whole)
     loaded = cprl.load(whole, allow=["one_road_parts:Stopping"])
     assert loaded.game == experiment.game
     value = cprl.evaluate_run(loaded, episodes=4).measures()["agent_0/return"].estimate.value

@@ -2,18 +2,18 @@
 
 import os
 import shutil
-import signal
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from same_runs import assert_same_training
+from stored_runs import command
 from test_finite import GAME, REPLAY, ROLLOUT
 
 import cprl
 from cprl import CommonsEnv, Experiment
 from cprl.algorithms import DQN, IPPO, MADDPG, MAPPO, PPO, QMIX, SAC, VDN, Tabular, TabularSettings
-from cprl.commands import main as cli
 from cprl.commands.recipe import parse
 from cprl.measuring.evaluate import evaluate
 from cprl.objectives.preferences import Exchange
@@ -148,7 +148,7 @@ def test_targets_start_with_the_same_weights_and_the_optimiser_and_exploration_a
 
 @pytest.mark.integration
 def test_a_training_that_starts_from_another_is_run_stopped_and_resumed_without_it(
-    stored, tmp_path, monkeypatch
+    stored, tmp_path, monkeypatch, stopped, capsys
 ):
     shutil.copytree(f"{stored}/alone", tmp_path / "alone")
     monkeypatch.chdir(tmp_path)
@@ -158,32 +158,13 @@ def test_a_training_that_starts_from_another_is_run_stopped_and_resumed_without_
     assert cprl.load(whole).experiment == begun
     recipe = cprl.runs.recipe.read_recipe(whole)
     assert recipe["experiment"]["agents"][0]["start_from"]["run"] == "../../alone"
-    monkeypatch.setenv("STOP_AT_STEP", "20")
-    stopping = replace(begun, callbacks=(cprl.Custom("test_start_from:Stops"),))
-    with pytest.raises(SystemExit):
-        cprl.run(stopping, "runs/stopped", watch="off")
+    stopping = replace(begun, callbacks=(cprl.Custom("one_road_parts:Stopping"),))
+    stopped(20, stopping, "runs/stopped")
     assert checkpoints_in(tmp_path / "runs/stopped/checkpoints")
-    monkeypatch.delenv("STOP_AT_STEP")
     shutil.rmtree(tmp_path / "alone")
-    words = ["cprl", "run", "runs/stopped", "--resume", "--watch", "off", "--allow", "test_start_from:Stops"]
-    monkeypatch.setattr("sys.argv", words)
-    cli.main()
-    mine, theirs = (
-        load_weights(tmp_path / f"runs/{name}/checkpoints/final.pt") for name in ("stopped", "whole")
-    )
-    assert repr(mine) == repr(theirs)
-
-
-class Stops:
-    """Asks for the end of the process at a step."""
-
-    def __init__(self):
-        self.steps = 0
-
-    def on_step(self, batch):
-        self.steps += 1
-        if self.steps == int(os.environ.get("STOP_AT_STEP", "-1")):
-            os.kill(os.getpid(), signal.SIGTERM)
+    words = ["run", "runs/stopped", "--resume", "--watch", "off", "--allow", "one_road_parts:Stopping"]
+    command(monkeypatch, capsys, *words)
+    assert_same_training(tmp_path / "runs/stopped", tmp_path / "runs/whole")
 
 
 @pytest.mark.integration

@@ -449,14 +449,6 @@ def assert_drawn(path):
         assert min(image.size) > 300
 
 
-@pytest.fixture
-def drawn(monkeypatch):
-    """The figures that are drawn, instead of their files."""
-    made = []
-    monkeypatch.setattr("cprl.terminal.style.save", lambda figure, path, **_: made.append(figure))
-    return made
-
-
 @pytest.mark.integration
 def test_figures_of_a_grid_are_drawn_with_a_condition_that_has_no_run(grid_runs, tmp_path):
     table = study_table(GRID, grid_runs)
@@ -480,7 +472,9 @@ LONG = "agents.*.algorithm.settings"
 
 @pytest.mark.integration
 @pytest.mark.parametrize("width", ["page", "column"])
-def test_a_study_of_24_conditions_most_of_which_were_not_run_has_figures_that_can_be_read(width, tmp_path):
+def test_a_study_of_24_conditions_most_of_which_were_not_run_has_figures_that_can_be_read(
+    width, tmp_path, drawn
+):
     factors = {
         TIME_OUT: [5, 25],
         f"{LONG}.optimizer": ["adam", "keras_rmsprop"],
@@ -490,16 +484,8 @@ def test_a_study_of_24_conditions_most_of_which_were_not_run_has_figures_that_ca
     study = Study(EXPERIMENT, factors, name="combat", replicas=2)
     names = [condition.name for condition in study.all_conditions]
     table = study_table(study, write_study(study, tmp_path / "runs", harvest, but=names[5:]))
-    drawn = []
-
-    def keep(figure, path, *, caption, **how):
-        figure.caption = caption
-        drawn.append(figure)
-
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("cprl.terminal.style.save", keep)
-        for _, _, draw in figures.figures_of(table, 30):
-            draw(tmp_path / "a.png", width=width)
+    for _, _, draw in figures.figures_of(table, 30):
+        draw(tmp_path / "a.png", width=width)
     assert len(drawn) > 5
     for figure in drawn:
         see_that_it_can_be_read(figure, WIDTH_IN[width])

@@ -11,6 +11,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from same_runs import written_at
 from tiny_study import FREEZE, GAMMA, TINY
 
 from cprl import Study
@@ -57,11 +58,6 @@ def here(tmp_path, monkeypatch):
 
 def sweep(line):
     sweep_words(shlex.split(line))
-
-
-def written_at(folder):
-    """When all files of a folder were written."""
-    return {path: path.stat().st_mtime_ns for path in Path(folder).rglob("*")}
 
 
 @pytest.mark.integration

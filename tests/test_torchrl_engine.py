@@ -306,8 +306,6 @@ def test_other_losses_networks_and_sizes_are_refused():
     parts = {"make_network": partial(DQN(settings=REPLAY).make_network, SPACES)}
     with pytest.raises(ValueError, match="an agent has the networks"):
         learner_of_parts(TorchRLRolloutLearner, PPO(settings=ROLLOUT), SPACES, parts=parts, **HOW)
-    with pytest.raises(ValueError, match=r"n_steps is 3; allowed with engine=\"torchrl\".*: 1"):
-        stock(DQN(settings=replace(REPLAY, n_steps=3)))
     with pytest.raises(
         MemoryError, match=r"4 agents x 1,000,000,000,000 transitions take .* smaller buffer_size"
     ):

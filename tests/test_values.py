@@ -127,7 +127,6 @@ def test_numbers_are_stored_exactly_and_texts_of_another_class_as_plain_ones():
         (partial(Frozen, "", 0), "Frozen.run"),
         (partial(Frozen, "a" * 5000, 0), "Frozen.run"),
         (partial(Scripted, "Greedy"), "Scripted.policy"),
-        (partial(presets.game, "commons", variant="pirated"), "variant"),
         (partial(presets.dqn_settings, ["commons"]), "board"),
         (partial(parse, lambda: 3, ["x.py"]), "what the recipe makes"),
     ],

@@ -15,7 +15,7 @@ import pyarrow as pa
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
@@ -39,7 +39,7 @@ from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
 from cprl.runs.episodes import Label, labelled
 from cprl.system.defaults import SEED
 from cprl.system.process import one_thread
-from cprl.training.agents import LoadedRun, Population, StoredAgent, load, stored_policies
+from cprl.training.agents import LoadedRun, Population, StoredAgent, in_a_row, load, stored_policies
 from cprl.values import Custom, Positive, Seed, Value, Where, made, refusal, trust
 
 Played: TypeAlias = dict[int, list[Episode]]
@@ -140,8 +140,7 @@ class Fresh(Value, stored=False):
     def worlds(self, where: Place) -> Iterator[tuple[list[int], EnvBase]]:
         """The numbers of replicas, and an environment with their worlds in the same order, with as many
         consecutive replicas as possible in one."""
-        breaks = np.flatnonzero(np.diff(self.replicas) > 1) + 1
-        for group in (numbers.tolist() for numbers in np.split(np.array(self.replicas), breaks)):
+        for group in in_a_row(self.replicas):
             first = group[0] * self.episodes
             yield group, where.env(len(group) * self.episodes, seed=self.seed, first_world=first)
 
@@ -343,12 +342,9 @@ class Turns:
         """Plays the next turn; returns its entries, batch size [1], see `cprl.keys`."""
         if self.has_ended:
             raise ValueError("the episode has ended; allowed: turns up to its end")
-        env = self.env
         with torch.no_grad(), one_thread(), set_exploration_type(ExplorationType.RANDOM):
-            batch: TensorDictBase = env.step(self.policy(self._moment))
-        self._moment = step_mdp(
-            batch, reward_keys=env.reward_keys, action_keys=env.action_keys, done_keys=env.done_keys
-        )
+            batch: TensorDictBase = self.env.step(self.policy(self._moment))
+        self._moment = self.env.step_mdp(batch)
         self.has_ended = bool(batch["next", "done"].any())
         return batch
 

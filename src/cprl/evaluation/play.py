@@ -66,11 +66,9 @@ class Session:
 
     def __init__(self, env: EnvBase, others: Policy, *, agent: int = 0, decision: int | None = None) -> None:
         commons = commons_of(env)
-        if commons is None:
-            raise ValueError(f"env is a {type(env).__name__}; allowed: a CommonsEnv, which has a board")
-        self._commons, self._others = commons, others
-        self.game: Game = commons.game
-        self.agent = checked("agent", agent, Annotated[int, Range(0, self.game.agents - 1)])
+        assert commons is not None
+        self._commons, self._others, self.game = commons, others, commons.game
+        self.agent = agent
         """The index of the person's agent."""
         if decision is not None:
             if not self.game.decisions:

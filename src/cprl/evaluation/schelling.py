@@ -35,9 +35,7 @@ from cprl.evaluation.evaluate import SEED, bars_of, heading
 from cprl.evaluation.lanes import (
     Fresh,
     Part,
-    Played,
     Results,
-    Who,
     Whose,
     agent_named,
     agents_specified,
@@ -87,11 +85,6 @@ def dilemma(restrained: Values, greedy: Values) -> Dilemma:
         restrained: R(k), float [R, N]: of each of R replicas, for k = 0 to N - 1 others that are restrained.
         greedy: G(k), likewise. Replicas are paired.
     """
-    if restrained.ndim != 2 or restrained.shape != greedy.shape or restrained.shape[1] < 2:
-        raise ValueError(
-            f"restrained is {list(restrained.shape)} and greedy {list(greedy.shape)}; allowed: [R, N] both, "
-            "at least 2 agents"
-        )
     pairs = {
         "restraint": (restrained[:, -1], greedy[:, 0]),
         "company": (restrained[:, -1], restrained[:, 0]),
@@ -149,11 +142,6 @@ class SchellingDiagram(Results):
     def measures(self, count: int) -> dict[str, Measured]:
         """The social metrics of the mixes with so many restrained agents."""
         return self._mixes(count).estimates()
-
-    @property
-    def by_mix(self) -> dict[Who, Played]:
-        """The episodes by the indices of the restrained agents, ascending."""
-        return {focal: part.played for part in self.parts for focal in part.focal}
 
     def _mixes(self, count: int) -> Results:
         parts = [part for part in self.parts if len(part.focal[0]) == count]

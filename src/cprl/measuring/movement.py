@@ -64,10 +64,7 @@ def trace(env: CommonsEnv, policy: Policy, *, explore: bool = True) -> Trace:
             places = read(now.row), read(now.col)
             before = moment[keys.IN_PLAY].numpy(force=True), ~moment["done"][:, 0].numpy(force=True)
             played = env.step(policy(moment))
-            moment = played["next"].exclude(keys.REWARD)
-            states = played.get(keys.RECURRENT_STATE, None)
-            if states is not None:
-                moment[keys.RECURRENT_STATE] = states
+            moment = env.step_mdp(played)
             hits = np.argwhere(moment[keys.TAGGED_BY].numpy(force=True))
             tags.append(np.insert(hits, 0, len(steps), axis=1))
             steps.append((*places, *before, moment[keys.FIRED].numpy(force=True)))

@@ -50,13 +50,11 @@ class Now:
     - rising: from the episode on in which m is a tenth above its first value, or above the last one of which
       that was true, while m was highest in one of the episodes that it is a mean of;
     - steady: else.
-
-    Args:
-        random_play: r, in the unit of the values; None for the first running mean instead.
     """
 
-    def __init__(self, *, random_play: float | None = None) -> None:
-        self.random_play = random_play
+    def __init__(self) -> None:
+        self.random_play: float | None = None
+        """r, in the unit of the values; None for the first running mean instead."""
         self.label = BEGINS
         self.mean = float("nan")
         """m after the last episode."""

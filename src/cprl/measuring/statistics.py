@@ -87,8 +87,8 @@ def difference(values: ArrayLike, reference: ArrayLike, *, paired: bool) -> Esti
     return estimate(first - second)
 
 
-def holm(p_values: ArrayLike, *, level: float = 1 - CONFIDENCE) -> NDArray[np.bool_]:
-    """Return which of several differences are not 0, with the level for a mistake in any of them.
+def holm(p_values: ArrayLike) -> NDArray[np.bool_]:
+    """Return which of several differences are not 0, with a level of 5 % for a mistake in any of them.
 
     S. Holm, "A simple sequentially rejective multiple test procedure" (1979): the smallest of m p-values is
     compared with level / m, the next one with level / (m - 1) and so on, up to the first that is larger.
@@ -103,7 +103,7 @@ def holm(p_values: ArrayLike, *, level: float = 1 - CONFIDENCE) -> NDArray[np.bo
     order = np.argsort(p_values)  # NaN last
     left = np.count_nonzero(~np.isnan(p_values)) - np.arange(len(order))
     with np.errstate(divide="ignore"):
-        is_small = p_values[order] <= level / np.maximum(left, 0)
+        is_small = p_values[order] <= (1 - CONFIDENCE) / np.maximum(left, 0)
     differs = np.zeros(len(order), bool)
     differs[order] = np.logical_and.accumulate(is_small)
     return differs
@@ -197,9 +197,6 @@ class Measured:
 
 def over_replicas(values: Mapping[int, Sequence[float]]) -> Measured:
     """Estimates a metric from its values by replica, at least one per episode, NaN where undefined."""
-    if not values or not all(map(len, values.values())):
-        counts = {replica: len(episodes) for replica, episodes in values.items()}
-        raise ValueError(f"episodes by replica are {counts}; allowed: at least one replica, each at least 1")
     defined = [[value for value in episodes if not isnan(value)] for episodes in values.values()]
     means = [fmean(episodes) for episodes in defined if episodes]
     episodes = sum(map(len, values.values()))

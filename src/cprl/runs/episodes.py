@@ -127,16 +127,12 @@ class EpisodeTable:
         """Continue after the given number of rows of its journal; later rows are dropped."""
         self._open(int(state["rows"]))
 
-    def add(self, *episodes: Episode, replica: int | None = None) -> None:
-        """Append episodes; the first one of a table determines the columns and metrics of all.
-
-        Args:
-            replica: the index of their replica; by default each episode's own.
-        """
+    def add(self, *episodes: Episode) -> None:
+        """Append episodes; the first one of a table determines the columns and metrics of all."""
         if not episodes:
             return
         file = self._file or self._open()  # without a checkpoint of the last attempt it starts over
-        batch = rows_of(episodes, replica, self._schema or schema_of(episodes[0]))
+        batch = rows_of(episodes, None, self._schema or schema_of(episodes[0]))
         end, left = file.tell(), memoryview(_message(batch, is_first=self._schema is None))
         try:
             while left:

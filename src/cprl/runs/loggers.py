@@ -99,7 +99,7 @@ class LoggerCallback:
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Count the environment steps of each replica."""
-        self._steps += self._worlds * (1 if batch.batch_dims == 1 else batch.batch_size[1])
+        self._steps += self._worlds
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Write the numbers of an episode once all replicas have ended it."""

@@ -112,7 +112,6 @@ def training_curve(
     *,
     title: str,
     random: list[Episode] | None = None,
-    smoothed: int = SMOOTHED_EPISODES,
     exploration_turns: float | None = None,
     path: Path | None = None,
     width: Width = "page",
@@ -120,14 +119,13 @@ def training_curve(
     """Plots the collective return in each episode of a run, and survival below it.
 
     Every episode and replica is faint, the mean over replicas and its highest point bold. Running means are
-    centred. Trainings of 1,000 to 100,000 episodes have their phases as bands behind the curves. A game
-    without a harvest has one panel, the return of all its agents. Games with institutions have two more,
-    violations and fines of all agents.
+    centred, over 100 episodes, or 1/20 of all where that is less. Trainings of 1,000 to 100,000 episodes have
+    their phases as bands behind the curves. A game without a harvest has one panel, the return of all its
+    agents. Games with institutions have two more, violations and fines of all agents.
 
     Args:
         random: episodes of the random policy, whose means are dashed lines; those of evaluations while the
             agents were trained are points.
-        smoothed: the largest window of the running means, in episodes; they take in at most 1/20 of all.
         exploration_turns: the turn of all worlds with which exploration ends, from
             `cprl.population.exploration_steps`; a tick marks its episode.
         path: of the picture, by default `figures/training_curve.png` of the run.
@@ -139,7 +137,7 @@ def training_curve(
     curves = curves_of(run)
     panels = _panels(run, curves, random or [])
     episodes = panels[0].values.shape[1]
-    window = min(smoothed, max(1, episodes // PARTS))
+    window = min(SMOOTHED_EPISODES, max(1, episodes // PARTS))
     ours = bands_of(phases_of(curves, centred=True) or [])
     strips = {"this run": ours} if ours else {}
 

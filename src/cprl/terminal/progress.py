@@ -101,6 +101,7 @@ class ProgressBar:
     def on_start(self, training: Any) -> None:
         """Continues where the training does."""
         self._steps = self._steps_then = training.steps * self._replicas
+        self._episodes = training.episodes_played
         self._before = self._done()
 
     def on_step(self, batch: TensorDictBase) -> None:
@@ -173,12 +174,6 @@ class ProgressBar:
             if CLOCK.is_running and spent_s - said_s >= period_s:
                 said_s, period_s = spent_s, 1.5 * period_s
                 self._print(f"{self._title}: compiling, {spent_s:.0f} s so far", self._done())
-
-    def state_dict(self) -> dict[str, int]:
-        return {"episodes": self._episodes}
-
-    def load_state_dict(self, state: Mapping[str, int]) -> None:
-        self._episodes = int(state["episodes"])
 
     def __enter__(self) -> Self:
         self._compiled_before_s = CLOCK.total_s

@@ -10,7 +10,7 @@ Modules, in the order in which one reads them:
 """
 
 from cprl.theory.growth import YieldBounds, yield_bounds
-from cprl.theory.payoff_table import PayoffTable, compositions, sharing_table
+from cprl.theory.payoff_table import PayoffTable, compositions
 from cprl.theory.sharing import CallableWorth, PowerWorth, SharingGame, Worth, appropriation, herders
 from cprl.theory.solutions import (
     AlphaRank,
@@ -39,6 +39,5 @@ __all__ = [
     "herders",
     "replicator",
     "replicator_ends",
-    "sharing_table",
     "yield_bounds",
 ]

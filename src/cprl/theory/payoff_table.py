@@ -19,7 +19,6 @@ from typing import Annotated, Final, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cprl.theory.sharing import SharingGame
 from cprl.values import Range, checked, refusal
 
 Counts = NDArray[np.int64]
@@ -163,21 +162,6 @@ class PayoffTable:
     def _with_one_more(self, others: Counts) -> list[tuple[int, ...]]:
         """The counts if one more agent plays each strategy in turn."""
         return list(map(tuple, (others + np.eye(self.strategies, dtype=np.int64)).tolist()))
-
-
-def sharing_table(game: SharingGame, levels: ArrayLike) -> PayoffTable:
-    """A game of sharing in which agents choose among a few levels of what they take.
-
-    Args:
-        levels: float [S], what an agent may take.
-    """
-    taken = np.asarray(levels, np.float64)
-    counts = compositions(game.agents, len(taken))
-    payoffs = np.zeros(counts.shape)
-    for row, players in enumerate(counts):
-        played = np.repeat(np.arange(len(taken)), players)
-        payoffs[row, played] = game.payoffs(taken[played])
-    return PayoffTable(agents=game.agents, payoffs=payoffs)
 
 
 def mixture_of(mixture: ArrayLike, strategies: int) -> Values:

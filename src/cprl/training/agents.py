@@ -6,6 +6,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import torch
 from torch import Tensor, nn
@@ -254,6 +255,12 @@ def _trained(spec: Learning | Team, network: nn.Module, decisions: Tensor | None
         algorithm=repr(spec.algorithm),
         decisions=decisions,
     )
+
+
+def in_a_row(replicas: Sequence[int]) -> list[list[int]]:
+    """Ascending numbers in groups without gaps, as the worlds of an environment are."""
+    breaks = np.flatnonzero(np.diff(replicas) > 1) + 1
+    return [numbers.tolist() for numbers in np.split(np.array(replicas), breaks)]
 
 
 def stored_policies(

@@ -24,7 +24,7 @@ from cprl.measuring.evaluate import evaluate
 from cprl.policies.present import PresentPolicy
 from cprl.runs.episodes import EVALUATIONS, labelled
 from cprl.runs.files import write_listed
-from cprl.training.agents import Population, stored_policies
+from cprl.training.agents import Population, in_a_row, stored_policies
 
 EXHIBITED_WORLD: Final = 2**31
 """The number of the exhibited world; those of a training, of as many replicas, are smaller."""
@@ -141,15 +141,9 @@ class Evaluations:
         write_listed(self._run, EVALUATIONS, lambda file: pq.write_table(table, file, compression="zstd"))
 
     def _play(self, replicas: Iterable[int]) -> dict[int, list[Episode]]:
-        groups: list[list[int]] = []  # without gaps, as the worlds of an environment are
-        for replica in sorted(replicas):
-            if groups and replica == groups[-1][-1] + 1:
-                groups[-1].append(replica)
-            else:
-                groups.append([replica])
         experiment, worlds = self._experiment, self._experiment.evaluation_episodes
         seed, played = experiment.seed + 1, dict[int, list[Episode]]()
-        for group in groups:
+        for group in in_a_row(sorted(replicas)):
             env = _worlds(experiment, len(group) * worlds, first=group[0] * worlds, fresh=True)
             load_transforms_state(env, transforms_state(self._env))
             agents, playing = self._population.as_stored(group), self._population.playing

@@ -435,7 +435,7 @@ def _out(frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
 
 
 def centres_of(frames: Frames) -> NDArray[np.float32]:
-    """The positions of agents on the image, (x, y): [T, N, 2]."""
+    """The positions of agents on the image, (x, y): [(T), N, 2]."""
     return np.stack([frames["col"], frames["row"]], -1).astype(np.float32) + RIM_CELLS + 0.5
 
 

@@ -301,9 +301,9 @@ class RerunLogger(Logger):
         for entity, (rows, what) in columns(self.scene, frames).items():
             self.log_columns(entity, (frames["step"][rows], frames["episode"][rows], numbers[rows]), what)
 
-    def log_text(self, text: str, level: str = "INFO") -> None:
+    def log_text(self, text: str) -> None:
         at = [self._now[0]], [self._now[1]], [self.frames]
-        self.log_columns("log", at, rr.TextLog.columns(text=[text], level=[level]))
+        self.log_columns("log", at, rr.TextLog.columns(text=[text], level=["INFO"]))
 
     def log_hparams(self, cfg: Any) -> None:
         """Logs a mapping, as a table, or a Markdown text, as the recipe of the run."""

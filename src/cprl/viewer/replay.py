@@ -15,7 +15,7 @@ from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode
 from cprl.policies.assignment import AgentPolicies, agent_indices
 from cprl.policies.lanes import LaneActor
-from cprl.viewer.board import RIM_CELLS
+from cprl.viewer.board import centres_of
 from cprl.viewer.layout import APART, BACKGROUND, BAR, GIVEN, HIGH, PAID, decision_panels
 from cprl.viewer.logger import RerunLogger
 
@@ -205,8 +205,7 @@ class Offences:
             return  # the board is already that of the next episode
         board = self._env.worlds.show(self._env.output)
         self._marked.append(violated.astype(np.bool_, copy=True))
-        centres = np.stack([board.col, board.row], -1).astype(np.float32)
-        self._centres.append(centres + RIM_CELLS + 0.5)
+        self._centres.append(centres_of(board._asdict()))
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         turns, frames = len(self._paid), len(self._marked)
