@@ -336,6 +336,23 @@ def test_runs_are_kept_relative_to_the_study_and_other_texts_as_they_are(tmp_pat
             assert there.transforms == here.transforms
 
 
+@pytest.mark.parametrize("starts", [False, True])
+def test_a_trial_has_the_same_name_from_wherever_its_stored_agents_are_named(tmp_path, monkeypatch, starts):
+    (tmp_path / "sub").mkdir()
+
+    def name(run, runs):
+        stored = Frozen(run, 0)
+        second = replace(LEARNING, start_from=stored) if starts else stored
+        (trial,) = trials_of(Study(replace(TINY, agents=(LEARNING, second))), runs)
+        return trial.name
+
+    monkeypatch.chdir(tmp_path)
+    names = [name(run, "studies/x/runs") for run in ("runs/a", "runs/b")]
+    monkeypatch.chdir(tmp_path / "sub")
+    assert [name(run, tmp_path / "studies/x/runs") for run in ("../runs/a", "../runs/b")] == names
+    assert names[0] != names[1]
+
+
 def test_a_table_that_is_no_study_is_refused():
     for change, message in (
         ({"factors": None}, "NoneType"),

@@ -349,7 +349,7 @@ def _list(study: "Study", options: StudyOptions) -> Path:
 
     out = directory_of(study, options.out)
     runs = out / RUNS if options.runs is None else options.runs
-    overview = Overview(trials_with(trials_of(study), options.only), runs, out / STATUS)
+    overview = Overview(trials_with(trials_of(study, runs), options.only), runs, out / STATUS)
     now = overview.look()
     if now.counts["unfinished"]:  # those that run say something new within a second
         time.sleep(1.5 * BEAT_S)

@@ -79,7 +79,7 @@ def run_study(
     """
     out = directory_of(study, out)
     folder = out / RUNS if runs is None else Path(runs)
-    trials = trials_of(study)
+    trials = trials_of(study, folder)
     tasks = [
         Task(
             trial=trial,

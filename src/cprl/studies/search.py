@@ -314,7 +314,7 @@ def value_of(search: Search, point: Point, runs: Path) -> float | None:
     if point.reason:
         return None
     means: list[float] = []
-    for trial in trials_of(search.study_of([point])):
+    for trial in trials_of(search.study_of([point]), runs):
         run = runs / trial.name
         if trial.state(runs) != "finished":
             return None

@@ -63,7 +63,13 @@ class Condition:
         Fields that have their default are left out, so that a later version, which has further ones, gives
         the same.
         """
-        table = {name: value for name, value in self.experiment.to_config().items() if name not in UNNAMED}
+        return self.checksum_in(".")
+
+    def checksum_in(self, runs: Path | str) -> str:
+        """The checksum in the names of its runs in a directory: what runs of `Frozen` agents are called from
+        there, so that it is the same wherever the study is run from."""
+        config = with_runs_moved(self.experiment.to_config(), ".", runs)
+        table = {name: value for name, value in config.items() if name not in UNNAMED}
         content = {"format": CONDITION_FORMAT, "experiment": without_defaults(table, Experiment)}
         return digest_of(json.dumps(content, sort_keys=True), size=6)
 

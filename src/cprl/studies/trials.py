@@ -52,6 +52,8 @@ class Trial:
 
     condition: Condition
     block: Block
+    runs: Path = Path()
+    """The directory in which the trial's is."""
 
     @cached_property
     def experiment(self) -> Experiment:
@@ -69,10 +71,14 @@ class Trial:
         agents = tuple(with_stored(spec, in_block) for spec in of_condition.agents)
         return replace(of_condition, seed=self.block.seed, replicas=self.block.replicas, agents=agents)
 
+    @cached_property
+    def checksum(self) -> str:
+        return self.condition.checksum_in(self.runs)
+
     @property
     def name(self) -> str:
         """The name of its directory: the condition's checksum, the seed and the number of replicas."""
-        return f"{self.condition.checksum}-s{self.experiment.seed}-r{self.experiment.replicas}"
+        return f"{self.checksum}-s{self.experiment.seed}-r{self.experiment.replicas}"
 
     @property
     def label(self) -> str:
@@ -110,9 +116,14 @@ class Trial:
             )
 
 
-def trials_of(study: Study) -> list[Trial]:
-    """Every trial of a study: the first blocks of all conditions, then their second ones, and so on."""
-    return [Trial(condition, block) for block in study.blocks for condition in study.all_conditions]
+def trials_of(study: Study, runs: Path | str = ".") -> list[Trial]:
+    """Every trial of a study: the first blocks of all conditions, then their second ones, and so on.
+
+    Args:
+        runs: the directory in which theirs are, on which their names depend where stored agents play.
+    """
+    runs = Path(runs)
+    return [Trial(condition, block, runs) for block in study.blocks for condition in study.all_conditions]
 
 
 def state_of(run: Path) -> State:

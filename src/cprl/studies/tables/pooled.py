@@ -61,7 +61,7 @@ def pooled_table(
                 run=run,
                 name=str(run),
                 condition=name,
-                checksum=Condition(experiment).checksum,
+                checksum=Condition(experiment).checksum_in(run.parent),
                 first=firsts[experiment.seed],
                 replicas=replicas,
                 episodes=experiment.episodes,

@@ -116,7 +116,7 @@ def design_of(study: Study) -> Design:
 def sources_of(study: Study, runs: Path, status: Path | None = None) -> tuple[list[Source], list[Lacking]]:
     """The finished runs of a study, and the others; `status` is where its trials say why they failed."""
     finished, lacking = [], []
-    for trial in trials_of(study):
+    for trial in trials_of(study, runs):
         state, condition, block = trial.state(runs), trial.condition, trial.block
         if state != "finished":
             failure = None if status is None else Status(status, trial.name).failure()
@@ -127,7 +127,7 @@ def sources_of(study: Study, runs: Path, status: Path | None = None) -> tuple[li
             run=runs / trial.name,
             name=trial.name,
             condition=condition.name,
-            checksum=condition.checksum,
+            checksum=trial.checksum,
             first=block.first,
             replicas=block.replicas,
             episodes=trial.experiment.episodes,
