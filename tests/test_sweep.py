@@ -159,6 +159,29 @@ def test_a_failed_condition_does_not_end_the_study_and_is_listed_with_what_tries
     assert "2 of 2 trials finished" in capsys.readouterr().out
 
 
+@pytest.mark.integration
+def test_a_study_whose_runs_lost_their_content_says_so_and_what_to_do(capsys):
+    line = f"mine.py --vary {FREEZE}=5,2 --episodes 10 --out here"
+    sweep(line)
+    first, second = (Path("here/runs") / trial.name for trial in trials_of(read_study("here")))
+    (first / "episodes.parquet").write_bytes(b"PAR1")
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as ended:
+        sweep(line)
+    assert ended.value.code == 1
+    said, summary = capsys.readouterr().out, Path("here/summary.md").read_text()
+    assert "1 of 2 trials cannot be read and are not in these results, in here/runs:" in said
+    assert f"freeze_steps=5: {first.name}, 1 replica, is damaged, remove or restore its directory" in said
+    assert "damaged runs once their directories are removed: `cprl sweep" in summary
+    for run in (first, second):
+        (run / "evaluation/trained.parquet").unlink()
+    with pytest.raises(SystemExit):
+        sweep(line)
+    said = capsys.readouterr().out
+    assert "tiny: 0 of 2 trials finished, 2 failed" in said
+    assert "2 of 2 trials failed:" in said
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [

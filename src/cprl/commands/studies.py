@@ -372,11 +372,9 @@ def _say_best(result: "SearchResult") -> None:
 
 
 def _say_result(result: "StudyResult", command: Sequence[str], last: int) -> None:
-    """Prints the results of a study, and where they are; of trials that failed why, where to look and what to
-    do, and exits."""
+    """Prints the results of a study, and where they are; of trials that failed or are damaged why, where to
+    look and what to do, and exits."""
     from cprl.studies.results import FIGURES
-    from cprl.studies.status import Status
-    from cprl.studies.study import STATUS
     from cprl.studies.tables.comparing import cells, compare, metrics_of, of_finished
     from cprl.terminal.tables import show
 
@@ -386,14 +384,27 @@ def _say_result(result: "StudyResult", command: Sequence[str], last: int) -> Non
         for figure in sorted((result.out / FIGURES).glob("*.png")):
             say(f"Figure: {figure}")
     say(result.out)
-    if not result.failed:
-        return
+    damaged = [run for run in result.table.lacking if run.is_damaged] if result.table is not None else []
+    if damaged:
+        numbers = f"{len(damaged)} of {len(result.trials)} trials"
+        lines = [f"{numbers} cannot be read and are not in these results, in {result.runs}:"]
+        say("\n".join([*lines, *(f"  {run}" for run in damaged)]))
+    if result.failed:
+        _say_failed(result, command)
+    if result.failed or damaged:
+        sys.exit(1)
+
+
+def _say_failed(result: "StudyResult", command: Sequence[str]) -> None:
+    from cprl.studies.status import Status
+    from cprl.studies.study import STATUS
+
     labels = {trial.name: trial.label for trial in result.trials}
     outcomes = {outcome.name: outcome for outcome in result.failed}
-    lines = [f"{len(outcomes)} of {len(labels)} trials failed; the others are kept:"]
+    kept = "; the others are kept" if len(outcomes) < len(labels) else ""
+    lines = [f"{len(outcomes)} of {len(labels)} trials failed{kept}:"]
     for name, outcome in outcomes.items():
         status = Status(result.out / STATUS, name)
         where = status.failed if status.failed.exists() else status.log
         lines += [f"  {labels[name]}: {outcome.reason}", f"    {where}", f"    {outcome.command}"]
     say("\n".join([*lines, f"To try them again: {printed(command_of(command))}"]))
-    sys.exit(1)

@@ -88,6 +88,8 @@ class Overview:
         self._since: dict[str, float] = {}
         """When a trial last said something new, by the clock of this process."""
         self._finished: set[str] = set()
+        self.failures: dict[str, str] = {}
+        """Why trials failed, by name, that may look finished or still running."""
         self._per_s: float | None = None
 
     def look(self) -> Snapshot:
@@ -100,14 +102,16 @@ class Overview:
     def _row(self, trial: Trial) -> Row:
         of = trial.experiment.expected_episodes * trial.experiment.replicas
         state = "finished" if trial.name in self._finished else trial.state(self._runs)
-        if state == "finished":
+        reason = self.failures.get(trial.name)
+        if state == "finished" and reason is None:
             self._finished.add(trial.name)
             return Row(trial, "finished", of, of)
         words = self._listen(trial.name)
         is_known = state != "missing" or trial.name in self._since
         episodes = min(of, words.get("episodes", 0)) if is_known else 0
-        if time.monotonic() - self._since.get(trial.name, -SILENT_S) >= SILENT_S:
-            note = self._status[trial.name].failure() or (REASONS["refused"] if state == "refused" else "")
+        if reason is not None or time.monotonic() - self._since.get(trial.name, -SILENT_S) >= SILENT_S:
+            note = reason or self._status[trial.name].failure()
+            note = note or (REASONS["refused"] if state == "refused" else "")
             idle: TrialState = "failed" if note else "missing" if state == "missing" else "unfinished"
             return Row(trial, idle, episodes, of, note=note)
         per_s = words.get("episodes_per_s") or 0.0
@@ -158,6 +162,8 @@ class Progress:
 
     def ended(self, outcome: Outcome) -> None:
         self._ended += 1
+        if outcome.state == "failed":
+            self._overview.failures[outcome.name] = outcome.reason
         if outcome.worked and self._live is None:
             why = f": {outcome.reason}" if outcome.reason else ""
             label = self._labels.get(outcome.name, outcome.name)

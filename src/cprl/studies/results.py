@@ -61,8 +61,9 @@ def write_summary(table: StudyTable, out: Path, *, last: int = LAST, again: str 
         lines += [f"**{word}.** {text}", ""] if text else []
     lines += [table.summary, ""]
     if table.lacking:
-        line = f"This line runs what is lacking: `{again}`"
-        line = line if again else "Running the study again runs what is lacking."
+        damaged = any(run.is_damaged for run in table.lacking)
+        what = "what is lacking" + ", damaged runs once their directories are removed" * damaged
+        line = f"This line runs {what}: `{again}`" if again else f"Running the study again runs {what}."
         lines += ["## What is not in these results", "", *(f"- {run}" for run in table.lacking), "", line, ""]
     if table.metrics:
         lines += [*_compared(table, TRAINING, last), *_compared(table, EVALUATION, last), *_phases(table)]

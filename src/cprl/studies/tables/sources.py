@@ -31,6 +31,7 @@ from cprl.studies.tables.table import (
     WINDOW,
     WORDS,
     Circumstances,
+    DAMAGED,
     Design,
     Lacking,
     StudyTable,
@@ -158,7 +159,8 @@ def table_of(
         try:
             measured.append(_measured(source, window))
         except (ValueError, OSError, KeyError) as error:
-            reason = f"is {'too short' if isinstance(error, TooShortError) else 'damaged'}: {error}"
+            begins = "is too short" if isinstance(error, TooShortError) else DAMAGED
+            reason = f"{begins}: {error}"
             damaged.append(Lacking(source.name, source.condition, source.replicas, reason))
     made = {run.source.name: run.circumstances for run in measured}
     by_condition: dict[str, list[_Measured]] = {}

@@ -98,6 +98,10 @@ class Design:
         return [levels[factor] for levels in self.conditions.values()]
 
 
+DAMAGED: Final = "is damaged, remove or restore its directory"
+"""How the reason begins why a run that ended is not part of a table."""
+
+
 @dataclass(frozen=True)
 class Lacking:
     """A run that is not part of a table, and why."""
@@ -106,6 +110,11 @@ class Lacking:
     condition: str
     replicas: int
     reason: str
+
+    @property
+    def is_damaged(self) -> bool:
+        """Whether it ended and cannot be read, so that nothing runs it again."""
+        return self.reason.startswith(DAMAGED)
 
     def __str__(self) -> str:
         """In a sentence."""
