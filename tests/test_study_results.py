@@ -159,6 +159,13 @@ def test_two_trials_whose_directories_were_swapped_are_named_and_not_part_of_the
     assert not {one, other} & set(table.rows["run"].to_pylist())
 
 
+def test_a_summary_made_again_keeps_the_line_that_runs_what_is_lacking(tmp_path):
+    table = results.write_results(GRID, tmp_path, tmp_path / "runs", again="cprl sweep x.py")
+    summary = (tmp_path / "summary.md").read_text()
+    assert "This line runs what is lacking: `cprl sweep x.py`" in summary
+    assert results.summarise_again(table, tmp_path).read_text() == summary
+
+
 def test_a_study_none_of_whose_runs_is_there_has_an_empty_table_and_a_summary_that_says_so(tmp_path):
     table = results.write_results(GRID, tmp_path, tmp_path / "runs")
     assert (len(table.rows), table.metrics, len(table.lacking)) == (0, (), 6)
@@ -708,6 +715,12 @@ def table_command(tmp_path, monkeypatch):
         ("--by name --part random --last 30", "--last .* without --part random"),
         ("", r"cprl table RUN\.\.\. --by "),
         ("--by name --summary", "--summary .* without --by"),
+        ("--csv --out a.csv", "without --out, --out FILE.csv"),
+        ("--csv --summary", "without --summary"),
+        ("--csv --metric equality", "without --metric"),
+        ("--csv --part random", "without --part"),
+        ("--csv --last 10", "without --last"),
+        ("--csv --reference x", "without --reference"),
     ],
 )
 def test_words_of_cprl_table_that_do_not_fit_are_refused_by_the_flag(words, message, table_command):
@@ -742,6 +755,10 @@ def test_cprl_table_of_a_study_says_and_writes_what_its_table_alone_gives(table_
     shutil.rmtree("runs")
     table_command("--summary", of="pairs")
     assert Path("pairs/summary.md").read_text() == summary
+    before = Path("pairs/figures/differences.png").read_bytes()
+    table_command("--summary", "--reference", "freeze_steps=25", of="pairs")
+    assert Path("pairs/figures/differences.png").read_bytes() != before
+    assert "Differences from freeze_steps=25" in Path("pairs/summary.md").read_text()
     table_command("--metric", "collective_return", "--reference", "freeze_steps=25", of="pairs")
     assert "-5.0 [-11.6, +1.6]" in capsys.readouterr().out
     for words in (["--window", "1"], ["--reference", "none"]):

@@ -62,12 +62,21 @@ def table(
         out: a new file: .parquet or .csv with every window of episodes, replica and metric, or .md with
             what is printed.
         csv: print every window of episodes, replica and metric as CSV, and nothing else.
-        summary: write summary.md of a study again, from its table alone.
+        summary: write summary.md and the figures of a study again, from its table alone.
     """
     if out is not None:
         if out.suffix not in _SUFFIXES:
             raise ValueError(f"--out is {out}; allowed: a name that ends in {', '.join(_SUFFIXES)}")
         refuse_to_write_over(out)
+    if csv:
+        given = {"out": out, "summary": summary, "reference": reference, **vars(compare)}
+        defaults = {"summary": False, **vars(Compare())}
+        for name, value in given.items():
+            if value != defaults.get(name):
+                raise ValueError(
+                    f"--csv prints every row and nothing else; allowed: without --{name}"
+                    + ", --out FILE.csv writes the same rows" * (name == "out")
+                )
     if not runs:
         raise ValueError("cprl table needs at least one run: cprl table RUN... --by FIELD")
     if summary and by:
@@ -93,9 +102,9 @@ def table(
     show(map(of_finished, compared))
     say(str(study_table))
     if summary:
-        from cprl.studies.results import write_summary
+        from cprl.studies.results import summarise_again
 
-        say(f"Written: {write_summary(study_table, runs[0], last=last)}")
+        say(f"Written: {summarise_again(study_table, runs[0], last=last)}")
     if out is not None:
         _write(study_table, compared, out)
         say(f"Written: {out}")

@@ -1,8 +1,9 @@
 """write_results: the table of a study, its summary and its figures, made of its finished runs alone.
 
-The summary and the figures are made of the table: `write_summary` makes a summary again where runs are gone.
+The summary and the figures are made of the table: `summarise_again` makes them again where runs are gone.
 """
 
+import re
 from pathlib import Path
 from typing import Final
 
@@ -43,14 +44,31 @@ def write_results(
     for metric in metrics_of(table)[:1]:
         compare(table, metric, last=last)  # refuses before anything is written
     table.write(out / STUDY_TABLE)
+    _draw(table, out, last)
+    write_summary(table, out, last=last, again=again)
+    return table
+
+
+def summarise_again(table: StudyTable, out: Path, *, last: int = LAST) -> Path:
+    """Write `summary.md` of a table alone, with the line of an earlier one that runs what is lacking, and draw
+    the figures that are there, so that both are of the same episodes and the same reference."""
+    for metric in metrics_of(table)[:1]:
+        compare(table, metric, last=last)  # refuses before anything is written
+    if (out / FIGURES).exists():
+        refuse_links(out)
+        _draw(table, out, last)
+    earlier = (out / SUMMARY).read_text("utf-8", "replace") if (out / SUMMARY).exists() else ""
+    again = re.search("^This line runs what is lacking.*?: `(.*)`$", earlier, re.MULTILINE)
+    return write_summary(table, out, last=last, again=again[1] if again else "")
+
+
+def _draw(table: StudyTable, out: Path, last: int) -> None:
     figures = {name: draw for name, _, draw in figures_of(table, last)}
     for name, draw in figures.items():
         draw(out / FIGURES / name)
     for path in (out / FIGURES).glob("*.png"):
         if path.name not in figures and DRAWN.fullmatch(path.name):  # of an earlier call
             path.unlink()
-    write_summary(table, out, last=last, again=again)
-    return table
 
 
 def write_summary(table: StudyTable, out: Path, *, last: int = LAST, again: str = "") -> Path:
