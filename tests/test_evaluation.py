@@ -497,6 +497,9 @@ def test_a_command_prints_its_numbers_and_writes_its_files_once(
     for option, path in files.items():
         with pytest.raises(SystemExit, match=rf"cprl: .*{path.name} exists and is not overwritten"):
             command(monkeypatch, capsys, *words, option, path)
+    if episodes:
+        with pytest.raises(SystemExit, match=r"--out is .*a\.csv; allowed: .*\.parquet"):
+            command(monkeypatch, capsys, *words, "--out", tmp_path / "a.csv")
     if is_drawn:
         with pytest.raises(SystemExit, match=r"--figure is '.*a\.jpg'"):
             command(monkeypatch, capsys, *words, "--figure", tmp_path / "a.jpg")

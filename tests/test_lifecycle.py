@@ -210,11 +210,14 @@ def test_a_run_interrupted_in_any_stage_is_finished_by_resuming_it(stage, whole,
     assert (tmp_path / "run" / "report.json").exists()
 
 
-def test_a_finished_run_that_is_resumed_says_so_and_stays_as_it_is(whole, capsys):
+def test_a_finished_run_that_is_resumed_says_so_and_stays_as_it_is(whole, tmp_path, capsys):
     before = contents(whole)
     resumed(FIELD, whole)
     assert f"{whole} is finished; with more --episodes it is extended" in capsys.readouterr().out
     assert contents(whole) == before
+    copy = export_results(whole, tmp_path / "copy")
+    resumed(FIELD, copy)
+    assert f"{copy} is finished; it keeps no state of its training" in capsys.readouterr().out
 
 
 @pytest.fixture(scope="module")

@@ -47,7 +47,7 @@ class Files:
     """Which files are written; none is written over."""
 
     out: Path | None = None
-    """A new parquet file, for every episode."""
+    """A new .parquet, for every episode."""
     figure: Path | None = None
     """A new .png, .pdf or .svg, see docs/evaluation.md."""
     figure_width: Literal["page", "column"] = "page"
@@ -58,6 +58,8 @@ class Files:
         if self.out is not None:
             from cprl.runs.files import refuse_to_write_over
 
+            if self.out.suffix != ".parquet":
+                raise ValueError(f"--out is {self.out}; allowed: a name that ends in .parquet")
             refuse_to_write_over(self.out)
         if self.figure is not None:
             from cprl.terminal.style import check_picture

@@ -244,6 +244,11 @@ def read_tensors(path: Path, refusal: str) -> dict[str, Any]:
     return content
 
 
+KEEPS_NO_STATE: Final = (
+    "it keeps no state of its training to extend it from, as a run without keep_checkpoint or an export"
+)
+
+
 def refuse_to_extend(run: Path, episodes: int | None, callbacks: Iterable[Any]) -> None:
     """Check that a longer run would equal one that had been begun as such.
 
@@ -265,9 +270,7 @@ def refuse_to_extend(run: Path, episodes: int | None, callbacks: Iterable[Any]) 
     if endings:
         read_checkpoint(endings[-1])
     elif (run / REPORT).exists() or (run / FOLDER / "final.pt").exists():
-        raise ValueError(
-            f"{run} keeps no state of its training to extend it from: it was run without keep_checkpoint"
-        )
+        raise ValueError(f"{run} is finished; {KEEPS_NO_STATE}")
     elif episodes and checkpoints and max(read_checkpoint(checkpoints[-1])["played"]) >= episodes:
         raise ValueError(
             f"{run} was stopped while its last replicas played their last episodes, and keeps no state from "

@@ -17,7 +17,16 @@ from cprl.envs.unwrap import agent_names
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode, own_name, try_own_metrics
 from cprl.population import exploration_steps, partners_in
-from cprl.runs.checkpoints import FOLDER, REPORT, Checkpointer, checkpoints_in, extend, refuse_to_extend
+from cprl.runs.checkpoints import (
+    FOLDER,
+    KEEPS_NO_STATE,
+    REPORT,
+    Checkpointer,
+    checkpoints_in,
+    extend,
+    is_ending,
+    refuse_to_extend,
+)
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.files import LOCK_FILE, RunLockedError, refuse_missing, write_json
 from cprl.runs.loggers import LoggerCallback, check_logger, make_logger
@@ -332,7 +341,9 @@ def _tidy_up(finished: Path, experiment: Experiment, *, keep_checkpoint: bool, t
     if (finished / LOCK_FILE).exists():
         with Checkpointer(finished, keep_ending=keep_checkpoint, take_over=take_over) as checkpointer:
             checkpointer.done()
-    text = f"{finished} is finished; with more --{experiment.unit} it is extended"
+    keeps_state = any(map(is_ending, checkpoints_in(finished / FOLDER)))
+    more = f"with more --{experiment.unit} it is extended" if keeps_state else KEEPS_NO_STATE
+    text = f"{finished} is finished; {more}"
     console().print(text, soft_wrap=True)
 
 
