@@ -1,10 +1,15 @@
 """Games of a few strategies by how many play each: payoffs, equilibria, alpha-rank, replicator dynamics."""
 
+from itertools import combinations
 from math import comb
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
+from cprl.evaluation.empirical_game import _draw_simplex
 from cprl.theory import (
     PayoffTable,
     PowerWorth,
@@ -155,6 +160,18 @@ def test_replicator_dynamics_follow_what_pays(open_spiel):
     assert sorted(np.round(ends.mixtures).tolist()) == [[0, 1], [1, 0]], "by where one starts"
     assert replicator_ends(CHICKEN, starts=3).mixtures == pytest.approx(np.array([[1 / 3, 2 / 3]]), abs=1e-3)
     assert replicator_ends(ROCK_PAPER_SCISSORS, starts=1).unsettled == 1.0
+
+
+def test_the_share_of_an_end_of_replicator_dynamics_is_not_written_over_the_name_of_its_corner():
+    ends = SimpleNamespace(mixtures=np.eye(3), shares=[0.1, 0.2, 0.7])
+    game = SimpleNamespace(names=["greedy", "restraint", "chance"])
+    figure = Figure(figsize=(4, 4))
+    axes = figure.add_subplot()
+    _draw_simplex(axes, SimpleNamespace(table=ROCK_PAPER_SCISSORS, ends=ends, game=game))
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    boxes = [text.get_window_extent(renderer) for text in axes.texts]
+    assert len(boxes) == 6
+    assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
 
 
 @pytest.mark.parametrize("gap", [0.2, 0.02, 0.001])

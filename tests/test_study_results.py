@@ -474,6 +474,12 @@ def test_figures_of_a_grid_are_drawn_with_a_condition_that_has_no_run(grid_runs,
             draw(tmp_path / f"{name}.jpg")
 
 
+def test_differences_that_are_all_0_are_drawn_on_an_axis_around_it(tmp_path, drawn):
+    table = table_of(tmp_path, {}, conditions={"one": {}, "other": {TIME_OUT: 6}})
+    figures.by_condition(table, tmp_path / "a.png", kind="differences")
+    assert {axes.get_xlim() for axes in drawn[0].axes if axes.get_visible()} == {(-1.0, 1.0)}
+
+
 LONG = "agents.*.algorithm.settings"
 
 

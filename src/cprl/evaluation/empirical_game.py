@@ -421,7 +421,8 @@ def _draw_simplex(axes: Axes, analysis: Analysis) -> None:
     for mixture, share in zip(analysis.ends.mixtures, analysis.ends.shares, strict=True):
         at = mixture @ _CORNERS
         axes.plot(*at, "o", color=style.MARK, markersize=9, zorder=4)
-        axes.annotate(f"{share:.0%}", at, (8, 8), textcoords="offset points")
+        offset = (9, -9) if at[1] > _CORNERS[:, 1].max() - 0.1 else (8, 8)  # not over the name of the top
+        axes.annotate(f"{share:.0%}", at, offset, textcoords="offset points")
     for corner, name in zip(_CORNERS, analysis.game.names, strict=True):
         at, side = ((0, 3), "bottom") if corner[1] > 0 else ((0, -3), "top")
         axes.annotate(name, corner, at, textcoords="offset points", ha="center", va=side)

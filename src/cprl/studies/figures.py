@@ -247,6 +247,10 @@ def is_logarithmic(levels: Sequence[float]) -> bool:
 # Conditions one below the other
 
 
+_NO_WIDTH: Final = 1e-12
+"""Of an axis on which all differences are 0."""
+
+
 def by_condition(
     table: StudyTable, path: Path | str, *, kind: Kind = "levels", last: int = LAST, width: Width = "page"
 ) -> Path:
@@ -283,6 +287,8 @@ def by_condition(
                     axes.plot([chance[name]] * 2, [place - 0.42, place + 0.42], **look)
             if not is_levels:
                 axes.axvline(0, **RANDOM_LINE)
+                if axes.dataLim.width < _NO_WIDTH:
+                    axes.set_xlim(-1, 1)
             axes.set_title(title_of(comparison))
             axes.set_yticks(range(len(conditions)), [names[name] for name in conditions])
             axes.locator_params(axis="x", nbins=3)
