@@ -290,6 +290,17 @@ def test_fresh_episodes_are_written_as_csv(runs, tmp_path, monkeypatch, capsys):
     assert {row["action"] for row in rows} <= set(CORRIDORS.actions)
     with pytest.raises(FileExistsError):
         export_episodes(runs / "greedy", path)
+    trained = load(runs / "greedy").experiment.seed
+    with pytest.raises(ValueError, match=f"seed is {trained}, the training seed"):
+        export_episodes(runs / "greedy", tmp_path / "new.csv", seed=trained)
+    assert not (tmp_path / "new.csv").exists()
+
+
+@pytest.mark.parametrize("flag", ["--episodes 3", "--replica 1", "--seed 5", "--format csv --no-weights"])
+def test_flags_of_another_format_are_refused_by_name(flag, runs, tmp_path, monkeypatch, capsys):
+    with pytest.raises(SystemExit, match=f"{flag.split()[-1 if 'no' in flag else 0]} is of"):
+        command(monkeypatch, capsys, "export", runs / "greedy", tmp_path / "new", *flag.split())
+    assert not (tmp_path / "new").exists()
 
 
 def test_episodes_of_a_matrix_game_are_written_as_csv_with_actions_by_number(tmp_path):

@@ -62,6 +62,9 @@ def test_a_report_of_a_study_has_question_expectation_answer_figure_and_tables(t
     numbers = [row for row in summary.splitlines() if row.startswith("| ")]
     first = numbers[1].split("|")[2:4]
     assert all(number.strip() in cells_of(text) for number in first)
+    for flag in ("episodes", "seed"):
+        with pytest.raises(ValueError, match=f"{flag} is 2, .* is a study"):
+            report(folder, tmp_path / "new.html", **{flag: 2})
 
 
 def test_pictures_of_other_places_are_no_part_of_a_report(tmp_path):

@@ -253,16 +253,22 @@ def export(
             agent, of the extra "minari".
         episodes: of "csv" and "minari": fresh episodes that are played.
         replica: likewise: whose agents.
-        seed: likewise: of the worlds and all chance, see cprl film.
+        seed: likewise: of the worlds and all chance, see cprl film; not that of the training.
     """
     from cprl.runs.recipe import read_recipe
 
     read_recipe(run)
     if format == "results":
+        fresh = {"episodes": (episodes, 20), "replica": (replica, 0), "seed": (seed, FILM_SEED)}
+        for name, (value, default) in fresh.items():
+            if value != default:
+                raise ValueError(f"--{name} is of fresh episodes; allowed: with --format csv or minari")
         from cprl.runs.export import export_results
 
         say(export_results(run, out, weights=weights))
         return
+    if not weights:
+        raise ValueError(f"--no-weights is of results; allowed: without --format {format}")
     from cprl.evaluation.export import export_episodes
 
     written = export_episodes(run, out, format=format, episodes=episodes, replica=replica, seed=seed)

@@ -180,7 +180,7 @@ def report(run: Path, /, *, out: Path | None = None, episodes: int = 20, seed: i
         run: the directory of a run or of a study, or their results.
         out: the page, an .html, which opens from the disk without a network; by default report.html in that
             directory.
-        episodes: of a run, how many fresh ones each replica plays, as of cprl evaluate.
+        episodes: of a run alone, how many fresh ones each replica plays, as of cprl evaluate.
         seed: likewise: of their worlds and all chance.
     """
     _begin(seed, *([] if (run / STUDY_TABLE).is_file() else [run]))
@@ -458,7 +458,7 @@ class Responses:
     seeds: int = 3
     """Trainings by each algorithm."""
     training_episodes: int | None = None
-    """Episodes of each training; by default a quarter of the run's."""
+    """Episodes of each training; by default a quarter of the run's, if somebody learned in it."""
     replicas: int | None = None
     """How many of the run's replicas are responded to, the first ones; by default all."""
     episodes: int = 20

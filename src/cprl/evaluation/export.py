@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from cprl import keys
 from cprl.commons.game import Game
+from cprl.evaluation.evaluate import opened
 from cprl.evaluation.film import fresh_episode
-from cprl.evaluation.lanes import Turns
+from cprl.evaluation.lanes import Turns, refuse_trained_in
 from cprl.runs.files import refuse_to_write_over
 from cprl.system.defaults import FILM_SEED as SEED
 from cprl.values import Positive, checked
@@ -77,10 +78,12 @@ def export_episodes(
     refuse_to_write_over(target)
     if format == "minari":
         _import_minari()
+    loaded = opened(run, allow)
+    refuse_trained_in(seed, [loaded])
 
     def played() -> Iterator[tuple[Played, Any]]:
         for episode in range(episodes):
-            fresh = fresh_episode(run, replica=replica, episode=episode, seed=seed, allow=allow)
+            fresh = fresh_episode(loaded, replica=replica, episode=episode, seed=seed)
             yield _play(Turns(fresh.env, fresh.policies)), fresh.run.game
 
     target.parent.mkdir(parents=True, exist_ok=True)

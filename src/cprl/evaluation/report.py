@@ -50,7 +50,7 @@ def report(
     Args:
         path: the directory of a run or of a study, or their results.
         out: the page, an .html, complete or absent; by default `report.html` in that directory.
-        episodes: of a run, fresh ones of each replica.
+        episodes: of a run alone, fresh ones of each replica.
         seed: likewise: of their worlds and all chance.
 
     Raises:
@@ -60,6 +60,9 @@ def report(
     page_path = Page(folder / "report.html" if out is None else out)
     page_path.refuse()
     is_study = (folder / STUDY_TABLE).is_file()
+    for name, value, default in (("episodes", episodes, 20), ("seed", seed, SEED)):
+        if is_study and value != default:
+            raise ValueError(f"{name} is {value}, and {folder} is a study; allowed: of a run alone")
     text = _of_study(folder) if is_study else _of_run(load(folder, allow=allow), episodes, seed)
     page_path.write(text)
     return page_path
