@@ -665,6 +665,20 @@ def test_a_trial_runs_while_it_says_something_new_whatever_the_clock_says(says, 
     assert look()[1].state == "missing"
 
 
+def test_trials_that_count_steps_are_shown_by_their_steps(tmp_path):
+    (long,) = trials_of(Study(replace(TINY, episodes=None, steps=4000, replicas=2)))
+    says = Status(tmp_path, long.name).path
+    expected = 2 * long.experiment.expected_episodes
+    overview = Overview([long], tmp_path, tmp_path)
+    for beat in (1, 2):
+        write_json(says, {"beat": beat, "episodes": expected // 2})
+        snapshot = overview.look()
+    assert snapshot.line.startswith("0 of 1 trials finished, 1 running, 4,000 of 8,000 steps")
+    screen = Console(file=io.StringIO(), width=80)
+    screen.print(table_of(snapshot, title="mine"))
+    assert screen.file.getvalue().splitlines()[1].split() == ["trial", "state", "steps"]
+
+
 @pytest.mark.integration
 def test_a_table_is_never_higher_than_a_screen_and_counts_the_rest(tmp_path):
     many = trials_of(Study(TINY, {FREEZE: range(1, 101)}))

@@ -42,12 +42,27 @@ class Row(NamedTuple):
     trial: Trial
     state: TrialState
     episodes: int
-    """Of all its replicas."""
+    """Of all its replicas; of one that trains so many steps, the share of those expected."""
     of: int
     per_s: float = 0.0
     """Episodes per second; 0 where that is not known."""
     note: str = ""
     """What else there is to say of it, in some words."""
+
+    @property
+    def unit(self) -> str:
+        """What its experiment counts: "episodes" or "steps"."""
+        return self.trial.experiment.unit
+
+    @property
+    def done(self) -> int:
+        """How far it is, in its unit."""
+        return self.whole * self.episodes // self.of
+
+    @property
+    def whole(self) -> int:
+        """How long it is, in its unit."""
+        return self.trial.experiment.length * self.trial.experiment.replicas
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,12 +78,17 @@ class Snapshot:
         return Counter("running" if row.state in AT_WORK else row.state for row in self.rows)
 
     @property
+    def units(self) -> list[str]:
+        return sorted({row.unit for row in self.rows})
+
+    @property
     def line(self) -> str:
         counts = self.counts
         parts = [f"{counts.get('finished', 0)} of {len(self.rows)} trials finished"]
         parts += [f"{counts[state]} {state}" for state in ("running", "failed") if counts.get(state)]
-        played, of = sum(row.episodes for row in self.rows), sum(row.of for row in self.rows)
-        parts.append(f"{played:,} of {of:,} episodes")
+        for unit in self.units:
+            rows = [row for row in self.rows if row.unit == unit]
+            parts.append(f"{sum(row.done for row in rows):,} of {sum(row.whole for row in rows):,} {unit}")
         compiling = sum(row.state == "compiling" for row in self.rows)
         parts += [f"{compiling} compiling"] if compiling else []
         parts += [f"{in_words(self.left_s)} left"] if self.left_s is not None else []
@@ -214,10 +234,10 @@ def table_of(now: Snapshot, *, title: str, most: int | None = None) -> Any:
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("trial", no_wrap=True, overflow="ellipsis")
     table.add_column("state", no_wrap=True)
-    table.add_column("episodes", justify="right", no_wrap=True)
+    table.add_column(" or ".join(now.units), justify="right", no_wrap=True)
     table.add_column("", no_wrap=True, overflow="ellipsis")
     for row in rows:
         state = Text(row.state, style=_COLOURS.get(row.state, ""))
-        table.add_row(Text(row.trial.label), state, f"{row.episodes:,}/{row.of:,}", Text(row.note))
+        table.add_row(Text(row.trial.label), state, f"{row.done:,}/{row.whole:,}", Text(row.note))
     end = [Text(rest, style="dim")] if rest else []
     return Group(Text(title, style="bold"), table, *end, Text(now.line))

@@ -152,7 +152,7 @@ def check_watch(watch: str, *, linger: bool = False, can_be_off: bool = True) ->
             recording.
         linger: whether the recording stays served after the run, which needs signals and something served.
     """
-    checked("watch", watch, Literal["file", "off"] | Served if can_be_off else Literal["file"] | Served)
+    checked("watch", watch, Literal["file", Served, "off"] if can_be_off else Literal["file", Served])
     if linger and watch not in get_args(Served):
         raise ValueError(
             f'linger is True, but watch is "{watch}", which serves nothing; allowed: watch "serve" or "spawn"'
