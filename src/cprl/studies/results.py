@@ -50,8 +50,8 @@ def write_results(
 
 
 def summarise_again(table: StudyTable, out: Path, *, last: int = LAST) -> Path:
-    """Write `summary.md` of a table alone, with the line of an earlier one that runs what is lacking, and draw
-    the figures that are there, so that both are of the same episodes and the same reference."""
+    """Write `summary.md` of a table alone, with an earlier one's line that runs what is lacking, and draw the
+    figures that are there, so that both are of the same episodes and the same reference."""
     for metric in metrics_of(table)[:1]:
         compare(table, metric, last=last)  # refuses before anything is written
     if (out / FIGURES).exists():

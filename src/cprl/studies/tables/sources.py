@@ -23,6 +23,7 @@ from cprl.studies.status import Status
 from cprl.studies.study import Study, level_text, unlike
 from cprl.studies.tables.table import (
     COLUMNS,
+    DAMAGED,
     NET,
     PARTS,
     RANDOM,
@@ -31,7 +32,6 @@ from cprl.studies.tables.table import (
     WINDOW,
     WORDS,
     Circumstances,
-    DAMAGED,
     Design,
     Lacking,
     StudyTable,
