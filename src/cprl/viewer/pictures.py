@@ -196,6 +196,8 @@ _LIVE_ROWS: Final = 10_000
 """From then on rows for viewers get rarer, because a server's memory holds them: period = time / rows."""
 _FEWEST_STEPS: Final = 10
 """Steps from one row of the file to the next, at least."""
+_LABELLED: Final = 8
+"""The largest number of boards whose labels say "turn" before its number."""
 _DIED: Final = STATES["tragedy"]
 _Row: TypeAlias = tuple[int, int, int, NDArray[np.uint8], list[str], NDArray[np.uint8]]
 """A step, episode and frame, the image, and the text of each board and its colour."""
@@ -253,7 +255,8 @@ class Wall(View):
         state = {name: read(getattr(now, name)[:shown]) for name in ("stock", "in_play", "row", "col")}
         image = self._panels.joined(boards(self._scene, {"step": state["stock"], **state}), UNSEEN)
         turns = read(now.step[:shown])[:, 0].tolist()
-        labels = [f"{board}: turn {turn}" for board, turn in enumerate(turns)]
+        word = "turn " if shown <= _LABELLED else ""  # more labels would stand on each other
+        labels = [f"{board}: {word}{turn}" for board, turn in enumerate(turns)]
         colours = np.where(self._died[:, None], _DIED, TEXT).astype(np.uint8)
         return step, episode, frame, image, labels, colours
 
