@@ -19,12 +19,12 @@ from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedActor
 class Stays(nn.Module):
     """Never moves."""
 
-    def __init__(self, actions):
+    def __init__(self, stay):
         super().__init__()
-        self.actions = actions
+        self.stay = stay
 
     def forward(self, tensordict):
-        return tensordict.set("action", torch.full(tensordict.batch_size, self.actions - 1))
+        return tensordict.set("action", torch.full(tensordict.batch_size, self.stay))
 
 
 class Scene(Play):
@@ -34,7 +34,7 @@ class Scene(Play):
         self.game = Game(map=maps.parse(drawing), rules=Rules(**{"regrow_prob": (0.0,), **rules}))
         seeds = [(seed, world) for world in range(worlds)]
         actor = ScriptedActor(policy, self.game, seeds=seeds, agents=1, spare=spare)
-        others = {agent: Stays(len(self.game.actions)) for agent in range(1, self.game.agents)}
+        others = {agent: Stays(self.game.actions.index("stay")) for agent in range(1, self.game.agents)}
         self.policy = AgentPolicies({(0,): actor, **others})
         self.env = CommonsEnv(self.game, worlds, seed=seed)
         self.batch, self.bitten = self.env.worlds, 0.0
@@ -158,6 +158,12 @@ def test_two_agents_that_want_one_cell_wait_at_random_until_one_gets_it():
     assert harvest.sum(1).tolist() == [1] * 10
     assert 0 < harvest[:, 0].sum() < 10, "not always the same agent"
     assert max(episode.steps for episode in ends) > 1
+
+
+def test_agents_that_wait_stay_also_where_they_may_clean():
+    scene = Scene("~~~~\n>A<.", "greedy", worlds=64, may_clean=True)
+    chosen = scene.policy(scene.env.reset())["agents", "action"][:, 0].tolist()
+    assert {scene.game.actions[action] for action in chosen} == {"forward", "stay"}
 
 
 def population(policy, game, worlds, seed=0):

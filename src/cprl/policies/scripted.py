@@ -178,6 +178,7 @@ def _settings(game: Game, spare: int) -> Settings:
     rules = game.rules
     return Settings(
         actions=game.tables.silent_actions,
+        stay=game.actions.index("stay"),
         has_beam=rules.may_fire,
         beam_length=min(*rules.beam_lengths_cells, rules.window_rows - 1),
         beam_half_width=min(rules.beam_width_cells, rules.window_columns) // 2,

@@ -126,7 +126,7 @@ def apples_near(roles: Bytes, frame: Frame, cell: int) -> int:
 RANDOM, GREEDY, SUSTAINABLE, TERRITORIAL, AGGRESSIVE, PACIFIST = range(6)
 
 FORWARD, BACKWARD, LEFT, RIGHT, TURN_LEFT, TURN_RIGHT, BEAM = range(7)
-"""Indices into `cprl.commons.rules.ACTIONS`; the last action of a game is "stay"."""
+"""Indices into `cprl.commons.rules.ACTIONS`; for "stay" see `Settings`."""
 
 EXPLORES, WHICH, WANDERS, WAITS, NUMBERS = range(5)
 """The uses of an agent's random numbers in a turn, and their count NUMBERS."""
@@ -145,6 +145,8 @@ class Settings(NamedTuple):
 
     actions: int
     """The number of actions without a signal: these agents are silent."""
+    stay: int
+    """The index of the action "stay"."""
     has_beam: bool
     """Whether there is a beam action."""
     beam_length: int
@@ -191,7 +193,7 @@ def walk_to(
     """The action for the first step on a shortest path to a reachable cell; may wait for another agent."""
     cell = step_to(frame, goal, scratch)
     if is_beside_an_agent(roles, frame, cell) and number < WAIT_PROB:
-        return settings.actions - 1
+        return settings.stay
     if cell == frame.middle - 1:
         return LEFT
     return RIGHT if cell == frame.middle + 1 else FORWARD
