@@ -122,6 +122,26 @@ def test_which_policies_fire_at_which_agents(drawing, policy, fires):
     assert scene.in_play[1] != fires, "and the beam hits"
 
 
+@pytest.mark.parametrize(
+    ("drawing", "policy", "rules", "fires"),
+    [
+        (">......\n.....<.\nA......", "aggressive", {}, True),
+        (">......\n.....<.\nA......", "aggressive", {"beam_tapers": True}, False),
+        (">......\n....<..\nA......", "aggressive", {"beam_tapers": True}, True),
+        (">....<.\n.......\nA......", "aggressive", {"beam_tapers": True}, True),
+        (">......\n<......\nA......", "aggressive", {}, False),
+        (">......\n<......\nA......", "aggressive", {"beam_from_beside": True}, True),
+        (">......\n#.<....\nA......", "aggressive", {"beam_from_beside": True}, False),
+        (">.<.<A.", "territorial", {}, True),
+        (">.<...<A", "territorial", {"beam_stops_at_agents": True, "beam_length_cells": 6}, False),
+    ],
+)
+def test_agents_fire_where_the_beam_of_the_game_hits(drawing, policy, rules, fires):
+    scene = Scene(drawing, policy, window_rows=8, window_columns=9, **rules)
+    assert (scene.go(1) == ["beam"]) == fires
+    assert all(scene.in_play) != fires, "and the beam hits"
+
+
 def test_aggressive_turns_to_an_agent_at_its_side_walks_towards_it_and_fires():
     scene = Scene(".A......\n^......<", "aggressive", window_rows=8, window_columns=17)
     assert scene.go(4) == ["turn_right", "forward", "forward", "beam"]

@@ -180,8 +180,11 @@ def _settings(game: Game, spare: int) -> Settings:
         actions=game.tables.silent_actions,
         stay=game.actions.index("stay"),
         has_beam=rules.may_fire,
-        beam_length=min(*rules.beam_lengths_cells, rules.window_rows - 1),
+        beam_length=min(rules.beam_lengths_cells),
         beam_half_width=min(rules.beam_width_cells, rules.window_columns) // 2,
+        beam_tapers=rules.beam_tapers,
+        beam_from_beside=rules.beam_from_beside,
+        beam_stops_at_agents=rules.beam_stops_at_agents,
         spare=spare,
     )
 

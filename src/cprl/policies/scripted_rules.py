@@ -150,10 +150,12 @@ class Settings(NamedTuple):
     has_beam: bool
     """Whether there is a beam action."""
     beam_length: int
-    """The cells ahead that a beam covers for every heading, since an agent does not know its heading; at most
-    those in the window."""
+    """The cells ahead that a beam covers for every heading, since an agent does not know its heading."""
     beam_half_width: int
     """The cells to each side that a beam covers; at most those in the window."""
+    beam_tapers: bool
+    beam_from_beside: bool
+    beam_stops_at_agents: bool
     spare: int
     """The number of other apples near an apple that "sustainable" harvests."""
 
@@ -212,13 +214,17 @@ def wander(roles: Bytes, frame: Frame, number: float, scratch: Scratch) -> int:
 def has_target(roles: Bytes, frame: Frame, settings: Settings, guards: bool) -> bool:
     """Whether a beam would cover a visible agent; with `guards`, one that is near a visible apple."""
     for side in range(-settings.beam_half_width, settings.beam_half_width + 1):
-        cell = frame.middle + side
-        for _ in range(settings.beam_length):
-            cell -= frame.stride
+        begin = 0 if settings.beam_from_beside and side != 0 else 1
+        end = settings.beam_length - abs(side) if settings.beam_tapers else settings.beam_length
+        for ahead in range(begin, end + 1):
+            cell = frame.middle + side - ahead * frame.stride
             if roles[cell] == WALL:
                 break
-            if roles[cell] == AGENT and (not guards or apples_near(roles, frame, cell) > 0):
-                return True
+            if roles[cell] == AGENT:
+                if not guards or apples_near(roles, frame, cell) > 0:
+                    return True
+                if settings.beam_stops_at_agents:
+                    break
     return False
 
 
