@@ -157,6 +157,28 @@ def test_a_pair_is_worked_by_hand():
     assert exact_yield(maps.parse("A>"), PUBLISHED).per_step == 0
 
 
+def test_a_pair_bears_less_where_nothing_grows_under_agents():
+    rules = Rules(regrow_prob=(0.0, 0.5), regrow_before_bites=True, regrow_under_agents=False)
+    bounds = yield_bounds(maps.parse("AA>"), rules)
+    assert (bounds.at_least, bounds.at_most) == pytest.approx((1 / 3, 1 / 2))
+
+
+@pytest.mark.parametrize(("regrow_by", "per_step"), [("count", 0.5), ("share", 1.0), ("share_with_own", 0.4)])
+def test_the_bounds_follow_what_growth_depends_on(regrow_by, per_step):
+    # By count the middle site grows with 0.5 between two apples. By share the other two do beside one, 0.5
+    # each; or with 0.2 each where the site itself, empty, counts as the half of those near.
+    rules = Rules(
+        regrow_prob=(0.0, 0.2, 0.5), regrow_radius_cells=1, regrow_by=regrow_by, regrow_before_bites=True
+    )
+    bounds = yield_bounds(maps.parse("AAA>"), rules)
+    assert (bounds.at_least, bounds.at_most) == pytest.approx((per_step, per_step))
+
+
+def test_the_bounds_of_a_map_with_a_river_are_refused():
+    with pytest.raises(ValueError, match=r"Map\.river"):
+        yield_bounds(maps.parse("~A>"), PUBLISHED)
+
+
 @st.composite
 def boards(draw):
     cells = draw(st.permutations([(r, c) for r in range(3) for c in range(4)]))

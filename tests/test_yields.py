@@ -40,6 +40,12 @@ FAR = maps.crosses(height=7, width=30, centres=((3, 3), (3, 12), (3, 21)), start
         # Apples from nothing: three sites are harvested, each 1/2 without regrowth in the same turn.
         (maps.parse("AAA>"), Rules(regrow_prob=(1.0,)), 1.5),
         (maps.parse("AAA>"), Rules(regrow_prob=(1.0,), regrow_before_bites=True), 3),
+        # Nothing grows under an agent, which has to leave the site for a turn.
+        (
+            maps.parse("AAA>"),
+            Rules(regrow_prob=(1.0,), regrow_before_bites=True, regrow_under_agents=False),
+            1.5,
+        ),
         # A pair whose probability falls. One harvested, its neighbour full: always one near, 0.2 / 1.2. Both
         # harvested: none or one near, so at least 0.2 each, 2 x 0.2 / 1.2.
         (maps.parse("AA>"), Rules(regrow_prob=(0.9, 0.2)), 2 * 0.2 / 1.2),

@@ -82,6 +82,16 @@ def growth(rules: Rules, around: Ints) -> tuple[NDArray[np.int64], NDArray[np.fl
     return of_site, np.interp(shares, np.linspace(0, 1, len(probs)), probs)
 
 
+def kept_rates(rules: Rules, rates: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the apples a turn of a site that is bitten as soon as it holds an apple, from its probabilities.
+
+    Such a site stands full for the turn in which it is bitten: p / (1 + p); or p, where its apple can grow
+    before the bite of an agent that stays on it.
+    """
+    at_once = rules.regrow_before_bites and rules.regrow_under_agents
+    return rates if at_once else rates / (1 + rates)
+
+
 def sites_around(board: Map, rules: Rules) -> list[NDArray[np.int64]]:
     """Return the sites near each site, int64 [..] each."""
     first, near = neighbours(board, rules)

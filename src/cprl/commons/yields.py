@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.maps import Map
-from cprl.commons.near import growth, sites_around
+from cprl.commons.near import growth, kept_rates, sites_around
 from cprl.commons.rules import Rules
 
 
@@ -14,14 +14,16 @@ def sustainable_yield(board: Map, rules: Rules) -> float:
     Some sites are harvested as soon as they hold an apple, the others never. A harvested site with m
     unharvested sites near it then grows an apple in every turn in which it is empty with at least the
     probability p = min(`regrow_prob`[m:]). So it bears p / (1 + p) apples a turn: it stands full for the turn
-    in which it is bitten, except under `regrow_before_bites`, where it bears p. Which sites are harvested is
-    found by a greedy search, so more may be possible. An isolated cross under the published probabilities
-    has two harvested sites with three apples near each: 0.1 apples a turn as run.
+    in which it is bitten, except under `regrow_before_bites` with `regrow_under_agents`, where it bears p.
+    Which sites are harvested is found by a greedy search, so more may be possible. An isolated cross under the
+    published probabilities has two harvested sites with three apples near each: 0.1 apples a turn as run.
+
+    On a map with a river it is the yield of a clean river, and no bound otherwise.
     """
     around = sites_around(board, rules)
     of_site, probs = growth(rules, np.array([len(some) for some in around], np.int32))
     lowest = np.minimum.accumulate(probs[:, ::-1], 1)[:, ::-1]
-    rates = lowest if rules.regrow_before_bites else lowest / (1 + lowest)
+    rates = kept_rates(rules, lowest)
     return _best(np.broadcast_to(rates[of_site], (len(around), rates.shape[1])), around)
 
 

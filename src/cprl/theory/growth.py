@@ -6,9 +6,9 @@ of apples near it. So no policy gets more in the long run than the largest growt
     max over s of  sum over k empty in s of  p(apples of s near k).
 
 The same stock tells how to harvest: take each apple as soon as it grows, and nothing else, and s stays.
-Where apples grow before bites this gives all that grows, so that both bounds meet if p never falls with the
-number of apples; else a harvested site is full in the turn in which it is bitten, and gives p / (1 + p)
-instead of p. The stock is found by integer programming (HiGHS, by scipy), whose own bound is a proof, too,
+Where apples grow before bites, also under agents, this gives all that grows, so that both bounds meet if p
+never falls with the number of apples; else a harvested site is full in the turn in which it is bitten, and
+gives p / (1 + p) instead of p. The stock is found by integer programming (HiGHS, by scipy), whose own bound is a proof, too,
 where the search is stopped early.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.maps import Map
-from cprl.commons.near import patches, sites_around
+from cprl.commons.near import growth, kept_rates, patches, sites_around
 from cprl.commons.rules import Rules
 
 NODES: Final = 500
@@ -55,23 +55,28 @@ def yield_bounds(board: Map, rules: Rules, *, nodes: int = NODES) -> YieldBounds
         nodes: how long the search goes on: more bring the bounds together. The result follows from it alone,
             not from the machine's speed.
     """
+    if board.river:
+        raise ValueError(
+            f"Map.river has {len(board.river)} cells, whose waste keeps apples from growing; allowed: a map "
+            "without a river"
+        )
     around = sites_around(board, rules)
-    probs = np.array(rules.regrow_prob, np.float64)
-    counts = np.minimum(np.arange(max(map(len, around)) + 1), len(probs) - 1)
-    highest = np.maximum.accumulate(probs[counts])
-    lowest = np.minimum.accumulate(probs[counts][::-1])[::-1]
-    kept_rate = lowest if rules.regrow_before_bites else lowest / (1 + lowest)
+    of_site, rows = growth(rules, np.array(list(map(len, around)), np.int32))
+    probs = np.broadcast_to(rows[of_site], (len(around), rows.shape[1]))
+    highest = np.maximum.accumulate(probs, 1)
+    kept_rate = kept_rates(rules, np.minimum.accumulate(probs[:, ::-1], 1)[:, ::-1])
     stock, bound = _best_stock(around, kept_rate, nodes)
     if not np.array_equal(kept_rate, highest):
         _, bound = _best_stock(around, highest, nodes)
     # A stock that is kept has the growth of its own counts, also where more apples near mean less.
-    at_least = _growth(stock, around, probs[counts] if rules.regrow_before_bites else kept_rate)
+    is_all = rules.regrow_before_bites and rules.regrow_under_agents
+    at_least = _growth(stock, around, probs if is_all else kept_rate)
     return YieldBounds(at_least=at_least, at_most=max(bound, at_least), stock=stock)
 
 
 def _growth(stock: NDArray[np.bool_], around: list[NDArray[np.int64]], rate: Floats) -> float:
-    """The sum over empty sites of the rate of the number of full ones near them."""
-    return float(sum(rate[stock[around[site]].sum()] for site in np.flatnonzero(~stock)))
+    """The sum over empty sites of their rate by the number of full ones near them; `rate`: [K, counts]."""
+    return float(sum(rate[site, stock[around[site]].sum()] for site in np.flatnonzero(~stock)))
 
 
 def _best_stock(around: list[NDArray[np.int64]], rate: Floats, nodes: int) -> tuple[NDArray[np.bool_], float]:
@@ -82,7 +87,7 @@ def _best_stock(around: list[NDArray[np.int64]], rate: Floats, nodes: int) -> tu
     for patch in range(patch_of.max() + 1):
         sites = np.flatnonzero(patch_of == patch)
         around_patch = [np.searchsorted(sites, around[site]) for site in sites]
-        stock[sites], most = _best_of_patch(around_patch, rate, nodes)
+        stock[sites], most = _best_of_patch(around_patch, rate[sites], nodes)
         bound += most
     return stock, bound
 
@@ -93,18 +98,18 @@ def _best_of_patch(
     """`_best_stock` of one patch, by integer programming.
 
     x_k says that site k is full, z_km that it is empty with m or more full sites near, for each m at which
-    the rate rises: the growth is the sum of the rises.
+    its rate rises: the growth is the sum of the rises.
     """
     from scipy.optimize import Bounds, LinearConstraint, milp
     from scipy.sparse import csr_array
 
-    sites, rises = len(around), np.diff(rate)
+    sites, rises = len(around), np.diff(rate, axis=1)
     steps = [
         (site, count + 1)
         for site, near in enumerate(around)
-        for count in np.flatnonzero(rises[: len(near)]).tolist()
+        for count in np.flatnonzero(rises[site, : len(near)]).tolist()
     ]
-    gain = np.array([-rate[0]] * sites + [rises[count - 1] for _, count in steps])
+    gain = np.array([*-rate[:, 0], *(rises[site, count - 1] for site, count in steps)])
     if not gain.any():
         return np.zeros(sites, np.bool_), 0.0
     cells: dict[tuple[int, int], float] = {}
@@ -127,4 +132,4 @@ def _best_of_patch(
     )
     if best.x is None:
         raise RuntimeError(f"no stock was found in {nodes:,} nodes; allowed: more nodes")
-    return best.x[:sites] > 0.5, float(rate[0]) * sites - float(best.mip_dual_bound)
+    return best.x[:sites] > 0.5, float(rate[:, 0].sum()) - float(best.mip_dual_bound)
