@@ -5,10 +5,11 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 from stored_runs import command, stored
 
-from cprl import Game, Rules, maps, presets
-from cprl.evaluation.play import board_text, help_of, open_session, play_in_terminal
+from cprl import CommonsEnv, Game, Rules, keys, maps, presets
+from cprl.evaluation.play import Session, board_text, help_of, open_session, play_in_terminal
 from cprl.measuring.episodes import EpisodeTracker
 
 DRAWING = """
@@ -131,6 +132,17 @@ def test_ctrl_c_ends_an_episode_like_quit(run, capsys):
 def test_a_game_without_a_beam_has_no_key_for_it():
     assert "f fire the beam" in help_of(MEADOW)
     assert "beam" not in help_of(presets.game("single_basic"))
+
+
+def test_keys_harvest_and_clean_where_the_game_has_these_actions(tmp_path, capsys):
+    assert not {"h harvest", "c clean the river"} & set(help_of(MEADOW).split(", "))
+    assert "h harvest" in help_of(presets.game("janssen/foraging-v1"))
+    rules = Rules(regrow_prob=(1.0,), may_clean=True, beam_width_cells=1, window_rows=3, window_columns=3)
+    env = CommonsEnv(Game(map=maps.parse("A>.~HH"), rules=rules), seed=0)
+    session = Session(env, lambda moment: moment.set(keys.ACTION, torch.zeros(1, 1, dtype=torch.long)))
+    assert text_of(session) == ["A 0>. ~ H H"]
+    in_terminal(session, "c\n", capsys)
+    assert text_of(session) == ["A 0>* * * H"]
 
 
 @pytest.mark.parametrize(

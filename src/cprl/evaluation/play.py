@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 
 from cprl import keys
 from cprl.commons import maps
-from cprl.commons.colours import APPLE, BEAM, PALETTE, WALL, Colour, agent_colour
+from cprl.commons.colours import APPLE, BEAM, CLEANING, PALETTE, WALL, WASTE, WATER, Colour, agent_colour
 from cprl.commons.game import Game
 from cprl.commons.maps import SIGN_OF_HEADING
 from cprl.commons.published import Variant, check_board
@@ -43,6 +43,8 @@ KEYS: Final = {
     "q": ("turn_left", "turn left"),
     "e": ("turn_right", "turn right"),
     "f": ("beam", "fire the beam"),
+    "h": ("harvest", "harvest"),
+    "c": ("clean", "clean the river"),
     ".": ("stay", "stay"),
 }
 """The action of each key, and what it is called."""
@@ -203,12 +205,18 @@ def _ask_and_play(session: Session, read_line: Callable[[], str]) -> bool:
 
 
 def board_text(session: Session) -> Text:
-    """The board by rows: `A` an apple, `#` a wall, `*` a beam, and each agent's number with its heading."""
+    """The board by rows: `A` an apple, `#` a wall, `~` and `H` a river's water and waste, `*` a beam, and
+    each agent's number with its heading."""
     board, now = session.game.map, session.moments[-1]
     wide = len(str(session.game.agents - 1)) + 1
     cells: dict[tuple[int, int], tuple[str, Colour]] = {
+        **dict.fromkeys(board.river, (maps.WATER, PALETTE[WATER])),
         **{cell: ("A", PALETTE[APPLE]) for cell, apple in zip(board.sites, now.stock, strict=True) if apple},
-        **{(int(row), int(col)): ("*", PALETTE[BEAM]) for row, col in np.argwhere(now.board == BEAM)},
+        **{
+            (int(row), int(col)): (sign, PALETTE[kind])
+            for kind, sign in ((WASTE, maps.WASTE), (BEAM, "*"), (CLEANING, "*"))
+            for row, col in np.argwhere(now.board == kind)
+        },
         **dict.fromkeys(board.walls, ("#" * wide, PALETTE[WALL])),
     }
     for agent, (row, col, heading) in enumerate(zip(now.row, now.col, now.heading, strict=True)):
