@@ -83,6 +83,22 @@ class Viewers(Stream):
         return list(RrdReader(self.path).stream().filter(content=f"/exhibition/{entity}"))
 
 
+@pytest.mark.parametrize(
+    ("drawing", "rules", "is_drawn"),
+    [
+        (".A>.A", {}, True),
+        (".A>.A", {"first_stock_share": 0.5}, False),
+        (".A>.A", {"shuffle_starts": True}, False),
+        (".A>.A", {"random_headings": True}, False),
+        (".A>.AP", {}, False),
+        (".A>.A~", {}, False),
+    ],
+)
+def test_the_map_is_sent_first_only_if_episodes_begin_so(drawing, rules, is_drawn):
+    game = Game(map=maps.parse(drawing), rules=Rules(**rules))
+    assert exhibition._begins_as_drawn(game) == is_drawn
+
+
 class Kept:
     """An exhibition whose viewers are files, on a clock that the test moves."""
 

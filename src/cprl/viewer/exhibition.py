@@ -89,7 +89,8 @@ class Exhibition(View):
         """Whether it has ended, because it failed."""
         kept.do(partial(_send_fixed, scene=scene))
         # Compiling may take half a minute, and of a run that is resumed no policy is loaded yet.
-        self._send(_before_the_first_step(commons.game), "the board as an episode begins")
+        if _begins_as_drawn(commons.game):
+            self._send(_before_the_first_step(commons.game), "the board as an episode begins")
 
     def on_step(self, turn: int, episode: int, frame: int | None) -> None:
         """Plays the steps of two seconds if they are due; `episode` is the training's, for the caption."""
@@ -251,6 +252,13 @@ def _rows(scene: Scene, frames: Frames) -> list[list[tuple[str, list[Any]]]]:
             row = [rr.ComponentColumn(kind, _Values(part), lengths=[len(part)]) for kind, part in values]
             rows[number].append((entity, row))
     return rows
+
+
+def _begins_as_drawn(game: Game) -> bool:
+    """Whether each episode begins with the map as it is: all apples on it, each agent at its start."""
+    rules = game.rules
+    by_chance = rules.first_stock_share < 1 or rules.shuffle_starts or rules.random_headings
+    return not (by_chance or game.map.spawns or game.map.river)
 
 
 def _before_the_first_step(game: Game) -> Frames:
