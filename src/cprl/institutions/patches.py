@@ -1,5 +1,6 @@
 """ClosedPatches: a patch is closed while it holds too few apples."""
 
+import warnings
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, NamedTuple
 
@@ -32,6 +33,17 @@ class ClosedPatches(Limit):
     at_most: ClassVar[int | None] = 1
     shows_places: ClassVar[bool] = True
     counts: ClassVar[tuple[str, ...]] = ("closed_bites",)
+
+    def check(self, game: Any) -> None:
+        """Warns (UserWarning) if no patch ever opens, so that nobody gets an apple."""
+        largest = int(np.bincount(game.patches).max())
+        if self.is_stopped and self.below > largest:
+            warnings.warn(
+                f"no agent can harvest any site: ClosedPatches.below is {self.below}, and no patch of "
+                f"Game.map has more than {largest} site{'s' if largest > 1 else ''}",
+                UserWarning,
+                stacklevel=5,
+            )
 
 
 class Arrays(NamedTuple):
