@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from cprl import Game, Map, Rules, maps
-from cprl.institutions import Boundaries, Quota
+from cprl.institutions import Boundaries, ClosedPatches, Quota
 
 BOARDS_OF_THE_STUDY = {  # name: (height, width, sites, agents), from shared/paper/maps.txt
     "single_basic": (7, 24, 13, 1),
@@ -61,6 +61,8 @@ def scattered(**changes):
         (board, {"starts": ((1, 2, 0),)}, "start at row 1, column 2 is on a wall"),
         (board, {"sites": ((1, 2),)}, "site at row 1, column 2 is on a wall"),
         (board, {"sites": ((0, 0), (0, 0))}, "site at row 0, column 0 is there twice"),
+        (board, {"sites": ((0, 1),), "river": ((0, 1),)}, "site at row 0, column 1 is on the river"),
+        (board, {"river": ((0, 1),), "waste": (0, 0)}, "Map.waste"),
         (board, {"starts": ((0, 3, 0),)}, "start at row 0, column 3 lies outside the board"),
         (board, {"starts": ((0, 0, 4),)}, "Map.starts"),
         (board, {"starts": ()}, "Map.starts"),
@@ -79,6 +81,11 @@ def scattered(**changes):
 def test_a_board_that_cannot_be_is_refused_with_the_place_of_what_is_wrong(make, arguments, message):
     with pytest.raises(ValueError, match=message):
         make(**arguments)
+
+
+def test_a_drawing_with_a_byte_order_mark_is_read(tmp_path):
+    (tmp_path / "board.txt").write_text("A.>", encoding="utf-8-sig")
+    assert maps.read(tmp_path / "board.txt") == maps.parse("A.>")
 
 
 WALLS_BY_ROW = {  # regions.md, after Perolat et al.: columns of wall, by row
@@ -232,3 +239,11 @@ def test_boundaries_that_stop_bites_are_reckoned_with_and_fines_are_not():
     without_a_warning(board, Boundaries.drawn(regions, owners=("1", "0#")))
     with pytest.warns(UserWarning, match="of the 1 sites"):
         game("A..>", Boundaries.drawn("-..."))
+
+
+def test_one_is_warned_of_patches_that_never_open():
+    with pytest.warns(UserWarning, match=r"ClosedPatches\.below is 3") as told:
+        game("AA....A.>", ClosedPatches(below=3))
+    assert told[0].filename == __file__
+    without_a_warning("AA....A.>", ClosedPatches(below=2))
+    without_a_warning("AA....A.>", ClosedPatches(below=3, fine=1.0))

@@ -87,6 +87,8 @@ class Map(Value):
         super().__post_init__()
         if any(index >= len(self.river) for index in self.waste):
             raise refusal("Map.waste", self.waste, f"indices of Map.river, which has {len(self.river)} cells")
+        if len(set(self.waste)) < len(self.waste):
+            raise refusal("Map.waste", self.waste, "each cell once")
         check_cells("Map", self.height, self.width)
         _check_cells(self)
 
@@ -127,8 +129,8 @@ def check_cells(name: str, height: int, width: int) -> None:
 
 
 def _check_cells(board: Map) -> None:
-    """Raise a ValueError for a cell outside the board, on a wall, or named twice."""
-    walls = set(board.walls)
+    """Raise a ValueError for a cell outside the board, on a wall, or named twice, and a site on a river."""
+    walls, river = set(board.walls), set(board.river)
     starts = [(row, col) for row, col, _ in board.starts]
     kinds = {
         "site": board.sites,
@@ -150,6 +152,8 @@ def _check_cells(board: Map) -> None:
                 problem = "is there twice; allowed: one per cell"
             elif name != "wall" and (row, col) in walls:
                 problem = "is on a wall; allowed: open ground"
+            elif name == "site" and (row, col) in river:
+                problem = "is on the river; allowed: ground"
             if problem:
                 raise ValueError(f"the {name} at row {row}, column {col} {problem}")
             seen.add((row, col))
@@ -200,7 +204,7 @@ def read(path: str | Path, *, legend: str | Mapping[str, Meaning] = "cprl", agen
     if Path(path).stat().st_size > _LARGEST_DRAWING_BYTES:
         raise ValueError(f"{path} has more than {_LARGEST_DRAWING_BYTES:,} bytes; allowed: a drawing")
     try:
-        return parse(Path(path).read_text(encoding="utf-8"), legend=legend, agents=agents)
+        return parse(Path(path).read_text(encoding="utf-8-sig"), legend=legend, agents=agents)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
