@@ -302,6 +302,12 @@ def test_a_fine_costs_the_one_who_fines():
         ({"first_stock_share": 1.5}, "first_stock_share"),
         ({"first_stock_share": 0.1}, "first_stock_share"),  # no apple, and none can grow
         ({"respawn_at_spawns": True}, "respawn_at_spawns"),
+        ({"may_clean": True}, "may_clean"),  # no river
+        ({"pollution_prob": 0.5}, "pollution_prob"),
+        ({"pollution_limit": 0.5}, "pollution_limit"),
+        ({"pollution_free": 0.1}, "pollution_free"),
+        ({"end_from_step": 5}, "end_from_step"),
+        ({"end_every_steps": 5}, "end_every_steps"),
     ],
 )
 def test_rules_that_do_not_go_together_are_refused(rules, named):

@@ -60,8 +60,12 @@ class Game(Value):
             raise ValueError(
                 "Rules.respawn_at_spawns is True and Map.spawns is empty; allowed: a map with spawn places"
             )
-        if rules.may_clean and not self.map.river:
-            raise ValueError("Rules.may_clean is True and Map.river is empty; allowed: a map with a river")
+        for name in ("may_clean", "pollution_prob", "pollution_limit", "pollution_free"):
+            if name in rules.changed and not self.map.river:
+                raise ValueError(
+                    f"Rules.{name} is {rules.changed[name]} and Map.river is empty; allowed: a map with a "
+                    "river"
+                )
         if round(rules.first_stock_share * len(self.map.sites)) == 0 and rules.regrow_prob[0] == 0:
             raise ValueError(
                 f"Rules.first_stock_share is {rules.first_stock_share} of {len(self.map.sites)} sites, and "
