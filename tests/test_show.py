@@ -17,7 +17,7 @@ from cprl.commons.colours import BEAM
 from cprl.commons.readable import growth_of, legend_of, meaning_of
 from cprl.evaluation.film import fresh_episode, play_to_show
 from cprl.evaluation.show import show
-from cprl.institutions import Boundaries, Monitoring, Quota, Tax
+from cprl.institutions import Boundaries, Monitoring, Punishment, Quota, Tax
 from cprl.measuring.social import SOCIAL
 
 COMMONS = presets.game("commons")
@@ -181,6 +181,7 @@ def test_institutions_say_what_they_do_in_numbers_that_hold_in_the_game():
     assert "costs 2 apples if it is noticed" in meaning_of(fined, watched)
     assert "50%" in meaning_of(watch, watched)
     assert "30%" in meaning_of(tax, game)
+    assert "Each shot costs 1." in meaning_of(Punishment(fine=50.0, cost=0.0, shot_cost=1.0), game)
 
 
 def test_the_legend_names_only_signs_that_can_appear():
@@ -188,6 +189,8 @@ def test_the_legend_names_only_signs_that_can_appear():
     assert not re.search("beam|diamond|river|Frames", legend_of([peaceful]))
     walled = replace(presets.game("two_complex"), institutions=(Quota(fine=1.0),))
     assert re.search("wall.*hit leaves the board for 25 turns.*diamond", legend_of([peaceful, walled]))
+    fined = replace(walled, rules=replace(walled.rules, freeze_steps=0))
+    assert "are a beam. " in legend_of([fined])
     assert legend_of([walled, walled]) == legend_of([walled])
 
 

@@ -86,8 +86,9 @@ def meaning_of(institution: Institution, game: "Game") -> str:
             return f"{rate:.0%} of what each agent picks is taken and {goes}."
         case Monitoring(prob=prob):
             return f"Of the turns in which an agent breaks a rule, {prob:.0%} are noticed."
-        case Punishment(fine=fine, cost=cost):
-            return f"A hit costs the agent that is hit {fine:g} apples and the shooter {cost:g}."
+        case Punishment(fine=fine, cost=cost, shot_cost=shot_cost):
+            words = f"A hit costs the agent that is hit {fine:g} apples and the shooter {cost:g}."
+            return words + f" Each shot costs {shot_cost:g}." * (shot_cost > 0)
     sentence = " ".join((getdoc(institution) or "").partition("\n\n")[0].split())
     return re.sub(r" \(.*\)\.$", ".", sentence)
 
@@ -115,8 +116,9 @@ def _signs(game: "Game") -> list[str]:
     if game.map.river:
         signs.append("Blue is the river, brown its waste.")
     if game.rules.may_fire:
-        turns = f"{game.rules.freeze_steps:,} turns"
-        signs.append(f"Light dots are a beam: an agent that is hit leaves the board for {turns}.")
+        turns = game.rules.freeze_steps
+        leaves = f": an agent that is hit leaves the board for {turns:,} turns" if turns else ""
+        signs.append(f"Light dots are a beam{leaves}.")
     if any(isinstance(institution, Boundaries) for institution in game.institutions):
         signs.append("Frames are regions with owners.")
     if any(institution.can_be_broken for institution in game.institutions):
