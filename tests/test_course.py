@@ -47,6 +47,10 @@ def test_the_course_has_the_peak_the_end_and_random_play(tmp_path):
     )
 
 
+def test_the_peak_of_a_short_run_is_one_of_its_episodes(tmp_path):
+    assert "around episode 2," in told_of(tmp_path / "run", [300.0, 310.0], [1000.0] * 2)
+
+
 @pytest.mark.parametrize(
     ("returns", "lengths", "ending"),
     [

@@ -76,7 +76,7 @@ def test_the_outcome_comes_first_and_what_institutions_never_did_has_no_table(tm
 
     idle, busy = (governed(0, harvest, [0, 0]) for harvest in ([1, 1], [90, 30]))
     _, text = told_of(tmp_path, random=[idle], trained=[busy])
-    first = "trained 120, 60.0 times random play; random play 2.0: apples an episode, all agents together"
+    first = "trained: 120, 60.0 times random play; random play: 2.0 apples an episode, all agents together"
     assert text.splitlines()[0] == first
     assert "institutions" not in text
     rows, text = told_of(tmp_path, random=[idle], trained=[governed(0, [9, 3], [2, 0])])

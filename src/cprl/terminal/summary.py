@@ -92,7 +92,8 @@ def course_of(run: Path) -> str:
         meaning = "They end no better off than agents who never learned."
     return (
         f"The agents began at {tens[0]:.0f} apples an episode, all together, and reached {peak:.0f} "
-        f"around episode {tens.argmax() + 5}, {times}. In the last {len(returns[-30:])} episodes they got "
+        f"around episode {min(tens.argmax() + 5, returns.size)}, {times}. "
+        f"In the last {len(returns[-30:])} episodes they got "
         f"{last:.0f}{', ' * bool(shares)}{' and '.join(shares)}. "
         f"Boards that can last {survival.max():.0f} steps now last {lasts:.0f}. {meaning}"
     )
@@ -104,13 +105,13 @@ def _verdict(played: Played) -> str:
     means = {name: fmean(_gains(episodes)) for name, episodes in played.items()}
     baseline, first = next(iter(means.items()))
     what = f"{'apples' if is_harvest else 'of return'} an episode, all agents together"
-    parts = [f"{_called(name)} {mean:,.{1 if abs(mean) < 100 else 0}f}" for name, mean in means.items()]
+    parts = [f"{_called(name)}: {mean:,.{1 if abs(mean) < 100 else 0}f}" for name, mean in means.items()]
     if len(means) > 1 and first > 0:
         parts = [
             part if name == baseline else f"{part}, {means[name] / first:.1f} times {_called(baseline)}"
             for part, name in zip(parts, means, strict=True)
         ]
-    return f"{parts[-1]}; {'; '.join(parts[:-1])}: {what}" if parts[1:] else f"{parts[0]}: {what}"
+    return f"{'; '.join([parts[-1], *parts[:-1]])} {what}"
 
 
 def _table(title: str, played: Played) -> Cells:
