@@ -15,8 +15,8 @@ def sustainable_yield(board: Map, rules: Rules) -> float:
     unharvested sites near it then grows an apple in every turn in which it is empty with at least the
     probability p = min(`regrow_prob`[m:]). So it bears p / (1 + p) apples a turn: it stands full for the turn
     in which it is bitten, except under `regrow_before_bites` with `regrow_under_agents`, where it bears p.
-    Which sites are harvested is found by a greedy search, so more may be possible. An isolated cross under the
-    published probabilities has two harvested sites with three apples near each: 0.1 apples a turn as run.
+    Which sites are harvested is found by a greedy search, so more may be possible. An isolated cross under
+    the published probabilities has two harvested sites with three apples near each: 0.1 apples a turn as run.
 
     On a map with a river it is the yield of a clean river, and no bound otherwise.
     """

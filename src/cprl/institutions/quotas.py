@@ -22,7 +22,8 @@ class Quota(Limit):
 
     Windows follow one another from the first turn of an episode. In each, an agent may harvest up to
     share x yield x window_steps / N apples, where the yield is `cprl.commons.yields.sustainable_yield`, a
-    proven lower bound (on a map with a river: while that is clean). Agents observe the part of their quota that is left and the time left in the window.
+    proven lower bound (on a map with a river: while that is clean). Agents observe the part of their quota
+    that is left and the time left in the window.
     """
 
     share: Annotated[float, Range(0, 1e6)] = 1.0

@@ -8,8 +8,8 @@ of apples near it. So no policy gets more in the long run than the largest growt
 The same stock tells how to harvest: take each apple as soon as it grows, and nothing else, and s stays.
 Where apples grow before bites, also under agents, this gives all that grows, so that both bounds meet if p
 never falls with the number of apples; else a harvested site is full in the turn in which it is bitten, and
-gives p / (1 + p) instead of p. The stock is found by integer programming (HiGHS, by scipy), whose own bound is a proof, too,
-where the search is stopped early.
+gives p / (1 + p) instead of p. The stock is found by integer programming (HiGHS, by scipy), whose own bound
+is a proof, too, where the search is stopped early.
 """
 
 from dataclasses import dataclass
