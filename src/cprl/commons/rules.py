@@ -125,7 +125,9 @@ class Rules(Value):
 
     may_clean: bool = False
     """[C] Whether agents may clean the river, `Map.river`: a further action "clean", a beam of the size of
-    the other one that removes the waste of the first cell of each column that has some, and ends there."""
+    the other one that removes the waste of the first cell of each column that has some, and ends there, at a
+    wall or at an agent. The picture shows it up to walls, as the other one: also beyond waste, and beyond
+    agents without `beam_stops_at_agents`."""
 
     pollution_prob: Probability = 0.0
     """[C] The probability per turn with which a clean cell of the river gets waste, tried cell by cell in an
