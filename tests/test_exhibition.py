@@ -94,9 +94,10 @@ class Viewers(Stream):
         (".A>.A~", {}, False),
     ],
 )
-def test_the_map_is_sent_first_only_if_episodes_begin_so(drawing, rules, is_drawn):
+def test_the_map_that_is_sent_first_is_called_what_it_is(drawing, rules, is_drawn):
     game = Game(map=maps.parse(drawing), rules=Rules(**rules))
-    assert exhibition._begins_as_drawn(game) == is_drawn
+    words = "the board as an episode begins" if is_drawn else "the map; episodes begin otherwise"
+    assert exhibition._beginning(game) == words
 
 
 class Kept:

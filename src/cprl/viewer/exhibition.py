@@ -89,8 +89,7 @@ class Exhibition(View):
         """Whether it has ended, because it failed."""
         kept.do(partial(_send_fixed, scene=scene))
         # Compiling may take half a minute, and of a run that is resumed no policy is loaded yet.
-        if _begins_as_drawn(commons.game):
-            self._send(_before_the_first_step(commons.game), "the board as an episode begins")
+        self._send(_before_the_first_step(commons.game), _beginning(commons.game))
 
     def on_step(self, turn: int, episode: int, frame: int | None) -> None:
         """Plays the steps of two seconds if they are due; `episode` is the training's, for the caption."""
@@ -254,15 +253,18 @@ def _rows(scene: Scene, frames: Frames) -> list[list[tuple[str, list[Any]]]]:
     return rows
 
 
-def _begins_as_drawn(game: Game) -> bool:
-    """Whether each episode begins with the map as it is: all apples on it, each agent at its start."""
+def _beginning(game: Game) -> str:
+    """What the frame before the first step is: each episode begins with the map as it is drawn, all apples on
+    it and each agent at its start, or otherwise by chance."""
     rules = game.rules
     by_chance = rules.first_stock_share < 1 or rules.shuffle_starts or rules.random_headings
-    return not (by_chance or game.map.spawns or game.map.river)
+    if by_chance or game.map.spawns or game.map.river:
+        return "the map; episodes begin otherwise"
+    return "the board as an episode begins"
 
 
 def _before_the_first_step(game: Game) -> Frames:
-    """The frame of the board as an episode begins, drawn from the map."""
+    """The frame before the first step, drawn from the map."""
     board = game.map
     row, col, heading = np.array(board.starts, np.int32).T
     frame = {
