@@ -131,6 +131,7 @@ def test_agents_see_where_their_bites_are_forbidden():
     assert plane(play, 0) == "...\n...\n..."
 
 
+@pytest.mark.filterwarnings("ignore:no agent can harvest:UserWarning")
 def test_only_what_is_observed_is_shown():
     # Site (0, 1) has no other apple near it, so its patch is closed with fewer than 2.
     hidden = Boundaries.drawn("..1..\n.....", observed=False)

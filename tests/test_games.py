@@ -306,8 +306,6 @@ def test_a_fine_costs_the_one_who_fines():
         ({"pollution_prob": 0.5}, "pollution_prob"),
         ({"pollution_limit": 0.5}, "pollution_limit"),
         ({"pollution_free": 0.1}, "pollution_free"),
-        ({"end_from_step": 5}, "end_from_step"),
-        ({"end_every_steps": 5}, "end_every_steps"),
     ],
 )
 def test_rules_that_do_not_go_together_are_refused(rules, named):

@@ -232,11 +232,6 @@ class Rules(Value):
                 raise ValueError(
                     f"Rules.{name} is {getattr(self, name)!r} and Rules.{other} is True; allowed: one of them"
                 )
-        for name in ("end_from_step", "end_every_steps"):
-            if name in self.changed and not self.end_prob:
-                raise ValueError(
-                    f"Rules.{name} is {self.changed[name]} and Rules.end_prob is 0; allowed: with an end_prob"
-                )
         if self.pollution_free >= self.pollution_limit:
             raise ValueError(
                 f"Rules.pollution_free is {self.pollution_free} and Rules.pollution_limit is "
