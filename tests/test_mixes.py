@@ -178,6 +178,13 @@ def test_one_replica_tells_nothing_for_certain():
     assert set(found.candidates) == {"prisoner's dilemma", "chicken", "stag hunt", "no dilemma"}
 
 
+@pytest.mark.parametrize("shapes", [((3, 1), (3, 1)), ((3,), (3,)), ((3, 2), (2, 2))])
+def test_payoffs_of_other_shapes_are_refused(shapes):
+    restrained, greedy = map(np.zeros, shapes)
+    with pytest.raises(ValueError, match=r"restrained is .* and greedy .*; allowed: \[R, N\]"):
+        dilemma(restrained, greedy)
+
+
 THREE = Game(
     map=maps.parse(
         """

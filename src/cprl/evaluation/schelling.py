@@ -85,6 +85,11 @@ def dilemma(restrained: Values, greedy: Values) -> Dilemma:
         restrained: R(k), float [R, N]: of each of R replicas, for k = 0 to N - 1 others that are restrained.
         greedy: G(k), likewise. Replicas are paired.
     """
+    if restrained.ndim != 2 or restrained.shape != greedy.shape or restrained.shape[1] < 2:
+        raise ValueError(
+            f"restrained is {list(restrained.shape)} and greedy {list(greedy.shape)}; allowed: [R, N] both, "
+            "at least 2 agents"
+        )
     pairs = {
         "restraint": (restrained[:, -1], greedy[:, 0]),
         "company": (restrained[:, -1], restrained[:, 0]),
