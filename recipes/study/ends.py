@@ -5,8 +5,7 @@
 Takes finished runs of one experiment, whose replicas count together, and writes a table in Markdown: how they
 do in fresh worlds, how far agents keep to cells of their own, in which dilemma they are with scripted agents,
 what trained best responses gain, and the phases of the training. Intervals are over replicas, by Student's t.
-Responses take the time: they are trained in the directory `responses` beside each run, and kept for the next
-call from the same working directory.
+Responses take the time: they are trained in the directory `responses` beside each run, and kept.
 """
 
 from pathlib import Path

@@ -82,14 +82,20 @@ def growth(rules: Rules, around: Ints) -> tuple[NDArray[np.int64], NDArray[np.fl
     return of_site, np.interp(shares, np.linspace(0, 1, len(probs)), probs)
 
 
-def kept_rates(rules: Rules, rates: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the apples a turn of a site that is bitten as soon as it holds an apple, from its probabilities.
+def bites_at_once(rules: Rules) -> bool:
+    """Whether an agent that stays on a site bites its apple in the turn in which it grows."""
+    return rules.regrow_before_bites and rules.regrow_under_agents
 
-    Such a site stands full for the turn in which it is bitten: p / (1 + p); or p, where its apple can grow
-    before the bite of an agent that stays on it.
+
+def kept_rates(rules: Rules, probs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the apples a turn of a site that is bitten as soon as it holds one, [.., M], while at least m
+    sites near it hold apples, from its probabilities of growth by their number m, [.., M].
+
+    With p the lowest of these from m on, it bears p, or p / (1 + p) where it stands full for the turn in
+    which it is bitten.
     """
-    at_once = rules.regrow_before_bites and rules.regrow_under_agents
-    return rates if at_once else rates / (1 + rates)
+    lowest = np.minimum.accumulate(probs[..., ::-1], -1)[..., ::-1]
+    return lowest if bites_at_once(rules) else lowest / (1 + lowest)
 
 
 def sites_around(board: Map, rules: Rules) -> list[NDArray[np.int64]]:

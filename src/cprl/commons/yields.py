@@ -22,8 +22,7 @@ def sustainable_yield(board: Map, rules: Rules) -> float:
     """
     around = sites_around(board, rules)
     of_site, probs = growth(rules, np.array([len(some) for some in around], np.int32))
-    lowest = np.minimum.accumulate(probs[:, ::-1], 1)[:, ::-1]
-    rates = kept_rates(rules, lowest)
+    rates = kept_rates(rules, probs)
     return _best(np.broadcast_to(rates[of_site], (len(around), rates.shape[1])), around)
 
 

@@ -114,9 +114,13 @@ class Experiment(Value, stored=False, called="experiment"):
     @property
     def trained_for(self) -> str:
         """How long it trains, in words."""
+        return f"trained for {self.length:,} {self.unit} in {self.trained_in}"
+
+    @property
+    def trained_in(self) -> str:
+        """Its replicas, and their worlds where they have several, in words."""
         worlds = f" of {self.worlds:,} worlds" if self.worlds > 1 else ""
-        replicas = f"{self.replicas} replica{'s' * (self.replicas > 1)}"
-        return f"trained for {self.length:,} {self.unit} in {replicas}{worlds}"
+        return f"{self.replicas} replica{'s' * (self.replicas > 1)}{worlds}"
 
     @property
     def unit(self) -> Literal["episodes", "steps"]:

@@ -14,8 +14,8 @@ from rich.text import Text
 from cprl.measuring.episodes import Episode
 from cprl.measuring.metrics import DIGITS, INSTITUTIONAL, is_own, left_out, with_unit
 from cprl.measuring.metrics import title as metric_title
-from cprl.runs.curves import as_curves, curves_of, running_mean
-from cprl.runs.episodes import read_table
+from cprl.runs.curves import as_curves, running_mean
+from cprl.runs.episodes import read_episodes, read_table
 from cprl.system.output import console as safe_console
 from cprl.system.output import printed
 from cprl.system.shipped import cprl_here
@@ -66,7 +66,8 @@ def course_of(run: Path) -> str:
     A tragedy, here: the last 30 episodes yield at most 95 % of random play, the best ten at least 1.5 times
     as much as it, and boards last at most 70 % of the turns that they could.
     """
-    curves, at_end = curves_of(run), curves_of(run, at_end=True)
+    table = read_episodes(run)
+    curves, at_end = as_curves(table), as_curves(table, at_end=True)
     if lacking := sorted({"collective_return", "survival_steps"} - set(curves)):
         raise ValueError(f"the episodes of {run} lack {', '.join(lacking)}; allowed: games that report them")
     returns, survival = curves["collective_return"].mean(0), curves["survival_steps"]

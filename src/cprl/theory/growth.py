@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.commons.maps import Map
-from cprl.commons.near import growth, kept_rates, patches, sites_around
+from cprl.commons.near import bites_at_once, growth, kept_rates, patches, sites_around
 from cprl.commons.rules import Rules
 
 NODES: Final = 500
@@ -64,13 +64,12 @@ def yield_bounds(board: Map, rules: Rules, *, nodes: int = NODES) -> YieldBounds
     of_site, rows = growth(rules, np.array(list(map(len, around)), np.int32))
     probs = np.broadcast_to(rows[of_site], (len(around), rows.shape[1]))
     highest = np.maximum.accumulate(probs, 1)
-    kept_rate = kept_rates(rules, np.minimum.accumulate(probs[:, ::-1], 1)[:, ::-1])
+    kept_rate = kept_rates(rules, probs)
     stock, bound = _best_stock(around, kept_rate, nodes)
     if not np.array_equal(kept_rate, highest):
         _, bound = _best_stock(around, highest, nodes)
     # A stock that is kept has the growth of its own counts, also where more apples near mean less.
-    is_all = rules.regrow_before_bites and rules.regrow_under_agents
-    at_least = _growth(stock, around, probs if is_all else kept_rate)
+    at_least = _growth(stock, around, probs if bites_at_once(rules) else kept_rate)
     return YieldBounds(at_least=at_least, at_most=max(bound, at_least), stock=stock)
 
 

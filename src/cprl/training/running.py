@@ -288,10 +288,8 @@ def _summarise(
 
 
 def _title(experiment: Experiment) -> str:
-    worlds = f" of {experiment.worlds:,} worlds" if experiment.worlds > 1 else ""
     length = experiment.length if experiment.unit == "episodes" else f"{experiment.length:,}"
-    replicas = f"{experiment.replicas} replica{'s' * (experiment.replicas != 1)}"
-    return f"{experiment.name}, {replicas}{worlds}, {length} {experiment.unit}"
+    return f"{experiment.name}, {experiment.trained_in}, {length} {experiment.unit}"
 
 
 def _weights_of_partners(experiment: Experiment, run: Path) -> dict[str, str]:
