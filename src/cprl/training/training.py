@@ -367,41 +367,23 @@ def train(
     env: EnvBase,
     learners: Mapping[tuple[int, ...], Learner],
     *,
-    episodes: int | None = None,
-    steps: int | None = None,
-    worlds: int = 1,
-    others: Mapping[AgentIndices, nn.Module] | None = None,
-    decisions: Decider | None = None,
-    callbacks: Sequence[Any] = (),
     checkpointer: Checkpointer | None = None,
-    update_every: int = 1,
-    make_collector: MakeCollector = StepCollector,
-    on_nan: OnNan = "stop",
-    metrics: Sequence[Custom] = (),
+    **how: Any,
 ) -> Training:
     """Plays so many episodes, or takes so many steps, of every replica; each learner stores every turn and
     then updates.
 
-    Returns the `Training`, which is over; arguments are its own. The checkpointer says where it resumes from,
-    and saves its state now and then.
+    Args:
+        checkpointer: says where the training resumes from, and saves its state now and then.
+        how: the other arguments of `Training`.
+
+    Returns:
+        The `Training`, which is over.
 
     Raises:
         NotFiniteError: where a number is not finite, before a checkpoint holds it.
     """
-    training = Training(
-        env,
-        learners,
-        episodes=episodes,
-        steps=steps,
-        worlds=worlds,
-        others=others,
-        decisions=decisions,
-        callbacks=callbacks,
-        update_every=update_every,
-        make_collector=make_collector,
-        on_nan=on_nan,
-        metrics=metrics,
-    )
+    training = Training(env, learners, **how)
     training.run(checkpointer)
     return training
 

@@ -228,18 +228,22 @@ def _send_caption(recording: Any, *, caption: str) -> None:
     recording.send_columns("exhibition/caption", [], rr.Points2D.columns(labels=[caption]))
 
 
-class _Values(NamedTuple):
-    """Values of one component of one frame."""
+class _Row(NamedTuple):
+    """A component's column of one row, as `send_columns` reads it."""
 
-    array: Any
+    kind: Any
+    values: Any
+
+    def component_descriptor(self) -> Any:
+        return self.kind
 
     def as_arrow_array(self) -> Any:
-        return self.array
+        return self.values
 
 
 def _rows(scene: Scene, frames: Frames) -> list[list[tuple[str, list[Any]]]]:
     """What each frame changes: entities and their columns of one row, cut out of those of all frames, which
-    takes a quarter of the time of columns for each."""
+    takes a tenth of the time of columns for each."""
     rows: list[list[tuple[str, list[Any]]]] = [[] for _ in frames["step"]]
     for entity, (numbers, columns) in board_columns(scene, frames).items():
         if entity in IMAGES:
@@ -247,9 +251,7 @@ def _rows(scene: Scene, frames: Frames) -> list[list[tuple[str, list[Any]]]]:
             columns = [*columns, *forms]
         arrays = [(column.component_descriptor(), column.as_arrow_array()) for column in columns]
         for place, number in enumerate(numbers.tolist()):
-            values = [(kind, array.slice(place, 1).flatten()) for kind, array in arrays]
-            row = [rr.ComponentColumn(kind, _Values(part), lengths=[len(part)]) for kind, part in values]
-            rows[number].append((entity, row))
+            rows[number].append((entity, [_Row(kind, array.slice(place, 1)) for kind, array in arrays]))
     return rows
 
 
