@@ -446,6 +446,39 @@ def test_a_page_with_a_short_address_is_on_this_machine_alone_until_it_is_closed
     page.close()
 
 
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_who_opens_the_page_late_reads_that_history_loads_until_it_has(tmp_path, monkeypatch):
+    monkeypatch.setattr(streams, "LOADING_S", 5.0)
+    get = build_opener(ProxyHandler({})).open
+    with RerunLogger("run", tmp_path, curves=SCENE, live="serve") as logger:
+        logger.log_frames(frames(3)[0])
+        logger.log_document("header", "#### Finished")
+        logger.flush()
+        live = logger.live.stream
+        get(logger.addresses["browser"]).read()
+        wait(lambda: not live.is_behind)
+        assert not live._loading, "a recording that has just begun has no history"
+        live._has_history_from = 0.0
+        get(logger.addresses["browser"]).read()
+        wait(lambda: live._loading)
+        client = connected(logger.addresses["native"].split()[2], tmp_path)
+        wait(lambda: not live._loading)
+        logger.log_static("last", rr.TextLog("last"))
+        try:
+            wait(lambda: static(tmp_path / "got.rrd", "last", "TextLog:text"))
+        finally:
+            client.terminate()
+            client.wait()
+    read = []
+    for chunk in RrdReader(tmp_path / "got.rrd").stream():
+        batch = chunk.to_record_batch()
+        if "SegmentationImage:buffer" in batch.schema.names and chunk.entity_path == "/world/board":
+            read.append("board")
+        if "TextDocument:text" in batch.schema.names:
+            read += batch["TextDocument:text"].to_pylist()[0]
+    assert read[-3:] == ["#### History loads · Finished", "board", "#### Finished"]
+
+
 def test_a_process_that_is_killed_leaves_no_page():
     script = "from cprl.viewer.page import WebViewer; print(WebViewer().port, flush=True); input()"
     process = subprocess.Popen([sys.executable, "-c", script], stdin=PIPE, stdout=PIPE, text=True)

@@ -12,7 +12,7 @@ from functools import cache, partial
 from operator import methodcaller
 from pathlib import Path
 from queue import Full, Queue
-from threading import Thread
+from threading import Thread, Timer
 from typing import Any, Final, TypeAlias
 
 import rerun as rr
@@ -43,9 +43,16 @@ FILES_MEMORY: Final = "75%"
 NEEDED_BYTES: Final = 2_000_000
 """The free disk space needed to start a recording; its layout and static parts take a tenth."""
 
+HISTORY_S: Final = 60.0
+"""The age of a live recording from which browsers may take a while to read it."""
+LOADING_S: Final = 20.0
+"""Seconds from when a browser opens the page until it reads the recording, about."""
+
 _STALLED: Final[list[Any]] = []
 """Recordings whose viewers do not answer: the end of the last reference to one would wait for them."""
 
+HEADER: Final = "header"
+"""The entity of the text that people read first."""
 Row: TypeAlias = tuple[int, int, int, list[float] | str]
 """Step, episode, frame, and a number for each line or a Markdown text."""
 
@@ -106,12 +113,18 @@ class Stream:
 
 class LiveStream(Stream):
     """A stream to viewers. Its calls are made in a thread of its own, because a viewer that stands still, or
-    accepts a connection and never reads, makes them wait for half a minute."""
+    accepts a connection and never reads, makes them wait for half a minute.
+
+    Args:
+        history_s: the age from which browsers that open it read in its header that history loads.
+    """
 
     is_live = True
 
-    def __init__(self, name: str, recording: Any, *, period_s: float) -> None:
+    def __init__(self, name: str, recording: Any, *, period_s: float, history_s: float = HISTORY_S) -> None:
         super().__init__(name, recording, period_s=period_s)
+        self._header, self._loading = "", 0
+        self._has_history_from = time.perf_counter() + history_s
         self._queue: Queue[Callable[[Any], object] | None] = Queue(QUEUED_CALLS)
         self._error: Exception | None = None
         self._thread = Thread(target=self._work, daemon=True, name="cprl viewer")
@@ -121,6 +134,34 @@ class LiveStream(Stream):
     def is_behind(self) -> bool:
         """Whether calls wait that viewers have not taken, so that what can be left out should be."""
         return self._queue.qsize() > 1
+
+    def say(self, recording: Any, name: str, text: str) -> None:
+        """Sends a Markdown text without a time, which takes the place of the one before at all times; to be
+        called with `do`.
+
+        A server sends it before the history, so who connects late never reads an old one as the present.
+        """
+        if name == HEADER:
+            self._header = text
+            mark, _, words = text.partition(" ")
+            text = f"{mark} History loads · {words}" if self._loading else text
+        recording.send_columns(name, [], rr.TextDocument.columns(text=[text]))
+
+    def opened(self) -> None:
+        """A browser has opened the page, and reads the newest header first, then the history, then what is
+        sent from now on: the header says that history loads until it is sent again."""
+        if time.perf_counter() < self._has_history_from:
+            return
+
+        def load(recording: Any, change: int) -> None:
+            self._loading += change
+            if self._header:
+                self.say(recording, HEADER, self._header)
+
+        self.do(partial(load, change=1))
+        loaded = Timer(LOADING_S, self.do, [partial(load, change=-1)])
+        loaded.daemon = True
+        loaded.start()
 
     def _call(self, what: Callable[[Any], object] | None) -> None:
         if self._error is not None:
@@ -201,7 +242,7 @@ class Live:
             self.exhibition = serve("exhibition", EXHIBITION_MEMORY, send_properties=False)
         if how == "spawn":
             _spawn(sources)
-        self._page = WebViewer(*sources)
+        self._page = WebViewer(*sources, opened=self.stream.opened)
         self.addresses = self._page.addresses
 
     def close(self) -> None:
@@ -230,14 +271,6 @@ def open_file(
         recording.save(f"/proc/self/fd/{folder}/{path.name}", default_blueprint=blueprint)
         os.close(folder)
     return Stream("file", recording, period_s=period_s)
-
-
-def send_text(recording: Any, name: str, text: str) -> None:
-    """Sends a Markdown text without a time, which takes the place of the one before at all times.
-
-    A server sends it before the history, so who connects late never reads an old one as the present.
-    """
-    recording.send_columns(name, [], rr.TextDocument.columns(text=[text]))
 
 
 def _serve(recording: Any, memory: str, blueprint: Any = None) -> str:
@@ -275,11 +308,12 @@ def served(files: Sequence[Path]) -> Iterator[WebViewer]:
             application, recording_id = store.application_id, store.recording_id
             layout = next((StoredLayout(reader.stream(store=stored)) for stored in reader.blueprints()), None)
     recording = _recording(application, recording_id, send_properties=False)
-    page = WebViewer(_serve(recording, FILES_MEMORY, layout))
-    stream = LiveStream("recording", recording, period_s=0.0)
+    source = _serve(recording, FILES_MEMORY, layout)
+    stream = LiveStream("recording", recording, period_s=0.0, history_s=0.0)
+    page = WebViewer(source, opened=stream.opened)
     try:
         if header is not None:
-            stream.do(partial(send_text, name="header", text=header))
+            stream.do(partial(stream.say, name=HEADER, text=header))
         for path in recordings:
             stream.do(methodcaller("log_file_from_path", path))
         yield page

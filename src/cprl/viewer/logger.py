@@ -6,6 +6,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -23,7 +24,7 @@ from cprl.system.output import console, legible
 from cprl.values import shown
 from cprl.viewer.board import Frames, columns, fixed
 from cprl.viewer.layout import Curves, Scene, layout
-from cprl.viewer.live import FLUSH_TIMEOUT_S, REPLAY, RUN, Live, Stream, open_file, send_text
+from cprl.viewer.live import FLUSH_TIMEOUT_S, REPLAY, RUN, Live, LiveStream, Stream, open_file
 
 FILE_NAME: Final = "run.rrd"
 TIMELINES: Final = ("step", "episode", "frame")
@@ -103,8 +104,8 @@ def times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
 def send_waiting(stream: Stream) -> None:
     """Sends the buffered numbers and texts of one stream, one chunk per entity.
 
-    Of texts viewers get the newest alone, by `send_text`. Files keep each with its time: of static texts in
-    several files of one recording a viewer shows the one that it loads last.
+    Of texts viewers get the newest alone, by `LiveStream.say`. Files keep each with its time: of static texts
+    in several files of one recording a viewer shows the one that it loads last.
     """
     waiting = stream.take()
 
@@ -112,8 +113,8 @@ def send_waiting(stream: Stream) -> None:
         known: dict[Any, list[Any]] = {}  # most names have the same times
         for name, rows in waiting.items():
             *at, values = zip(*rows, strict=True)
-            if stream.is_live and isinstance(values[-1], str):
-                send_text(recording, name, values[-1])
+            if isinstance(stream, LiveStream) and isinstance(values[-1], str):
+                stream.say(recording, name, values[-1])
                 continue
             if tuple(at) not in known:
                 known[tuple(at)] = times(*at)
@@ -278,7 +279,8 @@ class RerunLogger(Logger):
 
     def show_live(self, name: str, text: str) -> None:
         """`log_document` in the live view alone, and at once; from any thread."""
-        self.do(lambda recording: send_text(recording, name, text), live_only=True)
+        if self.live is not None:
+            self.live.stream.do(partial(self.live.stream.say, name=name, text=text))
 
     def _wait(self, name: str, step: int, values: list[float] | str) -> None:
         for stream in self._streams:

@@ -41,9 +41,12 @@ class WebViewer:
 
     Rerun's own server of its web viewer is a process of its own, which ends with this one. The address of its
     page names all others, so a server with a short one leads there and hands out what it serves.
+
+    Args:
+        opened: called when a browser opens the page, from another thread.
     """
 
-    def __init__(self, *sources: str) -> None:
+    def __init__(self, *sources: str, opened: Callable[[], object] = lambda: None) -> None:
         port = free_port()
         command = [str(viewer_binary()), "--serve-web", "--bind", LOCALHOST, "--port", str(free_port())]
         command += ["--web-viewer-port", str(port)]
@@ -58,7 +61,7 @@ class WebViewer:
             start_new_session=True,  # Ctrl-C is for this process alone
         )
         page = "/?" + "&".join([*(f"url={quote(source, safe='')}" for source in sources), _QUERY])
-        handler = partial(_Page, f"http://{LOCALHOST}:{port}", page)
+        handler = partial(_Page, f"http://{LOCALHOST}:{port}", page, opened)
         self._server = ThreadingHTTPServer((LOCALHOST, 0), handler)
         Thread(target=self._server.serve_forever, daemon=True).start()
         self.port = self._server.server_port
@@ -82,8 +85,8 @@ class WebViewer:
 class _Page(BaseHTTPRequestHandler):
     """Leads to a page of another server, and hands out what that one serves."""
 
-    def __init__(self, origin: str, page: str, *arguments: Any) -> None:
-        self._origin, self._page = origin, page
+    def __init__(self, origin: str, page: str, opened: Callable[[], object], *arguments: Any) -> None:
+        self._origin, self._page, self._opened = origin, page, opened
         super().__init__(*arguments)
 
     def do_GET(self) -> None:
@@ -92,6 +95,8 @@ class _Page(BaseHTTPRequestHandler):
             self.send_header("Location", self._page)
             self.end_headers()
             return
+        if self.path.startswith("/?"):
+            self._opened()
         try:
             with _OPEN(self._origin + self.path) as answer:
                 content = answer.read()
