@@ -4,8 +4,8 @@
 
 Half a million steps of each replica, whichever the number of worlds; "as long" has so many steps of 256
 worlds as take about the time of half a million of one; "1e8" is PPO as run, of one epoch, for a hundred
-million steps (`--only "PPO, as run, 256 worlds, 1e8 steps"`). The committed table has 4 replicas of that,
-and 8 of each other, by `--replicas 8 --block 8 --only "PPO, as run, 1 world"` and so on. Settings are those that
+million steps (`--only "PPO, as run, 256 worlds, 1e8 steps"`). The committed table has 4 replicas of that, and
+8 of each other, by `--replicas 8 --block 8 --only "PPO, as run, 1 world"` and so on. Settings are those that
 recipes/study/learners/tuning_commons.py chose. DQN samples eight transitions a step, as the study's does: in
 W worlds one update a turn of 8 W. PPO has minibatches of 50, 256 and 2,048 steps.
 
