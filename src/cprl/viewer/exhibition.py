@@ -31,11 +31,11 @@ from cprl.viewer.layout import Scene
 from cprl.viewer.live import LiveStream
 from cprl.viewer.pictures import View
 
-BATCH_S: Final = 2.0
+BATCH_S: Final = 2.1
 """Seconds whose steps are played at once, because many steps in a row take a quarter of the time of as many
 between steps of the training; they are sent one by one."""
 BATCH_STEPS: Final = 21
-"""Steps of the exhibited world in this time: 10.5 in a second of wall time."""
+"""Steps of the exhibited world in this time: 10 in a second of wall time."""
 MOST_SHARE: Final = 0.01
 """The share of the training's wall time that its thread may spend on the exhibition: where a step of it takes
 longer than 0.95 ms, it plays fewer."""
@@ -92,7 +92,7 @@ class Exhibition(View):
         self._send(_before_the_first_step(commons.game), _beginning(commons.game))
 
     def on_step(self, turn: int, episode: int, frame: int | None) -> None:
-        """Plays the steps of two seconds if they are due; `episode` is the training's, for the caption."""
+        """Plays the steps of a batch if they are due; `episode` is the training's, for the caption."""
         now = self._clock()
         if now >= self._due and not self.is_over:
             self._due = now + BATCH_S
