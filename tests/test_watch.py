@@ -455,11 +455,16 @@ def test_who_opens_the_page_late_reads_that_history_loads_until_it_has(tmp_path,
         logger.log_document("header", "#### Finished")
         logger.flush()
         live = logger.live.stream
-        get(logger.addresses["browser"]).read()
+
+        def opens():
+            with suppress(HTTPError):  # until Rerun's own server is up
+                return bool(get(logger.addresses["browser"]).read())
+
+        wait(opens)
         wait(lambda: not live.is_behind)
         assert not live._loading, "a recording that has just begun has no history"
         live._has_history_from = 0.0
-        get(logger.addresses["browser"]).read()
+        assert opens()
         wait(lambda: live._loading)
         client = connected(logger.addresses["native"].split()[2], tmp_path)
         wait(lambda: not live._loading)

@@ -28,6 +28,7 @@ from cprl.commons.picture import DIGIT_HIGH, INK_COLOUR, MARK_COLOUR, POINTS, nu
 from cprl.commons.world import Bytes
 from cprl.envs.commons_env import CommonsEnv
 from cprl.viewer.layout import TEXT, Curves, Scene, classes, styles, window_corners
+from cprl.viewer.live import HEADER
 
 if TYPE_CHECKING:
     from cprl.viewer.logger import RerunLogger
@@ -284,7 +285,7 @@ def fixed(curves: Curves) -> dict[str, list[Any]]:
     parts = {
         "/": [classes(curves)],
         **{entity: [style] for entity, style in styles(curves).items()},
-        "header": [rr.TextDocument.from_fields(media_type=rr.MediaType.MARKDOWN)],
+        HEADER: [rr.TextDocument.from_fields(media_type=rr.MediaType.MARKDOWN)],
     }
     if not isinstance(curves, Scene):
         return parts

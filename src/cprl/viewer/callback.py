@@ -23,6 +23,7 @@ from cprl.runs.episodes import metrics_in, read_episodes
 from cprl.viewer.board import Filming
 from cprl.viewer.exhibition import Exhibition
 from cprl.viewer.layout import curves_of, missing_in, scene_of
+from cprl.viewer.live import HEADER
 from cprl.viewer.logger import FILE_NAME, RerunLogger, recording_id, recordings_of
 from cprl.viewer.pictures import (
     JointActions,
@@ -167,7 +168,7 @@ class ViewerCallback:
 
     def _show_status(self, status: str) -> None:
         if self.story is not None and self._episode == 0:
-            self.logger.show_live("header", self.story.header.begins(status))
+            self.logger.show_live(HEADER, self.story.header.begins(status))
 
     def on_start(self, training: Any) -> None:
         """Goes on where a `Training` that is resumed is."""

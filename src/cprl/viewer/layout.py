@@ -45,6 +45,7 @@ from cprl.measuring import now, phases
 from cprl.measuring.episodes import decisions_of, metrics_of, yield_of
 from cprl.measuring.metrics import FIELDS, METRICS, NAMES, available, colour, is_own, left_out, title
 from cprl.measuring.series import OF_AGENTS
+from cprl.viewer.live import HEADER
 
 SHARES: Final = (
     "violations_per_step",
@@ -455,7 +456,7 @@ def layout(curves: Curves, *, live: bool = False, ended: bool = False) -> Any:
         _replay(curves)
         if isinstance(curves, Scene) and is_replay
         else rrb.Vertical(
-            rrb.TextDocumentView(name="Now", origin="/header", titlebar=False),
+            rrb.TextDocumentView(name="Now", origin=f"/{HEADER}", titlebar=False),
             rrb.Tabs(*_tabs(curves, live=live), active_tab=0),
             _strips(),
             row_shares=[_HEADER, _VIEWS, _RULER + strips * _STRIP],

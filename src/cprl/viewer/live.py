@@ -326,7 +326,7 @@ def _newest_header(readers: Sequence[RrdReader]) -> tuple[RrdReader, str | None]
     """The recording that has the newest header, and the header; None if none has one."""
     step, header, newest = -1, None, readers[0]
     for reader in readers:
-        for chunk in reader.stream().filter(content="/header"):
+        for chunk in reader.stream().filter(content=f"/{HEADER}"):
             batch = chunk.to_record_batch()
             if "step" in batch.schema.names and batch["step"][-1].as_py() >= step:
                 step, header = batch["step"][-1].as_py(), batch["TextDocument:text"][-1].as_py()[0]

@@ -279,8 +279,9 @@ class RerunLogger(Logger):
 
     def show_live(self, name: str, text: str) -> None:
         """`log_document` in the live view alone, and at once; from any thread."""
-        if self.live is not None:
-            self.live.stream.do(partial(self.live.stream.say, name=name, text=text))
+        for stream in self._streams:
+            if isinstance(stream, LiveStream):
+                stream.do(partial(stream.say, name=name, text=text))
 
     def _wait(self, name: str, step: int, values: list[float] | str) -> None:
         for stream in self._streams:

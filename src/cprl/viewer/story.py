@@ -21,6 +21,7 @@ from cprl.runs.curves import running_mean
 from cprl.system.times import CLOCK
 from cprl.viewer.board import Filming
 from cprl.viewer.layout import ANOTHER, SETTLED, STRIPS, Curves
+from cprl.viewer.live import HEADER
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.pictures import View, has_died
 
@@ -194,7 +195,7 @@ class Story(View):
         self._is_over = False
         # A file of a resumed run must not say so: it is shown with those before it.
         logger.log_states(_NOW, {0: BEGINS}, live_only=True)
-        logger.log_document("header", self.header.begins("begins"))
+        logger.log_document(HEADER, self.header.begins("begins"))
         logger.flush()
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
@@ -238,7 +239,7 @@ class Story(View):
             random_play=None if self._random is None else self._random.mean,
             died=died,
         )
-        self._logger.log_document("header", text)
+        self._logger.log_document(HEADER, text)
 
     def _label(self, episode: int, means: Mapping[str, float]) -> list[str]:
         """Logs the live label where an episode's means change it, and whether agents explore; returns the
@@ -269,7 +270,7 @@ class Story(View):
         if self._is_over:
             return
         if self._ended + self._curves.worlds <= self._episodes and not self.header.is_about:
-            self._logger.log_document("header", self.header.stopped(self._ended, self.now.mean))
+            self._logger.log_document(HEADER, self.header.stopped(self._ended, self.now.mean))
         else:
             self._end(self.header.ended(self.now.mean))
 
@@ -283,7 +284,7 @@ class Story(View):
             if within := {first: label for first, label in published if first < self._ended}:
                 self._logger.log_states(_PUBLISHED, within)
             self._logger.show_end()
-        self._logger.log_document("header", header)
+        self._logger.log_document(HEADER, header)
 
     def _in_words(self, numbers: Played) -> str:
         error = f" ± {numbers.error:.2g}" if isfinite(numbers.error) else ""
