@@ -749,6 +749,7 @@ def test_cprl_table_prints_any_runs_by_a_field_and_writes_them(table_command, ca
             table_command(*words, out)
 
 
+@pytest.mark.integration
 def test_cprl_table_of_a_study_says_and_writes_what_its_table_alone_gives(table_command, capsys):
     table = results.write_results(PAIRED, "pairs", write_study(PAIRED, Path("runs"), harvest))
     summary = Path("pairs/summary.md").read_text()

@@ -446,6 +446,7 @@ def test_a_page_with_a_short_address_is_on_this_machine_alone_until_it_is_closed
     page.close()
 
 
+@pytest.mark.integration
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_who_opens_the_page_late_reads_that_history_loads_until_it_has(tmp_path, monkeypatch):
     monkeypatch.setattr(streams, "LOADING_S", 5.0)
