@@ -189,32 +189,27 @@ def table(found: list[Row]) -> str:
 
 def elsewhere() -> str:
     """A table in Markdown of what each change adds, and how many times the harvest it gives, by setting."""
-    columns = {
-        "DQN, 1 world": {
-            change: (nets(of, name), nets(of, base)) for change, (of, name, base) in AS_HERE.items()
-        }
-    }
+    columns = {"DQN, 1 world": [(nets(of, name), nets(of, base)) for of, name, base in AS_HERE.values()]}
     conditions = table_of("elsewhere").design.conditions
     for setting in dict.fromkeys(name.partition(": ")[0] for name in conditions):
         base = nets("elsewhere", f"{setting}: nothing changed")
-        found = {change: nets("elsewhere", f"{setting}: {change}") for change in AS_HERE}
-        columns[setting] = {change: (values, base) for change, values in found.items() if len(values)}
+        columns[setting] = [(nets("elsewhere", f"{setting}: {change}"), base) for change in AS_HERE]
     lines = [f"| apples after fines | {' | '.join(columns)} |", "|---|" + "---:|" * len(columns)]
-    unchanged = " | ".join(text_of(estimate(next(iter(pairs.values()))[1])) for pairs in columns.values())
-    cells = [changes(pairs) for pairs in columns.values()]
+    unchanged = " | ".join(text_of(estimate(pairs[0][1])) for pairs in columns.values())
+    cells = {setting: changes(pairs) for setting, pairs in columns.items()}
     lines.append(f"| nothing changed | {unchanged} |")
-    for change in AS_HERE:
-        lines.append(f"| {change} | {' | '.join(texts.get(change, 'not run') for texts in cells)} |")
+    for at, change in enumerate(AS_HERE):
+        lines.append(f"| {change} | {' | '.join(texts[at] for texts in cells.values())} |")
     return "\n".join([*lines, ""])
 
 
-def changes(pairs: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]) -> dict[str, str]:
+def changes(pairs: list[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> list[str]:
     """The difference of each, paired by replica, and the ratio; stars by Holm's method for all of these."""
-    texts = marked([difference(*pair, paired=True) for pair in pairs.values()])
-    ratios = [value.mean() / base.mean() for value, base in pairs.values()]
-    return {
-        change: f"{text}, x {ratio:.1f}" for change, text, ratio in zip(pairs, texts, ratios, strict=True)
-    }
+    texts = iter(marked([difference(*pair, paired=True) for pair in pairs if len(pair[0])]))
+    return [
+        f"{next(texts)}, x {value.mean() / base.mean():.1f}" if len(value) else "not run"
+        for value, base in pairs
+    ]
 
 
 def draw(found: list[Row], path: Path) -> None:
