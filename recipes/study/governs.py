@@ -196,20 +196,18 @@ def elsewhere() -> str:
         columns[setting] = [(nets("elsewhere", f"{setting}: {change}"), base) for change in AS_HERE]
     lines = [f"| apples after fines | {' | '.join(columns)} |", "|---|" + "---:|" * len(columns)]
     unchanged = " | ".join(text_of(estimate(pairs[0][1])) for pairs in columns.values())
-    cells = {setting: changes(pairs) for setting, pairs in columns.items()}
+    cells = [changes(pairs) for pairs in columns.values()]
     lines.append(f"| nothing changed | {unchanged} |")
-    for at, change in enumerate(AS_HERE):
-        lines.append(f"| {change} | {' | '.join(texts[at] for texts in cells.values())} |")
+    for change, *texts in zip(AS_HERE, *cells, strict=True):
+        lines.append(f"| {change} | {' | '.join(texts)} |")
     return "\n".join([*lines, ""])
 
 
 def changes(pairs: list[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> list[str]:
     """The difference of each, paired by replica, and the ratio; stars by Holm's method for all of these."""
-    texts = iter(marked([difference(*pair, paired=True) for pair in pairs if len(pair[0])]))
-    return [
-        f"{next(texts)}, x {value.mean() / base.mean():.1f}" if len(value) else "not run"
-        for value, base in pairs
-    ]
+    texts = marked([difference(*pair, paired=True) for pair in pairs])
+    ratios = [value.mean() / base.mean() for value, base in pairs]
+    return [f"{text}, x {ratio:.1f}" for text, ratio in zip(texts, ratios, strict=True)]
 
 
 def draw(found: list[Row], path: Path) -> None:
