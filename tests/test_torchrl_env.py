@@ -99,6 +99,7 @@ def test_the_specs_are_kept(board, state):
 def test_entries_have_the_shapes_and_types_of_the_house_and_each_spec_is_there_for_a_single_world(worlds):
     env = CommonsEnv(presets.game("commons"), worlds=worlds, state=True)
     assert env.group_map == {"agents": ["agent_0", "agent_1", "agent_2", "agent_3"]}
+    assert env.n_agents == 4  # as TorchRL's own environments of several agents, which its tutorials ask
     assert env.full_action_spec[keys.ACTION].n == 8
     first = env.reset()
     after = env.step(env.rand_action(first.clone()))["next"]

@@ -79,6 +79,7 @@ class CommonsEnv(LeanStepEnv):
         seed = drawn_seed() if seed is None else seed
         self.worlds = Batch(game, worlds, seed=seed, first_world=first_world, driver=driver)
         self.group_map = {keys.AGENTS: list(game.agent_names)}
+        self.n_agents = game.agents
         self._size = worlds
         self._agents_size = torch.Size([worlds, game.agents])
         paid = _PAID_ENTRIES if game.institutions else ()
