@@ -174,7 +174,7 @@ def test_chromium_plays_a_page_from_the_disk(runs, tmp_path, width):
 def test_institutions_say_what_they_do_in_numbers_that_hold_in_the_game():
     quota, watch, tax = Quota(share=0.25, window_steps=50), Monitoring(prob=0.5), Tax(rate=0.3)
     game = replace(COMMONS, institutions=(quota,))
-    apples = int(re.search(r"at most (\d+) apples in 50 turns", meaning_of(quota, game))[1])
+    apples = int(re.search(r"at most (\d+) apples in each window of 50 turns", meaning_of(quota, game))[1])
     assert apples == int(0.25 * game.sustainable_yield * 50 / 4)
     fined = replace(quota, fine=2.0)
     watched = replace(game, institutions=(fined, watch))

@@ -84,7 +84,7 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
     sections = [
         _html("\n".join(after)),
         *([f"<h2>Training</h2>{_training_figure(run)}"] if curves else []),
-        *([_html("\n".join(_rules(game)))] if is_commons else []),
+        *([_html("\n".join(_rules(run)))] if is_commons else []),
         _recipe(run),
     ]
     after_it = "".join(f"<section>{section}</section>" for section in sections)
@@ -99,14 +99,18 @@ def _curves(run: LoadedRun) -> dict[str, Values]:
         return {}
 
 
-def _rules(game: Game) -> list[str]:
-    """The institutions and the rules that differ from the defaults, in Markdown."""
+def _rules(run: LoadedRun) -> list[str]:
+    """The institutions, what is of the user's own, and the rules that differ from the defaults, in
+    Markdown."""
+    game, experiment = run.game, run.experiment
     lines = [
         "## Rules",
         "",
         f"{game.agents} agents on a board of {game.map.height} x {game.map.width} cells.",
     ]
     lines += ["", *(f"- **{rule_of(one)}**: {meaning_of(one, game)}" for one in game.institutions)]
+    lines += [f"- **Rules of its own**: {experiment.own_rules}"] * bool(experiment.own_rules)
+    lines += ["", experiment.own_code] * bool(experiment.own_code)
     changed = game.rules.changed
     lines += ["", "Rules that differ from `Rules()`:" if changed else "All other rules: `Rules()`."]
     return [*lines, "", *(f"- `{name}`: `{value}`" for name, value in changed.items())]

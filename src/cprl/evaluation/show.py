@@ -30,7 +30,6 @@ from cprl.commons.colours import (
     agent_mark,
     line_colour,
 )
-from cprl.commons.game import Game
 from cprl.commons.maps import Map
 from cprl.commons.picture import EMPTY_SITE_COLOUR
 from cprl.commons.readable import NO_RULES, growth_of, legend_of, meaning_of, rules_of
@@ -102,7 +101,8 @@ def _heading(fresh: Sequence[FreshEpisode], data: dict[str, Any]) -> str:
     if len(fresh) == 1:
         return str(data["populations"][0]["title"])
     learners = {learned(population.run.specs) for population in fresh}
-    rules = {rules_of(commons_game(population.run)) for population in fresh}
+    runs = [population.run for population in fresh]
+    rules = {(run.game.rules, run.game.institutions, run.experiment.own_rules) for run in runs}
     alike = "Same" if len(learners) == 1 else "Different"
     return f"{alike} learners, {'the same rules' if len(rules) == 1 else 'different rules'}"
 
@@ -176,7 +176,7 @@ def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, An
     lives = f"apples still grow after {last:,} turns"
     return {
         "title": title,
-        "about": f"{_players(fresh.run)} {_rules(game)}",
+        "about": f"{_players(fresh.run)} {_rules(fresh.run)}",
         "outcome": dead if filmed.is_dead else lives,
         "isDead": filmed.is_dead,
         "counted": counted,
@@ -209,10 +209,14 @@ def _players(run: LoadedRun) -> str:
     return f"Computer players that learned by practice: {who}, {run.experiment.trained_for}."
 
 
-def _rules(game: Game) -> str:
-    if not game.institutions:
-        return f"Rules: {NO_RULES}."
-    return " ".join([*(meaning_of(kind, game) for kind in game.institutions), f"Settings: {rules_of(game)}."])
+def _rules(run: LoadedRun) -> str:
+    game, experiment = commons_game(run), run.experiment
+    words = [meaning_of(kind, game) for kind in game.institutions]
+    if game.institutions:
+        words.append(f"Settings: {rules_of(game)}.")
+    if experiment.own_rules:
+        words.append(f"Rules of its own: {experiment.own_rules}.")
+    return " ".join([*(words or [f"Rules: {NO_RULES}."]), experiment.own_code]).strip()
 
 
 def _cells(board: Map, places: Sequence[Sequence[int]]) -> list[int]:

@@ -34,6 +34,7 @@ from cprl.values.custom import Custom as Custom
 from cprl.values.custom import allowed as allowed
 from cprl.values.custom import allowing as allowing
 from cprl.values.custom import custom_targets as custom_targets
+from cprl.values.custom import described as described
 from cprl.values.custom import made as made
 from cprl.values.custom import refuse_targets
 from cprl.values.custom import shown as shown
