@@ -44,8 +44,8 @@ def numbers(words):
 def said(sentence):
     """The hits that a sentence asks for, and the turns and the apples that a tag costs, by level."""
     hits = re.search(r"after (\d+) hits", sentence)
-    turns = re.search(r"leaves the board for (.*?) turns?", sentence)
-    paid = re.search(r"pays (.*?) apples?", sentence)
+    turns = re.search(r"leaves the board for (\S+ turns?(?: \([^)]*\))?)", sentence)
+    paid = re.search(r"pays (\S+ apples?(?: \([^)]*\))?)", sentence)
     fined = re.search(r"is fined (.*?) apples?", sentence)
     return (
         int(hits[1]) if hits else 1,
@@ -161,7 +161,7 @@ def test_a_tag_in_words_has_hits_turns_and_what_is_paid():
     assert tag_of(AS_RUN) == "after 2 hits an agent leaves the board for 24 turns"
     assert tag_of(COMMONS).startswith("an agent that is hit leaves the board for 25 turns, longer")
     sanctioned = governed(GraduatedSanctions(on="tags"), game=AS_RUN)
-    assert tag_of(sanctioned).endswith("leaves the board for 4, then 24, then 99 turns")
+    assert tag_of(sanctioned).endswith("leaves the board for 4 turns (24, then 99 as offences add up)")
     of_violations = governed(GraduatedSanctions(on="violations"), Quota(fine=0.0), game=AS_RUN)
     assert tag_of(of_violations) == tag_of(AS_RUN)
     by_shooter = GraduatedSanctions(on="tags", freeze_steps=((1, 2), (3, 4), (5, 6), (7, 8)), fines=(0,))

@@ -4,10 +4,10 @@ What these sentences say holds in the game that they are about; `tests/test_read
 """
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from html import escape
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from cprl.commons.svg import board_svg
 from cprl.institutions import (
@@ -105,7 +105,7 @@ def tag_of(game: "Game") -> str:
     if punishment is not None and punishment.fine:
         effects.append(f"is fined {_apples(punishment.fine)} by each who tags it")
     if sanctions is not None and any(sanctions.fines):
-        effects.append(f"pays {_by_level(sanctions.fines)} apples")
+        effects.append(f"pays {_by_level(sanctions.fines, _apples)}")
     if any(missed):
         place = "" if rules.pairwise_clashes else ", longer while its cell is taken"
         place = " and returns at a free spawn place" if rules.respawn_at_spawns else place
@@ -239,7 +239,7 @@ def _graduated_sanctions(sanctions: GraduatedSanctions, game: "Game") -> str:
         offences.append(f"a turn in which it breaks a rule{_noticed(game)}")
     turns = _missed(turns_missed(game, sanctions), sanctions)
     words = f"An agent's offences ({' or '.join(offences)}) cost it a time-out of {turns}"
-    words += f" and {_by_level(sanctions.fines)} apples" * any(sanctions.fines)
+    words += f" and {_by_level(sanctions.fines, _apples)}" * any(sanctions.fines)
     if sanctions.recovery_steps is None:
         return f"{words}."
     return f"{words}; each {_turns(sanctions.recovery_steps)} without one take one back."
@@ -287,15 +287,20 @@ def _missed(missed: Sequence[int], sanctions: GraduatedSanctions | None) -> str:
     """The turns of a time-out, by level, or from the least to the most where they depend on who tags, too."""
     if sanctions is not None and sanctions.is_table:
         return f"{min(missed):,} to {_turns(max(missed))}, by who tags it and how often it was tagged"
-    return f"{_by_level(missed)} turn{'s' * (missed[-1] != 1)}"
+    return _by_level(missed, _turns)
 
 
-def _by_level(numbers: Sequence[float]) -> str:
-    """The numbers of levels, e.g. "4, then 24, then 99"; the last one holds for all higher levels."""
+Number = TypeVar("Number", int, float)
+
+
+def _by_level(numbers: Sequence[Number], amount: Callable[[Number], str]) -> str:
+    """The amounts of levels, e.g. "4 turns (24, then 99 as offences add up)"; the last one holds for all
+    higher levels."""
     levels = [*numbers]
     while len(levels) > 1 and levels[-1] == levels[-2]:
         levels.pop()
-    return ", then ".join(map(_number, levels))
+    more = ", then ".join(map(_number, levels[1:]))
+    return amount(levels[0]) + (f" ({more} as offences add up)" if more else "")
 
 
 def _number(value: float) -> str:

@@ -30,6 +30,7 @@ from cprl.commons.colours import (
     agent_mark,
     line_colour,
 )
+from cprl.commons.game import Game
 from cprl.commons.maps import Map
 from cprl.commons.picture import EMPTY_SITE_COLOUR
 from cprl.commons.readable import NO_RULES, growth_of, legend_of, meaning_of, rules_of
@@ -91,9 +92,13 @@ def show(
     path.refuse()
     fresh = [fresh_episode(one, replica=replica, episode=episode, seed=seed, allow=allow) for one in runs]
     data, filmed = shown(fresh, titles)
-    text = page(_heading(fresh, data), f"<p>{escape(growth_of(commons_game(fresh[0].run)))}</p>", data)
-    path.write(text)
+    path.write(page(_heading(fresh, data), begins(commons_game(fresh[0].run)), data))
     return path, tuple(one.episode for one in filmed)
+
+
+def begins(game: Game) -> str:
+    """What a page says above its episodes, as HTML."""
+    return f"<p>{escape(growth_of(game))}</p>"
 
 
 def _heading(fresh: Sequence[FreshEpisode], data: dict[str, Any]) -> str:
@@ -176,7 +181,7 @@ def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, An
     lives = f"apples still grow after {last:,} turns"
     return {
         "title": title,
-        "about": f"{_players(fresh.run)} {_rules(fresh.run)}",
+        "about": about(fresh.run),
         "outcome": dead if filmed.is_dead else lives,
         "isDead": filmed.is_dead,
         "counted": counted,
@@ -199,6 +204,11 @@ def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, An
         "marks": [agent_mark(agent) for agent in agents],
         **_packed(arrays),
     }
+
+
+def about(run: LoadedRun) -> str:
+    """Who plays, under which rules, in sentences."""
+    return f"{_players(run)} {_rules(run)}"
 
 
 def _players(run: LoadedRun) -> str:
