@@ -6,18 +6,27 @@ done
 python docs/draw_gallery.py --runs runs
 
 The committed pictures of none and quota are replica 0 of runs with 16 replicas, without `--replicas 1`.
+Without `--runs` the pages are made again of the episodes that they hold, in the words of today.
 """
 
+import json
+import re
+from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from runpy import run_path
+from types import SimpleNamespace
+from typing import Any, Final
 
 import tyro
 
+from cprl import Experiment
 from cprl.commons.picture import world_image
+from cprl.commons.readable import legend_of
 from cprl.evaluation.film import fresh_episode, play_to_show
 from cprl.evaluation.film_pictures import write_gif
 from cprl.evaluation.lanes import commons_game
-from cprl.evaluation.show import show
+from cprl.evaluation.show import about, begins, page, show
+from cprl.population import specs_by_agent
 
 TITLES: Final = {
     "none": "No rule",
@@ -35,18 +44,41 @@ EVERY: Final = 12
 """Turns from one picture of a board to the next."""
 
 
-def main(*, runs: Path, out: Path = Path(__file__).parent / "gallery") -> None:
+def with_new_words(text: str, experiment: Experiment) -> str:
+    """Return a page that shows the episode of another, of the same experiment, as `show` writes it now."""
+    data: dict[str, Any] = json.loads(
+        re.findall(r'id="data" type="application/json">(.*?)</script>', text)[0]
+    )
+    (population,) = data["populations"]
+    (replicas,) = re.findall(r"in (\d+) replica", population["about"])
+    experiment = replace(experiment, replicas=int(replicas))
+    game: Any = experiment.game
+    specs = specs_by_agent(experiment.agents, game.agents)
+    run: Any = SimpleNamespace(experiment=experiment, game=game, specs=specs, networks=specs)
+    population["about"] = about(run)
+    data["legend"] = legend_of([game])
+    return page(population["title"], begins(game), data)
+
+
+def main(*, runs: Path | None = None, out: Path = Path(__file__).parent / "gallery") -> None:
     """Make NAME.html and NAME.gif of each run.
 
     Args:
         runs: the directory that holds the runs, by the names of the institutions.
         out: the directory of the files.
     """
+    if runs is None:
+        recipe = run_path(str(Path(__file__).parents[1] / "recipes" / "institutions.py"))
+        for name in TITLES:
+            path = out / f"{name}.html"
+            text = with_new_words(path.read_text(encoding="utf-8"), recipe["experiment"](institution=name))
+            path.write_text(text, encoding="utf-8")
+        return
     out.mkdir(parents=True, exist_ok=True)
     for name, title in TITLES.items():
-        page = out / f"{name}.html"
-        page.unlink(missing_ok=True)
-        show(runs / name, page, titles=[title])
+        path = out / f"{name}.html"
+        path.unlink(missing_ok=True)
+        show(runs / name, path, titles=[title])
         fresh = fresh_episode(runs / name)
         moments = play_to_show(fresh).moments
         shown = [*moments[::EVERY], moments[-1]]

@@ -43,8 +43,8 @@ Choice = Literal[
 ]
 
 SHARE, WINDOW = 0.25, 50
-"""Of every quota here: a quarter of the map's proven yield, counted in windows of 50 turns: about 7 apples
-per agent and window."""
+"""Of every quota here: a quarter of the map's proven yield, counted in windows of 50 turns: 6.9 apples
+per agent and window, of which an agent may take 6."""
 
 INSTITUTIONS: dict[Choice, tuple[Institution, ...]] = {
     "none": (),

@@ -28,6 +28,17 @@ class Fatigue(Transform):
         return next_tensordict
 
 
+class Gift(Transform):
+    """Adds a part of an apple to every reward."""
+
+    def __init__(self, apples: float) -> None:
+        super().__init__(in_keys=[keys.REWARD], out_keys=[keys.REWARD])
+        self.apples = apples
+
+    def _apply_transform(self, reward):
+        return reward + self.apples
+
+
 def largest_share(episode):
     """Of all apples that were harvested, those of the agent with most."""
     return episode.harvest.max() / episode.harvest.sum()

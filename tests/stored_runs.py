@@ -57,11 +57,11 @@ def ran(folder, game, members, **how):
     return cprl.run(an_experiment(folder.name, game, members, **how), folder, watch="off")
 
 
-def stored(folder, game=CORRIDORS, policy="greedy", *, name="", replicas=1):
-    """A run of scripted agents, of which no episode was played."""
+def stored(folder, game=CORRIDORS, policy="greedy", *, name="", replicas=1, **parts):
+    """A run of scripted agents, of which no episode was played; `parts`: more of its experiment."""
     name = name or folder.name
     agents = (Scripted(policy),) * game.agents
-    experiment = Experiment(name=name, game=game, agents=agents, replicas=replicas, episodes=1)
+    experiment = Experiment(name=name, game=game, agents=agents, replicas=replicas, episodes=1, **parts)
     save_weights(start_run(folder, name, experiment.to_recipe), {})
     return folder
 

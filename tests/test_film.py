@@ -15,7 +15,7 @@ from imageio_ffmpeg import get_ffmpeg_exe
 from PIL import Image
 from stored_runs import CORRIDORS, command, stored
 
-from cprl import Game, Rules, load, maps
+from cprl import Custom, Game, Rules, load, maps
 from cprl.commons.colours import APPLE, GROUND, PALETTE, agent_colour
 from cprl.commons.picture import EMPTY_SITE_COLOUR
 from cprl.envs.matrix import stag_hunt
@@ -24,6 +24,7 @@ from cprl.evaluation.export import export_episodes
 from cprl.evaluation.film import Style, film, film_video, fresh_episode, titles_of
 from cprl.evaluation.film_pictures import EpisodePicture, nice
 from cprl.institutions import Monitoring, Quota
+from cprl.values import allowing
 
 LEFT = [5, 3, 2, 0]
 """Apples on the board at the start and after each turn."""
@@ -149,6 +150,13 @@ def test_titles_are_what_tells_runs_apart(runs, tmp_path):
     assert titles(runs / "greedy", runs / "random") == ["Greedy", "Random"]
     assert titles(*governed[:2]) == ["No rule", "Quota and monitoring"]
     assert titles(*governed) == ["one", "two", "three"], "two have the same rules, all the same name"
+    own = stored(
+        tmp_path / "own",
+        replace(CORRIDORS, institutions=limits),
+        transforms=[Custom("one_road_parts:Gift", {"apples": 0.5})],
+    )
+    with allowing(["one_road_parts:Gift"]):
+        assert titles(runs / "greedy", own) == ["No rule", "Quota and monitoring and gift"]
 
 
 def test_the_film_is_the_episode_that_the_recording_has(runs, tmp_path):

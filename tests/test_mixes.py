@@ -16,7 +16,7 @@ from cprl.envs.matrix import stag_hunt
 from cprl.evaluation import analyse, draw_egta, pairwise_game, play_empirical_game, play_population, schelling
 from cprl.evaluation.empirical_game import egta_tables
 from cprl.evaluation.lanes import shifted
-from cprl.evaluation.schelling import dilemma
+from cprl.evaluation.schelling import between_the_ends, dilemma
 from cprl.population import Frozen, Scripted
 from cprl.theory import PayoffTable, compositions
 
@@ -128,6 +128,26 @@ def test_the_recipe_leaves_out_diagrams_of_trained_agents_that_are_not_there(tmp
     monkeypatch.setattr(recipe, "schelling", None)  # it would be called
     with pytest.raises(FileExistsError, match=r"commons_as_run_trained\.png exists"):
         recipe.main(out=Path(), trained=Path())
+
+
+@pytest.mark.parametrize(
+    ("pulls", "said"),
+    [
+        ([15, 18, -15, 37], " at the ends, not at 2 of 3"),
+        ([15, 18, 20, 37], ""),
+        ([15, 0.5, -15, 37], " at the ends, not at 2 of 3, not shown at 1 of 3"),
+        ([-5, -5, 3, 9], ""),
+        ([-5, 0.5, 3, 9], ""),
+        ([-5, 3, -3, 9], " at the ends, not at 1 of 3"),
+        ([9, 3, -3, -9], ""),
+        ([9, -3, -3, 9], " at the ends, not at 1 and 2 of 3"),
+        ([9, -9], ""),
+    ],
+)
+def test_a_dilemma_of_the_ends_is_not_said_of_points_between_them_that_show_something_else(pulls, said):
+    noise = np.linspace(-1, 1, 4)[:, None]
+    restrained = np.full((4, len(pulls)), 50.0)
+    assert between_the_ends(restrained, restrained + pulls + noise) == said
 
 
 def of(reward, sucker, temptation, punishment, *, spread=0.0, replicas=4):

@@ -1,5 +1,6 @@
 """Games, boards and experiments draw themselves; the notebook of `examples` runs from the first cell on."""
 
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -43,6 +44,13 @@ def test_a_game_and_an_experiment_say_what_they_are():
     game = cprl.Game(map=game.map, rules=game.rules, institutions=(Quota(share=0.25, window_steps=50),))
     experiment = cprl.Experiment(name="a<b", game=game, agents=agents, episodes=3, replicas=2, worlds=4)
     html = experiment._repr_html_()
+    assert "of its own" not in html
+    own = {"transforms": (cprl.Custom("laws:RichPay"),), "metrics": (cprl.Custom("fair:gap"),)}
+    with_own = replace(experiment, **own)._repr_html_()
+    assert "Rules: quota (share 0.25); laws:RichPay." in with_own
+    assert "Code of its own: metrics: fair:gap." in with_own
+    soft = replace(learning, algorithm=cprl.Custom("soft_q:soft_q"))
+    assert "by soft_q:soft_q" in replace(experiment, agents=(soft,) * 4)._repr_html_()
     for part in ("<b>a&lt;b</b>: 2 agents by DQN", "2 replicas of 4 worlds", "quota (share 0.25", "<svg"):
         assert part in html
 

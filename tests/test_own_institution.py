@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from same_runs import assert_same_training
@@ -44,8 +45,12 @@ def game(**rules):
     )
 
 
-def test_the_first_shot_of_each_episode_is_charged_and_the_price_rises_with_every_licence(licence):
-    env = make_env(game(episode_steps=3), worlds=2, transforms=[licence.Licence(fee=1.0, rise=0.25)])
+@pytest.mark.parametrize("institutions", [game().institutions, ()], ids=["governed", "ungoverned"])
+def test_the_first_shot_of_each_episode_is_charged_and_the_price_rises_with_every_licence(
+    licence, institutions
+):
+    of_three_turns = replace(game(episode_steps=3), institutions=institutions)
+    env = make_env(of_three_turns, worlds=2, transforms=[licence.Licence(fee=1.0, rise=0.25)])
     beam, stay = 6, 7
     plan = [[beam, stay], [beam, stay], [stay, beam]] * 2
     now, steps = env.reset(), []
@@ -97,6 +102,20 @@ def test_a_run_that_is_stopped_and_resumed_equals_the_undisturbed_one_bit_for_bi
     one, two = (cprl.evaluate_run(run, episodes=2, allow=ALLOW).table() for run in (parts, whole))
     assert repr(one.to_pydict()) == repr(two.to_pydict())
     assert cprl.load(parts, allow=ALLOW).experiment == experiment()
+
+
+@pytest.mark.integration
+def test_what_an_own_rule_takes_is_measured_in_a_game_without_institutions(licence, tmp_path, capsys):
+    alone = experiment(game=replace(game(), institutions=()), callbacks=())
+    run = cprl.run(alone, tmp_path / "run", watch="off")
+    assert "licence:Licence (fee 1.0, rise 0.25)" in " ".join(capsys.readouterr().out.split())
+    table = read_episodes(run)
+    assert sum(table["fines"].to_pylist()) > 0
+    income = np.array(table["harvest"]) - np.array(table["fines"]) + np.array(table["transfers"])
+    np.testing.assert_allclose(np.array(table["return"]), income, atol=1e-5)
+    measured = cprl.evaluate_run(run, episodes=2, allow=ALLOW).measures("random")
+    assert measured["institutions/fines"].estimate.value > 0
+    assert "institutions/net_equality" in measured
 
 
 @pytest.mark.integration

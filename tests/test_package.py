@@ -217,6 +217,13 @@ def test_every_package_is_in_the_list_and_an_import_from_below_is_noticed():
     assert entries - {"__init__", "__main__"} == set(LAYERS)
 
 
+def test_a_package_says_which_modules_it_has():
+    for path in SOURCE.rglob("__init__.py"):
+        words = set(re.findall(r"\w+", ast.get_docstring(ast.parse(path.read_text())) or ""))
+        modules = {module.stem for module in path.parent.glob("[a-z]*.py")}
+        assert modules - words == set(), path.parent.name
+
+
 def test_the_game_knows_nothing_of_torch():
     for path in (SOURCE / "commons").rglob("*.py"):
         roots = {name.split(".")[0] for name in modules_imported(path.read_text())}

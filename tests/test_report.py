@@ -11,6 +11,7 @@ from stored_runs import CORRIDORS, command, stored
 from test_course import LENGTHS, RISE_AND_FALL, told_of
 from viewers import browser, wait_until
 
+from cprl import Custom, presets
 from cprl.envs.matrix import prisoners_dilemma
 from cprl.evaluation.evaluate import evaluate_run, run_table
 from cprl.evaluation.report import report
@@ -40,6 +41,17 @@ def test_a_report_of_a_run_has_its_numbers_rules_episode_and_recipe(tmp_path):
     assert "&quot;kind&quot;: &quot;Quota&quot;" in text
     assert "<h2>Training</h2>" not in text, "no episode was played"
     assert not re.search(r"(?:src|href)=\"(?!data:)|https?://", text)
+
+
+def test_a_report_names_what_is_of_ones_own_and_says_what_a_tag_does(tmp_path):
+    game = presets.game("two_complex", variant="as_run")
+    game = replace(game, rules=replace(game.rules, episode_steps=5))
+    own = Custom("one_road_parts:largest_share"), Custom("one_road_parts:Gift", {"apples": 0.5})
+    run = stored(tmp_path / "run", game, metrics=own[:1], transforms=own[1:])
+    text = report(run, episodes=2, allow=[one.target for one in own]).read_text(encoding="utf-8")
+    assert "Rules of its own: one_road_parts:Gift (apples 0.5): Adds a part of an apple" in text
+    assert "metrics: one_road_parts:largest_share" in text
+    assert "<p>After 2 hits an agent leaves the board for 24 turns.</p>" in text
 
 
 def test_a_report_of_a_training_says_what_happened_and_draws_it(tmp_path):

@@ -12,7 +12,7 @@ import pytest
 from stored_runs import CORRIDORS, command, stored
 from viewers import browser, wait_until
 
-from cprl import presets
+from cprl import Custom, presets
 from cprl.commons.colours import BEAM
 from cprl.commons.readable import growth_of, legend_of, meaning_of
 from cprl.evaluation.film import fresh_episode, play_to_show
@@ -102,6 +102,35 @@ def test_a_page_opens_without_a_network_and_is_small(runs, tmp_path):
     assert path.stat().st_size < 400_000
 
 
+OWN = {
+    "transforms": (Custom("one_road_parts:Gift", {"apples": 0.5}),),
+    "metrics": (Custom("one_road_parts:largest_share"),),
+}
+OWN_TARGETS = ("one_road_parts:Gift", "one_road_parts:largest_share")
+
+
+def test_rules_and_metrics_of_ones_own_are_named_on_the_page(runs, tmp_path):
+    run = stored(tmp_path / "own", **OWN)
+    path, _ = show(run, tmp_path / "own.html", beside=[runs / "greedy"], allow=OWN_TARGETS)
+    own, plain = told(path)["populations"]
+    rule = "Rules of its own: one_road_parts:Gift (apples 0.5): Adds a part of an apple to every reward"
+    assert rule in own["about"]
+    assert "metrics: one_road_parts:largest_share: Of all apples" in own["about"]
+    assert "none beyond the game" not in own["about"]
+    assert plain["about"].endswith("Rules: none beyond the game.")
+    assert (own["title"], plain["title"]) == ("Gift", "No rule")
+    assert "learners, different rules</h1>" in path.read_text(encoding="utf-8")
+
+
+def test_rules_are_the_same_where_no_number_of_them_differs(runs, tmp_path):
+    slower = replace(CORRIDORS, rules=replace(CORRIDORS.rules, episode_steps=8))
+    run = stored(tmp_path / "slower", slower)
+    path, _ = show(runs / "greedy", tmp_path / "own.html", beside=[run])
+    assert "learners, different rules</h1>" in path.read_text(encoding="utf-8")
+    path, _ = show(runs / "greedy", tmp_path / "same.html", beside=[runs / "greedy"])
+    assert "learners, the same rules</h1>" in path.read_text(encoding="utf-8")
+
+
 def test_titles_are_text_and_not_html(runs, tmp_path):
     title = "</script><script>alert(1)</script> $data"
     path, _ = show(runs / "greedy", tmp_path / "own.html", titles=[title])
@@ -174,7 +203,7 @@ def test_chromium_plays_a_page_from_the_disk(runs, tmp_path, width):
 def test_institutions_say_what_they_do_in_numbers_that_hold_in_the_game():
     quota, watch, tax = Quota(share=0.25, window_steps=50), Monitoring(prob=0.5), Tax(rate=0.3)
     game = replace(COMMONS, institutions=(quota,))
-    apples = int(re.search(r"at most (\d+) apples in 50 turns", meaning_of(quota, game))[1])
+    apples = int(re.search(r"at most (\d+) apples in each window of 50 turns", meaning_of(quota, game))[1])
     assert apples == int(0.25 * game.sustainable_yield * 50 / 4)
     fined = replace(quota, fine=2.0)
     watched = replace(game, institutions=(fined, watch))

@@ -318,6 +318,13 @@ def test_the_header_says_where_a_run_is_and_which_institutions_are_in_force():
         assert line == "#### Episode 1 of 200 · steady · return 4.25"
 
 
+def test_the_header_names_rules_of_ones_own(tmp_path):
+    recipe = {"transforms": [{"kind": "Custom", "target": "laws:RichPay", "arguments": {"share": 0.5}}]}
+    game = replace(SMALL, institutions=(Quota(fine=1.0),))
+    with ViewerCallback(tmp_path, CommonsEnv(game), title="run", episodes=1, recipe=recipe) as viewer:
+        assert viewer.story.header.rules == "quota (share 1, fine 1), laws:RichPay (share 0.5)"
+
+
 SMALL = Game(
     map=maps.parse(".A>.A\n.A#A.\n..<.A"),
     rules=Rules(regrow_prob=(0.0, 0.02), window_rows=3, window_columns=5, episode_steps=70),

@@ -2,6 +2,7 @@
 allocated; values become tables and come back the same, and what is not known is refused by its place."""
 
 import json
+import sys
 from collections import UserDict
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -44,7 +45,7 @@ from cprl.runs.recipe import read_recipe
 from cprl.system.memory import TooLargeError
 from cprl.theory import appropriation, herders
 from cprl.training.running import run
-from cprl.values import KINDS, allowing, custom_targets, differences, from_config, to_config
+from cprl.values import KINDS, allowing, custom_targets, described, differences, from_config, to_config
 
 GAME = presets.game("two_complex")
 REPLAY, ROLLOUTS, TABLES = DQNSettings(), RolloutSettings(), TabularSettings()
@@ -425,6 +426,19 @@ class MyDQN(DQN):
 def test_a_live_object_is_refused_with_what_to_write_instead(value, message):
     with pytest.raises(ValueError, match=r"^callbacks\[1\] ?" + message):
         to_config((None, value), "callbacks")
+
+
+def test_code_of_ones_own_is_described_without_importing_it(tmp_path, monkeypatch):
+    (tmp_path / "own_laws.py").write_text('class RichPay:\n    """The rich\x1b[2J pay."""\n\nPLAIN = 1\n')
+    monkeypatch.syspath_prepend(tmp_path)
+    own = Custom("own_laws:RichPay", arguments={"fee": 2.0, "to": "all"}), Custom("own_laws:Missing.part")
+    table = to_config([*own, *own])
+    said = ["own_laws:RichPay (fee 2.0, to 'all')", "own_laws:Missing.part"]
+    assert described(table) == said
+    assert "own_laws" not in sys.modules
+    own[0].resolve()
+    assert described(table) == [f"{said[0]}: The rich?[2J pay", said[1]]
+    del sys.modules["own_laws"]
 
 
 def test_what_would_be_imported_is_refused_unless_it_is_allowed():

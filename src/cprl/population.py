@@ -149,7 +149,9 @@ def _kind(spec: AgentSpec) -> str:
     match spec:
         case Learning() | Team():
             team = " as a team" if isinstance(spec, Team) else ""
-            return f"by {type(spec.algorithm).__name__}{team}"
+            algorithm = spec.algorithm
+            name = algorithm.target if isinstance(algorithm, Custom) else type(algorithm).__name__
+            return f"by {name}{team}"
         case Scripted():
             return f"by the script {spec.policy!r}"
         case Frozen():

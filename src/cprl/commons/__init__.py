@@ -5,6 +5,8 @@ In reading order:
     rules        every number of the game, with unit, range and source
     maps         boards: drawn, named or generated
     published    the published games by name: boards with their rules
+    literature   the games of other programs and papers by name
+    spaces       what agents of a game observe and may do, in numbers
     observation  what agents observe, and in which form
     game         Game: a map, its rules and its observations; the memory that worlds of it take
     world        the arrays of B worlds: state, step output, scratch memory
@@ -14,6 +16,7 @@ In reading order:
     tables       a game as lookup tables for the compiled rules
     chance       counter-based random numbers
     moves        turning, walking and clashes, on one world
+    river        the river: waste, and how it is cleaned, on one world
     beam         beams, hits and tags, on one world
     apples       harvest and regrowth, on one world
     views        the picture of the board and the agents' windows, on one world
@@ -25,5 +28,7 @@ In reading order:
     state        reads, checks and restores the state of B worlds
     batch        Batch: B worlds, played a turn at a time
     decoding     observations back to classes of cells
+    svg          an image of the board of a map as SVG
+    readable     a game's rules in words, for readers
     picture      an image of the board for people, in which agents have number, heading and second mark
 """

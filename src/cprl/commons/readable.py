@@ -1,34 +1,42 @@
-"""A game for readers: its rules and institutions in words, beside its board."""
+"""A game for readers: its rules and institutions in words, beside its board.
+
+What these sentences say holds in the game that they are about; `tests/test_readable.py` plays it.
+"""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from html import escape
-from inspect import getdoc
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from cprl.commons.svg import board_svg
 from cprl.institutions import (
     Boundaries,
+    ClosedPatches,
     ClosedSeason,
+    GraduatedSanctions,
     Institution,
+    Levies,
+    Mediation,
     Monitoring,
     Punishment,
     Quota,
     Rotation,
+    Sanctioner,
     Tax,
+    Vote,
 )
-from cprl.institutions.base import Limit
+from cprl.institutions.base import Kind
+from cprl.institutions.monitoring import ELECTED
 
 if TYPE_CHECKING:
     from cprl.commons.game import Game
 
 
-def game_html(game: "Game") -> str:
-    """A game's board and its rules in words, as HTML."""
-    return (
-        f"<p>{escape(growth_of(game))} Rules: {escape(rules_of(game) or NO_RULES)}.</p>{board_svg(game.map)}"
-    )
+def game_html(game: "Game", own: str = "") -> str:
+    """A game's board and its rules in words, as HTML; `own`: rules of the user's own, in words."""
+    rules = "; ".join(filter(None, (rules_of(game), own))) or NO_RULES
+    return f"<p>{escape(growth_of(game))} Rules: {escape(rules)}.</p>{board_svg(game.map)}"
 
 
 NO_RULES: Final = "none beyond the game"
@@ -36,14 +44,21 @@ NO_RULES: Final = "none beyond the game"
 
 def growth_of(game: "Game") -> str:
     """How apples grow back, for readers who see the game for the first time."""
+    rules, probs = game.rules, game.rules.regrow_prob
     if game.map.river:
-        return "Agents pick apples. Apples grow only while the river is clean; who cleans it picks nothing."
-    probs = game.rules.regrow_prob
-    if probs[0] > 0 or len(probs) < 2:
+        return (
+            "Agents pick apples. Apples grow slower the more waste is in the river, and not at all where it "
+            f"covers {_percent(rules.pollution_limit)} of it{'; agents can clean it' * rules.may_clean}."
+        )
+    if not any(probs):
+        return "Agents pick apples, which do not grow back."
+    if probs[0] > 0:
         return "Agents pick apples, which grow back."
+    is_even = rules.regrow_by == "count" and len({*probs[1:]}) == 1
+    faster = "" if is_even else ", faster where there are more"
     return (
-        "Agents pick apples. Apples grow back only near other apples, faster where there are more: "
-        "a place that is picked bare stays bare."
+        f"Agents pick apples. Apples grow back only near other apples{faster}: "
+        "a patch that is picked bare stays bare."
     )
 
 
@@ -53,52 +68,255 @@ def rules_of(game: "Game | None") -> str:
     return ", ".join(rule_of(institution) for institution in (game.institutions if game else ()))
 
 
-def rule_of(institution: Institution) -> str:
-    """An institution with its first number and all that are not the defaults."""
-    words = re.sub("(?<!^)(?=[A-Z])", " ", type(institution).__name__).lower()
+def rule_of(institution: Institution, *, is_voted_on: bool = False) -> str:
+    """An institution with its first number and all that are not the defaults; without a rate or share that
+    is not used, since it is voted on or there are brackets."""
+    words = in_lower_case(type(institution).__name__)
+    unused = {"rate", "share"} if is_voted_on or getattr(institution, "brackets", ()) else set[str]()
     settings: list[str] = []
     for field in fields(institution):
         value = getattr(institution, field.name)
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        numbers = [one for one in (value if isinstance(value, tuple) else (value,)) if _is_number(one)]
         if isinstance(value, Institution):
-            settings.append(f"on {rule_of(value)}")
-        elif is_number and (not settings or value != field.default):
-            settings.append(f"{field.name.replace('_', ' ')} {value:g}")
+            settings.append(f"on {rule_of(value, is_voted_on=True)}")
+        elif numbers and field.name not in unused and (value != field.default or not (settings or unused)):
+            settings.append(f"{field.name.replace('_', ' ')} {' '.join(map(_number, numbers))}")
     return f"{words} ({', '.join(settings)})" if settings else words
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def in_lower_case(name: str) -> str:
+    """The name of a class in words, e.g. "closed season"."""
+    return re.sub("(?<=[a-z])(?=[A-Z])", " ", name).lower()
+
+
+def tag_of(game: "Game") -> str:
+    """What it takes to tag an agent in this game and what that does to it, e.g. "after 2 hits an agent leaves
+    the board for 24 turns"; "" where nobody can be tagged, or nothing follows."""
+    rules = game.rules
+    if not rules.may_fire or game.agents == 1:
+        return ""
+    sanctions, punishment = _sanctions_of_tags(game), _first(game, Punishment)
+    missed = turns_missed(game, sanctions)
+    effects = []
+    if punishment is not None and punishment.fine:
+        effects.append(f"is fined {_apples(punishment.fine)} by each who tags it")
+    if sanctions is not None and any(sanctions.fines):
+        effects.append(f"pays {_by_level(sanctions.fines, _apples)}")
+    if any(missed):
+        place = "" if rules.pairwise_clashes else ", longer while its cell is taken"
+        place = " and returns at a free spawn place" if rules.respawn_at_spawns else place
+        effects.append(f"leaves the board for {_missed(missed, sanctions)}{place}")
+    elif rules.respawn_at_spawns:
+        effects.append("goes to a free spawn place")
+    who = "an agent that is hit" if rules.hits_to_tag == 1 else f"after {rules.hits_to_tag} hits an agent"
+    return f"{who} {' and '.join(effects)}" if effects else ""
+
+
+def turns_missed(game: "Game", sanctions: GraduatedSanctions | None) -> tuple[int, ...]:
+    """The turns that an agent misses after a tag, or after any other offence, by the level of sanctions, and
+    by who tags it where sanctions have a table."""
+    steps: Sequence[object] = (game.rules.freeze_steps,) if sanctions is None else sanctions.freeze_steps
+    flat = [each for row in steps for each in (row if isinstance(row, tuple) else (row,))]
+    return tuple(max(0, each - game.rules.freeze_counts_tag_turn) for each in flat)
+
+
+def _sanctions_of_tags(game: "Game") -> GraduatedSanctions | None:
+    """The sanctions of a game that take the place of `Rules.freeze_steps`."""
+    sanctions = _first(game, GraduatedSanctions)
+    return None if sanctions is None or sanctions.on == "violations" else sanctions
+
+
+def _first(game: "Game", kind: type[Kind]) -> Kind | None:
+    """The institution of a kind of which a game has one at most."""
+    return next((one for one in game.institutions if isinstance(one, kind)), None)
 
 
 def meaning_of(institution: Institution, game: "Game") -> str:
     """What an institution does in this game, in sentences for readers who do not know its settings."""
     match institution:
-        case Quota(window_steps=window):
-            apples = int(institution.share * game.sustainable_yield * window / game.agents + 1e-9)
-            fewer = ", and fewer as the board empties" if institution.by_stock else ""
-            words = f"Each agent may pick at most {apples:,} apples in {window:,} turns{fewer}. "
-            return words + _breach(institution, game)
+        case Boundaries():
+            return _boundaries(institution, game)
+        case Quota():
+            apples = institution.share * _quota_unit(institution, game)
+            return _quota(institution, game, _apples(int(apples + 1e-9)))
         case ClosedSeason(period_steps=period, closed_steps=closed):
-            words = f"Nobody may pick in the last {closed:,} of every {period:,} turns. "
-            return words + _breach(institution, game)
+            words = f"Nobody {_may(institution.fine)} pick in the last {closed:,} of every {_turns(period)}."
+            return words + _breach(institution.fine, game)
+        case ClosedPatches(below=below):
+            few = f"has fewer than {_apples(below)} when a turn begins"
+            words = f"Nobody {_may(institution.fine)} pick from a patch of near places that {few}."
+            return words + _breach(institution.fine, game)
         case Rotation(window_steps=window):
-            words = f"Only one agent may pick; every {window:,} turns it is another one. "
-            return words + _breach(institution, game)
-        case Tax(brackets=(), rate=rate):
-            goes = "shared equally among all" if institution.redistribution == "equal" else "lost"
-            return f"{rate:.0%} of what each agent picks is taken and {goes}."
-        case Monitoring(prob=prob):
-            return f"Of the turns in which an agent breaks a rule, {prob:.0%} are noticed."
+            words = (
+                f"Only one agent {_may(institution.fine)} pick; every {_turns(window)} it is the next one."
+            )
+            return words + _breach(institution.fine, game)
+        case Vote():
+            return _vote(institution, game)
+        case Tax():
+            return _tax(institution)
+        case Levies(groups=groups, local_rate=local, joint_rate=joint):
+            who = "; ".join(_agents(group) for group in groups)
+            words = f"{_percent(local)} of what each agent picks is shared equally within its group ({who}), "
+            return words + f"and {_percent(joint)} among all."
+        case Monitoring(prob=prob, cost=cost):
+            words = f"Of the turns in which an agent breaks a rule, {_percent(prob)} are noticed."
+            return words + f" That costs {_apples(cost)} a turn, paid by {_payer(institution)}." * (cost > 0)
+        case GraduatedSanctions():
+            return _graduated_sanctions(institution, game)
+        case Mediation(turns=turns, refund=refund):
+            words = f"An agent that is tagged and broke no rule in the last {_turns(turns)}"
+            return words + f" gets {_apples(refund)} from who tagged it."
         case Punishment(fine=fine, cost=cost, shot_cost=shot_cost):
-            words = f"A hit costs the agent that is hit {fine:g} apples and the shooter {cost:g}."
-            return words + f" Each shot costs {shot_cost:g}." * (shot_cost > 0)
-    sentence = " ".join((getdoc(institution) or "").partition("\n\n")[0].split())
-    return re.sub(r" \(.*\)\.$", ".", sentence)
+            hits = game.rules.hits_to_tag
+            tag = "A hit" if hits == 1 else f"A tag, which takes {hits} hits,"
+            words = f"{tag} costs the agent that is hit {_apples(fine)} and the shooter {_number(cost)}."
+            return words + f" Each shot costs {_number(shot_cost)}." * (shot_cost > 0)
+        case Sanctioner():
+            return _sanctioner(institution)
+    raise TypeError(f"{type(institution).__name__} has no sentence in cprl.commons.readable")
 
 
-def _breach(limit: Limit, game: "Game") -> str:
-    """What happens to who picks against a limit."""
-    if limit.fine is None:
-        return "More cannot be picked."
-    noticed = " if it is noticed" * any(isinstance(one, Monitoring) for one in game.institutions)
-    return f"Each apple picked against this rule costs {limit.fine:g} apples{noticed}." if limit.fine else ""
+def _boundaries(boundaries: Boundaries, game: "Game") -> str:
+    bite = boundaries.bite_fine
+    step = boundaries.step_fine
+    may_not = "cannot" if bite is None else "may not"
+    words = f"The board has regions with owners; others {may_not} pick there.{_breach(bite, game)}"
+    if step is None:
+        return words
+    return f"{words} A turn that ends in another's region {_costs(step, game)}."
+
+
+def _quota_unit(quota: Quota, game: "Game") -> float:
+    """The apples that an agent may pick in a window of turns where the quota's share is 1."""
+    return game.sustainable_yield * quota.window_steps / game.agents
+
+
+def _quota(quota: Quota, game: "Game", most: str) -> str:
+    """What a quota of at most so much means."""
+    fewer = ", fewer if the board is not full when it begins" if quota.by_stock else ""
+    words = f"Each agent may pick at most {most} in each window of {_turns(quota.window_steps)}{fewer}."
+    return words + (" More cannot be picked." if quota.is_stopped else _breach(quota.fine, game))
+
+
+def _tax(tax: Tax, rate: str = "") -> str:
+    """What a tax means; `rate`: what is said of it where it is voted on."""
+    goes = "shared equally among all" if tax.redistribution == "equal" else "lost"
+    if not tax.brackets:
+        return f"{rate or _percent(tax.rate)} of what each agent picks is taken and {goes}."
+    brackets = ", ".join(f"{_percent(share)} from {_number(apples)} on" for apples, share in tax.brackets)
+    words = f"Of the apples that an agent picks in {_turns(tax.period_steps)} a part is taken and {goes}"
+    return f"{words}: {brackets}."
+
+
+def _vote(vote: Vote, game: "Game") -> str:
+    choices = ", ".join(map(_number, vote.choices))
+    words = f"Agents vote on {vote.on.voted_on}, {choices}, {_every(vote.period_episodes)}: the median counts"
+    words += _override(vote.override_prob)
+    if isinstance(vote.on, Tax):
+        return f"{words}. {_tax(vote.on, 'That share')}"
+    unit = _number(round(_quota_unit(vote.on, game), 1))
+    return f"{words}. {_quota(vote.on, game, f'that share of {unit} apples')}"
+
+
+def _sanctioner(sanctioner: Sanctioner) -> str:
+    if sanctioner.agents is not None:
+        return f"Only {_agents(sanctioner.agents)} may fire."
+    words = f"Only one agent may fire, which all elect {_every(sanctioner.period_episodes)}"
+    return f"{words}{_override(sanctioner.override_prob)}."
+
+
+def _graduated_sanctions(sanctions: GraduatedSanctions, game: "Game") -> str:
+    is_broken = any(one.can_be_broken for one in game.institutions)
+    offences = []
+    if sanctions.on != "violations" and game.rules.may_fire:
+        offences.append("to be tagged")
+    if sanctions.on != "tags" and is_broken:
+        offences.append(f"a turn in which it breaks a rule{_noticed(game)}")
+    turns = _missed(turns_missed(game, sanctions), sanctions)
+    words = f"An agent's offences ({' or '.join(offences)}) cost it a time-out of {turns}"
+    words += f" and {_by_level(sanctions.fines, _apples)}" * any(sanctions.fines)
+    if sanctions.recovery_steps is None:
+        return f"{words}."
+    return f"{words}; each {_turns(sanctions.recovery_steps)} without one take one back."
+
+
+def _may(fine: float | None) -> str:
+    """Whether something cannot be done, or may not be, at a price."""
+    return "can" if fine is None else "may"
+
+
+def _breach(fine: float | None, game: "Game") -> str:
+    """What happens to who picks against a rule, after the sentence about the rule; "" if nobody can."""
+    return "" if fine is None else f" Each apple picked against this rule {_costs(fine, game)}."
+
+
+def _costs(fine: float, game: "Game") -> str:
+    return f"costs {_apples(fine)}{_noticed(game)}" if fine else "is a violation, but costs nothing by itself"
+
+
+def _noticed(game: "Game") -> str:
+    return " if it is noticed" if _first(game, Monitoring) else ""
+
+
+def _payer(monitoring: Monitoring) -> str:
+    if monitoring.monitor is None:
+        return "all in equal parts"
+    if monitoring.monitor == ELECTED:
+        return f"an agent that all elect {_every(monitoring.period_episodes)}"
+    return f"agent {monitoring.monitor}"
+
+
+def _every(episodes: int) -> str:
+    return "in each episode" if episodes == 1 else f"every {episodes:,} episodes"
+
+
+def _override(prob: float) -> str:
+    return f", but with a probability of {_percent(prob)} chance decides" if prob else ""
+
+
+def _agents(indices: Sequence[int]) -> str:
+    return f"agent{'s' * (len(indices) > 1)} {' and '.join(map(str, indices))}"
+
+
+def _missed(missed: Sequence[int], sanctions: GraduatedSanctions | None) -> str:
+    """The turns of a time-out, by level, or from the least to the most where they depend on who tags, too."""
+    if sanctions is not None and sanctions.is_table:
+        return f"{min(missed):,} to {_turns(max(missed))}, by who tags it and how often it was tagged"
+    return _by_level(missed, _turns)
+
+
+Number = TypeVar("Number", int, float)
+
+
+def _by_level(numbers: Sequence[Number], amount: Callable[[Number], str]) -> str:
+    """The amounts of levels, e.g. "4 turns (24, then 99 as offences add up)"; the last one holds for all
+    higher levels."""
+    levels = [*numbers]
+    while len(levels) > 1 and levels[-1] == levels[-2]:
+        levels.pop()
+    more = ", then ".join(map(_number, levels[1:]))
+    return amount(levels[0]) + (f" ({more} as offences add up)" if more else "")
+
+
+def _number(value: float) -> str:
+    return f"{value:,.10g}"
+
+
+def _turns(count: int) -> str:
+    return f"{count:,} turn{'s' * (count != 1)}"
+
+
+def _apples(amount: float) -> str:
+    return f"{_number(amount)} apple{'s' * (amount != 1)}"
+
+
+def _percent(share: float) -> str:
+    return f"{_number(100 * share)}%"
 
 
 def legend_of(games: Iterable["Game"]) -> str:
@@ -116,9 +334,8 @@ def _signs(game: "Game") -> list[str]:
     if game.map.river:
         signs.append("Blue is the river, brown its waste.")
     if game.rules.may_fire:
-        turns = game.rules.freeze_steps
-        leaves = f": an agent that is hit leaves the board for {turns:,} turns" if turns else ""
-        signs.append(f"Light dots are a beam{leaves}.")
+        tag = tag_of(game)
+        signs.append(f"Light dots are a beam{f': {tag}' * bool(tag)}.")
     if any(isinstance(institution, Boundaries) for institution in game.institutions):
         signs.append("Frames are regions with owners.")
     if any(institution.can_be_broken for institution in game.institutions):

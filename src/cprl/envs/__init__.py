@@ -8,6 +8,7 @@ Modules, in the order in which one reads them:
     taking           TakingGame: how much to take of what is shared, once or several times
     drivers          where the worlds run: CPU threads or a GPU
     stepping          what environments share in a step: actions, recurrent states
+    unwrap           what lies under an environment's transforms, and what its specs say of agents
     state            the state of an environment and its transforms, for checkpoints
     pettingzoo_env   parallel_env and env, one world
     gymnasium_env    one world of one agent, played by the parallel_env

@@ -22,7 +22,8 @@ _REPLACED: Final = frozenset(
 )
 """The entries that the environment writes anew in each turn."""
 _LENGTH: Final = np.uint64(5 << 28)
-"""The purpose of a draw in `cprl.commons.chance`: how many turns an episode lasts."""
+"""The first counter of the draw of how many turns an episode lasts; `cprl.commons.chance` has it for spawn
+places, of which these games have none."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,6 +14,10 @@ Modules, in the order in which one reads them:
                     agents whose place they take
     film            an episode, every step recorded, or as a GIF or an MP4
     film_pictures   the pictures of a film, and its files
+    show            episodes side by side on an HTML page
+    report          an HTML page about a run or a study
+    sandbox         an HTML page with sliders, whose agents play at once
+    export          episodes for other programs: CSV, Minari
     play            a person among trained or scripted agents
 """
 

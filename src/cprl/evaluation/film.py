@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import keys
-from cprl.commons.readable import growth_of, legend_of
+from cprl.commons.readable import growth_of, in_lower_case, legend_of
 from cprl.commons.world import Bytes, Shown
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.evaluate import opened
@@ -285,17 +285,21 @@ def check_titles(titles: Sequence[str], runs: int) -> None:
 
 
 def titles_of(fresh: Sequence[FreshEpisode]) -> Sequence[str]:
-    """Return what tells runs apart: their institutions, their names, or the names of their directories."""
-    kinds = [
-        [type(kind).__name__ for kind in commons_game(population.run).institutions] for population in fresh
-    ]
-    rules = [re.sub("(?<=[a-z])(?=[A-Z])", " ", " and ".join(names)).lower() for names in kinds]
+    """Return what tells runs apart: their institutions and transforms, their names, or the names of their
+    directories."""
+    rules = [in_lower_case(" and ".join(_rules_in(population.run))) for population in fresh]
     names = [population.run.experiment.name.replace("_", " ") for population in fresh]
     titles = [rule or "no rule" for rule in rules] if any(rules) else names
     for candidates in (titles, names):
         if len(set(candidates)) == len(fresh):
             return [title[0].upper() + title[1:] for title in candidates]
     return [legible(population.run.path.resolve().name) for population in fresh]
+
+
+def _rules_in(run: LoadedRun) -> list[str]:
+    """The names of the classes of a run's institutions and transforms."""
+    institutions = [type(kind).__name__ for kind in commons_game(run).institutions]
+    return [*institutions, *(re.split("[:.]", own.target)[-1] for own in run.experiment.transforms)]
 
 
 class Filmed(NamedTuple):

@@ -12,7 +12,7 @@ from typing import Final
 from markdown_it import MarkdownIt
 
 from cprl.commons.game import Game
-from cprl.commons.readable import growth_of, meaning_of, rule_of
+from cprl.commons.readable import growth_of, meaning_of, rule_of, tag_of
 from cprl.evaluation.evaluate import evaluate_run, run_table
 from cprl.evaluation.film import fresh_episode
 from cprl.evaluation.show import Page, page, shown
@@ -79,12 +79,14 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
     if has_course and (run.path / "evaluation" / "random.parquet").is_file():
         before.append(f"**{course_of(run.path)}**")
     before.append(f"{learned(run.specs)}, {run.experiment.trained_for}.")
+    own = run.experiment.own_rules
+    before += [f"Rules of its own: {own}."] * bool(own) + [run.experiment.own_code]
     after = ["## Fresh episodes, beside random play", "", *markdown(run_table(evaluation))]
     after += [f"The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`."]
     sections = [
         _html("\n".join(after)),
         *([f"<h2>Training</h2>{_training_figure(run)}"] if curves else []),
-        *([_html("\n".join(_rules(game)))] if is_commons else []),
+        *([_rules(game)] if is_commons else []),
         _recipe(run),
     ]
     after_it = "".join(f"<section>{section}</section>" for section in sections)
@@ -99,17 +101,27 @@ def _curves(run: LoadedRun) -> dict[str, Values]:
         return {}
 
 
-def _rules(game: Game) -> list[str]:
-    """The institutions and the rules that differ from the defaults, in Markdown."""
+def _rules(game: Game) -> str:
+    """The institutions, what a tag does and the rules that differ from the defaults, as HTML."""
     lines = [
         "## Rules",
         "",
         f"{game.agents} agents on a board of {game.map.height} x {game.map.width} cells.",
     ]
     lines += ["", *(f"- **{rule_of(one)}**: {meaning_of(one, game)}" for one in game.institutions)]
+    tag = tag_of(game)
+    lines += ["", f"{tag[:1].upper()}{tag[1:]}."] * bool(tag)
+    return _html("\n".join(lines)) + _changed(game)
+
+
+def _changed(game: Game) -> str:
+    """The rules that differ from the defaults, for those who program, as HTML that is closed at first."""
     changed = game.rules.changed
-    lines += ["", "Rules that differ from `Rules()`:" if changed else "All other rules: `Rules()`."]
-    return [*lines, "", *(f"- `{name}`: `{value}`" for name, value in changed.items())]
+    if not changed:
+        return _html("All other rules: `Rules()`.")
+    fields = "\n".join(f"- `{name}`: `{value}`" for name, value in changed.items())
+    summary = "<summary>For programmers: the rules that differ from <code>Rules()</code></summary>"
+    return f"<details>{summary}{_html(fields)}</details>"
 
 
 def _recipe(run: LoadedRun) -> str:

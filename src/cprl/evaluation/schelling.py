@@ -11,7 +11,8 @@ the only one who restrains itself, R(N-1) > R(0), and yet one of two things pull
     fear    G(0) > R(0): who meets greedy agents only had better be greedy
     greed   G(N-1) > R(N-1): who meets restrained agents only had better be greedy
 
-With both it is a prisoner's dilemma, with greed alone chicken, with fear alone a stag hunt.
+With both it is a prisoner's dilemma, with greed alone chicken, with fear alone a stag hunt. So a name is one
+of the ends, k = 0 and N - 1; a title says where a diagram shows something else between them.
 
 Sources: T. C. Schelling, "Hockey Helmets, Concealed Weapons, and Daylight Saving" (1973); for policies of
 agents that learn, E. Hughes et al., "Inequity aversion improves cooperation in intertemporal social dilemmas"
@@ -99,6 +100,29 @@ def dilemma(restrained: Values, greedy: Values) -> Dilemma:
     return Dilemma(**{name: difference(*pair, paired=True) for name, pair in pairs.items()})
 
 
+def between_the_ends(restrained: Values, greedy: Values) -> str:
+    """Where greed pays between the ends of a diagram although it does not at them, or the other way round, as
+    what follows a dilemma's name; "" for nowhere.
+
+    Where it pays at one end alone, it may change once from one to the other. Where the ends agree, a point
+    whose interval holds 0 is not shown to agree with them.
+
+    Args:
+        restrained, greedy: of `dilemma`.
+    """
+    pulls = [difference(*pair, paired=True) for pair in zip(greedy.T, restrained.T, strict=True)]
+    signs = [0 if pull.low <= 0 < pull.high else (-1) ** (pull.value <= 0) for pull in pulls]
+    others = len(signs) - 1
+    against = [k for k in range(1, others) if signs[k] == -signs[0] and signs[0] in signs[k:]]
+    unsure = [k for k in range(1, others) if signs[k] == 0 and signs[0] == signs[-1]]
+    parts = [
+        f", {words} {' and '.join(map(str, points))} of {others}"
+        for words, points in (("not at", against), ("not shown at", unsure))
+        if points
+    ]
+    return f" at the ends{''.join(parts)}" if parts else ""
+
+
 def _name(restraint: bool, company: bool, fear: bool, greed: bool) -> str:
     prisoners, chicken, stag_hunt, none = _NAMES
     if not (restraint and company and (fear or greed)):
@@ -143,6 +167,14 @@ class SchellingDiagram(Results):
 
     def dilemma(self) -> Dilemma:
         return dilemma(self.restrained_payoffs, self.greedy_payoffs)
+
+    @property
+    def title(self) -> str:
+        """The name of the dilemma, and where between the ends it does not hold, or is not shown to."""
+        dilemma = self.dilemma()
+        if len(dilemma.candidates) > 1 or dilemma.name == _NAMES[-1]:
+            return dilemma.name
+        return dilemma.name + between_the_ends(self.restrained_payoffs, self.greedy_payoffs)
 
     def measures(self, count: int) -> dict[str, Measured]:
         """The social metrics of the mixes with so many restrained agents."""
@@ -228,7 +260,7 @@ def draw_schelling(diagram: SchellingDiagram, path: Path | str, *, width: style.
         for axes in (single, group):
             axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
         candidates = diagram.dilemma().candidates
-        sheet.title = f"Schelling diagram: {candidates[0] if len(candidates) == 1 else 'undecided'}"
+        sheet.title = f"Schelling diagram: {diagram.title if len(candidates) == 1 else 'undecided'}"
         sheet.caption = (
             f"{diagram.fresh} for each choice of restrained agents; bars: 95 % intervals by Student's t."
         )
@@ -254,7 +286,7 @@ def schelling_tables(diagram: SchellingDiagram) -> Iterator[Cells]:
         f"greed, G({last}) - R({last})": dilemma.greed,
     }
     rows = [(name, str(margin)) for name, margin in margins.items()]
-    yield Cells(f"{dilemma.name}, by returns", ["", "difference, paired by replica"], rows)
+    yield Cells(f"{diagram.title}, by returns", ["", "difference, paired by replica"], rows)
     payoffs = zip(diagram.restrained_payoffs.T, diagram.greedy_payoffs.T, strict=True)
     yield Cells(
         heading("Schelling diagram", diagram.fresh, (), " for each choice of restrained agents"),

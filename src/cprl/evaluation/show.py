@@ -92,9 +92,13 @@ def show(
     path.refuse()
     fresh = [fresh_episode(one, replica=replica, episode=episode, seed=seed, allow=allow) for one in runs]
     data, filmed = shown(fresh, titles)
-    text = page(_heading(fresh, data), f"<p>{escape(growth_of(commons_game(fresh[0].run)))}</p>", data)
-    path.write(text)
+    path.write(page(_heading(fresh, data), begins(commons_game(fresh[0].run)), data))
     return path, tuple(one.episode for one in filmed)
+
+
+def begins(game: Game) -> str:
+    """What a page says above its episodes, as HTML."""
+    return f"<p>{escape(growth_of(game))}</p>"
 
 
 def _heading(fresh: Sequence[FreshEpisode], data: dict[str, Any]) -> str:
@@ -102,7 +106,8 @@ def _heading(fresh: Sequence[FreshEpisode], data: dict[str, Any]) -> str:
     if len(fresh) == 1:
         return str(data["populations"][0]["title"])
     learners = {learned(population.run.specs) for population in fresh}
-    rules = {rules_of(commons_game(population.run)) for population in fresh}
+    runs = [population.run for population in fresh]
+    rules = {(run.game.rules, run.game.institutions, run.experiment.own_rules) for run in runs}
     alike = "Same" if len(learners) == 1 else "Different"
     return f"{alike} learners, {'the same rules' if len(rules) == 1 else 'different rules'}"
 
@@ -176,7 +181,7 @@ def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, An
     lives = f"apples still grow after {last:,} turns"
     return {
         "title": title,
-        "about": f"{_players(fresh.run)} {_rules(game)}",
+        "about": about(fresh.run),
         "outcome": dead if filmed.is_dead else lives,
         "isDead": filmed.is_dead,
         "counted": counted,
@@ -201,6 +206,11 @@ def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, An
     }
 
 
+def about(run: LoadedRun) -> str:
+    """Who plays, under which rules, in sentences."""
+    return f"{_players(run)} {_rules(run)}"
+
+
 def _players(run: LoadedRun) -> str:
     """Who plays, for readers who do not know what a learner is."""
     who = learned(run.specs)
@@ -209,10 +219,14 @@ def _players(run: LoadedRun) -> str:
     return f"Computer players that learned by practice: {who}, {run.experiment.trained_for}."
 
 
-def _rules(game: Game) -> str:
-    if not game.institutions:
-        return f"Rules: {NO_RULES}."
-    return " ".join([*(meaning_of(kind, game) for kind in game.institutions), f"Settings: {rules_of(game)}."])
+def _rules(run: LoadedRun) -> str:
+    game, experiment = commons_game(run), run.experiment
+    words = [meaning_of(kind, game) for kind in game.institutions]
+    if game.institutions:
+        words.append(f"Settings: {rules_of(game)}.")
+    if experiment.own_rules:
+        words.append(f"Rules of its own: {experiment.own_rules}.")
+    return " ".join([*(words or [f"Rules: {NO_RULES}."]), experiment.own_code]).strip()
 
 
 def _cells(board: Map, places: Sequence[Sequence[int]]) -> list[int]:

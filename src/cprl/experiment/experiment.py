@@ -37,6 +37,7 @@ from cprl.values import (
     build,
     checked,
     custom_targets,
+    described,
     differences,
     hints_of,
     shown,
@@ -108,8 +109,22 @@ class Experiment(Value, stored=False, called="experiment"):
         who, game = "", f"<p>{escape(repr(self.game))}</p>"
         if isinstance(self.game, Game):
             who = f"{learned(specs_by_agent(self.agents, self.game.agents))}, "
-            game = game_html(self.game)
-        return f"<p><b>{escape(self.name)}</b>: {escape(who + self.trained_for)}.</p>{game}"
+            game = game_html(self.game, self.own_rules)
+        own = f"<p>{escape(self.own_code)}</p>" if self.own_code else ""
+        return f"<p><b>{escape(self.name)}</b>: {escape(who + self.trained_for)}.</p>{game}{own}"
+
+    @property
+    def own_rules(self) -> str:
+        """The rules of the user's own in words, a transform or a game each; "" without any."""
+        return rules_of_own(self.to_config())
+
+    @property
+    def own_code(self) -> str:
+        """What else is of the user's own, in a sentence; "" without any."""
+        table = self.to_config()
+        parts = {name: described(table[name]) for name in table if name not in _OF_RULES}
+        said = "; ".join(f"{name}: {', '.join(words)}" for name, words in parts.items() if words)
+        return f"Code of its own: {said}." if said else ""
 
     @property
     def trained_for(self) -> str:
@@ -200,6 +215,14 @@ class Experiment(Value, stored=False, called="experiment"):
 
     def __hash__(self) -> int:
         return hash((self.name, self.unit, self.length, self.replicas, self.seed))
+
+
+_OF_RULES: Final = ("game", "transforms")
+
+
+def rules_of_own(table: Mapping[str, Any]) -> str:
+    """The rules of the user's own in words, of what `Experiment.to_config` gives; "" without any."""
+    return "; ".join(described([table.get(name) for name in _OF_RULES]))
 
 
 def changes(before: Experiment, now: Experiment) -> list[str]:

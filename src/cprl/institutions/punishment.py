@@ -13,8 +13,9 @@ class Punishment(Institution):
     """Whoever tags another agent fines it, and pays for that (costly punishment: E. Fehr and S. Gächter,
     "Cooperation and punishment in public goods experiments", 2000).
 
-    An agent that several tag at once pays to each of them. Fines go to nobody. With `Rules.freeze_steps` of 0
-    a tag is a fine and nothing else. Agents observe nothing of it.
+    An agent that several tag at once pays for each of them. Fines go to nobody. With `Rules.freeze_steps` of
+    0 a tagged agent misses no turn; it is only absent from the windows of the turn in which it is tagged.
+    Agents observe nothing of it.
     """
 
     fine: Amount = 2.0

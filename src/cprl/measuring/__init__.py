@@ -7,7 +7,8 @@ Modules, in the order in which one reads them:
     episodes      Episode, and EpisodeTracker, which makes them of batches of turns; metrics of the user's own
     evaluate      one fresh episode in every world, without learning
     statistics    estimates over replicas, with intervals by Student's t
-    series, now   numbers while a training runs, and what a group is doing at the moment
+    series        numbers while a training runs
+    now           what a group is doing at the moment
     phases        change points of a whole training, and the phases between them
     movement      where agents go, which cells they share or keep, and who tags whom
 """

@@ -2,7 +2,8 @@
 
 Modules, in the order in which one reads them:
     lanes           LaneActor: many agents at once, by the values or logits of their networks
-    scripted        agents that follow a rule; scripted_rules is compiled for them
+    scripted        agents that follow a rule
+    scripted_rules  these rules, compiled
     tabular         agents that look actions up in tables
     decisions       Decider: what agents decide at an episode's begin; Bandit: how they learn it
     assignment      AgentPolicies: which policy controls which agents

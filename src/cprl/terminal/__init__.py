@@ -3,6 +3,7 @@
 Modules, in the order in which one reads them:
     progress  a bar while a training runs
     summary   what a run came to
+    tables    tables of texts, for the terminal and for Markdown
     figures   the training curve
     style     what all figures share: sizes, colours, legends
 """

@@ -8,7 +8,8 @@ numbers as Python's, whole numbers of a float field as floats. A refusal is a Va
 "DQNSettings.gamma is 7; allowed: a number in 0..1".
 
 A table is what JSON can hold of a value, `{"kind": "DQN", ...its fields}`; a tuple is a list there. Reading a
-table is strict: what is not known is refused by the place where it stands.
+table is strict: what is not known is refused by the place where it stands. `cprl.values.custom` has Custom,
+something of the user's own by its name.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -34,6 +35,7 @@ from cprl.values.custom import Custom as Custom
 from cprl.values.custom import allowed as allowed
 from cprl.values.custom import allowing as allowing
 from cprl.values.custom import custom_targets as custom_targets
+from cprl.values.custom import described as described
 from cprl.values.custom import made as made
 from cprl.values.custom import refuse_targets
 from cprl.values.custom import shown as shown

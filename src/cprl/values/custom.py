@@ -105,7 +105,29 @@ def allowed() -> tuple[str, ...]:
 
 
 def custom_targets(table: object) -> list[str]:
-    return sorted(set(_targets(table)))
+    return sorted({str(entry.get("target")) for entry in _tables_of_customs(table)})
+
+
+def described(table: object) -> list[str]:
+    """Return in words what a table has of code of the user's own: "laws:RichPay (fee 2.0): The rich pay".
+
+    The sentence is the first line of a docstring. Nothing is imported to be described: without its module
+    there is the name alone.
+    """
+    customs = (Custom(entry["target"], entry.get("arguments", {})) for entry in _tables_of_customs(table))
+    return list(dict.fromkeys(map(_in_words, customs)))
+
+
+def _in_words(custom: Custom) -> str:
+    arguments = ", ".join(f"{name} {shown(value)}" for name, value in custom.arguments.items())
+    words = f"{custom.target} ({arguments})" if arguments else custom.target
+    module, _, name = custom.target.partition(":")
+    target: Any = sys.modules.get(module)
+    for part in name.split("."):
+        target = getattr(target, part, None)
+    lines = str(getattr(target, "__doc__", None) or "").strip().splitlines()
+    words = f"{words}: {lines[0].rstrip('.')}" if lines else words
+    return "".join(sign if sign.isprintable() else "?" for sign in words)
 
 
 def refuse_targets(table: object) -> None:
@@ -119,16 +141,16 @@ def refuse_targets(table: object) -> None:
         )
 
 
-def _targets(table: object) -> Iterator[str]:
+def _tables_of_customs(table: object) -> Iterator[Mapping[str, Any]]:
     if isinstance(table, Mapping):
         if table.get("kind") == "Custom":
-            yield str(table.get("target"))
+            yield table
         else:
             for entry in table.values():
-                yield from _targets(entry)
+                yield from _tables_of_customs(entry)
     elif isinstance(table, list | tuple):
         for entry in table:
-            yield from _targets(entry)
+            yield from _tables_of_customs(entry)
 
 
 _IMPORTED: Final[dict[str, tuple[object, str | None]]] = {}

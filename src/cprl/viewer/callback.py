@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl.envs.unwrap import agent_names, base_env, commons_of
+from cprl.experiment.experiment import rules_of_own
 from cprl.measuring.episodes import Episode
 from cprl.measuring.metrics import reported_by
 from cprl.measuring.series import OF_AGENTS, Series, numbers_of
@@ -120,7 +121,8 @@ class ViewerCallback:
         self.story: Story | None = None
         self.exhibition: Exhibition | None = None
         """What the present policy plays for viewers; None where nothing is exhibited."""
-        self._views = self._make_views(episodes, exhibited, is_about=is_about, is_replay=is_replay)
+        own = rules_of_own(recipe or {})
+        self._views = self._make_views(episodes, exhibited, own, is_about=is_about, is_replay=is_replay)
         self._sampled = gcd(*(view.stride for view in self._views)) or 1
         """Turns from one look at the worlds to the next where no frame is recorded."""
         self.filming.choose(0)
@@ -129,6 +131,7 @@ class ViewerCallback:
         self,
         episodes: int,
         exhibited: tuple[PresentPolicy, EnvBase] | None,
+        own: str,
         *,
         is_about: bool,
         is_replay: bool,
@@ -160,7 +163,7 @@ class ViewerCallback:
         if curves.has_lorenz:
             views.append(Lorenz(logger, every=every))
         game = None if commons is None else commons.game
-        self.story = Story(logger, self.filming, episodes=episodes, is_about=is_about, game=game)
+        self.story = Story(logger, self.filming, episodes=episodes, is_about=is_about, game=game, own=own)
         views.append(self.story)
         if live is not None:
             views.append(CompilingNotice(self._show_status))
