@@ -545,6 +545,8 @@ def test_the_effects_of_rules_together_are_those_of_which_a_table_was_made(shipp
     committed = FOLDER.parents[1] / "docs" / "results" / "studies" / "together"
     effects.main(committed)
     assert capsys.readouterr().out == (committed / "effects.md").read_text()
+    effects.main(committed, part="evaluation")
+    assert capsys.readouterr().out == (committed / "effects_frozen.md").read_text()
 
 
 @pytest.mark.integration
