@@ -388,8 +388,8 @@ def draw(found: list[Row], path: Path) -> None:
         sheet.title = "What governs the commons"
         sheet.caption = (
             f"Four learners, last {LAST} of 200 episodes; 95 % intervals by Student's t over replicas. "
-            "Boards of green and violet rows bear more or fewer apples than the others; lines are of the "
-            "unchanged one. (1) to (8): Ostrom's principles."
+            "Green rows have boards that bear more or fewer apples; lines are of the unchanged one. "
+            "(1) to (8): Ostrom's principles."
         )
 
 
