@@ -18,7 +18,7 @@ import tyro
 from numpy.typing import NDArray
 
 from cprl.measuring.statistics import Estimate, curve_interval, estimate, holm
-from cprl.runs.curves import as_curves, centres, curves_of, running_mean
+from cprl.runs.curves import as_curves, centres, curves_of, net_of, running_mean
 from cprl.runs.episodes import read_table
 from cprl.terminal import style
 from cprl.terminal.style import INTERVAL, MEAN, RANDOM_LINE
@@ -38,12 +38,15 @@ NAMES: Final = {
 """Directories of runs, and what they are called; numbers are those of Ostrom's principles."""
 METRICS: Final = {
     "collective_return": "harvest, apples",
-    "net": "harvest - fines + transfers",
-    "equality": "equality",
+    "equality": "equality of the harvest",
+    "net": "income, apples",
+    "income_equality": "equality of income",
     "sustainability": "sustainability, steps",
     "survival_steps": "survival, steps",
     "peacefulness": "peacefulness, steps",
 }
+WITHOUT_MONEY: Final = {"net": "collective_return", "income_equality": "equality"}
+"""By the metric of income: that of the harvest, of which it is a copy where no apple is paid and lost."""
 LAST, SMOOTHED = 30, 10
 """Episodes at the end that are compared; episodes of a running mean."""
 
@@ -53,7 +56,8 @@ Values = NDArray[np.float64]
 def of_replicas(run: Path) -> dict[str, Values]:
     """The mean of the last episodes of each replica, [R] by metric."""
     curves = curves_of(run)
-    curves["net"] = np.sum([own for name, own in curves.items() if name.startswith("return_")], axis=0)
+    curves["net"] = net_of(curves)
+    curves["income_equality"] = curves.get("institutions/net_equality", curves["equality"])
     return {name: np.nanmean(curves[name][:, -LAST:], 1) for name in METRICS}
 
 
@@ -65,14 +69,33 @@ def text_of(estimated: Estimate, *, sign: str = "") -> str:
     return f"{value} [{low}, {high}]"
 
 
-def difference_texts(differences: dict[str, dict[str, Estimate]]) -> dict[str, list[str]]:
-    """Differences with their intervals; bold those that are not 0 by Holm's method for all of them."""
-    estimates = [estimated for of_metric in differences.values() for estimated in of_metric.values()]
-    is_different = holm([estimated.p_value for estimated in estimates])
-    texts = [text_of(estimated, sign="+") for estimated in estimates]
-    texts = [f"**{text}**" if differs else text for text, differs in zip(texts, is_different, strict=True)]
-    rows = np.array(texts).reshape(len(differences), len(METRICS))
-    return {name: list(row) for name, row in zip(differences, rows, strict=True)}
+def difference_texts(differences: dict[str, dict[str, Estimate]]) -> tuple[dict[str, list[str]], int]:
+    """Differences with their intervals, bold where they are not 0 by Holm's method, and how many that
+    compared: a metric of income that is the harvest's, since nothing is lost, counts once."""
+    compared = {
+        (name, metric): estimated
+        for name, of_metric in differences.items()
+        for metric, estimated in of_metric.items()
+        if not is_copy(metric, of_metric)
+    }
+    is_different = holm([estimated.p_value for estimated in compared.values()])
+    marks = dict(zip(compared, is_different, strict=True))
+    rows: dict[str, list[str]] = {}
+    for name, of_metric in differences.items():
+        rows[name] = []
+        for metric, estimated in of_metric.items():
+            counted = WITHOUT_MONEY[metric] if is_copy(metric, of_metric) else metric
+            text = text_of(estimated, sign="+")
+            rows[name].append(f"**{text}**" if marks[name, counted] else text)
+    return rows, len(compared)
+
+
+def is_copy(metric: str, differences: dict[str, Estimate]) -> bool:
+    """Whether a metric of income is in a row what that of the harvest is."""
+    if metric not in WITHOUT_MONEY:
+        return False
+    own, other = differences[metric], differences[WITHOUT_MONEY[metric]]
+    return np.allclose((own.value, own.low, own.high), (other.value, other.low, other.high), atol=1e-9)
 
 
 def table(head: str, rows: dict[str, list[str]]) -> str:
@@ -87,7 +110,7 @@ def forest(differences: dict[str, dict[str, Estimate]], path: Path) -> None:
     """Draws the paired differences of every metric, with their intervals."""
     names = list(differences)
     with style.drawing(path) as sheet:
-        panels = sheet.panels(len(METRICS), columns=3, high=2.4 * len(names) + 6, sharey=True)
+        panels = sheet.panels(len(METRICS), columns=4, high=2.4 * len(names) + 6, sharey=True)
         for axes, metric in zip(panels, METRICS, strict=True):
             for place, name in enumerate(names):
                 found = differences[name][metric]
@@ -141,7 +164,9 @@ def main(*, runs: Path, figures: Path) -> None:
         for name, own in values.items()
         if name != NONE
     }
-    print(table("difference from none", difference_texts(differences)))
+    texts, compared = difference_texts(differences)
+    print(table("difference from none", texts), end="\n\n")
+    print(f"Bold: not 0 by Holm's method for {compared} comparisons, those that are copies counted once.")
     figures.mkdir(exist_ok=True)
     forest(differences, figures / "differences.png")
     courses(found, figures / "courses.png")

@@ -5,7 +5,7 @@
 
 The first one writes NAME.csv and NAME.png for each population into docs/results/scenarios, and leaves out
 those whose NAME.csv is there, so that it can be stopped and started again. The second one plays nothing and
-prints the tables.
+prints the tables. Of the figures only commons.png is on a page, so the others are not committed.
 """
 
 import csv

@@ -12,7 +12,10 @@ import pytest
 from recordings import watched_training
 from rerun.chunk import RrdReader
 
+from cprl import presets
 from cprl.commands import main as cli
+from cprl.commons.yields import sustainable_yield
+from cprl.institutions import Quota
 from cprl.measuring import institutions, social
 from cprl.measuring.series import OF_AGENTS
 from cprl.runs.episodes import OF_INSTITUTIONS
@@ -92,9 +95,60 @@ def test_the_rules_of_the_readme_have_the_numbers_of_the_page_of_institutions():
     readme = rows("README.md", "Five rules")
     measured = rows("docs/institutions.md", "What they do to the tragedy")
     assert len(readme) == 6, "with that of none"
-    harvest, net, equality, survival = 0, 1, 2, 4
-    of_page = [[row[column] for column in (harvest, net, survival, equality)] for row in measured]
-    assert [row for row in readme if row not in of_page] == []
+    assert [len(row) for row in readme] == [5] * 6, "the harvest and its equality, income and its equality"
+    assert [row for row in readme if row not in measured] == []
+
+
+def test_the_table_of_institutions_is_made_of_the_committed_runs():
+    page = (ROOT / "docs" / "institutions.md").read_text()
+    made = (ROOT / "docs" / "results" / "institutions" / "table.md").read_text()
+    rows = [
+        line for line in page.splitlines() if line.startswith(("| none", "| 1 b", "| 2 ", "| 3 ", "| 4 "))
+    ]
+    rows += [line for line in page.splitlines() if line.startswith(("| 5 g", "| 6 ", "| 7 ", "| 8 "))]
+    assert len(rows) == 9
+    for row in rows:
+        name, harvest, equality, income, income_equality, survival = row.strip("| ").split(" | ")
+        assert f"| {name} | {harvest} | {equality} | {income} | {income_equality} | " in made
+        assert f" | {survival} | " in made
+
+
+def test_a_page_that_compares_the_quota_over_the_full_schedule_names_its_cap():
+    game = presets.game("commons", variant="as_run")
+    quota = Quota(share=0.25, window_steps=50)
+    of_an_agent = int(
+        quota.share * sustainable_yield(game.map, game.rules) * quota.window_steps / game.agents
+    )
+    windows = game.rules.episode_steps // quota.window_steps
+    cap = of_an_agent * windows * game.agents
+    assert cap == 480
+    for name in (
+        "README.md",
+        "docs/governs.md",
+        "docs/governs_more.md",
+        "docs/studies.md",
+        "docs/institutions.md",
+    ):
+        text = (ROOT / name).read_text()
+        assert f"{cap}" in text, name
+
+
+def plain(text):
+    """A text without links, bold type and code."""
+    return re.sub(r"\[([^][]*)\]\([^)]*\)", r"\1", text).replace("**", "").replace("`", "")
+
+
+def test_sentences_that_a_referee_refuted_stand_on_no_page_and_those_in_their_place_do():
+    verdicts = (ROOT / "docs" / "results" / "changed_verdicts.md").read_text()
+    section = verdicts.split("\n## By a referee")[1].split("\n## ")[0]
+    rows = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("| ")][1:]
+    assert len(rows) > 60
+    for page, before, after, finding, rests_on in rows:
+        text = plain((ROOT / page).read_text())
+        assert before not in text, page
+        assert after == "withdrawn" or after in text, page
+        assert finding, before
+        assert rests_on, before
 
 
 def codes(page):
@@ -175,7 +229,8 @@ def test_links_between_pages_lead_somewhere():
 
 
 def test_every_interval_of_the_reproduction_stands_in_a_report_or_is_printed_by_the_page_itself(capsys):
-    of_today = (ROOT / "docs" / "results" / "changed_verdicts.md").read_text().split("\n## ")[1]
+    verdicts = (ROOT / "docs" / "results" / "changed_verdicts.md").read_text()
+    counted = verdicts.split("\n## By what is counted")[1].split("\n## ")[0]
     page = "".join((ROOT / "docs" / own).read_text() for own in ("results.md", "results/details.md"))
     reports = "experiment_3", "dip", "combat"
     written = (
@@ -190,7 +245,7 @@ def test_every_interval_of_the_reproduction_stands_in_a_report_or_is_printed_by_
     tables += capsys.readouterr().out
     told = re.findall(INTERVAL, page)
     assert len(told) > 90
-    assert [one for one in (*told, *re.findall(INTERVAL, of_today)) if one not in tables] == []
+    assert [one for one in (*told, *re.findall(INTERVAL, counted)) if one not in tables] == []
 
 
 @pytest.mark.integration
@@ -203,13 +258,23 @@ def test_what_governs_is_made_of_the_committed_tables_and_its_pages_have_their_n
     assert (tmp_path / "elsewhere.md").read_text() == elsewhere.read_text()
     studies = ROOT / "docs" / "results" / "studies"
     of_studies = {
-        "together": ("effects", "summary"),
+        "together": ("effects", "effects_frozen", "summary"),
         "best_rules": ("summary",),
         "elsewhere": ("summary",),
         "many_worlds": ("ends", "summary"),
     }
+    contrasts = ROOT / "docs" / "results" / "governs" / "contrasts.md"
+    command = [
+        sys.executable,
+        ROOT / "recipes" / "study" / "contrasts.py",
+        "--out",
+        tmp_path / "contrasts.md",
+    ]
+    subprocess.run(command, check=True, cwd=ROOT)
+    assert (tmp_path / "contrasts.md").read_text() == contrasts.read_text()
     more = [f"{study}/{name}.md" for study, names in of_studies.items() for name in names]
-    tables = committed + elsewhere.read_text() + "".join((studies / name).read_text() for name in more)
+    tables = committed + elsewhere.read_text() + contrasts.read_text()
+    tables += "".join((studies / name).read_text() for name in more)
     pages = "".join((ROOT / "docs" / name).read_text() for name in ("governs.md", "governs_more.md"))
     intervals = re.findall(r"\[[-+\d., ]+\]", pages)
     assert len(intervals) > 40

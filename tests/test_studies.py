@@ -26,6 +26,7 @@ from cprl.studies.factors import changed, drawn, factors_of, values_at
 from cprl.studies.study import CONDITION_FORMAT, Condition, apart, level_text, named, short_names
 from cprl.studies.tables.table import Design
 from cprl.studies.trials import trials_of
+from cprl.theory.growth import yield_bounds
 from cprl.values import KINDS, defaults_of
 
 OF_FIRST, OF_SECOND = (GAMMA.replace("*", agent) for agent in "01")
@@ -545,6 +546,24 @@ def test_the_effects_of_rules_together_are_those_of_which_a_table_was_made(shipp
     committed = FOLDER.parents[1] / "docs" / "results" / "studies" / "together"
     effects.main(committed)
     assert capsys.readouterr().out == (committed / "effects.md").read_text()
+    effects.main(committed, part="evaluation")
+    assert capsys.readouterr().out == (committed / "effects_frozen.md").read_text()
+
+
+@pytest.mark.integration
+def test_the_most_that_a_changed_board_allows_is_what_the_theory_proves(shipped):
+    governs = import_module("governs")
+    for study, condition, name in (
+        ("space", "half the apples, scattered", "half the apples, scattered"),
+        ("space", "half the board", "half the board"),
+        ("regrowth", "regrowth=0.25", "regrowth x 0.25"),
+        ("regrowth", "regrowth=4", "regrowth x 4"),
+    ):
+        (game,) = (one.experiment.game for one in shipped(study).all_conditions if one.name == condition)
+        bounds = yield_bounds(game.map, game.rules)
+        of_the_board = len(game.map.sites) + bounds.at_most * game.rules.episode_steps
+        of_its_agents = game.agents * game.rules.episode_steps
+        assert governs.AT_MOST[name] == pytest.approx(min(of_the_board, of_its_agents), abs=1)
 
 
 @pytest.mark.integration

@@ -53,7 +53,7 @@ def gains(run: LoadedRun, episodes: int, training_episodes: int) -> dict[str, Va
     plan = plan_responses(run, algorithms=("own",), training_episodes=training_episodes, episodes=episodes)
     responses = exploitability(plan, run.path.parent / "responses" / run.path.name, progress=False)
     own, best = responses.returns_of(0)
-    return {"return of agent 0": own, "gain of the best response in its place": best - own}
+    return {"return of agent 0": own, "gain of the best of our responses in its place": best - own}
 
 
 def mixes(runs: list[LoadedRun], episodes: int, **policies: str) -> dict[str, str]:

@@ -62,7 +62,10 @@ def condition(levels: dict[str, bool]) -> dict[str, Any]:
 
 
 def name(levels: dict[str, bool]) -> str:
-    """The factors that are at their high level."""
+    """The factors that are at their high level.
+
+    Without a quota or boundaries those named monitoring and sanctions are not in the game, see `condition`.
+    """
     return ", ".join(factor for factor in FACTORS if levels[factor]) or "none"
 
 
