@@ -12,6 +12,7 @@ import torch
 from recordings import GAME, SCENE, column, names, static, strict_rerun
 from rerun.chunk import RrdReader
 from tensordict import TensorDict
+from test_now import SIXTEEN_WORLDS
 from test_watch import connected, fake
 
 from cprl import CommonsEnv, Game, Rules, maps, presets
@@ -124,6 +125,33 @@ def test_strips_and_events_say_what_the_group_does_and_where_exploration_ends(tm
     assert states == ([0, 9], [["begins"], ["steady"]])
     states = column(path, "now_exploring", "StateChange:state", "episode")
     assert states == ([0, 19], [["exploring"], ["settled"]])
+
+
+def test_with_many_worlds_header_label_bold_line_and_new_bests_count_episodes(tmp_path):
+    """The tragedy of sixteen worlds, as the viewer told it once: "steady, 333 apples" at 206."""
+    with ViewerCallback(tmp_path, CommonsEnv(GAME, 16), title="run", episodes=288, worlds=16) as viewer:
+        viewer.random_play([fake(0, 0, returned=280.0, tagged=0)] * 2)
+        for group, apples in enumerate(SIXTEEN_WORLDS):
+            for world in range(16):
+                episode = fake(16 * group + world, world, returned=float(apples), tagged=0)
+                viewer.on_episode(replace(episode, replica=0), {})
+    path = tmp_path / "run.rrd"
+    said = [(at + 1, *text.split(" · ")[1:3]) for at, text in headers(path) if "random play 280" in text]
+    assert [at for at, *_ in said] == list(range(16, 289, 16))
+    for (_, label, amount), apples in zip(said, SIXTEEN_WORLDS, strict=True):
+        assert label != "begins"
+        assert float(amount.split(" apples")[0]) == pytest.approx(apples, rel=0.1)
+    states = dict(zip(*column(path, "now", "StateChange:state", "episode"), strict=True))
+    at = {state[0]: episode for episode, state in reversed(states.items())}
+    assert at["rising"] < at["falling"] < at["below random play"] < 170
+    assert states[max(states)] == ["below random play"]
+    lines = column(path, "social/collective_return", "Scalars:scalars")[1]
+    assert lines == [[apples, apples] for apples in SIXTEEN_WORLDS], "a mean of ten would be of 160 episodes"
+    best = [text for text in texts(path) if "new best" in text]
+    assert best == [
+        "episode 63: new best: 339.5 apples per episode, mean of the last 64",
+        "episode 127: new best: 437.8 apples per episode, mean of the last 64",
+    ]
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from math import gcd
+from math import ceil, gcd
 from operator import methodcaller
 from pathlib import Path
 from threading import Event
@@ -136,7 +136,8 @@ class ViewerCallback:
         logger, commons = self.logger, commons_of(self.env)
         curves, scene, live = logger.curves, logger.scene, logger.live
         every = max(1, min(LONGEST, episodes // _IMAGES))
-        views: list[View] = [Plots(logger), Events(logger, self.filming, every=every)]
+        of_world = ceil(every / curves.worlds)
+        views: list[View] = [Plots(logger), Events(logger, self.filming, every=of_world)]
         if curves.joint:
             views.append(JointActions(logger, actions=base_env(self.env).game.actions))
         if curves.has_tags_between:

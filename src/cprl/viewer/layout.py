@@ -103,9 +103,9 @@ STRIPS: Final = ("now", "now_exploring", "phase/found", "phase/as_published")
 run ends."""
 
 
-def window_of(episodes: int) -> int:
-    """The episodes whose mean is the bold line of a run of so many."""
-    return max(10, round(0.02 * episodes))
+def window_of(episodes: int, *, worlds: int = 1) -> int:
+    """The episodes whose mean is the bold line of a run of so many, as many of each world of a replica."""
+    return worlds * ceil(max(10, round(0.02 * episodes)) / worlds)
 
 
 _MOST_BOARDS: Final = 16
@@ -123,11 +123,12 @@ class Curves:
     worlds: int = 1
     """The worlds W of each replica."""
     mean_over: int = 10
-    """The episodes whose mean is the bold line."""
+    """The episodes of a replica whose mean is the bold line, a multiple of W."""
     metrics: tuple[str, ...] = (*METRICS, "stock_left", "yield_share")
     """The metrics that the game reports, without the prefix `social/`."""
     has_phases: bool = True
-    """Whether phases are found when the run ends: it is long enough, and these metrics tell."""
+    """Whether phases are found when the run ends: it is long enough, these metrics tell, and the means of W
+    episodes are no further apart than the resolution of phases."""
     has_tags: bool = True
     """Whether the game reports who tagged whom."""
     institutions: tuple[str, ...] = ()
@@ -202,9 +203,11 @@ def curves_of(
         agents=agents,
         replicas=env.batch_size.numel() // worlds,
         worlds=worlds,
-        mean_over=window_of(episodes),
+        mean_over=window_of(episodes, worlds=worlds),
         metrics=metrics,
-        has_phases=episodes in phases.EPISODES and set(phases.METRICS) <= set(metrics),
+        has_phases=(
+            episodes in phases.EPISODES and worlds <= phases.GRID and set(phases.METRICS) <= set(metrics)
+        ),
         has_tags="tagged_by" in reported,
         institutions=metrics_of(env, reported),
         in_force=decisions_of(env) if "in_force" in reported else (),

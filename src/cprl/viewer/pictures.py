@@ -117,7 +117,8 @@ class Plots(View):
             singles = values.tolist() if is_social and len(values) > 1 else []
             lines = [*singles, mean := mean_of(values)]
             if is_social or name.endswith(_WITH_MEAN):
-                lines.append(self._recent.setdefault(name, Recent(curves.mean_over)).add(mean))
+                recent = self._recent.setdefault(name, Recent(curves.mean_over, each=curves.worlds))
+                lines.append(recent.add(mean))
             self._logger.log_lines(name, lines)
         for name, mean in self._random.items():
             self._logger.log_scalar(f"{RANDOM_PLAY}/{name}", mean)
@@ -135,7 +136,7 @@ class JointActions(View):
         self._places = actions ** np.arange(len(curves.agents))[::-1]
         self._counts = np.zeros((len(self._worlds), len(curves.joint)))
         self._shares: dict[int, list[NDArray[np.float64]]] = {}
-        self._recent = [Recent(curves.mean_over) for _ in curves.joint]
+        self._recent = [Recent(curves.mean_over, each=curves.worlds) for _ in curves.joint]
 
     def on_batch(self, batch: TensorDictBase) -> None:
         action = batch[keys.ACTION].cpu().numpy()

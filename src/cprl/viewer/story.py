@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite, isnan
+from math import ceil, isfinite, isnan
 from statistics import fmean, stdev
 from threading import Event, Thread
 from typing import Final, NamedTuple
@@ -17,7 +17,7 @@ from cprl.measuring import phases
 from cprl.measuring.episodes import Episode
 from cprl.measuring.now import BEGINS, EXPLORING, Now
 from cprl.measuring.series import Values, mean_of
-from cprl.runs.curves import running_mean
+from cprl.runs.curves import SMOOTHED_EPISODES, running_mean
 from cprl.system.times import CLOCK
 from cprl.viewer.board import Filming
 from cprl.viewer.layout import ANOTHER, SETTLED, STRIPS, Curves
@@ -115,41 +115,44 @@ def _number(value: float) -> str:
 
 
 class Course:
-    """The course of the metrics that tell new bests and phases, as means over replicas."""
+    """The course of the metrics that tell new bests and phases, as means over replicas and, of replicas in W
+    worlds, over W episodes of each."""
 
     BEST_OVER = 50
-    """Episodes of the mean return that is compared with the best."""
+    """Episodes of the mean return that is compared with the best, at least."""
     BETTER = 1.05
     """The factor by which a new best must exceed the last reported one."""
 
-    def __init__(self) -> None:
+    def __init__(self, worlds: int = 1) -> None:
+        self._worlds = worlds
         self._means: list[list[float]] = []
         self._best = 0.0
 
     def new_best(self, means: Mapping[str, float]) -> str | None:
-        """Adds the means of an episode; returns the new best in words if there is one."""
+        """Adds the means of an episode, or of W; returns the new best in words if there is one."""
         self._means.append([means[f"social/{name}"] for name in phases.METRICS])
-        if len(self._means) % self.BEST_OVER:
+        count = ceil(self.BEST_OVER / self._worlds)
+        if len(self._means) % count:
             return None
-        reached = float(np.mean([mean[0] for mean in self._means[-self.BEST_OVER :]]))
+        reached = float(np.mean([mean[0] for mean in self._means[-count:]]))
         if not reached > self.BETTER * self._best:
             return None
         self._best = reached
-        return f"new best: {reached:.1f} apples per episode, mean of the last {self.BEST_OVER}"
+        return f"new best: {reached:.1f} apples per episode, mean of the last {count * self._worlds}"
 
     def phases(self) -> list[phases.Phase]:
         """The phases so far, four at most; empty until there are enough episodes for one.
 
         They are of running means, in which an undefined metric repeats its last value.
         """
-        if len(self._means) < phases.SHORTEST:
+        if len(self._means) * self._worlds < phases.SHORTEST:
             return []
-        smoothed = running_mean(np.array(self._means).T)
-        episodes = np.arange(smoothed.shape[1])
+        smoothed = running_mean(np.array(self._means).T, ceil(SMOOTHED_EPISODES / self._worlds))
+        episodes = self._worlds * np.arange(smoothed.shape[1])
         for row in smoothed:
             defined = np.flatnonzero(~np.isnan(row))
             row[:] = np.interp(episodes, defined, row[defined]) if len(defined) else 0.0
-        number = max(0, min(3, len(episodes) // phases.SHORTEST - 1))
+        number = max(0, min(3, len(episodes) * self._worlds // phases.SHORTEST - 1))
         return phases.find_phases(episodes, dict(zip(phases.METRICS, smoothed, strict=True)), number=number)
 
 
@@ -186,8 +189,9 @@ class Story(View):
             rules=rules_of(game),
             is_about=is_about,
         )
-        self.now = Now()
-        self._course = Course() if set(phases.METRICS) <= set(self._curves.metrics) else None
+        self.now = Now(self._curves.worlds)
+        has_course = set(phases.METRICS) <= set(self._curves.metrics)
+        self._course = Course(self._curves.worlds) if has_course else None
         self._random: Played | None = None
         self._ended = 0
         self._died: dict[int, int] = {}
@@ -277,8 +281,7 @@ class Story(View):
     def _end(self, header: str) -> None:
         self._is_over = True
         if self._course is not None and self._curves.has_phases:
-            worlds = self._curves.worlds
-            found = {round(phase.first) * worlds: phase.label or ANOTHER for phase in self._course.phases()}
+            found = {round(phase.first): phase.label or ANOTHER for phase in self._course.phases()}
             self._logger.log_states(_FOUND, found)
             published = published_phases(self._game).items()
             if within := {first: label for first, label in published if first < self._ended}:
