@@ -3,6 +3,7 @@ boards of all replicas, where agents go, the stock over the turn, and the Lorenz
 
 import time
 from dataclasses import replace
+from threading import Event
 from types import SimpleNamespace
 
 import numpy as np
@@ -32,7 +33,7 @@ from cprl.viewer.layout import Curves, Panels, curves_of, joint_actions, layout
 from cprl.viewer.live import LiveStream, Stream
 from cprl.viewer.logger import RerunLogger, as_table, send_waiting
 from cprl.viewer.pictures import Turns, Visits, Wall, gini, lorenz_curve
-from cprl.viewer.story import CLOCK, CompilingNotice, Header, played, published_phases
+from cprl.viewer.story import CompilingNotice, Header, played, published_phases
 
 __all__ = ["strict_rerun"]
 
@@ -84,7 +85,7 @@ def test_the_header_goes_from_the_beginning_to_the_end(tmp_path):
     line = "Finished, 6 episodes · trained 100 apples, random play 282 · 4 of 4 boards died early"
     assert said[-1] == (5, f"#### {line}")
     words = [text for text in texts(path) if "random play" in text]
-    assert words == ["random play 282.0 ± 2 apples; 0 of 2 boards died early"]
+    assert words == ["random play 282 [257, 307] apples; 0 of 2 boards died early"]
     assert column(path, "phase/found", "StateChange:state") == ([], []), "too few episodes"
 
 
@@ -239,21 +240,21 @@ def test_a_recording_of_a_training_too_long_for_the_search_has_no_phases():
 
 
 def test_while_code_is_compiled_the_live_header_says_for_how_long(monkeypatch):
+    clock, said, is_over = SimpleNamespace(is_running=True, total_s=3.0), [], Event()
     monkeypatch.setattr(CompilingNotice, "PERIOD_S", 0.02)
-    said = []
+    monkeypatch.setattr("cprl.viewer.story.CLOCK", clock)
 
     def say(status):
         said.append(status)
+        clock.total_s = 15.0
+        clock.is_running = len(said) < 2  # it ends while that is said
         if status == "begins":
             notice.close()
+            is_over.set()
 
     notice = CompilingNotice(say)
-    with CLOCK.running():
-        while len(said) < 2:
-            pass
-    while said[-1] != "begins":
-        pass
-    assert said[0] == "compiling, 0 s so far"
+    assert is_over.wait(10), said
+    assert said == ["compiling, 0 s so far", "compiling, 12 s so far", "begins"]
 
 
 def test_the_recipe_is_a_table_of_places():
@@ -503,7 +504,8 @@ class Listener:
 def test_viewers_get_the_wall_every_two_seconds_and_the_file_does_not(run, monkeypatch):
     _, viewer, _ = run
     clock, listener = iter(np.arange(10.0, 20.0, 0.8)), Listener()
-    monkeypatch.setattr("cprl.viewer.pictures.time.perf_counter", lambda: next(clock))
+    perf_counter = SimpleNamespace(perf_counter=lambda: next(clock))  # other threads have the clock itself
+    monkeypatch.setattr("cprl.viewer.pictures.time", perf_counter)
     wall = Wall(viewer.env, listener, viewer.logger.scene, recorded_steps=100)
     for step in range(1, 10):
         wall.on_step(step, 3, None)
@@ -512,10 +514,13 @@ def test_viewers_get_the_wall_every_two_seconds_and_the_file_does_not(run, monke
     assert listener.live_only == [True] * 3
 
 
-def test_the_numbers_of_an_evaluation_are_means_with_their_error():
-    episodes = [fake(5, 0, returned=apples, tagged=0) for apples in (10.0, 14.0)]
-    assert played(episodes) == (12.0, 2.0, 2, 2)
-    assert np.isnan(played(episodes[:1]).error)
+def test_the_numbers_of_an_evaluation_are_means_with_their_interval_over_replicas():
+    """Episodes of a replica are no evidence of their own: 10 and 14 apples, so 12 and 12.706 x 2."""
+    episodes = [fake(5, 0, returned=apples, tagged=0) for apples in (9.0, 11.0, 15.0, 13.0)]
+    apples, died, count = played(episodes, replicas=2)
+    assert (apples.value, died, count) == (12.0, 4, 4)
+    assert (apples.low, apples.high) == pytest.approx((12 - 25.412, 12 + 25.412), abs=0.001)
+    assert f"{played(episodes).harvest}" == "12.0", "one replica has no interval"
 
 
 def test_who_tagged_whom_is_a_matrix_of_numbers_of_the_last_fifty_episodes(tmp_path):

@@ -446,6 +446,38 @@ def test_a_page_with_a_short_address_is_on_this_machine_alone_until_it_is_closed
     page.close()
 
 
+def asked(port, line, host):
+    """The first line of the answer to a request; "" for none."""
+    with socket.create_connection((LOCALHOST, port), timeout=10) as connection:
+        connection.sendall(b"%b\r\nHost: %b\r\n\r\n" % (line, host.encode()))
+        return connection.makefile("rb").readline().decode().strip()
+
+
+def test_a_page_answers_this_machine_alone_and_odd_requests_with_an_error(capfd):
+    served = WebViewer("rerun+http://127.0.0.1:9/proxy")
+    try:
+        for host, code in (
+            (f"127.0.0.1:{served.port}", 302),
+            (f"localhost:{served.port}", 302),
+            ("evil.example", 403),
+            (f"evil.example:{served.port}", 403),
+            ("127.0.0.1", 403),
+            ("", 403),
+        ):
+            assert f" {code} " in asked(served.port, b"GET / HTTP/1.1", host), host
+        ours = f"127.0.0.1:{served.port}"
+        for path in (b"/a\x01b", b"*", b"[", "/ü".encode(), b"http://evil.example/", b"/\x7f"):
+            assert " 400 " in asked(served.port, b"GET %b HTTP/1.1" % path, ours), path
+        wait(lambda: " 200 " in asked(served.port, b"GET /re_viewer_bg.wasm HTTP/1.1", ours))
+        with socket.create_connection((LOCALHOST, served.port), timeout=10) as leaves:
+            leaves.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # a reset
+            leaves.sendall(f"GET /re_viewer_bg.wasm HTTP/1.1\r\nHost: {ours}\r\n\r\n".encode())
+        wait(lambda: not [thread for thread in threading.enumerate() if "request" in thread.name])
+    finally:
+        served.close()
+    assert capfd.readouterr() == ("", "")
+
+
 @pytest.mark.integration
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_who_opens_the_page_late_reads_that_history_loads_until_it_has(tmp_path, monkeypatch):

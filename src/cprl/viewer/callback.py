@@ -24,7 +24,8 @@ from cprl.viewer.board import Filming
 from cprl.viewer.exhibition import Exhibition
 from cprl.viewer.layout import curves_of, missing_in, scene_of
 from cprl.viewer.live import HEADER
-from cprl.viewer.logger import FILE_NAME, RerunLogger, recording_id, recordings_of
+from cprl.viewer.logger import RerunLogger, recording_id
+from cprl.viewer.page import FILE_NAME, recordings_of
 from cprl.viewer.pictures import (
     JointActions,
     Lorenz,

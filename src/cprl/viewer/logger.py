@@ -1,6 +1,5 @@
 """RerunLogger: records a run with Rerun, to a file and, on request, live on 127.0.0.1."""
 
-import itertools
 import json
 import time
 import uuid
@@ -25,8 +24,8 @@ from cprl.values import shown
 from cprl.viewer.board import Frames, columns, fixed
 from cprl.viewer.layout import Curves, Scene, layout
 from cprl.viewer.live import FLUSH_TIMEOUT_S, REPLAY, RUN, Live, LiveStream, Stream, open_file
+from cprl.viewer.page import FILE_NAME
 
-FILE_NAME: Final = "run.rrd"
 TIMELINES: Final = ("step", "episode", "frame")
 """The timelines of every row: environment steps of the run, episodes, and frames recorded so far."""
 
@@ -38,12 +37,6 @@ _LONGEST: Final = 90
 """Characters of a value in the table; the recipe of the run has them all."""
 
 Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
-
-
-def recordings_of(run: Path) -> list[Path]:
-    """The recordings of a run so far, in their order: run.rrd, run-2.rrd and so on."""
-    names = (FILE_NAME if number == 1 else f"run-{number}.rrd" for number in itertools.count(1))
-    return list(itertools.takewhile(Path.exists, (run / name for name in names)))
 
 
 def recording_id(run: Path, file_name: str) -> str | None:

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, isfinite, isnan
-from statistics import fmean, stdev
 from threading import Event, Thread
 from typing import Final, NamedTuple
 
@@ -17,6 +16,7 @@ from cprl.measuring import phases
 from cprl.measuring.episodes import Episode
 from cprl.measuring.now import BEGINS, EXPLORING, Now
 from cprl.measuring.series import Values, mean_of
+from cprl.measuring.statistics import Estimate, estimate
 from cprl.runs.curves import SMOOTHED_EPISODES, running_mean
 from cprl.system.times import CLOCK
 from cprl.viewer.board import Filming
@@ -29,22 +29,22 @@ from cprl.viewer.pictures import View, has_died
 class Played(NamedTuple):
     """Episodes in fresh worlds, in numbers."""
 
-    mean: float
-    """The mean collective return in apples, or where the game reports no harvest the mean summed return."""
-    error: float
-    """Its standard error over episodes; NaN for a single one."""
+    harvest: Estimate
+    """The mean collective return in apples, or where the game reports no harvest the mean summed return, with
+    its interval over replicas; that of a single replica has none."""
     died: int | None
     """Episodes whose board died before the time was up; None where the game reports no stock."""
     episodes: int
 
 
-def played(episodes: Sequence[Episode]) -> Played:
-    """The numbers of at least one episode."""
+def played(episodes: Sequence[Episode], *, replicas: int = 1) -> Played:
+    """The numbers of at least one episode in fresh worlds, equally many of each replica, one replica after the
+    other; of any other number the mean alone."""
+    replicas = 1 if len(episodes) % replicas else replicas
     values = [float(episode.metrics.get("collective_return", episode.return_.sum())) for episode in episodes]
     died = [has_died(episode) for episode in episodes]
     return Played(
-        mean=fmean(values),
-        error=stdev(values) / len(values) ** 0.5 if len(values) > 1 else float("nan"),
+        harvest=estimate(np.reshape(values, (replicas, -1)).mean(1)),
         died=None if None in died else sum(map(bool, died)),
         episodes=len(values),
     )
@@ -82,7 +82,7 @@ class Header:
 
     def finished(self, trained: Played, random: Played) -> str:
         """After the evaluation of a run: the trained policy beside the random one, in fresh worlds."""
-        beside = f"trained {self._amount(trained.mean)}, random play {_number(random.mean)}"
+        beside = f"trained {self._amount(trained.harvest.value)}, random play {_number(random.harvest.value)}"
         died = "" if trained.died is None else self._died(trained.died, trained.episodes)
         return self._text(self._finished, beside, died)
 
@@ -204,8 +204,8 @@ class Story(View):
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
         """Sets what the group is compared with, and logs it as an event."""
-        self._random = played(episodes)
-        self.now.random_play = self._random.mean
+        self._random = played(episodes, replicas=self._curves.replicas)
+        self.now.random_play = self._random.harvest.value
         self._logger.log_text(f"random play {self._in_words(self._random)}")
 
     def on_episode(self, episode: Episode) -> None:
@@ -240,7 +240,7 @@ class Story(View):
             episode=self._ended,
             label=f"{self.now.label}, {EXPLORING}" if self.now.explores else self.now.label,
             mean=self.now.mean,
-            random_play=None if self._random is None else self._random.mean,
+            random_play=self.now.random_play,
             died=died,
         )
         self._logger.log_document(HEADER, text)
@@ -265,7 +265,9 @@ class Story(View):
 
     def finished(self, played_by: Mapping[str, Sequence[Episode]]) -> None:
         """Logs the evaluation of a run that is over, and its phases."""
-        trained, random = played(played_by["trained"]), played(played_by["random"])
+        replicas = self._curves.replicas
+        trained = played(played_by["trained"], replicas=replicas)
+        random = played(played_by["random"], replicas=replicas)
         self._end(self.header.finished(trained, random))
         self._logger.log_text(f"finished: trained {self._in_words(trained)}")
 
@@ -290,9 +292,8 @@ class Story(View):
         self._logger.log_document(HEADER, header)
 
     def _in_words(self, numbers: Played) -> str:
-        error = f" ± {numbers.error:.2g}" if isfinite(numbers.error) else ""
         died = "" if numbers.died is None else f"; {numbers.died:,} of {numbers.episodes:,} boards died early"
-        return f"{numbers.mean:.1f}{error} {self.header.unit}{died}"
+        return f"{numbers.harvest} {self.header.unit}{died}"
 
 
 def published_phases(game: Game | None) -> dict[int, str]:
@@ -371,8 +372,9 @@ class CompilingNotice(View):
     def _watch(self) -> None:
         was_running = False
         while not self._over.wait(self.PERIOD_S):
-            if CLOCK.is_running:
+            is_running = CLOCK.is_running  # once: it may end in between
+            if is_running:
                 self._show(f"compiling, {CLOCK.total_s - self._before_s:.0f} s so far")
             elif was_running:
                 self._show("begins")
-            was_running = CLOCK.is_running
+            was_running = is_running
