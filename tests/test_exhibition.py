@@ -21,7 +21,7 @@ from cprl.envs.make_env import make_env
 from cprl.population import Learning, Scripted, Team
 from cprl.training import train
 from cprl.training.agents import Population
-from cprl.training.outcome import exhibited, fresh_env
+from cprl.training.outcome import exhibited, fresh_env, random_play
 from cprl.viewer import exhibition
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.exhibition import BATCH_S, BATCH_STEPS, Exhibition
@@ -202,7 +202,25 @@ def test_it_plays_ten_to_twelve_steps_a_second_however_often_the_training_asks(k
     assert abs(len(boards) - 3 * BATCH_STEPS) <= 2
     assert len({repr(board) for board in boards}) > len(boards) / 2, "the board moves"
     assert kept.waits == [BATCH_S / BATCH_STEPS] * 3 * (BATCH_STEPS - 1), "they are sent one by one"
-    assert kept.rows("Points2D:labels", "caption")[-1] == ["present policy, episode 7, epsilon 1.00"]
+    assert kept.rows("Points2D:labels", "caption")[-1] == ["current policy, episode 7, epsilon 1.00"]
+
+
+@pytest.mark.parametrize("has_begun", [False, True])
+def test_random_play_moves_on_the_board_until_the_training_begins(has_begun, kept):
+    experiment = replace(ALONE, evaluation_episodes=2)
+    _, population = population_of(experiment)
+    played = random_play(experiment, population, seen=kept.exhibition.seen)
+    assert [episode.return_.tolist() for episode in played] == [
+        episode.return_.tolist() for episode in random_play(experiment, population)
+    ]
+    kept.exhibition.steps = int(has_begun)
+    kept.exhibition.random_play(played)
+    boards = kept.rows("SegmentationImage:buffer")[1:]  # the first is the map
+    assert len(boards) == (1 if has_begun else played[0].steps)
+    assert kept.rows("Points2D:labels", "caption")[-1] == ["random play, before the training"]
+    if not has_begun:
+        assert len({repr(board) for board in boards}) > len(boards) / 2, "the board moves"
+        assert set(kept.waits) == {BATCH_S / len(boards)}, "ten steps a second, of a long episode"
 
 
 @pytest.mark.integration

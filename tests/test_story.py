@@ -124,7 +124,7 @@ def test_strips_and_events_say_what_the_group_does_and_where_exploration_ends(tm
     assert said["episode 9: now steady"] == 9
     states = column(path, "now", "StateChange:state", "episode")
     assert states == ([0, 9], [["begins"], ["steady"]])
-    states = column(path, "now_exploring", "StateChange:state", "episode")
+    states = column(path, "exploring", "StateChange:state", "episode")
     assert states == ([0, 19], [["exploring"], ["settled"]])
 
 
@@ -153,6 +153,29 @@ def test_with_many_worlds_header_label_bold_line_and_new_bests_count_episodes(tm
         "episode 63: new best: 339.5 apples per episode, mean of the last 64",
         "episode 127: new best: 437.8 apples per episode, mean of the last 64",
     ]
+
+
+def test_header_and_timelines_count_the_episodes_that_all_replicas_have_ended(tmp_path):
+    """The first replica is far ahead; its last apples and frames stand where the header is."""
+    env = CommonsEnv(GAME, 4)
+    with ViewerCallback(tmp_path, env, title="run", episodes=20, worlds=2) as viewer:
+        for number, world in ((0, 0), (1, 1), (2, 0), (3, 1), (4, 0), (5, 0)):
+            viewer.on_episode(replace(fake(number, world, returned=30.0, tagged=0), replica=0), {})
+        for number, world in ((0, 2), (1, 3)):
+            viewer.on_episode(replace(fake(number, world, returned=30.0, tagged=0), replica=1), {})
+        assert viewer._episode == 2
+        viewer.on_episode(replace(fake(6, 0, returned=30.0, tagged=0), replica=0), {})
+    path = tmp_path / "run.rrd"
+    said = headers(path)
+    assert said[1][1].startswith("#### Episode 2 of 20 ")
+    assert said[1][0] == 1, "counted from 0"
+    assert texts(path)["episode 5: last apple taken in step 7"] == 0
+    ends = [
+        max(chunk.to_record_batch().column("episode").to_pylist())
+        for chunk in RrdReader(path).stream()
+        if "episode" in chunk.to_record_batch().schema.names
+    ]
+    assert max(ends) <= 2
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
@@ -200,7 +223,7 @@ def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_g
     assert titles[1] == {episode: title for episode, title in titles[0].items() if episode > 48}
     episodes, labels = column(resumed, "visits/labels", "Points2D:labels", "episode")
     assert (episodes[0], labels[0][0]) == (50, "0: episodes 50 to 51"), "who went where before was not kept"
-    for entity, present in (("now", {48: ["falling"]}), ("now_exploring", {50: ["exploring"]})):
+    for entity, present in (("now", {48: ["falling"]}), ("exploring", {50: ["exploring"]})):
         states = dict(zip(*column(complete, entity, "StateChange:state", "episode"), strict=True))
         later = {episode: state for episode, state in states.items() if episode > 48}
         goes_on = dict(zip(*column(resumed, entity, "StateChange:state", "episode"), strict=True))
@@ -273,6 +296,12 @@ def test_the_recipe_is_a_table_of_places():
     )
 
 
+def plotted(view):
+    """The entities of all plots of a layout."""
+    parts = getattr(view, "contents", None) or ()
+    return [entity for part in parts for entity in ([part] if isinstance(part, str) else plotted(part))]
+
+
 def test_a_layout_has_the_views_of_what_a_game_reports_and_the_live_one_the_present_policy():
     alone = replace(SCENE, agents=("a",))
     bare = Curves(agents=("a", "b"), metrics=(), has_tags=False)
@@ -287,13 +316,19 @@ def test_a_layout_has_the_views_of_what_a_game_reports_and_the_live_one_the_pres
             layout(bare),
         )
     )
-    assert {"Present policy", "Recorded episodes", "Overview", "Stock left at the end, apples"} <= live
-    assert live - file == {"Present policy", "Recorded episodes"}
+    assert {"Current policy", "Recorded episodes", "Overview", "Stock left at the end, apples"} <= live
+    assert live - file == {"Current policy", "Recorded episodes"}
     assert file - live == {"Board"}
-    wall = "All replicas; orange: the board of its last episode died"
+    wall = "All replicas; orange: the episode before ended without an apple"
     assert wall in several - file
     tags = next(name for name in file if name.startswith("Tags in"))
+    of_worlds = layout(replace(SCENE, worlds=16)).root_container.contents[1].contents
+    overview = next(set(names(tab)) for tab in of_worlds if tab.name == "Overview")
+    assert "Apples on the board, over the turn" in overview, "not sixteen small boards"
+    assert {"Peace", "Peacefulness"} <= {name.split(" (")[0].split(",")[0] for name in file}
     assert {tags, "Equality (1 - Gini), 0 to 1"} <= file - single
+    for curves in (SCENE, bare):
+        assert "+ /evaluation/return" in plotted(layout(curves).root_container)
     joint = "Joint actions, share of turns; agent 0 first"
     assert joint in matrix - stage
     assert {"Return of each, rewards", "Learning", "Events", "Recipe"} <= stage
@@ -523,10 +558,17 @@ def test_the_numbers_of_an_evaluation_are_means_with_their_interval_over_replica
     assert f"{played(episodes).harvest}" == "12.0", "one replica has no interval"
 
 
-def test_who_tagged_whom_is_a_matrix_of_numbers_of_the_last_fifty_episodes(tmp_path):
-    path = recorded(tmp_path, range(60), episodes=60, tagged=1)
+def test_who_tagged_whom_is_a_matrix_of_tags_in_an_episode_of_the_last_fifty(tmp_path):
+    with ViewerCallback(tmp_path, CommonsEnv(GAME, 2), title="run", episodes=60) as viewer:
+        for number in range(60):
+            for world in (0, 1):
+                episode = fake(number, world, returned=30.0, tagged=2 if number < 10 else world)
+                viewer.on_episode(episode, {})
+    path = tmp_path / "run.rrd"
     episodes, labels = column(path, "tags/counts", "Points2D:labels", "episode")
     assert episodes == [9, 19, 29, 39, 49, 59]
-    assert labels[0] == ["0", "0", "10", "0", "0", "1", "0", "1"], "agent 1 by agent 0"
-    assert labels[-1][2] == "50"
+    assert labels[0] == ["0", "0", "2", "0", "0", "1", "0", "1"], "agent 1 by agent 0"
+    assert labels[1][2] == "1.25", "10 episodes of 2 and 10 of 0 or 1, in each of two replicas"
+    assert labels[4][2] == "0.8", "of fifty"
+    assert labels[5][2] == "0.5", "the first ten are too long ago"
     assert len(column(path, "tags", "Image:buffer")[0]) == 6

@@ -52,8 +52,8 @@ class Now:
     - steady: else.
 
     Args:
-        worlds: the worlds W of each replica. A value is then the mean of W episodes, and m is of as few values
-            as have these episodes: of sixteen worlds of one value, the mean of sixteen episodes.
+        worlds: the worlds W of each replica. A value is then the mean of W episodes, and m is of as few
+            values as have these episodes: of sixteen worlds of one value, the mean of sixteen episodes.
     """
 
     def __init__(self, worlds: int = 1) -> None:

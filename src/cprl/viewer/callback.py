@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 
 from cprl.envs.unwrap import agent_names, base_env, commons_of
 from cprl.measuring.episodes import Episode
+from cprl.measuring.evaluate import Policy
 from cprl.measuring.metrics import reported_by
 from cprl.measuring.series import OF_AGENTS, Series, numbers_of
 from cprl.policies.present import PresentPolicy
@@ -23,7 +24,6 @@ from cprl.runs.episodes import metrics_in, read_episodes
 from cprl.viewer.board import Filming
 from cprl.viewer.exhibition import Exhibition
 from cprl.viewer.layout import curves_of, missing_in, scene_of
-from cprl.viewer.live import HEADER
 from cprl.viewer.logger import RerunLogger, recording_id
 from cprl.viewer.page import FILE_NAME, recordings_of
 from cprl.viewer.pictures import (
@@ -55,8 +55,9 @@ class ViewerCallback:
 
     Frames are recorded for every k-th episode of that world, including the first and the last, and for the
     episode after each new best. With several replicas metrics are logged once all have ended an episode: the
-    mean and each replica; returns, losses and the like as means only. Those of every W episodes of replicas
-    in W worlds are logged together. A callback of `cprl.training`, and a context manager.
+    mean and each replica; returns, losses and the like as means only. With W worlds a replica, metrics are
+    means over every W episodes. Header, board and timelines count the episodes that all replicas have ended.
+    A callback of `cprl.training`, and a context manager.
 
     Of a run that is resumed the views get the episodes in its table, and viewers the recording so far.
 
@@ -69,7 +70,7 @@ class ViewerCallback:
         worlds: the worlds W of each replica.
         metrics: the names of the user's own.
         live: "serve" or "spawn", see `cprl.viewer.live`; None for the file alone.
-        exhibited: what is exhibited live: the present policy and one world for it, see
+        exhibited: what is exhibited live: the current policy and one world for it, see
             `cprl.viewer.exhibition`.
         file_name: the name of the recording instead of `run.rrd`; there must be no such file.
         is_replay: whether a stored policy is replayed, see `cprl.viewer.layout.Scene`.
@@ -110,7 +111,9 @@ class ViewerCallback:
         self.filming = Filming(commons, self.logger, scene, episodes=-(-episodes // worlds))
         """Which episodes of the first world are recorded frame by frame."""
         self._series = Series(curves.replicas, worlds)
-        self._turn = self._step = self._episode = self._filmed = 0
+        self._turn = self._step = self._filmed = 0
+        self._episode = 0
+        """The episodes that all replicas have ended: what header, board and timelines say."""
         self._rate_at, self._rate_step = time.perf_counter(), 0
         self.logger.log_hparams({"run": run.name, **(recipe or {})})
         self.logger.log_text(f"{title} begins")
@@ -120,7 +123,7 @@ class ViewerCallback:
             self.logger.log_text("no exhibition: the game has no board")
         self.story: Story | None = None
         self.exhibition: Exhibition | None = None
-        """What the present policy plays for viewers; None where nothing is exhibited."""
+        """What the current policy plays for viewers; None where nothing is exhibited."""
         self._views = self._make_views(episodes, exhibited, is_about=is_about, is_replay=is_replay)
         self._sampled = gcd(*(view.stride for view in self._views)) or 1
         """Turns from one look at the worlds to the next where no frame is recorded."""
@@ -170,7 +173,7 @@ class ViewerCallback:
 
     def _show_status(self, status: str) -> None:
         if self.story is not None and self._episode == 0:
-            self.logger.show_live(HEADER, self.story.header.begins(status))
+            self.story.begins(status)
 
     def on_start(self, training: Any) -> None:
         """Goes on where a `Training` that is resumed is."""
@@ -210,20 +213,17 @@ class ViewerCallback:
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Logs the numbers of an episode, and its events, once all replicas have ended it."""
-        self.logger.at(step=self._step, episode=episode.episode)
+        self.logger.at(step=self._step, episode=self._episode)
         for view in self._views:
             view.on_episode(episode)
-        if episode.replica == 0:
-            self._episode = episode.episode + 1
         if episode.world == 0:
             self._filmed, self.filming.shows_next = self._filmed + 1, False
-        of_all, worlds = (
-            self._series.add(episode, numbers_of(episode, learning, self._agents)),
-            self._series.worlds,
-        )
+        of_all = self._series.add(episode, numbers_of(episode, learning, self._agents))
         if of_all is not None:
+            self._episode += self._series.worlds
+            self.logger.at(step=self._step, episode=self._episode - 1)
             for view in self._views:
-                view.on_all(episode.episode // worlds * worlds + worlds - 1, of_all)
+                view.on_all(self._episode - 1, of_all)
             self._log_speed()
         self.filming.choose(self._filmed)
 
@@ -232,6 +232,10 @@ class ViewerCallback:
         if steps:
             self.logger.log_scalar("time/env_steps_per_s", steps / (now - self._rate_at))
             self._rate_at, self._rate_step = now, self._step
+
+    def seen_at_random(self, env: EnvBase, policy: Policy) -> Policy:
+        """The policy of random play; viewers see its first world until the training begins."""
+        return policy if self.exhibition is None else self.exhibition.seen(env, policy)
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
         """Compares the training with these episodes of random play: in header, label, plots and an event."""

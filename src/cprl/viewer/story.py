@@ -20,7 +20,7 @@ from cprl.measuring.statistics import Estimate, estimate
 from cprl.runs.curves import SMOOTHED_EPISODES, running_mean
 from cprl.system.times import CLOCK
 from cprl.viewer.board import Filming
-from cprl.viewer.layout import ANOTHER, SETTLED, STRIPS, Curves
+from cprl.viewer.layout import ANOTHER, SETTLED, STRIPS, Curves, legend_of
 from cprl.viewer.live import HEADER
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.pictures import View, has_died
@@ -38,8 +38,8 @@ class Played(NamedTuple):
 
 
 def played(episodes: Sequence[Episode], *, replicas: int = 1) -> Played:
-    """The numbers of at least one episode in fresh worlds, equally many of each replica, one replica after the
-    other; of any other number the mean alone."""
+    """The numbers of at least one episode in fresh worlds, equally many of each replica, one replica after
+    the other; of any other number the mean alone."""
     replicas = 1 if len(episodes) % replicas else replicas
     values = [float(episode.metrics.get("collective_return", episode.return_.sum())) for episode in episodes]
     died = [has_died(episode) for episode in episodes]
@@ -62,6 +62,8 @@ class Header:
     """"apples" or "return"."""
     rules: str = ""
     """The institutions in force, in words."""
+    legend: str = ""
+    """What a point of a curve is, below each header."""
     is_about: bool = False
     """Whether it trains so many steps."""
 
@@ -69,8 +71,9 @@ class Header:
     def _of(self) -> str:
         return f"of {'about ' * self.is_about}{self.episodes:,}"
 
-    def begins(self, status: str) -> str:
-        return self._text(f"Episode 1 {self._of}", status)
+    def begins(self, status: str, random_play: float | None = None) -> str:
+        beside = "" if random_play is None else f"random play {self._amount(random_play)}"
+        return self._text(f"Episode 1 {self._of}", status, beside)
 
     def line(
         self, *, episode: int, label: str, mean: float, random_play: float | None, died: int | None
@@ -99,7 +102,8 @@ class Header:
         return self._text(f"Stopped after {episode:,} {self._of} episodes", amount)
 
     def _text(self, *parts: str) -> str:
-        return f"#### {' · '.join(part for part in (*parts, self.rules) if part)}"
+        line = f"#### {' · '.join(part for part in (*parts, self.rules) if part)}"
+        return f"{line}\n\n{self.legend}" if self.legend else line
 
     def _amount(self, value: float) -> str:
         return f"{_number(value)} apples" if self.unit == "apples" else f"{self.unit} {_number(value)}"
@@ -187,6 +191,7 @@ class Story(View):
             boards=self._curves.replicas * self._curves.worlds,
             unit=self._curves.unit,
             rules=rules_of(game),
+            legend=legend_of(self._curves),
             is_about=is_about,
         )
         self.now = Now(self._curves.worlds)
@@ -207,6 +212,12 @@ class Story(View):
         self._random = played(episodes, replicas=self._curves.replicas)
         self.now.random_play = self._random.harvest.value
         self._logger.log_text(f"random play {self._in_words(self._random)}")
+        if not self._ended:
+            self.begins(BEGINS)
+
+    def begins(self, status: str) -> None:
+        """Says live what is done before the first episode ends, e.g. "compiling, 12 s so far"."""
+        self._logger.show_live(HEADER, self.header.begins(status, self.now.random_play))
 
     def on_episode(self, episode: Episode) -> None:
         if (died := has_died(episode)) is not None:
@@ -255,7 +266,7 @@ class Story(View):
             return []
         before, explored, events = self.now.label, self.now.explores, []
         label = self.now.add(value, {name: mean for name, mean in means.items() if name.endswith("/epsilon")})
-        if label != before or episode == 0:
+        if label != before or episode < self._curves.worlds:
             self._logger.log_states(_NOW, {episode: label})
         if self.now.explores != explored:
             self._logger.log_states(_EXPLORING, {episode: EXPLORING if self.now.explores else SETTLED})
