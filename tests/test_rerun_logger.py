@@ -98,6 +98,20 @@ def test_beams_and_those_out_of_play_have_marks_that_are_told_when_they_change(t
     assert colours[1][0] >> 8 == 0xE66100, "in agent 1's own colour"
 
 
+def test_what_is_logged_together_is_sent_together(tmp_path):
+    """A header that is sent with the next episode's first number is old when it is read."""
+    with RerunLogger("run", tmp_path, curves=SCENE) as logger:
+        (stream,) = logger._streams
+        stream.period_s = 0.0
+        logger.log_scalar("alone", 1.0)
+        assert not stream.waiting
+        with logger.together():
+            logger.log_scalar("first", 1.0)
+            logger.log_document("header", "# Episode 1")
+            assert list(stream.waiting) == ["first", "header"]
+        assert not stream.waiting
+
+
 def test_colours_and_names_of_classes_are_in_the_recording(tmp_path):
     with RerunLogger("run", tmp_path, curves=SCENE):
         pass

@@ -32,7 +32,7 @@ from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.layout import Curves, Panels, curves_of, joint_actions, layout
 from cprl.viewer.live import LiveStream, Stream
 from cprl.viewer.logger import RerunLogger, as_table, send_waiting
-from cprl.viewer.pictures import Turns, Visits, Wall, gini, lorenz_curve
+from cprl.viewer.pictures import Lorenz, Plots, Turns, Visits, Wall, gini, lorenz_curve
 from cprl.viewer.story import CompilingNotice, Header, played, published_phases
 
 __all__ = ["strict_rerun"]
@@ -409,6 +409,31 @@ def trained(folder, *, game=SMALL, replicas=2, episodes=6):
         others = random_agents(game.spaces, tuple(range(game.agents)), replicas=replicas, seed=1)
         train(env, {}, others=others, episodes=episodes, callbacks=[seen, viewer])
     return folder / "run.rrd", viewer, seen
+
+
+def test_before_the_first_point_viewers_see_random_play_and_read_when_curves_begin():
+    sent = []
+
+    def log_columns(name, at, columns, *, live_only=False):
+        assert live_only, "the file has them with the first point"
+        values = {
+            part.component_descriptor().component: part.as_arrow_array().to_pylist() for part in columns
+        }
+        sent.append((name, at[1], values))
+
+    curves = curves_of(CommonsEnv(GAME, 16), GAME.agent_names, ["harvest"], episodes=300, worlds=16)
+    logger = SimpleNamespace(curves=curves, log_columns=log_columns, log_static=lambda *parts: None)
+    Plots(logger).random_play([fake(0, 0, returned=280.0, tagged=0)])
+    lines = {name: (at, values["Scalars:scalars"]) for name, at, values in sent}
+    assert lines["random_play/collective_return"] == ([0, 1], [[280.0], [280.0]]), "a line needs two points"
+    sent.clear()
+    Turns(CommonsEnv(GAME, 16), logger, every=15)
+    Lorenz(logger, every=20)
+    said = [(name, values["Points2D:labels"]) for name, _, values in sent]
+    assert said == [
+        ("turn/title", [["lines from episode 16 on"]]),
+        ("lorenz/title", [["lines from episode 32 on"]]),
+    ]
 
 
 def view_of(viewer, kind):

@@ -222,9 +222,10 @@ class ViewerCallback:
         if of_all is not None:
             self._episode += self._series.worlds
             self.logger.at(step=self._step, episode=self._episode - 1)
-            for view in self._views:
-                view.on_all(self._episode - 1, of_all)
-            self._log_speed()
+            with self.logger.together():
+                for view in self._views:
+                    view.on_all(self._episode - 1, of_all)
+                self._log_speed()
         self.filming.choose(self._filmed)
 
     def _log_speed(self) -> None:

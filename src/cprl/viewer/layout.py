@@ -443,7 +443,7 @@ def flat(
     return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=BACKGROUND, visual_bounds=bounds)
 
 
-_HEADER, _RULER, _STRIP, _VIEWS = 92, 22, 40, 460
+_HEADER, _RULER, _STRIP, _VIEWS = 80, 22, 40, 470
 """Heights in a window of 1280 x 720, in pixels: the header, the ruler above strips, a strip, and all else.
 Rows share out any other height as they do this one."""
 

@@ -166,6 +166,7 @@ class RerunLogger(Logger):
         self.frames = 0
         """Frames recorded so far, including those in earlier files of the recording."""
         self._now = (0, 0)
+        self._is_together = False
         self._clips_end: dict[str, int] = {}
         super().__init__(exp_name, str(log_dir))
 
@@ -228,6 +229,21 @@ class RerunLogger(Logger):
         finally:
             self._streams = streams
 
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """Send all that is logged within the block at the same time, so that it agrees when it is seen."""
+        self._is_together = True
+        try:
+            yield
+        finally:
+            self._is_together = False
+            self._send_due()
+
+    def _send_due(self) -> None:
+        for stream in self._streams:
+            if stream.is_due and not self._is_together:
+                send_waiting(stream)
+
     def log_static(self, entity: str, *what: Any) -> None:
         """Logs archetypes that hold at all times."""
         self.do(lambda recording: recording.log(entity, *what, static=True))
@@ -279,8 +295,7 @@ class RerunLogger(Logger):
     def _wait(self, name: str, step: int, values: list[float] | str) -> None:
         for stream in self._streams:
             stream.waiting.setdefault(name, []).append((step, self._now[1], self.frames, values))
-            if stream.is_due:
-                send_waiting(stream)
+        self._send_due()
 
     def log_states(self, name: str, states: Mapping[int, str], *, live_only: bool = False) -> None:
         """Logs states by the episode from which they hold; their step is the one set by `at`."""
