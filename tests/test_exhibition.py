@@ -296,9 +296,9 @@ def test_viewers_that_do_not_keep_up_miss_frames_and_nothing_waits(kept, monkeyp
 def test_after_the_training_the_trained_policy_plays_on_and_rests_on_the_last_board_of_an_episode(kept):
     waits = []
     stop = SimpleNamespace(wait=waits.append, is_set=lambda: waits.count(exhibition.REST_S) == 2)
-    kept.exhibition.play_on(stop, episode=4)
+    kept.exhibition.play_on(stop)
     boards, captions = kept.rows("SegmentationImage:buffer"), kept.rows("Points2D:labels", "caption")
-    plays = "trained policy, episode 4, epsilon 0.05"
+    plays = "trained policy, epsilon 0.05"
     assert captions[1:] == 2 * [[plays], [f"{plays}: the end, turn 20"]]
     assert waits == 2 * [exhibition.REST_S]
     assert len(boards) == 1 + 2 * (1 + 20)

@@ -14,7 +14,7 @@ from recordings import GAME, SCENE, column, names, static, strict_rerun
 from rerun.chunk import RrdReader
 from tensordict import TensorDict
 from test_now import SIXTEEN_WORLDS
-from test_watch import connected, fake
+from test_watch import connected, fake, received
 
 from cprl import CommonsEnv, Game, Rules, maps, presets
 from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, agent_colour
@@ -82,7 +82,8 @@ def test_the_header_goes_from_the_beginning_to_the_end(tmp_path):
     line = "Episode 1 of 6 · begins, exploring · 50 apples, random play 282 · 0 of 2 boards died early"
     assert said[1] == (0, f"#### {line}")
     assert said[-2][1].endswith("· 2 of 2 boards died early")
-    line = "Finished, 6 episodes · trained 100 apples, random play 282 · 4 of 4 boards died early"
+    amounts = "while learning 50 apples, trained 100, random play 282"
+    line = f"Finished, 6 episodes · {amounts} · 4 of 4 boards died early"
     assert said[-1] == (5, f"#### {line}")
     words = [text for text in texts(path) if "random play" in text]
     assert words == ["random play 282 [257, 307] apples; 0 of 2 boards died early"]
@@ -237,7 +238,7 @@ def seen_by_viewers(logger, folder, entity, episodes):
     client = connected(logger.addresses["native"].split()[-1], folder)
     try:
         ends = time.monotonic() + 60
-        while sorted(column(folder / "got.rrd", entity, "Scalars:scalars", "episode")[0]) != episodes:
+        while sorted(received(folder, entity, "Scalars:scalars", "episode")[0]) != episodes:
             assert time.monotonic() < ends
             time.sleep(0.5)
     finally:
@@ -316,8 +317,8 @@ def test_a_layout_has_the_views_of_what_a_game_reports_and_the_live_one_the_pres
             layout(bare),
         )
     )
-    assert {"Current policy", "Recorded episodes", "Overview", "Stock left at the end, apples"} <= live
-    assert live - file == {"Current policy", "Recorded episodes"}
+    assert {"Live board", "Recorded episodes", "Overview", "Stock left at the end, apples"} <= live
+    assert live - file == {"Live board", "Recorded episodes"}
     assert file - live == {"Board"}
     wall = "All replicas; orange: the episode before ended without an apple"
     assert wall in several - file

@@ -253,7 +253,7 @@ class ViewerCallback:
     def play_on(self, stop: Event) -> None:
         """Exhibits the trained policy until the event is set; returns at once where nothing is exhibited."""
         if self.exhibition is not None:
-            self.exhibition.play_on(stop, episode=self._episode)
+            self.exhibition.play_on(stop)
 
     def flush(self) -> None:
         """Sends all that waits, to the file and to viewers."""

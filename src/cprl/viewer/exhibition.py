@@ -123,14 +123,14 @@ class Exhibition(View):
     def _rests(self, seconds: float) -> bool:
         return self._wait(seconds) or self.steps > 0
 
-    def play_on(self, stop: Event, *, episode: int) -> None:
+    def play_on(self, stop: Event) -> None:
         """Plays the trained policy until the event is set; returns at once where it has ended.
 
         It rests when an episode ends.
         """
         self._policy.is_trained = True
         while not (self.is_over or stop.is_set()):
-            self._play(episode)
+            self._play(0)
             stop.wait(BATCH_S if self._carried is not None else REST_S)
 
     def close(self) -> None:
@@ -213,11 +213,11 @@ class Exhibition(View):
 
 def caption_of(policy: PresentPolicy, episode: int) -> str:
     """What is shown: "current policy, episode 1,234, epsilon 0.31", without the last for agents that have no
-    epsilon."""
+    epsilon, and without the episode after the training."""
     policy.explore_as_now()
     chances = list(dict.fromkeys(f"{epsilon:.2f}" for epsilon in policy.epsilons))
     chance = f", epsilon {' to '.join(dict.fromkeys((chances[0], chances[-1])))}" if chances else ""
-    return f"{'trained' if policy.is_trained else 'current'} policy, episode {episode:,}{chance}"
+    return f"trained policy{chance}" if policy.is_trained else f"current policy, episode {episode:,}{chance}"
 
 
 _CAPTION_CELLS = 2.3

@@ -427,13 +427,13 @@ def decision_panels(agents: int, actions: int, window: tuple[int, int]) -> Panel
 
 PLOT_WIDE, PLOT_HIGH = 260.0, 80.0
 """The size of a plot that is not over time, in the view's units; (0, 0) is the top left of its area."""
-TITLE: Final = PLOT_WIDE / 2, -16.0
+TITLE: Final = PLOT_WIDE / 2, -22.0
 """Where its title hangs."""
 
 
 def _drawn_plot(name: str, origin: str) -> Any:
     """The view of a plot that is not over time, with room for its texts."""
-    return flat(name, origin, x=(-24.0, PLOT_WIDE + 16.0), y=(TITLE[1], PLOT_HIGH + 26.0))
+    return flat(name, origin, x=(-24.0, PLOT_WIDE + 16.0), y=(TITLE[1], PLOT_HIGH + 34.0))
 
 
 def flat(
@@ -443,7 +443,7 @@ def flat(
     return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=BACKGROUND, visual_bounds=bounds)
 
 
-_HEADER, _RULER, _STRIP, _VIEWS = 80, 22, 40, 470
+_HEADER, _RULER, _STRIP, _VIEWS = 90, 22, 40, 462
 """Heights in a window of 1280 x 720, in pixels: the header, the ruler above strips, a strip, and all else.
 Rows share out any other height as they do this one."""
 
@@ -537,9 +537,7 @@ def _overview(curves: Curves, *, live: bool) -> Any:
             else None
         )
         return rrb.Horizontal(rrb.Vertical(gets, _returns(curves)), *_present([joint]), name="Overview")
-    board = (
-        _board("Current policy", curves, origin="exhibition", below=4.2) if live else _board("Board", curves)
-    )
+    board = _board("Live board", curves, origin="exhibition", below=4.2) if live else _board("Board", curves)
     boards, high = _social(curves, "survival_steps"), 1.0
     if curves.worlds > 1:
         boards, high = _turns(), 1.4

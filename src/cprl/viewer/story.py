@@ -83,9 +83,15 @@ class Header:
         deaths = "" if died is None else self._died(died, self.boards)
         return self._text(f"Episode {episode:,} {self._of}", label, f"{self._amount(mean)}{beside}", deaths)
 
-    def finished(self, trained: Played, random: Played) -> str:
-        """After the evaluation of a run: the trained policy beside the random one, in fresh worlds."""
-        beside = f"trained {self._amount(trained.harvest.value)}, random play {_number(random.harvest.value)}"
+    def finished(self, learning: float, trained: Played, random: Played) -> str:
+        """After the evaluation of a run: the last mean of its training, and of fresh worlds those of the
+        trained policy, which explores less there, and of random play."""
+        amounts = {"trained": trained.harvest.value, "random play": random.harvest.value}
+        if not isnan(learning):
+            amounts = {"while learning": learning, **amounts}
+        (first, amount), *others = amounts.items()
+        beside = ", ".join(f"{name} {_number(value)}" for name, value in others)
+        beside = f"{first} {self._amount(amount)}, {beside}"
         died = "" if trained.died is None else self._died(trained.died, trained.episodes)
         return self._text(self._finished, beside, died)
 
@@ -279,7 +285,7 @@ class Story(View):
         replicas = self._curves.replicas
         trained = played(played_by["trained"], replicas=replicas)
         random = played(played_by["random"], replicas=replicas)
-        self._end(self.header.finished(trained, random))
+        self._end(self.header.finished(self.now.mean, trained, random))
         self._logger.log_text(f"finished: trained {self._in_words(trained)}")
 
     def close(self) -> None:
