@@ -21,7 +21,7 @@ from cprl.envs.make_env import make_env
 from cprl.population import Learning, Scripted, Team
 from cprl.training import train
 from cprl.training.agents import Population
-from cprl.training.outcome import exhibited, fresh_env
+from cprl.training.outcome import exhibited, fresh_env, random_play
 from cprl.viewer import exhibition
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.exhibition import BATCH_S, BATCH_STEPS, Exhibition
@@ -202,7 +202,25 @@ def test_it_plays_ten_to_twelve_steps_a_second_however_often_the_training_asks(k
     assert abs(len(boards) - 3 * BATCH_STEPS) <= 2
     assert len({repr(board) for board in boards}) > len(boards) / 2, "the board moves"
     assert kept.waits == [BATCH_S / BATCH_STEPS] * 3 * (BATCH_STEPS - 1), "they are sent one by one"
-    assert kept.rows("Points2D:labels", "caption")[-1] == ["present policy, episode 7, epsilon 1.00"]
+    assert kept.rows("Points2D:labels", "caption")[-1] == ["current policy, episode 7, epsilon 1.00"]
+
+
+@pytest.mark.parametrize("has_begun", [False, True])
+def test_random_play_moves_on_the_board_until_the_training_begins(has_begun, kept):
+    experiment = replace(ALONE, evaluation_episodes=2)
+    _, population = population_of(experiment)
+    played = random_play(experiment, population, seen=kept.exhibition.seen)
+    assert [episode.return_.tolist() for episode in played] == [
+        episode.return_.tolist() for episode in random_play(experiment, population)
+    ]
+    kept.exhibition.steps = int(has_begun)
+    kept.exhibition.random_play(played)
+    boards = kept.rows("SegmentationImage:buffer")[1:]  # the first is the map
+    assert len(boards) == (1 if has_begun else played[0].steps)
+    assert kept.rows("Points2D:labels", "caption")[-1] == ["random play, before the training"]
+    if not has_begun:
+        assert len({repr(board) for board in boards}) > len(boards) / 2, "the board moves"
+        assert set(kept.waits) == {BATCH_S / len(boards)}, "ten steps a second, of a long episode"
 
 
 @pytest.mark.integration
@@ -278,9 +296,9 @@ def test_viewers_that_do_not_keep_up_miss_frames_and_nothing_waits(kept, monkeyp
 def test_after_the_training_the_trained_policy_plays_on_and_rests_on_the_last_board_of_an_episode(kept):
     waits = []
     stop = SimpleNamespace(wait=waits.append, is_set=lambda: waits.count(exhibition.REST_S) == 2)
-    kept.exhibition.play_on(stop, episode=4)
+    kept.exhibition.play_on(stop)
     boards, captions = kept.rows("SegmentationImage:buffer"), kept.rows("Points2D:labels", "caption")
-    plays = "trained policy, episode 4, epsilon 0.05"
+    plays = "trained policy, epsilon 0.05"
     assert captions[1:] == 2 * [[plays], [f"{plays}: the end, turn 20"]]
     assert waits == 2 * [exhibition.REST_S]
     assert len(boards) == 1 + 2 * (1 + 20)

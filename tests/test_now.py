@@ -13,6 +13,11 @@ from cprl.runs.curves import curves_of
 RANDOM = 282.0
 TRAGEDY = np.repeat([312, 413, 492, 534, 587, 629, 618, 572, 418, 373, 270], 10)
 """Apples of four DQN agents who explore for sixty episodes; issue 17."""
+SIXTEEN_WORLDS = (
+    *(318, 395, 322, 323, 437, 516, 438, 360, 266, 243, 217, 206),
+    *(195, 193, 200, 191, 197, 190),
+)
+"""Mean apples of each 16 episodes of recipes/tragedy.py, whose random play gets 280; the last ones about."""
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 
 
@@ -51,6 +56,28 @@ def test_a_tragedy_is_seen_from_its_numbers_before_it_is_over():
 def test_a_course_is_judged_by_what_it_gains_loses_and_regains(levels, random_play, expected):
     course = labels(np.repeat(levels, 20), random_play=random_play)
     assert " ".join(label for label, _ in course) == expected
+
+
+def test_with_many_worlds_the_tragedy_is_seen_in_as_many_episodes_as_with_one():
+    now, seen = Now(worlds=16), []
+    now.random_play = 280.0
+    for group, apples in enumerate(SIXTEEN_WORLDS, 1):
+        seen.append((16 * group, now.add(apples)))
+        assert now.mean == pytest.approx(apples, rel=0.1)
+    first = {label: episode for episode, label in reversed(seen)}
+    assert set(first) == {"steady", "rising", "falling", "below random play"}
+    assert first["steady"] == 16, "sixteen episodes are evidence enough"
+    assert first["rising"] < first["falling"] < first["below random play"] < 170
+    assert dict(seen)[96] == "rising", "where the agents get most"
+    assert all(label == "below random play" for episode, label in seen if episode >= 170)
+
+
+def test_a_mean_counts_episodes_whatever_the_number_that_each_value_is_of():
+    assert [Recent(10, each=worlds).window for worlds in (1, 3, 4, 10, 16, 256)] == [10, 4, 3, 1, 1, 1]
+    recent = Recent(10, share=0.1, each=16)
+    for value in range(40):
+        recent.add(value)
+    assert recent.window == 4, "a tenth of 640 episodes"
 
 
 def test_noise_around_random_play_is_neither_rise_nor_fall():

@@ -15,6 +15,7 @@ from cprl.algorithms import DQN
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.learners.settings import DQNSettings
 from cprl.measuring.evaluate import evaluate
+from cprl.measuring.statistics import estimate
 from cprl.population import Learning, Scripted
 from cprl.runs.episodes import read_table
 from cprl.training.outcome import evaluate_population, fresh_env, is_same_later, make_agents, random_play
@@ -83,18 +84,21 @@ def test_a_run_has_the_same_outcome_watched_or_not_and_its_recording_shows_the_e
         unwatched, others = (read_table(run / "evaluation" / f"{policy}.parquet") for run in (off, watched))
         assert unwatched.equals(others)
     headers = [text[0] for text in column(watched / "run.rrd", "header", "TextDocument:text")[1]]
-    random, trained = (
-        np.mean(np.array(read_table(watched / "evaluation" / f"{policy}.parquet")["collective_return"]))
+    harvests = (
+        np.array(read_table(watched / "evaluation" / f"{policy}.parquet")["collective_return"])
         for policy in ("random", "trained")
     )
+    estimates = [estimate(harvest.reshape(EXPERIMENT.replicas, -1).mean(1)) for harvest in harvests]
+    random, trained = (each.value for each in estimates)
     assert headers[0].startswith("#### Episode 1 of 3 · begins")
     assert headers[-2].startswith("#### Episode 3 of 3 · begins, exploring · ")
     assert f" apples, random play {random:.3g} · " in headers[-2]
-    ended = f"#### Finished, 3 episodes · trained {trained:.3g} apples, random play {random:.3g} · "
-    assert headers[-1].startswith(ended)
+    learning = headers[-2].split(" · ")[2].split(",")[0]
+    ended = f"#### Finished, 3 episodes · while learning {learning}, trained {trained:.3g}, "
+    assert headers[-1].startswith(f"{ended}random play {random:.3g} · ")
     events = [text[0] for text in column(watched / "run.rrd", "log", "TextLog:text")[1]]
-    assert any(event.startswith(f"random play {random:.1f} ± ") for event in events)
-    assert any(event.startswith(f"finished: trained {trained:.1f}") for event in events)
+    assert any(event.startswith(f"random play {estimates[0]} apples") for event in events)
+    assert any(event.startswith(f"finished: trained {estimates[1]} apples") for event in events)
     assert not any("checkpoint" in event for event in events)
     lines = column(watched / "run.rrd", "random_play/survival_steps", "Scalars:scalars", "episode")
     assert lines[0] == [0, 1, 2]

@@ -26,7 +26,7 @@ from cprl import CommonsEnv, Observation
 from cprl.commons.colours import APPLE, BEAM, COLOURS, FIRST_AGENT, GROUND, OTHER, PALETTE, SELF, WALL
 from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.viewer.board import boards, mosaic
-from cprl.viewer.layout import Scene, window_corners
+from cprl.viewer.layout import EMPTY_SITE, Scene, window_corners
 from cprl.viewer.logger import RerunLogger
 
 __all__ = ["strict_rerun"]
@@ -62,9 +62,10 @@ def test_frames_show_the_board_the_agents_and_what_each_sees(tmp_path):
         if frame.in_play[1]:
             agents[int(frame.row[1]), int(frame.col[1])] = FIRST_AGENT + 1
         for site, apple in zip(GAME.map.sites, frame.stock, strict=True):
-            assert site in agents or inner[site] == (APPLE if apple else GROUND)
+            assert site in agents or inner[site] == (APPLE if apple else EMPTY_SITE)
         assert {cell: inner[cell] for cell in agents} == agents
-        assert (inner >= FIRST_AGENT).sum() == len(agents), "who is out of play is not drawn as if it were in"
+        others = (inner >= FIRST_AGENT) & (inner != EMPTY_SITE)
+        assert others.sum() == len(agents), "who is out of play is not drawn as if it were in"
     _, lines = column(path, "world/agents", "LineStrips2D:strips")
     assert [len(drawn) for drawn in lines] == [4, 4, 2, 2, 2, 2], "a triangle and a digit an agent in play"
     (_, tip, *_), _, digit, _ = (np.array(line) for line in lines[1])
@@ -85,10 +86,9 @@ def test_beams_and_those_out_of_play_have_marks_that_are_told_when_they_change(t
     with RerunLogger("run", tmp_path, curves=SCENE) as logger:
         logger.log_frames(frames(6)[0])
     path = tmp_path / "run.rrd"
-    steps, beams = column(path, "world/beams", "SegmentationImage:buffer")
+    steps, beams = column(path, "world/beams", "Points2D:positions")
     assert steps == [1, 3, 5], "a beam over no cell, over one from frame 2 on, over two from frame 4 on"
-    covered = [np.argwhere(np.array(beam[0]).reshape(5, 7) == BEAM).tolist() for beam in beams]
-    assert covered == [[], [[1, 1]], [[1, 1], [1, 2]]]
+    assert beams == [[], [[1.5, 1.5]], [[1.5, 1.5], [2.5, 1.5]]], "a dot in the middle of each cell"
     steps, labels = column(path, "world/out", "Boxes2D:labels")
     assert steps == [1, 3, 4, 5, 6]
     assert labels == [[], ["out"], ["out"], ["by 0"], ["by 0"]]
@@ -96,6 +96,20 @@ def test_beams_and_those_out_of_play_have_marks_that_are_told_when_they_change(t
     assert centres[1] == [[4 + 1.5, 2 + 1.5]]
     _, colours = column(path, "world/out", "Boxes2D:colors")
     assert colours[1][0] >> 8 == 0xE66100, "in agent 1's own colour"
+
+
+def test_what_is_logged_together_is_sent_together(tmp_path):
+    """A header that is sent with the next episode's first number is old when it is read."""
+    with RerunLogger("run", tmp_path, curves=SCENE) as logger:
+        (stream,) = logger._streams
+        stream.period_s = 0.0
+        logger.log_scalar("alone", 1.0)
+        assert not stream.waiting
+        with logger.together():
+            logger.log_scalar("first", 1.0)
+            logger.log_document("header", "# Episode 1")
+            assert list(stream.waiting) == ["first", "header"]
+        assert not stream.waiting
 
 
 def test_colours_and_names_of_classes_are_in_the_recording(tmp_path):
@@ -151,7 +165,7 @@ def test_no_image_comes_before_its_format_else_viewers_draw_nothing_until_the_ne
         if any(name.endswith("Image:buffer") for name in chunk.to_record_batch().schema.names):
             assert chunk.entity_path in formats
             drawn.add(chunk.entity_path)
-    assert drawn == {"/later", "/clip", "/world/board", "/world/beams", "/windows"}
+    assert drawn == {"/later", "/clip", "/world/board", "/windows"}
 
 
 def test_a_recording_is_never_written_over(tmp_path):

@@ -322,9 +322,12 @@ def test_watch_opens_all_recordings_of_a_run_as_one(tmp_path, opened, monkeypatc
     (tmp_path / "recipe.json").touch()
     with pytest.raises(ValueError, match=r"recipe\.json is no recording"):
         cli.watch(tmp_path / "recipe.json")
-    (tmp_path / "run-2.rrd").touch()
+    for name in ("run-2.rrd", "run-4.rrd", "film-0-0.rrd"):
+        (tmp_path / name).touch()
     cli.watch(tmp_path)
-    assert opened[0][1:] == [str(tmp_path / "run-2.rrd"), str(tmp_path / "run.rrd")]
+    assert opened[0][1:] == [str(tmp_path / "run.rrd"), str(tmp_path / "run-2.rrd")], "and no film"
+    cli.watch(tmp_path / "film-0-0.rrd")
+    assert opened[1][1:] == [str(tmp_path / "film-0-0.rrd")]
 
 
 def test_watch_waits_for_the_viewer_on_windows_where_no_program_replaces_another(

@@ -3,6 +3,7 @@ boards of all replicas, where agents go, the stock over the turn, and the Lorenz
 
 import time
 from dataclasses import replace
+from threading import Event
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +13,8 @@ import torch
 from recordings import GAME, SCENE, column, names, static, strict_rerun
 from rerun.chunk import RrdReader
 from tensordict import TensorDict
-from test_watch import connected, fake
+from test_now import SIXTEEN_WORLDS
+from test_watch import connected, fake, received
 
 from cprl import CommonsEnv, Game, Rules, maps, presets
 from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, agent_colour
@@ -30,8 +32,8 @@ from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.layout import Curves, Panels, curves_of, joint_actions, layout
 from cprl.viewer.live import LiveStream, Stream
 from cprl.viewer.logger import RerunLogger, as_table, send_waiting
-from cprl.viewer.pictures import Turns, Visits, Wall, gini, lorenz_curve
-from cprl.viewer.story import CLOCK, CompilingNotice, Header, played, published_phases
+from cprl.viewer.pictures import Lorenz, Plots, Turns, Visits, Wall, gini, lorenz_curve
+from cprl.viewer.story import CompilingNotice, Header, played, published_phases
 
 __all__ = ["strict_rerun"]
 
@@ -80,10 +82,11 @@ def test_the_header_goes_from_the_beginning_to_the_end(tmp_path):
     line = "Episode 1 of 6 · begins, exploring · 50 apples, random play 282 · 0 of 2 boards died early"
     assert said[1] == (0, f"#### {line}")
     assert said[-2][1].endswith("· 2 of 2 boards died early")
-    line = "Finished, 6 episodes · trained 100 apples, random play 282 · 4 of 4 boards died early"
+    amounts = "while learning 50 apples, trained 100, random play 282"
+    line = f"Finished, 6 episodes · {amounts} · 4 of 4 boards died early"
     assert said[-1] == (5, f"#### {line}")
     words = [text for text in texts(path) if "random play" in text]
-    assert words == ["random play 282.0 ± 2 apples; 0 of 2 boards died early"]
+    assert words == ["random play 282 [257, 307] apples; 0 of 2 boards died early"]
     assert column(path, "phase/found", "StateChange:state") == ([], []), "too few episodes"
 
 
@@ -122,8 +125,58 @@ def test_strips_and_events_say_what_the_group_does_and_where_exploration_ends(tm
     assert said["episode 9: now steady"] == 9
     states = column(path, "now", "StateChange:state", "episode")
     assert states == ([0, 9], [["begins"], ["steady"]])
-    states = column(path, "now_exploring", "StateChange:state", "episode")
+    states = column(path, "exploring", "StateChange:state", "episode")
     assert states == ([0, 19], [["exploring"], ["settled"]])
+
+
+def test_with_many_worlds_header_label_bold_line_and_new_bests_count_episodes(tmp_path):
+    """The tragedy of sixteen worlds, as the viewer told it once: "steady, 333 apples" at 206."""
+    with ViewerCallback(tmp_path, CommonsEnv(GAME, 16), title="run", episodes=288, worlds=16) as viewer:
+        viewer.random_play([fake(0, 0, returned=280.0, tagged=0)] * 2)
+        for group, apples in enumerate(SIXTEEN_WORLDS):
+            for world in range(16):
+                episode = fake(16 * group + world, world, returned=float(apples), tagged=0)
+                viewer.on_episode(replace(episode, replica=0), {})
+    path = tmp_path / "run.rrd"
+    said = [(at + 1, *text.split(" · ")[1:3]) for at, text in headers(path) if "random play 280" in text]
+    assert [at for at, *_ in said] == list(range(16, 289, 16))
+    for (_, label, amount), apples in zip(said, SIXTEEN_WORLDS, strict=True):
+        assert label != "begins"
+        assert float(amount.split(" apples")[0]) == pytest.approx(apples, rel=0.1)
+    states = dict(zip(*column(path, "now", "StateChange:state", "episode"), strict=True))
+    at = {state[0]: episode for episode, state in reversed(states.items())}
+    assert at["rising"] < at["falling"] < at["below random play"] < 170
+    assert states[max(states)] == ["below random play"]
+    lines = column(path, "social/collective_return", "Scalars:scalars")[1]
+    assert lines == [[apples, apples] for apples in SIXTEEN_WORLDS], "a mean of ten would be of 160 episodes"
+    best = [text for text in texts(path) if "new best" in text]
+    assert best == [
+        "episode 63: new best: 339.5 apples per episode, mean of the last 64",
+        "episode 127: new best: 437.8 apples per episode, mean of the last 64",
+    ]
+
+
+def test_header_and_timelines_count_the_episodes_that_all_replicas_have_ended(tmp_path):
+    """The first replica is far ahead; its last apples and frames stand where the header is."""
+    env = CommonsEnv(GAME, 4)
+    with ViewerCallback(tmp_path, env, title="run", episodes=20, worlds=2) as viewer:
+        for number, world in ((0, 0), (1, 1), (2, 0), (3, 1), (4, 0), (5, 0)):
+            viewer.on_episode(replace(fake(number, world, returned=30.0, tagged=0), replica=0), {})
+        for number, world in ((0, 2), (1, 3)):
+            viewer.on_episode(replace(fake(number, world, returned=30.0, tagged=0), replica=1), {})
+        assert viewer._episode == 2
+        viewer.on_episode(replace(fake(6, 0, returned=30.0, tagged=0), replica=0), {})
+    path = tmp_path / "run.rrd"
+    said = headers(path)
+    assert said[1][1].startswith("#### Episode 2 of 20 ")
+    assert said[1][0] == 1, "counted from 0"
+    assert texts(path)["episode 5: last apple taken in step 7"] == 0
+    ends = [
+        max(chunk.to_record_batch().column("episode").to_pylist())
+        for chunk in RrdReader(path).stream()
+        if "episode" in chunk.to_record_batch().schema.names
+    ]
+    assert max(ends) <= 2
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
@@ -171,7 +224,7 @@ def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_g
     assert titles[1] == {episode: title for episode, title in titles[0].items() if episode > 48}
     episodes, labels = column(resumed, "visits/labels", "Points2D:labels", "episode")
     assert (episodes[0], labels[0][0]) == (50, "0: episodes 50 to 51"), "who went where before was not kept"
-    for entity, present in (("now", {48: ["falling"]}), ("now_exploring", {50: ["exploring"]})):
+    for entity, present in (("now", {48: ["falling"]}), ("exploring", {50: ["exploring"]})):
         states = dict(zip(*column(complete, entity, "StateChange:state", "episode"), strict=True))
         later = {episode: state for episode, state in states.items() if episode > 48}
         goes_on = dict(zip(*column(resumed, entity, "StateChange:state", "episode"), strict=True))
@@ -185,7 +238,7 @@ def seen_by_viewers(logger, folder, entity, episodes):
     client = connected(logger.addresses["native"].split()[-1], folder)
     try:
         ends = time.monotonic() + 60
-        while sorted(column(folder / "got.rrd", entity, "Scalars:scalars", "episode")[0]) != episodes:
+        while sorted(received(folder, entity, "Scalars:scalars", "episode")[0]) != episodes:
             assert time.monotonic() < ends
             time.sleep(0.5)
     finally:
@@ -211,21 +264,21 @@ def test_a_recording_of_a_training_too_long_for_the_search_has_no_phases():
 
 
 def test_while_code_is_compiled_the_live_header_says_for_how_long(monkeypatch):
+    clock, said, is_over = SimpleNamespace(is_running=True, total_s=3.0), [], Event()
     monkeypatch.setattr(CompilingNotice, "PERIOD_S", 0.02)
-    said = []
+    monkeypatch.setattr("cprl.viewer.story.CLOCK", clock)
 
     def say(status):
         said.append(status)
+        clock.total_s = 15.0
+        clock.is_running = len(said) < 2  # it ends while that is said
         if status == "begins":
             notice.close()
+            is_over.set()
 
     notice = CompilingNotice(say)
-    with CLOCK.running():
-        while len(said) < 2:
-            pass
-    while said[-1] != "begins":
-        pass
-    assert said[0] == "compiling, 0 s so far"
+    assert is_over.wait(10), said
+    assert said == ["compiling, 0 s so far", "compiling, 12 s so far", "begins"]
 
 
 def test_the_recipe_is_a_table_of_places():
@@ -244,6 +297,12 @@ def test_the_recipe_is_a_table_of_places():
     )
 
 
+def plotted(view):
+    """The entities of all plots of a layout."""
+    parts = getattr(view, "contents", None) or ()
+    return [entity for part in parts for entity in ([part] if isinstance(part, str) else plotted(part))]
+
+
 def test_a_layout_has_the_views_of_what_a_game_reports_and_the_live_one_the_present_policy():
     alone = replace(SCENE, agents=("a",))
     bare = Curves(agents=("a", "b"), metrics=(), has_tags=False)
@@ -258,13 +317,19 @@ def test_a_layout_has_the_views_of_what_a_game_reports_and_the_live_one_the_pres
             layout(bare),
         )
     )
-    assert {"Present policy", "Recorded episodes", "Overview", "Stock left at the end, apples"} <= live
-    assert live - file == {"Present policy", "Recorded episodes"}
+    assert {"Live board", "Recorded episodes", "Overview", "Stock left at the end, apples"} <= live
+    assert live - file == {"Live board", "Recorded episodes"}
     assert file - live == {"Board"}
-    wall = "All replicas; orange: the board of its last episode died"
+    wall = "All replicas; orange: the episode before ended without an apple"
     assert wall in several - file
     tags = next(name for name in file if name.startswith("Tags in"))
+    of_worlds = layout(replace(SCENE, worlds=16)).root_container.contents[1].contents
+    overview = next(set(names(tab)) for tab in of_worlds if tab.name == "Overview")
+    assert "Apples on the board, over the turn" in overview, "not sixteen small boards"
+    assert {"Peace", "Peacefulness"} <= {name.split(" (")[0].split(",")[0] for name in file}
     assert {tags, "Equality (1 - Gini), 0 to 1"} <= file - single
+    for curves in (SCENE, bare):
+        assert "+ /evaluation/return" in plotted(layout(curves).root_container)
     joint = "Joint actions, share of turns; agent 0 first"
     assert joint in matrix - stage
     assert {"Return of each, rewards", "Learning", "Events", "Recipe"} <= stage
@@ -352,6 +417,31 @@ def trained(folder, *, game=SMALL, replicas=2, episodes=6):
         others = random_agents(game.spaces, tuple(range(game.agents)), replicas=replicas, seed=1)
         train(env, {}, others=others, episodes=episodes, callbacks=[seen, viewer])
     return folder / "run.rrd", viewer, seen
+
+
+def test_before_the_first_point_viewers_see_random_play_and_read_when_curves_begin():
+    sent = []
+
+    def log_columns(name, at, columns, *, live_only=False):
+        assert live_only, "the file has them with the first point"
+        values = {
+            part.component_descriptor().component: part.as_arrow_array().to_pylist() for part in columns
+        }
+        sent.append((name, at[1], values))
+
+    curves = curves_of(CommonsEnv(GAME, 16), GAME.agent_names, ["harvest"], episodes=300, worlds=16)
+    logger = SimpleNamespace(curves=curves, log_columns=log_columns, log_static=lambda *parts: None)
+    Plots(logger).random_play([fake(0, 0, returned=280.0, tagged=0)])
+    lines = {name: (at, values["Scalars:scalars"]) for name, at, values in sent}
+    assert lines["random_play/collective_return"] == ([0, 1], [[280.0], [280.0]]), "a line needs two points"
+    sent.clear()
+    Turns(CommonsEnv(GAME, 16), logger, every=15)
+    Lorenz(logger, every=20)
+    said = [(name, values["Points2D:labels"]) for name, _, values in sent]
+    assert said == [
+        ("turn/title", [["lines from episode 16 on"]]),
+        ("lorenz/title", [["lines from episode 32 on"]]),
+    ]
 
 
 def view_of(viewer, kind):
@@ -482,7 +572,8 @@ class Listener:
 def test_viewers_get_the_wall_every_two_seconds_and_the_file_does_not(run, monkeypatch):
     _, viewer, _ = run
     clock, listener = iter(np.arange(10.0, 20.0, 0.8)), Listener()
-    monkeypatch.setattr("cprl.viewer.pictures.time.perf_counter", lambda: next(clock))
+    perf_counter = SimpleNamespace(perf_counter=lambda: next(clock))  # other threads have the clock itself
+    monkeypatch.setattr("cprl.viewer.pictures.time", perf_counter)
     wall = Wall(viewer.env, listener, viewer.logger.scene, recorded_steps=100)
     for step in range(1, 10):
         wall.on_step(step, 3, None)
@@ -491,16 +582,26 @@ def test_viewers_get_the_wall_every_two_seconds_and_the_file_does_not(run, monke
     assert listener.live_only == [True] * 3
 
 
-def test_the_numbers_of_an_evaluation_are_means_with_their_error():
-    episodes = [fake(5, 0, returned=apples, tagged=0) for apples in (10.0, 14.0)]
-    assert played(episodes) == (12.0, 2.0, 2, 2)
-    assert np.isnan(played(episodes[:1]).error)
+def test_the_numbers_of_an_evaluation_are_means_with_their_interval_over_replicas():
+    """Episodes of a replica are no evidence of their own: 10 and 14 apples, so 12 and 12.706 x 2."""
+    episodes = [fake(5, 0, returned=apples, tagged=0) for apples in (9.0, 11.0, 15.0, 13.0)]
+    apples, died, count = played(episodes, replicas=2)
+    assert (apples.value, died, count) == (12.0, 4, 4)
+    assert (apples.low, apples.high) == pytest.approx((12 - 25.412, 12 + 25.412), abs=0.001)
+    assert f"{played(episodes).harvest}" == "12.0", "one replica has no interval"
 
 
-def test_who_tagged_whom_is_a_matrix_of_numbers_of_the_last_fifty_episodes(tmp_path):
-    path = recorded(tmp_path, range(60), episodes=60, tagged=1)
+def test_who_tagged_whom_is_a_matrix_of_tags_in_an_episode_of_the_last_fifty(tmp_path):
+    with ViewerCallback(tmp_path, CommonsEnv(GAME, 2), title="run", episodes=60) as viewer:
+        for number in range(60):
+            for world in (0, 1):
+                episode = fake(number, world, returned=30.0, tagged=2 if number < 10 else world)
+                viewer.on_episode(episode, {})
+    path = tmp_path / "run.rrd"
     episodes, labels = column(path, "tags/counts", "Points2D:labels", "episode")
     assert episodes == [9, 19, 29, 39, 49, 59]
-    assert labels[0] == ["0", "0", "10", "0", "0", "1", "0", "1"], "agent 1 by agent 0"
-    assert labels[-1][2] == "50"
+    assert labels[0] == ["0", "0", "2", "0", "0", "1", "0", "1"], "agent 1 by agent 0"
+    assert labels[1][2] == "1.25", "10 episodes of 2 and 10 of 0 or 1, in each of two replicas"
+    assert labels[4][2] == "0.8", "of fifty"
+    assert labels[5][2] == "0.5", "the first ten are too long ago"
     assert len(column(path, "tags", "Image:buffer")[0]) == 6

@@ -206,11 +206,11 @@ def watch(run: Path, /, *, serve: bool = False) -> None:
     """
     if run.is_file() and run.suffix != ".rrd":
         raise ValueError(f"{run} is no recording; allowed: a run's directory, or a file that ends in .rrd")
-    files = [run] if run.is_file() else sorted(run.glob("*.rrd"))
-    if not files:
-        raise ValueError(f"{run} holds no recording (*.rrd); recipes write one unless watch is off")
-    from cprl.viewer.page import has_display, to_watch
+    from cprl.viewer.page import FILE_NAME, has_display, recordings_of, to_watch
 
+    files = [run] if run.is_file() else recordings_of(run)
+    if not files:
+        raise ValueError(f"{run} holds no recording ({FILE_NAME}); recipes write one unless watch is off")
     if serve or not has_display():
         _serve(files, why="" if serve else "There is no display: ")
         return

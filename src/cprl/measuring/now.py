@@ -37,7 +37,7 @@ SHORT: Final = 0.1
 
 
 class Now:
-    """The live label of a training, episode by episode.
+    """The live label of a training, episode by episode; of replicas in W worlds, W episodes at a time.
 
     With m the running mean over the last 10 % of the episodes so far (at least 10), p its peak since the last
     fall, low its lowest in a fall, and r the mean of random play:
@@ -50,9 +50,13 @@ class Now:
     - rising: from the episode on in which m is a tenth above its first value, or above the last one of which
       that was true, while m was highest in one of the episodes that it is a mean of;
     - steady: else.
+
+    Args:
+        worlds: the worlds W of each replica. A value is then the mean of W episodes, and m is of as few
+            values as have these episodes: of sixteen worlds of one value, the mean of sixteen episodes.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, worlds: int = 1) -> None:
         self.random_play: float | None = None
         """r, in the unit of the values; None for the first running mean instead."""
         self.label = BEGINS
@@ -66,25 +70,21 @@ class Now:
         self._course = STEADY
         self._low = self._top = self._first = self._level = float("nan")
         self._highest = 0
-        """The number of the episode with the highest m."""
-        self._recent = Recent(FEWEST, share=SHARE)
+        """The number of the value with the highest m."""
+        self._recent = Recent(FEWEST, share=SHARE, each=worlds)
         self._epsilons: dict[str, float] = {}
 
-    @property
-    def window(self) -> int:
-        """How many episodes the running mean is of, at most."""
-        return self._recent.window
-
     def add(self, value: float, epsilons: Mapping[str, float] | None = None) -> str:
-        """Adds an episode, and returns the label.
+        """Adds an episode, or W of them, and returns the label.
 
         Args:
-            value: of the episode, e.g. the collective return as a mean over replicas; finite.
+            value: of the episode, e.g. the collective return as a mean over replicas, and over W episodes of
+                each; finite.
             epsilons: of each learner that has one at the end of the episode, by its name; NaN is left out.
         """
         self.mean = self._recent.add(value)
         self._look(epsilons or {})
-        if self._recent.count >= FEWEST:
+        if self._recent.count >= self._recent.least:
             self._course = self._followed(self._course)
             self.label = BELOW if self._is_below() else self._course
         return self.label
@@ -118,7 +118,8 @@ class Now:
         if mean - self._level > RISEN * abs(self._level):
             self._level = mean
             return RISING
-        return RISING if course == RISING and self._recent.count < self._highest + self.window else STEADY
+        is_recent = self._recent.count < self._highest + self._recent.window
+        return RISING if course == RISING and is_recent else STEADY
 
     def _is_lost(self, loss: float) -> bool:
         lead = self._top - (self._first if self.random_play is None else self.random_play)

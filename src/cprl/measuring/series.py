@@ -95,12 +95,14 @@ class Recent:
     """The mean of the last values: of a share of those so far, but of `least` at least.
 
     Args:
-        least: how many values at least; with fewer, the mean is that of all.
+        least: how many episodes at least; with fewer, the mean is that of all.
         share: of the values so far, 0..1; 0 for a window of always `least`.
+        each: the number of episodes that each value is the mean of.
     """
 
-    def __init__(self, least: int, *, share: float = 0.0) -> None:
-        self.least = least
+    def __init__(self, least: int, *, share: float = 0.0, each: int = 1) -> None:
+        self.least = ceil(least / each)
+        """Values at least."""
         self.share = share
         self.count = 0
         """Values so far."""

@@ -1,7 +1,7 @@
 """The agents of a training in fresh worlds: by chance before it, greedily meanwhile, as trained after it."""
 
 import random as random_of_python
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from io import BytesIO
@@ -20,7 +20,7 @@ from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.envs.unwrap import commons_of
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
-from cprl.measuring.evaluate import evaluate
+from cprl.measuring.evaluate import Policy, evaluate
 from cprl.policies.present import PresentPolicy
 from cprl.runs.episodes import EVALUATIONS, labelled
 from cprl.runs.files import write_listed
@@ -78,7 +78,7 @@ def _worlds(
 def exhibited(
     experiment: Experiment, trained: EnvBase, population: Population
 ) -> tuple[PresentPolicy, EnvBase] | None:
-    """The present policy, and one world for it that neither training nor evaluation plays; None where the
+    """The current policy, and one world for it that neither training nor evaluation plays; None where the
     game has no board. Torch's generator is left as it was."""
     if commons_of(trained) is None:
         return None
@@ -87,12 +87,24 @@ def exhibited(
         return population.present_policy(), env
 
 
-def random_play(experiment: Experiment, population: Population) -> list[Episode]:
+def random_play(
+    experiment: Experiment,
+    population: Population,
+    *,
+    seen: Callable[[EnvBase, Policy], Policy] | None = None,
+) -> list[Episode]:
     """Let agents who take every action with equal probability play the worlds of the evaluation, before the
-    training: what it is compared with while it runs. No generator moves."""
+    training: what it is compared with while it runs. No generator moves.
+
+    Args:
+        seen: Returns the policy that is played in the place of theirs, in these worlds, and looks on.
+    """
     with _generators_kept(experiment.device):
-        policy = population.random_policy(experiment.evaluation_episodes)
-        return evaluate(fresh_env(experiment), policy, metrics=experiment.metrics)
+        env = fresh_env(experiment)
+        policy: Policy = population.random_policy(experiment.evaluation_episodes)
+        if seen is not None:
+            policy = seen(env, policy)
+        return evaluate(env, policy, metrics=experiment.metrics)
 
 
 @contextmanager

@@ -193,7 +193,7 @@ def _carry_out(
 ) -> None:
     random = None
     if work.viewer is not None:
-        random = random_play(work.experiment, work.population)
+        random = random_play(work.experiment, work.population, seen=work.viewer.seen_at_random)
         work.viewer.random_play(random)
     training = _train(work, observers, checkpointer)
     played = _evaluate(work, random)

@@ -6,7 +6,7 @@ Modules, in the order in which one reads them:
     pictures   View; lines, tags, all boards at once, where agents go, stock over the turn, Lorenz curve
     board      which episodes are recorded frame by frame, and how a board looks
     replay     what policies say of their actions, who breaks a rule, and what is paid
-    exhibition a world that the present policy plays, for viewers alone
+    exhibition a world that the current policy plays, for viewers alone
     layout     what a recording shows, with names and colours, and where the viewer shows it
     logger     RerunLogger: TorchRL's logger interface on a recording
     live       the streams of a recording, to a file and served live, each of which may fail without harm

@@ -27,7 +27,7 @@ from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.commons.picture import DIGIT_HIGH, INK_COLOUR, MARK_COLOUR, POINTS, number_paths
 from cprl.commons.world import Bytes
 from cprl.envs.commons_env import CommonsEnv
-from cprl.viewer.layout import TEXT, Curves, Scene, classes, styles, window_corners
+from cprl.viewer.layout import EMPTY_SITE, TEXT, Curves, Scene, classes, styles, window_corners
 from cprl.viewer.live import HEADER
 
 if TYPE_CHECKING:
@@ -265,9 +265,10 @@ RIM_CELLS: Final = 1
 """The width of the wall shown around the board, in cells."""
 BAR_CELLS: Final = 0.3
 """Half the height of the bar of apples below the board."""
-BEAM_OPACITY: Final = 0.7
-IMAGES: Final = ("board", "beams")
-"""The parts of a board that are images of classes; all others are lines and boxes."""
+LABEL_BELOW_CELLS: Final = 0.5
+"""The distance from the bar to the point below which its text hangs."""
+SHOT_CELLS: Final = 0.1
+"""The radius of the dot in each cell that a shot passes, in cells."""
 
 
 def image_form(size: tuple[int, int]) -> Any:
@@ -291,8 +292,7 @@ def fixed(curves: Curves) -> dict[str, list[Any]]:
         return parts
     for name, styles_of_part in board_styles().items():
         parts[f"world/{name}"] = styles_of_part
-        if name in IMAGES:
-            parts[f"world/{name}"].append(rr.SegmentationImage.from_fields(format=board_form(curves)))
+    parts["world/board"].append(rr.SegmentationImage.from_fields(format=board_form(curves)))
     agents, (rows, columns) = len(curves.agents), curves.window
     corners = np.array(window_corners(agents, curves.window), np.float32)[:, ::-1]
     parts["windows"] = [
@@ -313,11 +313,13 @@ def fixed(curves: Curves) -> dict[str, list[Any]]:
 
 
 def board_styles() -> dict[str, list[Any]]:
-    """How the parts of a board look, by the names of `board_columns`; the forms of images are left out."""
+    """How the parts of a board look, by the names of `board_columns`; the form of the image is left out."""
     image, lines = rr.SegmentationImage.from_fields, rr.LineStrips2D.from_fields
     return {
         "board": [image(opacity=1.0, draw_order=-10.0)],
-        "beams": [image(opacity=BEAM_OPACITY, draw_order=-5.0)],
+        "beams": [
+            rr.Points2D.from_fields(colors=[PALETTE[BEAM]], radii=[SHOT_CELLS], draw_order=-5.0),
+        ],
         "agents": [lines(colors=[INK_COLOUR], radii=[RADIUS_CELLS])],
         "marks": [lines(colors=[MARK_COLOUR], radii=[RADIUS_CELLS])],
         "out": [rr.Boxes2D.from_fields(radii=[OUT_STROKE_CELLS], show_labels=False)],
@@ -357,9 +359,11 @@ def board_columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.in
     }
     if len(marks(agents).owner):
         contents["marks"] = everywhere, _lines(marks(agents), frames)
-    covered = _with_rim(np.where(frames["beams"], BEAM, UNSEEN).astype(np.uint8), UNSEEN)
-    changed = _changes(covered)
-    contents["beams"] = changed, _pictures(covered[changed])
+    changed = _changes(frames["beams"])
+    frame, row, col = np.nonzero(frames["beams"][changed])
+    dots = np.stack([col, row], -1).astype(np.float32) + RIM_CELLS + 0.5
+    shots = np.bincount(frame, minlength=len(changed))
+    contents["beams"] = changed, rr.Points2D.columns(positions=dots).partition(shots)
     return contents | {"stock": _stock(scene, frames)} | _out(frames)
 
 
@@ -372,7 +376,7 @@ def _stock(scene: Scene, frames: Frames) -> tuple[NDArray[np.intp], Any]:
     bars = np.full((len(apples), 3, 2, 2), (left, low), np.float32)  # the last, a point, has the text
     bars[:, 0, 1, 0] += scene.width
     bars[:, 1, 1, 0] += scene.width * apples / sites
-    bars[:, 2, :, 0] += scene.width / 2
+    bars[:, 2] += scene.width / 2, LABEL_BELOW_CELLS
     words = [text for count in apples for text in ("", "", f"{count} of {len(scene.sites)} apples")]
     columns = rr.LineStrips2D.columns(strips=bars.reshape(-1, 2, 2), labels=words)
     return changed, columns.partition([3] * len(apples))
@@ -383,7 +387,7 @@ def _pictures(images: Bytes) -> Any:
 
 
 def boards(scene: Scene, frames: Frames) -> Bytes:
-    """Boards with a border of wall: apples, and agents in play, each in a class of its own.
+    """Boards with a border of wall: apples, sites without one and agents in play, in a class of their own.
 
     Returns:
         uint8 [T, H + 2, W + 2].
@@ -393,7 +397,7 @@ def boards(scene: Scene, frames: Frames) -> Bytes:
     if scene.walls:
         drawn[:, *np.array(scene.walls).T] = WALL
     if scene.sites:
-        drawn[:, *np.array(scene.sites).T] = np.where(frames["stock"] > 0, APPLE, GROUND)
+        drawn[:, *np.array(scene.sites).T] = np.where(frames["stock"] > 0, APPLE, EMPTY_SITE)
     for agent in range(len(scene.agents)):
         at = np.flatnonzero(frames["in_play"][:, agent])
         drawn[at, frames["row"][at, agent], frames["col"][at, agent]] = FIRST_AGENT + agent

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from math import gcd
+from math import ceil, gcd
 from operator import methodcaller
 from pathlib import Path
 from threading import Event
@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 from cprl.envs.unwrap import agent_names, base_env, commons_of
 from cprl.experiment.experiment import rules_of_own
 from cprl.measuring.episodes import Episode
+from cprl.measuring.evaluate import Policy
 from cprl.measuring.metrics import reported_by
 from cprl.measuring.series import OF_AGENTS, Series, numbers_of
 from cprl.policies.present import PresentPolicy
@@ -24,8 +25,8 @@ from cprl.runs.episodes import metrics_in, read_episodes
 from cprl.viewer.board import Filming
 from cprl.viewer.exhibition import Exhibition
 from cprl.viewer.layout import curves_of, missing_in, scene_of
-from cprl.viewer.live import HEADER
-from cprl.viewer.logger import FILE_NAME, RerunLogger, recording_id, recordings_of
+from cprl.viewer.logger import RerunLogger, recording_id
+from cprl.viewer.page import FILE_NAME, recordings_of
 from cprl.viewer.pictures import (
     JointActions,
     Lorenz,
@@ -55,8 +56,9 @@ class ViewerCallback:
 
     Frames are recorded for every k-th episode of that world, including the first and the last, and for the
     episode after each new best. With several replicas metrics are logged once all have ended an episode: the
-    mean and each replica; returns, losses and the like as means only. Those of every W episodes of replicas
-    in W worlds are logged together. A callback of `cprl.training`, and a context manager.
+    mean and each replica; returns, losses and the like as means only. With W worlds a replica, metrics are
+    means over every W episodes. Header, board and timelines count the episodes that all replicas have ended.
+    A callback of `cprl.training`, and a context manager.
 
     Of a run that is resumed the views get the episodes in its table, and viewers the recording so far.
 
@@ -69,7 +71,7 @@ class ViewerCallback:
         worlds: the worlds W of each replica.
         metrics: the names of the user's own.
         live: "serve" or "spawn", see `cprl.viewer.live`; None for the file alone.
-        exhibited: what is exhibited live: the present policy and one world for it, see
+        exhibited: what is exhibited live: the current policy and one world for it, see
             `cprl.viewer.exhibition`.
         file_name: the name of the recording instead of `run.rrd`; there must be no such file.
         is_replay: whether a stored policy is replayed, see `cprl.viewer.layout.Scene`.
@@ -110,7 +112,9 @@ class ViewerCallback:
         self.filming = Filming(commons, self.logger, scene, episodes=-(-episodes // worlds))
         """Which episodes of the first world are recorded frame by frame."""
         self._series = Series(curves.replicas, worlds)
-        self._turn = self._step = self._episode = self._filmed = 0
+        self._turn = self._step = self._filmed = 0
+        self._episode = 0
+        """The episodes that all replicas have ended: what header, board and timelines say."""
         self._rate_at, self._rate_step = time.perf_counter(), 0
         self.logger.log_hparams({"run": run.name, **(recipe or {})})
         self.logger.log_text(f"{title} begins")
@@ -120,7 +124,7 @@ class ViewerCallback:
             self.logger.log_text("no exhibition: the game has no board")
         self.story: Story | None = None
         self.exhibition: Exhibition | None = None
-        """What the present policy plays for viewers; None where nothing is exhibited."""
+        """What the current policy plays for viewers; None where nothing is exhibited."""
         own = rules_of_own(recipe or {})
         self._views = self._make_views(episodes, exhibited, own, is_about=is_about, is_replay=is_replay)
         self._sampled = gcd(*(view.stride for view in self._views)) or 1
@@ -139,7 +143,8 @@ class ViewerCallback:
         logger, commons = self.logger, commons_of(self.env)
         curves, scene, live = logger.curves, logger.scene, logger.live
         every = max(1, min(LONGEST, episodes // _IMAGES))
-        views: list[View] = [Plots(logger), Events(logger, self.filming, every=every)]
+        of_world = ceil(every / curves.worlds)
+        views: list[View] = [Plots(logger), Events(logger, self.filming, every=of_world)]
         if curves.joint:
             views.append(JointActions(logger, actions=base_env(self.env).game.actions))
         if curves.has_tags_between:
@@ -171,7 +176,7 @@ class ViewerCallback:
 
     def _show_status(self, status: str) -> None:
         if self.story is not None and self._episode == 0:
-            self.logger.show_live(HEADER, self.story.header.begins(status))
+            self.story.begins(status)
 
     def on_start(self, training: Any) -> None:
         """Goes on where a `Training` that is resumed is."""
@@ -211,21 +216,19 @@ class ViewerCallback:
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Logs the numbers of an episode, and its events, once all replicas have ended it."""
-        self.logger.at(step=self._step, episode=episode.episode)
+        self.logger.at(step=self._step, episode=self._episode)
         for view in self._views:
             view.on_episode(episode)
-        if episode.replica == 0:
-            self._episode = episode.episode + 1
         if episode.world == 0:
             self._filmed, self.filming.shows_next = self._filmed + 1, False
-        of_all, worlds = (
-            self._series.add(episode, numbers_of(episode, learning, self._agents)),
-            self._series.worlds,
-        )
+        of_all = self._series.add(episode, numbers_of(episode, learning, self._agents))
         if of_all is not None:
-            for view in self._views:
-                view.on_all(episode.episode // worlds * worlds + worlds - 1, of_all)
-            self._log_speed()
+            self._episode += self._series.worlds
+            self.logger.at(step=self._step, episode=self._episode - 1)
+            with self.logger.together():
+                for view in self._views:
+                    view.on_all(self._episode - 1, of_all)
+                self._log_speed()
         self.filming.choose(self._filmed)
 
     def _log_speed(self) -> None:
@@ -233,6 +236,10 @@ class ViewerCallback:
         if steps:
             self.logger.log_scalar("time/env_steps_per_s", steps / (now - self._rate_at))
             self._rate_at, self._rate_step = now, self._step
+
+    def seen_at_random(self, env: EnvBase, policy: Policy) -> Policy:
+        """The policy of random play; viewers see its first world until the training begins."""
+        return policy if self.exhibition is None else self.exhibition.seen(env, policy)
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
         """Compares the training with these episodes of random play: in header, label, plots and an event."""
@@ -249,7 +256,7 @@ class ViewerCallback:
     def play_on(self, stop: Event) -> None:
         """Exhibits the trained policy until the event is set; returns at once where nothing is exhibited."""
         if self.exhibition is not None:
-            self.exhibition.play_on(stop, episode=self._episode)
+            self.exhibition.play_on(stop)
 
     def flush(self) -> None:
         """Sends all that waits, to the file and to viewers."""

@@ -1,8 +1,8 @@
-"""Exhibition: a world of its own that the present policy of a training plays, for viewers alone."""
+"""Exhibition: a world of its own that the current policy of a training plays, for viewers alone."""
 
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from threading import Event
 from typing import Any, Final, NamedTuple
@@ -17,9 +17,10 @@ from cprl.commons.game import Game
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.envs.stepping import begin_states
 from cprl.envs.unwrap import commons_of
+from cprl.measuring.episodes import Episode
+from cprl.measuring.evaluate import Policy
 from cprl.policies.present import PresentPolicy
 from cprl.viewer.board import (
-    IMAGES,
     RIM_CELLS,
     FrameRecorder,
     Frames,
@@ -79,6 +80,7 @@ class Exhibition(View):
         self._policy, self._env, self._trained, self._scene = policy, env, trained, scene
         self._stream, self._clock, self._closing = newest, clock, Event()
         self._wait = wait or self._slept
+        self._at_random: FrameRecorder | None = None
         self._recorder = FrameRecorder(commons, scene, has_windows=False)
         self._carried: TensorDictBase | None = None
         self._due, self._count = clock(), BATCH_STEPS
@@ -98,14 +100,37 @@ class Exhibition(View):
             self._due = now + BATCH_S
             self._play(episode)
 
-    def play_on(self, stop: Event, *, episode: int) -> None:
+    def seen(self, env: EnvBase, policy: Policy) -> Policy:
+        """The policy of random play, whose first world viewers see until the training begins."""
+        commons = commons_of(env)
+        assert commons is not None
+        recorder = self._at_random = FrameRecorder(commons, self._scene, has_windows=False)
+
+        def acted(moment: TensorDictBase) -> TensorDictBase:
+            recorder.add_board()
+            return policy(moment)
+
+        return acted
+
+    def random_play(self, episodes: Sequence[Episode]) -> None:
+        """Has the episode of the first world sent, which shows what compares with the training while its code
+        is compiled; what is left of it when the exhibition begins is left out."""
+        frames = None if self._at_random is None else self._at_random.take()
+        if frames is not None:
+            first = {name: array[: episodes[0].steps] for name, array in frames.items()}
+            self._send(first, "random play, before the training", wait=self._rests)
+
+    def _rests(self, seconds: float) -> bool:
+        return self._wait(seconds) or self.steps > 0
+
+    def play_on(self, stop: Event) -> None:
         """Plays the trained policy until the event is set; returns at once where it has ended.
 
         It rests when an episode ends.
         """
         self._policy.is_trained = True
         while not (self.is_over or stop.is_set()):
-            self._play(episode)
+            self._play(0)
             stop.wait(BATCH_S if self._carried is not None else REST_S)
 
     def close(self) -> None:
@@ -181,18 +206,18 @@ class Exhibition(View):
         self._carried = None
         return end
 
-    def _send(self, frames: Frames, caption: str) -> None:
-        send = partial(_send_frames, scene=self._scene, frames=frames, caption=caption, wait=self._wait)
-        self._stream.do(send)
+    def _send(self, frames: Frames, caption: str, *, wait: Callable[[float], bool] | None = None) -> None:
+        send = partial(_send_frames, scene=self._scene, frames=frames, caption=caption)
+        self._stream.do(partial(send, wait=wait or self._wait))
 
 
 def caption_of(policy: PresentPolicy, episode: int) -> str:
-    """What is shown: "present policy, episode 1,234, epsilon 0.31", without the last for agents that have no
-    epsilon."""
+    """What is shown: "current policy, episode 1,234, epsilon 0.31", without the last for agents that have no
+    epsilon, and without the episode after the training."""
     policy.explore_as_now()
     chances = list(dict.fromkeys(f"{epsilon:.2f}" for epsilon in policy.epsilons))
     chance = f", epsilon {' to '.join(dict.fromkeys((chances[0], chances[-1])))}" if chances else ""
-    return f"{'trained' if policy.is_trained else 'present'} policy, episode {episode:,}{chance}"
+    return f"trained policy{chance}" if policy.is_trained else f"current policy, episode {episode:,}{chance}"
 
 
 _CAPTION_CELLS = 2.3
@@ -220,7 +245,7 @@ def _send_frames(
     for sent, row in enumerate(rows, 1):
         for entity, columns in row:
             recording.send_columns(f"exhibition/{entity}", [], columns)
-        if sent < len(rows) and wait(BATCH_S / len(rows)):
+        if sent < len(rows) and wait(BATCH_S / min(len(rows), BATCH_STEPS)):
             return
 
 
@@ -246,7 +271,7 @@ def _rows(scene: Scene, frames: Frames) -> list[list[tuple[str, list[Any]]]]:
     takes a tenth of the time of columns for each."""
     rows: list[list[tuple[str, list[Any]]]] = [[] for _ in frames["step"]]
     for entity, (numbers, columns) in board_columns(scene, frames).items():
-        if entity in IMAGES:
+        if entity == "board":
             forms = rr.SegmentationImage.columns(format=[board_form(scene)] * len(numbers))
             columns = [*columns, *forms]
         arrays = [(column.component_descriptor(), column.as_arrow_array()) for column in columns]

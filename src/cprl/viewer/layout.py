@@ -1,8 +1,8 @@
 """What a recording shows: the numbers and boards, their names and colours, and the layout of the viewer.
 
     header: one line in large type
-    tabs, of which the first has the board (live: the present policy's) beside the harvest, the apples left
-    and the boards of all replicas
+    tabs, of which the first has the board (live: the current policy's) beside the harvest, the apples left
+    and the boards of all replicas, or the apples on the board over the turn in all worlds of one
     the live label, whether agents explore and, at the end, the phases, as strips
 
 A new tab is a line of `_tabs`.
@@ -38,6 +38,7 @@ from cprl.commons.colours import (
 )
 from cprl.commons.decoding import UNSEEN
 from cprl.commons.game import Game
+from cprl.commons.picture import EMPTY_SITE_COLOUR
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.matrix import MatrixGame
 from cprl.envs.unwrap import base_env
@@ -79,6 +80,8 @@ ANOTHER: Final = "another"
 """The name of a phase that matches no pattern of the study."""
 SETTLED: Final = "settled"
 """The state of agents who explore no more, which is not drawn."""
+EMPTY_SITE: Final = UNSEEN - 1
+"""The class of a site without an apple on boards."""
 TEXT: Final = (200, 200, 200)
 BACKGROUND: Final = (24, 26, 32)
 """The background of boards and windows, which sets their dark cells apart from the viewer's own colour."""
@@ -98,14 +101,14 @@ STATES: Final = {
     SETTLED: BACKGROUND,
 }
 """The colours of phases and live labels, which share one where they mean the same."""
-STRIPS: Final = ("now", "now_exploring", "phase/found", "phase/as_published")
+STRIPS: Final = ("now", "exploring", "phase/found", "phase/as_published")
 """The entities of states: the live label, whether agents explore, and the phases that are logged when a long
 run ends."""
 
 
-def window_of(episodes: int) -> int:
-    """The episodes whose mean is the bold line of a run of so many."""
-    return max(10, round(0.02 * episodes))
+def window_of(episodes: int, *, worlds: int = 1) -> int:
+    """The episodes whose mean is the bold line of a run of so many, as many of each world of a replica."""
+    return worlds * ceil(max(10, round(0.02 * episodes)) / worlds)
 
 
 _MOST_BOARDS: Final = 16
@@ -123,11 +126,12 @@ class Curves:
     worlds: int = 1
     """The worlds W of each replica."""
     mean_over: int = 10
-    """The episodes whose mean is the bold line."""
+    """The episodes of a replica whose mean is the bold line, a multiple of W."""
     metrics: tuple[str, ...] = (*METRICS, "stock_left", "yield_share")
     """The metrics that the game reports, without the prefix `social/`."""
     has_phases: bool = True
-    """Whether phases are found when the run ends: it is long enough, and these metrics tell."""
+    """Whether phases are found when the run ends: it is long enough, these metrics tell, and the means of W
+    episodes are no further apart than the resolution of phases."""
     has_tags: bool = True
     """Whether the game reports who tagged whom."""
     institutions: tuple[str, ...] = ()
@@ -202,9 +206,11 @@ def curves_of(
         agents=agents,
         replicas=env.batch_size.numel() // worlds,
         worlds=worlds,
-        mean_over=window_of(episodes),
+        mean_over=window_of(episodes, worlds=worlds),
         metrics=metrics,
-        has_phases=episodes in phases.EPISODES and set(phases.METRICS) <= set(metrics),
+        has_phases=(
+            episodes in phases.EPISODES and worlds <= phases.GRID and set(phases.METRICS) <= set(metrics)
+        ),
         has_tags="tagged_by" in reported,
         institutions=metrics_of(env, reported),
         in_force=decisions_of(env) if "in_force" in reported else (),
@@ -272,15 +278,18 @@ def classes(curves: Curves, colour_of: Callable[[int], Colour] = picture_colour)
         rr.AnnotationInfo(id=kind, label=class_name(kind), color=colour_of(kind))
         for kind in range(FIRST_AGENT + len(curves.agents))
     ]
-    return rr.AnnotationContext([*known, rr.AnnotationInfo(id=UNSEEN, label="", color=(0, 0, 0, 0))])
+    empty = rr.AnnotationInfo(id=EMPTY_SITE, label="no apple", color=EMPTY_SITE_COLOUR)
+    unseen = rr.AnnotationInfo(id=UNSEEN, label="", color=(0, 0, 0, 0))
+    return rr.AnnotationContext([*known, empty, unseen])
 
 
 def styles(curves: Curves) -> dict[str, Any]:
     """The names, colours and widths of each plot's lines, and the colours of states, by entity."""
-    replicas, mean = curves.replicas, f"mean of {curves.mean_over}"
+    replicas, mean = curves.replicas, f"mean of {curves.mean_over} episodes"
     lines = {
         "time/env_steps_per_s": line("steps per second", GREY),
         f"{EVALUATION}/greedy_return": line("greedy, evaluated", ORANGE),
+        f"{EVALUATION}/return": line("sum of all, evaluated", ORANGE),
         "turn/stock": line("apples", PALETTE[APPLE]),
     }
     if curves.unit == "return":
@@ -418,13 +427,13 @@ def decision_panels(agents: int, actions: int, window: tuple[int, int]) -> Panel
 
 PLOT_WIDE, PLOT_HIGH = 260.0, 80.0
 """The size of a plot that is not over time, in the view's units; (0, 0) is the top left of its area."""
-TITLE: Final = PLOT_WIDE / 2, -16.0
+TITLE: Final = PLOT_WIDE / 2, -22.0
 """Where its title hangs."""
 
 
 def _drawn_plot(name: str, origin: str) -> Any:
     """The view of a plot that is not over time, with room for its texts."""
-    return flat(name, origin, x=(-24.0, PLOT_WIDE + 16.0), y=(TITLE[1], PLOT_HIGH + 26.0))
+    return flat(name, origin, x=(-24.0, PLOT_WIDE + 16.0), y=(TITLE[1], PLOT_HIGH + 34.0))
 
 
 def flat(
@@ -434,7 +443,7 @@ def flat(
     return rrb.Spatial2DView(name=name, origin=f"/{origin}", background=BACKGROUND, visual_bounds=bounds)
 
 
-_HEADER, _RULER, _STRIP, _VIEWS = 64, 24, 43, 480
+_HEADER, _RULER, _STRIP, _VIEWS = 90, 22, 40, 462
 """Heights in a window of 1280 x 720, in pixels: the header, the ruler above strips, a strip, and all else.
 Rows share out any other height as they do this one."""
 
@@ -447,7 +456,7 @@ def layout(curves: Curves, *, live: bool = False, ended: bool = False) -> Any:
 
     Args:
         curves: the numbers that are plotted; a `Scene` if there is a board.
-        live: whether it is the layout of the live view, which has the present policy's exhibition
+        live: whether it is the layout of the live view, which has the current policy's exhibition
             (`/exhibition`, in the live stream alone), and no room for phases before they are there.
     """
     is_replay = isinstance(curves, Scene) and curves.is_replay
@@ -510,7 +519,7 @@ def _events() -> Any:
 def _strips() -> Any:
     """The live label, below it whether agents explore, and the phases found at the end and the published
     ones, as bands over episodes."""
-    contents = ["+ /now", "+ /now_exploring", "+ /phase/**"]
+    contents = [f"+ /{strip}" for strip in STRIPS]
     return rrb.StateTimelineView(name="Phases", contents=contents, time_view=_whole(), titlebar=False)
 
 
@@ -519,9 +528,8 @@ def _overview(curves: Curves, *, live: bool) -> Any:
     if curves.unit == "apples":
         gets = _social(curves, "collective_return", is_explained=True)
     else:
-        gets = _plot(
-            f"Sum of all returns; {_lines(curves)}", [RETURN, f"{RANDOM_PLAY}/{RETURN}"], has_legend=False
-        )
+        entities = [RETURN, f"{RANDOM_PLAY}/{RETURN}", f"{EVALUATION}/return"]
+        gets = _plot(f"Sum of all returns; {_bold(curves)}", entities, has_legend=False)
     if not isinstance(curves, Scene):
         joint = (
             _plot("Joint actions, share of turns; agent 0 first", [JOINT], share=True)
@@ -529,12 +537,15 @@ def _overview(curves: Curves, *, live: bool) -> Any:
             else None
         )
         return rrb.Horizontal(rrb.Vertical(gets, _returns(curves)), *_present([joint]), name="Overview")
-    board = (
-        _board("Present policy", curves, origin="exhibition", below=4.2) if live else _board("Board", curves)
-    )
-    boards = _wall(curves) if curves.boards > 1 else _social(curves, "survival_steps")
+    board = _board("Live board", curves, origin="exhibition", below=4.2) if live else _board("Board", curves)
+    boards, high = _social(curves, "survival_steps"), 1.0
+    if curves.worlds > 1:
+        boards, high = _turns(), 1.4
+    elif curves.boards > 1:
+        boards = _wall(curves)
     beside = _present([gets, _social(curves, "stock_left"), boards])
-    return rrb.Horizontal(board, rrb.Vertical(*beside), column_shares=[3, 2], name="Overview")
+    rows = rrb.Vertical(*beside, row_shares=[1.0, 1.0, high][-len(beside) :])
+    return rrb.Horizontal(board, rows, column_shares=[3, 2], name="Overview")
 
 
 def _tabs(curves: Curves, *, live: bool) -> list[Any]:
@@ -545,14 +556,16 @@ def _tabs(curves: Curves, *, live: bool) -> list[Any]:
         [f"institutions/{name}" for name in names if name in curves.institutions]
         for names in (SHARES, INCOMES)
     )
-    recorded, windows, visits, stock = None, None, None, None
+    recorded, windows, visits, stock, wall = None, None, None, None, None
     if isinstance(curves, Scene):
         recorded = _board("Recorded episodes", curves) if live else None
         windows = flat(f"Recorded windows: {curves.caption}", "windows")
-        stock = _drawn_plot("Apples on the board, over the turn", "turn")
+        stock = _turns() if curves.worlds == 1 else None
+        wall = _wall(curves) if curves.worlds > 1 else None
         places = boards_of(curves, len(agents))
         visits = places.view("Where agents go in the first replica, by episodes", "visits")
     tabs = {
+        "Worlds": [wall],
         "Windows and events" if windows else "Events": [recorded, windows, _events()],
         "Agents": [
             _returns(curves) if windows else None,
@@ -582,7 +595,7 @@ def _tabs(curves: Curves, *, live: bool) -> list[Any]:
             stock,
             *(
                 _social(curves, name)
-                for name in ("peacefulness", "efficiency", "sustainability", "yield_share")
+                for name in ("peacefulness", "peace", "efficiency", "sustainability", "yield_share")
             ),
         ],
         "Your metrics": [_social(curves, name) for name in filter(is_own, curves.metrics)],
@@ -604,14 +617,18 @@ def _present(views: Iterable[Any]) -> list[Any]:
 
 
 def _wall(scene: Scene) -> Any:
-    whose = "All replicas" if scene.worlds == 1 else "Worlds of the first replica"
+    whose = "All replicas" if scene.worlds == 1 else "Worlds of the first replica, number: turn"
     wall = boards_of(scene, scene.boards)
-    return wall.view(f"{whose}; orange: the board of its last episode died", "wall")
+    return wall.view(f"{whose}; orange: the episode before ended without an apple", "wall")
+
+
+def _turns() -> Any:
+    return _drawn_plot("Apples on the board, over the turn", "turn")
 
 
 def _tags(agents: int) -> Any:
     bounds = (-1.0, agents + 0.5)
-    return flat("Tags in 50 episodes: who (row) was tagged by whom (column)", "tags", x=bounds, y=bounds)
+    return flat("Tags in an episode: who (row) was tagged by whom (column)", "tags", x=bounds, y=bounds)
 
 
 def _rewards(curves: Curves) -> str:
@@ -619,21 +636,29 @@ def _rewards(curves: Curves) -> str:
 
 
 def _returns(curves: Curves) -> Any:
-    entities = [*_of(curves.agents, "return"), f"{EVALUATION}/greedy_return"]
+    summed = [f"{EVALUATION}/greedy_return", *([f"{EVALUATION}/return"] if curves.unit == "apples" else [])]
+    entities = [*_of(curves.agents, "return"), *summed]
     return _plot(f"Return of each, {_rewards(curves)}", entities)
 
 
 def _social(curves: Curves, metric: str, *, share: bool = False, is_explained: bool = False) -> Any:
-    """The plot of a metric with the lines of random play and of evaluations, of which its name says which is
-    which if it is explained; None if the game does not report it."""
+    """The plot of a metric with the lines of random play and of evaluations, whose name says what the bold
+    line is if it is explained; None if the game does not report it."""
     folders = ("social", RANDOM_PLAY, EVALUATION) if metric in curves.metrics else ()
     name = metric if is_own(metric) else title(metric)[0].upper() + title(metric)[1:]
-    name += f"; {_lines(curves)}" if is_explained else ""
+    name += f"; {_bold(curves)}" if is_explained else ""
     return _plot(name, [f"{folder}/{metric}" for folder in folders], share=share, has_legend=False)
 
 
-def _lines(curves: Curves) -> str:
-    return f"bold: mean of {curves.mean_over}, grey: random play"
+def legend_of(curves: Curves) -> str:
+    """What the lines of plots are, and how many episodes a point of them is of."""
+    point = "" if curves.worlds == 1 else f"a point is the mean of {curves.worlds} episodes; "
+    thin = "thin: a replica, " if curves.replicas > 1 else ""
+    return f"Curves by episode: {point}{thin}{_bold(curves)}, grey: random play"
+
+
+def _bold(curves: Curves) -> str:
+    return f"bold: mean of {curves.mean_over} episodes"
 
 
 def _plot(name: str, entities: Sequence[str], *, share: bool = False, has_legend: bool = True) -> Any:

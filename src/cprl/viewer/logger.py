@@ -1,6 +1,5 @@
 """RerunLogger: records a run with Rerun, to a file and, on request, live on 127.0.0.1."""
 
-import itertools
 import json
 import time
 import uuid
@@ -25,8 +24,8 @@ from cprl.values import shown
 from cprl.viewer.board import Frames, columns, fixed
 from cprl.viewer.layout import Curves, Scene, layout
 from cprl.viewer.live import FLUSH_TIMEOUT_S, REPLAY, RUN, Live, LiveStream, Stream, open_file
+from cprl.viewer.page import FILE_NAME
 
-FILE_NAME: Final = "run.rrd"
 TIMELINES: Final = ("step", "episode", "frame")
 """The timelines of every row: environment steps of the run, episodes, and frames recorded so far."""
 
@@ -38,12 +37,6 @@ _LONGEST: Final = 90
 """Characters of a value in the table; the recipe of the run has them all."""
 
 Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
-
-
-def recordings_of(run: Path) -> list[Path]:
-    """The recordings of a run so far, in their order: run.rrd, run-2.rrd and so on."""
-    names = (FILE_NAME if number == 1 else f"run-{number}.rrd" for number in itertools.count(1))
-    return list(itertools.takewhile(Path.exists, (run / name for name in names)))
 
 
 def recording_id(run: Path, file_name: str) -> str | None:
@@ -173,6 +166,7 @@ class RerunLogger(Logger):
         self.frames = 0
         """Frames recorded so far, including those in earlier files of the recording."""
         self._now = (0, 0)
+        self._is_together = False
         self._clips_end: dict[str, int] = {}
         super().__init__(exp_name, str(log_dir))
 
@@ -235,6 +229,21 @@ class RerunLogger(Logger):
         finally:
             self._streams = streams
 
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """Send all that is logged within the block at the same time, so that it agrees when it is seen."""
+        self._is_together = True
+        try:
+            yield
+        finally:
+            self._is_together = False
+            self._send_due()
+
+    def _send_due(self) -> None:
+        for stream in self._streams:
+            if stream.is_due and not self._is_together:
+                send_waiting(stream)
+
     def log_static(self, entity: str, *what: Any) -> None:
         """Logs archetypes that hold at all times."""
         self.do(lambda recording: recording.log(entity, *what, static=True))
@@ -286,8 +295,7 @@ class RerunLogger(Logger):
     def _wait(self, name: str, step: int, values: list[float] | str) -> None:
         for stream in self._streams:
             stream.waiting.setdefault(name, []).append((step, self._now[1], self.frames, values))
-            if stream.is_due:
-                send_waiting(stream)
+        self._send_due()
 
     def log_states(self, name: str, states: Mapping[int, str], *, live_only: bool = False) -> None:
         """Logs states by the episode from which they hold; their step is the one set by `at`."""

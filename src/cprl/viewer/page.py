@@ -1,13 +1,17 @@
 """How recordings are opened: Rerun's viewers, native and in a browser, and a run that stays served."""
 
+import itertools
 import os
+import re
 import shutil
 import socket
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
+from http.client import HTTPException
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Event, Thread, current_thread, main_thread
@@ -22,6 +26,7 @@ from cprl.values import checked
 if TYPE_CHECKING:
     from cprl.viewer.logger import RerunLogger
 
+FILE_NAME: Final = "run.rrd"
 LOCALHOST: Final = "127.0.0.1"
 Served = Literal["serve", "spawn"]
 
@@ -32,8 +37,16 @@ _THIS_MACHINE: Final = (
 """Rerun's page would ask other machines for fonts, and tell one of its use."""
 _OPEN: Final = build_opener(ProxyHandler({})).open
 """Past the proxies of the environment, which do not know the ports of this machine."""
+_PATH: Final = re.compile("/[!-~]*")
+"""What a request may ask for: printed ASCII characters without spaces."""
 _UNTIL_THE_PIPE_CLOSES: Final = '"$@" & read -r _; kill $!'
 """A shell ends Rerun's server when this process ends, even when it is killed."""
+
+
+def recordings_of(run: Path) -> list[Path]:
+    """The recordings of a run so far, in their order: run.rrd, run-2.rrd and so on; films are none."""
+    names = (FILE_NAME if number == 1 else f"run-{number}.rrd" for number in itertools.count(1))
+    return list(itertools.takewhile(Path.exists, (run / name for name in names)))
 
 
 class WebViewer:
@@ -83,13 +96,25 @@ class WebViewer:
 
 
 class _Page(BaseHTTPRequestHandler):
-    """Leads to a page of another server, and hands out what that one serves."""
+    """Leads to a page of another server, and hands out what that one serves, where it is asked by the name of
+    this machine: a foreign page that has bound its own name to 127.0.0.1 gets nothing."""
 
     def __init__(self, origin: str, page: str, opened: Callable[[], object], *arguments: Any) -> None:
         self._origin, self._page, self._opened = origin, page, opened
         super().__init__(*arguments)
 
+    def handle(self) -> None:
+        with suppress(ConnectionError):  # a browser that leaves
+            super().handle()
+
     def do_GET(self) -> None:
+        port = self.server.server_address[1]
+        if self.headers.get("Host") not in (f"{LOCALHOST}:{port}", f"localhost:{port}"):
+            self.send_error(HTTPStatus.FORBIDDEN)
+            return
+        if not _PATH.fullmatch(self.path):
+            self.send_error(HTTPStatus.BAD_REQUEST)
+            return
         if self.path == "/":
             self.send_response(HTTPStatus.FOUND)
             self.send_header("Location", self._page)
@@ -100,7 +125,7 @@ class _Page(BaseHTTPRequestHandler):
         try:
             with _OPEN(self._origin + self.path) as answer:
                 content = answer.read()
-        except OSError as error:
+        except (OSError, HTTPException) as error:
             self.send_error(getattr(error, "code", HTTPStatus.SERVICE_UNAVAILABLE))
             return
         self.send_response(HTTPStatus.OK)

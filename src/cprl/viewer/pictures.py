@@ -2,6 +2,7 @@
 boards of all replicas, where agents go, the stock over the turn, the Lorenz curve, and borders of regions."""
 
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import chain
@@ -107,6 +108,11 @@ class Plots(View):
             defined = [value for value in values if value == value]
             if defined:
                 self._random[name] = fmean(defined)
+        for name, mean in self._random.items():  # a line in plots that have no curve yet
+            points = rr.Scalars.columns(scalars=[mean, mean])
+            self._logger.log_columns(
+                f"{RANDOM_PLAY}/{name}", ([0, 0], [0, 1], [0, 0]), points, live_only=True
+            )
 
     def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
         curves = self._logger.curves
@@ -117,7 +123,8 @@ class Plots(View):
             singles = values.tolist() if is_social and len(values) > 1 else []
             lines = [*singles, mean := mean_of(values)]
             if is_social or name.endswith(_WITH_MEAN):
-                lines.append(self._recent.setdefault(name, Recent(curves.mean_over)).add(mean))
+                recent = self._recent.setdefault(name, Recent(curves.mean_over, each=curves.worlds))
+                lines.append(recent.add(mean))
             self._logger.log_lines(name, lines)
         for name, mean in self._random.items():
             self._logger.log_scalar(f"{RANDOM_PLAY}/{name}", mean)
@@ -135,7 +142,7 @@ class JointActions(View):
         self._places = actions ** np.arange(len(curves.agents))[::-1]
         self._counts = np.zeros((len(self._worlds), len(curves.joint)))
         self._shares: dict[int, list[NDArray[np.float64]]] = {}
-        self._recent = [Recent(curves.mean_over) for _ in curves.joint]
+        self._recent = [Recent(curves.mean_over, each=curves.worlds) for _ in curves.joint]
 
     def on_batch(self, batch: TensorDictBase) -> None:
         action = batch[keys.ACTION].cpu().numpy()
@@ -155,15 +162,20 @@ class JointActions(View):
 
 
 class Tags(View):
-    """Draws a matrix of who tagged whom every ten episodes of a world: the sum over the last fifty, of all
-    replicas."""
+    """Draws a matrix of who tagged whom every ten episodes of a replica: the mean over its last fifty, or as
+    many of each of its worlds as have fifty, and over all replicas."""
 
-    EVERY, OVER = 10, 5
+    EVERY, OVER = 10, 50
 
     def __init__(self, logger: RerunLogger) -> None:
         self._logger = logger
         agents = range(len(logger.curves.agents))
-        self._last = [np.zeros((len(agents),) * 2)]
+        self._every = ceil(self.EVERY / logger.curves.worlds)
+        """Groups of W episodes from one matrix to the next."""
+        self._groups = 0
+        parts = ceil(self.OVER / (self._every * logger.curves.worlds))
+        self._last = deque([(0, np.zeros((len(agents),) * 2))], maxlen=parts)
+        """Episodes of all replicas and their tags, since the last matrix and between those before."""
         cells = [(col + 0.5, row + 0.3) for row in agents for col in agents]
         edges = [(-0.5, agent + 0.3) for agent in agents] + [(agent + 0.5, -0.7) for agent in agents]
         places = rr.Points2D.from_fields(
@@ -173,20 +185,23 @@ class Tags(View):
 
     def on_episode(self, episode: Episode) -> None:
         if episode.tagged_by is not None:
-            self._last[-1] += episode.tagged_by
+            count, tags = self._last[-1]
+            self._last[-1] = count + 1, tags + episode.tagged_by
 
     def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
-        if (episode + 1) // self._logger.curves.worlds % self.EVERY == 0:
-            tags = np.sum(self._last, 0)
-            light = (tags / max(1.0, tags.max()))[..., None]
+        self._groups += 1
+        if self._groups % self._every == 0:
+            counts, sums = zip(*self._last, strict=True)
+            tags = np.sum(sums, 0) / max(1, sum(counts))
+            light = (tags / (tags.max() or 1.0))[..., None]
             image = np.array(PALETTE[GROUND]) * (1 - light) + np.array(STATES["combat"]) * light
             self._logger.log_row("tags", rr.Image(image.round().astype(np.uint8)))
             texts = [
-                *(f"{count:.0f}" for count in tags.ravel()),
+                *(f"{count:.3g}" for count in tags.ravel()),
                 *2 * [f"{agent}" for agent in range(len(tags))],
             ]
             self._logger.log_row("tags/counts", rr.Points2D.from_fields(labels=texts))
-            self._last = [*self._last[1 - self.OVER :], np.zeros_like(self._last[0])]
+            self._last.append((0, np.zeros_like(tags)))
 
 
 WALL_BYTES: Final = 4_000_000
@@ -386,9 +401,16 @@ class Visits(Sampled):
 
 
 class DrawnPlot:
-    """A plot that is not over time, with two axes from 0 on; the name of its view says what y is."""
+    """A plot that is not over time, with two axes from 0 on; the name of its view says what y is.
 
-    def __init__(self, logger: RerunLogger, origin: str, x: str, *, x_end: float, y_end: float) -> None:
+    Args:
+        x: what the other axis is.
+        begins: the episodes after which it has its first lines; until then viewers read that.
+    """
+
+    def __init__(
+        self, logger: RerunLogger, origin: str, x: str, *, x_end: float, y_end: float, begins: int
+    ) -> None:
         self._logger, self._origin, self._ends = logger, origin, np.array((x_end, y_end))
         faint, grey = (50, 52, 58), (120, 120, 120)
         ticks = [_ticks(x_end), _ticks(y_end)]
@@ -405,6 +427,9 @@ class DrawnPlot:
         logger.log_static(
             f"{origin}/axes/texts", _texts([*below, *left, (PLOT_WIDE / 2, PLOT_HIGH + 13.0)], texts)
         )
+        soon = rr.Points2D.columns(positions=[TITLE], labels=[f"lines from episode {begins} on"])
+        style = rr.Points2D.columns(colors=[TEXT], radii=[0.0], show_labels=[True])
+        logger.log_columns(f"{origin}/title", ([0], [0], [0]), [*soon, *style], live_only=True)
 
     def log(self, title: str, curves: Sequence[tuple[Any, Any]], *, colours: Any, radii: Any) -> None:
         """Log a title and lines, each of x and y."""
@@ -440,7 +465,10 @@ class Turns(Sampled):
 
     def __init__(self, env: CommonsEnv, logger: RerunLogger, *, every: int) -> None:
         game, boards = env.game, logger.curves.boards
-        self._whose = "each replica" if logger.curves.worlds == 1 else "each world shown"
+        self._whose = "each replica"
+        if logger.curves.worlds > 1:
+            worlds = "each world" if logger.curves.worlds == boards else f"the first {boards} worlds"
+            self._whose = f"{worlds} of the first replica"
         stride = ceil(game.rules.episode_steps / self.POINTS)
         super().__init__(env, ("step", "stock_left"), worlds=boards, every=every, stride=stride)
         self._playing = np.full((boards, game.rules.episode_steps // self.stride + 1, 2), np.nan)
@@ -449,7 +477,8 @@ class Turns(Sampled):
         """The points of each board's last episode, (turn, stock)."""
         self._died = [False] * boards
         ends = {"x_end": game.rules.episode_steps, "y_end": max(1, len(game.map.sites))}
-        self._plot = DrawnPlot(logger, "turn", "turn of the episode", **ends)
+        begins = ceil(every / logger.curves.worlds) * logger.curves.worlds
+        self._plot = DrawnPlot(logger, "turn", "turn of the episode", begins=begins, **ends)
 
     def _add(self, *arrays: NDArray[Any]) -> None:
         """Places the points, the latest last: it stays where two have the same place."""
@@ -472,7 +501,7 @@ class Turns(Sampled):
         boards = [board for board, line in enumerate(self.lines) if len(line) > 1]
         if boards:
             self._plot.log(
-                f"last episode of {self._whose}: {sum(self._died)} of {len(boards)} boards died (orange)",
+                f"last episode of {self._whose}: {sum(self._died)} of {len(boards)} died (orange)",
                 [tuple(np.array(self.lines[board]).T) for board in boards],
                 colours=[_DIED if self._died[board] else GREY for board in boards],
                 radii=0.5,
@@ -507,7 +536,9 @@ class Lorenz(Picture):
         self._curves: dict[int, list[NDArray[np.float64]]] = {}
         """Of each episode, for those of the replicas that had a harvest."""
         self._first: tuple[NDArray[np.float64], str] | None = None
-        self._plot = DrawnPlot(logger, "lorenz", "agents, the poorest first, %", x_end=100, y_end=100)
+        begins = ceil(every / logger.curves.worlds) * logger.curves.worlds
+        ends = {"x_end": 100.0, "y_end": 100.0}
+        self._plot = DrawnPlot(logger, "lorenz", "agents, the poorest first, %", begins=begins, **ends)
 
     def on_episode(self, episode: Episode) -> None:
         if episode.harvest is not None and episode.harvest.sum() > 0:

@@ -2,8 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite, isnan
-from statistics import fmean, stdev
+from math import ceil, isfinite, isnan
 from threading import Event, Thread
 from typing import Final, NamedTuple
 
@@ -17,10 +16,11 @@ from cprl.measuring import phases
 from cprl.measuring.episodes import Episode
 from cprl.measuring.now import BEGINS, EXPLORING, Now
 from cprl.measuring.series import Values, mean_of
-from cprl.runs.curves import running_mean
+from cprl.measuring.statistics import Estimate, estimate
+from cprl.runs.curves import SMOOTHED_EPISODES, running_mean
 from cprl.system.times import CLOCK
 from cprl.viewer.board import Filming
-from cprl.viewer.layout import ANOTHER, SETTLED, STRIPS, Curves
+from cprl.viewer.layout import ANOTHER, SETTLED, STRIPS, Curves, legend_of
 from cprl.viewer.live import HEADER
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.pictures import View, has_died
@@ -29,22 +29,22 @@ from cprl.viewer.pictures import View, has_died
 class Played(NamedTuple):
     """Episodes in fresh worlds, in numbers."""
 
-    mean: float
-    """The mean collective return in apples, or where the game reports no harvest the mean summed return."""
-    error: float
-    """Its standard error over episodes; NaN for a single one."""
+    harvest: Estimate
+    """The mean collective return in apples, or where the game reports no harvest the mean summed return, with
+    its interval over replicas; that of a single replica has none."""
     died: int | None
     """Episodes whose board died before the time was up; None where the game reports no stock."""
     episodes: int
 
 
-def played(episodes: Sequence[Episode]) -> Played:
-    """The numbers of at least one episode."""
+def played(episodes: Sequence[Episode], *, replicas: int = 1) -> Played:
+    """The numbers of at least one episode in fresh worlds, equally many of each replica, one replica after
+    the other; of any other number the mean alone."""
+    replicas = 1 if len(episodes) % replicas else replicas
     values = [float(episode.metrics.get("collective_return", episode.return_.sum())) for episode in episodes]
     died = [has_died(episode) for episode in episodes]
     return Played(
-        mean=fmean(values),
-        error=stdev(values) / len(values) ** 0.5 if len(values) > 1 else float("nan"),
+        harvest=estimate(np.reshape(values, (replicas, -1)).mean(1)),
         died=None if None in died else sum(map(bool, died)),
         episodes=len(values),
     )
@@ -62,6 +62,8 @@ class Header:
     """"apples" or "return"."""
     rules: str = ""
     """The institutions in force, in words."""
+    legend: str = ""
+    """What a point of a curve is, below each header."""
     is_about: bool = False
     """Whether it trains so many steps."""
 
@@ -69,8 +71,9 @@ class Header:
     def _of(self) -> str:
         return f"of {'about ' * self.is_about}{self.episodes:,}"
 
-    def begins(self, status: str) -> str:
-        return self._text(f"Episode 1 {self._of}", status)
+    def begins(self, status: str, random_play: float | None = None) -> str:
+        beside = "" if random_play is None else f"random play {self._amount(random_play)}"
+        return self._text(f"Episode 1 {self._of}", status, beside)
 
     def line(
         self, *, episode: int, label: str, mean: float, random_play: float | None, died: int | None
@@ -80,9 +83,15 @@ class Header:
         deaths = "" if died is None else self._died(died, self.boards)
         return self._text(f"Episode {episode:,} {self._of}", label, f"{self._amount(mean)}{beside}", deaths)
 
-    def finished(self, trained: Played, random: Played) -> str:
-        """After the evaluation of a run: the trained policy beside the random one, in fresh worlds."""
-        beside = f"trained {self._amount(trained.mean)}, random play {_number(random.mean)}"
+    def finished(self, learning: float, trained: Played, random: Played) -> str:
+        """After the evaluation of a run: the last mean of its training, and of fresh worlds those of the
+        trained policy, which explores less there, and of random play."""
+        amounts = {"trained": trained.harvest.value, "random play": random.harvest.value}
+        if not isnan(learning):
+            amounts = {"while learning": learning, **amounts}
+        (first, amount), *others = amounts.items()
+        beside = ", ".join(f"{name} {_number(value)}" for name, value in others)
+        beside = f"{first} {self._amount(amount)}, {beside}"
         died = "" if trained.died is None else self._died(trained.died, trained.episodes)
         return self._text(self._finished, beside, died)
 
@@ -99,7 +108,8 @@ class Header:
         return self._text(f"Stopped after {episode:,} {self._of} episodes", amount)
 
     def _text(self, *parts: str) -> str:
-        return f"#### {' · '.join(part for part in (*parts, self.rules) if part)}"
+        line = f"#### {' · '.join(part for part in (*parts, self.rules) if part)}"
+        return f"{line}\n\n{self.legend}" if self.legend else line
 
     def _amount(self, value: float) -> str:
         return f"{_number(value)} apples" if self.unit == "apples" else f"{self.unit} {_number(value)}"
@@ -115,41 +125,44 @@ def _number(value: float) -> str:
 
 
 class Course:
-    """The course of the metrics that tell new bests and phases, as means over replicas."""
+    """The course of the metrics that tell new bests and phases, as means over replicas and, of replicas in W
+    worlds, over W episodes of each."""
 
     BEST_OVER = 50
-    """Episodes of the mean return that is compared with the best."""
+    """Episodes of the mean return that is compared with the best, at least."""
     BETTER = 1.05
     """The factor by which a new best must exceed the last reported one."""
 
-    def __init__(self) -> None:
+    def __init__(self, worlds: int = 1) -> None:
+        self._worlds = worlds
         self._means: list[list[float]] = []
         self._best = 0.0
 
     def new_best(self, means: Mapping[str, float]) -> str | None:
-        """Adds the means of an episode; returns the new best in words if there is one."""
+        """Adds the means of an episode, or of W; returns the new best in words if there is one."""
         self._means.append([means[f"social/{name}"] for name in phases.METRICS])
-        if len(self._means) % self.BEST_OVER:
+        count = ceil(self.BEST_OVER / self._worlds)
+        if len(self._means) % count:
             return None
-        reached = float(np.mean([mean[0] for mean in self._means[-self.BEST_OVER :]]))
+        reached = float(np.mean([mean[0] for mean in self._means[-count:]]))
         if not reached > self.BETTER * self._best:
             return None
         self._best = reached
-        return f"new best: {reached:.1f} apples per episode, mean of the last {self.BEST_OVER}"
+        return f"new best: {reached:.1f} apples per episode, mean of the last {count * self._worlds}"
 
     def phases(self) -> list[phases.Phase]:
         """The phases so far, four at most; empty until there are enough episodes for one.
 
         They are of running means, in which an undefined metric repeats its last value.
         """
-        if len(self._means) < phases.SHORTEST:
+        if len(self._means) * self._worlds < phases.SHORTEST:
             return []
-        smoothed = running_mean(np.array(self._means).T)
-        episodes = np.arange(smoothed.shape[1])
+        smoothed = running_mean(np.array(self._means).T, ceil(SMOOTHED_EPISODES / self._worlds))
+        episodes = self._worlds * np.arange(smoothed.shape[1])
         for row in smoothed:
             defined = np.flatnonzero(~np.isnan(row))
             row[:] = np.interp(episodes, defined, row[defined]) if len(defined) else 0.0
-        number = max(0, min(3, len(episodes) // phases.SHORTEST - 1))
+        number = max(0, min(3, len(episodes) * self._worlds // phases.SHORTEST - 1))
         return phases.find_phases(episodes, dict(zip(phases.METRICS, smoothed, strict=True)), number=number)
 
 
@@ -186,10 +199,12 @@ class Story(View):
             boards=self._curves.replicas * self._curves.worlds,
             unit=self._curves.unit,
             rules=", ".join(filter(None, (rules_of(game), own))),
+            legend=legend_of(self._curves),
             is_about=is_about,
         )
-        self.now = Now()
-        self._course = Course() if set(phases.METRICS) <= set(self._curves.metrics) else None
+        self.now = Now(self._curves.worlds)
+        has_course = set(phases.METRICS) <= set(self._curves.metrics)
+        self._course = Course(self._curves.worlds) if has_course else None
         self._random: Played | None = None
         self._ended = 0
         self._died: dict[int, int] = {}
@@ -202,9 +217,15 @@ class Story(View):
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
         """Sets what the group is compared with, and logs it as an event."""
-        self._random = played(episodes)
-        self.now.random_play = self._random.mean
+        self._random = played(episodes, replicas=self._curves.replicas)
+        self.now.random_play = self._random.harvest.value
         self._logger.log_text(f"random play {self._in_words(self._random)}")
+        if not self._ended:
+            self.begins(BEGINS)
+
+    def begins(self, status: str) -> None:
+        """Says live what is done before the first episode ends, e.g. "compiling, 12 s so far"."""
+        self._logger.show_live(HEADER, self.header.begins(status, self.now.random_play))
 
     def on_episode(self, episode: Episode) -> None:
         if (died := has_died(episode)) is not None:
@@ -238,7 +259,7 @@ class Story(View):
             episode=self._ended,
             label=f"{self.now.label}, {EXPLORING}" if self.now.explores else self.now.label,
             mean=self.now.mean,
-            random_play=None if self._random is None else self._random.mean,
+            random_play=self.now.random_play,
             died=died,
         )
         self._logger.log_document(HEADER, text)
@@ -253,7 +274,7 @@ class Story(View):
             return []
         before, explored, events = self.now.label, self.now.explores, []
         label = self.now.add(value, {name: mean for name, mean in means.items() if name.endswith("/epsilon")})
-        if label != before or episode == 0:
+        if label != before or episode < self._curves.worlds:
             self._logger.log_states(_NOW, {episode: label})
         if self.now.explores != explored:
             self._logger.log_states(_EXPLORING, {episode: EXPLORING if self.now.explores else SETTLED})
@@ -263,8 +284,10 @@ class Story(View):
 
     def finished(self, played_by: Mapping[str, Sequence[Episode]]) -> None:
         """Logs the evaluation of a run that is over, and its phases."""
-        trained, random = played(played_by["trained"]), played(played_by["random"])
-        self._end(self.header.finished(trained, random))
+        replicas = self._curves.replicas
+        trained = played(played_by["trained"], replicas=replicas)
+        random = played(played_by["random"], replicas=replicas)
+        self._end(self.header.finished(self.now.mean, trained, random))
         self._logger.log_text(f"finished: trained {self._in_words(trained)}")
 
     def close(self) -> None:
@@ -279,8 +302,7 @@ class Story(View):
     def _end(self, header: str) -> None:
         self._is_over = True
         if self._course is not None and self._curves.has_phases:
-            worlds = self._curves.worlds
-            found = {round(phase.first) * worlds: phase.label or ANOTHER for phase in self._course.phases()}
+            found = {round(phase.first): phase.label or ANOTHER for phase in self._course.phases()}
             self._logger.log_states(_FOUND, found)
             published = published_phases(self._game).items()
             if within := {first: label for first, label in published if first < self._ended}:
@@ -289,9 +311,8 @@ class Story(View):
         self._logger.log_document(HEADER, header)
 
     def _in_words(self, numbers: Played) -> str:
-        error = f" ± {numbers.error:.2g}" if isfinite(numbers.error) else ""
         died = "" if numbers.died is None else f"; {numbers.died:,} of {numbers.episodes:,} boards died early"
-        return f"{numbers.mean:.1f}{error} {self.header.unit}{died}"
+        return f"{numbers.harvest} {self.header.unit}{died}"
 
 
 def published_phases(game: Game | None) -> dict[int, str]:
@@ -370,8 +391,9 @@ class CompilingNotice(View):
     def _watch(self) -> None:
         was_running = False
         while not self._over.wait(self.PERIOD_S):
-            if CLOCK.is_running:
+            is_running = CLOCK.is_running  # once: it may end in between
+            if is_running:
                 self._show(f"compiling, {CLOCK.total_s - self._before_s:.0f} s so far")
             elif was_running:
                 self._show("begins")
-            was_running = CLOCK.is_running
+            was_running = is_running
