@@ -80,7 +80,7 @@ def run(
     *,
     resume: bool = False,
     take_over: bool = False,
-    keep_checkpoint: bool = True,
+    keep_checkpoint: bool = False,
     watch: str = "file",
     linger: bool = False,
     threads: int = 1,
@@ -98,8 +98,8 @@ def run(
             of fewer episodes, stopped or finished, is extended. Either equals a run that was not interrupted,
             bit for bit. Of a finished run of as many episodes nothing is done.
         take_over: whether to resume a run that a process on another host has locked.
-        keep_checkpoint: whether a finished run keeps the state of its training, buffers included, so that it
-            can be extended.
+        keep_checkpoint: whether a finished run keeps the state of its training, so that it can be extended:
+            hundreds of megabytes, buffers included.
         watch: "file" for a recording for the Rerun viewer; "serve" or "spawn" to watch
             live as well, see `cprl.viewer.live.Live`; "off" for none.
         linger: whether the recording stays served after the run, until Ctrl-C (SIGINT) or SIGTERM; only with
@@ -358,8 +358,6 @@ def _remove(directory: Path, *, with_directory: bool) -> None:
 
 def _say_what_is_kept(directory: Path, experiment: Experiment) -> None:
     for checkpoint in checkpoints_in(directory / FOLDER):
-        console().print(
-            f"Kept so that it can be extended (--resume with more --{experiment.unit}): {checkpoint}, "
-            f"{checkpoint.stat().st_size / 1e6:,.1f} MB",
-            soft_wrap=True,
-        )
+        size = checkpoint.stat().st_size / 1e6
+        text = f"Kept to extend it by --resume with more --{experiment.unit}: {FOLDER}/ending-*.pt, {size:,.0f} MB"
+        console().print(text, style="dim", highlight=False, soft_wrap=True)
