@@ -89,9 +89,10 @@ def with_unit(name: str, *, rewards: str = "") -> str:
 
 
 def bounds(name: str) -> tuple[float, float]:
-    """What a metric can be, as far as its unit says so."""
+    """What a metric can be, as far as it is known of every game; of a return, anything."""
     is_share = name in NAMES and NAMES[name][1] == social.SHARE
-    return 0.0 if is_share or name in social.SOCIAL else -inf, 1.0 if is_share else inf
+    is_amount = name in NAMES or name.endswith(("/fines", "/transfers", "/violations"))
+    return 0.0 if is_amount else -inf, 1.0 if is_share else inf
 
 
 OPTIONAL: Final = ("harvest", "in_play", "fired", "hit_by", "tagged_by", "stock")

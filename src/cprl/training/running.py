@@ -359,5 +359,5 @@ def _remove(directory: Path, *, with_directory: bool) -> None:
 def _say_what_is_kept(directory: Path, experiment: Experiment) -> None:
     for checkpoint in checkpoints_in(directory / FOLDER):
         size = checkpoint.stat().st_size / 1e6
-        text = f"Kept to extend it by --resume with more --{experiment.unit}: {FOLDER}/ending-*.pt, {size:,.0f} MB"
-        console().print(text, style="dim", highlight=False, soft_wrap=True)
+        text = f"Kept to extend it by --resume with more --{experiment.unit}: {FOLDER}/ending-*.pt"
+        console().print(f"{text}, {size:,.0f} MB", style="dim", highlight=False, soft_wrap=True)
