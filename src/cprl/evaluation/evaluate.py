@@ -20,6 +20,7 @@ from cprl.measuring.statistics import (
     Measured,
     agents_without_harvest,
     by_metric,
+    clock_of,
     difference_paired,
     notes_on,
     over_replicas,
@@ -86,7 +87,8 @@ class Evaluation(Results):
     def measures(self, policy: str = "trained") -> dict[str, Measured]:
         """The social metrics over replicas by name, those of institutions as `institutions/fines` and so on,
         then the agents' returns, and what they paid, got and broke, as `agent_0/return` and so on."""
-        return {name: over_replicas(values, name) for name, values in self._values(policy).items()}
+        clock = clock_of(self.played)
+        return {name: over_replicas(values, name, clock) for name, values in self._values(policy).items()}
 
     def differences(self) -> dict[str, Estimate | None]:
         """How much more the run's agents have of each of `measures` than random ones, paired by replica,

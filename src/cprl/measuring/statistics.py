@@ -39,19 +39,19 @@ class Estimate:
     bounds: tuple[float, float] = (-inf, inf)
     """What the number can be. Student's t knows no bounds: `low` and `high` may pass them."""
 
-    def of(self, metric: str) -> Self:
-        """This estimate as one of a metric, whose bounds cut what is shown of the interval."""
-        return replace(self, bounds=bounds(metric))
+    def of(self, metric: str, clock: float = inf) -> Self:
+        """This estimate as one of a metric, whose `bounds` cut what is shown of the interval."""
+        return replace(self, bounds=bounds(metric, clock))
 
     @property
     def interval(self) -> tuple[float, float]:
         """The interval as it is shown, within the bounds."""
-        least, most = self.bounds
+        least, most = min(self.bounds[0], self.value), max(self.bounds[1], self.value)
         return max(self.low, least), min(self.high, most)  # NaN stays NaN
 
     @property
     def is_cut(self) -> bool:
-        return self.low < self.bounds[0] or self.high > self.bounds[1]
+        return self.interval != (self.low, self.high) and not isnan(self.low)
 
     def __str__(self) -> str:
         return format(self)
@@ -233,11 +233,11 @@ ByReplica = Mapping[int, Sequence[float]]
 """The values of a metric by replica, at least one per episode, NaN where undefined."""
 
 
-def over_replicas(values: ByReplica, metric: str = "") -> Measured:
-    """Estimate a metric, which may be named; a mean that is not finite has no interval."""
+def over_replicas(values: ByReplica, metric: str = "", clock: float = inf) -> Measured:
+    """Estimate a metric, which may be named, see `bounds`; a mean that is not finite has no interval."""
     means = list(_means(values).values())
     return Measured(
-        estimate=_shown(means).of(metric) if means else None,
+        estimate=_shown(means).of(metric, clock) if means else None,
         undefined=sum(isnan(value) for episodes in values.values() for value in episodes),
         episodes=sum(map(len, values.values())),
     )
@@ -286,7 +286,14 @@ def social_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measur
 def _measures(
     played: Mapping[int, Sequence[Episode]], metrics_of: Callable[[Episode], dict[str, float]]
 ) -> dict[str, Measured]:
-    return {name: over_replicas(values, name) for name, values in by_metric(played, metrics_of).items()}
+    clock, metrics = clock_of(played), by_metric(played, metrics_of)
+    return {name: over_replicas(values, name, clock) for name, values in metrics.items()}
+
+
+def clock_of(played: Mapping[int, Sequence[Episode]]) -> float:
+    """Return the steps of an episode that the clock ended, infinity where none was."""
+    episodes = (episode for of_replica in played.values() for episode in of_replica)
+    return max((episode.steps for episode in episodes if not episode.terminated), default=inf)
 
 
 def by_metric(

@@ -27,6 +27,7 @@ from cprl.runs.checkpoints import (
     is_ending,
     refuse_to_extend,
 )
+from cprl.runs.course import NEEDED, course_of
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.files import LOCK_FILE, RunLockedError, refuse_missing, write_json
 from cprl.runs.loggers import LoggerCallback, check_logger, make_logger
@@ -58,6 +59,7 @@ from cprl.training.agents import Population
 from cprl.training.finite import summary
 from cprl.training.outcome import (
     Evaluations,
+    by_replica,
     evaluate_population,
     exhibited,
     make_agents,
@@ -283,8 +285,16 @@ def _summarise(
     chances = {learner.settings.epsilon_evaluation for learner in learners if not learner.actor.stochastic}
     heading = "trained" + "".join(f", epsilon {chance:g}" for chance in sorted(chances))
     columns = {"random": played["random"], heading if learners else "agents": played["trained"]}
-    note = summary(training.finite.reported)
-    summarise(work.directory, title=_title(work.experiment), played=columns, figure=figure, note=note)
+    each = work.experiment.evaluation_episodes
+    has_course = all(training.episodes_by_replica) and set(NEEDED) <= set(played["trained"][0].social)
+    summarise(
+        work.directory,
+        title=_title(work.experiment),
+        played={name: by_replica(episodes, each) for name, episodes in columns.items()},
+        course=course_of(work.directory, work.experiment.agents) if has_course else "",
+        figure=figure,
+        note=summary(training.finite.reported),
+    )
 
 
 def _title(experiment: Experiment) -> str:

@@ -152,6 +152,9 @@ def _means(
     if grid is None:
         return {}, 0, []
     ends = (grid["episode"] + grid["window_episodes"]).max(1, keepdims=True)
+    longest = int(grid["window_episodes"].max())
+    if longest > table.window:  # as many episodes of each of many worlds
+        last = -(-last // longest) * longest
     is_last = (grid["episode"] >= ends - last) | (part != TRAINING)
     some = is_last.any(0)
     lengths, undefined, values = (
