@@ -71,9 +71,9 @@ def test_the_course_has_the_end_of_the_training_and_fresh_worlds_with_intervals_
         "they get 252 [125, 379] apples, and boards last 600 [600, 600] steps. By replica that is 242 and "
         "262 apples and 600 and 600 steps; 100% and 100% of the boards die. Random play gets 282 [282, 282] "
         "apples, and boards last 1,000 [1,000, 1,000] steps. Beside random play, in apples, that is -82.0 "
-        "[-94.7, -69.3] while they learn and -30 [-157, +97] in fresh worlds. Each agent learned to take what "
-        "pays now, and while they learn all of them end worse off than agents who never learned: the tragedy "
-        "of the commons. Whether they do in fresh worlds cannot be told."
+        "[-94.7, -69.3] while they learn and -30 [-157, +97] in fresh worlds. Each agent learned to take "
+        "what pays now, and while they learn all of them end worse off than agents who never learned: the "
+        "tragedy of the commons. Whether they do in fresh worlds cannot be told."
     )
 
 

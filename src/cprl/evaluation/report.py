@@ -80,7 +80,10 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
         before.append(f"**{course_of(run.path, run.specs)}**")
     before.append(f"{learned(run.specs)}, {run.experiment.trained_for}.")
     after = ["## Fresh episodes, beside random play", "", *markdown(run_table(evaluation))]
-    after += [f"The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`."]
+    after += [
+        f"These episodes were played for this page, in other worlds than those above, so that means differ by "
+        f"chance. The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`."
+    ]
     sections = [
         _html("\n".join(after)),
         *([f"<h2>Training</h2>{_training_figure(run)}"] if curves else []),
