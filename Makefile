@@ -11,7 +11,7 @@ VIEWER_PACKAGES := mesa-vulkan-drivers libvulkan1 chromium chromium-driver
 .PHONY: run docs docs-serve lint test test-integration test-oldest test-newest test-slow test-wheel test-gpu test-viewer test-docs viewer-packages check bench bench-gpu clean
 
 run: $(INSTALLED)
-	$(BIN)/python recipes/tragedy.py --watch serve --linger --no-keep-checkpoint
+	$(BIN)/python recipes/tragedy.py --watch serve --linger
 
 # The site of docs/*.md with the reference, warnings as errors; docs-serve serves it on 127.0.0.1, PORT takes another port.
 docs: $(DOCS_INSTALLED)

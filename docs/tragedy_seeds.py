@@ -6,11 +6,11 @@
 Intervals are those of the mean over replicas, 95 %, by Student's t.
 """
 
-import runpy
 import sys
 from pathlib import Path
 
 from cprl.measuring.statistics import Estimate, estimate
+from cprl.runs.course import course_of
 from cprl.runs.curves import as_curves, curves_of, running_mean
 from cprl.runs.episodes import read_table
 from cprl.training.agents import load
@@ -25,23 +25,22 @@ def main(runs: list[Path]) -> None:
     """Prints a row for each run."""
     print(HEADING)
     print("|" + "---:|" * HEADING.count(" | ") + "---|")
-    course_of = runpy.run_path(str(Path(__file__).parents[1] / "recipes" / "tragedy.py"))["course_of"]
     for run in runs:
-        curves = curves_of(run)
-        returns, lengths = curves["collective_return"], curves["survival_steps"][:, -30:].mean(1)
+        stored, at_end = load(run), curves_of(run, last=30)
+        returns, lengths = curves_of(run)["collective_return"], at_end["survival_steps"].mean(1)
         first = int(running_mean(returns.mean(0), 10).argmax())
-        last = estimate(returns[:, -30:].mean(1))
+        last = estimate(at_end["collective_return"].mean(1))
         random = as_curves(read_table(run / "evaluation" / "random.parquet"))["collective_return"]
         error = random.std(ddof=1) / random.size**0.5
         cells = [
-            load(run).experiment.seed,
+            stored.experiment.seed,
             len(returns),
             _told(estimate(returns[:, first : first + 10].mean(1))),
             first,
             _told(last),
             f"{last.value / random.mean() - 1:+.0%} of {random.mean():.0f} ± {error:.1f}",
             _told(estimate(lengths)),
-            "yes" if course_of(run).endswith("the tragedy of the commons.") else "no",
+            "yes" if "the tragedy of the commons" in course_of(run, stored.specs) else "no",
         ]
         print("| " + " | ".join(map(str, cells)) + " |")
 

@@ -175,7 +175,8 @@ def main(
     ends = exploration_steps(experiment.agents)
     figure = training_curve(run, title=title, random=played["random"], exploration_turns=ends)
     note = None if best.path else "No best weights: greedy play harvested nothing whenever it was tried"
-    summarise(run, title=title, played=played, figure=figure, note=note)
+    of_one = {name: {0: episodes} for name, episodes in played.items()}  # replica
+    summarise(run, title=title, played=of_one, figure=figure, note=note)
     published = printed([*cprl_here(), "run", "single_basic"])
     say(f"This was a shortened schedule. The published one, with 8 replicas: {published}")
     return run

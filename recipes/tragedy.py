@@ -16,7 +16,6 @@ from cprl.algorithms import DQN
 from cprl.population import Learning
 from cprl.system.output import printed, say
 from cprl.system.shipped import cprl_here
-from cprl.terminal.summary import course_of
 
 WORLDS = 16
 SHORT = {
@@ -55,8 +54,7 @@ def experiment() -> cprl.Experiment:
 
 
 def tell(run: Path) -> None:
-    """Says what happened, and what to try next."""
-    say(course_of(run))
+    """Says what to try next."""
     say(NEXT.format(run=printed([str(run)]), cprl=printed(cprl_here())))
 
 

@@ -297,7 +297,9 @@ def test_the_terminal_shows_it_too(tmp_path, monkeypatch):
     assert "return 12.5" in output.getvalue()
     figure = training_curve(tmp_path, title="matrix", random=episodes)
     assert figure.stat().st_size > 10_000
-    summarise(tmp_path, title="matrix", played={"random": episodes, "trained": episodes}, console=console)
+    summarise(
+        tmp_path, title="matrix", played={"random": {0: episodes}, "trained": {0: episodes}}, console=console
+    )
     text = output.getvalue()
     assert text.count("left out: collective_return") == 1
     assert re.search(r"survival, steps\s*│\s*5\.\d+ │", text)
@@ -316,9 +318,13 @@ def test_the_table_of_an_evaluation_says_what_is_left_out():
         def measures(self, policy):
             return social_measures({0: episodes})
 
+        def differences(self):
+            return dict.fromkeys(self.measures("trained"))
+
     table = run_table(Evaluation())
     assert table.note.startswith("left out: collective_return")
     assert [name for name, *_ in table.rows] == ["survival, steps"]
+    assert "One replica: no interval." in table.note
 
 
 def test_actions_of_numbers_are_refused_by_the_name_of_their_entry():

@@ -340,7 +340,7 @@ def test_a_recipe_runs_its_experiment(runs):
         "resume": True,
         "take_over": False,
         "threads": 1,
-        "keep_checkpoint": True,
+        "keep_checkpoint": False,
         "watch": "file",
         "linger": False,
         "callbacks": [],

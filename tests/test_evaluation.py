@@ -511,8 +511,15 @@ def test_the_table_of_an_evaluation_has_every_metric_and_its_file_every_episode(
     found, out = cprl.evaluate_run(alike, episodes=1), tmp_path / "episodes.parquet"
     rows = rows_of(command(monkeypatch, capsys, "evaluate", alike, "--episodes", 1, "--out", out))
     assert pq.read_table(out).equals(found.table())
+    more = found.differences()
     for name, random in found.measures("random").items():
-        assert [with_unit(name, rewards="apples"), str(found.measures()[name]), str(random)] in rows
+        trained, of_difference = found.measures()[name], "" if more[name] is None else f"{more[name]:+}"
+        assert [with_unit(name, rewards="apples"), str(trained), str(random), of_difference] in rows
+    values = [
+        np.mean([one.return_.sum() for one in trained]) - np.mean([one.return_.sum() for one in random])
+        for trained, random in zip(found.trained.values(), found.random.values(), strict=True)
+    ]
+    assert more["collective_return"].value == pytest.approx(np.mean(values))
 
 
 @pytest.mark.parametrize(

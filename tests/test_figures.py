@@ -136,6 +136,18 @@ def test_a_centred_running_mean_stands_at_the_middle_of_its_episodes(tmp_path, d
     assert centres(np.zeros(5), 2).tolist() == [0.5, 1.5, 2.5, 3.5]
 
 
+def test_a_running_mean_of_many_worlds_counts_each_world_alike(tmp_path, drawn):
+    worlds = np.array([*[0, 1, 2, 3] * 10, *[0, 1, 2] * 20])  # the fourth plays a long episode at the end
+    metrics = the_tragedy(1, 100)
+    metrics["collective_return"] = np.where(worlds == 3, 400.0, 100.0)[None]
+    run = a_run(tmp_path / "run", metrics)
+    table = pq.read_table(run / "episodes.parquet").append_column("world", pa.array(np.repeat(worlds, 2)))
+    pq.write_table(table, run / "episodes.parquet")
+    training_curve(run, title="four worlds")
+    assert "last mean of 8 episodes, 175 apples" in " / ".join(labels(drawn[0]))
+    assert drawn[0].caption == "Running means are over 8 episodes, centred, 2 of each of 4 worlds."
+
+
 def test_what_is_not_over_by_the_last_episode_is_said(tmp_path, drawn):
     training_curve(a_run(tmp_path / "run", the_tragedy(2, 40)), title="short", exploration_turns=10**6)
     assert "exploration ends" not in " ".join(labels(drawn[0]))

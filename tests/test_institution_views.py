@@ -22,6 +22,7 @@ from cprl.evaluation.film import Style, film, film_video
 from cprl.evaluation.film_pictures import EpisodePicture
 from cprl.institutions import Boundaries, GraduatedSanctions, Monitoring, Sanctioner, Tax, Vote
 from cprl.measuring.metrics import reported_by
+from cprl.measuring.statistics import form_for
 from cprl.policies.lanes import random_agents
 from cprl.population import Scripted
 from cprl.runs.episodes import read_episodes
@@ -236,14 +237,20 @@ def evaluation(whole):
 
 
 def test_the_summary_has_a_table_of_institutions(evaluation):
-    played = {"random": evaluation.random[0], "trained": evaluation.trained[0]}
+    played = {"random": {0: evaluation.random[0]}, "trained": {0: evaluation.trained[0]}}
     text = printed(institutions_table(played))
-    paid = [np.mean([episode.fines.sum() for episode in episodes]) for episodes in played.values()]
+    paid = [
+        np.mean([episode.fines.sum() for episode in episodes])
+        for by in played.values()
+        for episodes in by.values()
+    ]
     row = next(line for line in text.splitlines() if "fines of all, apples" in line)
-    assert [float(cell) for cell in row.replace("│", " ").split()[-2:]] == pytest.approx(paid, abs=0.01)
+    assert row.replace("│", " ").split()[-3:-1] == [
+        f"{of_policy:{form_for(of_policy)}}" for of_policy in paid
+    ]
     agent = next(line for line in text.splitlines() if "agent 1" in line)
     fined, broke = (
-        np.mean([getattr(episode, name)[1] for episode in played["trained"]])
+        np.mean([getattr(episode, name)[1] for episode in played["trained"][0]])
         for name in ("fines", "violations")
     )
     assert f"{fined:.1f} / " in agent
@@ -251,13 +258,13 @@ def test_the_summary_has_a_table_of_institutions(evaluation):
     assert "in force: decision 0" in text
     assert "where one may bite" not in text, "nothing counted a bite"
     nothing = dict.fromkeys(("fines", "transfers", "violations", "counts", "in_force"))
-    without = {"trained": [replace(episode, **nothing) for episode in evaluation.trained[0]]}
+    without = {"trained": {0: [replace(episode, **nothing) for episode in evaluation.trained[0]]}}
     assert institutions_table(without) is None
 
 
 def test_what_is_printed_at_the_end_says_it_too(whole, evaluation):
     console = Console(width=110, record=True, file=StringIO())
-    summarise(whole, title="own", played={"trained": evaluation.trained[0]}, console=console)
+    summarise(whole, title="own", played={"trained": {0: evaluation.trained[0]}}, console=console)
     assert "violations per turn in play, 0 to 1" in console.export_text()
 
 

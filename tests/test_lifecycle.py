@@ -58,7 +58,7 @@ def interrupted(*_, **__):
 
 
 def run(experiment, out, **options):
-    return cprl.run(experiment, out, watch="off", **options)
+    return cprl.run(experiment, out, **{"watch": "off", "keep_checkpoint": True, **options})
 
 
 def resumed(experiment, out, **options):
@@ -321,7 +321,7 @@ def test_stored_agents_play_with_the_weights_they_had_when_the_run_began(tmp_pat
 
 @pytest.mark.integration
 def test_what_cannot_be_extended_bit_for_bit_is_refused_before_anything_is_written(whole, tmp_path):
-    bare = run(FIELD, tmp_path / "bare", keep_checkpoint=False)
+    bare = cprl.run(FIELD, tmp_path / "bare", watch="off")
     assert checkpoints_in(bare / "checkpoints") == []
     before = contents(bare)
     with pytest.raises(ValueError, match=r"keeps no state of its training to extend it from"):
@@ -602,6 +602,15 @@ def test_it_saves_at_its_interval_and_not_before(tmp_path):
         seldom.after_step(State(steps))
     assert len(checkpoints_in(tmp_path / "a" / "checkpoints")) == 2
     assert checkpoints_in(tmp_path / "b" / "checkpoints") == []
+    over = State(3)
+    over.is_over = True
+    long = Checkpointer(tmp_path / "c", every_s=1000, keep_ending=False)
+    long.run.mkdir()
+    long.after_step(over)
+    assert checkpoints_in(long.folder) == [], "seconds of training"
+    long._saved -= 61
+    long.after_step(over)
+    assert len(checkpoints_in(long.folder)) == 1, "a minute that an interrupted evaluation would repeat"
     with pytest.raises(ValueError, match="every_s is 0"):
         Checkpointer(tmp_path, every_s=0)
 

@@ -441,7 +441,7 @@ def test_a_run_has_a_row_for_each_episode_of_each_replica_with_its_world(finishe
 def test_a_run_that_is_extended_equals_one_that_was_begun_as_long(short, whole, tmp_path):
     """Also where more episodes end in the last turn than were asked for."""
     longer = cprl.run(experiment(**whole), tmp_path / "whole", watch="off", figures=False)
-    run = cprl.run(experiment(**short), tmp_path / "run", watch="off", figures=False)
+    run = cprl.run(experiment(**short), tmp_path / "run", watch="off", figures=False, keep_checkpoint=True)
     before = rows_of(run)
     cprl.run(experiment(**whole), run, resume=True, watch="off", figures=False)
     assert written(rows_of(run)) == written(rows_of(longer))

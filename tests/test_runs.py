@@ -30,7 +30,7 @@ from cprl.experiment import Experiment
 from cprl.measuring import EpisodeTracker
 from cprl.population import Frozen, Learning
 from cprl.runs import loggers
-from cprl.runs.curves import as_curves, running_mean
+from cprl.runs.curves import as_curves, last_of, mean_of_worlds, running_mean, worlds_of
 from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
 from cprl.runs.recipe import read_recipe, refuse_another_run, resume_command, runs_in, start_run
@@ -212,8 +212,51 @@ def test_curves_are_those_of_each_replica_and_agent():
     curves = as_curves(pa.table(columns))
     assert curves["return_1"].tolist() == [[4.0], [2.0]], "the episodes that all replicas have ended"
     np.testing.assert_array_equal(curves["equality"], [[np.nan], [0.5]])
-    assert as_curves(pa.table(columns), at_end=True)["return_1"].tolist() == [[6.0], [2.0]], "the latest"
+    assert as_curves(pa.table(columns), last=1)["return_1"].tolist() == [[6.0], [2.0]], "the latest"
     assert as_curves(pa.table(columns).slice(0, 0)) == {}
+
+
+def ended(lengths, harvests, *, turns):
+    """The table of a replica whose worlds begin together, and play episodes of these lengths, [W, K]."""
+    worlds = len(lengths)
+    ends = np.cumsum(lengths, 1)
+    order = np.lexsort([np.repeat(np.arange(worlds), ends.shape[1]), ends.ravel()])
+    order = order[ends.ravel()[order] <= turns]
+    zeros = np.zeros(len(order), np.int64)
+    columns = {"replica": zeros, "world": order // ends.shape[1], "episode": np.arange(len(order))}
+    returns = np.asarray(harvests, float).ravel()[order]
+    return pa.table({**columns, "agent": zeros, "return": returns, "collective_return": returns})
+
+
+def test_the_last_episodes_of_many_worlds_are_the_last_of_each_world():
+    lengths = np.repeat([[10], [10], [100], [100]], 90, 1)
+    table = ended(lengths, np.where(lengths == 10, 2.0, 8.0), turns=900)
+    assert as_curves(table)["return_0"][0, -6:].mean() < 5, "of the last that ended most are of short worlds"
+    last = as_curves(table, last=6)["collective_return"]
+    assert sorted(last[0]) == [2.0] * 4 + [8.0] * 4, "2 of each of 4 worlds"
+    assert as_curves(table, last=1000)["return_0"].shape == (1, 36), "as many of each as all have ended"
+    assert worlds_of(last_of(table, 6)).tolist()[0].count(3) == 2
+
+
+def test_the_last_episodes_are_neither_the_longest_nor_the_shortest_ones():
+    rng, truth, by_end, by_world = np.random.default_rng(0), 503.0, [], []
+    for _ in range(40):
+        lengths = rng.integers(500, 1000, (64, 12))
+        harvests = truth + (lengths - 749.5)  # long episodes yield more
+        table = ended(lengths, harvests, turns=1500)
+        by_end.append(as_curves(table)["collective_return"][0, -30:].mean())
+        by_world.append(as_curves(table, last=30)["collective_return"].mean())
+    assert abs(np.mean(by_end) - truth) > 0.1 * truth
+    assert abs(np.mean(by_world) - truth) < 0.01 * truth
+
+
+def test_a_running_mean_of_many_worlds_counts_each_world_alike():
+    values, worlds = np.array([1.0, 5.0, 3.0, 9.0, 2.0]), np.array([0, 1, 0, 0, 1])
+    nan = np.nan
+    np.testing.assert_array_equal(mean_of_worlds(values, worlds, 1), [nan, 3.0, 4.0, 7.0, 5.5])
+    np.testing.assert_array_equal(mean_of_worlds(values, worlds, 3), [nan, nan, nan, nan, (6 + 3.5) / 2])
+    one = np.zeros(5, np.int64)
+    np.testing.assert_array_equal(mean_of_worlds(values, one, 2)[1:], running_mean(values, 2))
 
 
 def test_running_means_stand_at_their_first_episode_and_leave_out_what_is_undefined():

@@ -17,6 +17,7 @@ from test_figures import see_that_it_can_be_read
 from cprl import Study
 from cprl.commands import main as cli
 from cprl.measuring.statistics import difference
+from cprl.runs.files import write_listed
 from cprl.runs.recipe import runs_in, write_circumstances
 from cprl.studies import figures, results
 from cprl.studies.factors import Uniform
@@ -435,6 +436,33 @@ FALL = [100] * 20 + [400] * 20
 )
 def test_a_short_training_ends_in_the_phase_that_its_last_episodes_say(course, agents, label):
     assert ending(np.array(course, float), random=100.0, agents=agents) == label
+
+
+def test_a_training_in_many_worlds_ends_as_each_of_its_worlds_does():
+    # Three worlds fall to nothing, in short episodes; in the time of twenty of them the fourth plays one.
+    worlds = np.array([*[0, 1, 2, 3] * 10, *[0, 1, 2] * 20])
+    returns = np.where(worlds == 3, 600.0, [*[100.0] * 20, *[400.0] * 20, *[0.0] * 60])
+    assert ending(returns, random=100.0, agents=4) == "tragedy"
+    assert ending(returns, random=100.0, agents=4, worlds=worlds) == "decline", "600 / 4 is above 95"
+
+
+def test_windows_of_many_worlds_have_as_many_episodes_of_each(tmp_path):
+    study = Study(replace(EXPERIMENT, worlds=2, replicas=1, episodes=30), {"game.rules.freeze_steps": [5]})
+    runs = write_study(study, tmp_path, lambda *_: 1.0)
+    run = runs / trials_of(study)[0].name
+    rows = pq.read_table(run / "episodes.parquet")
+    quick = rows["episode"].to_numpy() % 3 < 2  # two episodes of one world in the time of one of the other
+    apples = pa.array(np.where(quick, 10.0, 40.0))
+    changed = rows.append_column("world", pa.array(np.where(quick, 0, 1)))
+    place = changed.column_names.index("collective_return")
+    changed = changed.set_column(place, "collective_return", apples)
+    write_listed(run, "episodes.parquet", lambda file: pq.write_table(changed, file))
+    table = study_table(study, runs)
+    (compared,) = compare(table, "collective_return", last=10).conditions
+    assert list(compared.values.values()) == [25.0], "the last five of each"
+    grid = table.values(compared.condition, "collective_return", "training")
+    assert grid["window_episodes"].tolist() == [[5, 5, 10, 10]]
+    assert grid["episode"].tolist() == [[0, 5, 10, 20]]
 
 
 def test_the_most_frequent_phase_of_a_condition_is_counted_over_replicas(tmp_path):

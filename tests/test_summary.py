@@ -25,7 +25,8 @@ def episode(number, harvest, **metrics):
 def told_of(tmp_path, **played):
     """The cells of each row by its name, and all that was printed."""
     output = io.StringIO()
-    summarise(tmp_path, title="a run", played=played, console=Console(file=output, width=200))
+    by_replica = {name: of if isinstance(of, dict) else {0: of} for name, of in played.items()}
+    summarise(tmp_path, title="a run", played=by_replica, console=Console(file=output, width=200))
     text = output.getvalue()
     cells = [[cell.strip() for cell in re.split("[│┃]", line)[1:-1]] for line in text.splitlines()]
     return {row[0]: row[1:] for row in cells if row}, text
@@ -37,22 +38,37 @@ def test_the_line_that_watches_again_can_be_copied(tmp_path):
     (run / "run.rrd").touch()
     output = io.StringIO()
     console = Console(file=output, width=200, markup=False)
-    summarise(run, title="a run", played={"random": [episode(0, [3, 1])]}, console=console)
+    summarise(run, title="a run", played={"random": {0: [episode(0, [3, 1])]}}, console=console)
     (line,) = (line for line in output.getvalue().splitlines() if line.startswith("Watch again: "))
     assert shlex.split(line)[-2:] == ["watch", str(run)], "all recordings of a run that was resumed"
 
 
-def test_rows_have_units_and_say_whose_return_is_the_measure(tmp_path):
-    random = [episode(0, [3, 1], equality=0.75), episode(1, [1, 1], equality=1.0)]
-    trained = [episode(0, [9, 3], equality=0.75), episode(1, [5, 1], equality=0.5)]
-    rows, _ = told_of(tmp_path, random=random, trained=trained)
-    assert rows[""] == ["random (baseline)", "trained"]
-    assert rows["collective return, apples"] == ["3.0 ± 1.0", "9.0 ± 3.0"]
-    assert rows["times random play"] == ["1.0", "3.0"]
-    assert rows["survival, steps"] == ["900.0", "900.0"]
-    assert rows["equality (1 - Gini), 0 to 1"] == ["0.88", "0.62"]
-    assert rows["stock left at the end, apples"] == ["1.0", "1.0"]
-    assert rows["episodes"] == ["2", "2"]
+def test_rows_have_units_intervals_over_replicas_and_paired_differences(tmp_path):
+    # Means of the replicas: 4, 2, 3 and 12, 6, 9 apples; t of two degrees of freedom is 4.30.
+    random = {0: [episode(0, [3, 1])], 1: [episode(0, [1, 1])], 2: [episode(0, [2, 1]), episode(1, [2, 1])]}
+    trained = {0: [episode(0, [9, 3])], 1: [episode(0, [5, 1])], 2: [episode(0, [7, 2]), episode(1, [7, 2])]}
+    rows, text = told_of(tmp_path, random=random, trained=trained)
+    assert rows[""] == ["random (baseline)", "trained", "difference, paired"]
+    assert rows["collective return, apples"] == ["3.00 [0.52, 5.48]", "9.0 [1.5, 16.5]", "+6.0 [+1.0, +11.0]"]
+    assert rows["survival, steps"] == ["900 [900, 900]", "900 [900, 900]", "+0 [+0, +0]"]
+    assert rows["episodes"] == ["4", "4", ""]
+    assert "means over replicas [95 % interval by Student's t]" in text
+
+
+def test_a_table_says_once_that_bounds_cut_intervals(tmp_path):
+    unequal = {r: [episode(0, [1, 1], equality=value)] for r, value in enumerate([0.2, 0.9, 0.9])}
+    rows, text = told_of(tmp_path, random=unequal)
+    assert rows["equality (1 - Gini), 0 to 1"] == ["0.67 [0.00, 1.00]"]
+    assert text.count("Bounds of a metric cut an interval where Student's t passes them.") == 1
+
+
+def test_returns_that_are_not_finite_are_shown_as_such(tmp_path):
+    endless = {
+        r: [replace(episode(0, [1, 1]), return_=np.array([value, 1.0]))]
+        for r, value in enumerate([np.inf, -np.inf, 1.0])
+    }
+    rows, _ = told_of(tmp_path, random=endless, trained=dict.fromkeys(range(3), endless[0]))
+    assert rows["return of all agents together, rewards"] == ["nan", "inf", "+nan"]
 
 
 def test_a_policy_that_harvests_nothing_has_words_instead_of_nan(tmp_path):
@@ -60,11 +76,9 @@ def test_a_policy_that_harvests_nothing_has_words_instead_of_nan(tmp_path):
     idle = [episode(number, [0, 0], equality=nan, sustainability=nan) for number in range(2)]
     busy = [episode(0, [2, 2], equality=1.0), episode(1, [0, 0], equality=nan, sustainability=nan)]
     rows, text = told_of(tmp_path, random=idle, trained=busy)
-    assert rows["times random play"] == ["undefined", "undefined"]
-    assert rows["equality (1 - Gini), 0 to 1"] == ["undefined", "1.00, undefined in 1 of 2"]
+    assert rows["equality (1 - Gini), 0 to 1"] == ["undefined in all 2", "1.00, undefined in 1 of 2", ""]
     assert "nan" not in text
     assert "random: nobody harvested anything, so equality and sustainability are undefined" in text
-    assert "times random play: undefined, because it is not above 0" in text
 
 
 def test_the_outcome_comes_first_and_what_institutions_never_did_has_no_table(tmp_path):
@@ -76,11 +90,11 @@ def test_the_outcome_comes_first_and_what_institutions_never_did_has_no_table(tm
 
     idle, busy = (governed(0, harvest, [0, 0]) for harvest in ([1, 1], [90, 30]))
     _, text = told_of(tmp_path, random=[idle], trained=[busy])
-    first = "trained: 120, 60.0 times random play; random play: 2.0 apples an episode, all agents together"
+    first = "trained: 120 (+118 beside random play); random play: 2.00 apples an episode, all agents together"
     assert text.splitlines()[0] == first
     assert "institutions" not in text
     rows, text = told_of(tmp_path, random=[idle], trained=[governed(0, [9, 3], [2, 0])])
-    assert rows["agent 0: violations"] == ["0.0", "2.0"]
+    assert rows["agent 0: violations"] == ["0.0", "2.0", ""]
 
 
 @pytest.mark.parametrize("names", [["a"] * 9, ["commons_targets_10_decay_500k, gamma=0.997"] * 4, ["x" * 90]])
@@ -104,18 +118,19 @@ def test_every_table_fits_80_columns_and_loses_no_number(names):
     assert text.count("condition=2") >= 1
 
 
-def test_one_episode_has_no_error_and_one_policy_no_baseline(tmp_path):
+def test_one_replica_has_no_interval_and_one_policy_no_baseline(tmp_path):
     rows, text = told_of(tmp_path, trained=[episode(0, [2, 1])])
-    assert rows["collective return, apples"] == ["3.0"]
+    assert rows["collective return, apples"] == ["3.00"]
     assert rows[""] == ["trained"]
-    assert not {"nan", "baseline", "times"} & set(re.findall(r"\w+", text))
+    assert "One replica: no interval." in text
+    assert not {"nan", "baseline", "difference"} & set(re.findall(r"\w+", text))
 
 
 def test_rewards_that_are_no_apples_have_a_row_of_their_own(tmp_path):
     fined = replace(episode(0, [3, 1]), return_=np.array([-1.0, 1.0]))
     rows, _ = told_of(tmp_path, random=[fined])
-    assert rows["collective return, apples"] == ["4.0"]
-    assert rows["return of all agents together, rewards"] == ["0.0"]
+    assert rows["collective return, apples"] == ["4.00"]
+    assert rows["return of all agents together, rewards"] == ["0"]
 
 
 def test_units_are_those_of_the_docs():

@@ -337,7 +337,7 @@ def test_loading_evaluating_and_resuming_warn_of_other_code_and_the_recipe_keeps
     experiment = replace(TINY, callbacks=(Custom(target),))
     text = "class Callback:\n    is_extendable = True\n    def on_episode(self, episode, learning): ...\n"
     write_module(text)
-    run = cprl.run(experiment, tmp_path / "run", watch="off", figures=False)
+    run = cprl.run(experiment, tmp_path / "run", watch="off", figures=False, keep_checkpoint=True)
     cprl.load(run, allow=[target])
     assert "own_callback" not in capsys.readouterr().err
     write_module(text + "# edited\n")

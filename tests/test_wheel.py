@@ -23,7 +23,7 @@ SHORT = (
     "--engine eager --episodes 2 --evaluation-episodes 1 --game.rules.episode-steps 20 "
     "--agents.0.algorithm.settings.buffer-size 200 --agents.1.algorithm.settings.buffer-size 200"
 )
-TRAINED = f"run two_complex {SHORT} --replicas 2 --watch file"
+TRAINED = f"run two_complex {SHORT} --replicas 2 --watch file --keep-checkpoint"
 OF_A_USER = """
 from dataclasses import replace
 

@@ -209,14 +209,19 @@ def grouped(specs: Sequence[AgentSpec], agents: int) -> list[tuple[AgentSpec, tu
 def exploration_steps(specs: Sequence[AgentSpec]) -> int | None:
     """The environment step of a replica at which the last agent's epsilon has reached its end; None if no
     agent explores by epsilon, or only by an algorithm of the user's own."""
-    ends = []
-    for spec in specs:
-        algorithm = spec.algorithm if isinstance(spec, Learning | Team) else None
-        if isinstance(algorithm, Algorithm) and not algorithm.stochastic:
-            settings = algorithm.settings
-            if isinstance(settings, Exploring) and settings.epsilon_end < settings.epsilon_start:
-                ends.append(settings.epsilon_hold_steps + settings.epsilon_decay_steps)
+    ends = [
+        settings.epsilon_hold_steps + settings.epsilon_decay_steps
+        for settings in exploring(specs)
+        if settings.epsilon_end < settings.epsilon_start
+    ]
     return max(ends, default=None)
+
+
+def exploring(specs: Sequence[AgentSpec]) -> list[Exploring]:
+    """Return the settings of agents who explore by epsilon, but for those of the user's own algorithms."""
+    learners = [spec.algorithm for spec in specs if isinstance(spec, Learning | Team)]
+    settings = [one.settings for one in learners if isinstance(one, Algorithm) and not one.stochastic]
+    return [one for one in settings if isinstance(one, Exploring)]
 
 
 def partners_in(specs: Iterable[AgentSpec]) -> list[str]:

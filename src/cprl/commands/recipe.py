@@ -68,8 +68,8 @@ class RunOptions:
     extend it."""
     take_over: bool = False
     """Resume a run that a process on another host has locked."""
-    keep_checkpoint: bool = True
-    """Keep the state of the training of a finished run, buffers included, so that it can be extended."""
+    keep_checkpoint: bool = False
+    """Keep the state of the training of a finished run, hundreds of megabytes, so that it can be extended."""
     watch: str = "file"
     """"file", or live as well: "serve", "spawn"; "off" for no recording."""
     threads: int = 1

@@ -23,7 +23,6 @@ from matplotlib.colors import Normalize
 
 from cprl.evaluation.evaluate import (
     SEED,
-    beyond,
     heading,
     opened,
     refuse_other_games,
@@ -32,7 +31,7 @@ from cprl.evaluation.evaluate import (
 )
 from cprl.evaluation.lanes import Part, Played, Results, Whose, agents_of, fresh_of, more
 from cprl.measuring.metrics import with_unit
-from cprl.measuring.statistics import HOLM, Estimate, Measured, starred
+from cprl.measuring.statistics import HOLM, Estimate, Measured, notes_on, starred
 from cprl.system.defaults import Diagonal
 from cprl.terminal import style
 from cprl.terminal.tables import Cells
@@ -284,7 +283,7 @@ def crossplay_tables(played: CrossPlay) -> Iterator[Cells]:
     for name in next(iter(cells.values())):
         measured = {pair: cell[name] for pair, cell in cells.items()}
         if name not in repeats and not says_nothing(name, measured.values()):
-            note = beyond((name, of_cell) for of_cell in measured.values())
+            note = "\n".join(notes_on([*measured.values()]))
             yield matrix_table(with_unit(name, rewards=rewards), corner, names, measured, note)
     returns = ("focal/return", "background/return", "group/return")
     headings = ["focal", "background", "focal agent", *(with_unit(name, rewards=rewards) for name in returns)]

@@ -3,6 +3,7 @@ evaluations share: whether runs have the same game, and tables for the terminal.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -12,9 +13,19 @@ import torch
 from cprl.envs.make_env import stored_game
 from cprl.envs.unwrap import agent_names
 from cprl.evaluation.lanes import Fresh, Part, Played, Results, agents_of, fresh_of, scripted
-from cprl.measuring.metrics import bounds, left_out, with_unit
+from cprl.measuring.metrics import left_out, with_unit
 from cprl.measuring.series import OF_AGENTS, Values
-from cprl.measuring.statistics import Estimate, Measured, agents_without_harvest, over_replicas
+from cprl.measuring.statistics import (
+    Estimate,
+    Measured,
+    agents_without_harvest,
+    by_metric,
+    clock_of,
+    difference_paired,
+    notes_on,
+    over_replicas,
+    signed,
+)
 from cprl.system.defaults import SEED as SEED
 from cprl.terminal.tables import Cells
 from cprl.training.agents import LoadedRun, load
@@ -76,22 +87,31 @@ class Evaluation(Results):
     def measures(self, policy: str = "trained") -> dict[str, Measured]:
         """The social metrics over replicas by name, those of institutions as `institutions/fines` and so on,
         then the agents' returns, and what they paid, got and broke, as `agent_0/return` and so on."""
-        results = self.where(policy=checked("policy", policy, Literal["trained", "random"]))
-        played = results.played
+        clock = clock_of(self.played)
+        return {name: over_replicas(values, name, clock) for name, values in self._values(policy).items()}
+
+    def differences(self) -> dict[str, Estimate | None]:
+        """How much more the run's agents have of each of `measures` than random ones, paired by replica,
+        which play the same worlds; None where a metric is undefined."""
+        trained, random = self._values("trained"), self._values("random")
+        return {name: difference_paired(values, random[name]) for name, values in trained.items()}
+
+    def _values(self, policy: str) -> dict[str, dict[int, list[float]]]:
+        """The values of all measures by replica."""
+        played = self.where(policy=checked("policy", policy, Literal["trained", "random"])).played
         first = next(iter(played.values()))[0]
         names = {"return_": "return"}
         names |= {name: name for name in OF_AGENTS if getattr(first, name) is not None}
         of_agents = {
-            f"{agent_name}/{name}": over_replicas(
-                {
-                    replica: [float(getattr(episode, entry)[agent]) for episode in episodes]
-                    for replica, episodes in played.items()
-                }
-            )
+            f"{agent_name}/{name}": {
+                replica: [float(getattr(episode, entry)[agent]) for episode in episodes]
+                for replica, episodes in played.items()
+            }
             for entry, name in names.items()
             for agent, agent_name in enumerate(agent_names(self.run.env()))
         }
-        return results.estimates() | of_agents
+        of_all = by_metric(played, attrgetter("social")) | by_metric(played, attrgetter("of_institutions"))
+        return of_all | of_agents
 
 
 def evaluate_run(
@@ -127,31 +147,24 @@ def opened(run: str | Path | LoadedRun, allow: Sequence[str] = ()) -> LoadedRun:
     return run if isinstance(run, LoadedRun) else load(run, allow=allow)
 
 
-def beyond(measures: Iterable[tuple[str, Measured]]) -> str:
-    """A sentence for a table of metrics some of whose intervals reach beyond what the metric can be."""
-    for name, measured in measures:
-        low, high = bounds(name)
-        if measured.estimate is not None and (measured.estimate.low < low or measured.estimate.high > high):
-            return "Some intervals by Student's t reach beyond what a metric can be."
-    return ""
-
-
 def bars_of(estimates: Iterable[Estimate]) -> tuple[Values, Values]:
     """Values, float64 [K], and how far their intervals reach below and above, [2, K], as `errorbar` takes
     them; 0 where there is none."""
-    means, low, high = np.array([(mean.value, mean.low, mean.high) for mean in estimates]).T
+    means, low, high = np.array([(mean.value, *mean.interval) for mean in estimates]).T
     return means, np.nan_to_num([means - low, high - means])
 
 
 def run_table(evaluation: Evaluation) -> Cells:
-    """A row for each metric: mean over replicas and 95 % interval, of the run's agents and random agents.
+    """A row for each metric: mean over replicas and 95 % interval, of the run's agents and random agents, and
+    their difference, paired by replica.
 
     Metrics of institutions that are undefined everywhere, since the game has other institutions, have none.
     """
     trained, random = evaluation.measures("trained"), evaluation.measures("random")
+    differences = evaluation.differences()
     rewards = unit_of_rewards(evaluation)
     rows: list[tuple[str, ...]] = [
-        (with_unit(name, rewards=rewards), str(measured), str(random[name]))
+        (with_unit(name, rewards=rewards), str(measured), str(random[name]), signed(differences[name]))
         for name, measured in trained.items()
         if not says_nothing(name, [measured, random[name]])
     ]
@@ -160,10 +173,12 @@ def run_table(evaluation: Evaluation) -> Cells:
     without = [agents_without_harvest(played) for played in (evaluation.trained, evaluation.random)]
     if None not in without:
         counts = (f"{count[0]} of {count[1]}" for count in without if count)
-        rows.append(("agents without a harvest, not in sustainability", *counts))
-    notes = left_out(next(iter(evaluation.trained.values()))[0].reported), zeros, beyond(trained.items())
+        rows.append(("agents without a harvest, not in sustainability", *counts, ""))
+    lacking = left_out(next(iter(evaluation.trained.values()))[0].reported)
+    notes = lacking, zeros, *notes_on([*trained.values(), *random.values()])
     title = heading(evaluation.run.path.name, evaluation.fresh, [evaluation.run])
-    return Cells(title, BESIDE_RANDOM, rows, "\n".join(filter(None, notes)))
+    head = [*BESIDE_RANDOM, "run's agents - random, paired"]
+    return Cells(title, head, rows, "\n".join(filter(None, notes)))
 
 
 def says_nothing(name: str, measured: Iterable[Measured]) -> bool:

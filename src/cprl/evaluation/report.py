@@ -19,6 +19,7 @@ from cprl.evaluation.show import Page, page, shown
 from cprl.measuring.metrics import with_unit
 from cprl.measuring.series import Values
 from cprl.population import learned
+from cprl.runs.course import course_of
 from cprl.runs.curves import curves_of
 from cprl.studies.results import SUMMARY
 from cprl.studies.tables.comparing import compare, differing, metrics_of
@@ -26,7 +27,6 @@ from cprl.studies.tables.table import EVALUATION, StudyTable
 from cprl.system.defaults import SEED, STUDY_TABLE
 from cprl.system.output import legible
 from cprl.terminal.figures import training_curve
-from cprl.terminal.summary import course_of
 from cprl.terminal.tables import markdown
 from cprl.training.agents import LoadedRun, load
 
@@ -77,12 +77,15 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
     curves = _curves(run)
     has_course = {"collective_return", "survival_steps"} <= set(curves)
     if has_course and (run.path / "evaluation" / "random.parquet").is_file():
-        before.append(f"**{course_of(run.path)}**")
+        before.append(f"**{course_of(run.path, run.specs)}**")
     before.append(f"{learned(run.specs)}, {run.experiment.trained_for}.")
     own = run.experiment.own_rules
     before += [f"Rules of its own: {own}."] * bool(own) + [run.experiment.own_code]
     after = ["## Fresh episodes, beside random play", "", *markdown(run_table(evaluation))]
-    after += [f"The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`."]
+    after += [
+        f"These episodes were played for this page, in other worlds than those above, so that means differ by "
+        f"chance. The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`."
+    ]
     sections = [
         _html("\n".join(after)),
         *([f"<h2>Training</h2>{_training_figure(run)}"] if curves else []),

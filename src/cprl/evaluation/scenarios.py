@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 
 from cprl.commons.game import Game
-from cprl.evaluation.evaluate import SEED, bars_of, beyond, heading, opened, refuse_other_games, refuse_unlike
+from cprl.evaluation.evaluate import SEED, bars_of, heading, opened, refuse_other_games, refuse_unlike
 from cprl.evaluation.lanes import (
     Agent,
     Part,
@@ -34,7 +34,7 @@ from cprl.evaluation.lanes import (
 )
 from cprl.experiment import presets
 from cprl.measuring.metrics import with_unit
-from cprl.measuring.statistics import HOLM, Estimate, Measured, estimate, starred
+from cprl.measuring.statistics import HOLM, Estimate, Measured, estimate, notes_on, starred
 from cprl.population import Frozen, Scripted
 from cprl.terminal import style
 from cprl.terminal.tables import Cells
@@ -313,7 +313,7 @@ def scenario_tables(scores: Scores) -> Iterator[Cells]:
     title = "all agents together, with the run's agents in the focal places"
     measured = {name: score.measures() for name, score in by_scenario.items()}
     social = [(name, *(str(measures[metric]) for metric in SOCIAL)) for name, measures in measured.items()]
-    note = beyond((metric, measures[metric]) for measures in measured.values() for metric in SOCIAL)
+    note = "\n".join(notes_on([measures[metric] for measures in measured.values() for metric in SOCIAL]))
     yield Cells(title, ["scenario", *map(with_unit, SOCIAL)], social, note)
 
 

@@ -88,10 +88,16 @@ def with_unit(name: str, *, rewards: str = "") -> str:
     return ", ".join(filter(None, (f"{who.replace('_', ' ')}: {what}" if slash else name, unit_of)))
 
 
-def bounds(name: str) -> tuple[float, float]:
-    """What a metric can be, as far as its unit says so."""
+def bounds(name: str, clock: float = inf) -> tuple[float, float]:
+    """What a metric can be, as far as that is known; of a return, anything.
+
+    Args:
+        clock: the steps of the longest episode that the game allows.
+    """
     is_share = name in NAMES and NAMES[name][1] == social.SHARE
-    return 0.0 if is_share or name in social.SOCIAL else -inf, 1.0 if is_share else inf
+    is_amount = name in NAMES or name.endswith(("/fines", "/transfers", "/violations"))
+    is_time = name in ("sustainability", "survival_steps", "peacefulness")
+    return 0.0 if is_amount else -inf, 1.0 if is_share else clock if is_time else inf
 
 
 OPTIONAL: Final = ("harvest", "in_play", "fired", "hit_by", "tagged_by", "stock")

@@ -7,16 +7,17 @@ different population variances are involved" (1947).
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from math import isnan
+from dataclasses import dataclass, replace
+from math import inf, isfinite, isnan
 from operator import attrgetter
 from statistics import fmean
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cprl.measuring.episodes import Episode
+from cprl.measuring.metrics import bounds
 from cprl.measuring.series import Values
 
 CONFIDENCE: Final = 0.95
@@ -35,21 +36,42 @@ class Estimate:
     p_value: float = float("nan")
     """How often a value at least as far from 0 would come by chance if it were 0, by the same t, two-sided;
     NaN for a single replica."""
+    bounds: tuple[float, float] = (-inf, inf)
+    """What the number can be. Student's t knows no bounds: `low` and `high` may pass them."""
+
+    def of(self, metric: str, clock: float = inf) -> Self:
+        """This estimate as one of a metric, whose `bounds` cut what is shown of the interval."""
+        return replace(self, bounds=bounds(metric, clock))
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The interval as it is shown, within the bounds."""
+        least, most = min(self.bounds[0], self.value), max(self.bounds[1], self.value)
+        return max(self.low, least), min(self.high, most)  # NaN stays NaN
+
+    @property
+    def is_cut(self) -> bool:
+        return self.interval != (self.low, self.high) and not isnan(self.low)
 
     def __str__(self) -> str:
         return format(self)
 
     def __format__(self, form: str) -> str:
         """The value with its interval, of a single replica the value alone; "" and "+" choose the digits."""
-        numbers = self.value, self.low, self.high
+        numbers = self.value, *self.interval
         form += form_for(*numbers) if form in ("", "+") else ""
         value, low, high = (f"{number:{form}}" for number in numbers)
         return f"{value} [{low}, {high}]" if np.isfinite([self.low, self.high]).all() else value
 
 
+CUT: Final = "Bounds of a metric cut an interval where Student's t passes them."
+"""What a table says once where an interval `is_cut`."""
+ONE_REPLICA: Final = "One replica: no interval."
+
+
 def form_for(*numbers: float) -> str:
     """Return the format of numbers that are shown together, with two or three digits of the largest."""
-    largest = max((abs(number) for number in numbers if not isnan(number)), default=0.0)
+    largest = max((abs(number) for number in numbers if isfinite(number)), default=0.0)
     if largest < 0.001:
         return ".3g"
     return f",.{next((digits for digits, size in enumerate((100, 10, 0.5)) if largest >= size), 3)}f"
@@ -195,16 +217,60 @@ class Measured:
         return f"{value}, undefined in {self.undefined} of {self.episodes}" if self.undefined else value
 
 
-def over_replicas(values: Mapping[int, Sequence[float]]) -> Measured:
-    """Estimates a metric from its values by replica, at least one per episode, NaN where undefined."""
-    defined = [[value for value in episodes if not isnan(value)] for episodes in values.values()]
-    means = [fmean(episodes) for episodes in defined if episodes]
-    episodes = sum(map(len, values.values()))
+def signed(difference: Estimate | None) -> str:
+    """Return a difference as a cell of a table; "" where there is none."""
+    return "" if difference is None else f"{difference:+}"
+
+
+def notes_on(measures: Sequence[Measured]) -> list[str]:
+    """Return what a table of metrics says once of its intervals."""
+    estimates = [measured.estimate for measured in measures if measured.estimate is not None]
+    is_single = bool(estimates) and all(estimate.replicas == 1 for estimate in estimates)
+    return [ONE_REPLICA] * is_single + [CUT] * any(estimate.is_cut for estimate in estimates)
+
+
+ByReplica = Mapping[int, Sequence[float]]
+"""The values of a metric by replica, at least one per episode, NaN where undefined."""
+
+
+def over_replicas(values: ByReplica, metric: str = "", clock: float = inf) -> Measured:
+    """Estimate a metric, which may be named, see `bounds`; a mean that is not finite has no interval."""
+    means = list(_means(values).values())
     return Measured(
-        estimate=estimate(means) if means else None,
-        undefined=episodes - sum(map(len, defined)),
-        episodes=episodes,
+        estimate=_shown(means).of(metric, clock) if means else None,
+        undefined=sum(isnan(value) for episodes in values.values() for value in episodes),
+        episodes=sum(map(len, values.values())),
     )
+
+
+def difference_paired(values: ByReplica, reference: ByReplica) -> Estimate | None:
+    """Return how much more the mean of a metric is, paired by replica, over the replicas in which both are
+    defined; None if there is none."""
+    means, others = _means(values), _means(reference)
+    pairs = [means[replica] - others[replica] for replica in means if replica in others]
+    return _shown(pairs) if pairs else None
+
+
+def _means(values: ByReplica) -> dict[int, float]:
+    """The mean of each replica over the episodes in which the metric is defined, if there are any."""
+    defined = {
+        replica: [value for value in episodes if not isnan(value)] for replica, episodes in values.items()
+    }
+    with np.errstate(invalid="ignore"):  # of infinite values of both signs
+        return {
+            replica: fmean(episodes) if all(map(isfinite, episodes)) else float(np.mean(episodes))
+            for replica, episodes in defined.items()
+            if episodes
+        }
+
+
+def _shown(means: Sequence[float]) -> Estimate:
+    """The estimate of means that may not be finite; then it is their mean, without an interval."""
+    if all(map(isfinite, means)):
+        return estimate(means)
+    with np.errstate(invalid="ignore"):
+        value = float(np.mean(means))
+    return Estimate(value=value, low=float("nan"), high=float("nan"), replicas=len(means))
 
 
 def institution_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measured]:
@@ -220,10 +286,24 @@ def social_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measur
 def _measures(
     played: Mapping[int, Sequence[Episode]], metrics_of: Callable[[Episode], dict[str, float]]
 ) -> dict[str, Measured]:
+    clock, metrics = clock_of(played), by_metric(played, metrics_of)
+    return {name: over_replicas(values, name, clock) for name, values in metrics.items()}
+
+
+def clock_of(played: Mapping[int, Sequence[Episode]]) -> float:
+    """Return the steps of an episode that the clock ended, infinity where none was."""
+    episodes = (episode for of_replica in played.values() for episode in of_replica)
+    return max((episode.steps for episode in episodes if not episode.terminated), default=inf)
+
+
+def by_metric(
+    played: Mapping[int, Sequence[Episode]], metrics_of: Callable[[Episode], dict[str, float]]
+) -> dict[str, dict[int, list[float]]]:
+    """Return the values of each metric by replica, of episodes by replica."""
     by_replica = {replica: list(map(metrics_of, episodes)) for replica, episodes in played.items()}
     names = next(iter(by_replica.values()))[0]
     return {
-        name: over_replicas({replica: [one[name] for one in by_replica[replica]] for replica in by_replica})
+        name: {replica: [one[name] for one in episodes] for replica, episodes in by_replica.items()}
         for name in names
     }
 

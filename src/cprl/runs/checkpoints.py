@@ -30,6 +30,8 @@ FOLDER: Final = "checkpoints"
 REPORT: Final = "report.json"
 """Written when everything of a run is finished."""
 EVERY_S: Final = 300.0
+LAST_S: Final = 60.0
+"""As much training may be repeated where a run is stopped between its last step and its end."""
 KEPT: Final = 2
 """Checkpoints that are kept: the newest, and one more in case it is unreadable."""
 
@@ -111,7 +113,7 @@ class Checkpointer:
         if ends:
             self.save(training, kind="ending")
             self._has_ending = True
-        elif time.monotonic() - self._saved >= self.every_s:
+        elif time.monotonic() - self._saved >= (LAST_S if training.is_over else self.every_s):
             self.save(training)
 
     def save(self, training: Any, *, kind: str = "training") -> Path:
@@ -178,7 +180,7 @@ class Checkpointer:
         if self._is_training:
             say("Stopping after this step; signal again to stop at once.")
             return
-        say("Stopped after the training, which is saved.")
+        say("Stopped after the training.")
         self._stop_now(number)
 
     def _stop_now(self, number: int) -> NoReturn:
@@ -245,7 +247,7 @@ def read_tensors(path: Path, refusal: str) -> dict[str, Any]:
 
 
 KEEPS_NO_STATE: Final = (
-    "it keeps no state of its training to extend it from, as a run without keep_checkpoint or an export"
+    "it keeps no state of its training to extend it from; a run with --keep-checkpoint does"
 )
 
 

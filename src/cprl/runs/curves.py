@@ -17,42 +17,41 @@ from cprl.measuring.social import Totals, measured
 from cprl.runs.episodes import OF_INSTITUTIONS, metrics_in, read_episodes
 
 Values = NDArray[np.float64]
+Numbers = NDArray[np.int64]
 
 SMOOTHED_EPISODES: Final = 100
 """The window of running means in episodes, where nothing else is asked for."""
 
 
-def curves_of(run: Path, *, at_end: bool = False) -> dict[str, Values]:
+def curves_of(run: Path, *, last: int | None = None) -> dict[str, Values]:
     """Read every metric that a run's game reports, and each agent's return as `return_0` and so on.
 
     Those of institutions are there as `institutions/fines` and so on, but for the share of unjust tags, since
     a table does not say who tagged, and for groups.
 
     Args:
-        at_end: whether, of replicas that have ended different numbers of episodes, each one's latest E are
-            read rather than its first.
+        last: of each replica only the last episodes, see `last_of`; by default all.
 
     Returns:
         float64 [R, E] by name, for R replicas and as many episodes as all of them have ended; NaN where a
         metric is undefined. Nothing of a run that has ended no episode.
     """
-    return as_curves(read_episodes(run), at_end=at_end)
+    return as_curves(read_episodes(run), last=last)
 
 
-def as_curves(table: pa.Table, *, at_end: bool = False) -> dict[str, Values]:
+def as_curves(table: pa.Table, *, last: int | None = None) -> dict[str, Values]:
     """Like `curves_of`, from a table of `read_episodes`."""
     if not table.num_rows:
         return {}
-    episode, agent = table["episode"].to_numpy(), table["agent"].to_numpy()
-    replicas, replica = np.unique(table["replica"].to_numpy(), return_inverse=True)
-    counts = np.array([int(episode[replica == row].max()) + 1 for row in range(len(replicas))])
-    place = episode - (counts - counts.min())[replica] if at_end else episode
-    read = (place >= 0) & (place < counts.min())
+    table = table if last is None else last_of(table, last)
+    agent = table["agent"].to_numpy()
+    replica, place, shape = _places(table)
+    read = place < shape[1]
     cells = replica[read], place[read], agent[read]
 
     def values(name: str) -> Values:
         """A column as [R, E, N]."""
-        column = np.full((len(replicas), counts.min(), int(agent.max()) + 1), np.nan)
+        column = np.full((*shape, int(agent.max()) + 1), np.nan)
         column[cells] = table[name].to_numpy()[read]
         return column
 
@@ -60,6 +59,87 @@ def as_curves(table: pa.Table, *, at_end: bool = False) -> dict[str, Values]:
     returns = values("return")
     curves |= {f"return_{number}": returns[..., number].copy() for number in np.unique(agent)}
     return curves | _of_institutions(table.column_names, values)
+
+
+def worlds_of(table: pa.Table) -> Numbers:
+    """Return the world of each episode of the curves of a table, int64 [R, E]; of a table that has none, the
+    replica."""
+    replica, place, shape = _places(table)
+    read = place < shape[1]
+    worlds = np.zeros(shape, np.int64)
+    worlds[replica[read], place[read]] = _world(table)[read]
+    return worlds
+
+
+def last_of(table: pa.Table, number: int) -> pa.Table:
+    """Return the rows of the last episodes of each replica: as many of each of its W worlds, and so many of
+    all together, or the next multiple of W.
+
+    The last that have ended, of all worlds, would be the longest ones where worlds began together. Where a
+    world has ended fewer, only as many of each world are there.
+    """
+    world, episode = _world(table), table["episode"].to_numpy().astype(np.int64)
+    size = int(episode.max(initial=0)) + 1
+    keys, row = np.unique(world * size + episode, return_inverse=True)
+    lanes, counts = np.unique(keys // size, return_counts=True)
+    each = rounds_of(number, len(lanes) // len(np.unique(table["replica"].to_numpy())))
+    is_last = episodes_after(keys // size) < min(each, counts.min())
+    return table.filter(pa.array(is_last[row]))
+
+
+def rounds_of(number: int, worlds: int) -> int:
+    """Return of how many episodes of each of W worlds a mean of so many episodes is."""
+    return -(-number // worlds)
+
+
+def episodes_after(world: Numbers) -> Numbers:
+    """Return how many later episodes its world has, of each episode of a replica, [E] in order."""
+    order = np.argsort(world, kind="stable")
+    counts = np.unique(world, return_counts=True)[1]
+    after = np.empty(len(world), np.int64)
+    after[order] = np.repeat(counts.cumsum(), counts) - 1 - np.arange(len(world))
+    return after
+
+
+def mean_of_worlds(values: Values, worlds: Numbers, window: int) -> Values:
+    """Return the mean of the last episodes at each episode of a replica, in which every world counts alike.
+
+    Args:
+        values: [E], in the order in which episodes ended.
+        worlds: [E], that of each.
+        window: of so many episodes, or the next multiple of the number of worlds; in one world it is the
+            `running_mean`.
+
+    Returns:
+        [E], at the last of the episodes that it is a mean of; NaN before each world has ended so many.
+    """
+    lanes = np.unique(worlds)
+    each = rounds_of(min(window, len(values)), len(lanes))
+    each = min(each, int(np.unique(worlds, return_counts=True)[1].min()))
+    means = np.full((len(lanes), len(values)), np.nan)
+    for lane, world in enumerate(lanes):
+        ended = np.flatnonzero(worlds == world)
+        of_world = running_mean(values[ended], each)
+        latest = np.searchsorted(ended, np.arange(len(values)), side="right") - each
+        means[lane, latest >= 0] = of_world[latest[latest >= 0]]
+    return np.asarray(means.mean(0))
+
+
+def _world(table: pa.Table) -> Numbers:
+    name = "world" if "world" in table.column_names else "replica"
+    return np.asarray(table[name].to_numpy().astype(np.int64))
+
+
+def _places(table: pa.Table) -> tuple[Numbers, Numbers, tuple[int, int]]:
+    """The row and the place of each row's episode in its replica, and how many of both: R, and as many
+    episodes as all replicas have."""
+    replicas, replica = np.unique(table["replica"].to_numpy(), return_inverse=True)
+    episode = table["episode"].to_numpy().astype(np.int64)
+    size = int(episode.max()) + 1
+    keys, row = np.unique(replica * size + episode, return_inverse=True)
+    firsts = np.searchsorted(keys // size, np.arange(len(replicas)))
+    counts = np.diff(np.append(firsts, len(keys)))
+    return replica, row - firsts[replica], (len(replicas), int(counts.min()))
 
 
 def net_of(curves: Mapping[str, Values]) -> Values:

@@ -321,7 +321,7 @@ def value_of(search: Search, point: Point, runs: Path) -> float | None:
         if search.over == "evaluation":
             curves = as_curves(read_table(run / "evaluation" / "trained.parquet"))
         else:
-            curves = {name: curve[:, -search.last :] for name, curve in curves_of(run, at_end=True).items()}
+            curves = curves_of(run, last=search.last)
         curves[NET] = net_of(curves)
         if search.metric not in curves:
             raise refusal("metric", search.metric, f"what the game reports: {', '.join(sorted(curves))}")

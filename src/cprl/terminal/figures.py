@@ -16,7 +16,18 @@ from cprl.measuring.metrics import unit
 from cprl.measuring.phases import UNNAMED as UNNAMED
 from cprl.measuring.phases import Phase
 from cprl.measuring.series import Values
-from cprl.runs.curves import SMOOTHED_EPISODES, centres, curves_of, episode_of_turn, phases_of, running_mean
+from cprl.runs.curves import (
+    SMOOTHED_EPISODES,
+    Numbers,
+    centres,
+    curves_of,
+    episode_of_turn,
+    mean_of_worlds,
+    phases_of,
+    rounds_of,
+    running_mean,
+    worlds_of,
+)
 from cprl.runs.episodes import read_episodes, read_evaluations
 from cprl.terminal import style
 from cprl.terminal.style import CHARACTER, MARK, Sheet, Width
@@ -103,6 +114,8 @@ class _Panel:
     title: str
     unit: str
     values: Values
+    worlds: Numbers
+    """The world of each episode, [R, E]."""
     random: float | None
     evaluated: tuple[Values, Values] | None
 
@@ -119,9 +132,10 @@ def training_curve(
     """Plots the collective return in each episode of a run, and survival below it.
 
     Every episode and replica is faint, the mean over replicas and its highest point bold. Running means are
-    centred, over 100 episodes, or 1/20 of all where that is less. Trainings of 1,000 to 100,000 episodes have
-    their phases as bands behind the curves. A game without a harvest has one panel, the return of all its
-    agents. Games with institutions have two more, violations and fines of all agents.
+    centred, over 100 episodes, or 1/20 of all where that is less, in which each of many worlds counts alike.
+    Trainings of 1,000 to 100,000 episodes have their phases as bands behind the curves. A game without a
+    harvest has one panel, the return of all its agents. Games with institutions have two more, violations and
+    fines of all agents.
 
     Args:
         random: episodes of the random policy, whose means are dashed lines; those of evaluations while the
@@ -159,7 +173,10 @@ def training_curve(
         for axes in every[: len(strips)]:
             draw_strip(sheet, axes, strips)
         drawn[-1].set_xlabel("episode")
-        note = f"Running means are over {window} episodes, centred." if window > 1 else "Nothing is smoothed."
+        over = _over(panels[0], window)
+        note = f"Running means are over {over} episodes, centred." if over > 1 else "Nothing is smoothed."
+        if lanes := _lanes(panels[0]):
+            note = f"{note.removesuffix('.')}, {over // lanes} of each of {lanes} worlds."
         if exploration_turns is not None and ends is None:
             note += " Exploration was not over at the last episode."
         sheet.title, sheet.caption = title, note
@@ -169,6 +186,7 @@ def training_curve(
 def _panels(run: Path, curves: dict[str, Values], random: Sequence[Episode]) -> list[_Panel]:
     """Collective return and survival, or the return of all agents of a game without a harvest; violations and
     fines of a game with institutions."""
+    worlds = worlds_of(read_episodes(run))
     played: list[dict[str, float]] = [
         {"return": float(one.return_.sum()), **one.social, **one.of_institutions} for one in random
     ]
@@ -182,6 +200,7 @@ def _panels(run: Path, curves: dict[str, Values], random: Sequence[Episode]) -> 
             title="return of all agents together" if name == "return" else metric_title(name),
             unit=unit(name),
             values=curves[name],
+            worlds=worlds,
             random=fmean(metrics[name] for metrics in played) if played else None,
             evaluated=_evaluated(run, name),
         )
@@ -203,6 +222,29 @@ def _evaluated(run: Path, name: str) -> tuple[Values, Values] | None:
     return at - 1.0, np.array([np.nanmean(values[trained == episodes]) for episodes in at])
 
 
+def _lanes(panel: _Panel) -> int:
+    """The worlds of a replica; 0 for one alone."""
+    lanes = len(np.unique(panel.worlds[0]))
+    return lanes if lanes > 1 else 0
+
+
+def _over(panel: _Panel, window: int) -> int:
+    """Over how many episodes running means are: as many of each world."""
+    lanes = _lanes(panel) or 1
+    return rounds_of(window, lanes) * lanes
+
+
+def _means(panel: _Panel, window: int) -> tuple[Values, Values]:
+    """The episodes at the centres of running means, and these of each replica, [R, ...]."""
+    if not _lanes(panel):
+        return centres(panel.values[0], window), running_mean(panel.values, window)
+    of_replicas = zip(panel.values, panel.worlds, strict=True)
+    means = np.stack([mean_of_worlds(*of_replica, window) for of_replica in of_replicas])
+    is_there = ~np.isnan(means).any(0)
+    at = np.arange(means.shape[1]) - (_over(panel, window) - 1) / 2
+    return at[is_there], means[:, is_there]
+
+
 def _draw(axes: Axes, panel: _Panel, window: int, dashed: str) -> None:
     replicas, episodes = panel.values.shape
     several = replicas > 1
@@ -210,7 +252,7 @@ def _draw(axes: Axes, panel: _Panel, window: int, dashed: str) -> None:
     raw = panel.values.mean(0)
     label = "each episode, mean of the replicas" if several else "each episode"
     axes.plot(raw, color=style.RAW, linewidth=0.7, marker=dot, label=label, zorder=1.5)
-    at, means = centres(raw, window), running_mean(panel.values, window)
+    at, means = _means(panel, window)
     if several:
         lines = axes.plot(at, means.T, color=style.REPLICA, linewidth=0.9, alpha=0.75, zorder=2)
         lines[0].set_label("each replica, running mean")
@@ -227,9 +269,14 @@ def _draw(axes: Axes, panel: _Panel, window: int, dashed: str) -> None:
 
 def _mark_peak(axes: Axes, panel: _Panel, window: int) -> None:
     """Marks the highest and the last running mean of the mean over replicas."""
-    mean = running_mean(panel.values.mean(0), window)
-    at, top, end = centres(panel.values[0], window), int(mean.argmax()), len(mean) - 1
-    over = f"mean of {window} episodes" if window > 1 else "episode"
+    if _lanes(panel):
+        at, means = _means(panel, window)
+        mean = means.mean(0)
+    else:
+        at, mean = centres(panel.values[0], window), running_mean(panel.values.mean(0), window)
+    top, end = int(mean.argmax()), len(mean) - 1
+    number = _over(panel, window)
+    over = f"mean of {number} episodes" if number > 1 else "episode"
     marks = {"highest": (top, "o"), "last": (end, "s")}
     if top == end:
         marks = {"highest and last": (top, "o")}

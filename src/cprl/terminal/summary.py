@@ -1,10 +1,8 @@
 """The results of a run, printed in the terminal: first what they come to, then tables and files."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain
-from math import isnan
+from operator import attrgetter
 from pathlib import Path
-from statistics import fmean, stdev
 from typing import Final
 
 import numpy as np
@@ -14,8 +12,16 @@ from rich.text import Text
 from cprl.measuring.episodes import Episode
 from cprl.measuring.metrics import DIGITS, INSTITUTIONAL, is_own, left_out, with_unit
 from cprl.measuring.metrics import title as metric_title
-from cprl.runs.curves import as_curves, running_mean
-from cprl.runs.episodes import read_episodes, read_table
+from cprl.measuring.statistics import (
+    ByReplica,
+    Measured,
+    by_metric,
+    clock_of,
+    difference_paired,
+    notes_on,
+    over_replicas,
+    signed,
+)
 from cprl.system.output import console as safe_console
 from cprl.system.output import printed
 from cprl.system.shipped import cprl_here
@@ -24,10 +30,10 @@ from cprl.terminal.tables import Cells
 _OF_AGENTS: Final = {"fines": "fined", "transfers": "given", "violations": "violations"}
 _FILES: Final = ("recipe.json", "episodes.parquet", "run.rrd", "checkpoints", "figures")
 RETURN: Final = "return of all agents together"
-UNDEFINED: Final = "undefined"
+INTERVALS: Final = "means over replicas [95 % interval by Student's t]"
 
-Played = Mapping[str, Sequence[Episode]]
-"""Episodes by the name of the policy."""
+Played = Mapping[str, Mapping[int, Sequence[Episode]]]
+"""Episodes by the name of the policy, then by replica."""
 
 
 def summarise(
@@ -35,23 +41,25 @@ def summarise(
     *,
     title: str,
     played: Played,
+    course: str = "",
     figure: Path | None = None,
     note: str | None = None,
     console: Console | None = None,
 ) -> None:
-    """Prints what policies get, tables that compare them, the metrics that are left out, and the files of
-    the run.
+    """Prints what became of the run, tables that compare policies, the metrics that are left out, and the
+    files of the run.
 
     Args:
         played: episodes in fresh worlds by the name of the policy; the first policy is the baseline.
+        course: see `cprl.runs.course`; by default what each policy gets.
     """
     console = console or safe_console()
-    console.print(Text(_verdict(played), style="bold"))
+    console.print(Text(course or _verdict(played), style="bold"))
     console.print(_table(title, played))
     of_institutions = institutions_table(played)
     if of_institutions is not None:
         console.print(of_institutions)
-    lines = [*_notes(played), note, left_out(next(iter(played.values()))[0].reported)]
+    lines = [*_notes(played), note, left_out(_first(played).reported)]
     files = [name for name in _FILES if (run / name).exists()]
     lines += [f"Saved in {run}: {', '.join(files)}", f"Training curve: {figure}" if figure else None]
     if any(run.glob("run*.rrd")):
@@ -60,125 +68,109 @@ def summarise(
         console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
-def course_of(run: Path) -> str:
-    """What happened in sentences: the peak, what followed, how long boards last, and what that means.
-
-    A tragedy, here: the last 30 episodes yield at most 95 % of random play, the best ten at least 1.5 times
-    as much as it, and boards last at most 70 % of the turns that they could.
-    """
-    table = read_episodes(run)
-    curves, at_end = as_curves(table), as_curves(table, at_end=True)
-    if lacking := sorted({"collective_return", "survival_steps"} - set(curves)):
-        raise ValueError(f"the episodes of {run} lack {', '.join(lacking)}; allowed: games that report them")
-    returns, survival = curves["collective_return"].mean(0), curves["survival_steps"]
-    last, lasts = (at_end[name][:, -30:].mean() for name in ("collective_return", "survival_steps"))
-    tens = running_mean(returns, 10)
-    by_chance = as_curves(read_table(run / "evaluation" / "random.parquet"))["collective_return"]
-    random, error = by_chance.mean(), by_chance.std(ddof=1) / by_chance.size**0.5
-    peak, times, shares = tens.max(), "where random play gets none", []
-    if peak:
-        shares.append(f"{1 - last / peak:.0%} below that peak")
-    if random:
-        times = f"{peak / random:.1f} times the {random:.0f} ± {error:.0f} of random play"
-        more = "less" if last < random else "more"
-        shares.append(f"{abs(last / random - 1):.0%} {more} than random play gets")
-    if random > 0 and last <= 0.95 * random and peak >= 1.5 * random and lasts <= 0.7 * survival.max():
-        meaning = (
-            "Each agent learned to take what pays now, and all of them, trained, end worse off than agents "
-            "who never learned: the tragedy of the commons."
-        )
-    elif last > random:
-        meaning = "They end better off than agents who never learned: no tragedy so far."
-    else:
-        meaning = "They end no better off than agents who never learned."
-    return (
-        f"The agents began at {tens[0]:.0f} apples an episode, all together, and reached {peak:.0f} "
-        f"around episode {min(tens.argmax() + 5, returns.size)}, {times}. "
-        f"In the last {len(returns[-30:])} episodes they got "
-        f"{last:.0f}{', ' * bool(shares)}{' and '.join(shares)}. "
-        f"Boards that can last {survival.max():.0f} steps now last {lasts:.0f}. {meaning}"
-    )
+def _first(played: Played) -> Episode:
+    return next(iter(next(iter(played.values())).values()))[0]
 
 
 def _verdict(played: Played) -> str:
-    """What each policy gets, and how many times as much as the first."""
-    is_harvest = all(map(_harvests, played.values()))
-    means = {name: fmean(_gains(episodes)) for name, episodes in played.items()}
-    baseline, first = next(iter(means.items()))
+    """What each policy gets, and how much more than the first, if it is more over replicas."""
+    gains = [_gains(episodes) for episodes in played.values()]
+    is_harvest = all(_harvests(episodes) for episodes in played.values())
     what = f"{'apples' if is_harvest else 'of return'} an episode, all agents together"
-    parts = [f"{_called(name)}: {mean:,.{1 if abs(mean) < 100 else 0}f}" for name, mean in means.items()]
-    if len(means) > 1 and first > 0:
-        parts = [
-            part if name == baseline else f"{part}, {means[name] / first:.1f} times {_called(baseline)}"
-            for part, name in zip(parts, means, strict=True)
-        ]
+    parts = [f"{_called(name)}: {over_replicas(gain)}" for name, gain in zip(played, gains, strict=True)]
+    for place, gain in enumerate(gains[1:], 1):
+        more = difference_paired(gain, gains[0])
+        parts[place] += f" ({more:+} beside {_called(next(iter(played)))})" if more is not None else ""
     return f"{'; '.join([parts[-1], *parts[:-1]])} {what}"
 
 
 def _table(title: str, played: Played) -> Cells:
-    """A column for each policy, a row for each number; the first policy is the baseline."""
+    """A column for each policy, then one for what each has more than the first; a row for each number."""
     names = [name if place or len(played) == 1 else f"{name} (baseline)" for place, name in enumerate(played)]
-    returns = [[float(episode.return_.sum()) for episode in episodes] for episodes in played.values()]
+    returns = [_returns(episodes) for episodes in played.values()]
     harvests = [_harvests(episodes) for episodes in played.values()]
-    if not all(harvests):
-        rows = _returns(RETURN, played, returns)
+    values: dict[str, list[ByReplica]] = {}
+    if all(harvests):
+        values[with_unit("collective_return")] = harvests
+        if not all(_are_close(*both) for both in zip(harvests, returns, strict=True)):  # as under fines
+            values[f"{RETURN}, rewards"] = returns
     else:
-        rows = _returns(with_unit("collective_return"), played, harvests)
-        pairs = zip(chain(*harvests), chain(*returns), strict=True)
-        if any(abs(harvest - reward) > 1e-3 for harvest, reward in pairs):  # as under fines
-            rows += _returns(f"{RETURN}, rewards", played, returns)
-    measured = [[episode.social for episode in episodes] for episodes in played.values()]
-    forms = {metric: f".{digits}f" for metric, digits in DIGITS.items()}
-    forms |= {metric: ".3g" for metric in measured[0][0] if is_own(metric)}
-    rows += [
-        (metric_title(metric), *(_mean(episodes, metric, form) for episodes in measured))
-        for metric, form in forms.items()
-        if metric in measured[0][0]
-    ]
-    rows.append(("episodes", *(str(len(episodes)) for episodes in played.values())))
-    return Cells(title, ["", *names], rows, "means over episodes ± their standard errors")
+        values[RETURN] = returns
+    measured = [by_metric(episodes, attrgetter("social")) for episodes in played.values()]
+    metrics = [name for name in DIGITS if name in measured[0]] + list(filter(is_own, measured[0]))
+    values |= {metric_title(name): [of_policy[name] for of_policy in measured] for name in metrics}
+    of_rows = dict(zip(values, [*[""] * (len(values) - len(metrics)), *metrics], strict=True))
+    rows, measures = _rows(values, of_rows, played)
+    counts = (str(sum(map(len, episodes.values()))) for episodes in played.values())
+    rows.append(["episodes", *counts, *[""] * (len(played) - 1)])
+    notes = "\n".join([INTERVALS, *notes_on(measures)])
+    return Cells(title, ["", *names, *_differences(played)], rows, notes)
 
 
-def _returns(name: str, played: Played, values: Sequence[Sequence[float]]) -> list[tuple[str, ...]]:
-    """The mean of a return with its standard error, and how many times the baseline's it is."""
-    errors = [f" ± {stdev(of_one) / len(of_one) ** 0.5:.1f}" if len(of_one) > 1 else "" for of_one in values]
-    means = [fmean(of_policy) for of_policy in values]
-    rows = [(name, *(f"{mean:.1f}{error}" for mean, error in zip(means, errors, strict=True)))]
-    if len(played) > 1:
-        times = [f"{mean / means[0]:.1f}" if means[0] > 0 else UNDEFINED for mean in means]
-        rows.append((f"  times {_called(next(iter(played)))}", *times))
-    return rows
+def _rows(
+    values: Mapping[str, Sequence[ByReplica]], metrics: Mapping[str, str], played: Played
+) -> tuple[list[list[str]], list[Measured]]:
+    """A row for each number by its words, but for those that are undefined everywhere; and all that is in
+    them.
+
+    Args:
+        values: of each policy.
+        metrics: the name of the metric, where it is one.
+    """
+    clock = max(clock_of(episodes) for episodes in played.values())
+    rows, all_measures = [], list[Measured]()
+    for words, of_policies in values.items():
+        measures = [over_replicas(of_policy, metrics[words], clock) for of_policy in of_policies]
+        if all(measured.estimate is None for measured in measures):
+            continue
+        more = (difference_paired(of_policy, of_policies[0]) for of_policy in of_policies[1:])
+        rows.append([words, *map(str, measures), *map(signed, more)])
+        all_measures += measures
+    return rows, all_measures
+
+
+def _differences(played: Played) -> list[str]:
+    """What the columns of differences are called."""
+    baseline, *others = played
+    return [f"{name} - {baseline}" if len(others) > 1 else "difference, paired" for name in others]
 
 
 def _called(policy: str) -> str:
     return "random play" if policy == "random" else policy
 
 
-def _harvests(episodes: Sequence[Episode]) -> list[float]:
-    """Of all agents in each episode; [] in a game that reports none."""
-    return [float(episode.harvest.sum()) for episode in episodes if episode.harvest is not None]
+def _returns(episodes: Mapping[int, Sequence[Episode]]) -> dict[int, list[float]]:
+    return {replica: [float(one.return_.sum()) for one in played] for replica, played in episodes.items()}
 
 
-def _gains(episodes: Sequence[Episode]) -> list[float]:
-    return _harvests(episodes) or [float(episode.return_.sum()) for episode in episodes]
+def _harvests(episodes: Mapping[int, Sequence[Episode]]) -> dict[int, list[float]]:
+    """Of all agents in each episode; {} in a game that reports none."""
+    harvests = {
+        replica: [float(one.harvest.sum()) for one in played if one.harvest is not None]
+        for replica, played in episodes.items()
+    }
+    return harvests if all(harvests.values()) else {}
 
 
-def _mean(measured: Sequence[Mapping[str, float]], name: str, form: str) -> str:
-    """The mean of a metric over the episodes in which it is defined, and the number of the others."""
-    defined = [metrics[name] for metrics in measured if not isnan(metrics[name])]
-    if not defined:
-        return UNDEFINED
-    others = len(measured) - len(defined)
-    return f"{fmean(defined):{form}}" + f", {UNDEFINED} in {others} of {len(measured)}" * (others > 0)
+def _gains(episodes: Mapping[int, Sequence[Episode]]) -> dict[int, list[float]]:
+    return _harvests(episodes) or _returns(episodes)
+
+
+def _are_close(values: ByReplica, others: ByReplica) -> bool:
+    return all(np.allclose(values[replica], others[replica], rtol=0, atol=1e-3) for replica in values)
 
 
 def _notes(played: Played) -> Iterator[str]:
+    """Say why metrics are undefined."""
     for policy, episodes in played.items():
-        if (harvests := _harvests(episodes)) and not any(harvests):
+        harvests = _harvests(episodes)
+        if harvests and not any(map(any, harvests.values())):
             yield f"{policy}: nobody harvested anything, so equality and sustainability are undefined"
-    baseline = next(iter(played))
-    if len(played) > 1 and fmean(_gains(played[baseline])) <= 0:
-        yield f"times {_called(baseline)}: undefined, because it is not above 0"
+
+
+def _is_any(name: str, episodes: Sequence[Episode]) -> bool:
+    values = [episode.of_institutions[name] for episode in episodes]
+    return any(value > 0 or value < 0 for value in values)
 
 
 def institutions_table(played: Played) -> Cells | None:
@@ -187,25 +179,23 @@ def institutions_table(played: Played) -> Cells | None:
 
     What is 0 under every policy has no row, nor have shares of something that never happened.
     """
-    first = next(iter(played.values()))[0]
+    first = _first(played)
     if all(getattr(first, name) is None for name in INSTITUTIONAL):
         return None
-    measured = [[episode.of_institutions for episode in episodes] for episodes in played.values()]
+    measured = [by_metric(episodes, attrgetter("of_institutions")) for episodes in played.values()]
+    together = [[one for of_replica in by.values() for one in of_replica] for by in played.values()]
     seen = {
         name
         for name in first.of_institutions
-        if "in_force_" in name
-        or any(metrics[name] > 0 or metrics[name] < 0 for of_policy in measured for metrics in of_policy)
+        if "in_force_" in name or any(_is_any(name, episodes) for episodes in together)
     }
     if all("equality" in name for name in seen):
         return None
-    rows = [
-        (with_unit(name), *(_mean(of_policy, name, ".2f") for of_policy in measured))
-        for name in first.of_institutions
-        if name in seen or "equality" in name
-    ]
+    names = [name for name in first.of_institutions if name in seen or "equality" in name]
+    values = {with_unit(name): [metrics[name] for metrics in measured] for name in names}
+    rows, measures = _rows(values, dict(zip(values, names, strict=True)), played)
     of_agents = {
-        word: [np.mean([getattr(episode, name) for episode in episodes], 0) for episodes in played.values()]
+        word: [np.mean([getattr(episode, name) for episode in episodes], 0) for episodes in together]
         for name, word in _OF_AGENTS.items()
         if getattr(first, name) is not None
     }
@@ -215,5 +205,6 @@ def institutions_table(played: Played) -> Cells | None:
             " / ".join(f"{means[place][agent]:.1f}" for means in of_agents.values())
             for place in range(len(played))
         )
-        rows.append((f"agent {agent}: {' / '.join(of_agents)}", *texts))
-    return Cells("institutions", ["", *played], rows, "means over episodes")
+        rows.append([f"agent {agent}: {' / '.join(of_agents)}", *texts, *[""] * (len(played) - 1)])
+    notes = "\n".join([f"{INTERVALS}; of agents, means", *notes_on(measures)])
+    return Cells("institutions", ["", *played, *_differences(played)], rows, notes)

@@ -222,10 +222,15 @@ def evaluate_population(
     return {"random": random, "trained": evaluate(fresh, policy, explore=True, metrics=experiment.metrics)}
 
 
+def by_replica(episodes: Sequence[Episode], of_replica: int) -> dict[int, Sequence[Episode]]:
+    """Return the episodes of an evaluation by replica, so many of each."""
+    starts = enumerate(range(0, len(episodes), of_replica))
+    return {replica: episodes[start : start + of_replica] for replica, start in starts}
+
+
 def write_evaluation(run: Path, played: Mapping[str, Sequence[Episode]], *, of_replica: int) -> None:
     """Write `evaluation/<policy>.parquet` of a run, so many episodes of each replica; again where one is
     there."""
     for name, episodes in played.items():
-        starts = enumerate(range(0, len(episodes), of_replica))
-        table = labelled(({}, replica, episodes[start : start + of_replica]) for replica, start in starts)
+        table = labelled(({}, *of_one) for of_one in by_replica(episodes, of_replica).items())
         write_listed(run, f"evaluation/{name}.parquet", partial(pq.write_table, table))

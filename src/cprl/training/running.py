@@ -27,6 +27,7 @@ from cprl.runs.checkpoints import (
     is_ending,
     refuse_to_extend,
 )
+from cprl.runs.course import NEEDED, course_of
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.files import LOCK_FILE, RunLockedError, refuse_missing, write_json
 from cprl.runs.loggers import LoggerCallback, check_logger, make_logger
@@ -58,6 +59,7 @@ from cprl.training.agents import Population
 from cprl.training.finite import summary
 from cprl.training.outcome import (
     Evaluations,
+    by_replica,
     evaluate_population,
     exhibited,
     make_agents,
@@ -80,7 +82,7 @@ def run(
     *,
     resume: bool = False,
     take_over: bool = False,
-    keep_checkpoint: bool = True,
+    keep_checkpoint: bool = False,
     watch: str = "file",
     linger: bool = False,
     threads: int = 1,
@@ -98,8 +100,8 @@ def run(
             of fewer episodes, stopped or finished, is extended. Either equals a run that was not interrupted,
             bit for bit. Of a finished run of as many episodes nothing is done.
         take_over: whether to resume a run that a process on another host has locked.
-        keep_checkpoint: whether a finished run keeps the state of its training, buffers included, so that it
-            can be extended.
+        keep_checkpoint: whether a finished run keeps the state of its training, so that it can be extended:
+            hundreds of megabytes, buffers included.
         watch: "file" for a recording for the Rerun viewer; "serve" or "spawn" to watch
             live as well, see `cprl.viewer.live.Live`; "off" for none.
         linger: whether the recording stays served after the run, until Ctrl-C (SIGINT) or SIGTERM; only with
@@ -285,8 +287,17 @@ def _summarise(
     columns = {"random": played["random"], heading if learners else "agents": played["trained"]}
     own = f"Rules of its own: {work.experiment.own_rules}" if work.experiment.own_rules else ""
     notes = filter(None, (summary(training.finite.reported), own, work.experiment.own_code))
-    note = "\n".join(notes) or None
-    summarise(work.directory, title=_title(work.experiment), played=columns, figure=figure, note=note)
+    each = work.experiment.evaluation_episodes
+    has_course = all(training.episodes_by_replica) and set(NEEDED) <= set(played["trained"][0].social)
+    summarise(
+        work.directory,
+        title=_title(work.experiment),
+        played={name: by_replica(episodes, each) for name, episodes in columns.items()},
+        course=course_of(work.directory, work.experiment.agents) if has_course else "",
+        figure=figure,
+        note="
+".join(notes) or None,
+    )
 
 
 def _title(experiment: Experiment) -> str:
@@ -360,8 +371,6 @@ def _remove(directory: Path, *, with_directory: bool) -> None:
 
 def _say_what_is_kept(directory: Path, experiment: Experiment) -> None:
     for checkpoint in checkpoints_in(directory / FOLDER):
-        console().print(
-            f"Kept so that it can be extended (--resume with more --{experiment.unit}): {checkpoint}, "
-            f"{checkpoint.stat().st_size / 1e6:,.1f} MB",
-            soft_wrap=True,
-        )
+        size = checkpoint.stat().st_size / 1e6
+        text = f"Kept to extend it by --resume with more --{experiment.unit}: {FOLDER}/ending-*.pt"
+        console().print(f"{text}, {size:,.0f} MB", style="dim", highlight=False, soft_wrap=True)

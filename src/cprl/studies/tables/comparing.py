@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl.measuring.metrics import is_own, title
-from cprl.measuring.statistics import CONFIDENCE, Estimate, difference, estimate, holm
+from cprl.measuring.statistics import CONFIDENCE, CUT, Estimate, difference, estimate, holm
 from cprl.studies.tables.table import NET, PARTS, RANDOM, TRAINING, StudyTable
 from cprl.system.defaults import LAST as LAST
 from cprl.terminal.tables import Cells as Cells
@@ -34,6 +34,7 @@ class Compared:
     """A metric under one condition."""
 
     condition: str
+    metric: str
     values: Mapping[int, float]
     """The mean over its episodes by the number of the replica; NaN where it is defined in none."""
     episodes: int
@@ -57,7 +58,7 @@ class Compared:
     @cached_property
     def estimate(self) -> Estimate | None:
         """Over the replicas in which it is defined; None if there are none."""
-        return estimate(self.defined) if len(self.defined) else None
+        return estimate(self.defined).of(self.metric) if len(self.defined) else None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -132,6 +133,7 @@ def _compared(table: StudyTable, metric: str, part: str, last: int) -> Compariso
         conditions=tuple(
             Compared(
                 condition=name,
+                metric=metric,
                 values=values,
                 episodes=sum(lengths),
                 undefined=undefined,
@@ -150,6 +152,9 @@ def _means(
     if grid is None:
         return {}, 0, []
     ends = (grid["episode"] + grid["window_episodes"]).max(1, keepdims=True)
+    longest = int(grid["window_episodes"].max())
+    if longest > table.window:  # as many episodes of each of many worlds
+        last = -(-last // longest) * longest
     is_last = (grid["episode"] >= ends - last) | (part != TRAINING)
     some = is_last.any(0)
     lengths, undefined, values = (
@@ -217,6 +222,9 @@ def cells(comparisons: Sequence[Comparison], kind: Kind = "levels") -> Cells:
             f"Bold: not 0 by Holm's method for {number} comparison{'s' * (number != 1)} (two-sided t-tests, "
             f"{1 - CONFIDENCE:.0%} for all together); intervals are of single comparisons."
         )
+    estimates = [one.estimate for comparison in comparisons for one in comparison.conditions]
+    if kind == "levels" and any(one is not None and one.is_cut for one in estimates):
+        note = CUT
     heading = f"{first.episodes_text[0].upper()}{first.episodes_text[1:]}; {what}; {INTERVALS}."
     return Cells(heading, head, rows, note)
 

@@ -15,7 +15,19 @@ from cprl.measuring import social
 from cprl.measuring.now import LEAST_LOSS, LOST, REGAINED
 from cprl.measuring.phases import FEWEST_EPISODES, UNNAMED
 from cprl.runs.checkpoints import REPORT
-from cprl.runs.curves import Values, as_curves, net_of, phases_of, running_mean
+from cprl.runs.course import BELOW_RANDOM, LAST_EPISODES, PEAK_EPISODES, PEAK_OVER_RANDOM
+from cprl.runs.curves import (
+    Numbers,
+    Values,
+    as_curves,
+    episodes_after,
+    mean_of_worlds,
+    net_of,
+    phases_of,
+    rounds_of,
+    running_mean,
+    worlds_of,
+)
 from cprl.runs.episodes import read_episodes, read_table
 from cprl.runs.files import read_json
 from cprl.runs.recipe import read_recipe
@@ -39,12 +51,6 @@ from cprl.studies.tables.table import (
 )
 from cprl.studies.trials import State, trials_of
 from cprl.values import Positive, checked
-
-PEAK_EPISODES, LAST_EPISODES = 10, 30
-"""Episodes of the mean whose highest value is the peak of a training, and at its end."""
-PEAK_OVER_RANDOM, BELOW_RANDOM = 1.5, 0.95
-"""How many times random play the peak of agents who learned something is at least, and a tragedy's end at
-most."""
 
 REASONS: Final[dict[State, str]] = {
     "missing": "was not begun",
@@ -218,25 +224,38 @@ def _measured(source: Source, window: int) -> _Measured:
     """
     windows: list[dict[tuple[str, str], Windows]] = [{} for _ in range(source.replicas)]
     curves: dict[str, list[dict[str, Values]]] = {}
+    worlds: dict[str, list[Numbers]] = {}
     for part, name in PARTS.items():
         folder = source.run / "evaluation"
         table = read_episodes(source.run) if name is None else read_table(folder / f"{name}.parquet")
         _refuse_gaps(table, source, part)
         # one by one: in as many steps, each replica ends a number of episodes of its own
         replica = table["replica"].to_numpy()
-        curves[part] = [as_curves(table.filter(replica == number)) for number in range(source.replicas)]
-        for of_replica, by_name in zip(windows, curves[part], strict=True):
+        of_replicas = [table.filter(replica == number) for number in range(source.replicas)]
+        curves[part] = list(map(as_curves, of_replicas))
+        worlds[part] = [worlds_of(rows)[0] for rows in of_replicas]
+        for of_replica, by_name, world in zip(windows, curves[part], worlds[part], strict=True):
             for metric, values in {**by_name, NET: net_of(by_name)}.items():
                 length = window if part == TRAINING or window == 1 else values.shape[1]
-                of_replica[part, metric] = _in_windows(values[0], length)
-    phases, rule = _phases(curves)
+                of_replica[part, metric] = _in_windows(values[0], length, world)
+    phases, rule = _phases(curves, worlds[TRAINING])
     episodes = [by_name["return_0"].shape[1] for by_name in curves[TRAINING]]
     made = circumstances_of(source.run)
     return _Measured(source, windows, phases, rule, made, episodes, _steps_of(source.run))
 
 
-def _in_windows(values: Values, window: int) -> Windows:
-    firsts = np.arange(0, len(values), window)
+def _in_windows(values: Values, window: int, world: Numbers) -> Windows:
+    """Windows of consecutive episodes; of many worlds, of as many consecutive ones of each, so that no window
+    has more of the short episodes, which end sooner. The last window is whole, the first ones may lack worlds
+    that have ended fewer."""
+    lanes = len(np.unique(world))
+    if lanes == 1 or window == 1:
+        firsts = np.arange(0, len(values), window)
+    else:
+        to_end = episodes_after(world) // rounds_of(window, lanes)
+        order = np.argsort(-to_end, kind="stable")
+        values = values[order]
+        firsts = np.flatnonzero(np.diff(to_end[order], prepend=-1))
     lengths = np.diff(np.append(firsts, len(values)))
     defined = ~np.isnan(values)
     counts = np.add.reduceat(defined.astype(np.int64), firsts)
@@ -398,30 +417,42 @@ BY_PHASES: Final = f"the last phase that cprl.measuring.phases finds, from {FEWE
 BY_RETURNS: Final = "its last 30 episodes against its peak and random play, see cprl.studies.tables.sources"
 
 
-def _phases(curves: Mapping[str, Sequence[dict[str, Values]]]) -> tuple[list[str], str]:
+def _phases(
+    curves: Mapping[str, Sequence[dict[str, Values]]], worlds: Sequence[Numbers]
+) -> tuple[list[str], str]:
     """In which phase each replica ends, and by which rule; `curves` are those of each, by the parts of the
-    run."""
+    run, `worlds` those of the episodes of training."""
     training = curves[TRAINING]
     by_phases = [phases_of(by_name) for by_name in training]
     if all(phases is not None for phases in by_phases):
         return [phases[-1].label or UNNAMED for phases in by_phases if phases is not None], BY_PHASES
     agents = sum(name.startswith("return_") for name in training[0])
     random = float(np.concatenate([_harvest(by_name) for by_name in curves[RANDOM]]).mean())
-    ends = [ending(_harvest(by_name)[0], random=random, agents=agents) for by_name in training]
+    ends = [
+        ending(_harvest(by_name)[0], random=random, agents=agents, worlds=world)
+        for by_name, world in zip(training, worlds, strict=True)
+    ]
     return ends, BY_RETURNS
 
 
-def ending(returns: Values, *, random: float, agents: int) -> str:
+def ending(returns: Values, *, random: float, agents: int, worlds: Numbers | None = None) -> str:
     """In which phase a replica of a short training ends.
 
     Args:
         returns: of all agents together by episode, [E].
         random: the mean of random play.
         agents: how many there are.
+        worlds: that of each episode, [E], if there are several, which then count alike.
     """
-    tens, means = running_mean(returns, PEAK_EPISODES), running_mean(returns, LAST_EPISODES)
+    lanes, after = 1 if worlds is None else len(np.unique(worlds)), 0
+    if worlds is None or lanes == 1:
+        tens, means = running_mean(returns, PEAK_EPISODES), running_mean(returns, LAST_EPISODES)
+    else:
+        tens, means = (mean_of_worlds(returns, worlds, size) for size in (PEAK_EPISODES, LAST_EPISODES))
+        tens, means = tens[~np.isnan(means)], means[~np.isnan(means)]
+        after = (rounds_of(LAST_EPISODES, lanes) - rounds_of(PEAK_EPISODES, lanes)) * lanes
     peak, at, last = float(tens.max()), int(tens.argmax()), float(means[-1])
-    low = float(means[min(at, len(means) - 1) :].min())
+    low = float(means[min(at + after, len(means) - 1) :].min())
 
     def is_lost(mean: float) -> bool:
         return bool(peak - mean >= max(LOST * (peak - random), LEAST_LOSS * peak))

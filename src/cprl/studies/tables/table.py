@@ -9,7 +9,8 @@ Columns:
     replica          its number in the study, int32
     part             "training", "evaluation" or "random", random play in the worlds of the evaluation
     metric           its name, as in docs/metrics.md, without "social/"; "net" is the return of all agents
-    episode          the first episode of the window, int32
+    episode          the first episode of the window, int32; in W worlds a window has as many consecutive
+                     episodes of each, and its first is that after all earlier windows
     window_episodes  episodes of the window, int32
     undefined        episodes of the window in which the metric is undefined, int32
     value            the mean over its other episodes, float64; NaN where there are none
