@@ -15,7 +15,7 @@ from cprl.measuring.episodes import Episode
 from cprl.measuring.metrics import DIGITS, INSTITUTIONAL, is_own, left_out, with_unit
 from cprl.measuring.metrics import title as metric_title
 from cprl.runs.curves import as_curves, running_mean
-from cprl.runs.episodes import read_episodes, read_table
+from cprl.runs.episodes import read_episodes, read_rows
 from cprl.system.output import console as safe_console
 from cprl.system.output import printed
 from cprl.system.shipped import cprl_here
@@ -73,7 +73,7 @@ def course_of(run: Path) -> str:
     returns, survival = curves["collective_return"].mean(0), curves["survival_steps"]
     last, lasts = (at_end[name][:, -30:].mean() for name in ("collective_return", "survival_steps"))
     tens = running_mean(returns, 10)
-    by_chance = as_curves(read_table(run / "evaluation" / "random.parquet"))["collective_return"]
+    by_chance = as_curves(read_rows(run / "evaluation" / "random.parquet"))["collective_return"]
     random, error = by_chance.mean(), by_chance.std(ddof=1) / by_chance.size**0.5
     peak, times, shares = tens.max(), "where random play gets none", []
     if peak:
