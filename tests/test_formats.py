@@ -1,6 +1,7 @@
 """Files of runs have formats: stored ones are read, others are refused by name."""
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from cprl.runs.files import (
     RECIPE_FORMAT,
     STUDY_FORMAT,
     TRAINING_STATE_FORMAT,
+    RunLock,
     checksum,
     verify,
 )
@@ -175,6 +177,22 @@ def test_files_beside_the_recipe_of_another_run_are_refused_by_the_manifest(read
     recipe = json.loads((STORED / "recipe.json").read_text())
     run = changed("recipe.json", experiment={**recipe["experiment"], "seed": 77})
     with pytest.raises(ValueError, match=r"manifest\.json is of another experiment than recipe\.json"):
+        read(run)
+
+
+@pytest.mark.parametrize("read", [cprl.load, report, cprl.evaluate_run])
+def test_a_run_before_its_first_checkpoint_says_how_far_it_is(read, tmp_path):
+    run = shutil.copytree(STORED, tmp_path / "run")
+    for name in ("checkpoints/final.pt", "report.json", "manifest.json"):
+        (run / name).unlink()
+    so_far = r"run has 4 episodes, .* and no checkpoint yet \({}\); read_episodes reads them"
+    with pytest.raises(ValueError, match=so_far.format(r"nobody is writing it; to resume it: .*--resume")):
+        read(run)
+    by_this = rf"process {os.getpid()} on \S+ since \S+ is writing it, or was killed"
+    with RunLock(run), pytest.raises(ValueError, match=so_far.format(by_this)):
+        read(run)
+    (run / "episodes.parquet").unlink()
+    with pytest.raises(ValueError, match=r"has .* been trained"):
         read(run)
 
 
