@@ -44,6 +44,16 @@ def largest_share(episode):
     return episode.harvest.max() / episode.harvest.sum()
 
 
+def rewrites_harvest(episode):
+    episode.harvest[:] = 99
+    return 1.0
+
+
+def rewrites_metrics(episode):
+    episode.metrics["collective_return"] = 99.0
+    return 1.0
+
+
 def no_number(episode):
     return episode.harvest
 

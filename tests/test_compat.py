@@ -438,6 +438,77 @@ def test_a_full_disk_leaves_compiled_functions_unkept_and_they_run(kept_summed, 
     assert not list(tmp_path.rglob("*.nbi"))
 
 
+def kept_anew(folder):
+    """What a new process has of the function that Numba keeps in a folder."""
+    with compiled.kept_in(folder):
+        return compiled.kept_on_disk(summed)
+
+
+def halved(content):
+    return content[: len(content) // 2]
+
+
+def flipped(content, place=0.6):
+    """A file in which one bit is another."""
+    index = int(len(content) * place)
+    return content[:index] + bytes([content[index] ^ 4]) + content[index + 1 :]
+
+
+DAMAGES = {
+    "cut": halved,
+    "empty": lambda _: b"",
+    "garbage": lambda content: content[:40] + b"\xff" * 300,
+    "zeros": lambda content: bytes(len(content)),
+    "a flipped bit": flipped,
+}
+
+
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_file_of_compiled_functions_is_named_once_and_made_anew(
+    kept_summed, tmp_path, suffix, damage
+):
+    assert kept_summed(np.ones(2)) == 2
+    [path] = tmp_path.rglob(f"*.{suffix}")
+    sound = path.read_bytes()
+    path.write_bytes(DAMAGES[damage](sound))
+    with pytest.warns(RuntimeWarning, match="damaged") as warned:
+        assert kept_anew(tmp_path)(np.ones(3)) == 3
+    assert str(path) in str(warned.pop().message)
+    assert len(warned) == 0
+    assert len(path.read_bytes()) > 100
+    healed = kept_anew(tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert healed(np.ones(3)) == 3
+    assert sum(healed.stats.cache_hits.values()) == 1
+
+
+def test_a_flipped_bit_of_machine_code_is_seen_wherever_it_is(kept_summed, tmp_path):
+    kept_summed(np.ones(2))
+    [path] = tmp_path.rglob("*.nbc")
+    assert compiled._is_whole(path)
+    sound = path.read_bytes()
+    for place in np.linspace(0, 1, 24, endpoint=False):
+        path.write_bytes(flipped(sound, place))
+        assert not compiled._is_whole(path), place
+
+
+def test_a_damaged_file_that_cannot_be_removed_is_not_read(kept_summed, tmp_path, monkeypatch):
+    kept_summed(np.ones(2))
+    [path] = tmp_path.rglob("*.nbc")
+    path.write_bytes(flipped(path.read_bytes()))
+
+    def refuse(path, **_):
+        raise OSError(errno.EROFS, "Read-only file system", str(path))
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    function = kept_anew(tmp_path)
+    with pytest.warns(RuntimeWarning, match="Read-only file system.*CPRL_CACHE"):
+        assert function(np.ones(3)) == 3
+    assert not function.stats.cache_hits
+
+
 def test_a_process_that_never_ends_to_compile_is_waited_for_no_longer_than_some_time(
     kept_summed, monkeypatch
 ):

@@ -1,26 +1,35 @@
 """Files of runs have formats: stored ones are read, others are refused by name."""
 
 import json
+import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 
 import cprl
+from cprl.evaluation.report import report
 from cprl.experiment import Experiment
 from cprl.runs.checkpoints import read_checkpoint
-from cprl.runs.episodes import read_episodes
+from cprl.runs.curves import curves_of
+from cprl.runs.episodes import EpisodeTable, read_episodes
 from cprl.runs.files import (
     MANIFEST_FORMAT,
     RECIPE_FORMAT,
     STUDY_FORMAT,
     TRAINING_STATE_FORMAT,
+    RunLock,
     checksum,
     verify,
 )
 from cprl.runs.recipe import read_recipe
 from cprl.studies import Study, read_study
+from cprl.studies.tables.sources import circumstances_of
+from cprl.system.output import console, say
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 STORED = Path(__file__).parent / "stored" / "run"
@@ -82,6 +91,127 @@ def test_what_a_newer_cprl_wrote_is_refused_by_name(name, entries, read, changed
     run, number = changed(name, **entries), entries["format"]
     with pytest.raises(ValueError, match=f"{name} {REFUSED.format(number, number - 1)}"):
         read(run)
+
+
+def nested(depth):
+    return [] if depth == 0 else [nested(depth - 1)]
+
+
+ODD_RECIPES = [
+    ({"extended": 3}, "extended"),
+    ({"extended": [None]}, "extended"),
+    ({"resumed": [1]}, "resumed"),
+    ({"resumed": "yes"}, "resumed"),
+    ({"versions": [1]}, "versions"),
+    ({"code": [["a", "b"]]}, "code"),
+    ({"code_text": 5}, "code_text"),
+    ({"extended": [{"versions": 7}]}, "versions"),
+    ({"note": nested(900)}, "nested"),
+    ({"experiment": {"note": nested(400)}}, "nested"),
+]
+LENGTHENED = Experiment.from_recipe(read_recipe(STORED), directory=STORED)
+LENGTHENED = replace(LENGTHENED, episodes=LENGTHENED.episodes + 1)
+READERS = [
+    cprl.load,
+    circumstances_of,
+    report,
+    lambda run: cprl.run(LENGTHENED, run, resume=True, watch="off"),
+]
+
+
+@pytest.mark.parametrize(("entries", "place"), ODD_RECIPES, ids=lambda value: str(value)[:30])
+@pytest.mark.parametrize("read", READERS, ids=["load", "table", "report", "extend"])
+def test_an_odd_recipe_is_refused_by_its_place(entries, place, read, changed):
+    run = changed("recipe.json", **entries)
+    with pytest.raises(ValueError, match=rf"recipe\.json.*{place}"):
+        read(run)
+
+
+OTHER_TABLES = {
+    "another schema": pa.table({"a": [1, 2]}),
+    "texts": pa.table({"replica": ["a"], "episode": ["b"], "agent": ["c"], "return": ["d"]}),
+    "no column agent": lambda table: table.drop(["agent"]),
+    "below 0": lambda table: table.set_column(0, "replica", pa.array([-1] * len(table), pa.int32())),
+    "empty": lambda table: table.set_column(0, "replica", pa.nulls(len(table), pa.int32())),
+    "twice": lambda table: table.append_column("agent", table["agent"]),
+}
+
+
+@pytest.mark.parametrize("what", OTHER_TABLES)
+@pytest.mark.parametrize("read", [read_episodes, curves_of])
+@pytest.mark.parametrize("suffix", ["parquet", "arrows"])
+def test_a_table_that_is_none_of_episodes_is_refused_by_its_name(what, read, suffix, tmp_path):
+    run = shutil.copytree(STORED, tmp_path / "run")
+    (run / "manifest.json").unlink()
+    other = OTHER_TABLES[what]
+    table = other if isinstance(other, pa.Table) else other(read_episodes(run))
+    if suffix == "parquet":
+        pq.write_table(table, run / "episodes.parquet")
+    else:
+        with pa.ipc.new_stream(run / "episodes.arrows", table.schema) as stream:
+            stream.write_table(table)
+    with pytest.raises(ValueError, match=rf"episodes\.{suffix} is not a table"):
+        read(run)
+
+
+def test_a_run_whose_table_is_none_of_episodes_is_not_extended(tmp_path):
+    run = shutil.copytree(STORED, tmp_path / "run")
+    (run / "manifest.json").unlink()
+    pq.write_table(OTHER_TABLES["another schema"], run / "episodes.parquet")
+    with pytest.raises(ValueError, match=r"episodes\.parquet is not a table of episodes"):
+        EpisodeTable(run / "episodes.parquet", resumable=True)
+    assert not (run / "episodes.arrows").exists()
+
+
+def test_a_manifest_is_of_one_experiment_whatever_its_length_and_name(changed):
+    listed = json.loads((STORED / "manifest.json").read_text())
+    recipe = json.loads((STORED / "recipe.json").read_text())
+    same = {**recipe["experiment"], "episodes": 7, "name": "renamed", "on_nan": "continue"}
+    run = changed("recipe.json", experiment=same)
+    verify(run / "episodes.parquet")
+    assert len(listed["experiment"]) == 32
+
+
+@pytest.mark.parametrize("read", [read_episodes, cprl.load])
+def test_files_beside_the_recipe_of_another_run_are_refused_by_the_manifest(read, changed):
+    recipe = json.loads((STORED / "recipe.json").read_text())
+    run = changed("recipe.json", experiment={**recipe["experiment"], "seed": 77})
+    with pytest.raises(ValueError, match=r"manifest\.json is of another experiment than recipe\.json"):
+        read(run)
+
+
+@pytest.mark.parametrize("read", [cprl.load, report, cprl.evaluate_run])
+def test_a_run_before_its_first_checkpoint_says_how_far_it_is(read, tmp_path):
+    run = shutil.copytree(STORED, tmp_path / "run")
+    for name in ("checkpoints/final.pt", "report.json", "manifest.json"):
+        (run / name).unlink()
+    so_far = r"run has 4 episodes, .* and no checkpoint yet \({}\); read_episodes reads them"
+    with pytest.raises(ValueError, match=so_far.format(r"nobody is writing it; to resume it: .*--resume")):
+        read(run)
+    by_this = rf"process {os.getpid()} on \S+ since \S+ is writing it, or was killed"
+    with RunLock(run), pytest.raises(ValueError, match=so_far.format(by_this)):
+        read(run)
+    (run / "episodes.parquet").unlink()
+    with pytest.raises(ValueError, match=r"has .* been trained"):
+        read(run)
+
+
+def test_names_of_a_foreign_manifest_and_recipe_reach_no_terminal_as_commands(changed, monkeypatch, capsys):
+    run = changed("manifest.json", files={"\x1b[31mred": "0", "new\rline": "0"})
+    with pytest.raises(ValueError, match="lacks") as refused:
+        cprl.load(run)
+    assert "\x1b" not in str(refused.value)
+    assert "\r" not in str(refused.value)
+    recipe = json.loads((run / "recipe.json").read_text())
+    versions = {**recipe["versions"], "torch": "\x1b[31m2.0", "\x9bm": "1"}
+    (run / "recipe.json").write_text(json.dumps({**recipe, "versions": versions}))
+    made = json.dumps(circumstances_of(run), ensure_ascii=False)
+    assert not {"\x1b", "\x9b"} & {*made}
+    say("\x1b[2J", "two\nlines")
+    console().print("\x1b[2J in a cell")
+    printed = capsys.readouterr().out
+    assert "\x1b" not in printed
+    assert "two\nlines" in printed
 
 
 def test_a_checkpoint_of_a_newer_cprl_is_refused_by_name(tmp_path):

@@ -23,7 +23,7 @@ from cprl.commons.spaces import Spaces
 from cprl.policies.rng import DRAWN_AHEAD, SAMPLING, LaneRng, lane_seeds
 from cprl.population import Frozen, Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, is_ending, read_checkpoint
-from cprl.runs.episodes import read_episodes, read_table
+from cprl.runs.episodes import EpisodeTable, read_episodes, read_table
 from cprl.runs.export import export_results
 from cprl.runs.files import RunLock, RunLockedError, checksum, refuse_to_write_over, write_atomically
 from cprl.runs.recipe import start_run
@@ -513,6 +513,34 @@ def test_a_run_with_a_link_out_of_it_is_refused_by_the_link_and_what_it_leads_to
     with pytest.raises(ValueError, match=f"{name} is a symbolic link"):
         resumed(FIELD, begun)
     assert contents(tmp_path) == before
+
+
+@pytest.mark.integration
+def test_a_killed_run_with_a_backup_by_hard_links_is_resumed_and_the_backup_stays_as_it_was(whole, tmp_path):
+    """As by `cp -al`; nothing is written through a link to a file of somebody else, either."""
+    begun, backup = copied(whole, tmp_path / "run"), tmp_path / "backup"
+    EpisodeTable(begun / "episodes.parquet", resumable=True)
+    (begun / "run.lock").write_text("a file of mine")
+    shutil.copytree(begun, backup, copy_function=os.link)
+    before = contents(backup)
+    assert {"episodes.arrows", "run.lock", "recipe.json", "checkpoints/final.pt"} <= set(before)
+    resumed(FIELD, begun)
+    assert contents(backup) == before
+    assert (begun / "report.json").exists()
+    assert not (begun / "run.lock").exists()
+
+
+def test_a_lock_with_a_hard_link_still_keeps_others_out(tmp_path):
+    with RunLock(tmp_path):
+        os.link(tmp_path / "run.lock", tmp_path / "backup.lock")
+        with pytest.raises(RunLockedError, match=str(os.getpid())), RunLock(tmp_path):
+            pass
+    assert not (tmp_path / "run.lock").exists()
+    (tmp_path / "backup.lock").write_text("a file of mine")
+    os.link(tmp_path / "backup.lock", tmp_path / "run.lock")
+    with RunLock(tmp_path), pytest.raises(RunLockedError), RunLock(tmp_path):
+        pass
+    assert (tmp_path / "backup.lock").read_text() == "a file of mine"
 
 
 def test_a_run_that_is_reached_through_a_link_and_links_within_it_are_no_obstacle(tmp_path):

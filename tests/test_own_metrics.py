@@ -112,6 +112,13 @@ def test_one_with_the_name_of_another_number_is_refused(targets):
         experiment(*targets)
 
 
+@pytest.mark.parametrize("target", ["rewrites_harvest", "rewrites_metrics"])
+def test_one_that_writes_into_its_episode_is_refused_before_anything_is_written(target, tmp_path):
+    with pytest.raises(ValueError, match=rf"{target} gives no number.*(read-only|assignment)"):
+        train(experiment(target), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_recipe_with_one_is_read_where_it_is_allowed():
     recipe = experiment("largest_share").to_recipe()
     with pytest.raises(ValueError, match=f"--allow {SHARE}"):

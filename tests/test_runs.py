@@ -1,6 +1,7 @@
 """What is kept of a run: never written over, resumed only by the same recipe, exported small and whole."""
 
 import contextlib
+import itertools
 import json
 import os
 import shlex
@@ -9,6 +10,7 @@ import sys
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from shutil import copytree
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -427,9 +429,10 @@ def test_each_episode_is_written_as_the_mean_of_the_replicas_and_of_each(tmp_pat
     assert all(float(rate.split(",")[1]) > 0 for rate in rates)
 
 
-def course(run, batches, *, first=0, state=None):
+def course(run, batches, *, first=0, state=None, resumes=False):
     """Logs batches; returns the states of tracker and callback after each."""
-    tracker, callback = EpisodeTracker(2, 2), loggers.LoggerCallback(csv_of(run), replicas=2)
+    tracker = EpisodeTracker(2, 2)
+    callback = loggers.LoggerCallback(csv_of(run), replicas=2, resumes=resumes)
     for each, before in zip((tracker, callback), state or (), strict=False):
         each.load_state_dict(before)
     states = []
@@ -444,12 +447,47 @@ def course(run, batches, *, first=0, state=None):
 def test_a_resumed_run_has_every_episode_once(tmp_path):
     batches = [batch for batch, _ in zip(StepCollector(MatrixGame(2), tit_for_tat), range(40), strict=False)]
     states = course(tmp_path / "whole", batches)
-    for checkpoint in (0, 4, 10, 11, 22, 35):
-        run = tmp_path / f"run {checkpoint}"
-        course(run, batches[: checkpoint + 1])
+    for checkpoint, killed in itertools.product((0, 4, 10, 11, 22, 35), (1, 9)):
+        run = tmp_path / f"run {checkpoint} {killed}"
+        course(run, batches[: checkpoint + killed])
         course(run, batches, first=checkpoint + 1, state=states[checkpoint])
         assert files(run) == files(tmp_path / "whole")
     assert files(tmp_path / "whole")["social/survival_steps"].count("\n") == 6
+
+
+def test_a_run_that_was_killed_before_its_first_checkpoint_has_every_episode_once(tmp_path):
+    batches = [batch for batch, _ in zip(StepCollector(MatrixGame(2), tit_for_tat), range(40), strict=False)]
+    course(tmp_path / "whole", batches)
+    course(tmp_path / "run", batches[:20])
+    course(tmp_path / "run", batches, resumes=True)
+    assert files(tmp_path / "run") == files(tmp_path / "whole")
+
+
+def test_another_training_into_the_same_folder_is_written_behind_the_first(tmp_path):
+    for _ in range(2):
+        with loggers.LoggerCallback(csv_of(tmp_path)) as callback:
+            play(MatrixGame(1), tit_for_tat, 12, callbacks=[callback])
+    assert files(tmp_path)["agent_0/return"].count("\n") == 4
+
+
+def test_a_callback_of_a_logger_takes_replicas_and_worlds_from_the_training(tmp_path):
+    callback = loggers.LoggerCallback(csv_of(tmp_path))
+    callback.on_start(SimpleNamespace(replicas=2, worlds=3))
+    callback.on_step(None)
+    assert callback.state_dict()["steps"] == 3
+    assert (callback._series.replicas, callback._series.worlds) == (2, 3)
+    for given in ({"replicas": 1}, {"worlds": 2}):
+        with pytest.raises(ValueError, match=f"{next(iter(given))}=.*leave it out"):
+            loggers.LoggerCallback(csv_of(tmp_path), **given).on_start(SimpleNamespace(replicas=2, worlds=3))
+
+
+def test_an_episode_of_a_replica_that_a_logger_does_not_expect_is_refused_by_name(tmp_path):
+    tracker, callback = EpisodeTracker(2, 2), loggers.LoggerCallback(csv_of(tmp_path))
+    turns = list(itertools.islice(StepCollector(MatrixGame(2), tit_for_tat), 7))
+    episodes = [episode for turn in turns for episode in tracker.add(turn)]
+    (of_another, *_) = (episode for episode in episodes if episode.replica == 1)
+    with pytest.raises(ValueError, match=r"replica 1; allowed: of replicas 0 to 0, as replicas says"):
+        callback.on_episode(of_another, {})
 
 
 def test_numbers_that_are_undefined_are_not_written(tmp_path):

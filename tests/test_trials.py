@@ -223,6 +223,23 @@ def test_a_finished_run_with_fewer_episodes_or_without_a_file_is_refused_and_an_
     assert "evaluation/trained.parquet" in failed.reason, "which its manifest lists"
 
 
+@pytest.mark.parametrize("other", [{}, {"seed": 1000}], ids=["condition", "block"])
+def test_files_of_another_trial_beside_a_trials_own_recipe_are_a_failure_by_name(other, tmp_path):
+    """As after a restore that mixed two trials: each file is sound, and the recipe is right."""
+    study = Study(EXPERIMENT, {TIME_OUT: [5, 25]})
+    first, second = trials_of(study)
+    experiment = replace(first.experiment, **other) if other else second.experiment
+    directory = write_run(tmp_path / "runs" / first.name, first.experiment, lambda *_: 1)
+    mixed = write_run(tmp_path / "mixed", experiment, lambda *_: 1)
+    shutil.copytree(mixed, directory, ignore=shutil.ignore_patterns("recipe.json"), dirs_exist_ok=True)
+    result = run_study(study, tmp_path, only=["freeze_steps=5"], progress=False)
+    (failed,) = result.failed
+    assert "another experiment" in failed.reason
+    assert len(result.table.rows) == 0
+    (reason,) = (each.reason for each in result.table.lacking if each.name == first.name)
+    assert "another experiment" in reason
+
+
 @pytest.mark.parametrize("name", ["study.json", "run.lock", "table.parquet", "status", "figures"])
 def test_a_study_with_a_link_out_of_it_is_refused_by_the_link_unless_its_runs_are_on_another_disk(
     name, tmp_path

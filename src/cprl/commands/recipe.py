@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 import tyro
 
 from cprl.commands.flags import RefusedError, Shape, ValueFlags, in_shape, numbered, shape_of
-from cprl.system.output import RESUMES, say
+from cprl.system.output import RESUMES, legible, say
 from cprl.system.process import at_signals
 from cprl.system.shipped import Recipe, program_of
 from cprl.values import meant, refusal, trust
@@ -144,7 +144,7 @@ def in_a_sentence(program: str) -> Iterator[None]:
                 raise
         if isinstance(error, BrokenPipeError) and not notes:  # `--help | head`: its reader has seen enough
             sys.exit(0)
-        sys.exit("\n".join([_shortened(f"{program}: {error}"), *notes]))
+        sys.exit(legible("\n".join([_shortened(f"{program}: {error}"), *notes])))
 
 
 @contextmanager

@@ -2,9 +2,10 @@
 
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from math import isfinite, nan
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -39,7 +40,8 @@ Turns = dict[str, Array]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Episode:
-    """One episode of one world, from its first step to its end. Steps are counted from 1."""
+    """One episode of one world, from its first step to its end. Steps are counted from 1; arrays are
+    read-only."""
 
     world: int
     """The index of the world in its batch."""
@@ -54,7 +56,7 @@ class Episode:
     truncated at its time limit."""
     return_: NDArray[np.float64]
     """[N], the undiscounted sum of rewards of each agent."""
-    metrics: dict[str, float]
+    metrics: Mapping[str, float]
     """`social.SOCIAL` of the episode, then those of the user's own; NaN where undefined. Metrics that need
     entries that the game does not report are missing."""
     harvest: NDArray[np.float64] | None = None
@@ -98,6 +100,9 @@ class Episode:
     def __post_init__(self) -> None:
         if self.replica < 0:
             object.__setattr__(self, "replica", self.world)
+        for name, value in list(vars(self).items()):
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, name, _read_only(value))
 
     def __repr__(self) -> str:
         returns = [round(value, 2) for value in self.return_.tolist()]
@@ -109,7 +114,7 @@ class Episode:
         """Each of "Social metrics" in docs/metrics.md that the game reports, and the user's own, by name; NaN
         where undefined."""
         stock = {} if self.stock_left is None else {"stock_left": float(self.stock_left)}
-        return self.metrics | stock
+        return {**self.metrics, **stock}
 
     @property
     def of_institutions(self) -> dict[str, float]:
@@ -133,6 +138,13 @@ class Episode:
         missing = {entry for name, needs in FIELDS.items() if getattr(self, name) is None for entry in needs}
         more = (entry for name, entry in INSTITUTIONAL.items() if getattr(self, name) is not None)
         return (*(entry for entry in OPTIONAL if entry not in missing), *more)
+
+
+def _read_only(array: Array) -> Array:
+    """Return an array that shares memory with another and cannot be written into."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 _TAKEN: Final = {
@@ -168,11 +180,20 @@ def own_metrics(metrics: Sequence[Custom], episode: Episode) -> dict[str, float]
     Raises:
         ValueError: if one fails, or returns no number; with its name.
     """
+    if not metrics:
+        return {}
+    counts = episode.counts
+    seen = replace(
+        episode,
+        metrics=MappingProxyType(episode.metrics),
+        institutions=MappingProxyType(episode.institutions),
+        counts=counts and MappingProxyType({name: _read_only(array) for name, array in counts.items()}),
+    )
     values = {}
     for metric in metrics:
         try:
             with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0: undefined
-                value = metric.make(episode)
+                value = metric.make(seen)
                 number = float(value)
         except Exception as error:
             raise ValueError(
@@ -463,8 +484,8 @@ class EpisodeTracker:
                 institutions={name: float(values[index]) for name, values in of_institutions.items()},
                 **{name: values[index] for name, values in columns.items()},
             )
-            episode.metrics.update(own_metrics(self._metrics, episode))
-            episodes.append(episode)
+            own = own_metrics(self._metrics, episode)
+            episodes.append(replace(episode, metrics={**episode.metrics, **own}) if own else episode)
         return episodes
 
 

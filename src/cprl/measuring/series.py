@@ -56,7 +56,15 @@ class Series:
         Returns:
             The numbers, [R] by name, NaN where a replica has none, if all replicas have ended the episode and
             it is the last of W; else None.
+
+        Raises:
+            ValueError: for an episode of a replica beyond R.
         """
+        if episode.replica >= self.replicas:
+            raise ValueError(
+                f"an episode of replica {episode.replica}; allowed: of replicas 0 to {self.replicas - 1}, as "
+                "replicas says"
+            )
         together = episode.episode // self.worlds
         of_replicas = self._waiting.setdefault(together, {})
         of_replicas.setdefault(episode.replica, []).append(dict(numbers))

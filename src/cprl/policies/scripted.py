@@ -47,7 +47,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl import keys
 from cprl.commons import colours
-from cprl.commons.compiled import CPU_OPTIONS, compiled, kept_on_disk
+from cprl.commons.compiled import CPU_OPTIONS, compiled, kept_in, kept_on_disk
 from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.commons.game import Game
 from cprl.commons.near import near_cells
@@ -56,6 +56,7 @@ from cprl.commons.world import Bytes
 from cprl.policies import scripted_rules
 from cprl.policies.lanes import ActorOfLanes, LaneActor
 from cprl.policies.scripted_rules import AGENT, APPLE, NUMBERS, OPEN, UNKNOWN, WALL, Frame, Scratch, Settings
+from cprl.system.process import cache_folder
 
 ScriptedPolicy = Literal["random", "greedy", "sustainable", "territorial", "aggressive", "pacifist"]
 SCRIPTED_POLICIES: Final[tuple[ScriptedPolicy, ...]] = get_args(ScriptedPolicy)
@@ -230,4 +231,5 @@ def _choose_all() -> Callable[..., None]:
         function.__name__ = function.__qualname__ = name
         return kept_on_disk(function, **options)
 
-    return compiled([scripted_rules.choose_all], jit)["choose_all"]
+    with kept_in(cache_folder() / "scripted"):
+        return compiled([scripted_rules.choose_all], jit)["choose_all"]

@@ -17,7 +17,7 @@ from cprl.measuring.series import Values
 from cprl.measuring.statistics import Estimate, difference, estimate, form_for
 from cprl.population import AgentSpec, Learning, Team, exploring
 from cprl.runs.curves import as_curves, last_of, mean_of_worlds, rounds_of, running_mean, worlds_of
-from cprl.runs.episodes import read_episodes, read_table
+from cprl.runs.episodes import read_episodes, read_rows
 
 PEAK_EPISODES: Final = 10
 """Episodes of the mean whose highest value is the peak of a training."""
@@ -53,8 +53,8 @@ def course_of(run: Path, agents: Sequence[AgentSpec]) -> str:
     table = read_episodes(run)
     if lacking := sorted(set(NEEDED) - set(table.column_names)):
         raise ValueError(f"the episodes of {run} lack {', '.join(lacking)}; allowed: games that report them")
-    trained = read_table(run / "evaluation" / "trained.parquet")
-    random = Outcome.of(read_table(run / "evaluation" / "random.parquet"))
+    trained = read_rows(run / "evaluation" / "trained.parquet")
+    random = Outcome.of(read_rows(run / "evaluation" / "random.parquet"))
     fresh = Outcome.of(trained)
     if not any(isinstance(spec, Learning | Team) for spec in agents):
         parts = [f"In fresh worlds they get {fresh}.", *_replicas(fresh, trained)]

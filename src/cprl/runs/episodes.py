@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, Final, Self
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from tensordict import TensorDictBase
 
@@ -23,12 +24,14 @@ from cprl.institutions import COUNTS
 from cprl.measuring import Episode, social
 from cprl.measuring.metrics import left_out
 from cprl.runs.files import (
+    RECIPE_FILE,
     RECIPE_FORMAT,
     read_json,
     refuse_newer,
     refuse_special,
     refuse_to_write_over,
     sync_folder,
+    take_apart,
     verify,
     write_atomically,
     write_listed,
@@ -109,6 +112,7 @@ class EpisodeTable:
         is_new = not self.journal.exists()
         if self._file is not None:
             self._file.close()
+        take_apart(self.journal)
         self._file = FileIO(self.journal, "x" if is_new else "r+")  # unbuffered: it survives the process
         self._file.truncate(bytes_kept)
         self._file.seek(bytes_kept)
@@ -193,16 +197,47 @@ def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
     """The episodes of a finished, running or killed run, in the order in which they ended; those of what is
     no run are a FileNotFoundError."""
     path = Path(run_directory) / FILE_NAME
-    recipe = path.with_name("recipe.json")  # with the format of the journal, which has none of its own
+    recipe = path.with_name(RECIPE_FILE)  # with the format of the journal, which has none of its own
     if recipe.is_file():
         refuse_newer(recipe, read_json(recipe), RECIPE_FORMAT)
     try:
         # The journal first: while it exists it holds every row, and a merge does not change it.
-        return read_journal(path.with_suffix(".arrows"))
+        table = read_journal(path.with_suffix(".arrows"))
     except FileNotFoundError:
         if not path.exists():
             raise FileNotFoundError(f"{path} and its journal do not exist: is this a run?") from None
-    return read_table(path)
+        return read_rows(path)
+    _refuse_other_columns(path.with_suffix(".arrows"), table)
+    return table
+
+
+def read_rows(path: str | os.PathLike[str]) -> pa.Table:
+    """Read a parquet file that has the columns of a run's table, as its evaluations do; see `read_table`."""
+    table = read_table(path)
+    _refuse_other_columns(path, table)
+    return table
+
+
+def _refuse_other_columns(path: str | os.PathLike[str], table: pa.Table) -> None:
+    """Refuse a table whose columns are not those of episodes, e.g. one that another program wrote."""
+    is_not = f"{path} is not a table of episodes: "
+    names = table.column_names
+    for name in (*_NUMBERED, "return", "steps", "terminated"):
+        if name not in names:
+            raise ValueError(f"{is_not}it has no column {name}")
+    for name, kind in {**COLUMNS, **OF_INSTITUTIONS}.items():
+        if name not in names:
+            continue
+        if names.count(name) > 1:
+            raise ValueError(f"{is_not}it has the column {name} more than once")
+        both = (table[name].type, kind)
+        if kind != table[name].type and not all(map(pa.types.is_floating, both)):  # an export has float32
+            raise ValueError(f"{is_not}its column {name} is {table[name].type}; allowed: {kind}")
+        if table[name].null_count and name != "wanted_return":
+            raise ValueError(f"{is_not}its column {name} has empty places")
+    for name in _NUMBERED:
+        if table.num_rows and pc.min(table[name]).as_py() < 0:
+            raise ValueError(f"{is_not}its column {name} has numbers below 0")
 
 
 def read_table(path: str | os.PathLike[str]) -> pa.Table:
@@ -225,7 +260,7 @@ episodes that the agents had been trained; "episode" counts those of an evaluati
 
 def read_evaluations(run: Path) -> pa.Table | None:
     """The table of `EVALUATIONS`; None for a run without `Experiment.evaluate_every`, or before the first."""
-    return read_table(run / EVALUATIONS) if (run / EVALUATIONS).exists() else None
+    return read_rows(run / EVALUATIONS) if (run / EVALUATIONS).exists() else None
 
 
 def as_table(episodes: Sequence[Episode], replica: int) -> pa.Table:
@@ -235,7 +270,7 @@ def as_table(episodes: Sequence[Episode], replica: int) -> pa.Table:
 
 def _reopen(path: Path, journal: Path) -> None:
     """Write the journal of a finished table again, a batch for each episode."""
-    table = read_table(path).combine_chunks()
+    table = read_rows(path).combine_chunks()
     batches = table.to_batches(max_chunksize=max(table["agent"].to_pylist(), default=0) + 1)
     messages = [_message(batch, is_first=place == 0) for place, batch in enumerate(batches)]
     write_atomically(journal, lambda file: file.writelines(messages))
@@ -263,6 +298,9 @@ COLUMNS: Final = {
 Values of the whole episode are repeated in the row of each agent. Values that the game does not report have
 no column; nor have, outside of a training, the world, which counts through those of all replicas, and the
 wanted return. It is null for agents that do not learn."""
+
+_NUMBERED: Final = ("replica", "episode", "agent")
+"""The columns that say whose a row is."""
 
 OF_INSTITUTIONS: Final = {
     "decision": pa.int32(),

@@ -19,15 +19,18 @@ from contextlib import ExitStack, suppress
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
+from shutil import copyfileobj
 from typing import Any, BinaryIO, Final, Self
 
-from cprl.values import shown
+from cprl.system.output import legible
+from cprl.values import refuse_other_keys, shown
 
 try:
     import fcntl
 except ImportError:  # Windows has no flock; runs are not locked there
     fcntl = None  # type: ignore[assignment]
 
+RECIPE_FILE: Final = "recipe.json"
 RECIPE_FORMAT: Final = 2
 """Of `recipe.json`, and of the journal and `report.json` beside it."""
 MANIFEST_FORMAT: Final = 1
@@ -39,6 +42,8 @@ STUDY_FORMAT: Final = 1
 STUDY_TABLE_FORMAT: Final = 1
 """Of the table of a study."""
 
+_MOST_NESTED: Final = 128
+"""How deep a JSON file may be nested: what a `Custom` may be, and as much around it."""
 _PARTIAL: Final = f"*.{8 * '[0-9a-f]'}.partial"
 """The names of files that are being written, or whose writing was interrupted."""
 
@@ -76,6 +81,14 @@ def write_atomically(
     return path
 
 
+def take_apart(path: Path) -> None:
+    """Replace a file that has another name too, a hard link as some backups make, by a copy: what is written
+    into it in place would else be written there."""
+    if path.is_file() and path.stat().st_nlink > 1:
+        with open(path, "rb") as source:
+            write_atomically(path, lambda file: copyfileobj(source, file))
+
+
 def sync_folder(folder: Path) -> None:
     """Sync a folder, so that a new name in it survives a power failure, if the system supports it."""
     if sys.platform == "win32":
@@ -109,6 +122,10 @@ def read_json(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} is not JSON: {error}") from error
     if not isinstance(value, dict):
         raise ValueError(f"{path} holds a {type(value).__name__}; allowed: a JSON object")
+    try:
+        refuse_other_keys(value, most=_MOST_NESTED)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     return value
 
 
@@ -161,6 +178,11 @@ def refuse_newer(what: object, table: Mapping[str, Any], newest: int) -> None:
         )
 
 
+ANY_LENGTH: Final = {"episodes": None, "steps": None}
+"""In place of how long experiments train, where their tables are compared without it."""
+FREE: Final = {"name": "", "on_nan": ""}
+"""In place of what else may differ in the experiments of one and the same run."""
+
 MANIFEST_FILE: Final = "manifest.json"
 _NAMED_CHECKSUM: Final = re.compile(r"-([0-9a-f]{32})\.pt")
 
@@ -182,7 +204,7 @@ def verify(path: Path) -> None:
     refuse_special(path)
     named = _NAMED_CHECKSUM.search(path.name)
     runs = [run for run in (path.parent, path.parent.parent) if (run / MANIFEST_FILE).exists()]
-    listed = _listed(runs[0]).get(path.relative_to(runs[0]).as_posix()) if runs and not named else None
+    listed = _sound(runs[0]).get(path.relative_to(runs[0]).as_posix()) if runs and not named else None
     expected = named[1] if named else listed
     if expected is not None and (actual := checksum(path)) != expected:
         raise ValueError(f"{path} is damaged or was changed: its checksum is {actual}, not {expected}")
@@ -190,7 +212,7 @@ def verify(path: Path) -> None:
 
 def refuse_missing(run: Path) -> None:
     """Refuse a run that lacks a file that its manifest lists; each is named."""
-    missing = [name for name in _listed(run) if not (run / name).exists()]
+    missing = [legible(name) for name in _sound(run) if not (run / name).exists()]
     if missing:
         raise ValueError(
             f"{run} lacks {', '.join(missing)}, which its {MANIFEST_FILE} lists; restore it, or take "
@@ -228,7 +250,7 @@ def rename_listed(run: Path, name: str, new: str) -> None:
             rename_listed(run, f"{name}/{path.name}", f"{new}/{path.name}")
         source.rmdir()
         return
-    listed = _listed(run).get(name)
+    listed = _manifest(run)["files"].get(name)
     _list(run, {name: None, new: None})
     source.replace(target)
     _list(run, {new: listed})
@@ -237,24 +259,53 @@ def rename_listed(run: Path, name: str, new: str) -> None:
 def _list(run: Path, changes: Mapping[str, str | None]) -> None:
     """Write new checksums of files into the manifest; None for a file that is about to be replaced, since a
     kill before its new checksum must not leave that of another content."""
-    before = _listed(run)
+    before = _manifest(run)["files"]
     files = {name: digest for name, digest in sorted({**before, **changes}.items()) if digest is not None}
     if files != before:
-        table = {"format": MANIFEST_FORMAT, "checksum": "blake2b, 16 bytes", "files": files}
-        write_json(run / MANIFEST_FILE, table)
+        table = {"format": MANIFEST_FORMAT, "checksum": "blake2b, 16 bytes"}
+        experiment = _experiment_in(run)
+        table |= {} if experiment is None else {"experiment": experiment}
+        write_json(run / MANIFEST_FILE, {**table, "files": files})
 
 
-def _listed(run: Path) -> dict[str, str]:
+def _experiment_in(run: Path) -> str | None:
+    """Return the checksum of the experiment in the recipe of a run, whatever its name and length; None where
+    there is none."""
+    try:
+        experiment = read_json(run / RECIPE_FILE).get("experiment")
+    except FileNotFoundError:
+        return None
+    if not isinstance(experiment, dict):
+        return None
+    return digest_of(json.dumps({**experiment, **FREE, **ANY_LENGTH}, sort_keys=True))
+
+
+def _sound(run: Path) -> dict[str, str]:
+    """Return the checksums of the files of a run, beside the recipe of the run that wrote them."""
+    table = _manifest(run)
+    wrote, experiment = table.get("experiment"), _experiment_in(run)
+    if None not in (wrote, experiment) and wrote != experiment:
+        raise ValueError(
+            f"{run / MANIFEST_FILE} is of another experiment than {RECIPE_FILE} beside it: were the files of "
+            "two runs mixed? restore them; if you changed the recipe yourself, remove the line with "
+            f'"experiment" from {MANIFEST_FILE}'
+        )
+    files: dict[str, str] = table["files"]
+    return files
+
+
+def _manifest(run: Path) -> dict[str, Any]:
+    """Read the manifest of a run; one that is not there lists nothing."""
     path = run / MANIFEST_FILE
     try:
         table = read_json(path)
     except FileNotFoundError:
-        return {}
+        return {"files": {}}
     refuse_newer(path, table, MANIFEST_FORMAT)
     files = table.get("files") if table.get("format") == MANIFEST_FORMAT else None
     if not isinstance(files, dict) or not all(isinstance(digest, str) for digest in files.values()):
         raise ValueError(f"{path} is not the manifest of a run, of the format {MANIFEST_FORMAT}")
-    return files
+    return table
 
 
 LOCK_FILE: Final = "run.lock"
@@ -335,6 +386,9 @@ class RunLock:
         started = datetime.now().astimezone().isoformat(timespec="seconds")
         holder = {"host": socket.gethostname(), "pid": os.getpid(), "started": started}
         holder |= {} if self._study is None else {"study": self._study}
+        if os.fstat(file).st_nlink > 1 and self._is_in_place(file):
+            self.path.unlink()  # a hard link, through which nothing is written; the next one is a new file
+            return
         try:
             os.ftruncate(file, 0)
             os.pwrite(file, (json.dumps(holder) + "\n").encode(), 0)

@@ -9,7 +9,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 from tensordict import TensorDictBase
-from torchrl.record.loggers import Logger, get_logger
+from torchrl.record.loggers import CSVLogger, Logger, get_logger
 
 from cprl.measuring.episodes import Episode
 from cprl.measuring.series import Series, Values, mean_of, numbers_of
@@ -66,6 +66,16 @@ def _wandb_id(folder: Path) -> str:
     return path.read_text(encoding="utf-8")
 
 
+def _last_step_in(logger: Logger, name: str) -> int:
+    """Return the last step that the file of a CSVLogger has of a number; -1 if none, or of another logger."""
+    if not isinstance(logger, CSVLogger):
+        return -1
+    path = Path(logger.experiment.log_dir, "scalars", f"{name}.csv")
+    lines = path.read_text(encoding="utf-8").split() if path.is_file() else []
+    step = lines[-1].partition(",")[0] if lines else ""
+    return int(step) if step.isdecimal() else -1
+
+
 class LoggerCallback:
     """Writes the numbers of each episode to a TorchRL logger, by the names of docs/metrics.md.
 
@@ -76,30 +86,54 @@ class LoggerCallback:
     `replica_0/social/equality`. Undefined values are not written, nor metrics that the game does not report,
     see `cprl.measuring.metrics`.
 
-    After a resume, loggers get the episodes after the checkpoint again, with the same steps.
+    After a resume, the episodes after the checkpoint are played again, with the same steps. TorchRL's
+    CSVLogger does not get those that its files have; other loggers get them again.
 
     Args:
         logger: any TorchRL logger, see `make_logger`. It is flushed at each checkpoint, and closed when the
             block ends, also by an error.
-        replicas: the number of replicas R.
-        worlds: the worlds W of each; a turn of them is W steps.
+        replicas: the number of replicas R; by default that of the training, and 1 outside of one.
+        worlds: the worlds W of each, likewise; a turn of them is W steps.
         agents: the names of the agents; by default agent_0 and so on.
+        resumes: whether an earlier process may have written episodes of the same training.
     """
 
+    is_extendable = True
+
     def __init__(
-        self, logger: Logger, *, replicas: int = 1, worlds: int = 1, agents: Sequence[str] | None = None
+        self,
+        logger: Logger,
+        *,
+        replicas: int | None = None,
+        worlds: int | None = None,
+        agents: Sequence[str] | None = None,
+        resumes: bool = False,
     ) -> None:
         for method in ("log_metrics", "flush", "shutdown"):
             if not callable(getattr(logger, method, None)):
                 kind = type(logger).__name__
                 raise TypeError(f"logger is a {kind} without {method}; allowed: a TorchRL logger")
         self.logger = logger
-        self._agents, self._series, self._worlds = agents, Series(replicas, worlds), worlds
+        self._agents, self._resumes = agents, resumes
+        self._given = {"replicas": replicas, "worlds": worlds}
+        self._series = Series(replicas or 1, worlds or 1)
+        self._last: dict[str, int] = {}
+        """The last step that the logger has of each number, where it resumes."""
         self._steps, self._steps_then, self._then = 0, 0, time.perf_counter()
+
+    def on_start(self, training: Any) -> None:
+        """Take the numbers of replicas and worlds from the training; others are refused."""
+        for name, given in self._given.items():
+            number = getattr(training, name)
+            if given not in (None, number):
+                raise ValueError(
+                    f"LoggerCallback has {name}={given}, and the training has {number}; leave it out"
+                )
+            setattr(self._series, name, number)
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Count the environment steps of each replica."""
-        self._steps += self._worlds
+        self._steps += self._series.worlds
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Write the numbers of an episode once all replicas have ended it."""
@@ -122,7 +156,15 @@ class LoggerCallback:
             written["time/env_steps_per_s"] = steps / (now - self._then)
             self._then, self._steps_then = now, self._steps
         defined = {name: value for name, value in written.items() if not np.isnan(value)}
-        self.logger.log_metrics(defined, step=episode)
+        if self._resumes:
+            defined = {name: value for name, value in defined.items() if episode > self._last_step(name)}
+        if defined:
+            self.logger.log_metrics(defined, step=episode)
+
+    def _last_step(self, name: str) -> int:
+        if name not in self._last:
+            self._last[name] = _last_step_in(self.logger, name)
+        return self._last[name]
 
     def state_dict(self) -> dict[str, Any]:
         """The number of steps and episodes; flushes the logger first."""
@@ -130,6 +172,7 @@ class LoggerCallback:
         return {"steps": self._steps, "series": self._series.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self._resumes = True
         self._steps = self._steps_then = int(state["steps"])
         self._then = time.perf_counter()
         self._series.load_state_dict(state["series"])

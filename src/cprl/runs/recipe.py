@@ -16,13 +16,13 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
+from cprl.runs.files import ANY_LENGTH as ANY_LENGTH
 from cprl.runs.files import LOCK_FILE, RECIPE_FORMAT, RunLock, digest_of, read_json, refuse_newer, write_json
+from cprl.runs.files import RECIPE_FILE as RECIPE_FILE
 from cprl.system.output import ERR, console, printed
 from cprl.system.process import cpu
 from cprl.system.shipped import PROGRAM, command_of, cprl_here
 from cprl.values import custom_targets, differences, refusal, shown, source_of
-
-RECIPE_FILE: Final = "recipe.json"
 
 _RESUMES: Final = ("--resume", "--no-resume", "--take-over", "--no-take-over")
 _DIRECTORIES: Final = ("--out", "--runs")
@@ -139,10 +139,6 @@ def refuse_another_run(
     return length
 
 
-ANY_LENGTH: Final = {"episodes": None, "steps": None}
-"""In place of how long experiments train, where their tables are compared without it."""
-
-
 def length_in(experiment: Mapping[str, Any]) -> tuple[str, Any]:
     """How long the table of an experiment says that it trains: "episodes" or "steps", and how many."""
     unit = "episodes" if experiment.get("steps") is None else "steps"
@@ -161,7 +157,26 @@ def read_recipe(run: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise ValueError(f"{path} is not the recipe of a run: {error!r}") from error
     recipe_config(recipe, where=path)
+    _refuse_odd_parts(recipe, path)
     return recipe
+
+
+def _refuse_odd_parts(recipe: Mapping[str, Any], path: Path) -> None:
+    """Refuse a recipe that says something else than tables of the processes that wrote the run."""
+    for name in ("extended", "resumed"):
+        parts = recipe.get(name, [])
+        if not isinstance(parts, list) or not all(isinstance(part, Mapping) for part in parts):
+            raise ValueError(f"{path}: {name} is {shown(parts)}; allowed: a list of tables")
+    for part in parts_of(recipe):
+        for name in ("versions", "code", "code_text"):
+            if not isinstance(part.get(name) or {}, Mapping):
+                raise ValueError(f"{path}: {name} is {shown(part[name])}; allowed: a table")
+
+
+def parts_of(recipe: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return what a recipe says of each process that wrote the run: of the first, of those before it was
+    extended, and of those that resumed it."""
+    return [recipe, *recipe.get("extended", ()), *recipe.get("resumed", ())]
 
 
 def recipe_config(recipe: Mapping[str, Any], *, where: object = "the recipe") -> dict[str, Any]:
@@ -269,8 +284,7 @@ def changed_code(recipe: Mapping[str, Any]) -> list[str]:
     Those of which the recipe has no checksum, and those that are gone, count as unchanged.
     """
     now = _code(recipe)
-    parts = (recipe, *recipe.get("extended", ()), *recipe.get("resumed", ()))
-    before = [item for part in parts for item in (part.get("code") or {}).items()]
+    before = [item for part in parts_of(recipe) for item in (part.get("code") or {}).items()]
     return sorted({module for module, digest in before if now.get(module, digest) != digest})
 
 
@@ -286,7 +300,7 @@ def _code(recipe: Mapping[str, Any]) -> dict[str, str]:
 def _code_text(recipe: Mapping[str, Any]) -> dict[str, dict[str, str]]:
     """What a recipe says of these texts: each by its checksum, with those of before."""
     texts = {digest_of(text): text for text in _sources(recipe).values()}
-    return {"code_text": {**recipe.get("code_text", {}), **texts}} if texts else {}
+    return {"code_text": {**(recipe.get("code_text") or {}), **texts}} if texts else {}
 
 
 def _sources(recipe: Mapping[str, Any]) -> dict[str, str]:

@@ -9,7 +9,9 @@ import torch
 from torch import nn
 
 from cprl.runs.checkpoints import FOLDER, REPORT, checkpoints_in, read_checkpoint, read_tensors
-from cprl.runs.files import checksum, refuse_missing, write_listed
+from cprl.runs.episodes import read_episodes
+from cprl.runs.files import LOCK_FILE, checksum, holder_of, refuse_missing, write_listed
+from cprl.runs.recipe import resume_command
 from cprl.values import refusal
 
 TRANSFORMS: Final = "transforms.pt"
@@ -98,8 +100,15 @@ def _from_checkpoint(run: Path) -> StoredWeights:
             f"{run} keeps no weights: its results were exported without them, or {final} was lost; allowed: "
             "the run itself, or an export with weights"
         )
+    checkpoints = checkpoints_in(run / FOLDER)
+    so_far = 0 if checkpoints else _episodes_in(run)
+    if so_far:
+        raise ValueError(
+            f"{run} has {so_far} episodes, of all replicas together, and no checkpoint yet "
+            f"({_writer_of(run)}); read_episodes reads them, and all else works from the first checkpoint on"
+        )
     reasons = [f"{final} is not there, nor a readable checkpoint: has {run} been trained?"]
-    for checkpoint in reversed(checkpoints_in(run / FOLDER)):
+    for checkpoint in reversed(checkpoints):
         try:
             state = read_checkpoint(checkpoint)
             networks = [learner["networks"] for learner in state["learners"]]
@@ -113,6 +122,21 @@ def _from_checkpoint(run: Path) -> StoredWeights:
             state.get("decisions", {}).get("_extra_state", {}).get("learned", {}),
         )
     raise ValueError("; ".join(reasons))
+
+
+def _episodes_in(run: Path) -> int:
+    """Return how many episodes the table of a run has, of all replicas together; 0 of a run without one."""
+    try:
+        agents = read_episodes(run)["agent"].to_numpy()
+    except FileNotFoundError:
+        return 0
+    return int((agents == 0).sum())
+
+
+def _writer_of(run: Path) -> str:
+    if (run / LOCK_FILE).exists():
+        return f"{holder_of(run)} is writing it, or was killed"
+    return f"nobody is writing it; to resume it: {resume_command(run)}"
 
 
 FIELD: Final = "frozen"

@@ -23,7 +23,7 @@ from cprl.experiment import Experiment
 from cprl.measuring import social
 from cprl.measuring.episodes import own_name
 from cprl.runs.curves import as_curves, curves_of, net_of
-from cprl.runs.episodes import read_table
+from cprl.runs.episodes import read_rows
 from cprl.runs.files import RunLock, digest_of
 from cprl.studies.executors import Executor
 from cprl.studies.factors import Distribution, Factor, Integers, LogUniform, levels_of
@@ -319,7 +319,7 @@ def value_of(search: Search, point: Point, runs: Path) -> float | None:
         if trial.state(runs) != "finished":
             return None
         if search.over == "evaluation":
-            curves = as_curves(read_table(run / "evaluation" / "trained.parquet"))
+            curves = as_curves(read_rows(run / "evaluation" / "trained.parquet"))
         else:
             curves = curves_of(run, last=search.last)
         curves[NET] = net_of(curves)

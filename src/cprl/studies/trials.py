@@ -21,7 +21,15 @@ from typing import Any, Final, Literal, NamedTuple
 from cprl.experiment import Experiment
 from cprl.population import Frozen, partners_in, with_stored
 from cprl.runs.checkpoints import FOLDER, REPORT, checkpoints_in, depends_on_episodes, is_ending
-from cprl.runs.files import LOCK_FILE, RunLock, RunLockedError, refuse_missing, remove_partial
+from cprl.runs.files import (
+    FREE,
+    LOCK_FILE,
+    RunLock,
+    RunLockedError,
+    refuse_missing,
+    remove_partial,
+    take_apart,
+)
 from cprl.runs.recipe import (
     ANY_LENGTH,
     RECIPE_FILE,
@@ -42,8 +50,6 @@ from cprl.values import allowed, custom_targets, differences
 State = Literal["missing", "unfinished", "finished", "refused"]
 ATTEMPTS: Final = 5
 """How often a trial is tried whose process dies."""
-_FREE: Final = {"name": "", "on_nan": ""}
-"""Fields that may differ between runs of the same trial."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +114,7 @@ class Trial:
         (unit, length), (unit_wanted, length_wanted) = length_in(stored), length_in(wanted)
         is_shorter = unit == unit_wanted and isinstance(length, int) and length < length_wanted
         may_grow = state_of(run) != "finished" and is_shorter
-        free = {**_FREE, **ANY_LENGTH} if may_grow else _FREE
+        free = {**FREE, **ANY_LENGTH} if may_grow else FREE
         if differ := differences({**stored, **free}, {**wanted, **free}, "experiment", Experiment):
             raise ValueError(
                 f"{run} was started as another trial than its name says: {differ[0]}; give it back its name, "
@@ -252,6 +258,7 @@ class Task:
         run, experiment = self.directory, self.trial.experiment
         self.status.folder.mkdir(parents=True, exist_ok=True)
         self.status.tidy_up()
+        take_apart(self.status.log)
         with open(self.status.log, "a", encoding="utf-8") as log:
             log.write(f"$ {self.command}\n")
         if not run.exists():
@@ -335,7 +342,7 @@ def begin_from_shorter(run: Path, experiment: Experiment, recipe: Mapping[str, A
     callbacks = [callback.resolve() for callback in experiment.callbacks]
     if any(not isinstance(callback, type) or depends_on_episodes(callback) for callback in callbacks):
         return None
-    free = {**_FREE, **ANY_LENGTH}
+    free = {**FREE, **ANY_LENGTH}
     wanted, beginnings = {**recipe["experiment"], **free}, []
     for other in sorted(path.parent for path in run.parent.glob(f"*/{RECIPE_FILE}")):
         with suppress(ValueError, KeyError, TypeError):  # of a recipe that cannot be read

@@ -5,7 +5,8 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Final, TextIO, cast
+from typing import TYPE_CHECKING, Any, Final, TextIO, cast
+from unicodedata import category
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -15,6 +16,8 @@ PLAIN: Final = str.maketrans(
 )
 """What stands for characters that the output cannot show; others become question marks."""
 
+_ODD: Final = ("Cc", "Cs")
+"""Of control characters, and of bytes that are no text, as Unicode calls them."""
 RESUMES: Final = "To resume: "
 """What stands before the command line that resumes a run."""
 
@@ -73,17 +76,25 @@ def console(output: Output = OUT, *, width: int | None = None) -> "Console":
     """A console that no encoding can stop, by default on standard output; square brackets and colons in
     texts, which may be those of a path, are shown as they are."""
     from rich.console import Console
+    from rich.text import Text
 
-    return Console(file=cast(TextIO, output), width=width, markup=False, emoji=False)
+    class Plain(Console):
+        """Shows no text that a terminal would take for a command."""
+
+        def render_str(self, text: str, **options: Any) -> Text:
+            return super().render_str(legible(text), **options)
+
+    return Plain(file=cast(TextIO, output), width=width, markup=False, emoji=False)
 
 
-def legible(name: str) -> str:
-    """Return the name of a file or folder, which may hold any bytes, as a text that UTF-8 can hold."""
-    return name.encode(errors="replace").decode()
+def legible(text: str) -> str:
+    """Return a text, which may be the name of a file or of anything in a file of somebody else, as one that
+    UTF-8 can hold and that no terminal takes for a command; lines stay."""
+    return "".join("?" if category(letter) in _ODD and letter not in "\n\t" else letter for letter in text)
 
 
 def say(*what: object) -> None:
-    OUT.write(" ".join(map(str, what)) + "\n")
+    OUT.write(legible(" ".join(map(str, what))) + "\n")
     OUT.flush()
 
 

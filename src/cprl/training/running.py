@@ -157,7 +157,7 @@ def run(
             if resume:
                 _begin_again(directory, experiment, is_begun=is_begun, length=length)
             viewer = closing.enter_context(_make_viewer(watch, directory, experiment, env, population))
-            work = _Work(directory, experiment, env, population, viewer)
+            work = _Work(directory, experiment, env, population, viewer, resume)
             _carry_out(work, observers, checkpointer, times, figures=figures)
     except BaseException as error:
         closing.close()
@@ -181,6 +181,7 @@ class _Work(NamedTuple):
     env: EnvBase
     population: Population
     viewer: "ViewerCallback | None"
+    resumes: bool
 
 
 def _start(experiment: Experiment, out: Path | None) -> Path:
@@ -209,17 +210,14 @@ def _carry_out(
 def _train(work: _Work, observers: Sequence[Any], checkpointer: Checkpointer) -> Training:
     """Trains with the callbacks that write the table of episodes, show the progress and write to loggers, and
     saves what was learned."""
-    directory, experiment, env, population, viewer = work
+    directory, experiment, env, population, viewer, _ = work
     names = agent_names(env)
     watching = [] if viewer is None else [viewer]
     with ExitStack() as stack:
         table = stack.enter_context(EpisodeTable(directory / "episodes.parquet", resumable=True))
         bar = stack.enter_context(ProgressBar.of(experiment))
         loggers = [make_logger(made(logger), directory) for logger in experiment.loggers]
-        logging = [
-            LoggerCallback(logger, replicas=experiment.replicas, worlds=experiment.worlds, agents=names)
-            for logger in loggers
-        ]
+        logging = [LoggerCallback(logger, agents=names, resumes=work.resumes) for logger in loggers]
         evaluations = Evaluations(directory, experiment, env, population)
         training = train(
             env,

@@ -37,6 +37,7 @@ from cprl.values.custom import allowing as allowing
 from cprl.values.custom import custom_targets as custom_targets
 from cprl.values.custom import described as described
 from cprl.values.custom import made as made
+from cprl.values.custom import refuse_other_keys as refuse_other_keys
 from cprl.values.custom import refuse_targets
 from cprl.values.custom import shown as shown
 from cprl.values.custom import source_of as source_of

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 _NAMES: Final = re.compile(r"[\w-]+(\.[\w-]+)*:\w+(\.\w+)*", re.ASCII)
 _LONGEST_NAME: Final = 1000
-_MOST_NESTED: Final = 64
+MOST_NESTED: Final = 64
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Custom:
             came = shown(self.arguments)
             raise ValueError(f"Custom.arguments is {came}; allowed: a table of keyword arguments")
         try:
-            _refuse_other_keys(self.arguments)
+            refuse_other_keys(self.arguments)
             text = json.dumps(dict(self.arguments), allow_nan=False)
             object.__setattr__(self, "arguments", json.loads(text))
         except (TypeError, ValueError, RecursionError) as error:
@@ -204,17 +204,18 @@ def made(value: Any, *positional: Any) -> Any:
     return value.make(*positional) if isinstance(value, Custom) else value
 
 
-def _refuse_other_keys(value: Any, depth: int = 0) -> None:
-    """Raises a TypeError for tables by something else than text, which JSON would turn into text."""
-    if depth > _MOST_NESTED:
-        raise ValueError(f"it is nested more than {_MOST_NESTED} deep")
+def refuse_other_keys(value: Any, *, most: int = MOST_NESTED, depth: int = 0) -> None:
+    """Refuse a value with tables by something else than text, which JSON would turn into text, and one that
+    is nested too deep for functions that call themselves."""
+    if depth > most:
+        raise ValueError(f"it is nested more than {most} deep")
     if isinstance(value, Mapping):
         for key in value:
             if not isinstance(key, str):
                 raise TypeError(f"a table has the key {key!r}; allowed: text")
     if isinstance(value, Mapping | list | tuple):
         for entry in value.values() if isinstance(value, Mapping) else value:
-            _refuse_other_keys(entry, depth + 1)
+            refuse_other_keys(entry, most=most, depth=depth + 1)
 
 
 def _with_keys(value: Any) -> Any:

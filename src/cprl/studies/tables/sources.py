@@ -28,9 +28,9 @@ from cprl.runs.curves import (
     running_mean,
     worlds_of,
 )
-from cprl.runs.episodes import read_episodes, read_table
+from cprl.runs.episodes import read_episodes, read_rows
 from cprl.runs.files import read_json
-from cprl.runs.recipe import read_recipe
+from cprl.runs.recipe import parts_of, read_recipe
 from cprl.studies.status import Status
 from cprl.studies.study import Study, level_text, unlike
 from cprl.studies.tables.table import (
@@ -50,6 +50,7 @@ from cprl.studies.tables.table import (
     counted,
 )
 from cprl.studies.trials import State, trials_of
+from cprl.system.output import legible
 from cprl.values import Positive, checked
 
 REASONS: Final[dict[State, str]] = {
@@ -227,7 +228,7 @@ def _measured(source: Source, window: int) -> _Measured:
     worlds: dict[str, list[Numbers]] = {}
     for part, name in PARTS.items():
         folder = source.run / "evaluation"
-        table = read_episodes(source.run) if name is None else read_table(folder / f"{name}.parquet")
+        table = read_episodes(source.run) if name is None else read_rows(folder / f"{name}.parquet")
         _refuse_gaps(table, source, part)
         # one by one: in as many steps, each replica ends a number of episodes of its own
         replica = table["replica"].to_numpy()
@@ -372,25 +373,22 @@ def _levels(levels: Sequence[Any]) -> pa.Array:
 def circumstances_of(run: Path) -> Circumstances:
     """What the recipe of a run says of how it was made."""
     recipe = read_recipe(run)
-    each = [
-        _circumstances(table) for table in (recipe, *recipe.get("extended", ()), *recipe.get("resumed", ()))
-    ]
+    each = [_circumstances(part) for part in parts_of(recipe)]
     names = dict.fromkeys(name for circumstances in each for name in circumstances)
     values = {name: [circumstances.get(name, UNKNOWN) for circumstances in each] for name in names}
     return {name: " then ".join(value for value, _ in groupby(in_order)) for name, in_order in values.items()}
 
 
 def _circumstances(recipe: Mapping[str, Any]) -> dict[str, str]:
-    made = {
-        name: str(version) for name, version in (recipe.get("versions") or {}).items() if version is not None
-    }
+    versions = recipe.get("versions") or {}
+    made = {name: str(version) for name, version in versions.items() if version is not None}
     made |= {module: str(digest)[:12] for module, digest in (recipe.get("code") or {}).items()}
     git = recipe.get("git")
     if isinstance(git, Mapping):
         made["git"] = f"{str(git.get('commit'))[:12]}{' with changes' if git.get('dirty') else ''}"
     if recipe.get("cpu"):
         made["cpu"] = str(recipe["cpu"])
-    return made
+    return {legible(name): legible(value) for name, value in made.items()}
 
 
 def marks(made: Mapping[str, Circumstances]) -> dict[str, str]:
