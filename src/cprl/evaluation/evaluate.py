@@ -16,6 +16,7 @@ from cprl.measuring.metrics import bounds, left_out, with_unit
 from cprl.measuring.series import OF_AGENTS, Values
 from cprl.measuring.statistics import Estimate, Measured, agents_without_harvest, over_replicas
 from cprl.system.defaults import SEED as SEED
+from cprl.system.working import working
 from cprl.terminal.tables import Cells
 from cprl.training.agents import LoadedRun, load
 from cprl.values import checked, differences, to_config
@@ -94,6 +95,7 @@ class Evaluation(Results):
         return results.estimates() | of_agents
 
 
+@working("evaluating")
 def evaluate_run(
     run: str | Path | LoadedRun,
     *,

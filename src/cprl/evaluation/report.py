@@ -25,6 +25,7 @@ from cprl.studies.tables.comparing import compare, differing, metrics_of
 from cprl.studies.tables.table import EVALUATION, StudyTable
 from cprl.system.defaults import SEED, STUDY_TABLE
 from cprl.system.output import legible
+from cprl.system.working import working
 from cprl.terminal.figures import training_curve
 from cprl.terminal.summary import course_of
 from cprl.terminal.tables import markdown
@@ -33,6 +34,7 @@ from cprl.training.agents import LoadedRun, load
 _LARGEST_SVG_BYTES: Final = 300_000
 
 
+@working("making a report")
 def report(
     path: str | Path,
     out: str | Path | None = None,
