@@ -3,7 +3,9 @@
 import io
 import re
 import time
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from rich.console import Console
 from tensordict import TensorDict
@@ -56,16 +58,41 @@ def test_the_bar_is_one_line_of_80_columns(monkeypatch):
 def test_a_notebook_has_one_line_with_a_bar_that_fills(monkeypatch):
     monkeypatch.setattr(progress, "_NOTEBOOK_PERIOD_S", 0.0)
     monkeypatch.setattr(progress, "COMPILING_PERIOD_S", float("inf"))  # else a line more with an empty cache
-    told = io.StringIO()
+    shown, told = [], io.StringIO()
+
+    class Block:
+        def update(self, content, *, raw):
+            shown.append(content["text/plain"])
+
+    def display(content, *, raw, display_id):
+        assert not shown, "a block of output more"
+        shown.append(content["text/plain"])
+        return Block()
+
+    monkeypatch.setattr("IPython.display.display", display)
     walker = LaneActor(None, 8, seeds=[(0,)], agents=1)
     with ProgressBar(GAME, episodes=4, console=Console(file=told, force_jupyter=True)) as bar:
         train(CommonsEnv(GAME, 1), {}, others={(0,): walker}, episodes=4, callbacks=[bar])
-    shown = told.getvalue()
-    assert shown.count("\n") == 1
-    assert shown.endswith("\n")
-    full = [line.count("█") for line in shown.split("\r")[1:]]
+    assert told.getvalue() == ""
+    full = [line.count("█") for line in shown]
     assert full == sorted(full)
     assert (full[0], full[-1]) == (1, 20)
+
+
+def test_the_return_is_the_mean_of_the_last_episodes_of_all_worlds():
+    with ProgressBar(GAME, episodes=9, replicas=2, worlds=2, console=Console(file=io.StringIO())) as bar:
+        for harvest in (100.0, 7.0, 1.0, 2.0, 4.0):
+            bar.on_episode(SimpleNamespace(return_=np.array([harvest]), harvest=None, steps=5), {})
+        assert bar._latest["return"] == "3.5"  # (7 + 1 + 2 + 4) / 4
+
+
+def test_the_bar_never_counts_more_episodes_than_there_are():
+    with ProgressBar(GAME, episodes=3, console=Console(file=io.StringIO())) as bar:
+        for _ in range(3):
+            bar.on_episode(SimpleNamespace(return_=np.ones(1), harvest=None, steps=5), {})
+        for _ in range(4):  # of an episode beyond the last one
+            bar.on_step(TensorDict(batch_size=[1]))
+        assert bar._done() == 3
 
 
 def test_the_bar_counts_the_episodes_that_run_in_every_world():

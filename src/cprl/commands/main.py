@@ -28,6 +28,7 @@ from cprl.system.defaults import FILM_SEED
 from cprl.system.output import OUT, printed, say
 from cprl.system.process import obey_parent
 from cprl.system.shipped import PROGRAM, is_shipped, recipe_named, recipe_names, run_shipped, shipped_recipes
+from cprl.system.working import working
 from cprl.values import meant
 
 COMMANDS: Final[Mapping[str, str]] = {
@@ -134,7 +135,8 @@ def run(
 
     directory, table = recipe if recipe.is_dir() else recipe.parent, read_recipe(recipe)
 
-    from cprl.experiment import Experiment
+    with working("starting"):
+        from cprl.experiment import Experiment
 
     experiment = Experiment.from_recipe(table, directory=directory)
     if options.resume and options.out is None:
@@ -161,6 +163,8 @@ def _is_run_by_name(words: Sequence[str]) -> bool:
             _refuse_unknown(Path(name))
             return False
         refuse_mistyped_flags(recipe_named(name), words[1:])
+        with working("starting"):
+            import_module("cprl.experiment")
         run_shipped(name, words[1:])
     return True
 

@@ -4,6 +4,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -22,6 +23,7 @@ from cprl.system.defaults import (
 )
 from cprl.system.output import printed, say
 from cprl.system.process import prepare_process
+from cprl.system.working import working
 
 if TYPE_CHECKING:
     from cprl.evaluation.lanes import Results
@@ -199,9 +201,10 @@ def sandbox(*, port: int = 0, out: Path | None = None, episodes: int = SANDBOX_E
         out: where trainings are kept; by default they are gone when the sandbox is closed.
         episodes: of a training.
     """
-    prepare_process(0)
+    _begin(0)
 
-    from cprl.evaluation.sandbox import Sandbox
+    with working("starting"):
+        from cprl.evaluation.sandbox import Sandbox
 
     served = Sandbox(out, port=port, episodes=episodes)
     say(f"{served.address} is open until Ctrl-C")
@@ -511,12 +514,14 @@ def exploit(
 def _begin(seed: int, *runs: Path | str, files: Files = Files()) -> None:
     """Refuse files that are there and runs that are not, before what plays agents is imported; prepare the
     process."""
-    from cprl.runs.recipe import read_recipe
+    with working("starting"):
+        from cprl.runs.recipe import read_recipe
 
-    files.check()
-    for run in runs:
-        read_recipe(Path(run))
-    prepare_process(seed)
+        files.check()
+        for run in runs:
+            read_recipe(Path(run))
+        prepare_process(seed)
+        import_module("cprl.evaluation.lanes")
 
 
 def _show(

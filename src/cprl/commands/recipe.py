@@ -23,6 +23,7 @@ from cprl.commands.flags import RefusedError, Shape, ValueFlags, in_shape, numbe
 from cprl.system.output import RESUMES, legible, say
 from cprl.system.process import at_signals
 from cprl.system.shipped import Recipe, program_of
+from cprl.system.working import working
 from cprl.values import meant, refusal, trust
 
 if TYPE_CHECKING:
@@ -185,7 +186,8 @@ def parse_with(
         program: what stands before these words, for messages.
         note: what `--help` says after the recipe's own text.
     """
-    from cprl.experiment import Experiment
+    with working("starting"):
+        from cprl.experiment import Experiment
 
     _refuse_names(make_experiment, {*Experiment.__dataclass_fields__, *vars(options)})
     is_help, is_short = bool(_HELP & {*words}), bool({"-h", "--help"} & {*words})

@@ -1,11 +1,14 @@
 """Compiles the rules: every target is built from the same plain Python functions.
 
 What relies on private parts of Numba is here, each in a function or constant of its own: `CPU_OPTIONS`,
-`kept_in`, `kept_on_disk` and `machine_code`. `tests/test_compat.py` has a test for each.
+`kept_in`, `kept_on_disk`, `_is_kept` and `machine_code`. `tests/test_compat.py` has a test for each.
 """
 
 import hashlib
 import os
+import pickle
+import subprocess
+import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -20,7 +23,7 @@ from filelock import FileLock
 
 from cprl.commons import loops
 from cprl.system.libraries import relying_on
-from cprl.system.process import cache_folder
+from cprl.system.process import cache_folder, obey_parent
 from cprl.system.times import CLOCK
 
 Compiled = dict[str, Callable[..., Any]]
@@ -50,12 +53,17 @@ def kept_in(folder: Path) -> Iterator[None]:
         _SETTINGS.CACHE_DIR = usual
 
 
-def kept_on_disk(function: FunctionType, **options: Any) -> Any:
+def kept_on_disk(function: FunctionType, *, in_child: Callable[[], Any] | None = None, **options: Any) -> Any:
     """Compile a function with Numba, and keep it on disk as far as the disk takes it.
 
     Of processes that lack it at the same time one compiles it, and the others wait and read it. Where it
     cannot be kept or read, e.g. on a full disk, each compiles it. Files have a checksum, which is compared
     before they are read: Numba would run damaged machine code, and stop at any other damage, each time.
+
+    Args:
+        in_child: gives the same compiled function in another process. A child then compiles it and this
+            process waits, so that it answers Ctrl-C: LLVM works for up to a minute without letting Python
+            look at signals.
     """
     try:
         made: Any = numba.njit(**options, cache=True)(function)
@@ -71,6 +79,8 @@ def kept_on_disk(function: FunctionType, **options: Any) -> Any:
     def compiled_once(types: Any) -> Any:
         try:
             _remove_damaged(folder, f"*.{function.__name__}-*.nb[ic]")
+            if in_child is not None and not _is_child and not _is_kept(made, types):
+                _compile_in_child(in_child, types)
             with _alone(folder / f"{function.__name__}.lock", but_if=f"*.{function.__name__}-*.nbi"):
                 return compile_for(types)
         except OSError as error:
@@ -121,6 +131,53 @@ def _is_whole(path: Path) -> bool:
     except FileNotFoundError:
         return True
     return content[-_CHECKSUM_BYTES:] == _checksum(content[:-_CHECKSUM_BYTES])
+
+
+def _is_kept(function: Any, types: Any) -> bool:
+    """Whether the machine code of a function for arguments of these types is on disk and can be read."""
+    with relying_on("numba", "the cache of a Dispatcher"):
+        cache, codegen = function._cache, function.targetctx.codegen
+        key_of, load = cache._index_key, cache._cache_file.load
+    try:
+        return load(key_of(types, codegen())) is not None
+    except Exception:  # of whatever kind a damaged file gives
+        return False
+
+
+_is_child = False
+"""Whether this process compiles for another one."""
+
+
+def _compile_in_child(function: Callable[[], Any], types: Any) -> None:
+    """Let a process of its own compile a function and keep it on disk; if it fails, nothing is kept."""
+    start = "from cprl.commons.compiled import compile_for_parent; compile_for_parent()"
+    words = [sys.executable, "-c", f"import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); {start}"]
+    surroundings = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    quiet = subprocess.DEVNULL
+    try:
+        child = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet, env=surroundings)
+    except OSError:  # e.g. where Python is part of another program
+        return
+    try:
+        assert child.stdin is not None
+        with suppress(OSError):  # it ended before it read all
+            child.stdin.write(pickle.dumps((function, types)))
+            child.stdin.flush()
+        child.wait()
+    finally:
+        child.kill()
+        child.wait()
+        with suppress(OSError):
+            child.stdin.close()
+
+
+def compile_for_parent() -> None:
+    """Compile what the process at the other end of standard input asks for, as long as it lives."""
+    global _is_child
+    _is_child = True
+    function, types = pickle.load(sys.stdin.buffer)
+    obey_parent()
+    function().compile(types)
 
 
 @contextmanager
@@ -175,14 +232,19 @@ def compiled(
     return {function.__name__: compile_one(function) for function in functions}
 
 
-def _jit_for_cpu(function: FunctionType, *, on_disk: bool) -> Callable[..., Any]:
+def _jit_for_cpu(function: FunctionType, *, on_disk: bool, further: bool) -> Callable[..., Any]:
     """Compiles a function for CPU threads."""
-    options = dict(CPU_OPTIONS)
-    if function.__name__ not in (entry.__name__ for entry in loops.ENTRIES):
+    options, name = dict(CPU_OPTIONS), function.__name__
+    if name not in (entry.__name__ for entry in loops.ENTRIES):
         options |= {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     elif on_disk:
-        return kept_on_disk(function, **options)
+        in_child = partial(_loop_for_cpu, name, further=further) if name in loops.LOOPS else None
+        return kept_on_disk(function, in_child=in_child, **options)
     return numba.njit(**options)(function)
+
+
+def _loop_for_cpu(name: str, *, further: bool) -> Callable[..., Any]:
+    return rules_for_cpu(further=further)[name]
 
 
 @cache
@@ -200,7 +262,9 @@ def rules_for_cpu(*, further: bool = False) -> Compiled:
     folder = cache_folder() / _fingerprint() / ("further" if further else "plain")
     on_disk = _can_write(folder)
     with kept_in(folder):
-        return compiled(loops.ENTRIES, partial(_jit_for_cpu, on_disk=on_disk), FURTHER=further)
+        return compiled(
+            loops.ENTRIES, partial(_jit_for_cpu, on_disk=on_disk, further=further), FURTHER=further
+        )
 
 
 ENTRIES: Final[Mapping[tuple[bool, bool], Compiled]] = {

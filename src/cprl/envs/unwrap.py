@@ -19,6 +19,12 @@ def commons_of(env: EnvBase) -> CommonsEnv | None:
     return base if isinstance(base, CommonsEnv) else None
 
 
+def clock_of(env: EnvBase) -> int | None:
+    """The turns of an episode at most; None where a game does not say."""
+    rules = getattr(getattr(base_env(env), "game", None), "rules", None)
+    return getattr(rules, "episode_steps", None)
+
+
 def agent_count(env: EnvBase) -> int:
     """The number of agents N of an environment of batch size [B]."""
     size = tuple(env.batch_size)

@@ -33,6 +33,7 @@ from cprl.evaluation.lanes import Part, Played, Results, Whose, agents_of, fresh
 from cprl.measuring.metrics import with_unit
 from cprl.measuring.statistics import HOLM, Estimate, Measured, notes_on, starred
 from cprl.system.defaults import Diagonal
+from cprl.system.working import say_how_far, working
 from cprl.terminal import style
 from cprl.terminal.tables import Cells
 from cprl.training.agents import LoadedRun
@@ -92,6 +93,7 @@ class CrossPlay(Results):
         return Cell(parts=parts, fresh=self.fresh)
 
 
+@working("playing each other")
 def crossplay(
     runs: Runs,
     *,
@@ -122,6 +124,7 @@ def crossplay(
     for focal, background in product(named, repeat=2):
         where, labels = named[background], {"focal": focal, "background": background}
         home = agents_of(where)
+        say_how_far(len(parts), None, "populations")
         if focal == background and diagonal == "self":
             each = tuple((agent,) for agent in range(len(home)))
             parts.append(Part({**labels, "focal_agent": SELF_PLAY}, play(where, home), each))

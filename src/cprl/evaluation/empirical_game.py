@@ -32,6 +32,7 @@ from cprl.evaluation.evaluate import SEED, heading
 from cprl.evaluation.lanes import Part, Played, Results, Who, agents_of, fresh_of, shifted
 from cprl.measuring.statistics import CONFIDENCE, HOLM, Estimate, estimate, starred
 from cprl.system.defaults import EGTA_RESAMPLES
+from cprl.system.working import say_how_far, working
 from cprl.terminal import style
 from cprl.terminal.tables import Cells
 from cprl.theory.payoff_table import PayoffTable, Values, compositions
@@ -92,6 +93,7 @@ class EmpiricalGame(Results):
         return np.array([self.payoff_table([place]).pairs for place in range(len(self.payoffs))])
 
 
+@working("playing all compositions")
 def play_empirical_game(
     runs: Runs,
     *,
@@ -123,6 +125,7 @@ def play_empirical_game(
     for counts in compositions(agents, len(named)).tolist():
         played = {}
         for who in shifted(counts):
+            say_how_far(len(parts), None, "populations")
             mixed = [of_runs[run][agent] for agent, run in enumerate(who)]
             played[who] = fresh.play(named[names[who[0]]], mixed, among=named.values())
             parts.append(Part({"runs": " ".join(names[run] for run in who)}, played[who]))
@@ -189,6 +192,7 @@ class Analysis:
     """Where replicator dynamics end."""
 
 
+@working("analysing the game")
 def analyse(game: EmpiricalGame, *, resamples: int = EGTA_RESAMPLES, seed: int = 0) -> Analysis:
     """Analyses an empirical game.
 

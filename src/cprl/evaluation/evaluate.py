@@ -27,6 +27,7 @@ from cprl.measuring.statistics import (
     signed,
 )
 from cprl.system.defaults import SEED as SEED
+from cprl.system.working import working
 from cprl.terminal.tables import Cells
 from cprl.training.agents import LoadedRun, load
 from cprl.values import checked, differences, to_config
@@ -114,6 +115,7 @@ class Evaluation(Results):
         return of_all | of_agents
 
 
+@working("evaluating")
 def evaluate_run(
     run: str | Path | LoadedRun,
     *,

@@ -18,6 +18,7 @@ from cprl.evaluation.film import fresh_episode
 from cprl.evaluation.lanes import Turns, refuse_trained_in
 from cprl.runs.files import refuse_to_write_over
 from cprl.system.defaults import FILM_SEED as SEED
+from cprl.system.working import say_how_far, working
 from cprl.values import Positive, checked
 
 Format = Literal["csv", "minari"]
@@ -47,6 +48,7 @@ class Played(NamedTuple):
     """Whether the episode ended by itself, and not by the clock."""
 
 
+@working("exporting")
 def export_episodes(
     run: str | Path,
     out: str | Path,
@@ -83,6 +85,7 @@ def export_episodes(
 
     def played() -> Iterator[tuple[Played, Any]]:
         for episode in range(episodes):
+            say_how_far(episode, episodes, "episodes")
             fresh = fresh_episode(loaded, replica=replica, episode=episode, seed=seed)
             yield _play(Turns(fresh.env, fresh.policies)), fresh.run.game
 
@@ -90,6 +93,7 @@ def export_episodes(
     return _write_csv(target, played()) if format == "csv" else _write_minari(target, list(played()))
 
 
+@working("playing an episode")
 def _play(turns: Turns) -> Played:
     batches = []
     while not turns.has_ended:

@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 from cprl import keys
 from cprl.commons.readable import growth_of, in_lower_case, legend_of
 from cprl.commons.world import Bytes, Shown
-from cprl.envs.unwrap import commons_of
+from cprl.envs.unwrap import clock_of, commons_of
 from cprl.evaluation.evaluate import opened
 from cprl.evaluation.film_pictures import (
     DEFAULT_WIDTH,
@@ -35,6 +35,7 @@ from cprl.system.defaults import FILM_SEED as SEED
 from cprl.system.defaults import FILM_SUFFIXES as SUFFIXES
 from cprl.system.memory import check_memory
 from cprl.system.output import legible
+from cprl.system.working import say_how_far, working
 from cprl.training import train
 from cprl.training.agents import LoadedRun
 from cprl.values import Natural, Positive, Range, Seed, Value, Where, checked, refusal
@@ -71,6 +72,7 @@ def fresh_episode(
     return FreshEpisode(loaded, env, loaded.policy(replica, seed=seed + episode))
 
 
+@working("making a film")
 def film(
     run: str | Path,
     out: str | Path | None = None,
@@ -109,6 +111,7 @@ def film(
         raise
 
 
+@working("playing an episode")
 def _recorded(fresh: FreshEpisode, target: Path, title: str) -> Episode:
     policies, env = fresh.policies, fresh.env
     with ViewerCallback(
@@ -149,6 +152,7 @@ class _Events:
 
     def on_step(self, batch: TensorDictBase) -> None:
         self._step += 1
+        say_how_far(self._step, clock_of(self.viewer.env), "turns")
         tagged_by = batch.get(("next", *keys.TAGGED_BY), None)
         tags = [] if tagged_by is None else tagged_by[0].nonzero().tolist()
         for event in (
@@ -199,6 +203,7 @@ class Style(Value, stored=False):
         return int(checked("width", width, allowed)) // runs
 
 
+@working("making a film")
 def film_video(
     run: str | Path,
     out: str | Path,
@@ -329,6 +334,7 @@ class Filmed(NamedTuple):
         return self.episode.terminated and self.left == 0
 
 
+@working("playing an episode")
 def play_to_show(fresh: FreshEpisode) -> Filmed:
     """Play an episode."""
     commons = commons_of(fresh.env)

@@ -22,6 +22,7 @@ from cprl.commons.spaces import Spaces
 from cprl.commons.world import Shown
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.make_env import is_playable, make_env, spaces_of
+from cprl.envs.unwrap import clock_of
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import Policy, evaluate
 from cprl.measuring.series import Values
@@ -39,6 +40,7 @@ from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
 from cprl.runs.episodes import Label, labelled
 from cprl.system.defaults import SEED
 from cprl.system.process import one_thread
+from cprl.system.working import say_how_far
 from cprl.training.agents import LoadedRun, Population, StoredAgent, in_a_row, load, stored_policies
 from cprl.values import Custom, Positive, Seed, Value, Where, made, refusal, trust
 
@@ -336,6 +338,7 @@ class Turns:
     def __init__(self, env: EnvBase, policy: Policy) -> None:
         self.env, self.policy = env, policy
         self._moment: TensorDictBase = env.reset()
+        self._turns, self._clock = 0, clock_of(env)
         self.has_ended = False
 
     def play(self) -> TensorDictBase:
@@ -345,6 +348,8 @@ class Turns:
         with torch.no_grad(), one_thread(), set_exploration_type(ExplorationType.RANDOM):
             batch: TensorDictBase = self.env.step(self.policy(self._moment))
         self._moment = self.env.step_mdp(batch)
+        self._turns += 1
+        say_how_far(self._turns, self._clock, "turns")
         self.has_ended = bool(batch["next", "done"].any())
         return batch
 

@@ -32,6 +32,7 @@ from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import Scripted
 from cprl.system.defaults import PLAY_SEED
 from cprl.system.output import OUT, console, say
+from cprl.system.working import working
 from cprl.training.agents import LoadedRun, Population, load
 from cprl.values import Range, checked, refusal, trust
 
@@ -254,6 +255,7 @@ def board_named(
     return Game(map=maps.read(path), rules=Rules()), None
 
 
+@working("preparing an episode")
 def open_session(
     board: str,
     *,

@@ -26,6 +26,7 @@ from cprl.studies.tables.comparing import compare, differing, metrics_of
 from cprl.studies.tables.table import EVALUATION, StudyTable
 from cprl.system.defaults import SEED, STUDY_TABLE
 from cprl.system.output import legible
+from cprl.system.working import working
 from cprl.terminal.figures import training_curve
 from cprl.terminal.tables import markdown
 from cprl.training.agents import LoadedRun, load
@@ -33,6 +34,7 @@ from cprl.training.agents import LoadedRun, load
 _LARGEST_SVG_BYTES: Final = 300_000
 
 
+@working("making a report")
 def report(
     path: str | Path,
     out: str | Path | None = None,
@@ -83,7 +85,7 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
     before += [f"Rules of its own: {own}."] * bool(own) + [run.experiment.own_code]
     after = ["## Fresh episodes, beside random play", "", *markdown(run_table(evaluation))]
     after += [
-        f"These episodes were played for this page, in other worlds than those above, so that means differ by "
+        "These episodes were played for this page, in other worlds than those above, so that means differ by "
         f"chance. The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`."
     ]
     sections = [

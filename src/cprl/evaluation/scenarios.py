@@ -36,6 +36,7 @@ from cprl.experiment import presets
 from cprl.measuring.metrics import with_unit
 from cprl.measuring.statistics import HOLM, Estimate, Measured, estimate, notes_on, starred
 from cprl.population import Frozen, Scripted
+from cprl.system.working import say_how_far, working
 from cprl.terminal import style
 from cprl.terminal.tables import Cells
 from cprl.training.agents import LoadedRun, check_scripted, load
@@ -189,6 +190,7 @@ class Scores(Results):
         return {name: Score(parts=self.where(scenario=name).parts, fresh=self.fresh) for name in names}
 
 
+@working("playing scenarios")
 def run_scenarios(
     run: str | Path | LoadedRun,
     *,
@@ -232,6 +234,7 @@ def run_scenarios(
             for places in scenario.placements:
                 agents = [focal[agent] if agent in places else background[agent] for agent in everyone]
                 indices = " ".join(map(str, places))
+                say_how_far(len(parts), None, "populations")
                 labels = {"scenario": scenario.name, "focal": who, "focal_agents": indices}
                 parts.append(Part(labels, fresh.play(loaded, agents), (places,)))
     return Scores(run=loaded, parts=parts, fresh=fresh)

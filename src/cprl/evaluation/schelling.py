@@ -46,6 +46,7 @@ from cprl.evaluation.lanes import (
 from cprl.measuring.series import Values
 from cprl.measuring.statistics import Estimate, Measured, difference, estimate
 from cprl.policies.scripted import SCRIPTED_POLICIES
+from cprl.system.working import say_how_far, working
 from cprl.terminal import style
 from cprl.terminal.tables import Cells
 from cprl.values import refusal, trust
@@ -188,6 +189,7 @@ class SchellingDiagram(Results):
         return np.stack([self._mixes(count).mean_returns(whose) for count in counts], 1)
 
 
+@working("playing mixes")
 def schelling(
     where: Any,
     *,
@@ -224,6 +226,7 @@ def schelling(
         for kind_of_agent in shifted((count, agents - count)):
             who = tuple(agent for agent, kind in enumerate(kind_of_agent) if kind == 0)
             mix = [kinds[kind][agent] for agent, kind in enumerate(kind_of_agent)]
+            say_how_far(len(parts), agents * (agents - 1) + 2, "populations")
             parts.append(Part({"restrained": " ".join(map(str, who))}, fresh.play(place, mix), (who,)))
     return SchellingDiagram(agents=agents, restrained=restrained, greedy=greedy, parts=parts, fresh=fresh)
 

@@ -43,6 +43,7 @@ from cprl.measuring.social import equality_of
 from cprl.population import learned
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.system.defaults import FILM_SEED as SEED
+from cprl.system.working import working
 from cprl.training.agents import LoadedRun
 from cprl.values import refusal
 from cprl.viewer.pictures import regions_of
@@ -57,6 +58,7 @@ _IN_PLAY, _VIOLATED = 4, 8
 """Bits of a pose, beside the heading of 0 to 3."""
 
 
+@working("making a page")
 def show(
     run: str | Path,
     out: str | Path | None = None,

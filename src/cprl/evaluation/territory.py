@@ -15,6 +15,7 @@ from cprl.evaluation.lanes import Agent, Fresh, agents_of, commons_game, fresh_o
 from cprl.measuring import movement
 from cprl.measuring.movement import Array, Trace, overlap, owners, trace, visits
 from cprl.measuring.statistics import Estimate, estimate
+from cprl.system.working import working
 from cprl.terminal import style
 from cprl.terminal.tables import Cells
 from cprl.training.agents import LoadedRun
@@ -64,6 +65,7 @@ class Territory:
         return stays
 
 
+@working("evaluating")
 def territory_of(
     run: str | Path | LoadedRun,
     *,

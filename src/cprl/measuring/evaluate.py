@@ -9,8 +9,10 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl.envs.commons_env import CommonsEnv
+from cprl.envs.unwrap import clock_of
 from cprl.measuring.episodes import Episode, tracker_of
 from cprl.system.process import one_thread
+from cprl.system.working import say_how_far, working
 from cprl.values import Custom
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -32,9 +34,13 @@ def evaluate(
     """
     tracker, episodes = tracker_of(env, metrics), dict[int, Episode]()
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
-    with torch.no_grad(), one_thread(), set_exploration_type(exploration):
+    clock, turns = clock_of(env), 0
+    what = f"playing {tracker.worlds:,} episodes"
+    with torch.no_grad(), one_thread(), set_exploration_type(exploration), working(what):
         moment = env.reset()
         while len(episodes) < tracker.worlds:
+            say_how_far(turns, clock, "turns")
+            turns += 1
             acted = policy(moment)
             if isinstance(env, CommonsEnv):
                 batch, moment = env.lean_step(acted, resets=False)

@@ -25,13 +25,15 @@ from cprl.runs.files import (
 from cprl.runs.recipe import resume_command, write_length
 from cprl.system.output import RESUMES, say
 from cprl.system.process import at_signals
+from cprl.system.times import CLOCK
 
 FOLDER: Final = "checkpoints"
 REPORT: Final = "report.json"
 """Written when everything of a run is finished."""
 EVERY_S: Final = 300.0
-LAST_S: Final = 60.0
-"""As much training may be repeated where a run is stopped between its last step and its end."""
+MOST_LOST_S: Final = 60.0
+"""Seconds of training, compiling apart, that a stop may lose: where a step would wait for a compiler, or
+between the last step of a run and its end."""
 KEPT: Final = 2
 """Checkpoints that are kept: the newest, and one more in case it is unreadable."""
 
@@ -44,8 +46,9 @@ class Checkpointer:
 
     Within its block the run is locked, see `RunLock`. On the first SIGINT or SIGTERM the checkpointer
     finishes the step, saves the state, prints the command that resumes and raises what `interruption` makes
-    of the signal; the second signal ends the process at once. Once the training is over, the first raises it.
-    The checkpoints stay until `done` is called, when whatever follows the training is finished too.
+    of the signal; the second signal ends the process at once. Once the training is over, the first raises it,
+    as before the training has begun, and while code is compiled and less than a minute would be lost. The
+    checkpoints stay until `done` is called, when whatever follows the training is finished too.
 
     Args:
         run: the run's directory, which is made if it does not exist.
@@ -69,7 +72,7 @@ class Checkpointer:
         self.resume_command = resume_command(run)
         self.has_begun = False
         """Whether a training has begun, or was resumed."""
-        self._saved = time.monotonic()
+        self._mark_saved()
         self._is_training = True
         self._asked_to_stop: int | None = None
         """The signal."""
@@ -93,13 +96,14 @@ class Checkpointer:
             for reason in reasons:
                 say(f"Passed over: {reason}")
             say(f"Resuming from step {training.steps:,}: {path}")
-            self._saved = time.monotonic()
+            self._mark_saved()
             self._sound = path if training.is_sound else None
             self._has_ending |= training.is_ending
             self.has_begun = True
             return
         if reasons:
             raise ValueError("no checkpoint can be read: " + "; ".join(reasons)) from cause
+        self._mark_saved()
         self.has_begun = True
 
     def after_step(self, training: Any) -> None:
@@ -113,7 +117,7 @@ class Checkpointer:
         if ends:
             self.save(training, kind="ending")
             self._has_ending = True
-        elif time.monotonic() - self._saved >= (LAST_S if training.is_over else self.every_s):
+        elif time.monotonic() - self._saved >= (MOST_LOST_S if training.is_over else self.every_s):
             self.save(training)
 
     def save(self, training: Any, *, kind: str = "training") -> Path:
@@ -143,7 +147,7 @@ class Checkpointer:
         same = [old for old in checkpoints_in(self.folder) if is_ending(old) == (kind == "ending")]
         for old in same[: -1 if kind == "ending" else -KEPT]:
             old.unlink()
-        self._saved = time.monotonic()
+        self._mark_saved()
         return path
 
     def done(self) -> None:
@@ -151,6 +155,10 @@ class Checkpointer:
         for path in checkpoints_in(self.folder):
             if not (self.keep_ending and is_ending(path)):
                 path.unlink()
+
+    def _mark_saved(self) -> None:
+        self._saved = time.monotonic()
+        self._compiled_s = CLOCK.total_s
 
     def _refuse_deleted(self) -> None:
         """End a run whose directory was deleted, or made again by somebody else; nothing is recreated."""
@@ -177,6 +185,12 @@ class Checkpointer:
             os.kill(os.getpid(), number)
             return
         self._asked_to_stop = number
+        if not self.has_begun:
+            raise interruption(number)
+        lost_s = time.monotonic() - self._saved - (CLOCK.total_s - self._compiled_s)
+        if CLOCK.is_running and lost_s < MOST_LOST_S:
+            say("Stopped while code was compiled; what came after the newest checkpoint is played again.")
+            self._stop_now(number)
         if self._is_training:
             say("Stopping after this step; signal again to stop at once.")
             return

@@ -18,6 +18,7 @@ from cprl.studies.status import Status
 from cprl.studies.tables.sources import REASONS
 from cprl.studies.trials import Outcome, Trial
 from cprl.system.output import Output, console
+from cprl.system.working import silent
 from cprl.terminal.progress import in_words
 
 _TABLE_PERIOD_S: Final = 1.0
@@ -175,6 +176,7 @@ class Progress:
         self._is_over = Event()
         self._live: Live | None = None
         self._thread = Thread(target=self._watch, daemon=True, name="cprl study")
+        self._silence = silent()
 
     def say(self, text: str) -> None:
         if self._is_shown:
@@ -190,6 +192,7 @@ class Progress:
             self.say(f"{self._title}: {label} {outcome.state}{why} ({self._ended} of {len(self._labels)})")
 
     def __enter__(self) -> Self:
+        self._silence.__enter__()
         if self._is_shown and self._console.is_terminal:
             self._live = Live(
                 console=self._console, auto_refresh=False, redirect_stdout=False, redirect_stderr=False
@@ -205,6 +208,7 @@ class Progress:
         self._show(is_line=True)
         if self._live is not None:
             self._live.stop()
+        self._silence.__exit__(None, None, None)
 
     def _watch(self) -> None:
         said_s, period_s = time.monotonic(), _TABLE_PERIOD_S

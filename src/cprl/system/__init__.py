@@ -9,5 +9,6 @@ Modules:
     process        settings of the process that trains, and where compiled code is kept
     shipped        the recipes that come with cprl, and how a command is typed again
     defaults       defaults that functions share with the command line
+    working        says what the process does where it takes more than a second
     times          where the time of a training goes; whether code is being compiled
 """

@@ -89,7 +89,7 @@ class Compiled:
         if self._compiled is not None and form == self._form:
             return self._compiled(*arguments)
         self._form = form
-        with CLOCK.running():
+        with CLOCK.running("what agents learn by (about a minute, once)"):
             return self._compile_and_call(*arguments)
 
     def _compile_and_call(self, *arguments: Any) -> Any:
@@ -246,7 +246,7 @@ def cleared_up() -> Iterator[None]:
     which looks at all objects once more and takes half a second."""
     global _is_set_aside
     if _is_set_aside:
-        with CLOCK.running():  # a late part of compiling
+        with CLOCK.running("what was learned by"):  # a late part of compiling
             gc.unfreeze()
             gc.collect()
             gc.freeze()

@@ -2,6 +2,7 @@
 
 import io
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -48,6 +49,7 @@ class Output:
 
     def write(self, text: str) -> int:
         """Writes, in plainer characters where the stream does not have these."""
+        LINE.erase()
         stream = self._stream()
         if stream is not None:
             try:
@@ -70,6 +72,68 @@ def _behind(stream: TextIO | None) -> TextIO | None:
 
 OUT: Final = Output(lambda: _behind(sys.stdout))
 ERR: Final = Output(lambda: _behind(sys.stderr))
+
+
+def in_notebook() -> bool:
+    """Whether this process is the kernel of a notebook."""
+    ipython: Any = sys.modules.get("IPython")
+    return ipython is not None and type(ipython.get_ipython()).__name__ == "ZMQInteractiveShell"
+
+
+class NotebookLine:
+    """A line of a notebook that is written over, also in a notebook that is executed unseen."""
+
+    def __init__(self) -> None:
+        self._handle: Any = None
+
+    def show(self, text: str) -> None:
+        from IPython.display import display
+
+        content = {"text/plain": text}
+        if self._handle is None:
+            self._handle = display(content, raw=True, display_id=True)
+        else:
+            self._handle.update(content, raw=True)
+
+
+class Line:
+    """A line on standard error that is written over, and vanishes; what is written on `OUT` or `ERR` erases
+    it before."""
+
+    def __init__(self) -> None:
+        self._shown = ""
+        self._in_notebook: NotebookLine | None = None
+
+    @property
+    def is_over_written(self) -> bool:
+        """Whether there is a terminal or a notebook to show it."""
+        return in_notebook() or ERR.isatty()
+
+    def show(self, text: str) -> None:
+        if in_notebook():
+            self._in_notebook = self._in_notebook or NotebookLine()
+            self._in_notebook.show(text)
+            return
+        width = shutil.get_terminal_size().columns - 1
+        shown = text[:width]
+        before = len(self._shown)
+        self._shown = ""  # else it would be erased
+        ERR.write(f"\r{shown.ljust(before)}")
+        ERR.flush()
+        self._shown = shown
+
+    def erase(self) -> None:
+        if self._in_notebook is not None:
+            self._in_notebook.show("")
+            self._in_notebook = None
+        if self._shown:
+            blank = " " * len(self._shown)
+            self._shown = ""
+            ERR.write(f"\r{blank}\r")
+            ERR.flush()
+
+
+LINE: Final = Line()
 
 
 def console(output: Output = OUT, *, width: int | None = None) -> "Console":

@@ -5,6 +5,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Final
 
+from cprl.system.working import working
+
+RULES: Final = "the rules (about a minute, once)"
+
 
 class CompileClock:
     """Counts the seconds in which the rules (Numba) and updates (torch) are compiled.
@@ -17,14 +21,19 @@ class CompileClock:
         self._began: float | None = None
 
     @contextmanager
-    def running(self) -> Iterator[None]:
-        """Count the time that the block takes; a block within a block counts once."""
+    def running(self, what: str = RULES) -> Iterator[None]:
+        """Count the time that the block takes, and say so; a block within a block counts once.
+
+        Args:
+            what: what is compiled.
+        """
         if self._began is not None:
             yield
             return
         self._began = time.perf_counter()
         try:
-            yield
+            with working(f"compiling {what}", before_s=self._spent_s):
+                yield
         finally:
             self._spent_s, self._began = self.total_s, None
 

@@ -1,6 +1,7 @@
 """The progress of a training in the terminal."""
 
 import time
+from collections import deque
 from collections.abc import Mapping
 from threading import Event, Thread
 from types import TracebackType
@@ -13,17 +14,19 @@ from rich.text import Text
 from tensordict import TensorDictBase
 
 from cprl.measuring.episodes import Episode
+from cprl.system.output import NotebookLine
 from cprl.system.output import console as safe_console
 from cprl.system.times import CLOCK
+from cprl.system.working import silent
 
 _BAR_PERIOD_S: Final = 0.25
 _NOTEBOOK_PERIOD_S: Final = 1.0
 _LINE_PERIOD_S: Final = 10.0
 """Seconds between updates of the bar, in a terminal and in a notebook, and between lines elsewhere."""
-_NOTEBOOK_CELLS: Final = 20, 100
-"""The width of a notebook's bar and of its line, in characters."""
+_NOTEBOOK_CELLS: Final = 20
+"""The width of a notebook's bar, in characters."""
 COMPILING_PERIOD_S: Final = 2.0
-"""Seconds of compiling after which a line says so, and between such lines, which come ever more slowly."""
+"""Seconds of compiling after which a line says so, and between such lines."""
 TIMED_STEPS: Final = 20
 """Steps that are timed before a remaining time is shown."""
 
@@ -37,10 +40,11 @@ def in_words(seconds: float) -> str:
 
 
 class ProgressBar:
-    """A bar with the return of the last episode, epsilon, steps per second and the time left.
+    """A bar with the return, epsilon, steps per second and the time left.
 
-    While code is compiled it says so, and for how long; that time does not count for the rest. In a notebook
-    the bar is one line of text; elsewhere, without a terminal, a plain line is printed every ten seconds. A
+    The return is the mean of the last episodes, as many as all replicas have worlds. While code is compiled
+    the bar says so, and for how long; that time does not count for the rest. In a notebook it is one line of
+    text, which is written over; elsewhere, without a terminal, a plain line is printed every ten seconds. A
     callback of `cprl.training`, and a context manager.
 
     Args:
@@ -84,6 +88,9 @@ class ProgressBar:
         self._started = self._then = _running_s()
         self._left_of, self._replicas, self._before = steps or episodes, replicas, 0.0
         self._worlds = replicas * worlds
+        self._returns: deque[float] = deque(maxlen=self._worlds)
+        self._notebook_line = NotebookLine()
+        self._silence = silent()
         self._compiled_before_s = CLOCK.total_s
         self._is_over, self._lines = Event(), Thread(target=self._say_compiling, daemon=True)
 
@@ -119,7 +126,9 @@ class ProgressBar:
         self._episodes += 1
         self._steps_running = max(0, self._steps_running - episode.steps)
         self._last_steps = episode.steps
-        self._latest["return"] = f"{episode.return_.sum():{'.0f' if episode.harvest is not None else '.4g'}}"
+        self._returns.append(float(episode.return_.sum()))
+        mean = sum(self._returns) / len(self._returns)
+        self._latest["return"] = f"{mean:{'.0f' if episode.harvest is not None else '.4g'}}"
         epsilons = [value for name, value in learning.items() if name.endswith("/epsilon")]
         if any(epsilons):
             self._latest["epsilon"] = f"{max(epsilons):.2f}"
@@ -145,18 +154,16 @@ class ProgressBar:
         if not self.console.is_jupyter:
             self.console.print(words, soft_wrap=True)
             return
-        wide, all_cells = _NOTEBOOK_CELLS
-        full = int(wide * min(1.0, done / max(1, self._left_of)))
-        self.console.file.write(f"\r{'█' * full}{'░' * (wide - full)} {words}".ljust(all_cells))
-        self.console.file.flush()
+        full = int(_NOTEBOOK_CELLS * done / max(1, self._left_of))
+        self._notebook_line.show(f"{'█' * full}{'░' * (_NOTEBOOK_CELLS - full)} {words}")
 
     def _done(self) -> float:
-        """Episodes of each replica so far, or steps."""
+        """Episodes of each replica so far, or steps; at most as many as there are to be."""
         if self._all_steps is not None:
-            return self._steps / self._replicas
+            return min(self._left_of, self._steps / self._replicas)
         episode_steps = self._clock or self._last_steps
         running = min(self._worlds, self._steps_running / episode_steps) if episode_steps else 0
-        return (self._episodes + running) / self._replicas
+        return min(self._left_of, (self._episodes + running) / self._replicas)
 
     def _time_left(self, done: float) -> str:
         """The time left after so many episodes, in words; empty before enough steps were timed."""
@@ -168,15 +175,16 @@ class ProgressBar:
 
     def _say_compiling(self) -> None:
         """Prints lines while code is compiled; in a terminal the bar shows it."""
-        period_s, said_s = COMPILING_PERIOD_S, 0.0
+        said_s = 0.0
         while not self._is_over.wait(0.2):
             spent_s = CLOCK.total_s - self._compiled_before_s
-            if CLOCK.is_running and spent_s - said_s >= period_s:
-                said_s, period_s = spent_s, 1.5 * period_s
+            if CLOCK.is_running and spent_s - said_s >= COMPILING_PERIOD_S:
+                said_s = spent_s
                 self._print(f"{self._title}: compiling, {spent_s:.0f} s so far", self._done())
 
     def __enter__(self) -> Self:
         self._compiled_before_s = CLOCK.total_s
+        self._silence.__enter__()
         self._progress.start()
         if not self.console.is_terminal:
             self._lines.start()
@@ -193,7 +201,7 @@ class ProgressBar:
         self._progress.stop()
         if self.console.is_jupyter:
             self._print(f"{self._title}: {self._episodes // self._replicas} episodes", self._done())
-            self.console.file.write("\n")
+        self._silence.__exit__(None, None, None)
 
 
 class _Now(ProgressColumn):

@@ -52,6 +52,7 @@ from cprl.system.compiling import cleared_up
 from cprl.system.output import RESUMES, console, say
 from cprl.system.process import prepare_process
 from cprl.system.times import Times
+from cprl.system.working import working
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
@@ -139,7 +140,8 @@ def run(
     resumed = out if resume else None
     is_begun = resumed is not None and bool(checkpoints_in(resumed / FOLDER))
     weights = {} if resumed is None else _weights_of_partners(experiment, resumed)
-    env, population = make_agents(experiment, starts=not is_begun, weights=weights)
+    with working("making agents"):
+        env, population = make_agents(experiment, starts=not is_begun, weights=weights)
     observers: list[Any] = [*(made(callback) for callback in experiment.callbacks), *callbacks]
     check_callbacks(observers)
     try_own_metrics(experiment.metrics, env)
@@ -165,6 +167,10 @@ def run(
             error.add_note(f"{RESUMES}{checkpointer.resume_command}")
         elif not resume and not isinstance(error, RunLockedError):
             _remove(directory, with_directory=is_new)
+            if isinstance(error, KeyboardInterrupt | SystemExit):
+                say("Stopped before the training began: nothing was written.")
+        elif resume and isinstance(error, KeyboardInterrupt | SystemExit):
+            say(f"{RESUMES}{checkpointer.resume_command}")
         raise
     with closing:
         for callback in observers:
@@ -250,6 +256,7 @@ def _evaluate(work: _Work, random: list[Episode] | None) -> dict[str, list[Episo
     return played
 
 
+@working("drawing the training curve")
 def _draw(experiment: Experiment, directory: Path, training: Training, random: list[Episode]) -> Path | None:
     if not all(training.episodes_by_replica):
         say(f"No training curve: a replica has ended no episode in {training.steps:,} steps")
@@ -293,8 +300,7 @@ def _summarise(
         played={name: by_replica(episodes, each) for name, episodes in columns.items()},
         course=course_of(work.directory, work.experiment.agents) if has_course else "",
         figure=figure,
-        note="
-".join(notes) or None,
+        note="\n".join(notes) or None,
     )
 
 

@@ -1,0 +1,120 @@
+"""working: says on standard error what the process does, where that takes more than a second.
+
+On a terminal and in a notebook it is one line, which is written over and vanishes; elsewhere a line every two
+seconds. Nothing is said of what ends within a second, or while something shows a progress of its own.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import Condition, Thread, get_ident
+from typing import Final
+
+from cprl.system.output import ERR, LINE
+
+FIRST_S: Final = 0.8
+"""Seconds before the first word."""
+PERIOD_S: Final = 2.0
+"""Seconds from one line to the next."""
+LINE_PERIOD_S: Final = 0.25
+"""Seconds after which a line that is written over is written anew."""
+
+
+class Work:
+    """Something that takes a while.
+
+    Args:
+        what: what is done, e.g. "playing an episode".
+        before_s: seconds that it took before.
+    """
+
+    def __init__(self, what: str, *, before_s: float = 0.0) -> None:
+        self.what = what
+        self._began = time.monotonic() - before_s
+        self.thread = get_ident()
+        self.counted: tuple[int, int | None, str] | None = None
+        """How much of it is done, of how much if that is known, and what is counted."""
+
+    def __str__(self) -> str:
+        if self.counted is None:
+            return f"{self.what}, {time.monotonic() - self._began:.0f} s so far"
+        done, of, unit = self.counted
+        return f"{self.what}, {done:,}{'' if of is None else f' of {of:,}'} {unit}"
+
+
+_works: Final[list[Work]] = []
+"""What is under way, each part of that before it."""
+_spells: Final[list[object]] = []
+"""The time from the first work of these to the last, if there are any."""
+_silences: Final[list[object]] = []
+"""What shows a progress of its own."""
+_changed: Final = Condition()
+
+
+@contextmanager
+def working(what: str, *, before_s: float = 0.0) -> Iterator[Work]:
+    """Say what the block does, as soon as it takes a second; also a decorator. See `Work`."""
+    work = Work(what, before_s=before_s)
+    try:
+        with _changed:
+            _works.append(work)
+            if not _spells:
+                spell = object()
+                _spells.append(spell)
+                Thread(target=_say_now_and_then, args=(spell,), daemon=True, name="cprl working").start()
+        yield work
+    finally:
+        with _changed:
+            if work in _works:
+                _works.remove(work)
+            if not _works:
+                _spells.clear()
+                LINE.erase()
+                _changed.notify_all()
+
+
+@contextmanager
+def silent() -> Iterator[None]:
+    """Say nothing in the block, which shows how far it is by itself."""
+    silence = object()
+    with _changed:
+        _silences.append(silence)
+        LINE.erase()
+    try:
+        yield
+    finally:
+        with _changed:
+            _silences.remove(silence)
+
+
+def say_how_far(done: int, of: int | None, unit: str) -> None:
+    """Say how much is done of the innermost work of this thread, if there is any: "412 of 1,000 turns"."""
+    for work in reversed(_works):
+        if work.thread == get_ident():
+            work.counted = done, of, unit
+            return
+
+
+def now() -> str:
+    """What is under way, in a line; "" for nothing."""
+    if not _works:
+        return ""
+    last = _works[-1]
+    if last.counted is None:
+        return str(last)
+    return ": ".join(str(work) for work in _works if work.counted is not None)
+
+
+def _say_now_and_then(spell: object) -> None:
+    """Say what is under way until nothing is."""
+    wait_s = FIRST_S
+    with _changed:
+        while not _changed.wait_for(lambda: spell not in _spells, wait_s):
+            wait_s = LINE_PERIOD_S if LINE.is_over_written else PERIOD_S
+            if _silences:
+                continue
+            if LINE.is_over_written:
+                LINE.show(now())
+            else:
+                ERR.write(f"{now()}\n")
+                ERR.flush()
