@@ -22,7 +22,7 @@ from cprl.envs.matrix import stag_hunt
 from cprl.evaluation import film_pictures
 from cprl.evaluation.export import export_episodes
 from cprl.evaluation.film import Style, film, film_video, fresh_episode, titles_of
-from cprl.evaluation.film_pictures import EpisodePicture, nice
+from cprl.evaluation.film_pictures import EpisodePicture
 from cprl.institutions import Monitoring, Quota
 
 LEFT = [5, 3, 2, 0]
@@ -259,9 +259,13 @@ def test_what_cannot_be_filmed_is_refused_before_anything_is_played(
 
 def test_the_command_says_what_it_wrote(runs, tmp_path, monkeypatch, capsys):
     filmed = partial(command, monkeypatch, capsys, "film", runs / "greedy", "--out")
-    assert filmed(tmp_path / "own.gif", "--width", 240).splitlines()[0] == "3 steps, apples: 2, 3; 0 left"
+    assert filmed(tmp_path / "own.gif", "--width", 240).splitlines()[:2] == [
+        "Replica 0, episode 0.",
+        "3 steps, apples: 2, 3; 0 left",
+    ]
     told = filmed(tmp_path / "both.gif", "--beside", runs / "meadow", "--width", 480)
-    first, second, _ = told.splitlines()
+    *which, first, second, _ = told.splitlines()
+    assert which == [f"{runs / name}: Replica 0, episode 0." for name in ("greedy", "meadow")]
     assert first == f"{runs / 'greedy'}: 3 steps, apples: 2, 3; 0 left"
     assert second.startswith(f"{runs / 'meadow'}: 12 steps")
 
@@ -348,6 +352,20 @@ def test_an_mp4_has_a_picture_for_each_turn_and_holds_the_card(runs, tmp_path):
     assert greens[0] > 2 * greens[3] > 0, "the area of the plot is left"
 
 
-@pytest.mark.parametrize(("number", "top"), [(0, 10), (10, 10), (11, 20), (201, 500), (1001, 2000)])
-def test_axes_end_at_round_numbers(number, top):
-    assert nice(number) == top
+def test_from_the_first_picture_on_a_line_says_what_the_episode_comes_to(runs, tmp_path, monkeypatch):
+    said, draw = [], EpisodePicture.draw
+
+    def noted(picture, moments, title, **words):
+        said.append((len(moments), words["comes_to"]))
+        return draw(picture, moments, title, **words)
+
+    monkeypatch.setattr(EpisodePicture, "draw", noted)
+    film_video(runs / "greedy", tmp_path / "film.gif", style=Style(width=240))
+    assert said[0][0] == 1, "the board as it begins"
+    assert {words for _, words in said} == {"This episode: 5 apples picked, gone for good at turn 3 of 9"}
+
+
+def test_the_axis_of_harvests_ends_at_the_largest():
+    picture = EpisodePicture(CORRIDORS.map, steps=9, width=240, most_harvested=3)
+    top = min(row for _, row in picture._points(0, np.array([0, 1, 3]), 3))
+    assert top == picture._axes_top

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cprl import keys
 from cprl.commons.game import Game
 from cprl.evaluation.evaluate import opened
-from cprl.evaluation.film import fresh_episode
+from cprl.evaluation.fresh import fresh_episode
 from cprl.evaluation.lanes import Turns, refuse_trained_in
 from cprl.runs.files import refuse_to_write_over
 from cprl.system.defaults import FILM_SEED as SEED

@@ -14,7 +14,7 @@ from markdown_it import MarkdownIt
 from cprl.commons.game import Game
 from cprl.commons.readable import growth_of, meaning_of, rule_of
 from cprl.evaluation.evaluate import evaluate_run, run_table
-from cprl.evaluation.film import fresh_episode
+from cprl.evaluation.fresh import fresh_episode
 from cprl.evaluation.show import Page, page, shown
 from cprl.measuring.metrics import with_unit
 from cprl.measuring.series import Values
@@ -72,7 +72,7 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
     game, name = run.game, legible(run.experiment.name.replace("_", " "))
     evaluation = evaluate_run(run, episodes=episodes, seed=seed)
     is_commons = isinstance(game, Game)
-    data = shown([fresh_episode(run, replica=run.replicas[0])])[0] if is_commons else None
+    data = shown([fresh_episode(run)])[0] if is_commons else None
     before = [growth_of(game)] if is_commons else []
     curves = _curves(run)
     has_course = {"collective_return", "survival_steps"} <= set(curves)
@@ -84,7 +84,7 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
     sections = [
         _html("\n".join(after)),
         *([f"<h2>Training</h2>{_training_figure(run)}"] if curves else []),
-        *([_html("\n".join(_rules(game)))] if is_commons else []),
+        *([_rules(game)] if is_commons else []),
         _recipe(run),
     ]
     after_it = "".join(f"<section>{section}</section>" for section in sections)
@@ -99,17 +99,21 @@ def _curves(run: LoadedRun) -> dict[str, Values]:
         return {}
 
 
-def _rules(game: Game) -> list[str]:
-    """The institutions and the rules that differ from the defaults, in Markdown."""
+def _rules(game: Game) -> str:
+    """The institutions in words, and which settings differ from the defaults."""
     lines = [
         "## Rules",
         "",
         f"{game.agents} agents on a board of {game.map.height} x {game.map.width} cells.",
+        "",
+        *(f"- **{rule_of(one)}**: {meaning_of(one, game)}" for one in game.institutions),
     ]
-    lines += ["", *(f"- **{rule_of(one)}**: {meaning_of(one, game)}" for one in game.institutions)]
-    changed = game.rules.changed
-    lines += ["", "Rules that differ from `Rules()`:" if changed else "All other rules: `Rules()`."]
-    return [*lines, "", *(f"- `{name}`: `{value}`" for name, value in changed.items())]
+    settings = "; ".join(f"`{name}`: `{value}`" for name, value in game.rules.changed.items())
+    if not settings:
+        return _html("\n".join([*lines, "", "All other rules are those of `Rules()`."]))
+    summary = "<summary>The settings that differ from those of <code>Rules()</code></summary>"
+    text = _html("\n".join(lines))
+    return f"{text}<details>{summary}{_html(settings)}</details>"
 
 
 def _recipe(run: LoadedRun) -> str:

@@ -23,7 +23,7 @@ from urllib.parse import parse_qsl, urlsplit
 
 from cprl.commons.game import Game
 from cprl.commons.published import game as published_game
-from cprl.evaluation.film import fresh_episode
+from cprl.evaluation.fresh import fresh_episode
 from cprl.evaluation.show import page, shown
 from cprl.experiment import Experiment
 from cprl.population import Scripted
