@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from itertools import pairwise
+from unittest.mock import Mock
 
 import minari
 import numpy as np
@@ -21,8 +22,9 @@ from cprl.commons.picture import EMPTY_SITE_COLOUR
 from cprl.envs.matrix import stag_hunt
 from cprl.evaluation import film_pictures
 from cprl.evaluation.export import export_episodes
-from cprl.evaluation.film import Style, film, film_video, fresh_episode, titles_of
+from cprl.evaluation.film import Style, film, film_video, titles_of
 from cprl.evaluation.film_pictures import EpisodePicture
+from cprl.evaluation.fresh import fresh_episode
 from cprl.institutions import Monitoring, Quota
 
 LEFT = [5, 3, 2, 0]
@@ -284,8 +286,9 @@ def test_boards_that_are_larger_than_the_picture_are_drawn_smaller():
 def test_fresh_episodes_are_written_as_csv(runs, tmp_path, monkeypatch, capsys):
     path = tmp_path / "deep" / "episodes.csv"
     words = ["export", runs / "greedy", path, "--format", "csv", "--episodes", "2"]
-    assert command(monkeypatch, capsys, *words) == f"{path}\n"
+    said = command(monkeypatch, capsys, *words)
     rows = list(csv.DictReader(path.read_text().splitlines()))
+    assert said == f"wrote {path}, {len(rows)} rows\n"
     episode = film(runs / "greedy", tmp_path / "film.rrd", episode=1)[1]
     second = [row for row in rows if row["episode"] == "1"]
     assert len(second) == episode.steps * 2
@@ -312,6 +315,34 @@ def test_episodes_of_a_matrix_game_are_written_as_csv_with_actions_by_number(tmp
     rows = list(csv.DictReader((tmp_path / "episodes.csv").read_text().splitlines()))
     assert [row["turn"] for row in rows[:6]] == ["1", "1", "2", "2", "3", "3"]
     assert {row["action"] for row in rows} <= {"0", "1"}
+    assert not {"row", "stock", "fines"} & {*rows[0]}, "what the game does not have"
+
+
+def test_a_csv_has_places_headings_stock_and_what_institutions_take_and_give(tmp_path):
+    governed = replace(
+        CORRIDORS, institutions=(Quota(share=0.0, window_steps=2, fine=1.0), Monitoring(prob=1.0))
+    )
+    path = tmp_path / "episodes.csv"
+    export_episodes(stored(tmp_path / "run", governed), path, episodes=1)
+    rows = list(csv.DictReader(path.read_text().splitlines()))
+    # Agent 0 begins at row 0, column 0 and walks right; agent 1 at row 2, column 4 and walks left.
+    turns = [[row for row in rows if row["agent"] == agent] for agent in "01"]
+    assert [(row["row"], row["column"], row["heading"]) for row in turns[0][:3]] == [
+        ("0", str(column), "right") for column in (1, 2, 3)
+    ]
+    assert [(row["row"], row["column"], row["heading"]) for row in turns[1][:3]] == [
+        ("2", str(column), "left") for column in (3, 2, 1)
+    ]
+    assert [row["stock"] for row in turns[0][:3]] == [str(left) for left in LEFT[1:]]
+    assert sum(float(row["fines"]) for row in rows) == 5, "an apple each"
+    assert {row["transfers"] for row in rows} == {"0.0"}
+
+
+def test_an_export_that_is_interrupted_leaves_no_file(runs, tmp_path, monkeypatch):
+    monkeypatch.setattr("cprl.evaluation.lanes.Turns.play", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        export_episodes(runs / "greedy", tmp_path / "episodes.csv")
+    assert not [*tmp_path.iterdir()]
 
 
 def test_fresh_episodes_are_written_as_minari_data_sets(runs, tmp_path, monkeypatch):

@@ -15,7 +15,8 @@ from viewers import browser, wait_until
 from cprl import presets
 from cprl.commons.colours import BEAM
 from cprl.commons.readable import growth_of, legend_of, meaning_of
-from cprl.evaluation.film import fresh_episode, play_to_show
+from cprl.evaluation.film import play_to_show
+from cprl.evaluation.fresh import fresh_episode
 from cprl.evaluation.show import show
 from cprl.institutions import Boundaries, Monitoring, Punishment, Quota, Tax
 from cprl.measuring.social import SOCIAL
