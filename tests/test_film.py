@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from itertools import pairwise
+from unittest.mock import Mock
 
 import minari
 import numpy as np
@@ -21,8 +22,9 @@ from cprl.commons.picture import EMPTY_SITE_COLOUR
 from cprl.envs.matrix import stag_hunt
 from cprl.evaluation import film_pictures
 from cprl.evaluation.export import export_episodes
-from cprl.evaluation.film import Style, film, film_video, fresh_episode, titles_of
-from cprl.evaluation.film_pictures import EpisodePicture, nice
+from cprl.evaluation.film import Style, film, film_video, titles_of
+from cprl.evaluation.film_pictures import EpisodePicture
+from cprl.evaluation.fresh import fresh_episode
 from cprl.institutions import Monitoring, Quota
 from cprl.values import allowing
 
@@ -267,9 +269,13 @@ def test_what_cannot_be_filmed_is_refused_before_anything_is_played(
 
 def test_the_command_says_what_it_wrote(runs, tmp_path, monkeypatch, capsys):
     filmed = partial(command, monkeypatch, capsys, "film", runs / "greedy", "--out")
-    assert filmed(tmp_path / "own.gif", "--width", 240).splitlines()[0] == "3 steps, apples: 2, 3; 0 left"
+    assert filmed(tmp_path / "own.gif", "--width", 240).splitlines()[:2] == [
+        "Replica 0, episode 0.",
+        "3 steps, apples: 2, 3; 0 left",
+    ]
     told = filmed(tmp_path / "both.gif", "--beside", runs / "meadow", "--width", 480)
-    first, second, _ = told.splitlines()
+    *which, first, second, _ = told.splitlines()
+    assert which == [f"{runs / name}: Replica 0, episode 0." for name in ("greedy", "meadow")]
     assert first == f"{runs / 'greedy'}: 3 steps, apples: 2, 3; 0 left"
     assert second.startswith(f"{runs / 'meadow'}: 12 steps")
 
@@ -288,8 +294,9 @@ def test_boards_that_are_larger_than_the_picture_are_drawn_smaller():
 def test_fresh_episodes_are_written_as_csv(runs, tmp_path, monkeypatch, capsys):
     path = tmp_path / "deep" / "episodes.csv"
     words = ["export", runs / "greedy", path, "--format", "csv", "--episodes", "2"]
-    assert command(monkeypatch, capsys, *words) == f"{path}\n"
+    said = command(monkeypatch, capsys, *words)
     rows = list(csv.DictReader(path.read_text().splitlines()))
+    assert said == f"wrote {path}, {len(rows)} rows\n"
     episode = film(runs / "greedy", tmp_path / "film.rrd", episode=1)[1]
     second = [row for row in rows if row["episode"] == "1"]
     assert len(second) == episode.steps * 2
@@ -316,6 +323,34 @@ def test_episodes_of_a_matrix_game_are_written_as_csv_with_actions_by_number(tmp
     rows = list(csv.DictReader((tmp_path / "episodes.csv").read_text().splitlines()))
     assert [row["turn"] for row in rows[:6]] == ["1", "1", "2", "2", "3", "3"]
     assert {row["action"] for row in rows} <= {"0", "1"}
+    assert not {"row", "stock", "fines"} & {*rows[0]}, "what the game does not have"
+
+
+def test_a_csv_has_places_headings_stock_and_what_institutions_take_and_give(tmp_path):
+    governed = replace(
+        CORRIDORS, institutions=(Quota(share=0.0, window_steps=2, fine=1.0), Monitoring(prob=1.0))
+    )
+    path = tmp_path / "episodes.csv"
+    export_episodes(stored(tmp_path / "run", governed), path, episodes=1)
+    rows = list(csv.DictReader(path.read_text().splitlines()))
+    # Agent 0 begins at row 0, column 0 and walks right; agent 1 at row 2, column 4 and walks left.
+    turns = [[row for row in rows if row["agent"] == agent] for agent in "01"]
+    assert [(row["row"], row["column"], row["heading"]) for row in turns[0][:3]] == [
+        ("0", str(column), "right") for column in (1, 2, 3)
+    ]
+    assert [(row["row"], row["column"], row["heading"]) for row in turns[1][:3]] == [
+        ("2", str(column), "left") for column in (3, 2, 1)
+    ]
+    assert [row["stock"] for row in turns[0][:3]] == [str(left) for left in LEFT[1:]]
+    assert sum(float(row["fines"]) for row in rows) == 5, "an apple each"
+    assert {row["transfers"] for row in rows} == {"0.0"}
+
+
+def test_an_export_that_is_interrupted_leaves_no_file(runs, tmp_path, monkeypatch):
+    monkeypatch.setattr("cprl.evaluation.lanes.Turns.play", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        export_episodes(runs / "greedy", tmp_path / "episodes.csv")
+    assert not [*tmp_path.iterdir()]
 
 
 def test_fresh_episodes_are_written_as_minari_data_sets(runs, tmp_path, monkeypatch):
@@ -356,6 +391,20 @@ def test_an_mp4_has_a_picture_for_each_turn_and_holds_the_card(runs, tmp_path):
     assert greens[0] > 2 * greens[3] > 0, "the area of the plot is left"
 
 
-@pytest.mark.parametrize(("number", "top"), [(0, 10), (10, 10), (11, 20), (201, 500), (1001, 2000)])
-def test_axes_end_at_round_numbers(number, top):
-    assert nice(number) == top
+def test_from_the_first_picture_on_a_line_says_what_the_episode_comes_to(runs, tmp_path, monkeypatch):
+    said, draw = [], EpisodePicture.draw
+
+    def noted(picture, moments, title, **words):
+        said.append((len(moments), words["comes_to"]))
+        return draw(picture, moments, title, **words)
+
+    monkeypatch.setattr(EpisodePicture, "draw", noted)
+    film_video(runs / "greedy", tmp_path / "film.gif", style=Style(width=240))
+    assert said[0][0] == 1, "the board as it begins"
+    assert {words for _, words in said} == {"This episode: 5 apples picked, gone for good at turn 3 of 9"}
+
+
+def test_the_axis_of_harvests_ends_at_the_largest():
+    picture = EpisodePicture(CORRIDORS.map, steps=9, width=240, most_harvested=3)
+    top = min(row for _, row in picture._points(0, np.array([0, 1, 3]), 3))
+    assert top == picture._axes_top

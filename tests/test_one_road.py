@@ -1,5 +1,6 @@
 """What an experiment names works everywhere: training, stop, resume, evaluation, film, from its recipe."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -79,9 +80,10 @@ def test_an_experiment_with_parts_of_its_own_is_stopped_resumed_evaluated_and_fi
     tables = [cprl.evaluate_run(each, episodes=2, allow=ALLOW).table() for each in (run, in_one_go)]
     assert repr(tables[0].to_pydict()) == repr(tables[1].to_pydict())
     assert cprl.load(run, allow=ALLOW).experiment == MEADOW
-    _, episode = film(run, allow=ALLOW)
+    recording, episode = film(run, allow=ALLOW)
     assert episode.steps <= 20
-    assert (run / "film-0-0.rrd").stat().st_size > 10_000
+    assert re.fullmatch(r"film-\d-\d\.rrd", recording.name), "a typical episode"
+    assert (run / recording.name).stat().st_size > 10_000
 
 
 def test_what_a_callback_writes_into_learning_is_logged(tmp_path):

@@ -1,7 +1,9 @@
 """A person plays among others: the session, the terminal."""
 
 import io
+import os
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,7 +11,7 @@ import torch
 from stored_runs import command, stored
 
 from cprl import CommonsEnv, Game, Rules, keys, maps, presets
-from cprl.evaluation.play import Session, board_text, help_of, open_session, play_in_terminal
+from cprl.evaluation.play import Session, board_text, help_of, keys_of, open_session, play_in_terminal
 from cprl.measuring.episodes import EpisodeTracker
 
 DRAWING = """
@@ -92,7 +94,8 @@ def in_terminal(session, text, capsys):
 
 def test_lines_of_keys_play_an_episode_to_its_end(run, capsys):
     told = in_terminal(open_session(str(run), seed=1), "ww\n\nq..\n", capsys)
-    assert told[6:8] == ["keys> ww", "turn 2: you harvest an apple"], "what is typed through a pipe is shown"
+    first = told.index("keys> ww")
+    assert told[first + 1] == "turn 2: you harvest an apple", "what is typed through a pipe is shown"
     assert "The end: time is over." in told
     assert len([line for line in told if line.startswith("turn")]) == 4 + 1
 
@@ -127,6 +130,60 @@ def test_ctrl_c_ends_an_episode_like_quit(run, capsys):
     session.act("stay")
     play_in_terminal(session, interrupted)
     assert "The end: stopped after turn 1." in capsys.readouterr().out
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a pseudo-terminal")
+def test_in_a_terminal_a_key_plays_at_once_and_the_terminal_is_left_as_it_was(run, monkeypatch, capsys):
+    import termios
+
+    session, turns = open_session(str(run), seed=1), []
+    ours, theirs = os.openpty()
+    before = termios.tcgetattr(theirs)
+    act = session.act
+
+    def noted(action):
+        turns.append(action)
+        os.write(ours, b"\x1b[D" if len(turns) == 1 else b"\x1b")
+        return act(action)
+
+    monkeypatch.setattr(session, "act", noted)
+    with open(theirs, encoding="utf-8", closefd=False) as typed:
+        monkeypatch.setattr("sys.stdin", typed)
+        os.write(ours, b"w")
+        play_in_terminal(session)
+    assert turns == ["forward", "turn_left"]
+    assert termios.tcgetattr(theirs) == before
+    assert "The end: stopped after turn 2." in capsys.readouterr().out
+    os.close(ours)
+    os.close(theirs)
+
+
+@pytest.mark.parametrize(
+    ("pressed", "keys"),
+    [
+        ("w", "w"),
+        ("\x1b[A\x1b[B", "ws"),
+        ("\x1bOC\x1bOD", "eq"),
+        ("\x1b", ""),
+        ("\x04", ""),
+        ("\n", "\n"),
+        ("", ""),
+    ],
+)
+def test_arrows_are_keys_and_escape_ends(pressed, keys):
+    assert keys_of(pressed) == keys
+
+
+def test_a_question_mark_prints_the_keys_in_lines_that_break_between_keys(run, capsys):
+    session = open_session(str(run), seed=1)
+    told = in_terminal(session, "?\nquit\n", capsys)
+    keys = [line for line in told if "w step forward" in line]
+    assert len(keys) == 2, "as it begins, and when asked"
+    assert session.turn == 0
+    printed = told[1 : told.index(next(line for line in told if "turn 0 of" in line)) - 3]
+    assert all(len(line) <= 80 for line in printed)
+    assert " ".join(printed).startswith(f"Keys: {help_of(MEADOW)}, ")
+    assert not any(line.endswith((" q", " e")) for line in printed)
 
 
 def test_a_game_without_a_beam_has_no_key_for_it():

@@ -2,15 +2,19 @@
 
 import json
 import runpy
+import socket
+import struct
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from http.client import HTTPConnection
+from unittest.mock import Mock
 
 import pytest
 from viewers import browser, wait_until
 
 from cprl import maps, presets
-from cprl.evaluation.sandbox import Sandbox, Sliders
+from cprl.evaluation.sandbox import Sandbox, Sliders, SupersededError
 from cprl.institutions import GraduatedSanctions, Quota, Tax
 
 
@@ -95,6 +99,66 @@ def test_trainings_of_an_earlier_sandbox_are_kept(tmp_path):
     assert (tmp_path / "sandbox-2.py").read_text() == Sliders(agents=2).recipe(1)
 
 
+def test_of_trainings_that_are_asked_for_at_once_one_begins(tmp_path, monkeypatch):
+    begun, running = [], Mock(poll=lambda: None)
+
+    def begin(words, **_):
+        time.sleep(0.05)  # in which the others ask
+        begun.append(words)
+        return running
+
+    served = Sandbox(tmp_path, episodes=1)
+    monkeypatch.setattr("cprl.evaluation.sandbox.subprocess.Popen", begin)
+    with ThreadPoolExecutor(6) as pool:
+        answers = [pool.submit(served.train, Sliders()) for _ in range(6)]
+        refused = [answer.exception() for answer in answers if answer.exception()]
+    served.close()
+    assert len(begun) == 1
+    assert [str(error) for error in refused] == ["a training runs; wait until it has ended"] * 5
+    running.terminate.assert_called_once()
+
+
+def test_questions_that_are_no_longer_asked_are_not_played(tmp_path, monkeypatch):
+    played, may_end = [], threading.Event()
+
+    def play(fresh, titles):
+        played.append(titles)
+        may_end.wait(20)
+        return {"populations": [{}]}, []
+
+    monkeypatch.setattr("cprl.evaluation.sandbox.shown", play)
+    served = Sandbox(tmp_path)
+    with ThreadPoolExecutor(4) as pool:
+        answers = []
+        for greedy in (0, 1, 2, 3):
+            answers.append(pool.submit(served.play, Sliders(greedy=greedy), trained=False))
+            wait_until(lambda: served._asked == len(answers), 20.0, "not asked")
+            wait_until(lambda: played, 20.0, "nothing is played")
+        may_end.set()
+    served.close()
+    assert played == [["0 greedy, 4 restrained"], ["3 greedy, 1 restrained"]]
+    assert [type(answer.exception()) for answer in answers[1:3]] == [SupersededError] * 2
+
+
+def test_a_browser_that_leaves_prints_nothing(sandbox, monkeypatch, capfd):
+    may_end = threading.Event()
+
+    def play(*_, **__):
+        may_end.wait(20)
+        return {"text": "long" * 10**6}
+
+    monkeypatch.setattr(sandbox, "play", play)
+    connection = socket.create_connection(("127.0.0.1", sandbox.server.server_port))
+    host = f"127.0.0.1:{sandbox.server.server_port}"
+    connection.sendall(f"GET /data HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # closed by a reset
+    connection.close()
+    may_end.set()
+    assert asked(sandbox, "/state")[0] == 200
+    time.sleep(0.2)
+    assert capfd.readouterr().err == ""
+
+
 @pytest.mark.integration
 def test_agents_are_trained_and_play_beside_the_scripted_ones(sandbox):
     assert asked(sandbox, "/train?agents=2", "POST")[0] == 200
@@ -104,7 +168,10 @@ def test_agents_are_trained_and_play_beside_the_scripted_ones(sandbox):
         time.sleep(0.5)
     assert sandbox.state()["state"] == "trained", (sandbox.folder / "sandbox-1.log").read_text()
     populations = json.loads(asked(sandbox, "/data?agents=2&trained=yes")[1])["populations"]
-    assert [one["title"] for one in populations] == ["2 greedy, 0 restrained", "Trained"]
+    assert [one["title"] for one in populations] == [
+        "2 greedy, 0 restrained",
+        "Trained with 2 agents, no rule, sight 7",
+    ]
     assert "2 agents by DQN, trained for 1 episodes" in populations[1]["about"]
 
 

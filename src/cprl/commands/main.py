@@ -275,6 +275,4 @@ def export(
         raise ValueError(f"--no-weights is of results; allowed: without --format {format}")
     from cprl.evaluation.export import export_episodes
 
-    written = export_episodes(run, out, format=format, episodes=episodes, replica=replica, seed=seed)
-    for path in written:
-        say(path)
+    export_episodes(run, out, format=format, episodes=episodes, replica=replica, seed=seed)

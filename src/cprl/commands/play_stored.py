@@ -24,6 +24,7 @@ from cprl.system.defaults import (
 from cprl.system.output import printed, say
 from cprl.system.process import prepare_process
 from cprl.system.working import working
+from cprl.values import Seed, checked
 
 if TYPE_CHECKING:
     from cprl.evaluation.lanes import Results
@@ -96,9 +97,9 @@ def film(
     run: Path,
     /,
     *,
-    replica: int = 0,
-    episode: int = 0,
-    seed: int = FILM_SEED,
+    replica: int | None = None,
+    episode: int | None = None,
+    seed: int | None = None,
     out: Path | None = None,
     options: Annotated[FilmOptions, tyro.conf.arg(name="")] = FilmOptions(),
 ) -> None:
@@ -106,11 +107,14 @@ def film(
 
     Args:
         run: the run's directory, or its results.
-        replica: whose agents.
-        episode: which of the fresh episodes; the same number plays the same again.
-        seed: of the worlds and all chance. With the seed of cprl evaluate, 30011 by default, the world of its
-            episode E of replica R is --episode R x EPISODES + E; what agents draw by chance differs. The
-            run's own evaluation plays by the seed of its experiment + 1.
+        replica: whose agents; by default, without --episode, those of a typical replica, whose boards last
+            nearest to the median over replicas.
+        episode: which of the fresh episodes; the same number plays the same again. By default, without
+            --replica, a typical one of the first five.
+        seed: of the worlds and all chance, by default 20011; not that of the training. With the seed of
+            cprl evaluate, 30011 by default, the world of its episode E of replica R is
+            --episode R x EPISODES + E; what agents draw by chance differs. The run's own evaluation plays by
+            the seed of its experiment + 1.
         out: what is written: a recording for the viewer (.rrd), or a film of the board, the stock and the
             harvests (.gif, or .mp4, which wants the extra "film"); by default film-<replica>-<episode>.rrd in
             the run's directory.
@@ -146,9 +150,9 @@ def show(
     *,
     out: Path | None = None,
     titles: tuple[str, ...] = (),
-    replica: int = 0,
-    episode: int = 0,
-    seed: int = FILM_SEED,
+    replica: int | None = None,
+    episode: int | None = None,
+    seed: int | None = None,
 ) -> None:
     """Lets the agents of runs play a fresh episode side by side, and writes it as one page for any browser.
 
@@ -157,7 +161,7 @@ def show(
         out: the page, an .html, which opens from the disk without a network; by default
             show-<replica>-<episode>.html in the directory of the first run.
         titles: one for each run; by default their institutions, or the names of their experiments.
-        replica: whose agents.
+        replica: whose agents, as of cprl film; by default of each run those of a typical replica.
         episode: which of the fresh episodes, as of cprl film.
         seed: of the worlds and all chance, as of cprl film.
     """
@@ -225,14 +229,14 @@ class Session:
     others: str | None = None
     """The directory of a run, whose agents play, or random, greedy, sustainable, territorial, aggressive or
     pacifist; by default the agents of the run that is the board, else greedy."""
-    replica: int = 0
-    """Of the run whose agents play."""
+    replica: int | None = None
+    """Of the run whose agents play; by default a typical one, as of cprl film."""
     variant: Variant = "published"
     """Of the boards with a name: published, as_run or, of two_complex, as_run_10_april; see docs/game.md."""
     steps: int | None = None
     """Turns of the episode at most; by default as many as the game has."""
-    seed: int = PLAY_SEED
-    """Of all chance; the same seed and the same keys play the same again."""
+    seed: int | None = None
+    """Of all chance, by default 40011; the same seed and the same keys play the same again."""
     decision: int | None = None
     """What you vote for in a game with votes or elections, by its number; by default chance votes."""
 
@@ -245,7 +249,7 @@ def play(board: str, /, *, session: Annotated[Session, tyro.conf.arg(name="")] =
             is played; or a file with a drawing.
     """
     check_board(board)
-    _begin(session.seed)
+    _begin(PLAY_SEED if session.seed is None else session.seed)
 
     from cprl.evaluation.play import open_session, play_in_terminal
 
@@ -511,12 +515,13 @@ def exploit(
     say(f"Episodes: {folder / TABLE}")
 
 
-def _begin(seed: int, *runs: Path | str, files: Files = Files()) -> None:
+def _begin(seed: int | None, *runs: Path | str, files: Files = Files()) -> None:
     """Refuse files that are there and runs that are not, before what plays agents is imported; prepare the
     process."""
     with working("starting"):
         from cprl.runs.recipe import read_recipe
 
+        seed = checked("--seed", FILM_SEED if seed is None else seed, Seed)
         files.check()
         for run in runs:
             read_recipe(Path(run))

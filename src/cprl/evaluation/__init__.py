@@ -12,6 +12,7 @@ Modules, in the order in which one reads them:
     territory       territory_of: where the agents of a run go and whom they tag
     exploit         exploitability: trains best responses, a study; play_responses: what they gain over the
                     agents whose place they take
+    fresh           fresh episodes that are shown, by default a typical one
     film            an episode, every step recorded, or as a GIF or an MP4
     film_pictures   the pictures of a film, and its files
     show            episodes side by side on an HTML page

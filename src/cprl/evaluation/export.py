@@ -1,30 +1,39 @@
 """Export fresh episodes of stored agents for other programs: as CSV, or as Minari data sets."""
 
 import csv
+import io
 import os
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, BinaryIO, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cprl import keys
 from cprl.commons.game import Game
+from cprl.envs.unwrap import commons_of
 from cprl.evaluation.evaluate import opened
-from cprl.evaluation.film import fresh_episode
-from cprl.evaluation.lanes import Turns, refuse_trained_in
-from cprl.runs.files import refuse_to_write_over
+from cprl.evaluation.fresh import fresh_episode
+from cprl.evaluation.lanes import Turns, board_now, refuse_trained_in
+from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.system.defaults import FILM_SEED as SEED
+from cprl.system.output import say
 from cprl.system.working import say_how_far, working
 from cprl.values import Positive, checked
 
 Format = Literal["csv", "minari"]
 COLUMNS: Final = ("episode", "turn", "agent", "action", "reward", "harvest", "in_play", "fired", "tagged")
 """Of a CSV, a row for each episode, turn and agent, turns counted from 1; `in_play` says whether the action
-of the turn counted, `tagged` whether the agent was tagged in it."""
+of the turn counted, `tagged` whether the agent was tagged in it. Then what the game has: `row`, `column` and
+`heading` of the agent and `stock`, the apples on the board, after the turn; its `fines` and `transfers`."""
+
+
+_PLACES: Final = ("row", "column", "heading", "stock")
+_HEADINGS: Final = ("up", "right", "down", "left")
+"""By number, see `cprl.maps.Map.starts`."""
 
 
 class Played(NamedTuple):
@@ -44,6 +53,8 @@ class Played(NamedTuple):
     """[T, N]."""
     tagged: NDArray[np.bool_]
     """[T, N]."""
+    more: dict[str, NDArray[Any]]
+    """[T, N] by the name of a column, what not every game has."""
     terminated: bool
     """Whether the episode ended by itself, and not by the clock."""
 
@@ -59,7 +70,8 @@ def export_episodes(
     seed: int = SEED,
     allow: Sequence[str] = (),
 ) -> list[Path]:
-    """Play fresh episodes of a run's agents, with the exploration of evaluation, and write what they did.
+    """Play fresh episodes of a run's agents, with the exploration of evaluation; write what they did, and say
+    how much that is.
 
     Args:
         out: of "csv", the file. Of "minari" a directory of Minari data sets, one for each agent:
@@ -81,7 +93,7 @@ def export_episodes(
     if format == "minari":
         _import_minari()
     loaded = opened(run, allow)
-    refuse_trained_in(seed, [loaded])
+    refuse_trained_in(seed, [loaded])  # before the folder is made
 
     def played() -> Iterator[tuple[Played, Any]]:
         for episode in range(episodes):
@@ -95,9 +107,13 @@ def export_episodes(
 
 @working("playing an episode")
 def _play(turns: Turns) -> Played:
-    batches = []
+    batches, places, commons = [], [], commons_of(turns.env)
     while not turns.has_ended:
         batches.append(turns.play().clone())
+        if commons is not None:
+            now = board_now(commons)
+            headings = [_HEADINGS[heading] for heading in now.heading]
+            places.append((now.row, now.col, headings, [now.stock.sum(dtype=np.int64)] * len(headings)))
     agents, last = keys.AGENTS, batches[-1]
 
     def stacked(*name: str, lacking: Any = None) -> Any:
@@ -108,6 +124,9 @@ def _play(turns: Turns) -> Played:
 
     observed, action = stacked(agents, "observation"), stacked(agents, "action")
     reward, nobody = stacked("next", agents, "reward")[..., 0], np.zeros(action.shape, np.bool_)
+    more = dict(zip(_PLACES, map(np.array, zip(*places, strict=True)), strict=True)) if places else {}
+    paid = {"fines": stacked("next", *keys.FINES), "transfers": stacked("next", *keys.TRANSFERS)}
+    more |= {name: values for name, values in paid.items() if values is not None}
     return Played(
         observation=np.concatenate([observed, last["next", agents, "observation"].numpy(force=True)]),
         action=action,
@@ -116,24 +135,35 @@ def _play(turns: Turns) -> Played:
         in_play=stacked(agents, "in_play", lacking=~nobody),
         fired=stacked("next", agents, "fired", lacking=nobody),
         tagged=stacked("next", *keys.TAGGED_BY, lacking=nobody[..., None]).any(-1),
+        more=more,
         terminated=bool(last["next", "terminated"].any()),
     )
 
 
-def _write_csv(path: Path, played: Iterator[tuple[Played, Any]]) -> list[Path]:
-    unfinished = path.with_name(f"{path.name}.unfinished")
-    with unfinished.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file)
-        rows.writerow(COLUMNS)
+def _write_csv(path: Path, played: Iterable[tuple[Played, Any]]) -> list[Path]:
+    count = 0
+
+    def write(file: BinaryIO) -> None:
+        nonlocal count
+        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+        table = csv.writer(text)
         for episode, (one, game) in enumerate(played):
+            if not episode:
+                table.writerow((*COLUMNS, *one.more))
             names = game.actions if isinstance(game, Game) else ()
             for turn, agent in np.ndindex(one.action.shape):
                 action = int(one.action[turn, agent])
                 numbers = (float(one.reward[turn, agent]), float(one.harvest[turn, agent]))
                 flags = (int(flag[turn, agent]) for flag in (one.in_play, one.fired, one.tagged))
+                more = (values[turn, agent].item() for values in one.more.values())
                 called = names[action] if names else action
-                rows.writerow((episode, turn + 1, agent, called, *numbers, *flags))
-    unfinished.replace(path)
+                table.writerow((episode, turn + 1, agent, called, *numbers, *flags, *more))
+            count += one.action.size
+        text.flush()
+        text.detach()  # the file is closed by who opened it
+
+    write_atomically(path, write)
+    say(f"wrote {path}, {count:,} rows")
     return [path]
 
 
@@ -179,6 +209,7 @@ def _write_minari(folder: Path, played: list[tuple[Played, Any]]) -> list[Path]:
                     data_format="arrow",
                 )
             written.append(folder / f"agent_{agent}-v0")
+    say(f"wrote {folder}, {len(written)} data sets of {len(played):,} episodes each")
     return written
 
 

@@ -10,13 +10,11 @@ from typing import Annotated, Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
-from torchrl.envs import EnvBase
 
 from cprl import keys
 from cprl.commons.readable import growth_of, in_lower_case, legend_of
 from cprl.commons.world import Bytes, Shown
 from cprl.envs.unwrap import clock_of, commons_of
-from cprl.evaluation.evaluate import opened
 from cprl.evaluation.film_pictures import (
     DEFAULT_WIDTH,
     LARGEST_WIDTH,
@@ -27,49 +25,19 @@ from cprl.evaluation.film_pictures import (
     write_gif,
     write_mp4,
 )
+from cprl.evaluation.fresh import FreshEpisode, fresh_episode, fresh_episodes, say_which
 from cprl.evaluation.lanes import Turns, board_now, commons_game
 from cprl.measuring.episodes import Episode, tracker_of
-from cprl.policies.assignment import AgentPolicies
 from cprl.runs.files import refuse_to_write_over
-from cprl.system.defaults import FILM_SEED as SEED
 from cprl.system.defaults import FILM_SUFFIXES as SUFFIXES
 from cprl.system.memory import check_memory
 from cprl.system.output import legible
 from cprl.system.working import say_how_far, working
 from cprl.training import train
 from cprl.training.agents import LoadedRun
-from cprl.values import Natural, Positive, Range, Seed, Value, Where, checked, refusal
+from cprl.values import Positive, Range, Value, Where, checked, refusal
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.replay import Decisions, Offences, events
-
-
-class FreshEpisode(NamedTuple):
-    """A fresh world of a run's game, and who plays in it."""
-
-    run: LoadedRun
-    env: EnvBase
-    """One world, with the run's transforms."""
-    policies: AgentPolicies
-
-
-def fresh_episode(
-    run: str | Path | LoadedRun,
-    *,
-    replica: int = 0,
-    episode: int = 0,
-    seed: int = SEED,
-    allow: Sequence[str] = (),
-) -> FreshEpisode:
-    """The world and the agents of an episode that is filmed; equal numbers give equal episodes."""
-    episode = checked("episode", episode, Annotated[int, Range(0, 2**32 - 1)])
-    replica = checked("replica", replica, Natural)
-    seed = checked("seed", seed, Seed)
-    loaded = opened(run, allow)
-    if replica not in loaded.replicas:
-        replicas = ", ".join(map(str, loaded.replicas))
-        raise ValueError(f"replica is {replica}; allowed: {replicas}, the replicas of {loaded.path}")
-    env = loaded.env(1, seed=seed, first_world=episode)
-    return FreshEpisode(loaded, env, loaded.policy(replica, seed=seed + episode))
 
 
 @working("making a film")
@@ -77,17 +45,18 @@ def film(
     run: str | Path,
     out: str | Path | None = None,
     *,
-    replica: int = 0,
-    episode: int = 0,
-    seed: int = SEED,
+    replica: int | None = None,
+    episode: int | None = None,
+    seed: int | None = None,
     allow: Sequence[str] = (),
 ) -> tuple[Path, Episode]:
-    """Records an episode of a run's agents in a fresh world, with the exploration of evaluation.
+    """Record an episode of a run's agents in a fresh world, with the exploration of evaluation; say which.
 
     Args:
         out: the recording, a .rrd, complete or absent; by default `film-<replica>-<episode>.rrd` in the run's
             directory.
-        episode: the index of the fresh episode; equal indices give equal episodes.
+        replica, episode: which fresh episode; by default a typical one, see `cprl.evaluation.fresh`. Equal
+            numbers give equal episodes.
         seed: of the worlds and all chance. The world is that of `evaluate_run` with the same seed, of number
             replica x episodes + episode there; what agents draw is their own.
 
@@ -99,11 +68,15 @@ def film(
     """
     if out is not None and Path(out).suffix != ".rrd":
         raise refusal("out", str(out), "a .rrd; film_video makes a .gif or an .mp4")
+    if out is not None:
+        refuse_to_write_over(Path(out))
     fresh = fresh_episode(run, replica=replica, episode=episode, seed=seed, allow=allow)
-    target = Path(run) / f"film-{replica}-{episode}.rrd" if out is None else Path(out)
+    which = f"{fresh.replica}-{fresh.episode}"
+    target = Path(run) / f"film-{which}.rrd" if out is None else Path(out)
     refuse_to_write_over(target)
+    say_which([fresh])
     target.parent.mkdir(parents=True, exist_ok=True)
-    title = f"{legible(Path(run).name)}, agents of replica {replica}, fresh episode {episode}"
+    title = f"{legible(Path(run).name)}, agents of replica {fresh.replica}, fresh episode {fresh.episode}"
     try:
         return target, _recorded(fresh, target, title)
     except BaseException:  # a recording of half an episode would stand in the way of the next attempt
@@ -209,18 +182,18 @@ def film_video(
     out: str | Path,
     *,
     beside: Sequence[str | Path] = (),
-    replica: int = 0,
-    episode: int = 0,
-    seed: int = SEED,
+    replica: int | None = None,
+    episode: int | None = None,
+    seed: int | None = None,
     style: Style = Style(),
     allow: Sequence[str] = (),
 ) -> tuple[Path, tuple[Episode, ...]]:
     """Film an episode of a run's agents, beside the agents of other runs if there are any.
 
-    A film shows the board, the apples on it and what each agent picked so far, turn by turn, and ends with a
-    card of two seconds that says how it ended; a note below says what the signs mean. Agents that broke a
-    rule since the last picture have a white diamond around them. Populations side by side play on one clock;
-    one whose board is dead waits for the others.
+    A film shows the board, the apples on it and what each agent picked so far, turn by turn. From the first
+    picture a line says what the episode comes to, and a card of two seconds at the end says it again; a note
+    below says what the signs mean. Agents that broke a rule since the last picture have a white diamond
+    around them. Populations side by side play on one clock; one whose board is dead waits for the others.
 
     It is the episode that `cprl.evaluation.film.film` records with the same numbers; the first and the last
     board are always in the film.
@@ -249,7 +222,8 @@ def film_video(
     refuse_to_write_over(path)
     if path.suffix == ".mp4":
         check_can_write_mp4(path)
-    fresh = [fresh_episode(one, replica=replica, episode=episode, seed=seed, allow=allow) for one in runs]
+    fresh = fresh_episodes(runs, replica=replica, episode=episode, seed=seed, allow=allow)
+    say_which(fresh)
     panels = _panels(fresh, style.titles or titles_of(fresh), width)
     length = max(len(panel.filmed.moments) for panel in panels)
     every = style.every or (1 if path.suffix == ".mp4" else ceil(length / GIF_FRAMES))
@@ -336,7 +310,8 @@ class Filmed(NamedTuple):
 
 @working("playing an episode")
 def play_to_show(fresh: FreshEpisode) -> Filmed:
-    """Play an episode."""
+    """Play an episode of a game with a board; raises a ValueError for others."""
+    commons_game(fresh.run)
     commons = commons_of(fresh.env)
     assert commons is not None
     tracker, turns = tracker_of(fresh.env, fresh.run.metrics), Turns(fresh.env, fresh.policies)
@@ -358,6 +333,7 @@ class _Panel(NamedTuple):
     title: str
     picture: EpisodePicture
     filmed: Filmed
+    is_typical: bool
 
     def draw(self, turn: int, *, since: int, card: bool = False) -> Bytes:
         """The population after a turn of the film's clock, or at its end if that was before.
@@ -370,9 +346,11 @@ class _Panel(NamedTuple):
         dead = f"gone for good at turn {last:,} of {self.picture.steps:,}" if filmed.is_dead else ""
         outcome = dead or f"{filmed.left:,} of {sites:,} still on the board"
         apples = f"{filmed.apples:,} apple{'' if filmed.apples == 1 else 's'} picked"
+        which = "A typical episode" if self.is_typical else "This episode"
         return self.picture.draw(
             filmed.moments[: turn + 1],
             self.title,
+            comes_to=f"{which}: {apples}, {outcome}",
             end=dead if turn >= last else "",
             card=f"{apples} · {outcome}" if card else "",
             violators=sorted(set().union(*filmed.violators[since : turn + 1])),
@@ -387,4 +365,5 @@ def _panels(fresh: Sequence[FreshEpisode], titles: Sequence[str], width: int) ->
     height = max(EpisodePicture(game.map, steps=1, width=width).size[1] for game in games)
     sizes = {"width": width, "height": height, "most_harvested": most}
     pictures = [EpisodePicture(game.map, steps=game.rules.episode_steps, **sizes) for game in games]
-    return [_Panel(*shown) for shown in zip(titles, pictures, episodes, strict=True)]
+    are_typical = [population.is_typical for population in fresh]
+    return [_Panel(*shown) for shown in zip(titles, pictures, episodes, are_typical, strict=True)]

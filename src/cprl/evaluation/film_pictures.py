@@ -61,7 +61,7 @@ class EpisodePicture:
     ) -> None:
         width -= width % 2  # which videos want
         self.board, self.steps, self._most = board, steps, most_harvested
-        self._unit = unit = max(10, width // 46)
+        self._unit = unit = max(10, width // 40)
         self._font, self._large = _font(unit), _font(2 * unit)
         highest = _BOARD_HEIGHT * width
         room = width - 2 * unit
@@ -71,11 +71,12 @@ class EpisodePicture:
         shrink = min(1.0, room / wide, highest / high)
         self._board_size = max(1, int(wide * shrink)), max(1, int(high * shrink))
         self._half = (width - 3 * unit) // 2
-        self._item = int(self._font.getlength("00 0000  "))
+        digits = 4 if most_harvested is None else len(str(most_harvested))
+        self._item = int(self._font.getlength(f"00 {'0' * digits}  "))
         self._in_a_row = max(1, self._half // self._item)
         rows = ceil(len(board.starts) / self._in_a_row)
         self._line = line = unit + unit // 2
-        self._title_height, self._plot_height = 3 * unit, _PLOT_HEIGHT * unit
+        self._title_height, self._plot_height = 5 * unit, _PLOT_HEIGHT * unit
         below = unit // 2 + 5 * unit // 2 + line * (1 + rows) + self._plot_height + 2 * line
         height = max(height, self._title_height + self._board_size[1] + below)
         self.size: tuple[int, int] = width, height + height % 2
@@ -90,6 +91,7 @@ class EpisodePicture:
         moments: Sequence[Shown],
         title: str,
         *,
+        comes_to: str = "",
         end: str = "",
         card: str = "",
         violators: Sequence[int] = (),
@@ -99,6 +101,7 @@ class EpisodePicture:
         Args:
             moments: the episode so far: the board as it began, then after each turn.
             title: what is shown, in large type; smaller where the room ends.
+            comes_to: what the whole episode comes to, below the title.
             end: how the episode ended, beside the title and in orange; the turn while this is empty.
             card: how the episode ended, in large type across the board.
             violators: the indices of agents that get a white diamond, since they broke a rule.
@@ -108,7 +111,7 @@ class EpisodePicture:
         """
         image = Image.new("RGB", self.size, PALETTE[GROUND])
         draw = ImageDraw.Draw(image)
-        self._caption(draw, title, end, f"turn {len(moments) - 1:,} of {self.steps:,}")
+        self._caption(draw, title, comes_to, end, f"turn {len(moments) - 1:,} of {self.steps:,}")
         drawn = Image.fromarray(world_image(self.board, moments[-1], cell_pixels=self._cell))
         if drawn.size != self._board_size:
             drawn = drawn.resize(self._board_size, Image.Resampling.BOX)
@@ -139,9 +142,11 @@ class EpisodePicture:
         top = self._board_top + row * down
         return left + col * across, top, left + (col + 1) * across, top + down
 
-    def _caption(self, draw: ImageDraw.ImageDraw, title: str, end: str, turn: str) -> None:
-        """The title on the left, the turn or the end on the right."""
-        edge, middle = self._unit, self._title_height // 2
+    def _caption(self, draw: ImageDraw.ImageDraw, title: str, comes_to: str, end: str, turn: str) -> None:
+        """The title on the left, the turn or the end on the right; below them what the episode comes to."""
+        edge, middle = self._unit, 3 * self._unit // 2
+        below = _fitting(comes_to, self.size[0] - 2 * edge, 5 * self._unit // 4)
+        draw.text((edge, 15 * self._unit // 4), comes_to, _TEXT, below, anchor="lm")
         words, colour = (end, _DEAD) if end else (turn, _TEXT)
         font = _fitting(words, (self.size[0] - 3 * edge) / 2, 4 * self._unit // 3)
         draw.text((self.size[0] - edge, middle), words, colour, font, anchor="rm")
@@ -166,8 +171,9 @@ class EpisodePicture:
     def _plot_harvests(self, draw: ImageDraw.ImageDraw, harvests: NDArray[np.int32]) -> None:
         """Each agent's harvest so far, [T, N], as lines in their colours, which a legend repeats."""
         left = 2 * self._unit + self._half
-        most = nice(int(harvests.max(initial=0)) if self._most is None else self._most)
-        self._axes(draw, left, f"{harvests[-1].sum():,}", "apples picked")
+        most = int(harvests.max(initial=0)) if self._most is None else self._most
+        words = f"apples picked; below by each, 0 to {most:,}"
+        self._axes(draw, left, f"{harvests[-1].sum():,}", words)
         for agent in range(harvests.shape[1]):
             path = self._points(left, harvests[:, agent], most)
             draw.line(path, agent_colour(agent), max(1, self._unit // 6))
@@ -226,16 +232,6 @@ def note(text: str, width: int) -> Bytes:
     image = Image.new("RGB", (width, high + high % 2), PALETTE[GROUND])
     ImageDraw.Draw(image).multiline_text((edge, 0), "\n".join(lines), _FAINT, font, spacing=line - font.size)
     return np.asarray(image)
-
-
-def nice(number: int) -> int:
-    """The next larger of 10, 20, 50, 100, 200, 500 and so on."""
-    power = 10
-    while True:
-        for step in (1, 2, 5):
-            if number <= step * power:
-                return step * power
-        power *= 10
 
 
 HOLD_S: Final = 2.0

@@ -1,13 +1,18 @@
 """Play: an episode in which a person decides for one agent, in the terminal, also through a pipe."""
 
+import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from math import isnan
 from pathlib import Path
+from textwrap import wrap
 from typing import Annotated, Final
 
 import numpy as np
+import pyarrow.compute as pc
 import torch
 from rich.text import Text
 from tensordict import TensorDictBase
@@ -23,13 +28,15 @@ from cprl.commons.rules import Rules
 from cprl.commons.world import Shown, StepOutput
 from cprl.envs.make_env import make_env
 from cprl.envs.unwrap import commons_of
-from cprl.evaluation.lanes import Turns, agent_named, board_now, commons_game
+from cprl.evaluation.fresh import averages_in_words, fresh_seed, typical_replica
+from cprl.evaluation.lanes import Turns, agent_named, board_now, commons_game, refuse_trained_in
 from cprl.experiment import presets
 from cprl.measuring import social
 from cprl.measuring.evaluate import Policy
 from cprl.measuring.metrics import title
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import Scripted
+from cprl.runs.episodes import read_rows
 from cprl.system.defaults import PLAY_SEED
 from cprl.system.output import OUT, console, say
 from cprl.system.working import working
@@ -50,7 +57,14 @@ KEYS: Final = {
 }
 """The action of each key, and what it is called."""
 QUIT: Final = "quit"
+HELP: Final = "?"
+_ARROWS: Final = {"A": "w", "B": "s", "C": "e", "D": "q"}
+"""The key for each arrow, by the last letter that a terminal sends: up, down, right, left."""
+_ENDING: Final = "\x1b\x04"
+"""Esc, and the end of a text."""
 _PROMPT: Final = "keys> "
+_BY_LINE: Final = f"Enter plays a line of them and alone stays, {HELP} prints them, {QUIT} ends"
+_BY_KEY: Final = f"arrows step and turn, Enter stays, {HELP} prints them, Esc ends"
 
 
 def help_of(game: Game) -> str:
@@ -66,6 +80,11 @@ class Session:
         others: writes the actions of all agents; that of the person's agent is replaced.
         decision: what the person decides, see `Game.decisions`; None for what `others` write.
     """
+
+    about_others: str = ""
+    """Who the others are, in sentences."""
+    usual: str = ""
+    """What agents get in whole episodes of this game, in a sentence; "" where that is not known."""
 
     def __init__(self, env: EnvBase, others: Policy, *, agent: int = 0, decision: int | None = None) -> None:
         commons = commons_of(env)
@@ -155,23 +174,35 @@ def happened(session: Session, turn: StepOutput) -> Iterator[str]:
         yield f"you tag {whom}" if by == me else f"agent {by} tags {whom}"
 
 
-def play_in_terminal(session: Session, read_line: Callable[[], str] | None = None) -> None:
-    """Play the episode: a line of keys is played key by key; `quit`, Ctrl-C or the end of input ends it.
+def play_in_terminal(session: Session, read_keys: Callable[[], str] | None = None) -> None:
+    """Play the episode; in a terminal each key plays at once, through a pipe a line of keys one by one.
 
     Args:
-        read_line: returns a line with its newline, or "" at the end; by default that of standard input.
+        read_keys: returns a line of keys with its newline, or "" at the end; by default what is typed.
     """
-    read_line = read_line or sys.stdin.readline
+    if read_keys is not None:
+        _play(session, read_keys, _BY_LINE)
+    elif sys.stdin.isatty():
+        with _single_keys() as pressed:
+            _play(session, pressed, _BY_KEY)
+    else:
+        _play(session, sys.stdin.readline, _BY_LINE)
+
+
+def _play(session: Session, read_keys: Callable[[], str], more: str) -> None:
     boards = console(width=None if OUT.isatty() else 4 * session.game.map.width + 120)
-    say(f"You are agent {session.agent}. Keys: {help_of(session.game)}; several in a line, then Enter.")
-    say(f"Enter alone stays; {QUIT} ends.")
+    say(f"You are agent {session.agent}. {session.about_others}".rstrip())
+    _say_keys(session, more)
     while True:
         boards.print(board_text(session), soft_wrap=True)
         say(state(session))
-        if session.has_ended or not _ask_and_play(session, read_line):
+        if session.has_ended or not _ask_and_play(session, read_keys, more):
             break
     ending = "no apple is left" if session.stock == 0 else "time is over"
     say(f"The end: {ending if session.has_ended else f'stopped after turn {session.turn:,}'}.")
+    if session.has_ended and session.usual:
+        apples = session.harvested[session.agent]
+        say(f"You got {apples} apple{'' if apples == 1 else 's'}. {session.usual}")
     for name, value in session.metrics().items():
         number = "undefined" if isnan(value) else f"{value:.4g}"
         say(f"{name:17s} {number:>9s}  {title(name)}")
@@ -179,30 +210,66 @@ def play_in_terminal(session: Session, read_line: Callable[[], str] | None = Non
         say("No turn was played, so there is nothing to measure.")
 
 
-def _ask_and_play(session: Session, read_line: Callable[[], str]) -> bool:
-    """Play the next line whose keys are known; False where the person leaves."""
+def _say_keys(session: Session, more: str) -> None:
+    """Print the keys in lines that break between keys alone."""
+    keys = f"Keys: {help_of(session.game)}, {more}."
+    joined = ", ".join(key.replace(" ", "\xa0") for key in keys.split(", "))
+    width = console().width if OUT.isatty() else 80
+    for line in wrap(joined, width, break_on_hyphens=False):
+        say(line.replace("\xa0", " "))
+
+
+def _ask_and_play(session: Session, read_keys: Callable[[], str], more: str) -> bool:
+    """Play the next keys that are known; False where the person leaves."""
     while True:
         OUT.write(_PROMPT)
         OUT.flush()
         try:
-            line = read_line()
+            keys = read_keys()
         except KeyboardInterrupt:
-            line = ""
-        if not sys.stdin.isatty() or not line:
-            say(line.rstrip("\n"))
-        typed = line.strip() or "."
-        if not line or typed == QUIT:
+            keys = ""
+        say(keys.rstrip("\n"))
+        typed = keys.strip() or "."
+        if not keys or typed == QUIT:
             return False
+        if typed == HELP:
+            _say_keys(session, more)
+            continue
         unknown = [key for key in typed if KEYS.get(key, ("",))[0] not in session.game.actions]
         if not unknown:
             break
-        say(f"key is {unknown[0]!r}; allowed: {help_of(session.game)}, or {QUIT}; nothing was played")
+        say(f"key is {unknown[0]!r}; allowed: {help_of(session.game)}; nothing was played")
     for key in typed:
         for event in happened(session, session.act(KEYS[key][0])):
             say(f"turn {session.turn:,}: {event}")
         if session.has_ended:
             break
     return True
+
+
+@contextmanager
+def _single_keys() -> Iterator[Callable[[], str]]:
+    """Make the terminal hand over keys as they are pressed, without showing them."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        yield lambda: keys_of(msvcrt.getwch())
+        return
+    import termios
+    import tty
+
+    before = termios.tcgetattr(sys.stdin)
+    tty.setcbreak(sys.stdin, termios.TCSADRAIN)  # by default what is typed already would be lost
+    try:
+        yield lambda: keys_of(os.read(sys.stdin.fileno(), 64).decode(errors="replace"))
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+
+
+def keys_of(pressed: str) -> str:
+    """Return the keys of what a terminal sent: arrows step and turn; "" for Esc, and if nothing was sent."""
+    keys = re.sub(r"\x1b[\[O]([ABCD])", lambda arrow: _ARROWS[arrow[1]], pressed)
+    return "" if any(key in _ENDING for key in keys) else keys
 
 
 def board_text(session: Session) -> Text:
@@ -261,10 +328,10 @@ def open_session(
     *,
     agent: int = 0,
     others: str | None = None,
-    replica: int = 0,
+    replica: int | None = None,
     variant: Variant = "published",
     steps: int | None = None,
-    seed: int = PLAY_SEED,
+    seed: int | None = None,
     decision: int | None = None,
     allow: Sequence[str] = (),
 ) -> Session:
@@ -273,25 +340,62 @@ def open_session(
     Args:
         others: the directory of a run, whose agents with the same indices play, or a scripted policy; by
             default the agents of the run that `board` names, else "greedy".
-        replica: the index of the run's replica whose agents play.
+        replica: the index of the run's replica whose agents play; by default a typical one, see
+            `cprl.evaluation.fresh.typical_replica`.
         steps: turns of the episode at most, in place of those of the game.
-        seed: of all random numbers; equal seeds and equal actions give equal episodes.
+        seed: of all random numbers, none that the others were trained with; by default 40011, or the next
+            with which they were not. Equal seeds and equal actions give equal episodes.
         decision: what the person decides in a game with votes or elections, 0 to `Game.decisions` - 1; None
             for a choice by chance, as of a scripted agent.
     """
     trust(*allow)
     game, run = board_named(board, variant)
+    is_whole = steps is None and others in (None, board)
     if steps is not None:
         game = replace(game, rules=replace(game.rules, episode_steps=steps))
     agent = checked("agent", agent, Annotated[int, Range(0, game.agents - 1)])
     others = others if others is not None else "greedy" if run is None else board
     if replica and others in SCRIPTED_POLICIES:
         raise ValueError(f'replica is {replica}, and others is "{others}"; allowed: with the agents of a run')
-    specs = [agent_named(others, index, replica=replica, name="others") for index in range(game.agents)]
+    stored = _run_of(others, board, run)
+    runs = [] if stored is None else [stored]
+    if seed is None:
+        seed = fresh_seed(runs, PLAY_SEED)
+    refuse_trained_in(seed, runs)
+    if replica is None and stored is not None:
+        replica = typical_replica(stored)
+    specs = [agent_named(others, index, replica=replica or 0, name="others") for index in range(game.agents)]
     specs[agent] = Scripted("random")
     if run is None:
         env = make_env(game, seed=seed)
     else:
         env = replace(run, experiment=replace(run.experiment, game=game)).env(seed=seed)
     population = Population(env, specs, seed=seed)
-    return Session(env, population.policy(1), agent=agent, decision=decision)
+    session = Session(env, population.policy(1), agent=agent, decision=decision)
+    if stored is not None:
+        known = averages_in_words(stored)
+        session.about_others = f"The others are of replica {replica}. {known}".rstrip()
+        session.usual = _usual(stored, agent) if is_whole else ""
+    return session
+
+
+def _run_of(others: str, board: str, run: LoadedRun | None) -> LoadedRun | None:
+    """The run whose agents play; None for scripted ones, and where there is none."""
+    if others == board:
+        return run
+    return load(others) if others not in SCRIPTED_POLICIES and Path(others).is_dir() else None
+
+
+def _usual(run: LoadedRun, agent: int) -> str:
+    """What an agent gets on average in the run's own evaluation, trained and at random; "" where that is not
+    known."""
+    apples = []
+    for policy in ("trained", "random"):
+        path = run.path / "evaluation" / f"{policy}.parquet"
+        table = read_rows(path) if run.networks and path.is_file() else None
+        if table is None or "harvest" not in table.column_names:
+            return ""
+        harvest = table.filter(pc.field("agent") == agent)["harvest"]
+        apples.append(f"{pc.mean(harvest).as_py():,.0f}")
+    trained, random = apples
+    return f"On average trained agent {agent} gets {trained}, and {random} where all act at random."

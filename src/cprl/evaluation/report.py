@@ -14,7 +14,7 @@ from markdown_it import MarkdownIt
 from cprl.commons.game import Game
 from cprl.commons.readable import growth_of, meaning_of, rule_of, tag_of
 from cprl.evaluation.evaluate import evaluate_run, run_table
-from cprl.evaluation.film import fresh_episode
+from cprl.evaluation.fresh import fresh_episode
 from cprl.evaluation.show import Page, page, shown
 from cprl.measuring.metrics import with_unit
 from cprl.measuring.series import Values
@@ -74,7 +74,7 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
     game, name = run.game, legible(run.experiment.name.replace("_", " "))
     evaluation = evaluate_run(run, episodes=episodes, seed=seed)
     is_commons = isinstance(game, Game)
-    data = shown([fresh_episode(run, replica=run.replicas[0])])[0] if is_commons else None
+    data = shown([fresh_episode(run)])[0] if is_commons else None
     before = [growth_of(game)] if is_commons else []
     curves = _curves(run)
     has_course = {"collective_return", "survival_steps"} <= set(curves)
@@ -107,13 +107,14 @@ def _curves(run: LoadedRun) -> dict[str, Values]:
 
 
 def _rules(game: Game) -> str:
-    """The institutions, what a tag does and the rules that differ from the defaults, as HTML."""
+    """The institutions in words, what a tag does, and which settings differ from the defaults, as HTML."""
     lines = [
         "## Rules",
         "",
         f"{game.agents} agents on a board of {game.map.height} x {game.map.width} cells.",
+        "",
+        *(f"- **{rule_of(one)}**: {meaning_of(one, game)}" for one in game.institutions),
     ]
-    lines += ["", *(f"- **{rule_of(one)}**: {meaning_of(one, game)}" for one in game.institutions)]
     tag = tag_of(game)
     lines += ["", f"{tag[:1].upper()}{tag[1:]}."] * bool(tag)
     return _html("\n".join(lines)) + _changed(game)

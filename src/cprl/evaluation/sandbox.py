@@ -8,6 +8,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from html import escape
@@ -23,7 +24,7 @@ from urllib.parse import parse_qsl, urlsplit
 
 from cprl.commons.game import Game
 from cprl.commons.published import game as published_game
-from cprl.evaluation.film import fresh_episode
+from cprl.evaluation.fresh import fresh_episode
 from cprl.evaluation.show import page, shown
 from cprl.experiment import Experiment
 from cprl.population import Scripted
@@ -32,6 +33,7 @@ from cprl.runs.weights import save_weights
 from cprl.system.defaults import SANDBOX_EPISODES as EPISODES
 from cprl.values import Positive, Range, Value, checked, hints_of
 
+FOR_TRAINED: Final = "changes nothing for scripted agents"
 Board = Literal["commons", "two_complex", "single_complex", "single_basic"]
 _RECIPE: Final = '''\
 """A commons from the sandbox of cprl."""
@@ -122,12 +124,24 @@ class Sliders(Value, stored=False):
         )
         return text if used else text.replace("from cprl.institutions import \n", "")
 
+    @property
+    def rules(self) -> str:
+        """The rules in a line, as a title says them."""
+        parts = [f"quota {self.quota:g}"] * bool(self.quota) + [f"tax {self.tax:g}"] * bool(self.tax)
+        parts += ["sanctions"] * bool(self.sanctions)
+        growth = f", growth {self.regrowth:g}" if self.regrowth != 1 else ""
+        return f"{self.agents} agents, {' and '.join(parts) or 'no rule'}{growth}, sight {self.sight}"
+
     def game(self) -> Game:
         """The game of the recipe."""
         namespace: dict[str, Any] = {"__name__": "sandbox"}
         exec(self.recipe(), namespace)
         game: Game = namespace["game"]()
         return game
+
+
+class SupersededError(Exception):
+    """A question that is no longer asked."""
 
 
 class Sandbox:
@@ -143,25 +157,40 @@ class Sandbox:
         self._temporary = TemporaryDirectory()
         self.folder = Path(self._temporary.name) if folder is None else folder
         self.episodes = checked("episodes", episodes, Positive)
-        self._lock = Lock()
+        self._playing = Lock()
+        self._changing = Lock()
+        """Of what is asked and trained."""
+        self._asked = 0
+        """Questions for an episode so far."""
         self._training: tuple[Path, subprocess.Popen[bytes]] | None = None
         self._trained: Path | None = None
         """The last run that ended well."""
+        self._learned_under: dict[Path, str] = {}
+        """The rules of each training."""
         self.server = ThreadingHTTPServer(("127.0.0.1", port), partial(_Handler, self))
         self.address = f"http://127.0.0.1:{self.server.server_port}/"
 
     def close(self) -> None:
         """End a training that runs, and stop serving."""
-        if self._training is not None:
-            _, process = self._training
-            process.terminate()
-            process.wait()
+        with self._changing:
+            if self._training is not None:
+                _, process = self._training
+                process.terminate()
+                process.wait()
         self.server.server_close()
         self._temporary.cleanup()
 
     def play(self, sliders: Sliders, *, trained: bool) -> dict[str, Any]:
-        """The data of `show.html` about an episode of scripted agents, and beside it one of trained ones."""
-        with self._lock:
+        """The data of `show.html` about an episode of scripted agents, and beside it one of trained ones.
+
+        Raises a SupersededError, and plays nothing, where another question has come while it waited.
+        """
+        with self._changing:
+            self._asked += 1
+            number = self._asked
+        with self._playing:
+            if number != self._asked:
+                raise SupersededError("a later question is answered instead")
             game, greedy = sliders.game(), min(sliders.greedy, sliders.agents)
             agents = (Scripted("greedy"),) * greedy + (Scripted("sustainable"),) * (game.agents - greedy)
             experiment = Experiment(name="scripted", game=game, agents=agents, episodes=1, replicas=1)
@@ -170,23 +199,28 @@ class Sandbox:
                 save_weights(start_run(run, "scripted", experiment.to_recipe), {})
                 runs = {f"{greedy} greedy, {game.agents - greedy} restrained": run}
                 if trained and self._trained is not None:
-                    runs["Trained"] = self._trained
-                data, _ = shown([fresh_episode(run) for run in runs.values()], list(runs))
+                    runs[f"Trained with {self._learned_under[self._trained]}"] = self._trained
+                fresh = [fresh_episode(run, replica=0, episode=0) for run in runs.values()]
+                data, _ = shown(fresh, list(runs))
+        data["populations"][0]["which"] = ""  # scripted agents have no replicas to choose from
         return data
 
     def train(self, sliders: Sliders) -> None:
         """Begin to train; raises a ValueError while a training runs."""
-        if self.state()["state"] == "training":
-            raise ValueError("a training runs; wait until it has ended")
-        self.folder.mkdir(parents=True, exist_ok=True)
-        names = (self.folder / f"sandbox-{number}" for number in count(1))
-        run = next(name for name in names if not name.with_suffix(".py").exists())
-        recipe = run.with_suffix(".py")
-        recipe.write_text(sliders.recipe(self.episodes), encoding="utf-8")
-        with run.with_suffix(".log").open("wb") as log:
-            words = [sys.executable, str(recipe), "--watch", "off", "--no-keep-checkpoint", "--out", str(run)]
-            process = subprocess.Popen(words, stdout=log, stderr=log, stdin=subprocess.DEVNULL)
-        self._training = run, process
+        with self._changing:
+            if self.state()["state"] == "training":
+                raise ValueError("a training runs; wait until it has ended")
+            self.folder.mkdir(parents=True, exist_ok=True)
+            names = (self.folder / f"sandbox-{number}" for number in count(1))
+            run = next(name for name in names if not name.with_suffix(".py").exists())
+            recipe = run.with_suffix(".py")
+            recipe.write_text(sliders.recipe(self.episodes), encoding="utf-8")
+            with run.with_suffix(".log").open("wb") as log:
+                words = [sys.executable, str(recipe), "--watch", "off", "--no-keep-checkpoint"]
+                words += ["--out", str(run)]
+                process = subprocess.Popen(words, stdout=log, stderr=log, stdin=subprocess.DEVNULL)
+            self._learned_under[run] = sliders.rules
+            self._training = run, process
 
     def state(self) -> dict[str, str]:
         """How the training is: "none", "training", "trained" or "failed", and its last line."""
@@ -232,6 +266,9 @@ class _Handler(BaseHTTPRequestHandler):
         except ValueError as error:
             self._send(str(error), "text/plain", HTTPStatus.BAD_REQUEST)
             return
+        except SupersededError as error:
+            self._send(str(error), "text/plain", HTTPStatus.CONFLICT)
+            return
         self._send(text, kind, HTTPStatus.OK)
 
     def _content(self, path: str, sliders: Sliders, *, trained: bool) -> tuple[str, str]:
@@ -247,11 +284,12 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _send(self, text: str, kind: str, status: HTTPStatus) -> None:
         content = text.encode()
-        self.send_response(status)
-        self.send_header("Content-Type", f"{kind}; charset=utf-8")
-        self.send_header("Content-Length", str(len(content)))
-        self.end_headers()
-        self.wfile.write(content)
+        with suppress(ConnectionError):  # of a browser that has left
+            self.send_response(status)
+            self.send_header("Content-Type", f"{kind}; charset=utf-8")
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
 
     def log_message(self, *arguments: Any) -> None:
         """Say nothing."""
@@ -268,16 +306,17 @@ def sandbox_page() -> str:
             "regrowth": ("apples grow, times as fast", 0.25),
             "sight": ("cells that agents see ahead", 1),
             "quota": ("quota, share of a sustainable harvest", 0.05),
-            "tax": ("tax, shared equally", 0.05),
-            "sanctions": ("graduated sanctions for tagging", 1),
+            "tax": (f"tax, shared equally; {FOR_TRAINED}", 0.05),
+            "sanctions": (f"sanctions for tagging; {FOR_TRAINED}", 1),
         }.items()
     )
     before = (
-        "<p>Move a slider: an episode is played by your rules at once. "
-        "Scripted agents do not mind what rules cost them; agents that are trained do.</p>"
+        "<p>Move a slider: an episode is played by your rules. The first quota, tax or sanction is compiled, "
+        "for about a minute, once. Scripted agents do not mind what rules cost them; agents that are trained "
+        "do.</p>"
         f'<div class="controls"><label>board <select name="board">{boards}</select></label>{sliders}</div>'
         '<button id="train">Train these</button> <button id="recipe">Copy as recipe</button> '
-        '<span id="said" class="faint" role="status"></span>'
+        '<span id="said" class="faint" role="status"></span><p id="results" role="status"></p>'
     )
     script = files("cprl.evaluation").joinpath("sandbox.js").read_text(encoding="utf-8")
     return page("A commons to play with", before, live=script)

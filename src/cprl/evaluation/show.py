@@ -35,14 +35,13 @@ from cprl.commons.maps import Map
 from cprl.commons.picture import EMPTY_SITE_COLOUR
 from cprl.commons.readable import NO_RULES, growth_of, legend_of, meaning_of, rules_of
 from cprl.envs.unwrap import commons_of
-from cprl.evaluation.film import Filmed, FreshEpisode, check_titles, fresh_episode, play_to_show, titles_of
-from cprl.evaluation.film_pictures import nice
+from cprl.evaluation.film import Filmed, check_titles, play_to_show, titles_of
+from cprl.evaluation.fresh import FreshEpisode, fresh_episodes, say_which
 from cprl.evaluation.lanes import commons_game
 from cprl.measuring.episodes import Episode
 from cprl.measuring.social import equality_of
 from cprl.population import learned
 from cprl.runs.files import refuse_to_write_over, write_atomically
-from cprl.system.defaults import FILM_SEED as SEED
 from cprl.system.working import working
 from cprl.training.agents import LoadedRun
 from cprl.values import refusal
@@ -65,14 +64,15 @@ def show(
     *,
     beside: Sequence[str | Path] = (),
     titles: Sequence[str] = (),
-    replica: int = 0,
-    episode: int = 0,
-    seed: int = SEED,
+    replica: int | None = None,
+    episode: int | None = None,
+    seed: int | None = None,
     allow: Sequence[str] = (),
 ) -> tuple["Page", tuple[Episode, ...]]:
     """Show an episode of a run's agents, beside the agents of other runs if there are any, as one HTML page.
 
-    It is the episode that `cprl.evaluation.film.film` records with the same numbers.
+    It is the episode that `cprl.evaluation.film.film` records with the same numbers, by default a typical
+    one, see `cprl.evaluation.fresh`; which one it is stands on the page.
 
     Args:
         out: the page, an .html, complete or absent; by default `show-<replica>-<episode>.html` in the
@@ -86,13 +86,17 @@ def show(
     Raises:
         FileExistsError: if the page exists.
     """
-    path = Page(Path(run) / f"show-{replica}-{episode}.html" if out is None else out)
     runs = (run, *beside)
     if len(runs) > MOST_RUNS:
         raise refusal("beside", f"{len(runs) - 1} runs", f"at most {MOST_RUNS - 1}")
     check_titles(tuple(titles), len(runs))
+    if out is not None:
+        Page(out).refuse()
+    fresh = fresh_episodes(runs, replica=replica, episode=episode, seed=seed, allow=allow)
+    by_default = Path(run) / f"show-{fresh[0].replica}-{fresh[0].episode}.html"
+    path = Page(by_default if out is None else out)
     path.refuse()
-    fresh = [fresh_episode(one, replica=replica, episode=episode, seed=seed, allow=allow) for one in runs]
+    say_which(fresh)
     data, filmed = shown(fresh, titles)
     path.write(page(_heading(fresh, data), begins(commons_game(fresh[0].run)), data))
     return path, tuple(one.episode for one in filmed)
@@ -107,11 +111,12 @@ def _heading(fresh: Sequence[FreshEpisode], data: dict[str, Any]) -> str:
     """The title of the population, or what differs between several."""
     if len(fresh) == 1:
         return str(data["populations"][0]["title"])
-    learners = {learned(population.run.specs) for population in fresh}
     runs = [population.run for population in fresh]
+    agents = {learned(run.specs) for run in runs}
     rules = {(run.game.rules, run.game.institutions, run.experiment.own_rules) for run in runs}
-    alike = "Same" if len(learners) == 1 else "Different"
-    return f"{alike} learners, {'the same rules' if len(rules) == 1 else 'different rules'}"
+    alike = "Same" if len(agents) == 1 else "Different"
+    who = "learners" if all(run.networks for run in runs) else "agents"
+    return f"{alike} {who}, {'the same rules' if len(rules) == 1 else 'different rules'}"
 
 
 class Page(type(Path())):  # type: ignore[misc]
@@ -160,12 +165,11 @@ def shown(
     most = max(int(one.moments[-1].harvested.max()) for one in filmed)
     games = [commons_game(population.run) for population in fresh]
     populations = [_population(*each) for each in zip(titles or titles_of(fresh), fresh, filmed, strict=True)]
-    axis = max(game.rules.episode_steps for game in games)
     return {
         "populations": populations,
         "palette": _COLOURS,
-        "axis": axis,
-        "most": nice(most),
+        "axis": max(len(one.moments) - 1 for one in filmed),
+        "most": most,
         "legend": legend_of(games),
     }, filmed
 
@@ -183,6 +187,7 @@ def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, An
     lives = f"apples still grow after {last:,} turns"
     return {
         "title": title,
+        "which": fresh.words,
         "about": about(fresh.run),
         "outcome": dead if filmed.is_dead else lives,
         "isDead": filmed.is_dead,

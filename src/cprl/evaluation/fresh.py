@@ -1,0 +1,197 @@
+"""Fresh episodes of stored agents, which are filmed, shown and exported; and which of them is typical.
+
+The trained agents of a run may do well in one replica and badly in another: what is shown without a choice is
+an episode near the middle, and words say so, and what the others do.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import count
+from pathlib import Path
+from typing import Annotated, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from torchrl.envs import EnvBase
+
+from cprl.evaluation.evaluate import opened
+from cprl.evaluation.lanes import refuse_trained_in
+from cprl.measuring.evaluate import evaluate
+from cprl.policies.assignment import AgentPolicies
+from cprl.runs.episodes import read_rows
+from cprl.system.defaults import FILM_SEED as SEED
+from cprl.system.output import say
+from cprl.training.agents import LoadedRun
+from cprl.values import Natural, Range, Seed, checked
+
+EPISODES_TRIED: Final = 5
+"""The fresh episodes among which a typical one is looked for."""
+_MOST_LISTED: Final = 6
+"""Replicas whose averages a sentence lists one by one."""
+
+
+class FreshEpisode(NamedTuple):
+    """A fresh world of a run's game, and who plays in it."""
+
+    run: LoadedRun
+    env: EnvBase
+    """One world, with the run's transforms."""
+    policies: AgentPolicies
+    replica: int
+    episode: int
+    is_typical: bool = False
+    """Whether it was chosen as the one whose length is nearest to the median over replicas."""
+
+    @property
+    def words(self) -> str:
+        """Which episode it is, and what the trained agents of the run come to on average."""
+        known = averages_in_words(self.run)
+        if not self.is_typical:
+            return f"Replica {self.replica}, episode {self.episode}. {known}".rstrip()
+        averages = averages_of(self.run)
+        middle = "the median of the replicas" if len(averages) > 1 else "the average"
+        nearest = f"its board's life is nearest to {middle}, {_median(averages)[0]:,.0f} turns"
+        which = f"replica {self.replica}, episode {self.episode}"
+        return f"A typical episode ({which}): of the first {EPISODES_TRIED} {nearest}. {known}"
+
+
+def averages_of(run: LoadedRun) -> dict[int, tuple[float, float]]:
+    """Return how many turns the trained agents of each replica last and how many apples they pick, on average
+    over the run's own evaluation, by replica; {} of a run that has none, or in which nobody learned."""
+    path = run.path / "evaluation" / "trained.parquet"
+    names = ("survival_steps", "collective_return")
+    if not run.networks or not path.is_file():
+        return {}
+    table = read_rows(path)
+    if not {*names} <= {*table.column_names}:
+        return {}
+    means = table.group_by("replica").aggregate([(name, "mean") for name in names]).sort_by("replica")
+    turns, apples = (means[f"{name}_mean"].to_pylist() for name in names)
+    by_replica = zip(means["replica"].to_pylist(), zip(turns, apples, strict=True), strict=True)
+    return {replica: average for replica, average in by_replica if replica in run.replicas}
+
+
+def _median(averages: Mapping[int, tuple[float, float]]) -> tuple[float, float]:
+    """The medians over replicas of the turns and of the apples."""
+    turns, apples = np.median([*averages.values()], axis=0).tolist()
+    return turns, apples
+
+
+def averages_in_words(run: LoadedRun) -> str:
+    """Return the averages of all replicas in a sentence; "" where there are none."""
+    averages = averages_of(run)
+    if not averages:
+        return ""
+    turns, apples = (_listed(numbers) for numbers in zip(*averages.values(), strict=True))
+    of_replicas = f" of the {len(averages)} replicas" if len(averages) > 1 else ""
+    return f"The trained agents{of_replicas} last {turns} turns on average and pick {apples} apples."
+
+
+def _listed(numbers: Sequence[float]) -> str:
+    """Numbers in words; of many the least and the greatest."""
+    texts = [f"{number:,.0f}" for number in numbers]
+    if len(texts) > _MOST_LISTED:
+        return f"{min(numbers):,.0f} to {max(numbers):,.0f}"
+    return " and ".join(filter(None, [", ".join(texts[:-1]), texts[-1]]))
+
+
+def fresh_episode(
+    run: str | Path | LoadedRun,
+    *,
+    replica: int | None = None,
+    episode: int | None = None,
+    seed: int | None = None,
+    allow: Sequence[str] = (),
+) -> FreshEpisode:
+    """The world and the agents of an episode that is filmed, see `fresh_episodes`."""
+    (fresh,) = fresh_episodes([run], replica=replica, episode=episode, seed=seed, allow=allow)
+    return fresh
+
+
+def fresh_episodes(
+    runs: Sequence[str | Path | LoadedRun],
+    *,
+    replica: int | None = None,
+    episode: int | None = None,
+    seed: int | None = None,
+    allow: Sequence[str] = (),
+) -> list[FreshEpisode]:
+    """The worlds and the agents of episodes that are shown together; equal numbers give equal episodes.
+
+    Without `replica` and `episode` it is a typical one: of each run the replica whose average survival in the
+    run's own evaluation is nearest to the median over replicas, and of the first five episodes the one whose
+    lengths are nearest to these medians; the same world for all. Runs in which nobody learned, or without an
+    evaluation, show their first replica, and alone the first episode.
+
+    Args:
+        replica, episode: if one of them is given, the other is the first.
+        seed: of the worlds and all chance, none that a run was trained with; by default 20011, or the next
+            with which none was.
+    """
+    if episode is not None:
+        episode = checked("episode", episode, Annotated[int, Range(0, 2**32 - 1)])
+    if replica is not None:
+        replica = checked("replica", replica, Natural)
+    if seed is not None:
+        seed = checked("seed", seed, Seed)
+    loaded = [opened(run, allow) for run in runs]
+    if seed is None:
+        seed = fresh_seed(loaded)
+    refuse_trained_in(seed, loaded)
+    if replica is not None or episode is not None:
+        return [_fresh(run, replica, episode or 0, seed) for run in loaded]
+    replicas = [typical_replica(run) for run in loaded]
+    medians = [_median(averages) if (averages := averages_of(run)) else None for run in loaded]
+
+    def distances(tried: int) -> tuple[float, float]:
+        """How far an episode of all runs is from the medians of its turns, and of its apples."""
+        far = np.zeros(2)
+        for run, of_run, median in zip(loaded, replicas, medians, strict=True):
+            if median is not None:
+                far += _distance(_fresh(run, of_run, tried, seed), median)
+        turns, apples = far.tolist()
+        return turns, apples
+
+    typical = min(range(EPISODES_TRIED), key=distances) if any(medians) else 0
+    return [
+        _fresh(run, of_run, typical, seed)._replace(is_typical=median is not None)
+        for run, of_run, median in zip(loaded, replicas, medians, strict=True)
+    ]
+
+
+def fresh_seed(runs: Sequence[LoadedRun], first: int = SEED) -> int:
+    """Return the first seed from one on with which none of the runs was trained."""
+    trained = {run.experiment.seed for run in runs}
+    return next(seed for seed in count(first) if seed not in trained)
+
+
+def typical_replica(run: LoadedRun) -> int:
+    """Return the replica whose average survival is nearest to the median over replicas, of equal ones that
+    whose harvest is; the first of a run without an evaluation of learned agents."""
+    averages = averages_of(run)
+    if not averages:
+        return run.replicas[0]
+    turns, apples = _median(averages)
+    return min(averages, key=lambda one: (abs(averages[one][0] - turns), abs(averages[one][1] - apples)))
+
+
+def _fresh(run: LoadedRun, replica: int | None, episode: int, seed: int) -> FreshEpisode:
+    if replica is None:
+        replica = run.replicas[0]
+    if replica not in run.replicas:
+        replicas = ", ".join(map(str, run.replicas))
+        raise ValueError(f"replica is {replica}; allowed: {replicas}, the replicas of {run.path}")
+    env = run.env(1, seed=seed, first_world=episode)
+    return FreshEpisode(run, env, run.policy(replica, seed=seed + episode), replica, episode)
+
+
+def _distance(fresh: FreshEpisode, median: tuple[float, float]) -> NDArray[np.float64]:
+    """Play an episode; return how far its turns and its apples are from their medians, as shares of these."""
+    (played,) = evaluate(fresh.env, fresh.policies, explore=True)
+    reached = np.array([played.steps, played.metrics["collective_return"]])
+    return np.asarray(np.abs(reached - median) / np.maximum(1.0, median))
+
+
+def say_which(fresh: Sequence[FreshEpisode]) -> None:
+    """Print which episode of each run is shown, and what its agents come to on average."""
+    for one in fresh:
+        say(f"{f'{one.run.path}: ' if len(fresh) > 1 else ''}{one.words}")
