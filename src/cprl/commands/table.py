@@ -1,5 +1,6 @@
 """`cprl table`: compares any runs, or the runs of a study."""
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -51,6 +52,8 @@ def table(
 ) -> None:
     """Compares any runs, grouped by fields of their experiments, with intervals over replicas.
 
+    Ends with exit code 1 where a damaged run had to be left out; it is named.
+
     Args:
         runs: directories of runs, or of directories that hold them, with --by; or the directory of a study.
         by: the path of a field, e.g. game.rules.freeze-steps, agents.*.algorithm.settings.gamma or name; may
@@ -92,6 +95,7 @@ def table(
         study_table = _table_in(runs, reference, window)
     if csv:
         OUT.write(study_table.to_csv())
+        _exit_if_damaged(study_table)
         return
 
     from cprl.studies.tables.comparing import compared_cells, of_finished
@@ -108,6 +112,13 @@ def table(
     if out is not None:
         _write(study_table, compared, out)
         say(f"Written: {out}")
+    _exit_if_damaged(study_table)
+
+
+def _exit_if_damaged(table: "StudyTable") -> None:
+    """End with code 1 where a damaged run was left out, so that no script takes the table for whole."""
+    if any(run.is_damaged for run in table.lacking):
+        sys.exit(1)
 
 
 def _table_in(runs: Sequence[Path], reference: str | None, window: int | None) -> "StudyTable":

@@ -6,7 +6,7 @@ that are marked differ by Holm's method: with 95 % none of the marked ones is by
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from math import isnan
 from typing import Final, Literal
 
@@ -104,7 +104,11 @@ def compare(table: StudyTable, metric: str, *, part: str = TRAINING, last: int =
     checked("last", last, Positive)
     if part == TRAINING and last < table.window:
         raise refusal("last", last, f"at least {table.window}, the episodes of a window of the table")
-    return _compared(table, metric, part, last)
+    asked = metric, part, last
+    if asked not in table.comparisons:
+        table.comparisons[asked] = _compared(table, metric, part, last)
+    comparison: Comparison = table.comparisons[asked]
+    return comparison
 
 
 def metrics_of(table: StudyTable, metrics: Sequence[str] = ()) -> tuple[str, ...]:
@@ -118,7 +122,6 @@ def metrics_of(table: StudyTable, metrics: Sequence[str] = ()) -> tuple[str, ...
     return tuple(metrics) or (*usual, *filter(is_own, table.metrics))
 
 
-@lru_cache(maxsize=128)  # figures and texts of a table share what it says
 def _compared(table: StudyTable, metric: str, part: str, last: int) -> Comparison:
     reference, is_paired = table.design.reference, table.design.is_paired
     means = {name: _means(table, name, metric, part, last) for name in table.design.conditions}
