@@ -422,12 +422,12 @@ def test_differences_are_bold_that_differ_among_all_of_their_table(tmp_path):
     # 5 +- 1 and 41 +- 1 of 3 pairs: t is 8.66 and 71.0, p is 0.0131 and 0.0002; the equality is 0.5 in all.
     alone = cells([compare(table, "collective_return")], "differences")
     assert [row[2] for row in alone.rows] == ["**+5.00 [+2.52, +7.48]**", "**+41.0 [+38.5, +43.5]**"]
-    assert "Holm's method for 2 comparisons" in alone.note
+    assert "Holm's method for the 2 differences of this table" in alone.note
     metrics = "collective_return", "equality", "peace"
     several = cells([compare(table, metric) for metric in metrics], "differences")
     assert [row[2] for row in several.rows] == ["+5.00 [+2.52, +7.48]", "**+41.0 [+38.5, +43.5]**"]
     assert several.rows[0][3] == "+0 [+0, +0]"
-    assert "for 6 comparisons" in several.note
+    assert "for the 6 differences of this table" in several.note
     assert markdown(several)[-2:] == [several.note, ""]
 
 

@@ -99,18 +99,20 @@ def table(
         return
 
     from cprl.studies.tables.comparing import compared_cells, of_finished
+    from cprl.studies.tables.effects import effect_cells
     from cprl.terminal.tables import show
 
     last = LAST if compare.last is None else compare.last
     compared = compared_cells(study_table, compare.metric, part=compare.part, last=last)
-    show(map(of_finished, compared))
+    effects = effect_cells(study_table, compare.metric, part=compare.part, last=last)
+    show([*map(of_finished, compared), *effects])
     say(str(study_table))
     if summary:
         from cprl.studies.results import summarise_again
 
         say(f"Written: {summarise_again(study_table, runs[0], last=last)}")
     if out is not None:
-        _write(study_table, compared, out)
+        _write(study_table, [*compared, *effects], out)
         say(f"Written: {out}")
     _exit_if_damaged(study_table)
 
