@@ -1,5 +1,6 @@
 """Figures: everything drawn is in the legend, which lies beside the data; phases only in long trainings."""
 
+import re
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -258,6 +259,15 @@ def test_the_suffix_says_what_is_written_the_same_each_time(tmp_path):
     for path, look in (("a.jpg", {}), ("a.png", {"is_new": True}), ("b.png", {"width": "poster"})):
         with pytest.raises((ValueError, FileExistsError), match=r"path is|a\.png|width is"):
             a_line(tmp_path / path, **look)
+
+
+def test_every_id_in_an_svg_stands_once(tmp_path):
+    with style.drawing(tmp_path / "a.svg") as sheet:
+        for axes in sheet.panels(4, columns=2, high=10):
+            axes.plot([1, 2])
+    ids = re.findall(r' id="([^"]*)"', (tmp_path / "a.svg").read_text())
+    assert len(ids) == len(set(ids))
+    assert not [one for one in ids if one[0].isdigit()], "which no name in XML begins with"
 
 
 @pytest.mark.parametrize("name", ["pay_$1_or_$_", "$a$", r"\$5"])

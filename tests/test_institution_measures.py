@@ -214,6 +214,9 @@ def test_with_groups_inequality_within_and_between_them_is_measured():
     (episode,) = played(*an_episode(), institutions=[Levies(groups=((0,), (1,)))])
     assert episode.institutions["net_equality_within"] == 1.0
     assert episode.institutions["net_equality_between"] == pytest.approx(1 - 2 / 30)
+    curves = as_curves(as_table([episode], 0))
+    assert {"institutions/equality_between", "institutions/net_equality_within"} <= set(curves)
+    assert curves["institutions/net_equality_between"].item() == pytest.approx(1 - 2 / 30)
 
 
 def test_a_game_without_institutions_is_as_it_was():
@@ -289,16 +292,17 @@ def test_the_table_has_a_column_for_each_number_and_keeps_it(tmp_path):
     assert kept.column_names[first : first + len(expected)] == expected
     numbers = {"fines": [0.5, 1.5], "violations": [0, 2], "own_bites": [2, 0], "in_force_0": [0.25, 0.25]}
     assert kept.select(list(numbers)).to_pydict() == numbers
+    measured = {f"institutions/{name}": [value, value] for name, value in episode.institutions.items()}
+    np.testing.assert_equal(kept.select(list(measured)).to_pydict(), measured)
     without = as_table(played(turn(done=[[True]])), 0)
-    assert set(kept.column_names) - set(expected) <= set(without.column_names)
+    assert set(kept.column_names) - set(expected) - set(measured) <= set(without.column_names)
 
 
 def test_curves_and_logged_numbers_are_those_of_the_episode():
     (episode,) = played(*an_episode())
     curves = as_curves(as_table([episode], 0))
     for name, value in episode.institutions.items():
-        if name != "unjust_share_of_tags":  # a table does not say who tagged
-            np.testing.assert_allclose(curves[f"institutions/{name}"], [[value]], err_msg=name)
+        np.testing.assert_allclose(curves[f"institutions/{name}"], [[value]], err_msg=name)
     assert curves["institutions/in_force_0"].tolist() == [[0.25]]
     assert not any("inst" in name for name in as_curves(as_table(played(turn(done=[[True]])), 0)))
     numbers = numbers_of(episode, {}, ["ann", "bob"])

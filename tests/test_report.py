@@ -69,7 +69,9 @@ def test_a_report_of_a_study_has_question_expectation_answer_figure_and_tables(t
     question = re.search(r"\*\*Question\.\*\* (.*)", summary)[1]
     assert f"<strong>Question.</strong> {question}" in text
     assert "<strong>Expected before it was run.</strong>" in text
-    assert re.search(r"<strong>Answer\.</strong> Collective return, apples in .*Holm", text)
+    answer = text[text.index("<strong>Answer.</strong>") : text.index("<h2>Training</h2>")]
+    assert re.search(r"In 50 fresh episodes of the trained agents, beside .* Holm", answer)
+    assert "<li>collective return, apples:" in answer
     assert text.count('<img src="data:image/png;base64,') == len(re.findall(r"!\[", summary)) > 0
     numbers = [row for row in summary.splitlines() if row.startswith("| ")]
     first = numbers[1].split("|")[2:4]

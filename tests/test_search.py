@@ -212,6 +212,28 @@ def test_what_has_failed_has_no_value_and_is_tried_again_next_time(tmp_path):
     assert len(mended.points) == 8
 
 
+def test_a_search_all_of_whose_points_fail_tries_each_once(tmp_path):
+    class Failing(Counting):
+        def run(self, tasks):
+            self.names += [task.name for task in tasks]
+            yield from super().run(tasks)
+
+    few = Search(ONE, {FREEZE: [30, 50]}, points=4, sampler="random")
+    executor = Failing(fails=[30, 50])
+    result = searched(few, tmp_path, executor)
+    assert len(executor.names) == len(set(executor.names)) == len(result.failed) == 2
+    assert {point.value for point in result.points} == {None}
+
+
+def test_a_lock_of_optunas_that_a_killed_process_left_holds_nobody_up(tmp_path, monkeypatch):
+    searched(a_search(2), tmp_path)
+    lock = tmp_path / FOLDER / f"{JOURNAL}.lock"
+    lock.touch()
+    monkeypatch.setattr("time.sleep", lambda _: pytest.fail("Optuna waits for the lock"))
+    assert len(searched(a_search(3), tmp_path).points) == 3
+    assert not lock.exists()
+
+
 @pytest.mark.integration
 def test_a_value_is_the_mean_over_replicas_of_the_episodes_asked_for(tmp_path, monkeypatch):
     monkeypatch.setattr("cprl.studies.search.value_of", value_of)

@@ -360,6 +360,8 @@ def test_a_table_that_is_no_study_is_refused():
         ({"factors": [["a", {"distribution": "Normal", "low": 0, "high": 1}]]}, "Normal"),
         ({"experiment": {"name": "x"}}, "lacks game, agents"),
         ({"pairing": False}, "pairing"),
+        ({"replica": 99}, "no 'replica' .did you mean 'replicas'.*allowed: format, experiment"),
+        ({"made up": 1}, "no 'made up'; allowed"),
         ({"format": 3}, "format"),
     ):
         with pytest.raises(ValueError, match=message):

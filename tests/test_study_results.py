@@ -1,8 +1,10 @@
 """What comes out of a study: table, means, differences, phases, figures, summary; numbers worked by hand."""
 
+import gc
 import json
 import shutil
 import sys
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -188,6 +190,20 @@ def test_a_damaged_run_is_named_and_does_not_end_the_table(tmp_path, name):
     assert broken not in table.rows["run"].to_pylist()
 
 
+def test_cprl_table_ends_with_1_where_a_damaged_run_was_left_out(table_command, capsys):
+    write_study(STUDY, Path("runs"), ten_for_each_turn)
+    words = ["--by", TIME_OUT, "--metric", "collective_return"]
+    table_command(*words)
+    broken = trials_of(STUDY)[0].name
+    Path("runs", broken, "episodes.parquet").write_bytes(b"PAR1")
+    for more in (["--csv"], [*words[2:], "--out", "a.md"]):
+        with pytest.raises(SystemExit) as ended:
+            table_command(*words[:2], *more)
+        assert ended.value.code == 1
+    assert f"{broken}, 2 replicas, is damaged" in capsys.readouterr().out
+    assert Path("a.md").exists(), "what can be read is written"
+
+
 def test_a_run_with_fewer_episodes_than_its_experiment_is_named(tmp_path):
     (trial,) = trials_of(ONE)
     run = write_run(tmp_path / trial.name, replace(trial.experiment, episodes=20), lambda *_: 1)
@@ -365,6 +381,15 @@ def test_conditions_are_compared_by_the_last_episodes_and_pairs_of_replicas(pair
             compare(pairs, **{"metric": "collective_return", name: value})
 
 
+def test_a_table_that_was_compared_is_freed_with_its_last_name(tmp_path):
+    table = table_of(tmp_path, {TIME_OUT: [5, 25]})
+    assert compare(table, "equality") is compare(table, "equality")
+    alive = weakref.ref(table)
+    del table
+    gc.collect()
+    assert alive() is None
+
+
 def test_replicas_without_a_value_are_counted_and_pairs_are_those_that_both_have(tmp_path):
     def equality(replica, number):
         return NAN if replica == 1 or number == 39 else 0.25
@@ -398,12 +423,12 @@ def test_differences_are_bold_that_differ_among_all_of_their_table(tmp_path):
     # 5 +- 1 and 41 +- 1 of 3 pairs: t is 8.66 and 71.0, p is 0.0131 and 0.0002; the equality is 0.5 in all.
     alone = cells([compare(table, "collective_return")], "differences")
     assert [row[2] for row in alone.rows] == ["**+5.00 [+2.52, +7.48]**", "**+41.0 [+38.5, +43.5]**"]
-    assert "Holm's method for 2 comparisons" in alone.note
+    assert "Holm's method for the 2 differences of this table" in alone.note
     metrics = "collective_return", "equality", "peace"
     several = cells([compare(table, metric) for metric in metrics], "differences")
     assert [row[2] for row in several.rows] == ["+5.00 [+2.52, +7.48]", "**+41.0 [+38.5, +43.5]**"]
     assert several.rows[0][3] == "+0 [+0, +0]"
-    assert "for 6 comparisons" in several.note
+    assert "for the 6 differences of this table" in several.note
     assert markdown(several)[-2:] == [several.note, ""]
 
 

@@ -28,7 +28,7 @@ from cprl import Custom, Study, run_study
 from cprl.runs.checkpoints import FOLDER as CHECKPOINTS
 from cprl.runs.episodes import read_episodes, read_table
 from cprl.runs.files import LOCK_FILE, RunLock, RunLockedError, write_json
-from cprl.runs.recipe import start_run, write_circumstances
+from cprl.runs.recipe import read_recipe, start_run, write_circumstances
 from cprl.studies import InProcess, Processes, Ray, executors, progress, read_study, run
 from cprl.studies.progress import Overview, Progress, table_of
 from cprl.studies.results import write_results
@@ -336,6 +336,21 @@ def test_other_code_is_refused_where_another_process_makes_the_trial_and_unknown
     assert write_circumstances(run) == []
     run_study(study, tmp_path / "b", on=executor, progress=False, results=False)
     assert executor.names == []
+
+
+def test_nothing_is_moved_from_under_another_process_that_runs_a_trial_of_earlier_code(
+    tmp_path, write_module
+):
+    study = Study(OWN_CODE, {TIME_OUT: [5, 25]})
+    write_module("class Callback: ...")
+    runs = run_study(study, tmp_path, on=Written(study, 1.0), progress=False, results=False).runs
+    *_, last = (trial.name for trial in trials_of(study))
+    write_module("class Callback: apples = 2")
+    before = sorted(path.name for path in runs.iterdir())
+    with RunLock(runs / last), pytest.raises(RunLockedError, match=last):
+        run_study(study, tmp_path, progress=False)
+    assert sorted(path.name for path in runs.iterdir()) == before
+    assert not (tmp_path / "runs-earlier").exists()
 
 
 def test_code_that_was_edited_and_not_imported_again_is_what_a_recipe_keeps(tmp_path, write_module):
@@ -813,6 +828,27 @@ def test_runs_that_kept_nothing_or_differ_are_no_beginning(tmp_path):
     ran(other, tmp_path / "other", pool, keep_checkpoints=True)
     ran(study_of(3), tmp_path / "more", pool)
     assert not list(run_of(study_of(3), pool).glob("evaluation-*"))
+
+
+def test_the_recipe_of_each_finished_run_is_read_once_however_many_trials_begin(tmp_path, monkeypatch):
+    seen = []
+
+    def reads(run):
+        seen.append(run.name)
+        return read_recipe(run)
+
+    class Begun:
+        def run(self, tasks):
+            for task in tasks:
+                assert task.begin() is None
+                yield Outcome(task.name, "failed", "is not trained here")
+
+    for number in range(3):
+        write_run(tmp_path / "pool" / f"other-{number}", replace(EXPERIMENT, seed=number), lambda *_: 1.0)
+    monkeypatch.setattr("cprl.studies.trials.read_recipe", reads)
+    study = Study(EXPERIMENT, {TIME_OUT: [1, 2, 3, 4]})
+    run_study(study, tmp_path / "study", runs=tmp_path / "pool", on=Begun(), progress=False, results=False)
+    assert sorted(name for name in seen if name.startswith("other")) == ["other-0", "other-1", "other-2"]
 
 
 @pytest.mark.integration

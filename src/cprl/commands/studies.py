@@ -320,7 +320,7 @@ def carry_out(study: "Study", options: StudyOptions, command: Sequence[str]) -> 
     executor = executor_of(options)
     if options.dry_run:
         return _list(study, options)
-    run = partial(run_study, study, only=options.only, keep_checkpoints=options.keep_checkpoints)
+    run = partial(run_study, study, only=options.only or None, keep_checkpoints=options.keep_checkpoints)
     result = _run(run, options, executor, command)
     _say_result(result, command, options.last)
     return result.out
@@ -349,7 +349,7 @@ def _list(study: "Study", options: StudyOptions) -> Path:
 
     out = directory_of(study, options.out)
     runs = out / RUNS if options.runs is None else options.runs
-    overview = Overview(trials_with(trials_of(study, runs), options.only), runs, out / STATUS)
+    overview = Overview(trials_with(trials_of(study, runs), options.only or None), runs, out / STATUS)
     now = overview.look()
     if now.counts["unfinished"]:  # those that run say something new within a second
         time.sleep(1.5 * BEAT_S)

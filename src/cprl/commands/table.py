@@ -1,5 +1,6 @@
 """`cprl table`: compares any runs, or the runs of a study."""
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -51,6 +52,8 @@ def table(
 ) -> None:
     """Compares any runs, grouped by fields of their experiments, with intervals over replicas.
 
+    Ends with exit code 1 where a damaged run had to be left out; it is named.
+
     Args:
         runs: directories of runs, or of directories that hold them, with --by; or the directory of a study.
         by: the path of a field, e.g. game.rules.freeze-steps, agents.*.algorithm.settings.gamma or name; may
@@ -92,22 +95,32 @@ def table(
         study_table = _table_in(runs, reference, window)
     if csv:
         OUT.write(study_table.to_csv())
+        _exit_if_damaged(study_table)
         return
 
     from cprl.studies.tables.comparing import compared_cells, of_finished
+    from cprl.studies.tables.effects import effect_cells
     from cprl.terminal.tables import show
 
     last = LAST if compare.last is None else compare.last
     compared = compared_cells(study_table, compare.metric, part=compare.part, last=last)
-    show(map(of_finished, compared))
+    effects = effect_cells(study_table, compare.metric, part=compare.part, last=last)
+    show([*map(of_finished, compared), *effects])
     say(str(study_table))
     if summary:
         from cprl.studies.results import summarise_again
 
         say(f"Written: {summarise_again(study_table, runs[0], last=last)}")
     if out is not None:
-        _write(study_table, compared, out)
+        _write(study_table, [*compared, *effects], out)
         say(f"Written: {out}")
+    _exit_if_damaged(study_table)
+
+
+def _exit_if_damaged(table: "StudyTable") -> None:
+    """End with code 1 where a damaged run was left out, so that no script takes the table for whole."""
+    if any(run.is_damaged for run in table.lacking):
+        sys.exit(1)
 
 
 def _table_in(runs: Sequence[Path], reference: str | None, window: int | None) -> "StudyTable":

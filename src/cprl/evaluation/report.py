@@ -3,8 +3,9 @@
 import json
 import re
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
+from math import isnan
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -16,19 +17,28 @@ from cprl.commons.readable import growth_of, meaning_of, rule_of, tag_of
 from cprl.evaluation.evaluate import evaluate_run, run_table
 from cprl.evaluation.fresh import fresh_episode
 from cprl.evaluation.show import Page, page, shown
-from cprl.measuring.metrics import with_unit
+from cprl.measuring.metrics import title, unit
 from cprl.measuring.series import Values
+from cprl.measuring.statistics import Estimate, form_for
 from cprl.population import learned
 from cprl.runs.course import course_of
 from cprl.runs.curves import curves_of
 from cprl.studies.results import SUMMARY
-from cprl.studies.tables.comparing import compare, differing, metrics_of
-from cprl.studies.tables.table import EVALUATION, StudyTable
+from cprl.studies.tables.comparing import (
+    Family,
+    Place,
+    compare,
+    differences_in,
+    family_of,
+    metrics_of,
+)
+from cprl.studies.tables.effects import effects_of, estimated
+from cprl.studies.tables.table import EVALUATION, NET, StudyTable
 from cprl.system.defaults import SEED, STUDY_TABLE
 from cprl.system.output import legible
 from cprl.system.working import working
 from cprl.terminal.figures import training_curve
-from cprl.terminal.tables import markdown
+from cprl.terminal.tables import cell, markdown
 from cprl.training.agents import LoadedRun, load
 
 _LARGEST_SVG_BYTES: Final = 300_000
@@ -170,20 +180,65 @@ def _of_study(folder: Path) -> str:
 
 
 def _answer(table: StudyTable) -> str:
-    """Which conditions differ from the reference in the first metric, in a sentence; "" without any."""
+    """What differs in the episodes of the evaluation: of a grid the effects of its factors, else conditions
+    from the reference; "" without any.
+
+    It is about income where money moves, and then about the harvest too; else about the first metric.
+    """
     if not table.metrics or len(table.design.conditions) < 2:
         return ""
-    comparison = compare(table, metrics_of(table)[0], part=EVALUATION)
-    differ = {condition for _, condition in differing([comparison])}
-    said: dict[str, list[str]] = {"more": [], "less": [], "no difference shown": []}
-    for one in comparison.conditions:
-        if one.difference is not None:
-            kind = "more" if one.difference.value > 0 else "less"
-            kind = kind if one.condition in differ else "no difference shown"
-            said[kind].append(f"{one.condition} ({one.difference.value:+,.3g})")
-    parts = [f"{kind}: {', '.join(names)}" for kind, names in said.items() if names]
-    what = f"{with_unit(comparison.metric)} in {comparison.episodes_text}, beside {comparison.reference}"
-    return f"{what[0].upper()}{what[1:]}: {'; '.join(parts)} (Holm's method over all conditions)."
+    metrics = metrics_of(table, part=EVALUATION)
+    comparisons = {metric: compare(table, metric, part=EVALUATION) for metric in metrics}
+    has_income = {NET, "collective_return"} <= set(metrics)
+    asked = {NET: _INCOME, "collective_return": _HARVEST} if has_income else {metrics[0]: title(metrics[0])}
+    unit_of = "apples" if has_income else unit(metrics[0])
+    first = comparisons[metrics[0]]
+    beside = f"beside {cell(first.reference)}, {first.pairing_text}"
+    family = family_of(differences_in(list(comparisons.values())))
+    tests = f"{family.tests} differences of their table below"
+    parts = []
+    for metric, words in asked.items():
+        differences = differences_in([comparisons[metric]])
+        if effects_of(table):
+            effects = estimated(table, comparisons[metric])
+            differences = {(metric, name): one for name, one in effects.estimates.items()}
+            family = effects.family
+            beside = "effects of each factor over all cells of the grid, paired by replica"
+            tests = f"{family.tests} effects on a metric"
+        parts += [f"- {words}:", *_said(differences, family, unit_of)]
+    what = f"In {first.episodes_text}, {beside}"
+    what += f"; by Holm's method for the {tests}:" if family.tests else ":"
+    return "\n".join([what, "", *parts])
+
+
+_INCOME: Final = "**Income** of all agents together (harvest - fines + transfers), apples"
+_HARVEST: Final = "**Harvest** (collective return), apples"
+_NONE: Final = "no difference shown"
+_ALONE: Final = "not shown among so many, though it would be alone"
+_UNTOLD: Final = "cannot be told, as one replica has no interval"
+
+
+def _said(differences: Mapping[Place, Estimate | None], family: Family, unit_of: str) -> list[str]:
+    """Lines on which differences are more and less than 0; of those not shown, how large one would have to
+    be."""
+    said: dict[str, list[str]] = {kind: [] for kind in ("more", "less", _NONE, _ALONE, _UNTOLD)}
+    for place, one in differences.items():
+        if one is None:
+            continue
+        text = f"{cell(place[1])} {one:+}"
+        half = (one.high - one.low) / 2
+        if place in family.marked:
+            kind = "more" if one.value > 0 else "less"
+        elif isnan(half):
+            kind = _UNTOLD
+        elif abs(one.value) > half:
+            kind = _ALONE
+        else:
+            kind = _NONE
+            size = f"{half:{form_for(one.value, one.low, one.high)}} {unit_of}".rstrip()
+            text += f" (differences below {size} would not show)" if half else ""
+        said[kind].append(text)
+    return [f"  - {kind}: {'; '.join(texts)}" for kind, texts in said.items() if texts]
 
 
 def _html(text: str) -> str:

@@ -26,8 +26,7 @@ SMOOTHED_EPISODES: Final = 100
 def curves_of(run: Path, *, last: int | None = None) -> dict[str, Values]:
     """Read every metric that a run's game reports, and each agent's return as `return_0` and so on.
 
-    Those of institutions are there as `institutions/fines` and so on, but for the share of unjust tags, since
-    a table does not say who tagged, and for groups.
+    Those of institutions are there as `institutions/fines` and so on.
 
     Args:
         last: of each replica only the last episodes, see `last_of`; by default all.
@@ -58,7 +57,7 @@ def as_curves(table: pa.Table, *, last: int | None = None) -> dict[str, Values]:
     curves = {name: values(name)[..., 0].copy() for name in metrics_in(table.schema)}
     returns = values("return")
     curves |= {f"return_{number}": returns[..., number].copy() for number in np.unique(agent)}
-    return curves | _of_institutions(table.column_names, values)
+    return _of_institutions(table.column_names, values) | curves
 
 
 def worlds_of(table: pa.Table) -> Numbers:
@@ -149,7 +148,11 @@ def net_of(curves: Mapping[str, Values]) -> Values:
 
 
 def _of_institutions(names: Sequence[str], values: Callable[[str], Values]) -> dict[str, Values]:
-    """The curves of institutions, [R, E] by name; none for a game without them."""
+    """The curves of institutions, [R, E] by name; none for a game without them.
+
+    Tables of before 0.1.0 have no column for their metrics: these are computed from the columns that they
+    have, but for the share of unjust tags and for groups.
+    """
     if not {*names} & {*OF_INSTITUTIONS}:
         return {}
 

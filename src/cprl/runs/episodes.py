@@ -376,6 +376,7 @@ def _columns(episode: Episode, replica: int | None = None) -> dict[str, Any]:
     if episode.in_force is not None:
         values |= {f"in_force_{place}": value for place, value in enumerate(episode.in_force.tolist())}
     values |= episode.metrics
+    values |= {f"institutions/{name}": value for name, value in episode.institutions.items()}
     return {name: np.broadcast_to(value, agents.shape) for name, value in values.items()}
 
 

@@ -6,7 +6,7 @@ random play in the worlds of the evaluation.
 """
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import combinations
 from math import isclose, nan
@@ -26,8 +26,10 @@ from cprl.studies.tables.comparing import (
     Compared,
     Comparison,
     Kind,
+    Place,
     compare,
-    differing,
+    differences_in,
+    family_of,
     metric_title,
     metrics_of,
 )
@@ -475,7 +477,7 @@ def heat_map(
     """Draw a metric over two factors: its mean with the number of replicas, and its difference.
 
     Levels are in the order of the conditions. Differences are from the reference; those that are not 0 by
-    Holm's method for all of the table have a star.
+    Holm's method for all that the table's summary tests have a star.
 
     Args:
         factors: two of its factors; any others are at the levels of the reference.
@@ -483,13 +485,15 @@ def heat_map(
     comparison = compare(table, metric, last=last)
     grid, elsewhere = _grid_of(table, factors)
     rows, columns = _levels_of(grid)
-    levels, differences = _numbers(comparison, grid)
+    tested = dict.fromkeys([*metrics_of(table), metric])
+    comparisons = [compare(table, other, last=last) for other in tested]
+    family = family_of(differences_in(comparisons))
+    levels, differences = _numbers(comparison, grid, family.marked)
     means = [value for value, _ in levels.values()]
     reach = max((abs(value) for value, _ in differences.values()), default=1.0) or 1.0
     maps = [(levels, Normalize(min(means, default=0), max(means, default=1)), "viridis", "mean (n)")]
     if differences:
-        title = "difference (* not 0 by Holm's method)"
-        maps.append((differences, Normalize(-reach, reach), "RdBu", title))
+        maps.append((differences, Normalize(-reach, reach), "RdBu", "difference"))
     with drawing(path, width=width, colours=SHADES) as sheet:
         side_by_side = sheet.fitting(len(maps), 5.5 * len(columns) + 12)
         panels = sheet.panels(len(maps), columns=side_by_side, high=_CELL * len(rows) + 8)
@@ -500,8 +504,12 @@ def heat_map(
             axes.set_title(title)
             sheet.figure.colorbar(matplotlib.cm.ScalarMappable(scale, name), ax=axes)
         sheet.title = f"{table.design.name}: {title_of(comparison)}"
-        differ = f"Differences from {table.design.reference}, {comparison.pairing_text}."
-        sheet.caption = f"{levels_note(comparison)} {differ}{elsewhere}{_not_run(table)}"
+        what = f"Means of {comparison.episodes_text}, then over n replicas."
+        differ = f" Differences from {table.design.reference}, {comparison.pairing_text}"
+        metrics = "metric" if len(tested) == 1 else f"{len(tested)} metrics"
+        star = f"; * not 0 by Holm's method for all {family.tests} of {metrics} together."
+        differ += star if family.tests else "."
+        sheet.caption = f"{what}{differ if differences else ''}{elsewhere}{_not_run(table)}"
     return Path(path)
 
 
@@ -552,9 +560,9 @@ Numbers = dict[str, tuple[float, str]]
 """The number and the text of a cell, by condition."""
 
 
-def _numbers(comparison: Comparison, grid: Grid) -> tuple[Numbers, Numbers]:
-    """The means and the differences of a map."""
-    levels, differences, marked = {}, {}, differing([comparison])
+def _numbers(comparison: Comparison, grid: Grid, marked: Collection[Place]) -> tuple[Numbers, Numbers]:
+    """The means and the differences of a map, with a star where they are marked."""
+    levels, differences = {}, {}
     for name in grid.values():
         compared = comparison.by_name[name]
         if compared.estimate is not None:

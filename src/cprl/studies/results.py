@@ -10,7 +10,8 @@ from typing import Final
 from cprl.runs.files import refuse_links, write_atomically
 from cprl.studies.figures import DRAWN, figures_of
 from cprl.studies.study import STATUS, Study
-from cprl.studies.tables.comparing import LAST, cells, compare, compared_cells, metrics_of
+from cprl.studies.tables.comparing import LAST, compare, compared_cells, metrics_of
+from cprl.studies.tables.effects import effect_cells
 from cprl.studies.tables.sources import study_table
 from cprl.studies.tables.table import EVALUATION, RANDOM, TRAINING, WINDOW, StudyTable
 from cprl.system.defaults import STUDY_TABLE
@@ -96,9 +97,9 @@ def write_summary(table: StudyTable, out: Path, *, last: int = LAST, again: str 
 
 
 def _compared(table: StudyTable, part: str, last: int) -> list[str]:
-    tables = compared_cells(table, part=part, last=last)
+    tables = compared_cells(table, part=part, last=last) + effect_cells(table, part=part, last=last)
     if part == EVALUATION:
-        tables.append(cells([compare(table, metric, part=RANDOM) for metric in metrics_of(table)]))
+        tables += compared_cells(table, part=RANDOM)[:1]
     lines = ["## Training" if part == TRAINING else "## Trained agents in fresh worlds", ""]
     for each in tables:
         lines += [each.heading, "", *markdown(each)]

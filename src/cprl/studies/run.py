@@ -16,7 +16,7 @@ from cprl.studies.status import PATIENCE_S, Status, is_silent
 from cprl.studies.study import FILE_NAME, RUNS, STATUS, Study, directory_of, levels_in
 from cprl.studies.tables.comparing import LAST
 from cprl.studies.tables.table import WINDOW, StudyTable
-from cprl.studies.trials import Outcome, Task, Trial, move_aside, trials_of
+from cprl.studies.trials import FinishedRuns, Outcome, Task, Trial, is_of_other_code, move_aside, trials_of
 from cprl.system.output import say
 from cprl.values import MOST_INT32, Range, checked, refusal
 
@@ -45,7 +45,7 @@ def run_study(
     *,
     on: Executor | None = None,
     runs: Path | str | None = None,
-    only: Sequence[str] = (),
+    only: Sequence[str] | None = None,
     keep_checkpoints: bool = False,
     progress: bool = True,
     results: bool = True,
@@ -63,7 +63,8 @@ def run_study(
         on: where trials are run, see `cprl.studies.executors`; by default in this process.
         runs: the directory of the runs, which several studies may share; by default `runs` in `out`.
         only: the conditions that are run now, by their names or by some of the levels in these, such as
-            "gamma=0.9" or "gamma=0.9, freeze_steps=5"; the others stay as they are. By default all are run.
+            "gamma=0.9" or "gamma=0.9, freeze_steps=5"; the others stay as they are. By default all are run;
+            of an empty list none.
         keep_checkpoints: whether runs keep the state of their trainings, buffers included, so that the same
             study with more episodes goes on from them, bit for bit.
         progress: whether a table of all trials is shown; lines where the output is not a terminal.
@@ -80,12 +81,14 @@ def run_study(
     out = directory_of(study, out)
     folder = out / RUNS if runs is None else Path(runs)
     trials = trials_of(study, folder)
+    finished = FinishedRuns(folder)
     tasks = [
         Task(
             trial=trial,
             runs=folder,
             status=Status(out / STATUS, trial.name),
             keep_checkpoint=keep_checkpoints,
+            finished=finished,
         )
         for trial in trials_with(trials, only)
     ]
@@ -93,7 +96,7 @@ def run_study(
     table = None
     with shared(study, out, progress=progress):
         folder.mkdir(parents=True, exist_ok=True)
-        failed = _run(tasks, on or InProcess(), study.name, progress=progress)
+        failed = _run(tasks, on or InProcess(), study.name, progress=progress) if tasks else ()
         if results and any(trial.state(folder) == "finished" for trial in trials):
             from cprl.studies.results import write_results  # with matplotlib
 
@@ -101,8 +104,10 @@ def run_study(
     return StudyResult(study, out, folder, tuple(trials), failed, table)
 
 
-def trials_with(trials: Sequence[Trial], only: Sequence[str]) -> list[Trial]:
-    """The trials of conditions that have one of some names, or else its levels; without any, all of them."""
+def trials_with(trials: Sequence[Trial], only: Sequence[str] | None) -> list[Trial]:
+    """Return the trials of conditions that have one of some names, or else its levels; with None, all."""
+    if only is None:
+        return list(trials)
     names = list(dict.fromkeys(trial.condition.name for trial in trials))
     chosen = set()
     for text in only:
@@ -111,7 +116,7 @@ def trials_with(trials: Sequence[Trial], only: Sequence[str]) -> list[Trial]:
         if not matching:
             raise refusal("only", text, f"a condition or levels of some: {'; '.join(names)}")
         chosen |= matching
-    return [trial for trial in trials if not only or trial.condition.name in chosen]
+    return [trial for trial in trials if trial.condition.name in chosen]
 
 
 @contextmanager
@@ -138,7 +143,7 @@ def _run(tasks: Sequence[Task], executor: Executor, title: str, *, progress: boo
     Those that another process runs come last: all others first, then it waits for these. Those that were made
     with other code of the user's own are moved aside and run anew."""
     runs, status = tasks[0].runs, tasks[0].status.folder
-    moved = [aside for task in tasks if (aside := move_aside(task.directory)) is not None]
+    moved = move_aside([task.directory for task in tasks if is_of_other_code(task.directory)])
     if moved and progress:
         places = f"{moved[0]}{f' and {len(moved) - 1} more' if moved[1:] else ''}"
         anew = f"{len(moved)} of {len(tasks)} trials are run anew, as the user's own code has changed"

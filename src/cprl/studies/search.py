@@ -202,6 +202,7 @@ class _Proposals:
     def __init__(self, search: Search, out: Path, optuna: Any) -> None:
         self._search, self._optuna, self._failed = search, optuna, optuna.trial.TrialState.FAIL
         path, backends = str(out / FOLDER / JOURNAL), optuna.storages.journal
+        Path(f"{path}.lock").unlink(missing_ok=True)  # of a process that died: whoever lives holds our lock
         # The other kind of lock wants symbolic links.
         backend = backends.JournalFileBackend(path, lock_obj=backends.JournalFileOpenLock(path))
         self._study = optuna.create_study(

@@ -26,7 +26,7 @@ from cprl.studies.factors import (
     grid,
 )
 from cprl.system.defaults import BLOCK
-from cprl.values import DirectoryName, Range, Value, refusal, shown, trust, without_defaults
+from cprl.values import DirectoryName, Range, Value, meant, refusal, shown, trust, without_defaults
 
 CONDITION_FORMAT: Final = 1
 """Of checksums: counted up when a default of any value of `cprl.values.KINDS`, or of `Experiment`, changes,
@@ -243,8 +243,10 @@ class Study(Value, stored=False):
         refuse_newer("the study", table, STUDY_FORMAT)
         if table.get("format") != STUDY_FORMAT:
             raise refusal("the study's format", table.get("format"), str(STUDY_FORMAT))
-        if table.get("pairing") is False:
-            raise refusal("the study's pairing", False, "True")
+        known = ("format", "experiment", "factors", "conditions", *_PLAIN)
+        if unknown := [name for name in table if name not in known]:
+            close = meant(unknown[0], known)
+            raise ValueError(f"the study has no {shown(unknown[0])}{close}; allowed: {', '.join(known)}")
         trust(*allow)
         try:
             values = {"experiment": table["experiment"]}

@@ -6,11 +6,12 @@ nothing but the recipe, or a run that was killed at any moment. `Task` is that p
 to what came of it.
 """
 
+import json
 import os
 import shutil
 import sys
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -26,6 +27,7 @@ from cprl.runs.files import (
     LOCK_FILE,
     RunLock,
     RunLockedError,
+    digest_of,
     refuse_missing,
     remove_partial,
     take_apart,
@@ -45,7 +47,7 @@ from cprl.studies.status import LOCKED, STOPPED, Status, StatusFile
 from cprl.studies.study import Block, Condition, Study
 from cprl.system.output import printed
 from cprl.system.shipped import cprl_here
-from cprl.values import allowed, custom_targets, differences
+from cprl.values import allowed, custom_targets, differences, without_defaults
 
 State = Literal["missing", "unfinished", "finished", "refused"]
 ATTEMPTS: Final = 5
@@ -139,14 +141,27 @@ def state_of(run: Path) -> State:
     return "unfinished" if (run / RECIPE_FILE).exists() else "missing"
 
 
-def move_aside(run: Path) -> Path | None:
-    """Moves a run out of the way that was made with other code of the user's own, into a folder beside that
-    of the runs, `runs-earlier`; returns where it is now, None for any other run."""
+def is_of_other_code(run: Path) -> bool:
+    """Return whether a run was made with other code of the user's own than is there now."""
     try:
-        if state_of(run) == "missing" or not changed_code(read_recipe(run)):
-            return None
+        return state_of(run) != "missing" and bool(changed_code(read_recipe(run)))
     except ValueError:  # its recipe cannot be read, which is a failure of the trial
-        return None
+        return False
+
+
+def move_aside(runs: Sequence[Path]) -> list[Path]:
+    """Move runs out of the way, into a folder beside theirs, `runs-earlier`, and return where they are now.
+
+    Raises:
+        RunLockedError: where another process writes one of them; then none is moved.
+    """
+    for run in runs:
+        with RunLock(run):
+            pass
+    return list(map(_move_aside, runs))
+
+
+def _move_aside(run: Path) -> Path:
     earlier = Path(os.path.abspath(run.parent))
     earlier = earlier.with_name(f"{earlier.name}-earlier")
     with RunLock(run):
@@ -170,6 +185,32 @@ class Outcome(NamedTuple):
     """Of a failure: the command line that repeats the trial by hand."""
 
 
+class FinishedRuns:
+    """Finds the finished runs of a directory that are the same experiment but for its length; reads the
+    recipe of each run once."""
+
+    def __init__(self, runs: Path) -> None:
+        self._runs = runs
+        self._read: set[str] = set()
+        self._by_content: dict[str, list[Path]] = {}
+
+    def like(self, config: Mapping[str, Any]) -> list[Path]:
+        """Return those of an experiment, in the order of their names."""
+        for path in self._runs.iterdir():
+            if path.name not in self._read and state_of(path) == "finished":
+                self._read.add(path.name)
+                with suppress(ValueError, KeyError, TypeError):  # of a recipe that cannot be read
+                    content = _content_of(recipe_config(read_recipe(path)))
+                    self._by_content.setdefault(content, []).append(path)
+        return sorted(self._by_content.get(_content_of(config), []))
+
+
+def _content_of(config: Mapping[str, Any]) -> str:
+    """What tells experiments from others that differ in more than their length."""
+    table = without_defaults({**config, **FREE, **ANY_LENGTH}, Experiment)
+    return digest_of(json.dumps(table, sort_keys=True))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Task:
     """A trial in its directory, and the process that makes a finished run of it."""
@@ -182,6 +223,8 @@ class Task:
     """Whether the finished run keeps the state of its training, so that a longer trial can go on from it."""
     take_over: bool = False
     """Whether the lock is taken that a process on another host left behind."""
+    finished: FinishedRuns | None = None
+    """The finished runs of the directory, which the tasks of a study share."""
 
     @property
     def name(self) -> str:
@@ -262,7 +305,7 @@ class Task:
         with open(self.status.log, "a", encoding="utf-8") as log:
             log.write(f"$ {self.command}\n")
         if not run.exists():
-            begin_from_shorter(run, experiment, self.recipe)
+            begin_from_shorter(run, experiment, self.recipe, self.finished)
         if run.exists():
             with RunLock(run, take_over=self.take_over):
                 if state_of(run) == "missing":
@@ -333,7 +376,9 @@ class Task:
             )
 
 
-def begin_from_shorter(run: Path, experiment: Experiment, recipe: Mapping[str, Any]) -> Path | None:
+def begin_from_shorter(
+    run: Path, experiment: Experiment, recipe: Mapping[str, Any], finished: FinishedRuns | None = None
+) -> Path | None:
     """Makes a run that is not there of the longest finished one beside it that has fewer episodes, keeps the
     state of its training and is the same otherwise; it is then to be resumed with its own episodes.
 
@@ -344,13 +389,12 @@ def begin_from_shorter(run: Path, experiment: Experiment, recipe: Mapping[str, A
         return None
     free = {**FREE, **ANY_LENGTH}
     wanted, beginnings = {**recipe["experiment"], **free}, []
-    for other in sorted(path.parent for path in run.parent.glob(f"*/{RECIPE_FILE}")):
+    for other in (finished or FinishedRuns(run.parent)).like(recipe["experiment"]):
         with suppress(ValueError, KeyError, TypeError):  # of a recipe that cannot be read
             stored = read_recipe(other)
             before = recipe_config(stored)
             if (
-                state_of(other) == "finished"
-                and not differences({**before, **free}, wanted, "experiment", Experiment)
+                not differences({**before, **free}, wanted, "experiment", Experiment)
                 and length_in(before)[0] == experiment.unit
                 and length_in(before)[1] < experiment.length
                 and not changed_code(stored)

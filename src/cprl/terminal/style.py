@@ -98,6 +98,8 @@ class Sheet:
         self.title, self.caption, self.legend_title = "", "", ""
         """The title has some five words; how the figure was made is said in the caption."""
         self._high = self._wide = 0.0
+        self._row_high: dict[Axes, float] = {}
+        """The height of each panel's row in em."""
 
     def fitting(self, number: int, least: float) -> int:
         """Return how many of so many panels stand side by side, each at least so many em wide."""
@@ -130,7 +132,7 @@ class Sheet:
         for axes in panels[number:]:
             axes.set_visible(False)
         for axes, row in zip(panels, [row for row in heights for _ in range(columns)], strict=True):
-            axes.set_gid(f"{row}")
+            self._row_high[axes] = row
         return panels[:number]
 
     def finish(self) -> None:
@@ -140,7 +142,7 @@ class Sheet:
         for axes in figure.axes:
             axes.set_title(wrapped(axes.get_title("left"), self._wide - 1))
             axes.set_xlabel(wrapped(axes.get_xlabel(), self._wide - 2))
-            axes.set_ylabel(wrapped(axes.get_ylabel(), float(axes.get_gid() or self._high) - 3))
+            axes.set_ylabel(wrapped(axes.get_ylabel(), self._row_high.get(axes, self._high) - 3))
         renderer: Any = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
         title = figure.text(
             0, 1, wrapped(self.title, 0.86 * self.width_em), fontsize="large", va="top", ha="left"

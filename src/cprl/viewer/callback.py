@@ -295,7 +295,7 @@ def _stored_episodes(run: Path) -> Iterator[Episode]:
     columns = {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
     curves = as_curves(table)
     agents = int(columns["agent"].max()) + 1
-    metrics = metrics_in(table.schema)
+    metrics = [name for name in metrics_in(table.schema) if not name.startswith("institutions/")]
     in_force = [name for name in columns if name.startswith("in_force_")]
     for row in range(0, table.num_rows, agents):
         replica, number = int(columns["replica"][row]), int(columns["episode"][row])

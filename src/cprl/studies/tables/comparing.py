@@ -6,9 +6,9 @@ that are marked differ by Holm's method: with 95 % none of the marked ones is by
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from math import isnan
-from typing import Final, Literal
+from functools import cached_property
+from math import isclose, isnan
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,20 @@ from cprl.values import Positive, checked, refusal
 
 METRICS: Final = ("collective_return", NET, "equality", "sustainability", "survival_steps", "peacefulness")
 """Metrics that are compared, unless others are asked for, where a table has them."""
+SAME_AS: Final = {
+    NET: "collective_return",
+    "peacefulness": "survival_steps",
+    "institutions/net_equality": "equality",
+}
+"""Metrics that are another one by construction where nobody pays or gets anything, or is out of play."""
 INTERVALS: Final = f"{CONFIDENCE:.0%} intervals over replicas by Student's t"
 
 Kind = Literal["levels", "differences"]
 Values = NDArray[np.float64]
+Place = tuple[str, str]
+"""Of a difference: the metric, and the condition or effect."""
+_ROUNDING: Final = 1e-6
+"""What payments of float32 round off, of a value."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,21 +115,45 @@ def compare(table: StudyTable, metric: str, *, part: str = TRAINING, last: int =
     checked("last", last, Positive)
     if part == TRAINING and last < table.window:
         raise refusal("last", last, f"at least {table.window}, the episodes of a window of the table")
-    return _compared(table, metric, part, last)
+    asked = metric, part, last
+    if asked not in table.comparisons:
+        table.comparisons[asked] = _compared(table, metric, part, last)
+    comparison: Comparison = table.comparisons[asked]
+    return comparison
 
 
-def metrics_of(table: StudyTable, metrics: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the metrics asked for, by default those of `METRICS` and of the user's own that a
-    table has."""
+def metrics_of(table: StudyTable, metrics: Sequence[str] = (), *, part: str = TRAINING) -> tuple[str, ...]:
+    """Return the metrics asked for, by default those of `METRICS` and of the user's own that a table has,
+    without those of `repeated_in`."""
     for metric in metrics:
         if metric not in table.metrics:
             allowed = ", ".join(table.metrics) or "none, as the table has no finished run"
             raise refusal("metric", metric, allowed)
-    usual = [metric for metric in METRICS if metric in table.metrics]
+    repeated = repeated_in(table, part)
+    usual = [metric for metric in METRICS if metric in table.metrics and metric not in repeated]
     return tuple(metrics) or (*usual, *filter(is_own, table.metrics))
 
 
-@lru_cache(maxsize=128)  # figures and texts of a table share what it says
+def repeated_in(table: StudyTable, part: str) -> tuple[str, ...]:
+    """Return the metrics that are the same as that of `SAME_AS` in every window of a part."""
+    conditions = [name for name in table.design.conditions if table.replicas[name]]
+    return tuple(
+        metric
+        for metric, other in SAME_AS.items()
+        if {metric, other} <= set(table.metrics)
+        and all(_are_equal(table, name, metric, other, part) for name in conditions)
+    )
+
+
+def _are_equal(table: StudyTable, condition: str, metric: str, other: str, part: str) -> bool:
+    one, two = (table.values(condition, name, part) for name in (metric, other))
+    if one is None or two is None:
+        return one is two
+    return one["value"].shape == two["value"].shape and np.allclose(
+        one["value"], two["value"], rtol=_ROUNDING, atol=_ROUNDING, equal_nan=True
+    )
+
+
 def _compared(table: StudyTable, metric: str, part: str, last: int) -> Comparison:
     reference, is_paired = table.design.reference, table.design.is_paired
     means = {name: _means(table, name, metric, part, last) for name in table.design.conditions}
@@ -180,16 +214,57 @@ def _difference(
     return difference(samples[0], samples[1], paired=False) if all(samples) else None
 
 
-def differing(comparisons: Sequence[Comparison]) -> set[tuple[str, str]]:
-    """Return which differences are not 0, by metric and condition, of all these together by Holm's method."""
-    differences = {
-        (comparison.metric, compared.condition): compared.difference.p_value
+class Family(NamedTuple):
+    """Differences that are tested together by Holm's method."""
+
+    marked: frozenset[Place]
+    """Those that are not 0."""
+    tests: int
+    """How many are tested; one that stands under two metrics of `SAME_AS` is a single test."""
+    is_repeated: bool
+    """Whether some stand under two metrics."""
+
+    def note(self, of: str) -> str:
+        """Return what bold means; `of` says which differences they are, e.g. "of this table"."""
+        number = f"the {self.tests} differences" if self.tests != 1 else "the one difference"
+        once = ", of which those that two columns have in common count once" if self.is_repeated else ""
+        return (
+            f"Bold: not 0 by Holm's method for {number} {of}{once} (two-sided t-tests, "
+            f"{1 - CONFIDENCE:.0%} for all together); intervals are of single comparisons."
+        )
+
+
+def family_of(differences: Mapping[Place, Estimate | None]) -> Family:
+    """Return which differences are not 0, of all these together."""
+    tests: dict[Place, list[Place]] = {}
+    for (metric, name), one in differences.items():
+        if one is None or isnan(one.p_value):
+            continue
+        same = SAME_AS.get(metric, ""), name
+        other = differences.get(same)
+        is_same = same in tests and other is not None and _is_same(one, other)
+        tests.setdefault(same if is_same else (metric, name), []).append((metric, name))
+    p_values = [differences[place].p_value for place in tests]  # type: ignore[union-attr]
+    marked: set[Place] = set()
+    for places, differs in zip(tests.values(), holm(p_values), strict=True):
+        marked |= set(places) if differs else set()
+    is_repeated = any(len(places) > 1 for places in tests.values())
+    return Family(frozenset(marked), len(tests), is_repeated)
+
+
+def _is_same(one: Estimate, other: Estimate) -> bool:
+    pairs = zip((one.value, one.low, one.high), (other.value, other.low, other.high), strict=True)
+    return all(isclose(a, b, rel_tol=_ROUNDING, abs_tol=_ROUNDING) for a, b in pairs)
+
+
+def differences_in(comparisons: Sequence[Comparison]) -> dict[Place, Estimate | None]:
+    """Return the differences from the reference by metric and condition."""
+    return {
+        (comparison.metric, compared.condition): compared.difference
         for comparison in comparisons
         for compared in comparison.conditions
-        if compared.difference is not None
+        if compared.condition != comparison.reference
     }
-    is_different = holm(list(differences.values()))
-    return {place for place, differs in zip(differences, is_different, strict=True) if differs}
 
 
 def cells(comparisons: Sequence[Comparison], kind: Kind = "levels") -> Cells:
@@ -200,8 +275,8 @@ def cells(comparisons: Sequence[Comparison], kind: Kind = "levels") -> Cells:
         kind: "levels", means over replicas; or "differences" from the reference.
     """
     first = comparisons[0]
-    marked = differing(comparisons) if kind == "differences" else set()
-    number, rows = 0, []
+    family = family_of(differences_in(comparisons) if kind == "differences" else {})
+    rows = []
     for compared in first.conditions:
         name, texts = compared.condition, []
         if kind == "differences" and name == first.reference:
@@ -211,17 +286,14 @@ def cells(comparisons: Sequence[Comparison], kind: Kind = "levels") -> Cells:
             if kind == "levels":
                 texts.append(level_text(of_metric))
             else:
-                texts.append(difference_text(of_metric, is_marked=(comparison.metric, name) in marked))
-                number += of_metric.difference is not None and not isnan(of_metric.difference.p_value)
+                is_marked = (comparison.metric, name) in family.marked
+                texts.append(difference_text(of_metric, is_marked=is_marked))
         rows.append([name, str(compared.replicas), *texts])
     head = ["condition", "replicas", *(metric_title(comparison.metric) for comparison in comparisons)]
     what, note = "means over replicas", ""
     if kind == "differences":
         what = f"differences from {first.reference}, {first.pairing_text}"
-        note = (
-            f"Bold: not 0 by Holm's method for {number} comparison{'s' * (number != 1)} (two-sided t-tests, "
-            f"{1 - CONFIDENCE:.0%} for all together); intervals are of single comparisons."
-        )
+        note = family.note("of this table")
     estimates = [one.estimate for comparison in comparisons for one in comparison.conditions]
     if kind == "levels" and any(one is not None and one.is_cut for one in estimates):
         note = CUT
@@ -234,9 +306,25 @@ def compared_cells(
 ) -> list[Cells]:
     """Return the levels of metrics, see `metrics_of`, and the differences where there are several conditions;
     nothing of a table without a finished run."""
-    comparisons = [compare(table, metric, part=part, last=last) for metric in metrics_of(table, metrics)]
-    kinds: tuple[Kind, ...] = ("levels", "differences") if len(table.design.conditions) > 1 else ("levels",)
-    return [cells(comparisons, kind) for kind in kinds if comparisons]
+    chosen = metrics_of(table, metrics, part=part)
+    comparisons = [compare(table, metric, part=part, last=last) for metric in chosen]
+    if not comparisons:
+        return []
+    levels = cells(comparisons)
+    if not metrics:
+        levels = levels._replace(note="\n".join(filter(None, (levels.note, repeated_note(table, part)))))
+    is_alone = len(table.design.conditions) == 1
+    return [levels] if is_alone else [levels, cells(comparisons, "differences")]
+
+
+def repeated_note(table: StudyTable, part: str) -> str:
+    """Return which of the usual metrics a table lacks, since they are the same as another one; "" if none."""
+    parts = [
+        f"{metric_title(metric).partition(',')[0]} is the same as {title(SAME_AS[metric]).partition(',')[0]}"
+        for metric in repeated_in(table, part)
+        if metric in METRICS
+    ]
+    return f"Not shown: {'; '.join(parts)} here, in every replica." if parts else ""
 
 
 def of_finished(table: Cells) -> Cells:

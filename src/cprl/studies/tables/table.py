@@ -143,6 +143,9 @@ class StudyTable:
     lengths: Mapping[str, Mapping[str, tuple[int, int]]] = field(default_factory=dict, repr=False)
     """The least and the most "episodes" and environment "steps" of the replicas of a condition; none where
     the reports of its runs do not say how many steps."""
+    comparisons: dict[tuple[str, str, int], Any] = field(default_factory=dict, init=False, repr=False)
+    """What figures and texts share: each metric, part and number of last episodes that was compared, see
+    `cprl.studies.tables.comparing`."""
 
     @cached_property
     def mixed(self) -> list[str]:
