@@ -283,8 +283,7 @@ def _summarise(
     chances = {learner.settings.epsilon_evaluation for learner in learners if not learner.actor.stochastic}
     heading = "trained" + "".join(f", epsilon {chance:g}" for chance in sorted(chances))
     columns = {"random": played["random"], heading if learners else "agents": played["trained"]}
-    own = f"Rules of its own: {work.experiment.own_rules}" if work.experiment.own_rules else ""
-    notes = filter(None, (summary(training.finite.reported), own, work.experiment.own_code))
+    notes = filter(None, (summary(training.finite.reported), work.experiment.own_code))
     note = "\n".join(notes) or None
     summarise(work.directory, title=_title(work.experiment), played=columns, figure=figure, note=note)
 
