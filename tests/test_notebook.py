@@ -48,7 +48,7 @@ def test_a_game_and_an_experiment_say_what_they_are():
     own = {"transforms": (cprl.Custom("laws:RichPay"),), "metrics": (cprl.Custom("fair:gap"),)}
     with_own = replace(experiment, **own)._repr_html_()
     assert "Rules: quota (share 0.25); laws:RichPay." in with_own
-    assert "Code of its own: metrics: fair:gap." in with_own
+    assert "Code of its own: transforms: laws:RichPay; metrics: fair:gap." in with_own
     soft = replace(learning, algorithm=cprl.Custom("soft_q:soft_q"))
     assert "by soft_q:soft_q" in replace(experiment, agents=(soft,) * 4)._repr_html_()
     for part in ("<b>a&lt;b</b>: 2 agents by DQN", "2 replicas of 4 worlds", "quota (share 0.25", "<svg"):

@@ -49,7 +49,7 @@ def test_a_report_names_what_is_of_ones_own_and_says_what_a_tag_does(tmp_path):
     own = Custom("one_road_parts:largest_share"), Custom("one_road_parts:Gift", {"apples": 0.5})
     run = stored(tmp_path / "run", game, metrics=own[:1], transforms=own[1:])
     text = report(run, episodes=2, allow=[one.target for one in own]).read_text(encoding="utf-8")
-    assert "Rules of its own: one_road_parts:Gift (apples 0.5): Adds a part of an apple" in text
+    assert "Code of its own: transforms: one_road_parts:Gift (apples 0.5): Adds a part" in text
     assert "metrics: one_road_parts:largest_share" in text
     assert "<p>After 2 hits an agent leaves the board for 24 turns.</p>" in text
 

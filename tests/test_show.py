@@ -116,7 +116,7 @@ def test_rules_and_metrics_of_ones_own_are_named_on_the_page(runs, tmp_path):
     run = stored(tmp_path / "own", **OWN)
     path, _ = show(run, tmp_path / "own.html", beside=[runs / "greedy"], allow=OWN_TARGETS)
     own, plain = told(path)["populations"]
-    rule = "Rules of its own: one_road_parts:Gift (apples 0.5): Adds a part of an apple to every reward"
+    rule = "Code of its own: transforms: one_road_parts:Gift (apples 0.5): Adds a part of an apple"
     assert rule in own["about"]
     assert "metrics: one_road_parts:largest_share: Of all apples" in own["about"]
     assert "none beyond the game" not in own["about"]

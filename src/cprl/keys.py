@@ -63,7 +63,7 @@ RECURRENT_STATE_BEFORE: Final = (AGENTS, "recurrent_state_before")
 
 FINES: Final = (AGENTS, "fines")
 """float32 [B, N]: apples that institutions took from the agent this turn. This entry and all of institutions
-below are there only in games that have any."""
+below are there only in games that have any, or a transform that writes them."""
 
 TRANSFERS: Final = (AGENTS, "transfers")
 """float32 [B, N]: apples that institutions gave the agent this turn."""

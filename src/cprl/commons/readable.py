@@ -4,10 +4,12 @@ What these sentences say holds in the game that they are about; `tests/test_read
 """
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from html import escape
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
 
 from cprl.commons.svg import board_svg
 from cprl.institutions import (
@@ -72,7 +74,8 @@ def rule_of(institution: Institution, *, is_voted_on: bool = False) -> str:
     """An institution with its first number and all that are not the defaults; without a rate or share that
     is not used, since it is voted on or there are brackets."""
     words = in_lower_case(type(institution).__name__)
-    unused = {"rate", "share"} if is_voted_on or getattr(institution, "brackets", ()) else set[str]()
+    has_brackets = isinstance(institution, Tax) and len(institution.brackets) > 0
+    unused = {"rate", "share"} if is_voted_on or has_brackets else set[str]()
     settings: list[str] = []
     for field in fields(institution):
         value = getattr(institution, field.name)
@@ -99,13 +102,14 @@ def tag_of(game: "Game") -> str:
     rules = game.rules
     if not rules.may_fire or game.agents == 1:
         return ""
-    sanctions, punishment = _sanctions_of_tags(game), _first(game, Punishment)
+    sanctions = _sanctions_of_tags(game)
+    punishment = _first(game, Punishment)
     missed = turns_missed(game, sanctions)
     effects = []
     if punishment is not None and punishment.fine:
         effects.append(f"is fined {_apples(punishment.fine)} by each who tags it")
     if sanctions is not None and any(sanctions.fines):
-        effects.append(f"pays {_by_level(sanctions.fines, _apples)}")
+        effects.append(f"pays {_by_level(sanctions.fines, 'apple')}")
     if any(missed):
         place = "" if rules.pairwise_clashes else ", longer while its cell is taken"
         place = " and returns at a free spawn place" if rules.respawn_at_spawns else place
@@ -119,9 +123,8 @@ def tag_of(game: "Game") -> str:
 def turns_missed(game: "Game", sanctions: GraduatedSanctions | None) -> tuple[int, ...]:
     """The turns that an agent misses after a tag, or after any other offence, by the level of sanctions, and
     by who tags it where sanctions have a table."""
-    steps: Sequence[object] = (game.rules.freeze_steps,) if sanctions is None else sanctions.freeze_steps
-    flat = [each for row in steps for each in (row if isinstance(row, tuple) else (row,))]
-    return tuple(max(0, each - game.rules.freeze_counts_tag_turn) for each in flat)
+    steps = np.ravel(game.rules.freeze_steps if sanctions is None else sanctions.freeze_steps).tolist()
+    return tuple(max(0, each - game.rules.freeze_counts_tag_turn) for each in steps)
 
 
 def _sanctions_of_tags(game: "Game") -> GraduatedSanctions | None:
@@ -239,7 +242,7 @@ def _graduated_sanctions(sanctions: GraduatedSanctions, game: "Game") -> str:
         offences.append(f"a turn in which it breaks a rule{_noticed(game)}")
     turns = _missed(turns_missed(game, sanctions), sanctions)
     words = f"An agent's offences ({' or '.join(offences)}) cost it a time-out of {turns}"
-    words += f" and {_by_level(sanctions.fines, _apples)}" * any(sanctions.fines)
+    words += f" and {_by_level(sanctions.fines, 'apple')}" * any(sanctions.fines)
     if sanctions.recovery_steps is None:
         return f"{words}."
     return f"{words}; each {_turns(sanctions.recovery_steps)} without one take one back."
@@ -287,20 +290,17 @@ def _missed(missed: Sequence[int], sanctions: GraduatedSanctions | None) -> str:
     """The turns of a time-out, by level, or from the least to the most where they depend on who tags, too."""
     if sanctions is not None and sanctions.is_table:
         return f"{min(missed):,} to {_turns(max(missed))}, by who tags it and how often it was tagged"
-    return _by_level(missed, _turns)
+    return _by_level(missed, "turn")
 
 
-Number = TypeVar("Number", int, float)
-
-
-def _by_level(numbers: Sequence[Number], amount: Callable[[Number], str]) -> str:
+def _by_level(numbers: Sequence[float], unit: str) -> str:
     """The amounts of levels, e.g. "4 turns (24, then 99 as offences add up)"; the last one holds for all
     higher levels."""
     levels = [*numbers]
     while len(levels) > 1 and levels[-1] == levels[-2]:
         levels.pop()
     more = ", then ".join(map(_number, levels[1:]))
-    return amount(levels[0]) + (f" ({more} as offences add up)" if more else "")
+    return _amount(levels[0], unit) + (f" ({more} as offences add up)" if more else "")
 
 
 def _number(value: float) -> str:
@@ -308,11 +308,15 @@ def _number(value: float) -> str:
 
 
 def _turns(count: int) -> str:
-    return f"{count:,} turn{'s' * (count != 1)}"
+    return _amount(count, "turn")
 
 
 def _apples(amount: float) -> str:
-    return f"{_number(amount)} apple{'s' * (amount != 1)}"
+    return _amount(amount, "apple")
+
+
+def _amount(amount: float, unit: str) -> str:
+    return f"{_number(amount)} {unit}{'s' * (amount != 1)}"
 
 
 def _percent(share: float) -> str:

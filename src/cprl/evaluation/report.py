@@ -91,8 +91,7 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
     if has_course and (run.path / "evaluation" / "random.parquet").is_file():
         before.append(f"**{course_of(run.path, run.specs)}**")
     before.append(f"{learned(run.specs)}, {run.experiment.trained_for}.")
-    own = run.experiment.own_rules
-    before += [f"Rules of its own: {own}."] * bool(own) + [run.experiment.own_code]
+    before.append(run.experiment.own_code)
     after = ["## Fresh episodes, beside random play", "", *markdown(run_table(evaluation))]
     after += [
         "These episodes were played for this page, in other worlds than those above, so that means differ by "

@@ -231,9 +231,9 @@ def _rules(run: LoadedRun) -> str:
     words = [meaning_of(kind, game) for kind in game.institutions]
     if game.institutions:
         words.append(f"Settings: {rules_of(game)}.")
-    if experiment.own_rules:
-        words.append(f"Rules of its own: {experiment.own_rules}.")
-    return " ".join([*(words or [f"Rules: {NO_RULES}."]), experiment.own_code]).strip()
+    elif not experiment.own_rules:
+        words.append(f"Rules: {NO_RULES}.")
+    return " ".join([*words, experiment.own_code]).strip()
 
 
 def _cells(board: Map, places: Sequence[Sequence[int]]) -> list[int]:

@@ -120,9 +120,8 @@ class Experiment(Value, stored=False, called="experiment"):
 
     @property
     def own_code(self) -> str:
-        """What else is of the user's own, in a sentence; "" without any."""
-        table = self.to_config()
-        parts = {name: described(table[name]) for name in table if name not in _OF_RULES}
+        """All that is of the user's own, by the field where it stands, in a sentence; "" without any."""
+        parts = {name: described(part) for name, part in self.to_config().items()}
         said = "; ".join(f"{name}: {', '.join(words)}" for name, words in parts.items() if words)
         return f"Code of its own: {said}." if said else ""
 

@@ -81,7 +81,7 @@ class Episode:
     """The first step that left no apple on the board, or -1."""
     fines: NDArray[np.float64] | None = None
     """[N], what institutions took from each agent, taxes included, in units of reward. This field and all
-    below are of games with institutions, see `cprl.measuring.metrics.INSTITUTIONAL`."""
+    below are of games that report what institutions do, see `cprl.measuring.metrics.INSTITUTIONAL`."""
     transfers: NDArray[np.float64] | None = None
     """[N], what institutions gave each agent."""
     violations: NDArray[np.int64] | None = None

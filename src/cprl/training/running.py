@@ -290,8 +290,7 @@ def _summarise(
     chances = {learner.settings.epsilon_evaluation for learner in learners if not learner.actor.stochastic}
     heading = "trained" + "".join(f", epsilon {chance:g}" for chance in sorted(chances))
     columns = {"random": played["random"], heading if learners else "agents": played["trained"]}
-    own = f"Rules of its own: {work.experiment.own_rules}" if work.experiment.own_rules else ""
-    notes = filter(None, (summary(training.finite.reported), own, work.experiment.own_code))
+    notes = filter(None, (summary(training.finite.reported), work.experiment.own_code))
     each = work.experiment.evaluation_episodes
     has_course = all(training.episodes_by_replica) and set(NEEDED) <= set(played["trained"][0].social)
     summarise(
