@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from cprl.commands.flags import NO_DEFAULT
 from cprl.commons.published import Variant, check_board
 from cprl.system.defaults import (
     EGTA_RESAMPLES,
@@ -141,7 +142,7 @@ def film(
 
 
 def show(
-    runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [RUN ...]")],
+    runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [RUN ...]", help_behavior_hint="")],
     /,
     *,
     out: Path | None = None,
@@ -293,7 +294,7 @@ def visits(
 
 
 def crossplay(
-    runs: tuple[str, ...],
+    runs: Annotated[tuple[str, ...], NO_DEFAULT],
     /,
     *,
     fresh: FreshFlags = Fresh(),
@@ -373,7 +374,7 @@ def schelling(
 
 
 def egta(
-    runs: tuple[str, ...],
+    runs: Annotated[tuple[str, ...], NO_DEFAULT],
     /,
     *,
     fresh: FreshFlags = Fresh(episodes=5),
