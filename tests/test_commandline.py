@@ -532,7 +532,7 @@ def test_a_file_or_a_run_of_that_name_comes_first_but_not_the_folder_of_a_study(
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("run comons --replicas 2", "'comons' is no file, .* .did you mean 'commons'.*allowed: .* mixed, "),
+        ("run comons --replicas 2", "'comons' is no file, .* .did you mean 'commons'.*cprl recipe lists"),
         ("run --episodes 2 commons", r"stands first, its flags behind it: cprl run commons \[FLAGS\]"),
         ("run study/base", "study/base runs nothing: other recipes import it; cprl recipe study/base"),
         ("run mine.py", r"mine\.py is a recipe of your own"),
@@ -656,3 +656,35 @@ def test_a_training_runs_in_any_terminal(env, tmp_path):
 def test_a_command_to_be_copied_is_quoted_for_the_shell_of_the_platform(platform, line, monkeypatch):
     monkeypatch.setattr(sys, "platform", platform)
     assert printed([r"C:\my runs\cprl", "film", "it's", "a.gif"]) == line
+
+
+def help_at_80_columns(command, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit) as ended:
+        call(monkeypatch, f"{command} --help".strip())
+    assert ended.value.code == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["", *(name for name in cli.COMMANDS if name not in ("sweep", "search"))])
+def test_help_fits_80_columns_and_shows_no_default_that_says_nothing(command, monkeypatch, capsys):
+    said = help_at_80_columns(command, monkeypatch, capsys)
+    assert max(map(len, said.splitlines())) <= 80
+    assert "\n\n\n" not in said
+    for noise in ("{None}", "(default: None)", "(default: )"):
+        assert noise not in said
+
+
+def test_help_lists_every_command_once_in_its_group(monkeypatch, capsys):
+    lines = help_at_80_columns("", monkeypatch, capsys).splitlines()
+    listed = [re.match(r"  (\w+)  ", line) for line in lines]
+    assert [name[1] for name in listed if name] == list(cli.COMMANDS)
+    groups = [line.removesuffix(":") for line in lines if re.fullmatch(r"\w+:", line)]
+    assert groups == ["Train", "Look", "Measure", "Compare"]
+
+
+@pytest.mark.parametrize("line", ["run tragdy", "evaluate tragdy"])
+def test_what_is_no_run_and_no_recipe_is_said_in_a_short_sentence(line, monkeypatch):
+    with pytest.raises(SystemExit) as ended:
+        call(monkeypatch, line)
+    assert len(ended.value.code) < 200, ended.value.code

@@ -55,6 +55,46 @@ def test_a_game_and_an_experiment_say_what_they_are():
         assert part in html
 
 
+def streams(notebook, name):
+    """What the cells of a notebook write on a stream, one block of output after the other."""
+    return [
+        output.text
+        for cell in notebook.cells
+        for output in cell.get("outputs", ())
+        if output.output_type == "stream" and output.name == name
+    ]
+
+
+@pytest.mark.integration
+def test_no_import_greets_in_a_notebook(tmp_path):
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell("import cprl\ncprl.run")])
+    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": tmp_path}}).execute()
+    assert streams(notebook, "stderr") == []
+
+
+BAR = """
+from cprl import CommonsEnv, Game, Rules, maps
+from cprl.policies.lanes import LaneActor
+from cprl.terminal import progress
+from cprl.training import train
+
+progress._NOTEBOOK_PERIOD_S = 0.0
+game = Game(map=maps.parse(".A>\\n..A"), rules=Rules(window_rows=3, window_columns=3, episode_steps=5))
+with progress.ProgressBar(game, episodes=9) as bar:
+    walker = LaneActor(None, 8, seeds=[(0,)], agents=1)
+    train(CommonsEnv(game, 1), {}, others={(0,): walker}, episodes=9, callbacks=[bar])
+"""
+
+
+@pytest.mark.integration
+def test_a_bar_is_one_block_of_an_executed_notebook_and_shows_the_end(tmp_path):
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(BAR)])
+    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": tmp_path}}).execute()
+    shown = [output.data["text/plain"] for output in notebook.cells[0].outputs]
+    (bar,) = [text for text in shown if "░" in text or "█" in text]
+    assert bar == f"{'█' * 20} training: 9 episodes"
+
+
 @pytest.mark.integration
 def test_the_notebook_runs(tmp_path):
     notebook = nbformat.read(NOTEBOOK, 4)
@@ -71,4 +111,6 @@ def test_the_notebook_runs(tmp_path):
     assert ["<svg" in html for html in shown] == [True, True, False, False]
     assert ["<iframe" in html for html in shown] == [False, False, True, True]
     assert "A quota" in shown[2]
+    assert streams(notebook, "stderr") == []
+    assert not any("\r" in text or "steps/s" in text for text in streams(notebook, "stdout"))
     assert (tmp_path / "notebook" / "no_rule" / "report.html").is_file()

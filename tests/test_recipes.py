@@ -381,7 +381,7 @@ def test_the_run_of_a_plain_agent_is_loaded_too_or_says_which_file_cannot_be_rea
     (run / "recipe.json").write_text(json.dumps(content))
     with pytest.raises(ValueError, match=r"recipe\.json: experiment\.game\.rules\.hits_to_tag is 0"):
         cprl.load(run)
-    with pytest.raises(ValueError, match=r"recipe\.json is not the recipe of a run"):
+    with pytest.raises(ValueError, match=r"is not the directory of a run: it holds no recipe\.json"):
         cprl.load(tmp_path)
 
 

@@ -168,7 +168,7 @@ def test_where_nothing_can_be_resumed_that_is_said(tmp_path):
     for directory, message in (
         (run, "format"),
         (None, "resume requires the directory of the run as out"),
-        (tmp_path / "nothing", r"recipe\.json is not the recipe of a run: FileNotFoundError"),
+        (tmp_path / "nothing", "nothing is not the directory of a run: there is no such directory"),
     ):
         with pytest.raises(ValueError, match=message):
             resume(directory)

@@ -188,7 +188,7 @@ def test_a_study_whose_runs_lost_their_content_says_so_and_what_to_do(capsys):
         ("mine.py", "nothing is varied"),
         ("--vary x=1", "the first word after cprl sweep is --vary"),
         ("nowhere.py --vary x=1", "the recipe is nowhere.py"),
-        ("nowhere --vary x=1", "is not the recipe of a run"),
+        ("nowhere --vary x=1", "nowhere is not the directory of a run: there is no such directory"),
         (f"mine.py --vary {FREEZE}=integers(1,9)", "with draws=N"),
         (f"mine.py --vary {FREEZE}=2 --reference best", "reference is 'best'"),
         (f"mine.py --vary {FREEZE}=2 --jobs 0", "--jobs is 0"),

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from threading import Event
+from types import SimpleNamespace
 
 import pytest
 
@@ -15,6 +16,7 @@ from cprl.envs import make_env
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import LaneActor
+from cprl.runs.checkpoints import MOST_LOST_S, Checkpointer
 from cprl.system import output, working
 from cprl.system.output import say
 from cprl.system.times import CLOCK
@@ -213,3 +215,51 @@ def test_ctrl_c_stops_a_compilation_and_leaves_no_process_behind(tmp_path):
     assert lines[-1] == "KeyboardInterrupt"
     assert "began" not in lines
     assert not list(tmp_path.rglob("*.nbi")), "it was stopped while the first of the rules was compiled"
+
+
+RUN = """
+import sys
+import cprl
+from cprl import Game, Rules, maps
+from cprl.population import Scripted
+game = Game(map=maps.parse(".A>"), rules=Rules(episode_steps=5))
+experiment = cprl.Experiment(name="stopped", game=game, agents=(Scripted("random"),), episodes=3)
+with cprl.commands.recipe.in_a_sentence("test"):
+    cprl.run(experiment, sys.argv[1], watch="off")
+"""
+
+
+@pytest.mark.integration
+def test_one_ctrl_c_while_a_run_compiles_ends_it_with_the_line_that_resumes(tmp_path):
+    with started(["-c", f"import cprl.commands.recipe\n{RUN}", str(tmp_path / "run")], tmp_path) as process:
+        lines = []
+        for line in process.stdout:
+            lines.append(line.strip())
+            if "compiling" in line:
+                process.send_signal(signal.SIGINT)
+                break
+        rest = process.stdout.read()
+    assert process.returncode == 130, rest
+    assert "Stopped while code was compiled" in rest
+    assert "To resume: " in rest
+    assert not list((tmp_path / "run").glob("checkpoints/*"))
+
+
+def test_a_signal_before_a_training_has_begun_is_not_delayed(tmp_path):
+    with pytest.raises(KeyboardInterrupt), Checkpointer(tmp_path / "run"):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_a_signal_while_code_is_compiled_is_not_delayed_unless_much_would_be_lost(tmp_path, capsys):
+    training = SimpleNamespace()
+    with Checkpointer(tmp_path / "run") as checkpointer, CLOCK.running():
+        checkpointer.restore(training)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert "Stopped while code was compiled" in capsys.readouterr().out
+    with Checkpointer(tmp_path / "run") as checkpointer:
+        checkpointer.restore(training)
+        checkpointer._saved -= 2 * MOST_LOST_S
+        with CLOCK.running():
+            signal.raise_signal(signal.SIGINT)
+    assert "Stopping after this step" in capsys.readouterr().out

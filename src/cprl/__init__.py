@@ -28,7 +28,7 @@ A package imports only from those above it:
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
-from cprl.system.libraries import when_imported
+from cprl.system.libraries import quiet_in_notebooks, when_imported
 
 if TYPE_CHECKING:
     from cprl import (
@@ -174,5 +174,6 @@ def _register_parallel() -> None:
             )
 
 
+quiet_in_notebooks()
 when_imported("gymnasium", _register)
 when_imported("pettingzoo", _register_parallel)

@@ -4,13 +4,14 @@ tyro reads dataclasses itself. The rule here tells it what it cannot know of a v
 which class each part is, and what no word can say and therefore stays.
 """
 
+import inspect
 import json
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Union, get_args, get_origin, get_type_hints
 
 import tyro
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
@@ -21,6 +22,33 @@ if TYPE_CHECKING:
     from cprl.experiment import Experiment
     from cprl.institutions import Institution
     from cprl.population import AgentSpec
+
+
+NO_DEFAULT: Final = tyro.conf.arg(help_behavior_hint="")
+"""Of a flag whose default says nothing: its text says what happens without it."""
+
+
+def _hint(default: str) -> str:
+    return f"(default: {default})" if default else ""
+
+
+def without_empty_defaults(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function whose flags, with those of its dataclasses, show no default that is None or ()."""
+    for name, parameter in inspect.signature(function).parameters.items():
+        if is_dataclass(parameter.default):
+            of_class = {field.name: field.default for field in fields(parameter.default)}
+            _mark_empty(type(parameter.default), of_class)
+        else:
+            _mark_empty(function, {name: parameter.default})
+    return function
+
+
+def _mark_empty(owner: Any, defaults: Mapping[str, Any]) -> None:
+    hints = get_type_hints(owner, include_extras=True)
+    empty = {name for name, default in defaults.items() if default is None or default == ()}
+    owner.__annotations__ = {
+        name: Annotated[hint, NO_DEFAULT] if name in empty else hint for name, hint in hints.items()
+    }
 
 
 class RefusedError(Exception):
@@ -90,6 +118,8 @@ class ValueFlags(ConstructorRegistry):
             kind = None if kind in (None, NoneType) or not fits(value, kind) else kind
         if kind is None:
             return None
+        if value is None or value == ():
+            kind = Annotated[kind, NO_DEFAULT, tyro.conf.DisallowNone]
         if self._listed is not None and not any(f"{path}.".startswith(f"{place}.") for path in self._listed):
             kind = Annotated[kind, tyro.conf.Suppress]
         return replace(field, type=kind)
@@ -130,7 +160,8 @@ class Shape:
     """How many agents, where all are alike. A board has its first starts then, or more of them on free ground
     around the first one."""
     institutions: Annotated[
-        tuple[str, ...], tyro.conf.arg(name="game.institutions", metavar="NAME|FILE.json")
+        tuple[str, ...],
+        tyro.conf.arg(name="game.institutions", metavar="NAME|FILE.json", help_behavior_hint=_hint),
     ] = ()
     """Institutions by their names, e.g. quota monitoring, with flags of their own, e.g.
     --game.institutions.quota.share 0.25; or a JSON file with a list of them as in a recipe.json; or none."""

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Final, Literal
 
 import tyro
 
+from cprl.commands.flags import without_empty_defaults
 from cprl.commands.recipe import (
     ALLOW,
     RunOptions,
@@ -23,38 +24,49 @@ from cprl.commands.recipe import (
     refuse_mistyped_flags,
     run_with,
     trusting,
+    wrapped,
 )
 from cprl.system.defaults import FILM_SEED
 from cprl.system.output import OUT, printed, say
 from cprl.system.process import obey_parent
-from cprl.system.shipped import PROGRAM, is_shipped, recipe_named, recipe_names, run_shipped, shipped_recipes
+from cprl.system.shipped import PROGRAM, is_shipped, recipe_named, run_shipped, shipped_recipes
 from cprl.system.working import working
 from cprl.values import meant
 
-COMMANDS: Final[Mapping[str, str]] = {
-    "run": "main:run",
-    "recipe": "main:recipe",
-    "watch": "main:watch",
-    "film": "play_stored:film",
-    "show": "play_stored:show",
-    "report": "play_stored:report",
-    "play": "play_stored:play",
-    "sandbox": "play_stored:sandbox",
-    "export": "main:export",
-    "evaluate": "play_stored:evaluate",
-    "visits": "play_stored:visits",
-    "crossplay": "play_stored:crossplay",
-    "schelling": "play_stored:schelling",
-    "egta": "play_stored:egta",
-    "scenarios": "play_stored:scenarios",
-    "exploit": "play_stored:exploit",
-    "sweep": "studies:sweep",
-    "search": "studies:search",
-    "table": "table:table",
+GROUPS: Final[Mapping[str, Mapping[str, str]]] = {
+    "Train": {
+        "run": "main:run",
+        "recipe": "main:recipe",
+        "sweep": "studies:sweep",
+        "search": "studies:search",
+    },
+    "Look": {
+        "watch": "main:watch",
+        "film": "play_stored:film",
+        "show": "play_stored:show",
+        "report": "play_stored:report",
+        "play": "play_stored:play",
+        "sandbox": "play_stored:sandbox",
+    },
+    "Measure": {
+        "evaluate": "play_stored:evaluate",
+        "visits": "play_stored:visits",
+        "scenarios": "play_stored:scenarios",
+        "schelling": "play_stored:schelling",
+        "exploit": "play_stored:exploit",
+        "export": "main:export",
+    },
+    "Compare": {
+        "table": "table:table",
+        "crossplay": "play_stored:crossplay",
+        "egta": "play_stored:egta",
+    },
 }
 """The functions of the commands, each in a module of this package, in the order in which `cprl --help` lists
-them. A command imports what it needs once its words are checked: torch takes seconds, which a mistake need
-not."""
+them."""
+COMMANDS: Final = {name: place for group in GROUPS.values() for name, place in group.items()}
+"""Those of all groups. A command imports what it needs once its words are checked: torch takes seconds,
+which a mistake need not."""
 
 _OPTIONS: Final = RunOptions()
 _TRIAL: Final[ContextVar[Path | None]] = ContextVar("trial", default=None)
@@ -84,9 +96,9 @@ def main() -> None:
             _function(words[0])(words[1:])
     elif words[0] != "run" or not _is_run_by_name(words[1:]):
         with in_a_sentence("cprl"), ended_by_sigterm():
-            function = _function(words[0])
-            about = f"{(getdoc(function) or '').partition(_ARGS)[0]}\n\n{ALLOW}"
-            config = (tyro.conf.HelptextFromCommentsOff,)
+            function = without_empty_defaults(_function(words[0]))
+            about = wrapped(f"{(getdoc(function) or '').partition(_ARGS)[0].strip()}\n\n{ALLOW}")
+            config = (tyro.conf.HelptextFromCommentsOff, tyro.conf.DisallowNone)
             others = trusting(words[1:])
             if words[0] == "run" and "--trial" in others[:-1]:
                 place = others.index("--trial")
@@ -102,9 +114,12 @@ def _function(command: str) -> Callable[..., Any]:
 
 
 def _print_help() -> None:
-    abouts = {name: (getdoc(_function(name)) or "").partition("\n\n")[0] for name in COMMANDS}
-    lines = ["usage: cprl [-h] [--version] COMMAND ...", "", __doc__, ""]
-    lines += [f"  {name:<10}  {' '.join(about.split())}" for name, about in abouts.items()]
+    lines = ["usage: cprl [-h] [--version] COMMAND ...", "", wrapped(__doc__ or "")]
+    for group, names in GROUPS.items():
+        lines += ["", f"{group}:"]
+        for name in names:
+            about = (getdoc(_function(name)) or "").partition("\n\n")[0]
+            lines.append(wrapped(about, before=f"  {name:<10}  "))
     say("\n".join([*lines, "", "cprl COMMAND --help lists the flags of a command."]))
 
 
@@ -181,7 +196,7 @@ def _refuse_unknown(path: Path) -> None:
         raise ValueError(f"the name of a recipe stands first, its flags behind it: {PROGRAM}{name} [FLAGS]")
     raise ValueError(
         f"{name!r} is no file, no directory of a run and no recipe of cprl{meant(name, shipped_recipes())}; "
-        f"allowed: those that are there, and the recipes {recipe_names()}"
+        "allowed: those that are there, and the recipes that cprl recipe lists"
     )
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from cprl.commands.flags import NO_DEFAULT
 from cprl.commons.published import Variant, check_board
 from cprl.system.defaults import (
     EGTA_RESAMPLES,
@@ -145,7 +146,7 @@ def film(
 
 
 def show(
-    runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [RUN ...]")],
+    runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [RUN ...]", help_behavior_hint="")],
     /,
     *,
     out: Path | None = None,
@@ -297,7 +298,7 @@ def visits(
 
 
 def crossplay(
-    runs: tuple[str, ...],
+    runs: Annotated[tuple[str, ...], NO_DEFAULT],
     /,
     *,
     fresh: FreshFlags = Fresh(),
@@ -377,7 +378,7 @@ def schelling(
 
 
 def egta(
-    runs: tuple[str, ...],
+    runs: Annotated[tuple[str, ...], NO_DEFAULT],
     /,
     *,
     fresh: FreshFlags = Fresh(episodes=5),

@@ -6,8 +6,10 @@ Its own arguments stand first; every number of the experiment can be changed by 
 
 import ast
 import inspect
+import shutil
 import signal
 import sys
+import textwrap
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -33,7 +35,7 @@ OptionsT = TypeVar("OptionsT")
 Words = tyro.conf.UseAppendAction[tuple[str, ...]]
 """--vary A --vary B."""
 ALLOW: Final = (
-    "--allow module:Class trusts code of your own that a stored run or a recipe.json names, see "
+    "Code of your own: --allow module:Class trusts what a stored run or a recipe.json names, see "
     "docs/experiments.md; it may be repeated."
 )
 
@@ -44,7 +46,9 @@ _LISTED: Final = (
     *("agents.0.policy", "agents.0.algorithm.settings.learning_rate", "agents.0.algorithm.settings.gamma"),
 )
 """The flags that people change, which `--help` lists."""
-_SHORT_NOTE: Final = "--help-all lists all flags: every number of the experiment can be changed by its place."
+_SHORT_NOTE: Final = (
+    "More: --help-all lists all flags, as every number of the experiment can be changed by its place."
+)
 _NOTE: Final = (
     "Every value of the experiment below can be changed by its place. Agents that equal one before are not "
     "listed; they have the same arguments by their own number. What is not listed cannot be changed on the "
@@ -221,7 +225,7 @@ def parse_with(
             read,
             args=[*numbered(given, start), *(["--help"] if is_help else [])],
             prog=program,
-            description="\n\n".join(filter(None, notes)),
+            description=wrapped("\n\n".join(filter(None, notes))),
             config=_CONFIG,
             registry=flags,
         )
@@ -248,6 +252,20 @@ def _refuse_names(make_experiment: "Callable[..., Experiment]", taken: set[str])
                 f"the recipe has an argument {name!r} of its own, which every experiment has on the command "
                 "line; allowed: another name"
             )
+
+
+def wrapped(text: str, *, before: str = "") -> str:
+    """Return paragraphs in lines that fit the terminal; all but the first of each begin with spaces, as tyro
+    joins others.
+
+    Args:
+        before: what stands before the first line, and as wide a space before the others.
+    """
+    width, indent = shutil.get_terminal_size().columns, " " * (len(before) or 2)
+    paragraphs = [" ".join(part.split()) for part in text.split("\n\n")]
+    return "\n\n".join(
+        textwrap.fill(part, width, initial_indent=before, subsequent_indent=indent) for part in paragraphs
+    )
 
 
 def _about(make_experiment: "Callable[..., Experiment]") -> str:

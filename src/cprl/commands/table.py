@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import tyro
 
+from cprl.commands.flags import NO_DEFAULT
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.runs.recipe import runs_in
 from cprl.system.defaults import LAST, STUDY_TABLE, WINDOW
@@ -39,7 +40,7 @@ class Compare:
 
 
 def table(
-    runs: tuple[Path, ...],
+    runs: Annotated[tuple[Path, ...], NO_DEFAULT],
     /,
     *,
     by: tyro.conf.UseAppendAction[tuple[str, ...]] = (),

@@ -154,6 +154,9 @@ def read_recipe(run: Path) -> dict[str, Any]:
     path = Path(run) if Path(run).is_file() else Path(run) / RECIPE_FILE
     try:
         recipe = read_json(path)
+    except FileNotFoundError as error:
+        reason = f"it holds no {RECIPE_FILE}" if Path(run).is_dir() else "there is no such directory"
+        raise ValueError(f"{run} is not the directory of a run: {reason}") from error
     except (OSError, ValueError) as error:
         raise ValueError(f"{path} is not the recipe of a run: {error!r}") from error
     recipe_config(recipe, where=path)

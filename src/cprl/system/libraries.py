@@ -3,12 +3,16 @@
 `cprl.system.compat` and `cprl.commons.compiled` use private parts of libraries through this.
 """
 
+import logging
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from types import ModuleType
+
+from cprl.system.output import in_notebook
 
 
 def require(library: str, holder: object, *parts: str) -> None:
@@ -53,6 +57,14 @@ def _installed(library: str) -> str:
         return version(library)
     except PackageNotFoundError:
         return "(not installed)"
+
+
+def quiet_in_notebooks() -> None:
+    """Let what TorchRL imports not greet in a notebook with advice to install widgets, which cprl uses not at
+    all: TorchRL imports Ray where that is installed, and Ray imports tqdm."""
+    if in_notebook():
+        warnings.filterwarnings("ignore", message="IProgress not found")
+        logging.getLogger("ray.widgets.util").setLevel(logging.WARNING)
 
 
 def when_imported(name: str, call: Callable[[], object]) -> None:

@@ -14,6 +14,8 @@ from shutil import which
 from types import ModuleType
 from typing import Final
 
+from cprl.values import meant
+
 PROGRAM: Final = "cprl run "
 """How the program of a shipped recipe begins, where a script has its path."""
 
@@ -84,13 +86,10 @@ def shipped_recipes() -> dict[str, Recipe]:
 def recipe_named(name: str) -> Recipe:
     recipes = shipped_recipes()
     if name not in recipes:
-        raise ValueError(f"there is no recipe {name!r}; allowed: {recipe_names()}")
+        raise ValueError(
+            f"there is no recipe {name!r}{meant(name, recipes)}; allowed: those that cprl recipe lists"
+        )
     return recipes[name]
-
-
-def recipe_names() -> str:
-    """The names of all recipes that can be run, for messages."""
-    return ", ".join(recipe.name for recipe in shipped_recipes().values() if recipe.runs)
 
 
 def is_shipped(word: str) -> bool:
