@@ -268,8 +268,8 @@ def export(
         out: the folder of the results, the file of "csv", or the directory of the Minari data sets.
         weights: also the trained weights. Without them a report tells of the training alone, and nothing can
             play the agents.
-        format: "results"; "csv", a row for each episode, turn and agent; or "minari", a data set for each
-            agent, of the extra "minari".
+        format: "results"; "csv", a row for each episode, turn and agent, with what it did and got and where
+            it stands; or "minari", a data set for each agent, of the extra "minari".
         episodes: of "csv" and "minari": fresh episodes that are played.
         replica: likewise: whose agents.
         seed: likewise: of the worlds and all chance, see cprl film; not that of the training.
