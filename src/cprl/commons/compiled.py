@@ -158,8 +158,8 @@ def _compile_in_child(function: Callable[[], Any], types: Any) -> None:
         child = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet, env=surroundings)
     except OSError:  # e.g. where Python is part of another program
         return
+    assert child.stdin is not None
     try:
-        assert child.stdin is not None
         with suppress(OSError):  # it ended before it read all
             child.stdin.write(pickle.dumps((function, types)))
             child.stdin.flush()

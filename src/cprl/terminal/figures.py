@@ -237,12 +237,12 @@ def _over(panel: _Panel, window: int) -> int:
 def _means(panel: _Panel, window: int) -> tuple[Values, Values]:
     """The episodes at the centres of running means, and these of each replica, [R, ...]."""
     if not _lanes(panel):
-        return centres(panel.values[0], window), running_mean(panel.values, window)
+        return np.asarray(centres(panel.values[0], window), np.float64), running_mean(panel.values, window)
     of_replicas = zip(panel.values, panel.worlds, strict=True)
     means = np.stack([mean_of_worlds(*of_replica, window) for of_replica in of_replicas])
     is_there = ~np.isnan(means).any(0)
     at = np.arange(means.shape[1]) - (_over(panel, window) - 1) / 2
-    return at[is_there], means[:, is_there]
+    return np.asarray(at[is_there], np.float64), means[:, is_there]
 
 
 def _draw(axes: Axes, panel: _Panel, window: int, dashed: str) -> None:
