@@ -17,7 +17,9 @@ from cprl.learners.settings import DQNSettings
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.statistics import estimate
 from cprl.population import Learning, Scripted
-from cprl.runs.episodes import read_table
+from cprl.runs.course import LAST_EPISODES
+from cprl.runs.curves import as_curves, last_of
+from cprl.runs.episodes import read_episodes, read_table
 from cprl.training.outcome import evaluate_population, fresh_env, is_same_later, make_agents, random_play
 from cprl.values import Custom
 
@@ -93,8 +95,8 @@ def test_a_run_has_the_same_outcome_watched_or_not_and_its_recording_shows_the_e
     assert headers[0].startswith("#### Episode 1 of 3 · begins")
     assert headers[-2].startswith("#### Episode 3 of 3 · begins, exploring · ")
     assert f" apples, random play {random:.3g} · " in headers[-2]
-    learning = headers[-2].split(" · ")[2].split(",")[0]
-    ended = f"#### Finished, 3 episodes · while learning {learning}, trained {trained:.3g}, "
+    learning = as_curves(last_of(read_episodes(watched), LAST_EPISODES))["collective_return"].mean()
+    ended = f"#### Finished, 3 episodes · while learning {learning:.3g} apples, trained {trained:.3g}, "
     assert headers[-1].startswith(f"{ended}random play {random:.3g} · ")
     events = [text[0] for text in column(watched / "run.rrd", "log", "TextLog:text")[1]]
     assert any(event.startswith(f"random play {estimates[0]} apples") for event in events)

@@ -156,6 +156,19 @@ def test_with_many_worlds_header_label_bold_line_and_new_bests_count_episodes(tm
     ]
 
 
+def test_the_header_of_a_finished_run_is_of_the_last_two_episodes_of_each_of_sixteen_worlds(tmp_path):
+    """As the terminal says it, whatever the window of the live label is."""
+    fresh = [fake(0, 0, returned=280.0, tagged=0)] * 2
+    with ViewerCallback(tmp_path, CommonsEnv(GAME, 16), title="run", episodes=64, worlds=16) as viewer:
+        viewer.random_play(fresh)
+        for group, apples in enumerate((100, 200, 300, 400)):
+            for world in range(16):
+                episode = fake(16 * group + world, world, returned=float(apples), tagged=0)
+                viewer.on_episode(replace(episode, replica=0), {})
+        viewer.finished({"random": fresh, "trained": fresh})
+    assert " · while learning 350 apples, trained 280, " in headers(tmp_path / "run.rrd")[-1][1]
+
+
 def test_header_and_timelines_count_the_episodes_that_all_replicas_have_ended(tmp_path):
     """The first replica is far ahead; its last apples and frames stand where the header is."""
     env = CommonsEnv(GAME, 4)

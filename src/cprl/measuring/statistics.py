@@ -237,7 +237,7 @@ def over_replicas(values: ByReplica, metric: str = "", clock: float = inf) -> Me
     """Estimate a metric, which may be named, see `bounds`; a mean that is not finite has no interval."""
     means = list(_means(values).values())
     return Measured(
-        estimate=_shown(means).of(metric, clock) if means else None,
+        estimate=estimate_if_finite(means).of(metric, clock) if means else None,
         undefined=sum(isnan(value) for episodes in values.values() for value in episodes),
         episodes=sum(map(len, values.values())),
     )
@@ -248,7 +248,7 @@ def difference_paired(values: ByReplica, reference: ByReplica) -> Estimate | Non
     defined; None if there is none."""
     means, others = _means(values), _means(reference)
     pairs = [means[replica] - others[replica] for replica in means if replica in others]
-    return _shown(pairs) if pairs else None
+    return estimate_if_finite(pairs) if pairs else None
 
 
 def _means(values: ByReplica) -> dict[int, float]:
@@ -264,7 +264,7 @@ def _means(values: ByReplica) -> dict[int, float]:
         }
 
 
-def _shown(means: Sequence[float]) -> Estimate:
+def estimate_if_finite(means: Sequence[float]) -> Estimate:
     """The estimate of means that may not be finite; then it is their mean, without an interval."""
     if all(map(isfinite, means)):
         return estimate(means)

@@ -1,8 +1,10 @@
 """Story: the header, the live label, events, and at the end the phases of a training."""
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import ceil, isfinite, isnan
+from math import ceil, isfinite, isnan, nan
+from statistics import fmean
 from threading import Event, Thread
 from typing import Final, NamedTuple
 
@@ -16,8 +18,9 @@ from cprl.measuring import phases
 from cprl.measuring.episodes import Episode
 from cprl.measuring.now import BEGINS, EXPLORING, Now
 from cprl.measuring.series import Values, mean_of
-from cprl.measuring.statistics import Estimate, estimate
-from cprl.runs.curves import SMOOTHED_EPISODES, running_mean
+from cprl.measuring.statistics import Estimate, estimate_if_finite
+from cprl.runs.course import LAST_EPISODES
+from cprl.runs.curves import SMOOTHED_EPISODES, rounds_of, running_mean
 from cprl.system.times import CLOCK
 from cprl.viewer.board import Filming
 from cprl.viewer.layout import ANOTHER, SETTLED, STRIPS, Curves, legend_of
@@ -41,13 +44,18 @@ def played(episodes: Sequence[Episode], *, replicas: int = 1) -> Played:
     """The numbers of at least one episode in fresh worlds, equally many of each replica, one replica after
     the other; of any other number the mean alone."""
     replicas = 1 if len(episodes) % replicas else replicas
-    values = [float(episode.metrics.get("collective_return", episode.return_.sum())) for episode in episodes]
+    values = list(map(_gained, episodes))
     died = [has_died(episode) for episode in episodes]
     return Played(
-        harvest=estimate(np.reshape(values, (replicas, -1)).mean(1)),
+        harvest=estimate_if_finite(np.reshape(values, (replicas, -1)).mean(1).tolist()),
         died=None if None in died else sum(map(bool, died)),
         episodes=len(values),
     )
+
+
+def _gained(episode: Episode) -> float:
+    """What all agents got together: apples, or the return where the game reports no harvest."""
+    return float(episode.metrics.get("collective_return", episode.return_.sum()))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,8 +92,8 @@ class Header:
         return self._text(f"Episode {episode:,} {self._of}", label, f"{self._amount(mean)}{beside}", deaths)
 
     def finished(self, learning: float, trained: Played, random: Played) -> str:
-        """After the evaluation of a run: the last mean of its training, and of fresh worlds those of the
-        trained policy, which explores less there, and of random play."""
+        """After the evaluation of a run: what agents got at the end of its training, and in fresh worlds the
+        trained policy, which explores less there, and random play."""
         amounts = {"trained": trained.harvest.value, "random play": random.harvest.value}
         if not isnan(learning):
             amounts = {"while learning": learning, **amounts}
@@ -209,6 +217,8 @@ class Story(View):
         self._ended = 0
         self._died: dict[int, int] = {}
         """How many boards died early, by the episode in their world, until all have ended it."""
+        self._last: dict[tuple[int, int], deque[float]] = {}
+        """What all agents got in the last episodes of each world of each replica."""
         self._is_over = False
         # A file of a resumed run must not say so: it is shown with those before it.
         logger.log_states(_NOW, {0: BEGINS}, live_only=True)
@@ -228,6 +238,9 @@ class Story(View):
         self._logger.show_live(HEADER, self.header.begins(status, self.now.random_play))
 
     def on_episode(self, episode: Episode) -> None:
+        each = rounds_of(LAST_EPISODES, self._curves.worlds)
+        last = self._last.setdefault((episode.replica, episode.world), deque(maxlen=each))
+        last.append(_gained(episode))
         if (died := has_died(episode)) is not None:
             together = episode.episode // self._curves.worlds
             self._died[together] = self._died.get(together, 0) + died
@@ -282,12 +295,19 @@ class Story(View):
                 events.append("exploration ends: no epsilon falls any more")
         return [*events, f"now {label}"] if label != before else events
 
+    @property
+    def _learning(self) -> float:
+        """What all agents got at the end of the training, as `cprl.runs.course` says it: in as many of the
+        last episodes of each world."""
+        each = min(map(len, self._last.values()), default=0)
+        return fmean(value for last in self._last.values() for value in list(last)[-each:]) if each else nan
+
     def finished(self, played_by: Mapping[str, Sequence[Episode]]) -> None:
         """Logs the evaluation of a run that is over, and its phases."""
         replicas = self._curves.replicas
         trained = played(played_by["trained"], replicas=replicas)
         random = played(played_by["random"], replicas=replicas)
-        self._end(self.header.finished(self.now.mean, trained, random))
+        self._end(self.header.finished(self._learning, trained, random))
         self._logger.log_text(f"finished: trained {self._in_words(trained)}")
 
     def close(self) -> None:
@@ -297,7 +317,7 @@ class Story(View):
         if self._ended + self._curves.worlds <= self._episodes and not self.header.is_about:
             self._logger.log_document(HEADER, self.header.stopped(self._ended, self.now.mean))
         else:
-            self._end(self.header.ended(self.now.mean))
+            self._end(self.header.ended(self._learning))
 
     def _end(self, header: str) -> None:
         self._is_over = True
