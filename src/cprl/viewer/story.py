@@ -193,11 +193,11 @@ class Story(View):
         self._logger, self._filming, self._curves, self._game = logger, filming, logger.curves, game
         self._episodes = episodes
         self.header = Header(
+            legend=legend_of(self._curves),
             episodes=episodes,
             boards=self._curves.replicas * self._curves.worlds,
             unit=self._curves.unit,
             rules=rules_of(game),
-            legend=legend_of(self._curves),
             is_about=is_about,
         )
         self.now = Now(self._curves.worlds)
