@@ -81,8 +81,8 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
     before.append(f"{learned(run.specs)}, {run.experiment.trained_for}.")
     after = ["## Fresh episodes, beside random play", "", *markdown(run_table(evaluation))]
     after += [
-        f"These episodes were played for this page, in other worlds than those above, so that means differ by "
-        f"chance. The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`."
+        "These episodes were played for this page, in other worlds than those above, so that means differ "
+        f"by chance. The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`."
     ]
     sections = [
         _html("\n".join(after)),

@@ -89,7 +89,7 @@ def _table(title: str, played: Played) -> Cells:
     names = [name if place or len(played) == 1 else f"{name} (baseline)" for place, name in enumerate(played)]
     returns = [_returns(episodes) for episodes in played.values()]
     harvests = [_harvests(episodes) for episodes in played.values()]
-    values: dict[str, list[ByReplica]] = {}
+    values: dict[str, list[dict[int, list[float]]]] = {}
     if all(harvests):
         values[with_unit("collective_return")] = harvests
         if not all(_are_close(*both) for both in zip(harvests, returns, strict=True)):  # as under fines
