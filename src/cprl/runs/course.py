@@ -187,7 +187,7 @@ def _verdict(ends: Mapping[str, Outcome], random: Outcome, others: str, *, is_fa
         more = {WORSE: "", BETTER: " In fresh worlds they end better off.", "": f" {_unsure(list(ends)[-1])}"}
         meaning = ends_text + more[words[-1]]
     elif len(set(words)) == 1:
-        no_fall = ": no tragedy so far" * (words[0] == BETTER)
+        no_fall = ": no tragedy so far" * (words[0] == BETTER and len(ends) > 1)
         meaning = f"They end {words[0]} than {others}{no_fall}." if words[0] else f"{whether}."
     else:
         known = [f"{when} they end {word} than {others}" for when, word in judged.items() if word]

@@ -19,6 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize, to_hex
 from matplotlib.ticker import NullLocator
 
+from cprl.measuring.metrics import bounds
 from cprl.measuring.statistics import Estimate, curve_interval, form_for
 from cprl.runs.curves import SMOOTHED_EPISODES, running_mean
 from cprl.studies.tables.comparing import (
@@ -185,6 +186,9 @@ def _draw_levels(
             axes.plot(at, [chance.get(name, nan) for name in names], marker="_", markersize=9, **look)
     if chance and (is_same or len(lines) > 1):
         axes.plot([], [], label=CHANCE, **RANDOM_LINE)
+    bottom, top = axes.get_ylim()
+    if bounds(comparison.metric)[0] == 0 and bottom < top / 2:
+        axes.set_ylim(0, None)
 
 
 def places_of(levels: Iterable[float]) -> tuple[dict[float, float], bool]:

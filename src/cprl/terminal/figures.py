@@ -241,8 +241,8 @@ def _means(panel: _Panel, window: int) -> tuple[Values, Values]:
     of_replicas = zip(panel.values, panel.worlds, strict=True)
     means = np.stack([mean_of_worlds(*of_replica, window) for of_replica in of_replicas])
     is_there = ~np.isnan(means).any(0)
-    at = np.arange(means.shape[1]) - (_over(panel, window) - 1) / 2
-    return np.asarray(at[is_there], np.float64), means[:, is_there]
+    at = np.arange(means.shape[1], dtype=np.float64) - (_over(panel, window) - 1) / 2
+    return at[is_there], means[:, is_there]
 
 
 def _draw(axes: Axes, panel: _Panel, window: int, dashed: str) -> None:
