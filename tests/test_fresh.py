@@ -104,8 +104,8 @@ def test_words_say_which_episode_it_is_and_what_all_replicas_come_to(run, tmp_pa
         "apples."
     )
     assert fresh.words == (
-        f"A typical episode (replica 0, episode {fresh.episode}): of the first 5 its board's life "
-        f"is nearest to the median of the replicas, 6 turns. {known}"
+        f"A typical episode (replica 0, episode {fresh.episode}), chosen of the first 5 for a life near the "
+        f"median of the replicas, 6 turns. {known}"
     )
     assert fresh_episode(run, replica=1, episode=3).words == f"Replica 1, episode 3. {known}"
     many = trained(tmp_path / "many", turns=list(range(1, 10)), apples=list(range(11, 20)))
@@ -113,7 +113,7 @@ def test_words_say_which_episode_it_is_and_what_all_replicas_come_to(run, tmp_pa
         "of the 9 replicas last 1 to 9 turns on average and pick 11 to 19 apples" in fresh_episode(many).words
     )
     alone = trained(tmp_path / "alone", turns=[9.0], apples=[20.0])
-    assert "nearest to the average, 9 turns. The trained agents last 9 turns" in fresh_episode(alone).words
+    assert "near the average, 9 turns. The trained agents last 9 turns" in fresh_episode(alone).words
 
 
 def test_what_is_asked_for_is_taken_as_it_is(run):

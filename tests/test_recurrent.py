@@ -408,8 +408,8 @@ def test_a_stored_run_is_loaded_evaluated_filmed_and_played_against(ran):
         )
         for one, other in zip(found.trained[replica], alone, strict=True):
             assert np.array_equal(one.return_, other.return_)
-    film(run)
-    assert (run / "film-0-0.rrd").stat().st_size > 10_000
+    recording, _ = film(run)
+    assert recording.stat().st_size > 10_000
     session = open_session(str(run), agent=2, steps=5)
     for _ in range(5):
         session.act("forward")

@@ -48,10 +48,11 @@ class FreshEpisode(NamedTuple):
         if not self.is_typical:
             return f"Replica {self.replica}, episode {self.episode}. {known}".rstrip()
         averages = averages_of(self.run)
+        turns, _ = _median(averages)
         middle = "the median of the replicas" if len(averages) > 1 else "the average"
-        nearest = f"its board's life is nearest to {middle}, {_median(averages)[0]:,.0f} turns"
+        chosen = f"chosen of the first {EPISODES_TRIED} for a life near {middle}, {turns:,.0f} turns"
         which = f"replica {self.replica}, episode {self.episode}"
-        return f"A typical episode ({which}): of the first {EPISODES_TRIED} {nearest}. {known}"
+        return f"A typical episode ({which}), {chosen}. {known}"
 
 
 def averages_of(run: LoadedRun) -> dict[int, tuple[float, float]]:
@@ -140,22 +141,19 @@ def fresh_episodes(
     if replica is not None or episode is not None:
         return [_fresh(run, replica, episode or 0, seed) for run in loaded]
     replicas = [typical_replica(run) for run in loaded]
-    medians = [_median(averages) if (averages := averages_of(run)) else None for run in loaded]
+    are_known = [bool(averages_of(run)) for run in loaded]
 
-    def distances(tried: int) -> tuple[float, float]:
-        """How far an episode of all runs is from the medians of its turns, and of its apples."""
-        far = np.zeros(2)
-        for run, of_run, median in zip(loaded, replicas, medians, strict=True):
-            if median is not None:
-                far += _distance(_fresh(run, of_run, tried, seed), median)
-        turns, apples = far.tolist()
-        return turns, apples
+    def played(tried: int) -> list[FreshEpisode]:
+        """An episode of all runs, each with its typical replica."""
+        each = zip(loaded, replicas, are_known, strict=True)
+        return [_fresh(run, own, tried, seed)._replace(is_typical=is_known) for run, own, is_known in each]
 
-    typical = min(range(EPISODES_TRIED), key=distances) if any(medians) else 0
-    return [
-        _fresh(run, of_run, typical, seed)._replace(is_typical=median is not None)
-        for run, of_run, median in zip(loaded, replicas, medians, strict=True)
-    ]
+    def distance(tried: int) -> list[float]:
+        """How far the turns of an episode of all runs are from the medians, and how far the apples."""
+        far = [_distance(fresh) for fresh in played(tried) if fresh.is_typical]
+        return list(np.sum(far, axis=0))
+
+    return played(min(range(EPISODES_TRIED), key=distance) if any(are_known) else 0)
 
 
 def fresh_seed(runs: Sequence[LoadedRun], first: int = SEED) -> int:
@@ -184,8 +182,9 @@ def _fresh(run: LoadedRun, replica: int | None, episode: int, seed: int) -> Fres
     return FreshEpisode(run, env, run.policy(replica, seed=seed + episode), replica, episode)
 
 
-def _distance(fresh: FreshEpisode, median: tuple[float, float]) -> NDArray[np.float64]:
+def _distance(fresh: FreshEpisode) -> NDArray[np.float64]:
     """Play an episode; return how far its turns and its apples are from their medians, as shares of these."""
+    median = _median(averages_of(fresh.run))
     (played,) = evaluate(fresh.env, fresh.policies, explore=True)
     reached = np.array([played.steps, played.metrics["collective_return"]])
     return np.asarray(np.abs(reached - median) / np.maximum(1.0, median))
