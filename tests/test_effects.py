@@ -8,11 +8,13 @@ import pyarrow as pa
 import pytest
 
 from cprl.evaluation.report import report
+from cprl.studies.figures import by_condition, heat_map
 from cprl.studies.results import write_summary
 from cprl.studies.tables.comparing import cells, compare, compared_cells, metrics_of
 from cprl.studies.tables.effects import contrast, effect_cells, effects_of, estimated
 from cprl.studies.tables.table import Design, StudyTable
 from cprl.system.defaults import STUDY_TABLE
+from cprl.terminal.style import Sheet
 
 FINES, PROBS, REPLICAS = (0, 1, 4), (0.25, 1.0), 4
 NOISE = (-1.0, 0.0, 0.0, 1.0)
@@ -218,3 +220,37 @@ def test_a_difference_that_two_columns_have_in_common_is_one_test():
     )
     rounded = {"collective_return": harvest, "net": lambda level, r: harvest(level, r) * (1 + 1e-8)}
     assert metrics_of(table_of(rounded, conditions)) == ("collective_return",), "payments are float32"
+
+
+def test_what_an_institution_took_and_found_stands_beside_and_is_not_tested(tmp_path):
+    taken = {
+        "institutions/fines": lambda fine, prob, r: fine * 10,
+        "institutions/violations": lambda *_: 0,
+    }
+    table = table_of({**BOTH, **taken}, GRID)
+    levels, differences, measures = compared_cells(table)
+    assert measures.head == ["condition", "replicas", "fines of all, apples"], "nothing was violated"
+    assert measures.rows[-1][2] == "40.0 [40.0, 40.0]"
+    assert not [name for name in (*levels.head, *differences.head) if "fines" in name]
+    assert len(compared_cells(table, ["net"])) == 2
+    by_condition(table, tmp_path / "levels.svg")
+    assert "fines of all" in (tmp_path / "levels.svg").read_text()
+
+
+def test_agents_that_follow_a_script_are_not_called_trained(tmp_path):
+    table = replace(table_of(BOTH, GRID), agents_learn=False)
+    assert StudyTable.read(table.write(tmp_path / "table.parquet")).agents_learn is False
+    summary = write_summary(table, tmp_path).read_text()
+    assert "## The agents in fresh worlds" in summary
+    assert "10 fresh episodes of the agents; means" in summary
+    assert "rained agents" not in summary
+
+
+def test_a_map_promises_no_intervals_and_names_the_family_of_its_stars(tmp_path, monkeypatch):
+    sheets = []
+    finish = Sheet.finish
+    monkeypatch.setattr(Sheet, "finish", lambda sheet: (sheets.append(sheet), finish(sheet)))
+    heat_map(table_of(BOTH, GRID), ("fine", "prob"), tmp_path / "map.png")
+    assert "interval" not in sheets[0].caption
+    assert "over n replicas." in sheets[0].caption
+    assert "; * not 0 by Holm's method for the 7 differences of 2 metrics together." in sheets[0].caption

@@ -38,6 +38,7 @@ from cprl.runs.curves import as_curves
 from cprl.runs.episodes import OF_INSTITUTIONS as COLUMNS
 from cprl.runs.episodes import EpisodeTable, as_table, read_episodes
 from cprl.training import train
+from cprl.viewer.callback import _stored_episodes
 
 NAN = float("nan")
 GROUPS = ((0, 1), (2, 3))
@@ -217,6 +218,15 @@ def test_with_groups_inequality_within_and_between_them_is_measured():
     curves = as_curves(as_table([episode], 0))
     assert {"institutions/equality_between", "institutions/net_equality_within"} <= set(curves)
     assert curves["institutions/net_equality_between"].item() == pytest.approx(1 - 2 / 30)
+
+
+def test_a_viewer_that_goes_on_with_a_run_has_the_measures_of_groups(tmp_path):
+    (episode,) = played(*an_episode(), institutions=[Levies(groups=((0,), (1,)))])
+    with EpisodeTable(tmp_path / "episodes.parquet") as table:
+        table.add(episode)
+    (again,) = _stored_episodes(tmp_path)
+    assert again.institutions["net_equality_between"] == pytest.approx(1 - 2 / 30)
+    assert not [name for name in again.metrics if "institutions" in name]
 
 
 def test_a_game_without_institutions_is_as_it_was():

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
@@ -740,7 +741,7 @@ def test_the_summary_says_how_many_steps_each_replica_learned_from_where_the_run
         results.write_results(PAIRED, tmp_path, tmp_path / "runs")
         return (tmp_path / "summary.md").read_text()
 
-    monkeypatch.setattr(results, "figures_of", lambda *_: iter(()))
+    monkeypatch.setattr(results, "figures_of", lambda *_, **__: iter(()))
     write_study(PAIRED, tmp_path / "runs", harvest)
     assert "environment steps" not in summary(), "runs of before did not say"
     reports = [tmp_path / "runs" / trial.name / "report.json" for trial in trials_of(PAIRED)]
@@ -774,6 +775,8 @@ def table_command(tmp_path, monkeypatch):
         ("--by name --part random --last 30", "--last .* without --part random"),
         ("", r"cprl table RUN\.\.\. --by "),
         ("--by name --summary", "--summary .* without --by"),
+        ("--by name --figures pdf", "--figures .* without --by"),
+        ("--csv --figures pdf", "without --figures"),
         ("--csv --out a.csv", "without --out, --out FILE.csv"),
         ("--csv --summary", "without --summary"),
         ("--csv --metric equality", "without --metric"),
@@ -795,7 +798,14 @@ def test_cprl_table_prints_any_runs_by_a_field_and_writes_them(table_command, ca
     printed = capsys.readouterr().out
     assert "+5.0 [-1.6, +11.6]" in printed
     assert "2 runs by game.rules.freeze_steps: 6 replicas of 2 of 2 conditions" in printed
-    assert len(StudyTable.read("table.parquet").rows) > 0
+    rows = StudyTable.read("table.parquet").rows
+    assert set(rows["metric"].to_pylist()) == {"collective_return"}
+    assert set(rows["part"].to_pylist()) == {"training", "evaluation", "random"}
+    first, second = pyarrow.csv.read_csv("table.csv").to_pylist()
+    assert (first["metric"], first["condition"], first["replicas"]) == (*words[3:4], "freeze_steps=5", 3)
+    assert (first["difference"], first["differs"]) == (None, False)
+    numbers = [second[name] for name in ("mean", "difference", "difference_low", "difference_high")]
+    assert numbers == pytest.approx([100 + 5 + 24.5, 5, -1.57, 11.57], abs=0.01)
     assert "| freeze_steps=25 | 3 | +5.0 [-1.6, +11.6] |" in Path("table.md").read_text()
     for out, message in (("table.md", "is not overwritten"), ("a.txt", r"a name that ends in \.parquet")):
         with pytest.raises(SystemExit, match=message):
@@ -821,6 +831,12 @@ def test_cprl_table_of_a_study_says_and_writes_what_its_table_alone_gives(table_
     assert "Differences from freeze_steps=25" in Path("pairs/summary.md").read_text()
     table_command("--metric", "collective_return", "--reference", "freeze_steps=25", of="pairs")
     assert "-5.0 [-11.6, +1.6]" in capsys.readouterr().out
+    table_command("--figures", "pdf", "--metric", "equality", of="pairs")
+    drawn = {path.name for path in Path("pairs/figures").glob("*.pdf")}
+    assert drawn == {
+        f"{name}.pdf" for name in ("by_game_rules_freeze_steps", "courses", "differences", "levels")
+    }
+    assert "Figure: pairs/figures/levels.pdf" in capsys.readouterr().out
     for words in (["--window", "1"], ["--reference", "none"]):
         with pytest.raises(SystemExit, match=words[0]):
             table_command(*words, of="pairs")

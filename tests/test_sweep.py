@@ -100,10 +100,10 @@ def test_the_end_of_the_training_that_is_compared_may_be_longer():
 def test_a_dry_run_lists_all_trials_drawn_ones_too_and_writes_nothing(here, capsys):
     sweep(f"mine.py --vary {FREEZE}=integers(1,8) --draws 8 --design latin_hypercube --dry-run")
     said = capsys.readouterr().out
-    assert all(f"freeze_steps={steps}, replica 0  missing" in said for steps in range(1, 9))
+    assert all(f"freeze_steps={steps}, replica 0  waiting" in said for steps in range(1, 9))
     sweep(f"mine.py --vary {FREEZE}=2,5 --dry-run")
     said = capsys.readouterr().out
-    assert "freeze_steps=5, replica 0  missing" in said
+    assert "freeze_steps=5, replica 0  waiting" in said
     assert "2 conditions (game.rules.freeze_steps), 1 replicas each, in studies/tiny/runs" in said
     assert sorted(path.name for path in here.iterdir()) == ["mine.py"]
 
@@ -257,7 +257,7 @@ def test_stored_and_shipped_recipes_are_varied_too_and_a_study_is_not(tmp_path, 
     run = start_run(tmp_path / "old.py", TINY.name, TINY.to_recipe)
     for source in (run, run / "recipe.json"):
         sweep(f"{source} --vary {FREEZE}=2,5 --dry-run")
-        assert "freeze_steps=5, replica 0  missing" in capsys.readouterr().out
+        assert "freeze_steps=5, replica 0  waiting" in capsys.readouterr().out
     assert recipe_of(run)() == TINY
     for name in ("commons", "tragedy", "mixed", "swap_the_loss", "two_complex"):
         sweep(f"{ROOT / 'recipes' / name}.py --vary {FREEZE}=5,25 --replicas 4 --dry-run")

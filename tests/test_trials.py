@@ -688,13 +688,13 @@ def test_a_trial_of_so_many_steps_is_as_far_as_its_steps_however_short_episodes_
 
 def test_a_trial_runs_while_it_says_something_new_whatever_the_clock_says(says, look, monkeypatch):
     says(0, beat=500, episodes=4, steps=9)
-    assert look()[1].state == "missing", "perhaps the last words of a dead process"
+    assert look()[1].state == "waiting", "perhaps the last words of a dead process"
     says(0, beat=501, episodes=4, steps=9)
     assert look()[1].state == "running"
     says(0, beat=502, episodes=20, steps=9)
     assert look()[1].state == "evaluating", "all are played, and it is not finished yet"
     monkeypatch.setattr(progress, "SILENT_S", 0.0)
-    assert look()[1].state == "missing"
+    assert look()[1].state == "waiting"
 
 
 def test_trials_that_count_steps_are_shown_by_their_steps(tmp_path):
@@ -721,7 +721,7 @@ def test_a_table_is_never_higher_than_a_screen_and_counts_the_rest(tmp_path):
     lines = screen.file.getvalue().splitlines()
     assert len(lines) == 19
     assert lines[2].split() == ["freeze_steps=78,", "replica", "0", "failed", "0/2", "ValueError:", "no"]
-    assert lines[-2].strip() == "and 85 missing"
+    assert lines[-2].strip() == "and 85 waiting"
     assert lines[-1].startswith("0 of 100 trials finished, 1 failed, 0 of 200 episodes")
 
 
@@ -905,7 +905,7 @@ def test_a_copy_that_was_cut_off_is_made_anew(tmp_path, monkeypatch):
     assert (run_of(long, pool) / "evaluation-2").is_dir()
 
 
-def test_failures_have_their_reason_and_stand_before_those_that_are_missing(look, tmp_path):
+def test_failures_have_their_reason_and_stand_before_those_that_wait(look, tmp_path):
     Status(tmp_path / "status", TRIALS[2].name).fail("ValueError: of | chance", "trace")
     snapshot, row = look(2)
     assert snapshot.rows[0] is row

@@ -138,6 +138,11 @@ class Scripted(Value):
 AgentSpec: TypeAlias = Learning | Team | Scripted | Frozen
 
 
+def any_learns(specs: Sequence[AgentSpec]) -> bool:
+    """Return whether an agent learns."""
+    return any(isinstance(spec, Learning | Team) for spec in specs)
+
+
 def learned(by_agent: Sequence[AgentSpec]) -> str:
     """Who plays and how they learned, of `specs_by_agent`, e.g. "4 agents by DQN"."""
     names = [_kind(spec) for spec in by_agent]

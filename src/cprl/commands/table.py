@@ -50,6 +50,7 @@ def table(
     out: Path | None = None,
     csv: bool = False,
     summary: bool = False,
+    figures: Literal["png", "pdf", "svg"] | None = None,
 ) -> None:
     """Compares any runs, grouped by fields of their experiments, with intervals over replicas.
 
@@ -63,28 +64,30 @@ def table(
             the first, or the reference of the study.
         window: episodes of a row of the table, of which --last compares whole ones, 10 by default; 1 for
             episodes one by one; with --by.
-        out: a new file: .parquet or .csv with every window of episodes, replica and metric, or .md with
-            what is printed.
+        out: a new file: .md or .csv with the means, differences and intervals that are printed, or .parquet
+            with every window of episodes and replica, of the metrics asked for.
         csv: print every window of episodes, replica and metric as CSV, and nothing else.
         summary: write summary.md and the figures of a study again, from its table alone.
+        figures: draw the figures of a study into its figures/ as png, pdf or svg, of the metrics asked for.
     """
     if out is not None:
         if out.suffix not in _SUFFIXES:
             raise ValueError(f"--out is {out}; allowed: a name that ends in {', '.join(_SUFFIXES)}")
         refuse_to_write_over(out)
     if csv:
-        given = {"out": out, "summary": summary, "reference": reference, **vars(compare)}
+        given = {"out": out, "summary": summary, "figures": figures, "reference": reference, **vars(compare)}
         defaults = {"summary": False, **vars(Compare())}
         for name, value in given.items():
             if value != defaults.get(name):
                 raise ValueError(
                     f"--csv prints every row and nothing else; allowed: without --{name}"
-                    + ", --out FILE.csv writes the same rows" * (name == "out")
+                    + ", --out FILE.csv writes means and intervals" * (name == "out")
                 )
     if not runs:
         raise ValueError("cprl table needs at least one run: cprl table RUN... --by FIELD")
-    if summary and by:
-        raise ValueError("--summary is of a study; allowed: without --by, cprl table STUDY --summary")
+    for flag, value in (("--summary", summary), ("--figures", figures)):
+        if value and by:
+            raise ValueError(f"{flag} is of a study; allowed: without --by, cprl table STUDY {flag}")
     if by:
         runs_in(runs)
 
@@ -112,8 +115,13 @@ def table(
         from cprl.studies.results import summarise_again
 
         say(f"Written: {summarise_again(study_table, runs[0], last=last)}")
+    if figures is not None:
+        from cprl.studies.results import draw
+
+        for path in draw(study_table, runs[0], last=last, suffix=f".{figures}", metrics=compare.metric):
+            say(f"Figure: {path}")
     if out is not None:
-        _write(study_table, [*compared, *effects], out)
+        _write(study_table, [*compared, *effects], compare, last, out)
         say(f"Written: {out}")
     _exit_if_damaged(study_table)
 
@@ -144,14 +152,24 @@ def _table_in(runs: Sequence[Path], reference: str | None, window: int | None) -
     return replace(table, design=replace(table.design, reference=reference))
 
 
-def _write(table: "StudyTable", compared: "Sequence[Cells]", out: Path) -> None:
-    if out.suffix == ".parquet":
-        table.write(out)
-        return
-    content = table.to_csv()
-    if out.suffix == ".md":
-        from cprl.terminal.tables import markdown
+def _write(table: "StudyTable", compared: "Sequence[Cells]", asked: Compare, last: int, out: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.compute as pc
 
+    from cprl.studies.tables.comparing import compare, compared_rows, metrics_of
+    from cprl.studies.tables.table import csv_of
+    from cprl.terminal.tables import markdown
+
+    if out.suffix == ".parquet":
+        chosen = table.rows.filter(pc.is_in(table.rows["metric"], pa.array(asked.metric or table.metrics)))
+        replace(table, rows=chosen).write(out)
+        return
+    if out.suffix == ".csv":
+        metrics = metrics_of(table, asked.metric, part=asked.part)
+        content = csv_of(
+            compared_rows([compare(table, metric, part=asked.part, last=last) for metric in metrics])
+        )
+    else:
         lines = [line for cells in compared for line in (cells.heading, "", *markdown(cells))]
         content = "\n".join([*lines, *str(table).split("\n"), ""])
     out.parent.mkdir(parents=True, exist_ok=True)

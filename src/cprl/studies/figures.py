@@ -31,6 +31,7 @@ from cprl.studies.tables.comparing import (
     compare,
     differences_in,
     family_of,
+    measures_of,
     metric_title,
     metrics_of,
 )
@@ -66,32 +67,35 @@ _MAPPED: Final = 2
 """Metrics that have a heat map."""
 
 
-def figures_of(table: StudyTable, last: int) -> Iterator[tuple[str, str, Callable[[Path], Path]]]:
+def figures_of(
+    table: StudyTable, last: int, *, suffix: str = ".png", metrics: Sequence[str] = ()
+) -> Iterator[tuple[str, str, Callable[[Path], Path]]]:
     """Yield what fits a study: the name of each figure's file, what it shows, and what draws it."""
     if not table.metrics:
         return
     design, conditions = table.design, finished(table)
     for factor in design.factors:
         if is_numeric([design.conditions[name][factor] for name in conditions]):
-            draw = partial(by_factor, table, factor, last=last)
-            yield f"by_{_file_name(factor)}.png", f"Outcome by {factor}", draw
+            draw = partial(by_factor, table, factor, metrics=metrics, last=last)
+            yield f"by_{_file_name(factor)}{suffix}", f"Outcome by {factor}", draw
     if len(conditions) <= MOST_CONDITIONS:
-        yield "levels.png", "Outcome by condition", partial(by_condition, table, last=last)
-        yield "courses.png", "The course of the training", partial(courses, table)
+        levels = partial(by_condition, table, metrics=metrics, last=last)
+        yield f"levels{suffix}", "Outcome by condition", levels
+        yield f"courses{suffix}", "The course of the training", partial(courses, table, metrics=metrics)
         if len(conditions) > 1 and table.replicas[design.reference]:
-            draw = partial(by_condition, table, kind="differences", last=last)
-            yield "differences.png", f"Differences from {design.reference}", draw
+            differences = partial(by_condition, table, kind="differences", metrics=metrics, last=last)
+            yield f"differences{suffix}", f"Differences from {design.reference}", differences
     for pair in grids(design):
         words, what = "_".join(map(_file_name, pair)), " and ".join(pair)
-        for metric in metrics_of(table)[:_MAPPED]:
+        for metric in metrics_of(table, metrics)[:_MAPPED]:
             draw = partial(heat_map, table, pair, metric=metric, last=last)
-            yield f"map_{words}_{metric}.png", f"{metric_title(metric)} by {what}", draw
+            yield f"map_{words}_{_file_name(metric)}{suffix}", f"{metric_title(metric)} by {what}", draw
         if len({next(iter(counts)) for counts in table.endings.values()}) > 1:
             title = f"In which phase most replicas end, by {what}"
-            yield f"phases_{words}.png", title, partial(phase_diagram, table, pair)
+            yield f"phases_{words}{suffix}", title, partial(phase_diagram, table, pair)
 
 
-DRAWN: Final = re.compile(r"(by_|map_|phases|levels|differences|courses).*\.png")
+DRAWN: Final = re.compile(r"(by_|map_|phases|levels|differences|courses).*\.(png|pdf|svg)")
 """The names of these files."""
 
 
@@ -130,7 +134,7 @@ def by_factor(
     if factor not in numeric:
         allowed = ", ".join(numeric) or "none, as no factor has levels that are numbers"
         raise refusal("factor", factor, allowed)
-    comparisons = [compare(table, metric, last=last) for metric in metrics_of(table, metrics)]
+    comparisons = [compare(table, metric, last=last) for metric in _chosen(table, metrics)]
     lines, others = _lines(table, factor), [name for name in design.factors if name != factor]
     only = [design.conditions[names[0]][others[0]] for names in lines.values()] if len(others) == 1 else []
     colours = colours_of(list(lines), only or range(len(lines)))
@@ -258,13 +262,20 @@ _NO_WIDTH: Final = 1e-12
 
 
 def by_condition(
-    table: StudyTable, path: Path | str, *, kind: Kind = "levels", last: int = LAST, width: Width = "page"
+    table: StudyTable,
+    path: Path | str,
+    *,
+    kind: Kind = "levels",
+    metrics: Sequence[str] = (),
+    last: int = LAST,
+    width: Width = "page",
 ) -> Path:
     """Draw conditions one below the other: means over replicas, or differences from the reference.
 
     Args:
         table: the table, of at most `MOST_CONDITIONS` conditions that were run; the others are left out.
         kind: "levels", with random play as dashes; or "differences", with a dashed line at 0.
+        metrics: by default those that are compared, and of levels what institutions took and found.
     """
     design, is_levels = table.design, kind == "levels"
     conditions = [name for name in finished(table) if is_levels or name != design.reference]
@@ -272,7 +283,8 @@ def by_condition(
         raise ValueError(f"the reference {design.reference} has no finished run; allowed: one that has")
     if not 0 < len(conditions) <= MOST_CONDITIONS:
         raise refusal("table", table, f"1 to {MOST_CONDITIONS} conditions, not {len(conditions)}")
-    comparisons = [compare(table, metric, last=last) for metric in metrics_of(table)]
+    chosen = _chosen(table, metrics) if is_levels else metrics_of(table, metrics)
+    comparisons = [compare(table, metric, last=last) for metric in chosen]
     first = comparisons[0]
     with drawing(path, width=width) as sheet:
         names = {
@@ -510,8 +522,10 @@ def heat_map(
         sheet.title = f"{table.design.name}: {title_of(comparison)}"
         what = f"Means of {comparison.episodes_text}, then over n replicas."
         differ = f" Differences from {table.design.reference}, {comparison.pairing_text}"
-        metrics = "metric" if len(tested) == 1 else f"{len(tested)} metrics"
-        star = f"; * not 0 by Holm's method for all {family.tests} of {metrics} together."
+        metrics = f"{len(tested)} metric{'s' * (len(tested) > 1)}"
+        has_star = any((metric, name) in family.marked for name in grid.values())
+        star = f"; {'*' if has_star else 'none shown to be'} not 0 by Holm's method for the {family.tests} "
+        star += f"differences of {metrics} together."
         differ += star if family.tests else "."
         sheet.caption = f"{what}{differ if differences else ''}{elsewhere}{_not_run(table)}"
     return Path(path)
@@ -678,6 +692,11 @@ def colours_of(names: Sequence[str], levels: Sequence[Any]) -> dict[str, str]:
         places = {level: 0.88 * place / (len(order) - 1) for place, level in enumerate(order)}
         return {name: to_hex(shades(places[level])) for name, level in zip(names, levels, strict=True)}
     return {name: COLOURS[place % len(COLOURS)] for place, name in enumerate(names)}
+
+
+def _chosen(table: StudyTable, metrics: Sequence[str]) -> tuple[str, ...]:
+    """The metrics whose levels are drawn."""
+    return metrics_of(table, metrics) + (() if metrics else measures_of(table))
 
 
 def replicas_text(replicas: Mapping[str, int]) -> str:

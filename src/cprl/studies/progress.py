@@ -27,13 +27,13 @@ _LINE_PERIOD_S: Final = 10.0
 _OTHER_LINES: Final = 8
 """Of the terminal's height, for all that is not a row."""
 _FEWEST_ROWS: Final = 3
-_COLOURS: Final = {"failed": "red", "finished": "green", "missing": "dim", "unfinished": "dim"}
+_COLOURS: Final = {"failed": "red", "finished": "green", "waiting": "dim", "unfinished": "dim"}
 SILENT_S: Final = 10.0
 """Seconds without a sign of life after which a trial no longer counts as running."""
 
-TrialState = Literal["running", "compiling", "evaluating", "failed", "unfinished", "missing", "finished"]
+TrialState = Literal["running", "compiling", "evaluating", "failed", "unfinished", "waiting", "finished"]
 AT_WORK: Final = ("running", "compiling", "evaluating")
-ORDER: Final[tuple[TrialState, ...]] = (*AT_WORK, "failed", "unfinished", "missing", "finished")
+ORDER: Final[tuple[TrialState, ...]] = (*AT_WORK, "failed", "unfinished", "waiting", "finished")
 """In which a table lists trials: what is under way first, what needs nobody last."""
 
 
@@ -133,7 +133,7 @@ class Overview:
         if reason is not None or time.monotonic() - self._since.get(trial.name, -SILENT_S) >= SILENT_S:
             note = reason or self._status[trial.name].failure()
             note = note or (REASONS["refused"] if state == "refused" else "")
-            idle: TrialState = "failed" if note else "missing" if state == "missing" else "unfinished"
+            idle: TrialState = "failed" if note else "waiting" if state == "missing" else "unfinished"
             return Row(trial, idle, episodes, of, note=note)
         per_s = words.get("episodes_per_s") or 0.0
         if words.get("is_compiling"):

@@ -4,6 +4,7 @@ The summary and the figures are made of the table: `summarise_again` makes them 
 """
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -45,7 +46,7 @@ def write_results(
     for metric in metrics_of(table)[:1]:
         compare(table, metric, last=last)  # refuses before anything is written
     table.write(out / STUDY_TABLE)
-    _draw(table, out, last)
+    draw(table, out, last=last)
     write_summary(table, out, last=last, again=again)
     return table
 
@@ -56,20 +57,30 @@ def summarise_again(table: StudyTable, out: Path, *, last: int = LAST) -> Path:
     for metric in metrics_of(table)[:1]:
         compare(table, metric, last=last)  # refuses before anything is written
     if (out / FIGURES).exists():
-        refuse_links(out)
-        _draw(table, out, last)
+        draw(table, out, last=last)
     earlier = (out / SUMMARY).read_text("utf-8", "replace") if (out / SUMMARY).exists() else ""
     again = re.search("^This line runs what is lacking.*?: `(.*)`$", earlier, re.MULTILINE)
     return write_summary(table, out, last=last, again=again[1] if again else "")
 
 
-def _draw(table: StudyTable, out: Path, last: int) -> None:
-    figures = {name: draw for name, _, draw in figures_of(table, last)}
-    for name, draw in figures.items():
-        draw(out / FIGURES / name)
-    for path in (out / FIGURES).glob("*.png"):
-        if path.name not in figures and DRAWN.fullmatch(path.name):  # of an earlier call
+def draw(
+    table: StudyTable, out: Path, *, last: int = LAST, suffix: str = ".png", metrics: Sequence[str] = ()
+) -> list[Path]:
+    """Draw the figures that fit a study into `figures/`, and return them; those of an earlier call with the
+    same suffix go.
+
+    Args:
+        suffix: ".png", ".pdf" or ".svg".
+        metrics: by default those that are compared.
+    """
+    refuse_links(out)
+    metrics_of(table, metrics)  # refuses before anything is drawn
+    figures = {name: draw_it for name, _, draw_it in figures_of(table, last, suffix=suffix, metrics=metrics)}
+    drawn = [draw_it(out / FIGURES / name) for name, draw_it in figures.items()]
+    for path in (out / FIGURES).glob(f"*{suffix}"):
+        if path.name not in figures and DRAWN.fullmatch(path.name):
             path.unlink()
+    return drawn
 
 
 def write_summary(table: StudyTable, out: Path, *, last: int = LAST, again: str = "") -> Path:
@@ -100,7 +111,8 @@ def _compared(table: StudyTable, part: str, last: int) -> list[str]:
     tables = compared_cells(table, part=part, last=last) + effect_cells(table, part=part, last=last)
     if part == EVALUATION:
         tables += compared_cells(table, part=RANDOM)[:1]
-    lines = ["## Training" if part == TRAINING else "## Trained agents in fresh worlds", ""]
+    agents = "Trained agents" if table.agents_learn else "The agents"
+    lines = ["## Training" if part == TRAINING else f"## {agents} in fresh worlds", ""]
     for each in tables:
         lines += [each.heading, "", *markdown(each)]
     return lines

@@ -196,7 +196,7 @@ class FinishedRuns:
 
     def like(self, config: Mapping[str, Any]) -> list[Path]:
         """Return those of an experiment, in the order of their names."""
-        for path in self._runs.iterdir():
+        for path in self._runs.glob("*"):
             if path.name not in self._read and state_of(path) == "finished":
                 self._read.add(path.name)
                 with suppress(ValueError, KeyError, TypeError):  # of a recipe that cannot be read

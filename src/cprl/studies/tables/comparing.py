@@ -11,6 +11,8 @@ from math import isclose, isnan
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from cprl.measuring.metrics import is_own, title
@@ -29,6 +31,8 @@ SAME_AS: Final = {
     "institutions/net_equality": "equality",
 }
 """Metrics that are another one by construction where nobody pays or gets anything, or is out of play."""
+MEASURES: Final = ("institutions/fines", "institutions/violations")
+"""What institutions took and found, which stands beside the metrics and is not tested."""
 INTERVALS: Final = f"{CONFIDENCE:.0%} intervals over replicas by Student's t"
 
 Kind = Literal["levels", "differences"]
@@ -83,6 +87,7 @@ class Comparison:
     is_paired: bool
     reference: str
     conditions: tuple[Compared, ...]
+    agents_learn: bool = True
 
     @cached_property
     def by_name(self) -> dict[str, Compared]:
@@ -95,7 +100,8 @@ class Comparison:
         number = f"{high}" if low == high else f"{low} to {high}"
         if self.part == TRAINING:
             return f"the last {number} episodes of training"
-        return f"{number} fresh episodes of {'random play' if self.part == RANDOM else 'the trained agents'}"
+        agents = "the trained agents" if self.agents_learn else "the agents"
+        return f"{number} fresh episodes of {'random play' if self.part == RANDOM else agents}"
 
     @property
     def pairing_text(self) -> str:
@@ -132,6 +138,13 @@ def metrics_of(table: StudyTable, metrics: Sequence[str] = (), *, part: str = TR
     repeated = repeated_in(table, part)
     usual = [metric for metric in METRICS if metric in table.metrics and metric not in repeated]
     return tuple(metrics) or (*usual, *filter(is_own, table.metrics))
+
+
+def measures_of(table: StudyTable, part: str = TRAINING) -> tuple[str, ...]:
+    """Return those of `MEASURES` that a table has and that are not 0 in all windows of a part."""
+    is_there = pc.and_(pc.equal(table.rows["part"], part), pc.greater(table.rows["value"], 0))
+    found = set(table.rows.filter(is_there)["metric"].unique().to_pylist())
+    return tuple(metric for metric in MEASURES if metric in found)
 
 
 def repeated_in(table: StudyTable, part: str) -> tuple[str, ...]:
@@ -175,6 +188,7 @@ def _compared(table: StudyTable, metric: str, part: str, last: int) -> Compariso
             )
             for name, (values, undefined, lengths) in means.items()
         ),
+        agents_learn=table.agents_learn,
     )
 
 
@@ -311,10 +325,14 @@ def compared_cells(
     if not comparisons:
         return []
     levels = cells(comparisons)
-    if not metrics:
-        levels = levels._replace(note="\n".join(filter(None, (levels.note, repeated_note(table, part)))))
-    is_alone = len(table.design.conditions) == 1
-    return [levels] if is_alone else [levels, cells(comparisons, "differences")]
+    tables = [levels, cells(comparisons, "differences")]
+    if len(table.design.conditions) == 1:
+        tables = [levels]
+    if metrics:
+        return tables
+    tables[0] = levels._replace(note="\n".join(filter(None, (levels.note, repeated_note(table, part)))))
+    measures = [compare(table, metric, part=part, last=last) for metric in measures_of(table, part)]
+    return [*tables, of_finished(cells(measures))] if measures else tables
 
 
 def repeated_note(table: StudyTable, part: str) -> str:
@@ -325,6 +343,34 @@ def repeated_note(table: StudyTable, part: str) -> str:
         if metric in METRICS
     ]
     return f"Not shown: {'; '.join(parts)} here, in every replica." if parts else ""
+
+
+def compared_rows(comparisons: Sequence[Comparison]) -> pa.Table:
+    """Return means and differences as a tidy table: a row for each metric and condition, numbers without an
+    interval as null; `differs` is what is bold in `cells` of all these together."""
+    family = family_of(differences_in(comparisons))
+    rows = []
+    for comparison in comparisons:
+        for compared in comparison.conditions:
+            one, difference = compared.estimate, compared.difference
+            rows.append(
+                {
+                    "metric": comparison.metric,
+                    "part": comparison.part,
+                    "condition": compared.condition,
+                    "replicas": compared.replicas,
+                    "mean": one and one.value,
+                    "low": one and one.low,
+                    "high": one and one.high,
+                    "reference": comparison.reference,
+                    "difference": difference and difference.value,
+                    "difference_low": difference and difference.low,
+                    "difference_high": difference and difference.high,
+                    "p_value": difference and difference.p_value,
+                    "differs": (comparison.metric, compared.condition) in family.marked,
+                }
+            )
+    return pa.Table.from_pylist(rows)
 
 
 def of_finished(table: Cells) -> Cells:

@@ -29,7 +29,7 @@ from cprl.terminal.tables import Cells
 MOST_INTERACTIONS: Final = 24
 """More are left out: so many tests together would show nothing."""
 
-Weights = Mapping[str, float]
+Weights = dict[str, float]
 """What each condition counts in an effect, by its name; together 0."""
 Levels = tuple[Any, Any]
 """A level of a factor, and the one that it is compared with."""
@@ -104,9 +104,9 @@ def _against(levels: Levels) -> str:
     return f"{level_text(levels[0])} against {level_text(levels[1])}"
 
 
-def _weights(design: Design, levels: Mapping[str, Levels]) -> dict[str, float]:
+def _weights(design: Design, levels: Mapping[str, Levels]) -> Weights:
     """The weights of the effect of one factor, or of the interaction of two."""
-    signs = {}
+    signs: Weights = {}
     for name, at in design.conditions.items():
         sign = 1.0
         for factor, (level, first) in levels.items():

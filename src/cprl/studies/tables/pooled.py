@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from cprl.experiment import Experiment
+from cprl.population import any_learns
 from cprl.runs.recipe import read_recipe, runs_in
 from cprl.studies.factors import ALL, normalised, values_at
 from cprl.studies.study import UNNAMED, Condition, named, short_names, unlike
@@ -65,6 +66,7 @@ def pooled_table(
                 first=firsts[experiment.seed],
                 replicas=replicas,
                 episodes=experiment.episodes,
+                agents_learn=any_learns(experiment.agents),
             )
             sources.append(source)
     seeds = {frozenset(experiment.seed for experiment in members.values()) for members in groups.values()}

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from cprl.measuring import social
 from cprl.measuring.now import LEAST_LOSS, LOST, REGAINED
 from cprl.measuring.phases import FEWEST_EPISODES, UNNAMED
+from cprl.population import any_learns
 from cprl.runs.checkpoints import REPORT
 from cprl.runs.course import BELOW_RANDOM, LAST_EPISODES, PEAK_EPISODES, PEAK_OVER_RANDOM
 from cprl.runs.curves import (
@@ -85,6 +86,8 @@ class Source:
     replicas: int
     episodes: int | None
     """That each replica trains; None where it trains so many steps."""
+    agents_learn: bool = True
+    """Whether any of its agents does."""
 
 
 def study_table(
@@ -139,6 +142,7 @@ def sources_of(study: Study, runs: Path, status: Path | None = None) -> tuple[li
             first=block.first,
             replicas=block.replicas,
             episodes=trial.experiment.episodes,
+            agents_learn=any_learns(trial.experiment.agents),
         )
         finished.append(source)
     return finished, lacking
@@ -184,6 +188,7 @@ def table_of(
             for name, runs in by_condition.items()
         },
         ending_rules=tuple(dict.fromkeys(run.rule for run in measured)),
+        agents_learn=any(run.source.agents_learn for run in measured) or not measured,
         lengths={
             name: {
                 "episodes": _range(number for run in runs for number in run.episodes),
@@ -411,8 +416,11 @@ def marks(made: Mapping[str, Circumstances]) -> dict[str, str]:
 HARVESTING, TRAGEDY, DECLINE = "harvesting", "tragedy", "decline"
 RECOVERY, NO_BETTER = "recovery", "no better"
 """How short trainings end, see `ending`."""
-BY_PHASES: Final = f"the last phase that cprl.measuring.phases finds, from {FEWEST_EPISODES:,} episodes on"
-BY_RETURNS: Final = "its last 30 episodes against its peak and random play, see cprl.studies.tables.sources"
+BY_PHASES: Final = f"the last phase of its course, from {FEWEST_EPISODES:,} episodes on"
+BY_RETURNS: Final = (
+    f"its last {LAST_EPISODES} episodes against its peak and random play ({NO_BETTER}: no mean of "
+    f"{PEAK_EPISODES} episodes reached {PEAK_OVER_RANDOM} times random play)"
+)
 
 
 def _phases(

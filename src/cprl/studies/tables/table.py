@@ -143,6 +143,8 @@ class StudyTable:
     lengths: Mapping[str, Mapping[str, tuple[int, int]]] = field(default_factory=dict, repr=False)
     """The least and the most "episodes" and environment "steps" of the replicas of a condition; none where
     the reports of its runs do not say how many steps."""
+    agents_learn: bool = True
+    """Whether any agent of its runs learns."""
     comparisons: dict[tuple[str, str, int], Any] = field(default_factory=dict, init=False, repr=False)
     """What figures and texts share: each metric, part and number of last episodes that was compared, see
     `cprl.studies.tables.comparing`."""
@@ -215,7 +217,7 @@ class StudyTable:
             "versions": versions(),
             "design": asdict(self.design),
             "lacking": [asdict(run) for run in self.lacking],
-            **{name: getattr(self, name) for name in _HELD},
+            **{name: getattr(self, name) for name in (*_HELD, "agents_learn")},
         }
         rows = self.rows.replace_schema_metadata({METADATA: json.dumps(held)})
         write_table(path, rows, over=True)
@@ -223,9 +225,7 @@ class StudyTable:
 
     def to_csv(self) -> str:
         """The rows as CSV, with the names of the columns, e.g. for spreadsheets and R."""
-        file = io.BytesIO()
-        pyarrow.csv.write_csv(self.rows, file)
-        return file.getvalue().decode()
+        return csv_of(self.rows)
 
     @classmethod
     def read(cls, path: Path | str) -> "StudyTable":
@@ -240,9 +240,17 @@ class StudyTable:
                 design=Design(**{**held["design"], "notes": tuple(held["design"]["notes"])}),
                 lacking=tuple(Lacking(**run) for run in held["lacking"]),
                 **{name: held[name] for name in _HELD},
+                agents_learn=held.get("agents_learn", True),  # of a table of before
             )
         except (pa.ArrowException, OSError, LookupError, TypeError, json.JSONDecodeError) as error:
             raise ValueError(f"{path} is not the table of a study: {error!r}") from error
+
+
+def csv_of(rows: pa.Table) -> str:
+    """Return rows as CSV, with the names of the columns."""
+    file = io.BytesIO()
+    pyarrow.csv.write_csv(rows, file)
+    return file.getvalue().decode()
 
 
 _HELD: Final = ("window", "made", "endings", "ending_rules", "lengths")
