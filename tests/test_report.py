@@ -17,6 +17,7 @@ from cprl.evaluation.evaluate import evaluate_run, run_table
 from cprl.evaluation.report import report
 from cprl.evaluation.show import show
 from cprl.institutions import Quota
+from cprl.training.agents import load
 
 STUDY = Path(__file__).parents[1] / "docs" / "results" / "studies" / "beam"
 GOVERNED = replace(CORRIDORS, institutions=(Quota(share=0.5, window_steps=2),))
@@ -56,7 +57,7 @@ def test_a_report_names_what_is_of_ones_own_and_says_what_a_tag_does(tmp_path):
 
 def test_a_report_of_a_training_says_what_happened_and_draws_it(tmp_path):
     run = stored(tmp_path / "run")
-    told = told_of(run, RISE_AND_FALL, LENGTHS)
+    told = told_of(run, RISE_AND_FALL, LENGTHS, agents=load(run).specs)
     text = report(run, tmp_path / "own.html", episodes=2).read_text(encoding="utf-8")
     assert f"<strong>{told}</strong>" in text
     assert '<img src="data:image/svg+xml;base64,' in text

@@ -96,8 +96,9 @@ class Outcome:
         curves = as_curves(table)
         terminated = table["terminated"].to_numpy(zero_copy_only=False)
         lasted = table["steps"].to_numpy()[~terminated]
+        clock = float(lasted.max()) if len(lasted) else inf
         apples, steps = (curves[name].mean(1) for name in NEEDED)
-        return cls(apples, steps, float(lasted.max()) if len(lasted) else inf)
+        return cls(apples, steps, clock)
 
     def __str__(self) -> str:
         apples, steps = (estimate(each).of(name, self.clock) for each, name in zip(self, NEEDED, strict=True))

@@ -59,7 +59,7 @@ def effects_of(table: StudyTable) -> dict[str, Weights]:
         return {}
     short = short_names(design.factors)
     pairs = {factor: list(_compared_levels(design, factor)) for factor in design.factors}
-    effects: dict[str, Mapping[str, float]] = {
+    effects = {
         f"{short[factor]} {_against(levels)}": _weights(design, {factor: levels})
         for factor in design.factors
         for levels in pairs[factor]
