@@ -105,6 +105,7 @@ ODD_RECIPES = [
     ({"versions": [1]}, "versions"),
     ({"code": [["a", "b"]]}, "code"),
     ({"code_text": 5}, "code_text"),
+    ({"frozen": 5}, "frozen"),
     ({"extended": [{"versions": 7}]}, "versions"),
     ({"note": nested(900)}, "nested"),
     ({"experiment": {"note": nested(400)}}, "nested"),

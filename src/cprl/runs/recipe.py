@@ -171,7 +171,7 @@ def _refuse_odd_parts(recipe: Mapping[str, Any], path: Path) -> None:
         if not isinstance(parts, list) or not all(isinstance(part, Mapping) for part in parts):
             raise ValueError(f"{path}: {name} is {shown(parts)}; allowed: a list of tables")
     for part in parts_of(recipe):
-        for name in ("versions", "code", "code_text"):
+        for name in ("versions", "code", "code_text", "frozen"):
             if not isinstance(part.get(name) or {}, Mapping):
                 raise ValueError(f"{path}: {name} is {shown(part[name])}; allowed: a table")
 
