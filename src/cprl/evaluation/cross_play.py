@@ -121,7 +121,8 @@ def crossplay(
     if diagonal == "cross_seed" and len(numbers) < 2:
         raise ValueError(f"the replicas are {list(numbers)}; allowed for cross_seed: at least 2")
     following = dict(zip(numbers, (*numbers[1:], numbers[0]), strict=True))
-    play, parts = partial(fresh.play, among=named.values()), []
+    play = partial(fresh.play, among=named.values())
+    parts: list[Part] = []
     for focal, background in product(named, repeat=2):
         where, labels = named[background], {"focal": focal, "background": background}
         home = agents_of(where)

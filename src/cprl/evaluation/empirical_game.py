@@ -121,7 +121,8 @@ def play_empirical_game(
         )
     fresh = fresh_of(named.values(), episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
     of_runs = [agents_of(run) for run in named.values()]
-    parts, payoffs = [], []
+    parts: list[Part] = []
+    payoffs = []
     for counts in compositions(agents, len(named)).tolist():
         played = {}
         for who in shifted(counts):

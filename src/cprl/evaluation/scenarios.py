@@ -227,7 +227,7 @@ def run_scenarios(
         "random": [scripted("random")] * len(everyone),
         "greedy": [scripted("greedy")] * len(everyone),
     }
-    parts = []
+    parts: list[Part] = []
     for scenario in chosen:
         background = [_background(spec, stored) for spec in scenario.background]
         for who, focal in focal_agents.items():

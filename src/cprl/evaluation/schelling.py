@@ -189,7 +189,7 @@ def schelling(
         agents_specified(place, [agent_named(who, agent, name=name) for agent in range(agents)], fresh)
         for name, who in (("restrained", restrained), ("greedy", greedy))
     ]
-    parts = []
+    parts: list[Part] = []
     for count in range(agents + 1):
         for kind_of_agent in shifted((count, agents - count)):
             who = tuple(agent for agent, kind in enumerate(kind_of_agent) if kind == 0)
