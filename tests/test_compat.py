@@ -421,6 +421,19 @@ def test_numba_keeps_compiled_functions_where_it_is_told(tmp_path):
     assert list(tmp_path.rglob("*.nbi")), "nothing was kept"
 
 
+def test_numba_says_which_functions_it_keeps_for_which_arguments_and_a_damaged_file_is_none(tmp_path):
+    with compiled.kept_in(tmp_path):
+        function = numba.njit(cache=True)(summed)
+    floats, integers = (numba.typeof(np.ones(2)),), (numba.typeof(np.ones(2, np.int64)),)
+    assert not compiled._is_kept(function, floats)
+    function(np.ones(2))
+    assert compiled._is_kept(function, floats)
+    assert not compiled._is_kept(function, integers)
+    (index,) = tmp_path.rglob("*.nbi")
+    index.write_bytes(b"damaged")
+    assert not compiled._is_kept(function, floats)
+
+
 @pytest.fixture
 def kept_summed(tmp_path):
     """A function that Numba keeps in a folder."""

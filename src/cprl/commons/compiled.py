@@ -158,17 +158,18 @@ def _compile_in_child(function: Callable[[], Any], types: Any) -> None:
         child = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet, env=surroundings)
     except OSError:  # e.g. where Python is part of another program
         return
-    assert child.stdin is not None
+    pipe = child.stdin
+    assert pipe is not None
     try:
         with suppress(OSError):  # it ended before it read all
-            child.stdin.write(pickle.dumps((function, types)))
-            child.stdin.flush()
+            pipe.write(pickle.dumps((function, types)))
+            pipe.flush()
         child.wait()
     finally:
         child.kill()
         child.wait()
         with suppress(OSError):
-            child.stdin.close()
+            pipe.close()
 
 
 def compile_for_parent() -> None:
