@@ -10,10 +10,10 @@ import sys
 from pathlib import Path
 
 from cprl.measuring.statistics import Estimate, estimate
-from cprl.runs.course import course_of
 from cprl.runs.curves import as_curves, curves_of, running_mean
 from cprl.runs.episodes import read_table
 from cprl.training.agents import load
+from cprl.training.course import course_of
 
 HEADING = (
     "| seed | replicas | peak of 10 episodes, apples | its episode | last 30 episodes, apples "

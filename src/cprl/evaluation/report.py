@@ -21,7 +21,6 @@ from cprl.measuring.metrics import title, unit
 from cprl.measuring.series import Values
 from cprl.measuring.statistics import Estimate, form_for
 from cprl.population import learned
-from cprl.runs.course import course_of
 from cprl.runs.curves import curves_of
 from cprl.studies.results import SUMMARY
 from cprl.studies.tables.comparing import (
@@ -40,6 +39,7 @@ from cprl.system.working import working
 from cprl.terminal.figures import training_curve
 from cprl.terminal.tables import cell, markdown
 from cprl.training.agents import LoadedRun, load
+from cprl.training.course import course_of
 
 _LARGEST_SVG_BYTES: Final = 300_000
 

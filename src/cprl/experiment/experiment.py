@@ -25,7 +25,7 @@ from cprl.population import (
     stored_of,
 )
 from cprl.runs.files import RECIPE_FORMAT, written_by_another
-from cprl.runs.recipe import recipe_config, with_runs_moved
+from cprl.runs.recipe import recipe_config, rules_of_own, with_runs_moved
 from cprl.system.memory import Device
 from cprl.values import (
     MOST_INT64,
@@ -214,14 +214,6 @@ class Experiment(Value, stored=False, called="experiment"):
 
     def __hash__(self) -> int:
         return hash((self.name, self.unit, self.length, self.replicas, self.seed))
-
-
-_OF_RULES: Final = ("game", "transforms")
-
-
-def rules_of_own(table: Mapping[str, Any]) -> str:
-    """The rules of the user's own in words, of what `Experiment.to_config` gives; "" without any."""
-    return "; ".join(described([table.get(name) for name in _OF_RULES]))
 
 
 def changes(before: Experiment, now: Experiment) -> list[str]:

@@ -70,6 +70,10 @@ def worlds_of(table: pa.Table) -> Numbers:
     return worlds
 
 
+LAST_EPISODES: Final = 30
+"""Those at the end of a training, unless somebody says how many."""
+
+
 def last_of(table: pa.Table, number: int) -> pa.Table:
     """Return the rows of the last episodes of each replica: as many of each of its W worlds, and so many of
     all together, or the next multiple of W.

@@ -22,7 +22,7 @@ from cprl.runs.files import RECIPE_FILE as RECIPE_FILE
 from cprl.system.output import ERR, console, printed
 from cprl.system.process import cpu
 from cprl.system.shipped import PROGRAM, command_of, cprl_here
-from cprl.values import custom_targets, differences, refusal, shown, source_of
+from cprl.values import custom_targets, described, differences, refusal, shown, source_of
 
 _RESUMES: Final = ("--resume", "--no-resume", "--take-over", "--no-take-over")
 _DIRECTORIES: Final = ("--out", "--runs")
@@ -402,3 +402,11 @@ def _git(folder: Path, *arguments: str) -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()
+
+
+_OF_RULES: Final = ("game", "transforms")
+
+
+def rules_of_own(table: Mapping[str, Any]) -> str:
+    """The rules of the user's own in words, of an experiment as a recipe stores it; "" without any."""
+    return "; ".join(described([table.get(name) for name in _OF_RULES]))

@@ -51,7 +51,7 @@ def summarise(
 
     Args:
         played: episodes in fresh worlds by the name of the policy; the first policy is the baseline.
-        course: see `cprl.runs.course`; by default what each policy gets.
+        course: see `cprl.training.course`; by default what each policy gets.
     """
     console = console or safe_console()
     console.print(Text(course or _verdict(played), style="bold"))

@@ -6,6 +6,7 @@ Modules, in the order in which one reads them:
     training    Training: one step after the other, with a state that can be read and set; train; callbacks
     agents      the agents of a population; load: those that an earlier run learned
     outcome     what is made of an experiment, and the trained agents in fresh worlds
+    course      the course of a run in sentences
     running     run: an experiment from its learners to its report
 """
 

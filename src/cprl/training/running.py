@@ -27,7 +27,6 @@ from cprl.runs.checkpoints import (
     is_ending,
     refuse_to_extend,
 )
-from cprl.runs.course import NEEDED, course_of
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.files import LOCK_FILE, RunLockedError, refuse_missing, write_json
 from cprl.runs.loggers import LoggerCallback, check_logger, make_logger
@@ -57,6 +56,7 @@ from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
 from cprl.training.agents import Population
+from cprl.training.course import NEEDED, course_of
 from cprl.training.finite import summary
 from cprl.training.outcome import (
     Evaluations,

@@ -14,7 +14,6 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl.envs.unwrap import agent_names, base_env, commons_of
-from cprl.experiment.experiment import rules_of_own
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import Policy
 from cprl.measuring.metrics import reported_by
@@ -22,6 +21,7 @@ from cprl.measuring.series import OF_AGENTS, Series, numbers_of
 from cprl.policies.present import PresentPolicy
 from cprl.runs.curves import as_curves
 from cprl.runs.episodes import metrics_in, read_episodes
+from cprl.runs.recipe import rules_of_own
 from cprl.viewer.board import Filming
 from cprl.viewer.exhibition import Exhibition
 from cprl.viewer.layout import curves_of, missing_in, scene_of

@@ -19,8 +19,7 @@ from cprl.measuring.episodes import Episode
 from cprl.measuring.now import BEGINS, EXPLORING, Now
 from cprl.measuring.series import Values, mean_of
 from cprl.measuring.statistics import Estimate, estimate_if_finite
-from cprl.runs.course import LAST_EPISODES
-from cprl.runs.curves import SMOOTHED_EPISODES, rounds_of, running_mean
+from cprl.runs.curves import LAST_EPISODES, SMOOTHED_EPISODES, rounds_of, running_mean
 from cprl.system.times import CLOCK
 from cprl.viewer.board import Filming
 from cprl.viewer.layout import ANOTHER, SETTLED, STRIPS, Curves, legend_of
@@ -297,7 +296,7 @@ class Story(View):
 
     @property
     def _learning(self) -> float:
-        """What all agents got at the end of the training, as `cprl.runs.course` says it: in as many of the
+        """What all agents got at the end of the training, as the terminal says it: in as many of the
         last episodes of each world."""
         each = min(map(len, self._last.values()), default=0)
         return fmean(value for last in self._last.values() for value in list(last)[-each:]) if each else nan

@@ -16,8 +16,8 @@ from cprl.measuring.now import LEAST_LOSS, LOST, REGAINED
 from cprl.measuring.phases import FEWEST_EPISODES, UNNAMED
 from cprl.population import any_learns
 from cprl.runs.checkpoints import REPORT
-from cprl.runs.course import BELOW_RANDOM, LAST_EPISODES, PEAK_EPISODES, PEAK_OVER_RANDOM
 from cprl.runs.curves import (
+    LAST_EPISODES,
     Numbers,
     Values,
     as_curves,
@@ -52,6 +52,7 @@ from cprl.studies.tables.table import (
 )
 from cprl.studies.trials import State, trials_of
 from cprl.system.output import legible
+from cprl.training.course import BELOW_RANDOM, PEAK_EPISODES, PEAK_OVER_RANDOM
 from cprl.values import Positive, checked
 
 REASONS: Final[dict[State, str]] = {

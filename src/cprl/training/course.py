@@ -16,13 +16,19 @@ import pyarrow as pa
 from cprl.measuring.series import Values
 from cprl.measuring.statistics import Estimate, difference, estimate, form_for
 from cprl.population import AgentSpec, Learning, Team, exploring
-from cprl.runs.curves import as_curves, last_of, mean_of_worlds, rounds_of, running_mean, worlds_of
+from cprl.runs.curves import (
+    LAST_EPISODES,
+    as_curves,
+    last_of,
+    mean_of_worlds,
+    rounds_of,
+    running_mean,
+    worlds_of,
+)
 from cprl.runs.episodes import read_episodes, read_rows
 
 PEAK_EPISODES: Final = 10
 """Episodes of the mean whose highest value is the peak of a training."""
-LAST_EPISODES: Final = 30
-"""Those at its end."""
 PEAK_OVER_RANDOM, BELOW_RANDOM = 1.5, 0.95
 """How many times random play the peak of agents who learned something is at least, and a tragedy's end at
 most."""
