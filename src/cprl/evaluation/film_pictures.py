@@ -64,7 +64,7 @@ class EpisodePicture:
         self._unit = unit = max(10, width // 40)
         self._font, self._large = _font(unit), _font(2 * unit)
         highest = _BOARD_HEIGHT * width
-        room = width - 2 * unit
+        room = width - unit
         fitting = min((room - 1) // board.width, (highest - 1) // board.height)
         self._cell = max(SMALLEST_CELL_PIXELS, fitting)
         wide, high = board.width * self._cell + 1, board.height * self._cell + 1
