@@ -392,7 +392,7 @@ def test_the_tragedy_ends_with_what_happened_and_what_to_try_next(tmp_path, caps
     words += ["--episodes", "12", "--replicas", "2", "--evaluation-episodes", "2"]
     run = cprl.recipe_main(own.experiment, words, at_end=own.tell)
     told = capsys.readouterr().out
-    before, after = told[: told.index("collective return, apples")], told[told.index("Training curve:") :]
+    before, after = told[: told.index("survival, steps")], told[told.index("Training curve:") :]
     assert "The agents began at" in before
     assert "of each of" in " ".join(before.split()), "the last episodes of many worlds"
     assert "In fresh worlds, where nobody learns" in " ".join(before.split())
