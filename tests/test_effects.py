@@ -180,7 +180,7 @@ def test_the_answer_tests_what_the_table_below_it_tests(tmp_path):
 
 def test_a_metric_that_is_another_by_construction_stands_and_counts_once():
     def steps(level, replica):
-        return 100 * level + replica
+        return 1000 + 100 * level + replica
 
     metrics = {"collective_return": steps, "net": steps, "survival_steps": steps, "peacefulness": steps}
     conditions = grid_of(("level", (0, 1)))

@@ -156,6 +156,9 @@ def test_agents_explore_with_the_runs_epsilon_for_evaluation(learned, tmp_path):
     for agent in text["experiment"]["agents"]:
         agent["algorithm"]["settings"]["epsilon_evaluation"] = 1.0
     (always / "recipe.json").write_text(json.dumps(text))
+    manifest = json.loads((always / "manifest.json").read_text())
+    del manifest["experiment"]  # which is of the recipe before
+    (always / "manifest.json").write_text(json.dumps(manifest))
     by_chance = cprl.evaluate_run(always, episodes=2)
     assert told(by_chance.trained[0]) == told(by_chance.random[0]), "with epsilon 1 every action is random"
     assert told(by_chance.trained[0]) != told(cprl.evaluate_run(always, episodes=2, greedy=True).trained[0])

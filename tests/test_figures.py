@@ -42,6 +42,7 @@ def a_run(folder, metrics):
     if "survival_steps" in metrics:
         columns["steps"] = np.repeat(np.round(metrics["survival_steps"].ravel()).astype(np.int32), 2)
     columns["return"] = np.repeat(metrics["collective_return"].ravel() / 2, 2)
+    columns["terminated"] = np.ones(replica.size, bool)
     folder.mkdir(parents=True, exist_ok=True)
     pq.write_table(pa.table(columns), folder / "episodes.parquet")
     return folder

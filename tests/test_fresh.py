@@ -39,6 +39,9 @@ def trained(folder, *, game=MEADOW, turns=TURNS, apples=APPLES, seed=3):
             "harvest": apples[replica] / 2 + agent,
             "survival_steps": turns[replica] + 2 * episode - 1,
             "collective_return": apples[replica],
+            "return": apples[replica] / 2,
+            "steps": int(turns[replica]),
+            "terminated": True,
         }
         for replica in range(len(turns))
         for episode in range(2)

@@ -122,16 +122,16 @@ def test_rules_and_metrics_of_ones_own_are_named_on_the_page(runs, tmp_path):
     assert "none beyond the game" not in own["about"]
     assert plain["about"].endswith("Rules: none beyond the game.")
     assert (own["title"], plain["title"]) == ("Gift", "No rule")
-    assert "learners, different rules</h1>" in path.read_text(encoding="utf-8")
+    assert "agents, different rules</h1>" in path.read_text(encoding="utf-8")
 
 
 def test_rules_are_the_same_where_no_number_of_them_differs(runs, tmp_path):
     slower = replace(CORRIDORS, rules=replace(CORRIDORS.rules, episode_steps=8))
     run = stored(tmp_path / "slower", slower)
     path, _ = show(runs / "greedy", tmp_path / "own.html", beside=[run])
-    assert "learners, different rules</h1>" in path.read_text(encoding="utf-8")
+    assert "agents, different rules</h1>" in path.read_text(encoding="utf-8")
     path, _ = show(runs / "greedy", tmp_path / "same.html", beside=[runs / "greedy"])
-    assert "learners, the same rules</h1>" in path.read_text(encoding="utf-8")
+    assert "agents, the same rules</h1>" in path.read_text(encoding="utf-8")
 
 
 def test_titles_are_text_and_not_html(runs, tmp_path):

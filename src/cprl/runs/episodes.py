@@ -218,6 +218,9 @@ def read_rows(path: str | os.PathLike[str]) -> pa.Table:
     return table
 
 
+_OF_ANY_SIZE: Final = (pa.types.is_floating, pa.types.is_integer)
+
+
 def _refuse_other_columns(path: str | os.PathLike[str], table: pa.Table) -> None:
     """Refuse a table whose columns are not those of episodes, e.g. one that another program wrote."""
     is_not = f"{path} is not a table of episodes: "
@@ -230,8 +233,8 @@ def _refuse_other_columns(path: str | os.PathLike[str], table: pa.Table) -> None
             continue
         if names.count(name) > 1:
             raise ValueError(f"{is_not}it has the column {name} more than once")
-        both = (table[name].type, kind)
-        if kind != table[name].type and not all(map(pa.types.is_floating, both)):  # an export has float32
+        both = (table[name].type, kind)  # which may differ in size: an export has float32
+        if kind != table[name].type and not any(all(map(of, both)) for of in _OF_ANY_SIZE):
             raise ValueError(f"{is_not}its column {name} is {table[name].type}; allowed: {kind}")
         if table[name].null_count and name != "wanted_return":
             raise ValueError(f"{is_not}its column {name} has empty places")
