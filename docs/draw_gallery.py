@@ -55,7 +55,9 @@ def with_new_words(text: str, experiment: Experiment) -> str:
     game: Any = experiment.game
     specs = specs_by_agent(experiment.agents, game.agents)
     run: Any = SimpleNamespace(experiment=experiment, game=game, specs=specs, networks=specs)
+    population["which"] = "Replica 0, episode 0."
     population["about"] = about(run)
+    data["axis"] = population["turns"] - 1
     data["legend"] = legend_of([game])
     return page(population["title"], begins(game), data)
 
