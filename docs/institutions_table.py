@@ -17,6 +17,7 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
+from cprl.experiment import presets
 from cprl.measuring.statistics import Estimate, curve_interval, estimate, holm
 from cprl.runs.curves import as_curves, centres, curves_of, net_of, running_mean
 from cprl.runs.episodes import read_table
@@ -49,6 +50,8 @@ WITHOUT_MONEY: Final = {"net": "collective_return", "income_equality": "equality
 """By the metric of income: that of the harvest, of which it is a copy where no apple is paid and lost."""
 LAST, SMOOTHED = 30, 10
 """Episodes at the end that are compared; episodes of a running mean."""
+CLOCK: Final = presets.game("commons").rules.episode_steps
+"""The turns of an episode at most."""
 
 Values = NDArray[np.float64]
 
@@ -63,7 +66,7 @@ def of_replicas(run: Path) -> dict[str, Values]:
 
 def text_of(estimated: Estimate, *, sign: str = "") -> str:
     """An estimate with its interval."""
-    numbers = estimated.value, estimated.low, estimated.high
+    numbers = estimated.value, *estimated.interval
     digits = 2 if max(map(abs, numbers)) < 5 else 0
     value, low, high = (f"{number:{sign}.{digits}f}" for number in numbers)
     return f"{value} [{low}, {high}]"
@@ -157,7 +160,10 @@ def main(*, runs: Path, figures: Path) -> None:
     """
     found = {name: runs / name for name in NAMES if (runs / name / "evaluation").is_dir()}
     values = {name: of_replicas(run) for name, run in found.items()}
-    levels = {name: [text_of(estimate(own[metric])) for metric in METRICS] for name, own in values.items()}
+    levels = {
+        name: [text_of(estimate(own[metric]).of(metric, CLOCK)) for metric in METRICS]
+        for name, own in values.items()
+    }
     print(table("institution", levels), end="\n\n")
     differences = {
         name: {metric: estimate(own[metric] - values[NONE][metric]) for metric in METRICS}

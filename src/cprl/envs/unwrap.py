@@ -21,8 +21,12 @@ def commons_of(env: EnvBase) -> CommonsEnv | None:
 
 def clock_of(env: EnvBase) -> int | None:
     """The turns of an episode at most; None where a game does not say."""
-    rules = getattr(getattr(base_env(env), "game", None), "rules", None)
-    return getattr(rules, "episode_steps", None)
+    return clock_in(getattr(base_env(env), "game", None))
+
+
+def clock_in(game: object) -> int | None:
+    """Return the turns of an episode of a game at most; None where it does not say."""
+    return getattr(getattr(game, "rules", None), "episode_steps", None)
 
 
 def agent_count(env: EnvBase) -> int:

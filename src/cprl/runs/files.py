@@ -39,7 +39,7 @@ TRAINING_STATE_FORMAT: Final = 5
 """Of checkpoints."""
 STUDY_FORMAT: Final = 1
 """Of `study.json`."""
-STUDY_TABLE_FORMAT: Final = 1
+STUDY_TABLE_FORMAT: Final = 2
 """Of the table of a study."""
 
 _MOST_NESTED: Final = 128

@@ -7,7 +7,7 @@ that are marked differ by Holm's method: with 95 % none of the marked ones is by
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import isclose, isnan
+from math import inf, isclose, isnan
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -57,6 +57,8 @@ class Compared:
     """Episodes in which the metric is undefined, which are no part of a mean."""
     difference: Estimate | None
     """From the reference; None of the reference itself, and where there are no replicas to compare."""
+    clock: float = inf
+    """The turns of an episode at most."""
 
     @property
     def replicas(self) -> int:
@@ -72,7 +74,7 @@ class Compared:
     @cached_property
     def estimate(self) -> Estimate | None:
         """Over the replicas in which it is defined; None if there are none."""
-        return estimate(self.defined).of(self.metric) if len(self.defined) else None
+        return estimate(self.defined).of(self.metric, self.clock) if len(self.defined) else None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -185,6 +187,7 @@ def _compared(table: StudyTable, metric: str, part: str, last: int) -> Compariso
                 episodes=sum(lengths),
                 undefined=undefined,
                 difference=_difference(values, means[reference][0], is_paired) if name != reference else None,
+                clock=table.design.clocks.get(name, inf),
             )
             for name, (values, undefined, lengths) in means.items()
         ),

@@ -11,7 +11,7 @@ from cprl.population import any_learns
 from cprl.runs.recipe import read_recipe, runs_in
 from cprl.studies.factors import ALL, normalised, values_at
 from cprl.studies.study import UNNAMED, Condition, named, short_names, unlike
-from cprl.studies.tables.sources import REASONS, Source, plain_level, table_of
+from cprl.studies.tables.sources import REASONS, Source, clocks_of, plain_level, table_of
 from cprl.studies.tables.table import WINDOW, Design, Lacking, StudyTable, some
 from cprl.studies.trials import state_of
 from cprl.values import differences, refusal, to_config
@@ -76,6 +76,7 @@ def pooled_table(
         reference=next(iter(groups)) if reference is None else reference,
         is_paired=len(seeds) == 1,
         notes=tuple(_notes(groups, fields)),
+        clocks=clocks_of({name: members.values() for name, members in groups.items()}),
     )
     return table_of(design, sources, lacking, window=window)
 

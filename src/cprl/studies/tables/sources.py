@@ -11,6 +11,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from cprl.envs.unwrap import clock_in
+from cprl.experiment import Experiment
 from cprl.measuring import social
 from cprl.measuring.now import LEAST_LOSS, LOST, REGAINED
 from cprl.measuring.phases import FEWEST_EPISODES, UNNAMED
@@ -120,9 +122,16 @@ def design_of(study: Study) -> Design:
         reference=study.reference_name,
         is_paired=True,
         is_grid=study.draws is None,
+        clocks=clocks_of({condition.name: [condition.experiment] for condition in study.all_conditions}),
         question=study.question,
         expectation=study.expectation,
     )
+
+
+def clocks_of(experiments: Mapping[str, Iterable[Experiment]]) -> dict[str, int]:
+    """Return the turns of an episode at most, by condition, where all its games say so."""
+    clocks = {name: [clock_in(one.game) for one in of_one] for name, of_one in experiments.items()}
+    return {name: max(filter(None, each)) for name, each in clocks.items() if None not in each}
 
 
 def sources_of(study: Study, runs: Path, status: Path | None = None) -> tuple[list[Source], list[Lacking]]:

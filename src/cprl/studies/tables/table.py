@@ -85,6 +85,8 @@ class Design:
     """Whether levels are few and repeat; not so for random draws."""
     notes: tuple[str, ...] = ()
     """Sentences on what is compared."""
+    clocks: Mapping[str, int] = field(default_factory=dict)
+    """The turns of an episode at most, by condition, where its game says so."""
     question: str = ""
     expectation: str = ""
     """Before it was run."""
