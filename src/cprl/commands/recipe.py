@@ -261,7 +261,8 @@ def wrapped(text: str, *, before: str = "") -> str:
     Args:
         before: what stands before the first line, and as wide a space before the others.
     """
-    width, indent = shutil.get_terminal_size().columns, " " * (len(before) or 2)
+    width = shutil.get_terminal_size().columns
+    indent = " " * (len(before) or 2)
     paragraphs = [" ".join(part.split()) for part in text.split("\n\n")]
     return "\n\n".join(
         textwrap.fill(part, width, initial_indent=before, subsequent_indent=indent) for part in paragraphs

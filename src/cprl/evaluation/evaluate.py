@@ -94,7 +94,8 @@ class Evaluation(Results):
     def differences(self) -> dict[str, Estimate | None]:
         """How much more the run's agents have of each of `measures` than random ones, paired by replica,
         which play the same worlds; None where a metric is undefined."""
-        trained, random = self._values("trained"), self._values("random")
+        trained = self._values("trained")
+        random = self._values("random")
         return {name: difference_paired(values, random[name]) for name, values in trained.items()}
 
     def _values(self, policy: str) -> dict[str, dict[int, list[float]]]:

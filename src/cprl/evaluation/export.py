@@ -107,7 +107,9 @@ def export_episodes(
 
 @working("playing an episode")
 def _play(turns: Turns) -> Played:
-    batches, places, commons = [], [], commons_of(turns.env)
+    batches = []
+    places = []
+    commons = commons_of(turns.env)
     while not turns.has_ended:
         batches.append(turns.play().clone())
         if commons is not None:

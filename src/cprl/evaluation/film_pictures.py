@@ -76,7 +76,8 @@ class EpisodePicture:
         self._in_a_row = max(1, self._half // self._item)
         rows = ceil(len(board.starts) / self._in_a_row)
         self._line = line = unit + unit // 2
-        self._title_height, self._plot_height = 5 * unit, _PLOT_HEIGHT * unit
+        self._title_height = 5 * unit
+        self._plot_height = _PLOT_HEIGHT * unit
         below = unit // 2 + 5 * unit // 2 + line * (1 + rows) + self._plot_height + 2 * line
         height = max(height, self._title_height + self._board_size[1] + below)
         self.size: tuple[int, int] = width, height + height % 2
@@ -144,7 +145,8 @@ class EpisodePicture:
 
     def _caption(self, draw: ImageDraw.ImageDraw, title: str, comes_to: str, end: str, turn: str) -> None:
         """The title on the left, the turn or the end on the right; below them what the episode comes to."""
-        edge, middle = self._unit, 3 * self._unit // 2
+        edge = self._unit
+        middle = 3 * self._unit // 2
         below = _fitting(comes_to, self.size[0] - 2 * edge, 5 * self._unit // 4)
         draw.text((edge, 15 * self._unit // 4), comes_to, _TEXT, below, anchor="lm")
         words, colour = (end, _DEAD) if end else (turn, _TEXT)

@@ -338,7 +338,8 @@ class Turns:
     def __init__(self, env: EnvBase, policy: Policy) -> None:
         self.env, self.policy = env, policy
         self._moment: TensorDictBase = env.reset()
-        self._turns, self._clock = 0, clock_of(env)
+        self._turns = 0
+        self._clock = clock_of(env)
         self.has_ended = False
 
     def play(self) -> TensorDictBase:

@@ -227,7 +227,8 @@ def _players(run: LoadedRun) -> str:
 
 
 def _rules(run: LoadedRun) -> str:
-    game, experiment = commons_game(run), run.experiment
+    game = commons_game(run)
+    experiment = run.experiment
     words = [meaning_of(kind, game) for kind in game.institutions]
     if game.institutions:
         words.append(f"Settings: {rules_of(game)}.")

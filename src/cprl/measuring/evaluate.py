@@ -34,7 +34,8 @@ def evaluate(
     """
     tracker, episodes = tracker_of(env, metrics), dict[int, Episode]()
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
-    clock, turns = clock_of(env), 0
+    clock = clock_of(env)
+    turns = 0
     what = f"playing {tracker.worlds:,} episodes"
     with torch.no_grad(), one_thread(), set_exploration_type(exploration), working(what):
         moment = env.reset()

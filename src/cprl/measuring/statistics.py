@@ -46,7 +46,8 @@ class Estimate:
     @property
     def interval(self) -> tuple[float, float]:
         """The interval as it is shown, within the bounds."""
-        least, most = min(self.bounds[0], self.value), max(self.bounds[1], self.value)
+        least = min(self.bounds[0], self.value)
+        most = max(self.bounds[1], self.value)
         return max(self.low, least), min(self.high, most)  # NaN stays NaN
 
     @property
@@ -246,7 +247,8 @@ def over_replicas(values: ByReplica, metric: str = "", clock: float = inf) -> Me
 def difference_paired(values: ByReplica, reference: ByReplica) -> Estimate | None:
     """Return how much more the mean of a metric is, paired by replica, over the replicas in which both are
     defined; None if there is none."""
-    means, others = _means(values), _means(reference)
+    means = _means(values)
+    others = _means(reference)
     pairs = [means[replica] - others[replica] for replica in means if replica in others]
     return estimate_if_finite(pairs) if pairs else None
 
@@ -286,7 +288,8 @@ def social_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measur
 def _measures(
     played: Mapping[int, Sequence[Episode]], metrics_of: Callable[[Episode], dict[str, float]]
 ) -> dict[str, Measured]:
-    clock, metrics = clock_of(played), by_metric(played, metrics_of)
+    clock = clock_of(played)
+    metrics = by_metric(played, metrics_of)
     return {name: over_replicas(values, name, clock) for name, values in metrics.items()}
 
 

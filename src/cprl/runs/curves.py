@@ -81,7 +81,8 @@ def last_of(table: pa.Table, number: int) -> pa.Table:
     The last that have ended, of all worlds, would be the longest ones where worlds began together. Where a
     world has ended fewer, only as many of each world are there.
     """
-    world, episode = _world(table), table["episode"].to_numpy().astype(np.int64)
+    world = _world(table)
+    episode = table["episode"].to_numpy().astype(np.int64)
     size = int(episode.max(initial=0)) + 1
     keys, row = np.unique(world * size + episode, return_inverse=True)
     lanes, counts = np.unique(keys // size, return_counts=True)

@@ -283,7 +283,8 @@ def _experiment_in(run: Path) -> str | None:
 def _sound(run: Path) -> dict[str, str]:
     """Return the checksums of the files of a run, beside the recipe of the run that wrote them."""
     table = _manifest(run)
-    wrote, experiment = table.get("experiment"), _experiment_in(run)
+    wrote = table.get("experiment")
+    experiment = _experiment_in(run)
     if None not in (wrote, experiment) and wrote != experiment:
         raise ValueError(
             f"{run / MANIFEST_FILE} is of another experiment than {RECIPE_FILE} beside it: were the files of "

@@ -114,7 +114,8 @@ class LoggerCallback:
                 kind = type(logger).__name__
                 raise TypeError(f"logger is a {kind} without {method}; allowed: a TorchRL logger")
         self.logger = logger
-        self._agents, self._resumes = agents, resumes
+        self._agents = agents
+        self._resumes = resumes
         self._given = {"replicas": replicas, "worlds": worlds}
         self._series = Series(replicas or 1, worlds or 1)
         self._last: dict[str, int] = {}

@@ -580,7 +580,8 @@ Numbers = dict[str, tuple[float, str]]
 
 def _numbers(comparison: Comparison, grid: Grid, marked: Collection[Place]) -> tuple[Numbers, Numbers]:
     """The means and the differences of a map, with a star where they are marked."""
-    levels, differences = {}, {}
+    levels = {}
+    differences = {}
     for name in grid.values():
         compared = comparison.by_name[name]
         if compared.estimate is not None:

@@ -273,8 +273,10 @@ def _mark_peak(axes: Axes, panel: _Panel, window: int) -> None:
         at, means = _means(panel, window)
         mean = means.mean(0)
     else:
-        at, mean = centres(panel.values[0], window), running_mean(panel.values.mean(0), window)
-    top, end = int(mean.argmax()), len(mean) - 1
+        at = centres(panel.values[0], window)
+        mean = running_mean(panel.values.mean(0), window)
+    top = int(mean.argmax())
+    end = len(mean) - 1
     number = _over(panel, window)
     over = f"mean of {number} episodes" if number > 1 else "episode"
     marks = {"highest": (top, "o"), "last": (end, "s")}

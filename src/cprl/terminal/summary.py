@@ -118,7 +118,8 @@ def _rows(
         metrics: the name of the metric, where it is one.
     """
     clock = max(clock_of(episodes) for episodes in played.values())
-    rows, all_measures = [], list[Measured]()
+    rows = []
+    all_measures = list[Measured]()
     for words, of_policies in values.items():
         measures = [over_replicas(of_policy, metrics[words], clock) for of_policy in of_policies]
         if all(measured.estimate is None for measured in measures):

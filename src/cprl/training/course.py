@@ -76,7 +76,8 @@ def course_of(run: Path, agents: Sequence[AgentSpec]) -> str:
         *_replicas(fresh, trained),
         f"Random play gets {random}.",
     ]
-    level, longest = random.apples.mean(), as_curves(table)["survival_steps"].max()
+    level = random.apples.mean()
+    longest = as_curves(table)["survival_steps"].max()
     is_fall = (
         len(np.unique(table["agent"].to_numpy())) > 1
         and last.apples.mean() <= BELOW_RANDOM * level
@@ -116,7 +117,8 @@ class Outcome:
 
 def last_text(table: pa.Table, number: int = LAST_EPISODES) -> str:
     """Return which episodes `last_of` takes, e.g. "the last 2 episodes of each of 16 worlds"."""
-    replicas, worlds = last_of(table, number), worlds_of(table)
+    replicas = last_of(table, number)
+    worlds = worlds_of(table)
     lanes = len(np.unique(worlds[0]))
     episodes = as_curves(replicas)["return_0"].shape[1] // lanes
     last = f"the last {episodes} episodes" if episodes > 1 else "the last episode"
@@ -126,7 +128,8 @@ def last_text(table: pa.Table, number: int = LAST_EPISODES) -> str:
 def _rise(table: pa.Table) -> tuple[float, float, int]:
     """What agents got in the first ten episodes, in the best ten, and around which episode these were, each
     as a mean over replicas."""
-    returns, worlds = as_curves(table)["collective_return"], worlds_of(table)
+    returns = as_curves(table)["collective_return"]
+    worlds = worlds_of(table)
     lanes = len(np.unique(worlds[0]))
     if lanes == 1:
         means = running_mean(returns.mean(0), PEAK_EPISODES)
@@ -154,7 +157,8 @@ def _differs(agents: Sequence[AgentSpec], table: pa.Table) -> str:
 def _replicas(fresh: Outcome, played: pa.Table) -> list[str]:
     """The replicas one by one, where they are few; and of how many most boards die, where they differ."""
     replicas = len(fresh.apples)
-    terminated, of = played["terminated"].to_numpy(zero_copy_only=False), played["replica"].to_numpy()
+    terminated = played["terminated"].to_numpy(zero_copy_only=False)
+    of = played["replica"].to_numpy()
     died = np.array([terminated[of == replica].mean() for replica in np.unique(of)])
     dead = int((died > 0.5).sum())
     if 1 < replicas <= FEW_REPLICAS:

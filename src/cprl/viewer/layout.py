@@ -285,7 +285,8 @@ def classes(curves: Curves, colour_of: Callable[[int], Colour] = picture_colour)
 
 def styles(curves: Curves) -> dict[str, Any]:
     """The names, colours and widths of each plot's lines, and the colours of states, by entity."""
-    replicas, mean = curves.replicas, f"mean of {curves.mean_over} episodes"
+    replicas = curves.replicas
+    mean = f"mean of {curves.mean_over} episodes"
     lines = {
         "time/env_steps_per_s": line("steps per second", GREY),
         f"{EVALUATION}/greedy_return": line("greedy, evaluated", ORANGE),
@@ -538,9 +539,11 @@ def _overview(curves: Curves, *, live: bool) -> Any:
         )
         return rrb.Horizontal(rrb.Vertical(gets, _returns(curves)), *_present([joint]), name="Overview")
     board = _board("Live board", curves, origin="exhibition", below=4.2) if live else _board("Board", curves)
-    boards, high = _social(curves, "survival_steps"), 1.0
+    boards = _social(curves, "survival_steps")
+    high = 1.0
     if curves.worlds > 1:
-        boards, high = _turns(), 1.4
+        boards = _turns()
+        high = 1.4
     elif curves.boards > 1:
         boards = _wall(curves)
     beside = _present([gets, _social(curves, "stock_left"), boards])
@@ -556,7 +559,11 @@ def _tabs(curves: Curves, *, live: bool) -> list[Any]:
         [f"institutions/{name}" for name in names if name in curves.institutions]
         for names in (SHARES, INCOMES)
     )
-    recorded, windows, visits, stock, wall = None, None, None, None, None
+    recorded = None
+    windows = None
+    visits = None
+    stock = None
+    wall = None
     if isinstance(curves, Scene):
         recorded = _board("Recorded episodes", curves) if live else None
         windows = flat(f"Recorded windows: {curves.caption}", "windows")

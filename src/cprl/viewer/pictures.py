@@ -165,7 +165,8 @@ class Tags(View):
     """Draws a matrix of who tagged whom every ten episodes of a replica: the mean over its last fifty, or as
     many of each of its worlds as have fifty, and over all replicas."""
 
-    EVERY, OVER = 10, 50
+    EVERY = 10
+    OVER = 50
 
     def __init__(self, logger: RerunLogger) -> None:
         self._logger = logger

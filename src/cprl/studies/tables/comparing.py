@@ -355,7 +355,8 @@ def compared_rows(comparisons: Sequence[Comparison]) -> pa.Table:
     rows = []
     for comparison in comparisons:
         for compared in comparison.conditions:
-            one, difference = compared.estimate, compared.difference
+            one = compared.estimate
+            difference = compared.difference
             rows.append(
                 {
                     "metric": comparison.metric,

@@ -460,12 +460,14 @@ def ending(returns: Values, *, random: float, agents: int, worlds: Numbers | Non
         agents: how many there are.
         worlds: that of each episode, [E], if there are several, which then count alike.
     """
-    lanes, after = 1 if worlds is None else len(np.unique(worlds)), 0
+    lanes = 1 if worlds is None else len(np.unique(worlds))
+    after = 0
     if worlds is None or lanes == 1:
         tens, means = running_mean(returns, PEAK_EPISODES), running_mean(returns, LAST_EPISODES)
     else:
         tens, means = (mean_of_worlds(returns, worlds, size) for size in (PEAK_EPISODES, LAST_EPISODES))
-        tens, means = tens[~np.isnan(means)], means[~np.isnan(means)]
+        tens = tens[~np.isnan(means)]
+        means = means[~np.isnan(means)]
         after = (rounds_of(LAST_EPISODES, lanes) - rounds_of(PEAK_EPISODES, lanes)) * lanes
     peak, at, last = float(tens.max()), int(tens.argmax()), float(means[-1])
     low = float(means[min(at + after, len(means) - 1) :].min())
