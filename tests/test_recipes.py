@@ -192,7 +192,7 @@ def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, caps
     learning = 1 if name == "two_against_random" else agents
     assert sorted(weights) == [f"replica_{r}/agent_{a}" for r in range(2) for a in range(learning)]
     assert (run / "figures" / "training_curve.png").exists()
-    assert "trained, epsilon" in told
+    assert "agents act at random in 5%" in " ".join(told.split())
     assert " 0.05 ┃" in told
     for policy in ("random", "trained"):
         played = pq.read_table(run / "evaluation" / f"{policy}.parquet").to_pydict()
@@ -242,7 +242,7 @@ def test_swapping_the_loss_is_one_argument_and_each_leaves_a_run_that_plays_agai
     run = run_recipe("swap_the_loss", tmp_path / "run", own={"loss": loss}, episodes=episodes, watch="off")
     loaded, algorithm = cprl.load(run), recipe("swap_the_loss").LOSSES[loss]
     assert loaded.experiment.agents == (Learning(algorithm),) * 2
-    explores = "trained, epsilon" in capsys.readouterr().out
+    explores = "agents act at random in" in " ".join(capsys.readouterr().out.split())
     assert explores == (loss not in ("sac", "iql", "ppo")), "who draws from a policy has no epsilon"
     members = [Learning(algorithm)] * 2
     for lane, network in Population(loaded.env(2), members, engine="eager").networks().items():

@@ -184,9 +184,12 @@ def test_runs_of_one_name_or_of_the_same_replicas_are_not_pooled(run, other, tmp
 
 
 def with_field(run, name, changed):
-    """Changes an entry of a run's recipe."""
+    """Changes an entry of a run's recipe, and unties the manifest from the recipe before."""
     recipe = json.loads((run / "recipe.json").read_text())
     (run / "recipe.json").write_text(json.dumps({**recipe, name: changed(recipe[name])}))
+    manifest = json.loads((run / "manifest.json").read_text())
+    manifest.pop("experiment", None)
+    (run / "manifest.json").write_text(json.dumps(manifest))
 
 
 @pytest.mark.integration

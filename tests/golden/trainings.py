@@ -206,7 +206,7 @@ def train(experiment: object, out: Path) -> dict[str, object]:
 
     quiet = {"watch": "off", "figures": False}
     whole = cprl.run(experiment, out / "whole", **quiet)
-    cprl.run(replace(experiment, episodes=1), out / "halves", **quiet)
+    cprl.run(replace(experiment, episodes=1), out / "halves", keep_checkpoint=True, **quiet)
     halves = cprl.run(experiment, out / "halves", resume=True, **quiet)
     found, again = tables(whole), tables(halves)
     learned, learned_again = weights(whole), weights(halves)
