@@ -61,15 +61,15 @@ def run(tmp_path_factory):
 SMALL = Style(width=240, every=50)
 
 
-def lengths_of(run, replica, folder):
-    """The turns of the first five fresh episodes of a replica."""
-    lengths = []
+def first_five(run, replica, folder):
+    """The turns and the apples of the first five fresh episodes of a replica."""
+    reached = []
     for episode in range(5):
         _, (played,) = film_video(
             run, folder / f"{episode}.gif", replica=replica, episode=episode, style=SMALL
         )
-        lengths.append(played.steps)
-    return lengths
+        reached.append((played.steps, played.harvest.sum()))
+    return np.array(reached)
 
 
 def test_the_replica_is_the_one_whose_survival_is_nearest_to_the_median(run, tmp_path):
@@ -81,13 +81,14 @@ def test_the_replica_is_the_one_whose_survival_is_nearest_to_the_median(run, tmp
     assert typical_replica(load(alike)) == 2, "of equal lives the harvest in the middle"
 
 
-def test_the_episode_is_the_one_of_five_whose_length_is_nearest_to_the_median(run, tmp_path):
-    lengths = lengths_of(run, 0, tmp_path)
-    far = [abs(length - np.median(TURNS)) for length in lengths]
+def test_the_episode_is_the_one_of_five_whose_turns_and_apples_are_nearest_to_the_medians(run, tmp_path):
+    reached = first_five(run, 0, tmp_path)
+    medians = np.median(TURNS), np.median(APPLES)
+    far = np.sum(abs(reached - medians) / medians, axis=1)
     fresh = fresh_episode(run)
     assert (fresh.replica, far[fresh.episode]) == (0, min(far))
     _, (filmed,) = film_video(run, tmp_path / "film.gif", style=SMALL)
-    assert filmed.steps == lengths[fresh.episode]
+    assert (filmed.steps, filmed.harvest.sum()) == tuple(reached[fresh.episode])
     again = fresh_episode(run)
     assert (again.replica, again.episode) == (fresh.replica, fresh.episode)
 
@@ -107,8 +108,8 @@ def test_words_say_which_episode_it_is_and_what_all_replicas_come_to(run, tmp_pa
         "apples."
     )
     assert fresh.words == (
-        f"A typical episode (replica 0, episode {fresh.episode}), chosen of the first 5 for a life near the "
-        f"median of the replicas, 6 turns. {known}"
+        f"A typical episode (replica 0, episode {fresh.episode}), chosen of the first 5 for a life and a "
+        f"harvest near the medians of the replicas, 6 turns and 16 apples. {known}"
     )
     assert fresh_episode(run, replica=1, episode=3).words == f"Replica 1, episode 3. {known}"
     many = trained(tmp_path / "many", turns=list(range(1, 10)), apples=list(range(11, 20)))
@@ -116,7 +117,10 @@ def test_words_say_which_episode_it_is_and_what_all_replicas_come_to(run, tmp_pa
         "of the 9 replicas last 1 to 9 turns on average and pick 11 to 19 apples" in fresh_episode(many).words
     )
     alone = trained(tmp_path / "alone", turns=[9.0], apples=[20.0])
-    assert "near the average, 9 turns. The trained agents last 9 turns" in fresh_episode(alone).words
+    assert (
+        "near the averages, 9 turns and 20 apples. The trained agents last 9 turns"
+        in fresh_episode(alone).words
+    )
 
 
 def test_what_is_asked_for_is_taken_as_it_is(run):

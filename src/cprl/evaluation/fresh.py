@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from torchrl.envs import EnvBase
 
 from cprl.evaluation.evaluate import opened
@@ -39,7 +38,7 @@ class FreshEpisode(NamedTuple):
     replica: int
     episode: int
     is_typical: bool = False
-    """Whether it was chosen as the one whose length is nearest to the median over replicas."""
+    """Whether it was chosen as the one whose turns and apples are nearest to their medians over replicas."""
 
     @property
     def words(self) -> str:
@@ -48,9 +47,10 @@ class FreshEpisode(NamedTuple):
         if not self.is_typical:
             return f"Replica {self.replica}, episode {self.episode}. {known}".rstrip()
         averages = averages_of(self.run)
-        turns, _ = _median(averages)
-        middle = "the median of the replicas" if len(averages) > 1 else "the average"
-        chosen = f"chosen of the first {EPISODES_TRIED} for a life near {middle}, {turns:,.0f} turns"
+        turns, apples = _median(averages)
+        middle = "the medians of the replicas" if len(averages) > 1 else "the averages"
+        near = f"{middle}, {turns:,.0f} turns and {apples:,.0f} apples"
+        chosen = f"chosen of the first {EPISODES_TRIED} for a life and a harvest near {near}"
         which = f"replica {self.replica}, episode {self.episode}"
         return f"A typical episode ({which}), {chosen}. {known}"
 
@@ -120,8 +120,8 @@ def fresh_episodes(
 
     Without `replica` and `episode` it is a typical one: of each run the replica whose average survival in the
     run's own evaluation is nearest to the median over replicas, and of the first five episodes the one whose
-    lengths are nearest to these medians; the same world for all. Runs in which nobody learned, or without an
-    evaluation, show their first replica, and alone the first episode.
+    turns and apples are nearest to the medians; the same world for all. Runs in which nobody learned, or
+    without an evaluation, show their first replica, and alone the first episode.
 
     Args:
         replica, episode: if one of them is given, the other is the first.
@@ -148,10 +148,9 @@ def fresh_episodes(
         each = zip(loaded, replicas, are_known, strict=True)
         return [_fresh(run, own, tried, seed)._replace(is_typical=is_known) for run, own, is_known in each]
 
-    def distance(tried: int) -> list[float]:
-        """How far the turns of an episode of all runs are from the medians, and how far the apples."""
-        far = [_distance(fresh) for fresh in played(tried) if fresh.is_typical]
-        return list(np.sum(far, axis=0))
+    def distance(tried: int) -> float:
+        """How far the turns and the apples of an episode of all runs are from the medians."""
+        return sum(_distance(fresh) for fresh in played(tried) if fresh.is_typical)
 
     return played(min(range(EPISODES_TRIED), key=distance) if any(are_known) else 0)
 
@@ -182,12 +181,12 @@ def _fresh(run: LoadedRun, replica: int | None, episode: int, seed: int) -> Fres
     return FreshEpisode(run, env, run.policy(replica, seed=seed + episode), replica, episode)
 
 
-def _distance(fresh: FreshEpisode) -> NDArray[np.float64]:
-    """Play an episode; return how far its turns and its apples are from their medians, as shares of these."""
+def _distance(fresh: FreshEpisode) -> float:
+    """Play an episode; return how far its turns and its apples are from their medians, in shares of these."""
     median = _median(averages_of(fresh.run))
     (played,) = evaluate(fresh.env, fresh.policies, explore=True)
     reached = np.array([played.steps, played.metrics["collective_return"]])
-    return np.asarray(np.abs(reached - median) / np.maximum(1.0, median))
+    return float(np.sum(np.abs(reached - median) / np.maximum(1.0, median)))
 
 
 def say_which(fresh: Sequence[FreshEpisode]) -> None:
