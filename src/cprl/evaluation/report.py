@@ -89,7 +89,8 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
     curves = _curves(run)
     has_course = {"collective_return", "survival_steps"} <= set(curves)
     if has_course and (run.path / "evaluation" / "random.parquet").is_file():
-        before.append(f"**{course_of(run.path, run.specs)}**")
+        *facts, meaning = course_of(run.path, run.specs).splitlines()
+        before.append("  \n".join([*facts, f"**{meaning}**"]))
     before.append(f"{learned(run.specs)}, {run.experiment.trained_for}.")
     before.append(run.experiment.own_code)
     after = ["## Fresh episodes, beside random play", "", *markdown(run_table(evaluation))]

@@ -43,7 +43,7 @@ NEEDED: Final = ("collective_return", "survival_steps")
 
 
 def course_of(run: Path, agents: Sequence[AgentSpec]) -> str:
-    """Return what became of a run, in sentences.
+    """Return what became of a run, in sentences: a line for each fact, and last what they mean.
 
     A tragedy, here: at the end of the training agents who learn get less than random play, over replicas, and
     at most 95 % of it; their best ten episodes yielded at least 1.5 times as much as it; and boards last at
@@ -65,7 +65,7 @@ def course_of(run: Path, agents: Sequence[AgentSpec]) -> str:
     if not any(isinstance(spec, Learning | Team) for spec in agents):
         parts = [f"In fresh worlds they get {fresh}.", *_replicas(fresh, trained)]
         parts += [f"Random play gets {random}.", _verdict({"in fresh worlds": fresh}, random, "random play")]
-        return " ".join(parts)
+        return "\n".join(parts)
     last = Outcome.of(last_of(table, LAST_EPISODES))
     began, peak, around = _rise(table)
     parts = [
@@ -85,7 +85,7 @@ def course_of(run: Path, agents: Sequence[AgentSpec]) -> str:
         and last.steps.mean() <= SHORT * longest
     )
     ends = {"while they learn": last, "in fresh worlds": fresh}
-    return " ".join([*parts, _verdict(ends, random, "agents who never learned", is_fall=bool(is_fall))])
+    return "\n".join([*parts, _verdict(ends, random, "agents who never learned", is_fall=bool(is_fall))])
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ def _verdict(ends: Mapping[str, Outcome], random: Outcome, others: str, *, is_fa
         unsure = [_unsure(when) for when, word in judged.items() if not word]
         sentences = [f"{one[0].upper()}{one[1:]}." for one in known]
         meaning = " ".join([*sentences, *unsure])
-    return f"Beside random play, in apples, that is {beside}. {meaning}"
+    return f"Beside random play, in apples, that is {beside}.\n{meaning}"
 
 
 def _judged(found: Estimate) -> str:
