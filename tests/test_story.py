@@ -601,6 +601,7 @@ def test_the_numbers_of_an_evaluation_are_means_with_their_interval_over_replica
     apples, died, count = played(episodes, replicas=2)
     assert (apples.value, died, count) == (12.0, 4, 4)
     assert (apples.low, apples.high) == pytest.approx((12 - 25.412, 12 + 25.412), abs=0.001)
+    assert f"{apples}" == "12.0 [0.0, 37.4]", "no harvest is below 0"
     assert f"{played(episodes).harvest}" == "12.0", "one replica has no interval"
 
 

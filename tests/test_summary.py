@@ -60,6 +60,9 @@ def test_a_table_says_once_that_bounds_cut_intervals(tmp_path):
     rows, text = told_of(tmp_path, random=unequal)
     assert rows["equality (1 - Gini), 0 to 1"] == ["0.67 [0.00, 1.00]"]
     assert text.count("Bounds of a metric cut an interval where Student's t passes them.") == 1
+    other = {r: [episode(0, [1, 1], equality=value)] for r, value in enumerate([0.0, 0.0, 0.9])}
+    rows, _ = told_of(tmp_path, random=unequal, trained=other)
+    assert rows["equality (1 - Gini), 0 to 1"][-1] == "-0.37 [-1.00, +0.81]", "two shares lie at most 1 apart"
 
 
 def test_returns_that_are_not_finite_are_shown_as_such(tmp_path):

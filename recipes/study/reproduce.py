@@ -110,7 +110,7 @@ def run(name: str, common: Sequence[str], *, runs: Path, results: Path) -> None:
     directory, log = runs / name, runs / f"{name}.log"
     runs.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, str(recipe_named(recipe).path), *arguments, *common]
-    command += ["--no-keep-checkpoint", "--out", str(directory)]
+    command += ["--out", str(directory)]
     command += ["--resume"] if (directory / "recipe.json").exists() else []
     say(f"{name}: see {log}")
     with open(log, "a") as told:

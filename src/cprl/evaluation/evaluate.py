@@ -96,7 +96,10 @@ class Evaluation(Results):
         which play the same worlds; None where a metric is undefined."""
         trained = self._values("trained")
         random = self._values("random")
-        return {name: difference_paired(values, random[name]) for name, values in trained.items()}
+        clock = clock_of(self.played)
+        return {
+            name: difference_paired(values, random[name], name, clock) for name, values in trained.items()
+        }
 
     def _values(self, policy: str) -> dict[str, dict[int, list[float]]]:
         """The values of all measures by replica."""

@@ -216,7 +216,7 @@ class Sandbox:
             recipe = run.with_suffix(".py")
             recipe.write_text(sliders.recipe(self.episodes), encoding="utf-8")
             with run.with_suffix(".log").open("wb") as log:
-                words = [sys.executable, str(recipe), "--watch", "off", "--no-keep-checkpoint"]
+                words = [sys.executable, str(recipe), "--watch", "off"]
                 words += ["--out", str(run)]
                 process = subprocess.Popen(words, stdout=log, stderr=log, stdin=subprocess.DEVNULL)
             self._learned_under[run] = sliders.rules

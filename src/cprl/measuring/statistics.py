@@ -43,6 +43,11 @@ class Estimate:
         """This estimate as one of a metric, whose `bounds` cut what is shown of the interval."""
         return replace(self, bounds=bounds(metric, clock))
 
+    def between(self, metric: str, clock: float = inf) -> Self:
+        """This difference as one between values of a metric, no larger than its `bounds` are apart."""
+        least, most = bounds(metric, clock)
+        return replace(self, bounds=(least - most, most - least))
+
     @property
     def interval(self) -> tuple[float, float]:
         """The interval as it is shown, within the bounds."""
@@ -244,13 +249,15 @@ def over_replicas(values: ByReplica, metric: str = "", clock: float = inf) -> Me
     )
 
 
-def difference_paired(values: ByReplica, reference: ByReplica) -> Estimate | None:
+def difference_paired(
+    values: ByReplica, reference: ByReplica, metric: str = "", clock: float = inf
+) -> Estimate | None:
     """Return how much more the mean of a metric is, paired by replica, over the replicas in which both are
     defined; None if there is none."""
     means = _means(values)
     others = _means(reference)
     pairs = [means[replica] - others[replica] for replica in means if replica in others]
-    return estimate_if_finite(pairs) if pairs else None
+    return estimate_if_finite(pairs).between(metric, clock) if pairs else None
 
 
 def _means(values: ByReplica) -> dict[int, float]:

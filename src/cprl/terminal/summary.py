@@ -124,7 +124,8 @@ def _rows(
         measures = [over_replicas(of_policy, metrics[words], clock) for of_policy in of_policies]
         if all(measured.estimate is None for measured in measures):
             continue
-        more = (difference_paired(of_policy, of_policies[0]) for of_policy in of_policies[1:])
+        name = metrics[words]
+        more = (difference_paired(of_policy, of_policies[0], name, clock) for of_policy in of_policies[1:])
         rows.append([words, *map(str, measures), *map(signed, more)])
         all_measures += measures
     return rows, all_measures

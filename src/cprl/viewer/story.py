@@ -44,9 +44,10 @@ def played(episodes: Sequence[Episode], *, replicas: int = 1) -> Played:
     the other; of any other number the mean alone."""
     replicas = 1 if len(episodes) % replicas else replicas
     values = list(map(_gained, episodes))
+    harvest = estimate_if_finite(np.reshape(values, (replicas, -1)).mean(1).tolist())
     died = [has_died(episode) for episode in episodes]
     return Played(
-        harvest=estimate_if_finite(np.reshape(values, (replicas, -1)).mean(1).tolist()),
+        harvest=harvest.of("collective_return") if "collective_return" in episodes[0].metrics else harvest,
         died=None if None in died else sum(map(bool, died)),
         episodes=len(values),
     )
