@@ -152,7 +152,7 @@ def _table_in(runs: Sequence[Path], reference: str | None, window: int | None) -
     return replace(table, design=replace(table.design, reference=reference))
 
 
-def _write(table: "StudyTable", compared: "Sequence[Cells]", asked: Compare, last: int, out: Path) -> None:
+def _write(table: "StudyTable", compared: "Sequence[Cells]", choice: Compare, last: int, out: Path) -> None:
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -161,13 +161,13 @@ def _write(table: "StudyTable", compared: "Sequence[Cells]", asked: Compare, las
     from cprl.terminal.tables import markdown
 
     if out.suffix == ".parquet":
-        chosen = table.rows.filter(pc.is_in(table.rows["metric"], pa.array(asked.metric or table.metrics)))
+        chosen = table.rows.filter(pc.is_in(table.rows["metric"], pa.array(choice.metric or table.metrics)))
         replace(table, rows=chosen).write(out)
         return
     if out.suffix == ".csv":
-        metrics = metrics_of(table, asked.metric, part=asked.part)
+        metrics = metrics_of(table, choice.metric, part=choice.part)
         content = csv_of(
-            compared_rows([compare(table, metric, part=asked.part, last=last) for metric in metrics])
+            compared_rows([compare(table, metric, part=choice.part, last=last) for metric in metrics])
         )
     else:
         lines = [line for cells in compared for line in (cells.heading, "", *markdown(cells))]

@@ -278,7 +278,10 @@ def titles_of(fresh: Sequence[FreshEpisode]) -> Sequence[str]:
 def _rules_in(run: LoadedRun) -> list[str]:
     """The names of the classes of a run's institutions and transforms."""
     institutions = [type(kind).__name__ for kind in commons_game(run).institutions]
-    return [*institutions, *(re.split("[:.]", own.target)[-1] for own in run.experiment.transforms)]
+    return [
+        *institutions,
+        *(re.split("[:.]", transform.target)[-1] for transform in run.experiment.transforms),
+    ]
 
 
 class Filmed(NamedTuple):

@@ -146,7 +146,7 @@ def fresh_episodes(
     def played(tried: int) -> list[FreshEpisode]:
         """An episode of all runs, each with its typical replica."""
         each = zip(loaded, replicas, are_known, strict=True)
-        return [_fresh(run, own, tried, seed)._replace(is_typical=is_known) for run, own, is_known in each]
+        return [_fresh(run, number, tried, seed)._replace(is_typical=known) for run, number, known in each]
 
     def distance(tried: int) -> float:
         """How far the turns and the apples of an episode of all runs are from the medians."""

@@ -190,14 +190,16 @@ def _answer(table: StudyTable) -> str:
     metrics = metrics_of(table, part=EVALUATION)
     comparisons = {metric: compare(table, metric, part=EVALUATION) for metric in metrics}
     has_income = {NET, "collective_return"} <= set(metrics)
-    asked = {NET: _INCOME, "collective_return": _HARVEST} if has_income else {metrics[0]: title(metrics[0])}
+    compared = (
+        {NET: _INCOME, "collective_return": _HARVEST} if has_income else {metrics[0]: title(metrics[0])}
+    )
     unit_of = "apples" if has_income else unit(metrics[0])
     first = comparisons[metrics[0]]
     beside = f"beside {cell(first.reference)}, {first.pairing_text}"
     family = family_of(differences_in(list(comparisons.values())))
     tests = f"{family.tests} differences of their table below"
     parts = []
-    for metric, words in asked.items():
+    for metric, words in compared.items():
         differences = differences_in([comparisons[metric]])
         if effects_of(table):
             effects = estimated(table, comparisons[metric])

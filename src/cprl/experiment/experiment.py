@@ -110,8 +110,8 @@ class Experiment(Value, stored=False, called="experiment"):
         if isinstance(self.game, Game):
             who = f"{learned(specs_by_agent(self.agents, self.game.agents))}, "
             game = game_html(self.game, self.own_rules)
-        own = f"<p>{escape(self.own_code)}</p>" if self.own_code else ""
-        return f"<p><b>{escape(self.name)}</b>: {escape(who + self.trained_for)}.</p>{game}{own}"
+        code = f"<p>{escape(self.own_code)}</p>" if self.own_code else ""
+        return f"<p><b>{escape(self.name)}</b>: {escape(who + self.trained_for)}.</p>{game}{code}"
 
     @property
     def own_rules(self) -> str:

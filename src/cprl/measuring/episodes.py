@@ -484,8 +484,8 @@ class EpisodeTracker:
                 institutions={name: float(values[index]) for name, values in of_institutions.items()},
                 **{name: values[index] for name, values in columns.items()},
             )
-            own = own_metrics(self._metrics, episode)
-            episodes.append(replace(episode, metrics={**episode.metrics, **own}) if own else episode)
+            added = own_metrics(self._metrics, episode)
+            episodes.append(replace(episode, metrics={**episode.metrics, **added}) if added else episode)
         return episodes
 
 

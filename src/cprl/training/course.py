@@ -186,9 +186,9 @@ def _verdict(ends: Mapping[str, Outcome], random: Outcome, others: str, *, is_fa
     whether = f"Whether they end better or worse off than {others} cannot be told"
     if len(random.apples) == 1:
         return f"{whether}: one replica has no interval."
-    found = {when: difference(end.apples, random.apples, paired=True) for when, end in ends.items()}
-    beside = " and ".join(f"{one:+} {when}" for when, one in found.items())
-    judged = {when: _judged(one) for when, one in found.items()}
+    gaps = {when: difference(end.apples, random.apples, paired=True) for when, end in ends.items()}
+    beside = " and ".join(f"{one:+} {when}" for when, one in gaps.items())
+    judged = {when: _judged(one) for when, one in gaps.items()}
     words = list(judged.values())
     if is_fall and words[0] == WORSE:
         ends_text = (
@@ -208,8 +208,8 @@ def _verdict(ends: Mapping[str, Outcome], random: Outcome, others: str, *, is_fa
     return f"Beside random play, in apples, that is {beside}.\n{meaning}"
 
 
-def _judged(found: Estimate) -> str:
-    return BETTER if found.low > 0 else WORSE if found.high < 0 else ""
+def _judged(gap: Estimate) -> str:
+    return BETTER if gap.low > 0 else WORSE if gap.high < 0 else ""
 
 
 def _unsure(when: str) -> str:

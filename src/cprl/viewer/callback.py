@@ -125,8 +125,8 @@ class ViewerCallback:
         self.story: Story | None = None
         self.exhibition: Exhibition | None = None
         """What the current policy plays for viewers; None where nothing is exhibited."""
-        own = rules_of_own(recipe or {})
-        self._views = self._make_views(episodes, exhibited, own, is_about=is_about, is_replay=is_replay)
+        own_rules = rules_of_own(recipe or {})
+        self._views = self._make_views(episodes, exhibited, own_rules, is_about=is_about, is_replay=is_replay)
         self._sampled = gcd(*(view.stride for view in self._views)) or 1
         """Turns from one look at the worlds to the next where no frame is recorded."""
         self.filming.choose(0)
@@ -135,7 +135,7 @@ class ViewerCallback:
         self,
         episodes: int,
         exhibited: tuple[PresentPolicy, EnvBase] | None,
-        own: str,
+        own_rules: str,
         *,
         is_about: bool,
         is_replay: bool,
@@ -168,7 +168,9 @@ class ViewerCallback:
         if curves.has_lorenz:
             views.append(Lorenz(logger, every=every))
         game = None if commons is None else commons.game
-        self.story = Story(logger, self.filming, episodes=episodes, is_about=is_about, game=game, own=own)
+        self.story = Story(
+            logger, self.filming, episodes=episodes, is_about=is_about, game=game, own_rules=own_rules
+        )
         views.append(self.story)
         if live is not None:
             views.append(CompilingNotice(self._show_status))

@@ -187,7 +187,7 @@ class Story(View):
         episodes: of each replica.
         is_about: whether it is only about as many.
         game: the game, if it is one of cprl's; the published one has the study's phases beside those found.
-        own: rules of the user's own, in words.
+        own_rules: rules of the user's own, in words.
     """
 
     def __init__(
@@ -198,7 +198,7 @@ class Story(View):
         episodes: int,
         is_about: bool = False,
         game: Game | None = None,
-        own: str = "",
+        own_rules: str = "",
     ) -> None:
         self._logger, self._filming, self._curves, self._game = logger, filming, logger.curves, game
         self._episodes = episodes
@@ -206,7 +206,7 @@ class Story(View):
             episodes=episodes,
             boards=self._curves.replicas * self._curves.worlds,
             unit=self._curves.unit,
-            rules=", ".join(filter(None, (rules_of(game), own))),
+            rules=", ".join(filter(None, (rules_of(game), own_rules))),
             legend=legend_of(self._curves),
             is_about=is_about,
         )

@@ -123,10 +123,10 @@ def compare(table: StudyTable, metric: str, *, part: str = TRAINING, last: int =
     checked("last", last, Positive)
     if part == TRAINING and last < table.window:
         raise refusal("last", last, f"at least {table.window}, the episodes of a window of the table")
-    asked = metric, part, last
-    if asked not in table.comparisons:
-        table.comparisons[asked] = _compared(table, metric, part, last)
-    comparison: Comparison = table.comparisons[asked]
+    key = metric, part, last
+    if key not in table.comparisons:
+        table.comparisons[key] = _compared(table, metric, part, last)
+    comparison: Comparison = table.comparisons[key]
     return comparison
 
 
