@@ -36,7 +36,7 @@ def evaluate(
     exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     clock = clock_of(env)
     turns = 0
-    what = f"playing {tracker.worlds:,} episodes"
+    what = "playing an episode" if tracker.worlds == 1 else f"playing {tracker.worlds:,} episodes"
     with torch.no_grad(), one_thread(), set_exploration_type(exploration), working(what):
         moment = env.reset()
         while len(episodes) < tracker.worlds:
