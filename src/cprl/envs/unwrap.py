@@ -20,7 +20,7 @@ def commons_of(env: EnvBase) -> CommonsEnv | None:
 
 
 def clock_of(env: EnvBase) -> int | None:
-    """The turns of an episode at most; None where a game does not say."""
+    """Return the turns of an episode at most; None where a game does not say."""
     return clock_in(getattr(base_env(env), "game", None))
 
 

@@ -92,8 +92,8 @@ class Evaluation(Results):
         return {name: over_replicas(values, name, clock) for name, values in self._values(policy).items()}
 
     def differences(self) -> dict[str, Estimate | None]:
-        """How much more the run's agents have of each of `measures` than random ones, paired by replica,
-        which play the same worlds; None where a metric is undefined."""
+        """Return how much more the run's agents have of each of `measures` than random ones, paired by
+        replica, which play the same worlds; None where a metric is undefined."""
         trained = self._values("trained")
         random = self._values("random")
         clock = clock_of(self.played)
@@ -102,7 +102,7 @@ class Evaluation(Results):
         }
 
     def _values(self, policy: str) -> dict[str, dict[int, list[float]]]:
-        """The values of all measures by replica."""
+        """Return the values of all measures by replica."""
         played = self.where(policy=checked("policy", policy, Literal["trained", "random"])).played
         first = next(iter(played.values()))[0]
         names = {"return_": "return"}

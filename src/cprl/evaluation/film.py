@@ -276,7 +276,7 @@ def titles_of(fresh: Sequence[FreshEpisode]) -> Sequence[str]:
 
 
 def _rules_in(run: LoadedRun) -> list[str]:
-    """The names of the classes of a run's institutions and transforms."""
+    """Return the names of the classes of a run's institutions and transforms."""
     institutions = [type(kind).__name__ for kind in commons_game(run).institutions]
     return [
         *institutions,

@@ -97,7 +97,7 @@ class EpisodePicture:
         card: str = "",
         violators: Sequence[int] = (),
     ) -> Bytes:
-        """The picture of the last of these moments.
+        """Return the picture of the last of these moments.
 
         Args:
             moments: the episode so far: the board as it began, then after each turn.

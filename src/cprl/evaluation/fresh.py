@@ -72,7 +72,7 @@ def averages_of(run: LoadedRun) -> dict[int, tuple[float, float]]:
 
 
 def _median(averages: Mapping[int, tuple[float, float]]) -> tuple[float, float]:
-    """The medians over replicas of the turns and of the apples."""
+    """Return the medians over replicas of the turns and of the apples."""
     turns, apples = np.median([*averages.values()], axis=0).tolist()
     return turns, apples
 
@@ -103,7 +103,7 @@ def fresh_episode(
     seed: int | None = None,
     allow: Sequence[str] = (),
 ) -> FreshEpisode:
-    """The world and the agents of an episode that is filmed, see `fresh_episodes`."""
+    """Return the world and the agents of an episode that is filmed, see `fresh_episodes`."""
     (fresh,) = fresh_episodes([run], replica=replica, episode=episode, seed=seed, allow=allow)
     return fresh
 
@@ -149,7 +149,7 @@ def fresh_episodes(
         return [_fresh(run, number, tried, seed)._replace(is_typical=known) for run, number, known in each]
 
     def distance(tried: int) -> float:
-        """How far the turns and the apples of an episode of all runs are from the medians."""
+        """Return how far the turns and the apples of an episode of all runs are from the medians."""
         return sum(_distance(fresh) for fresh in played(tried) if fresh.is_typical)
 
     return played(min(range(EPISODES_TRIED), key=distance) if any(are_known) else 0)

@@ -380,7 +380,7 @@ def open_session(
 
 
 def _run_of(others: str, board: str, run: LoadedRun | None) -> LoadedRun | None:
-    """The run whose agents play; None for scripted ones, and where there is none."""
+    """Return the run whose agents play; None for scripted ones, and where there is none."""
     if others == board:
         return run
     return load(others) if others not in SCRIPTED_POLICIES and Path(others).is_dir() else None

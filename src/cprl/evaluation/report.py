@@ -180,8 +180,8 @@ def _of_study(folder: Path) -> str:
 
 
 def _answer(table: StudyTable) -> str:
-    """What differs in the episodes of the evaluation: of a grid the effects of its factors, else conditions
-    from the reference; "" without any.
+    """Return what differs in the episodes of the evaluation: of a grid the effects of its factors, else
+    conditions from the reference; "" without any.
 
     It is about income where money moves, and then about the harvest too; else about the first metric.
     """

@@ -103,7 +103,7 @@ def show(
 
 
 def begins(game: Game) -> str:
-    """What a page says above its episodes, as HTML."""
+    """Return what a page says above its episodes, as HTML."""
     return f"<p>{escape(growth_of(game))}</p>"
 
 

@@ -89,7 +89,7 @@ def with_unit(name: str, *, rewards: str = "") -> str:
 
 
 def bounds(name: str, clock: float = inf) -> tuple[float, float]:
-    """What a metric can be, as far as that is known; of a return, anything.
+    """Return what a metric can be, as far as that is known; of a return, anything.
 
     Args:
         clock: the steps of the longest episode that the game allows.

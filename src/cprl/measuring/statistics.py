@@ -261,7 +261,7 @@ def difference_paired(
 
 
 def _means(values: ByReplica) -> dict[int, float]:
-    """The mean of each replica over the episodes in which the metric is defined, if there are any."""
+    """Return the mean of each replica over the episodes in which the metric is defined, if there are any."""
     defined = {
         replica: [value for value in episodes if not isnan(value)] for replica, episodes in values.items()
     }
@@ -274,7 +274,7 @@ def _means(values: ByReplica) -> dict[int, float]:
 
 
 def estimate_if_finite(means: Sequence[float]) -> Estimate:
-    """The estimate of means that may not be finite; then it is their mean, without an interval."""
+    """Return the estimate of means that may not be finite; then it is their mean, without an interval."""
     if all(map(isfinite, means)):
         return estimate(means)
     with np.errstate(invalid="ignore"):

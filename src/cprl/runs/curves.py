@@ -135,7 +135,7 @@ def _world(table: pa.Table) -> Numbers:
 
 
 def _places(table: pa.Table) -> tuple[Numbers, Numbers, tuple[int, int]]:
-    """The row and the place of each row's episode in its replica, and how many of both: R, and as many
+    """Return the row and the place of each row's episode in its replica, and how many of both: R, and as many
     episodes as all replicas have."""
     replicas, replica = np.unique(table["replica"].to_numpy(), return_inverse=True)
     episode = table["episode"].to_numpy().astype(np.int64)
@@ -153,7 +153,7 @@ def net_of(curves: Mapping[str, Values]) -> Values:
 
 
 def _of_institutions(names: Sequence[str], values: Callable[[str], Values]) -> dict[str, Values]:
-    """The curves of institutions, [R, E] by name; none for a game without them.
+    """Return the curves of institutions, [R, E] by name; none for a game without them.
 
     Tables of before 0.1.0 have no column for their metrics: these are computed from the columns that they
     have, but for the share of unjust tags and for groups.

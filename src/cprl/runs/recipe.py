@@ -408,5 +408,5 @@ _OF_RULES: Final = ("game", "transforms")
 
 
 def rules_of_own(table: Mapping[str, Any]) -> str:
-    """The rules of the user's own in words, of an experiment as a recipe stores it; "" without any."""
+    """Return the rules of the user's own in words, of an experiment as a recipe stores it; "" without any."""
     return "; ".join(described([table.get(name) for name in _OF_RULES]))

@@ -579,7 +579,7 @@ Numbers = dict[str, tuple[float, str]]
 
 
 def _numbers(comparison: Comparison, grid: Grid, marked: Collection[Place]) -> tuple[Numbers, Numbers]:
-    """The means and the differences of a map, with a star where they are marked."""
+    """Return the means and the differences of a map, with a star where they are marked."""
     levels = {}
     differences = {}
     for name in grid.values():
@@ -696,7 +696,7 @@ def colours_of(names: Sequence[str], levels: Sequence[Any]) -> dict[str, str]:
 
 
 def _chosen(table: StudyTable, metrics: Sequence[str]) -> tuple[str, ...]:
-    """The metrics whose levels are drawn."""
+    """Return the metrics whose levels are drawn."""
     return metrics_of(table, metrics) + (() if metrics else measures_of(table))
 
 

@@ -206,7 +206,7 @@ class FinishedRuns:
 
 
 def _content_of(config: Mapping[str, Any]) -> str:
-    """What tells experiments from others that differ in more than their length."""
+    """Return what tells experiments from others that differ in more than their length."""
     table = without_defaults({**config, **FREE, **ANY_LENGTH}, Experiment)
     return digest_of(json.dumps(table, sort_keys=True))
 

@@ -96,7 +96,7 @@ def say_how_far(done: int, of: int | None, unit: str) -> None:
 
 
 def now() -> str:
-    """What is under way, in a line; "" for nothing."""
+    """Return what is under way, in a line; "" for nothing."""
     if not _works:
         return ""
     last = _works[-1]

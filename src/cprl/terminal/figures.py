@@ -223,7 +223,7 @@ def _evaluated(run: Path, name: str) -> tuple[Values, Values] | None:
 
 
 def _lanes(panel: _Panel) -> int:
-    """The worlds of a replica; 0 for one alone."""
+    """Return the worlds of a replica; 0 for one alone."""
     lanes = len(np.unique(panel.worlds[0]))
     return lanes if lanes > 1 else 0
 
@@ -235,7 +235,7 @@ def _over(panel: _Panel, window: int) -> int:
 
 
 def _means(panel: _Panel, window: int) -> tuple[Values, Values]:
-    """The episodes at the centres of running means, and these of each replica, [R, ...]."""
+    """Return the episodes at the centres of running means, and these of each replica, [R, ...]."""
     if not _lanes(panel):
         return np.asarray(centres(panel.values[0], window), np.float64), running_mean(panel.values, window)
     of_replicas = zip(panel.values, panel.worlds, strict=True)

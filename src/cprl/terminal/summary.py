@@ -73,7 +73,7 @@ def _first(played: Played) -> Episode:
 
 
 def _verdict(played: Played) -> str:
-    """What each policy gets, and how much more than the first, if it is more over replicas."""
+    """Return what each policy gets, and how much more than the first, if it is more over replicas."""
     gains = [_gains(episodes) for episodes in played.values()]
     is_harvest = all(_harvests(episodes) for episodes in played.values())
     what = f"{'apples' if is_harvest else 'of return'} an episode, all agents together"
@@ -132,7 +132,7 @@ def _rows(
 
 
 def _differences(played: Played) -> list[str]:
-    """What the columns of differences are called."""
+    """Return what the columns of differences are called."""
     baseline, *others = played
     return [f"{name} - {baseline}" if len(others) > 1 else "difference, paired" for name in others]
 

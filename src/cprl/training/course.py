@@ -126,8 +126,8 @@ def last_text(table: pa.Table, number: int = LAST_EPISODES) -> str:
 
 
 def _rise(table: pa.Table) -> tuple[float, float, int]:
-    """What agents got in the first ten episodes, in the best ten, and around which episode these were, each
-    as a mean over replicas."""
+    """Return what agents got in the first ten episodes, in the best ten, and around which episode these were,
+    each as a mean over replicas."""
     returns = as_curves(table)["collective_return"]
     worlds = worlds_of(table)
     lanes = len(np.unique(worlds[0]))
@@ -142,7 +142,7 @@ def _rise(table: pa.Table) -> tuple[float, float, int]:
 
 
 def _differs(agents: Sequence[AgentSpec], table: pa.Table) -> str:
-    """What is otherwise in fresh worlds than at the end of the training."""
+    """Return what is otherwise in fresh worlds than at the end of the training."""
     replicas = len(np.unique(table["replica"].to_numpy()))
     steps = int(table["steps"].to_numpy()[table["agent"].to_numpy() == 0].sum()) // replicas
     settings = exploring(agents)
@@ -176,7 +176,7 @@ def _listed(values: Values, form: str) -> str:
 
 
 def _verdict(ends: Mapping[str, Outcome], random: Outcome, others: str, *, is_fall: bool = False) -> str:
-    """How agents end beside random play, as far as replicas can tell.
+    """Return how agents end beside random play, as far as replicas can tell.
 
     Args:
         ends: What they get, by when.

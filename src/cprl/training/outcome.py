@@ -78,8 +78,8 @@ def _worlds(
 def exhibited(
     experiment: Experiment, trained: EnvBase, population: Population
 ) -> tuple[PresentPolicy, EnvBase] | None:
-    """The current policy, and one world for it that neither training nor evaluation plays; None where the
-    game has no board. Torch's generator is left as it was."""
+    """Return the current policy, and one world for it that neither training nor evaluation plays; None where
+    the game has no board. Torch's generator is left as it was."""
     if commons_of(trained) is None:
         return None
     with torch.random.fork_rng(devices=[]):

@@ -240,7 +240,7 @@ class ViewerCallback:
             self._rate_at, self._rate_step = now, self._step
 
     def seen_at_random(self, env: EnvBase, policy: Policy) -> Policy:
-        """The policy of random play; viewers see its first world until the training begins."""
+        """Return the policy of random play; viewers see its first world until the training begins."""
         return policy if self.exhibition is None else self.exhibition.seen(env, policy)
 
     def random_play(self, episodes: Sequence[Episode]) -> None:

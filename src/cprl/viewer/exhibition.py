@@ -101,7 +101,7 @@ class Exhibition(View):
             self._play(episode)
 
     def seen(self, env: EnvBase, policy: Policy) -> Policy:
-        """The policy of random play, whose first world viewers see until the training begins."""
+        """Return the policy of random play, whose first world viewers see until the training begins."""
         commons = commons_of(env)
         assert commons is not None
         recorder = self._at_random = FrameRecorder(commons, self._scene, has_windows=False)

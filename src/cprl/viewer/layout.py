@@ -649,8 +649,8 @@ def _returns(curves: Curves) -> Any:
 
 
 def _social(curves: Curves, metric: str, *, share: bool = False, is_explained: bool = False) -> Any:
-    """The plot of a metric with the lines of random play and of evaluations, whose name says what the bold
-    line is if it is explained; None if the game does not report it."""
+    """Return the plot of a metric with the lines of random play and of evaluations, whose name says what the
+    bold line is if it is explained; None if the game does not report it."""
     folders = ("social", RANDOM_PLAY, EVALUATION) if metric in curves.metrics else ()
     name = metric if is_own(metric) else title(metric)[0].upper() + title(metric)[1:]
     name += f"; {_bold(curves)}" if is_explained else ""
@@ -658,7 +658,7 @@ def _social(curves: Curves, metric: str, *, share: bool = False, is_explained: b
 
 
 def legend_of(curves: Curves) -> str:
-    """What the lines of plots are, and how many episodes a point of them is of."""
+    """Return what the lines of plots are, and how many episodes a point of them is of."""
     point = "" if curves.worlds == 1 else f"a point is the mean of {curves.worlds} episodes; "
     thin = "thin: a replica, " if curves.replicas > 1 else ""
     return f"Curves by episode: {point}{thin}{_bold(curves)}, grey: random play"

@@ -44,7 +44,7 @@ _UNTIL_THE_PIPE_CLOSES: Final = '"$@" & read -r _; kill $!'
 
 
 def recordings_of(run: Path) -> list[Path]:
-    """The recordings of a run so far, in their order: run.rrd, run-2.rrd and so on; films are none."""
+    """Return the recordings of a run so far, in their order: run.rrd, run-2.rrd and so on; films are none."""
     names = (FILE_NAME if number == 1 else f"run-{number}.rrd" for number in itertools.count(1))
     return list(itertools.takewhile(Path.exists, (run / name for name in names)))
 

@@ -40,8 +40,8 @@ class Played(NamedTuple):
 
 
 def played(episodes: Sequence[Episode], *, replicas: int = 1) -> Played:
-    """The numbers of at least one episode in fresh worlds, equally many of each replica, one replica after
-    the other; of any other number the mean alone."""
+    """Return the numbers of at least one episode in fresh worlds, equally many of each replica, one replica
+    after the other; of any other number the mean alone."""
     replicas = 1 if len(episodes) % replicas else replicas
     values = list(map(_gained, episodes))
     harvest = estimate_if_finite(np.reshape(values, (replicas, -1)).mean(1).tolist())
@@ -54,7 +54,7 @@ def played(episodes: Sequence[Episode], *, replicas: int = 1) -> Played:
 
 
 def _gained(episode: Episode) -> float:
-    """What all agents got together: apples, or the return where the game reports no harvest."""
+    """Return what all agents got together: apples, or the return where the game reports no harvest."""
     return float(episode.metrics.get("collective_return", episode.return_.sum()))
 
 

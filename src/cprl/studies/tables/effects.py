@@ -105,7 +105,7 @@ def _against(levels: Levels) -> str:
 
 
 def _weights(design: Design, levels: Mapping[str, Levels]) -> Weights:
-    """The weights of the effect of one factor, or of the interaction of two."""
+    """Return the weights of the effect of one factor, or of the interaction of two."""
     signs: Weights = {}
     for name, at in design.conditions.items():
         sign = 1.0
