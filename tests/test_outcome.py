@@ -89,7 +89,8 @@ def test_a_run_has_the_same_outcome_watched_or_not_and_its_recording_shows_the_e
         np.array(read_table(watched / "evaluation" / f"{policy}.parquet")["collective_return"])
         for policy in ("random", "trained")
     )
-    estimates = [estimate(harvest.reshape(EXPERIMENT.replicas, -1).mean(1)) for harvest in harvests]
+    means = [harvest.reshape(EXPERIMENT.replicas, -1).mean(1) for harvest in harvests]
+    estimates = [estimate(of_replicas).of("collective_return") for of_replicas in means]
     random, trained = (each.value for each in estimates)
     assert headers[0].startswith("#### Episode 1 of 3 · begins")
     assert headers[-2].startswith("#### Episode 3 of 3 · begins, exploring · ")
