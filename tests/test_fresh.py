@@ -11,7 +11,7 @@ from stored_runs import CORRIDORS, DQN, MEADOW, an_experiment, command, stored
 
 from cprl.envs.matrix import prisoners_dilemma
 from cprl.evaluation.film import Style, film, film_video
-from cprl.evaluation.fresh import averages_of, fresh_episode, fresh_episodes, typical_replica
+from cprl.evaluation.fresh import averages_of, fresh_episode, fresh_episodes, fresh_seed, typical_replica
 from cprl.evaluation.play import open_session, play_in_terminal
 from cprl.evaluation.report import report
 from cprl.evaluation.show import show
@@ -177,6 +177,7 @@ def test_the_worlds_of_a_training_are_refused_as_fresh_ones(run, tmp_path, how):
 def test_by_default_no_world_of_a_training_is_taken(tmp_path, seed):
     """Agents of a run that was trained with the default seed play the worlds of the next one."""
     runs = [trained(tmp_path / name, seed=each) for name, each in (("one", seed), ("two", seed + 1))]
+    assert fresh_seed([load(one) for one in runs], seed) == seed + 2
     show(runs[0], tmp_path / "a.html", beside=[runs[1]])
     report(runs[0], episodes=1)
     open_session(str(runs[0]), agent=1)
