@@ -16,8 +16,9 @@ from cprl import keys
 from cprl.commons.game import Game
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.evaluate import opened
-from cprl.evaluation.fresh import fresh_episode
-from cprl.evaluation.lanes import Turns, board_now, refuse_trained_in
+from cprl.evaluation.fresh import FreshEpisode, fresh_episode
+from cprl.evaluation.lanes import board_now, refuse_trained_in
+from cprl.measuring.evaluate import turns
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.system.defaults import FILM_SEED as SEED
 from cprl.system.output import say
@@ -99,19 +100,19 @@ def export_episodes(
         for episode in range(episodes):
             say_how_far(episode, episodes, "episodes")
             fresh = fresh_episode(loaded, replica=replica, episode=episode, seed=seed)
-            yield _play(Turns(fresh.env, fresh.policies)), fresh.run.game
+            yield _play(fresh), fresh.run.game
 
     target.parent.mkdir(parents=True, exist_ok=True)
     return _write_csv(target, played()) if format == "csv" else _write_minari(target, list(played()))
 
 
 @working("playing an episode")
-def _play(turns: Turns) -> Played:
+def _play(fresh: FreshEpisode) -> Played:
     batches = []
     places = []
-    commons = commons_of(turns.env)
-    while not turns.has_ended:
-        batches.append(turns.play().clone())
+    commons = commons_of(fresh.env)
+    for batch in turns(fresh.env, fresh.policies):
+        batches.append(batch.clone())
         if commons is not None:
             now = board_now(commons)
             headings = [_HEADINGS[heading] for heading in now.heading]
