@@ -35,12 +35,13 @@ def turns(env: EnvBase, policy: Policy, *, explore: bool = True) -> Iterator[Ten
     Returns:
         The entries of each turn, batch size [B], see `cprl.keys`, up to the one in which the last world ends.
     """
-    return _turns(env, policy, env.reset(), ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC)
+    with torch.no_grad(), one_thread():
+        begun = env.reset()
+    return _turns(env, policy, begun, explore)
 
 
-def _turns(
-    env: EnvBase, policy: Policy, moment: TensorDictBase, exploration: ExplorationType
-) -> Iterator[TensorDictBase]:
+def _turns(env: EnvBase, policy: Policy, moment: TensorDictBase, explore: bool) -> Iterator[TensorDictBase]:
+    exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
     clock = clock_of(env)
     has_ended = np.zeros((*env.batch_size, 1), np.bool_)
     count = 0
@@ -82,7 +83,7 @@ def evaluate(
 
 
 def mean_return(episodes: list[Episode]) -> tuple[float, float]:
-    """Return the mean over episodes of the agents' summed return, and its standard error; NaN for one episode."""
+    """Return the mean over episodes of the summed return, and its standard error; NaN for one episode."""
     returns = [float(episode.return_.sum()) for episode in episodes]
     error = stdev(returns) / len(returns) ** 0.5 if len(returns) > 1 else float("nan")
     return fmean(returns), error
