@@ -28,8 +28,8 @@ from cprl.commons.rules import Rules
 from cprl.commons.world import Shown, StepOutput
 from cprl.envs.make_env import make_env
 from cprl.envs.unwrap import commons_of
-from cprl.evaluation.fresh import averages_in_words, fresh_seed, typical_replica
-from cprl.evaluation.lanes import agent_named, board_now, commons_game, refuse_trained_in
+from cprl.evaluation.fresh import averages_in_words, board_now, fresh_seed, typical_replica
+from cprl.evaluation.lanes import agent_named, commons_game, refuse_trained_in
 from cprl.experiment import presets
 from cprl.measuring import social
 from cprl.measuring.evaluate import Policy, turns
