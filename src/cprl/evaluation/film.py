@@ -160,7 +160,7 @@ class Style(Value, stored=False):
     that has room. The height follows from the boards, each at most twice as high as its part is wide."""
 
     def width_of_each(self, runs: int) -> int:
-        """The width of the part of each run."""
+        """Return the width of the part of each run."""
         width = min(LARGEST_WIDTH, DEFAULT_WIDTH * runs) if self.width is None else self.width
         allowed = Annotated[int, Range(SMALLEST_WIDTH * runs, LARGEST_WIDTH)]
         return int(checked("width", width, allowed)) // runs
@@ -219,7 +219,7 @@ def film_video(
     chosen = sorted({*range(0, length, every), length - 1})
 
     def draw(turns: Sequence[int]) -> Iterator[Bytes]:
-        """The pictures after these turns, and the end card."""
+        """Yield the pictures after these turns, and the end card."""
         for turn in turns:
             since = max((other for other in chosen if other < turn), default=-1) + 1
             yield joined([panel.draw(turn, since=since) for panel in panels])
@@ -284,7 +284,7 @@ class _Panel(NamedTuple):
     is_typical: bool
 
     def draw(self, turn: int, *, since: int, card: bool = False) -> Bytes:
-        """The population after a turn of the film's clock, or at its end if that was before.
+        """Draw the population after a turn of the film's clock, or at its end if that was before.
 
         Args:
             card: whether to say how the episode ended.

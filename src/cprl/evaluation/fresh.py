@@ -98,7 +98,7 @@ def averages_in_words(run: LoadedRun) -> str:
 
 
 def _listed(numbers: Sequence[float]) -> str:
-    """Numbers in words; of many the least and the greatest."""
+    """Return numbers in words; of many the least and the greatest."""
     texts = [f"{number:,.0f}" for number in numbers]
     if len(texts) > _MOST_LISTED:
         return f"{min(numbers):,.0f} to {max(numbers):,.0f}"
@@ -138,7 +138,7 @@ def fresh_episodes(
     episode: int | None = None,
     seed: int | None = None,
 ) -> list[FreshEpisode]:
-    """The worlds and the agents of episodes that are shown together; equal numbers give equal episodes.
+    """Return the worlds and the agents of episodes that are shown together; equal numbers, equal episodes.
 
     Without `replica` and `episode` it is a typical one: of each run the replica whose average survival in the
     run's own evaluation is nearest to the median over replicas, and of the first five episodes the one whose
@@ -166,7 +166,7 @@ def fresh_episodes(
     are_known = [bool(averages_of(run)) for run in loaded]
 
     def played(tried: int) -> list[FreshEpisode]:
-        """An episode of all runs, each with its typical replica."""
+        """Return an episode of all runs, each with its typical replica."""
         each = zip(loaded, replicas, are_known, strict=True)
         return [_fresh(run, number, tried, seed)._replace(is_typical=known) for run, number, known in each]
 

@@ -54,7 +54,8 @@ _COLOURS: Final = {
     **{name: PALETTE[kind] for name, kind in (("water", WATER), ("waste", WASTE), ("cleaning", CLEANING))},
     "empty": EMPTY_SITE_COLOUR,
 }
-_IN_PLAY, _VIOLATED = 4, 8
+_IN_PLAY: Final = 4
+_VIOLATED: Final = 8
 """Bits of a pose, beside the heading of 0 to 3."""
 
 
@@ -108,7 +109,7 @@ def begins(game: Game) -> str:
 
 
 def _heading(fresh: Sequence[FreshEpisode], data: dict[str, Any]) -> str:
-    """The title of the population, or what differs between several."""
+    """Return the title of the population, or what differs between several."""
     if len(fresh) == 1:
         return str(data["populations"][0]["title"])
     runs = [population.run for population in fresh]
@@ -144,7 +145,7 @@ class Page(type(Path())):  # type: ignore[misc]
 def page(
     title: str, before: str, data: dict[str, Any] | None = None, after: str = "", *, live: str = ""
 ) -> str:
-    """The text of a page.
+    """Return the text of a page.
 
     Args:
         before, after: HTML above and below the episode.
@@ -219,12 +220,12 @@ def _population(title: str, fresh: FreshEpisode, played: Recorded) -> dict[str, 
 
 
 def about(run: LoadedRun) -> str:
-    """Who plays, under which rules, in sentences."""
+    """Say who plays, under which rules, in sentences."""
     return f"{_players(run)} {_rules(run)}"
 
 
 def _players(run: LoadedRun) -> str:
-    """Who plays, for readers who do not know what a learner is."""
+    """Say who plays, for readers who do not know what a learner is."""
     who = learned(run.specs)
     if not run.networks:
         return f"Computer players: {who}."
@@ -243,7 +244,7 @@ def _rules(run: LoadedRun) -> str:
 
 
 def _cells(board: Map, places: Sequence[Sequence[int]]) -> list[int]:
-    """The indices of cells, row by row."""
+    """Return the indices of cells, row by row."""
     return [row * board.width + col for row, col, *_ in places]
 
 
@@ -277,7 +278,7 @@ def _turns(board: Map, played: Recorded) -> dict[str, NDArray[Any]]:
 
 
 def _packed(arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
-    """Arrays one after the other as deflated bytes, and the name, type and length of each."""
+    """Return arrays one after the other as deflated bytes, and the name, type and length of each."""
     raw = b"".join(values.astype(values.dtype.newbyteorder("<")).tobytes() for values in arrays.values())
     lengths = [
         (name, f"{values.dtype.kind}{values.itemsize}", values.size) for name, values in arrays.items()
