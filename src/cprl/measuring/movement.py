@@ -95,8 +95,8 @@ def overlap(trace: Trace) -> Array:
 
 
 def visitors(visits: ArrayLike) -> Array:
-    """Return how many agents share a cell, float64 [...], 1..N: 1 if each has cells of its own, N if all spend equal
-    shares of their time in each cell.
+    """Return how many agents share a cell, float64 [...], 1..N: 1 if each has cells of its own, N if all spend
+    equal shares of their time in each cell.
 
     It is exp H(agent | cell): with p(i, c) = visits[i, c] / N, of the N agents that were in play, the entropy
     of who it is that one meets in a cell, mean over the cells by how often one meets somebody there. NaN
@@ -113,8 +113,8 @@ def visitors(visits: ArrayLike) -> Array:
 
 
 def exclusion(visits: ArrayLike) -> Array:
-    """Return how far agents keep each other out of cells, float64 [...], 0..1: 1 if no cell has two visitors, 0 if
-    all agents spend equal shares of their time in each cell; NaN for fewer than two agents.
+    """Return how far agents keep each other out of cells, float64 [...], 0..1: 1 if no cell has two visitors,
+    0 if all agents spend equal shares of their time in each cell; NaN for fewer than two agents.
 
     It is 1 - H(agent | cell) / log N, or the information about who an agent is that its cell gives, as a
     share of all that there is; equal to the Jensen-Shannon divergence of the N distributions over cells,

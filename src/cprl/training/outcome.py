@@ -193,8 +193,8 @@ def _means(episodes: Sequence[Episode]) -> dict[str, float]:
 
 
 def is_same_later(experiment: Experiment) -> bool:
-    """Return whether random play is the same before and after a training: the game is one of cprl's, whose chance
-    depends on seeds alone, and has no transforms, which may learn in between."""
+    """Return whether random play is the same before and after a training: the game is one of cprl's, whose
+    chance depends on seeds alone, and has no transforms, which may learn in between."""
     return isinstance(experiment.game, OF_CPRL) and not experiment.transforms
 
 
