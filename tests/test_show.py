@@ -18,7 +18,7 @@ from cprl.commons.readable import growth_of, legend_of, meaning_of
 from cprl.evaluation.fresh import fresh_episode, record
 from cprl.evaluation.show import show
 from cprl.institutions import Boundaries, Monitoring, Punishment, Quota, Tax
-from cprl.measuring.social import SOCIAL
+from cprl.measuring.registry import SOCIAL
 from cprl.values import trust
 
 COMMONS = presets.game("commons")

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from cprl import keys
@@ -40,7 +39,7 @@ from cprl.evaluation.film import check_titles, titles_of
 from cprl.evaluation.fresh import FreshEpisode, Recorded, fresh_episodes, record, say_which
 from cprl.evaluation.lanes import commons_game
 from cprl.measuring.episodes import Episode
-from cprl.measuring.social import equality_of
+from cprl.measuring.social import equality
 from cprl.population import learned
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.system.working import working
@@ -271,7 +270,7 @@ def _turns(board: Map, played: Recorded) -> dict[str, NDArray[Any]]:
         "cell": (of_all("row") * board.width + of_all("col")).astype(np.uint32),
         "pose": pose.astype(np.uint8),
         "harvested": harvested.astype(np.uint32),
-        "equality": equality_of(torch.as_tensor(harvested, dtype=torch.float64)).numpy().astype(np.float32),
+        "equality": equality(harvested).astype(np.float32),
         "beam_first": np.searchsorted(turns, np.arange(len(stock) + 1)).astype(np.uint32),
         "beams": lit.astype(np.uint32),
     }
