@@ -95,7 +95,7 @@ def overlap(trace: Trace) -> Array:
 
 
 def visitors(visits: ArrayLike) -> Array:
-    """Return how many agents share a cell, float64 [...], 1..N: 1 if each has cells of its own, N if all spend
+    """Return how many agents share a cell, float64 [...], 1..N: 1 if each has cells of its own, N if all$
     equal shares of their time in each cell.
 
     It is exp H(agent | cell): with p(i, c) = visits[i, c] / N, of the N agents that were in play, the entropy
