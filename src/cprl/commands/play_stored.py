@@ -21,6 +21,7 @@ from cprl.system.defaults import (
     SEED,
     STUDY_TABLE,
     Diagonal,
+    Fresh,
 )
 from cprl.system.output import printed, say
 from cprl.system.process import prepare_process
@@ -28,22 +29,9 @@ from cprl.system.working import working
 from cprl.values import Seed, checked
 
 if TYPE_CHECKING:
-    from cprl.evaluation.lanes import Results
+    import pyarrow as pa
+
     from cprl.terminal.tables import Cells
-
-
-@dataclass(frozen=True, kw_only=True)
-class Fresh:
-    """Which fresh worlds are played, and how."""
-
-    episodes: int = 20
-    """Episodes of each replica, in each choice of who plays where."""
-    greedy: bool = False
-    """Whether stored agents take their best action, without exploring or drawing."""
-    seed: int = SEED
-    """Of the worlds and all chance; the same one gives the same numbers."""
-    replicas: tuple[int, ...] = ()
-    """Which replicas, by number; by default all that every run has."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,10 +255,11 @@ def evaluate(run: Path, /, *, fresh: FreshFlags = Fresh(), out: Path | None = No
     files = Files(out=out)
     _begin(fresh.seed, run, files=files)
 
-    from cprl.evaluation.evaluate import evaluate_run, run_table
+    from cprl.evaluation.evaluate import evaluate_run
+    from cprl.evaluation.pages import run_table
 
-    evaluation = evaluate_run(run, **vars(fresh))
-    _show(evaluation, files, [run_table(evaluation)], below=f"Weights: {evaluation.run.weights_from}")
+    table = evaluate_run(run, fresh)
+    _show(table, files, [run_table(table)])
 
 
 def visits(
@@ -318,16 +307,10 @@ def crossplay(
     _begin(fresh.seed, *_paths(named), files=files)
 
     from cprl.evaluation.cross_play import crossplay as play_each_other
-    from cprl.evaluation.cross_play import crossplay_heading, crossplay_tables, draw_gains
+    from cprl.evaluation.cross_play import crossplay_cells, draw_gains
 
-    played = play_each_other(named, diagonal=diagonal, **vars(fresh))
-    _show(
-        played,
-        files,
-        crossplay_tables(played),
-        above=crossplay_heading(played),
-        draw=partial(draw_gains, played),
-    )
+    table = play_each_other(named, fresh, diagonal=diagonal)
+    _show(table, files, crossplay_cells(table), draw=partial(draw_gains, table))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -341,8 +324,8 @@ class Mixes:
     """Who plays greedy, of the same."""
     episodes: int = 5
     """Of each replica and choice of restrained agents; with N agents these are N (N - 1) + 2."""
-    replicas: int = 8
-    """Of runs, their replicas from 0 on; of scripted agents, independent groups of episodes."""
+    replicas: tuple[int, ...] = ()
+    """Which replicas, by number; by default all that every run has, and 0 to 7 of scripted agents."""
     seed: int = SEED
     """Of the worlds and all chance; the same one gives the same numbers."""
 
@@ -369,12 +352,14 @@ def schelling(
     _begin(mixes.seed, files=files)
 
     from cprl.evaluation.play import board_named
-    from cprl.evaluation.schelling import draw_schelling, schelling_tables
+    from cprl.evaluation.schelling import draw_schelling, schelling_cells
     from cprl.evaluation.schelling import schelling as play_all_mixes
 
     game, run = board_named(board, variant)
-    diagram = play_all_mixes(game if run is None else run, **vars(mixes))
-    _show(diagram, files, schelling_tables(diagram), draw=partial(draw_schelling, diagram))
+    fresh = Fresh(episodes=mixes.episodes, replicas=mixes.replicas, seed=mixes.seed)
+    players = {"restrained": mixes.restrained, "greedy": mixes.greedy}
+    table = play_all_mixes(game if run is None else run, fresh, **players)
+    _show(table, files, schelling_cells(table), draw=partial(draw_schelling, table))
 
 
 def egta(
@@ -440,18 +425,10 @@ def scenarios(
     """
     _begin(fresh.seed, run, files=files)
 
-    from cprl.evaluation.scenarios import draw_scenarios, run_scenarios, scenario_heading, scenario_tables
+    from cprl.evaluation.scenarios import draw_scenarios, run_scenarios, scenario_cells
 
-    scores = run_scenarios(run, scenarios=scenarios, **vars(fresh))
-    below = f"Weights: {scores.run.weights_from}"
-    _show(
-        scores,
-        files,
-        scenario_tables(scores),
-        above=scenario_heading(scores),
-        below=below,
-        draw=partial(draw_scenarios, scores),
-    )
+    table = run_scenarios(run, fresh, scenarios=scenarios)
+    _show(table, files, scenario_cells(table), draw=partial(draw_scenarios, table))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -531,34 +508,32 @@ def _begin(seed: int | None, *runs: Path | str, files: Files = Files()) -> None:
 
 
 def _show(
-    played: "Results | None",
+    table: "pa.Table",
     files: Files,
-    tables: "Iterable[Cells]",
+    cells: "Iterable[Cells]",
     *,
-    above: str = "",
-    below: str = "",
     draw: Callable[..., Path] | None = None,
 ) -> None:
-    """Write every episode, print tables with a line above and below them, and draw."""
+    """Write every episode, print tables below the heading of what was played, and draw."""
+    from cprl.evaluation.lanes import said
     from cprl.terminal.tables import show
 
-    if played is not None:
-        _write(played, files)
-    show([above] * bool(above))
-    show(tables)
-    if below:
-        say(below)
+    _write(table, files)
+    show([said(table, "heading"), *cells])
+    weights = said(table, "weights")
+    if weights:
+        say(f"Weights: {weights}")
     if files.out is not None:
         say(f"Episodes: {files.out}")
     if files.figure is not None and draw is not None:
         say(f"Figure: {draw(files.figure, width=files.figure_width)}")
 
 
-def _write(played: "Results", files: Files) -> None:
+def _write(table: "pa.Table", files: Files) -> None:
     if files.out is not None:
         from cprl.runs.episodes import write_table
 
-        write_table(files.out, played.table())
+        write_table(files.out, table)
 
 
 def _paths(named: Sequence[str] | Mapping[str, str]) -> Iterable[str]:
