@@ -117,22 +117,16 @@ def show(tables: Iterable[RenderableType]) -> None:
         terminal.print(table)
 
 
-def table_path(path: str | Path, name: str = "path") -> Path:
-    """Return the path of tables that are to be written, checked before hours of work."""
-    path = Path(path)
-    if path.suffix not in SUFFIXES:
-        raise refusal(name, str(path), f"a file whose name ends in {', '.join(SUFFIXES)}")
-    refuse_to_write_over(path)
-    return path
-
-
 def write(tables: Sequence[Cells], path: str | Path, *, notes: Sequence[str] = ()) -> Path:
     """Write tables into a new file: as text, Markdown, LaTeX or CSV, by the suffix of its name.
 
     Args:
         notes: lines below all tables, which a CSV does not have.
     """
-    path = table_path(path)
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise refusal("path", str(path), f"a file whose name ends in {', '.join(SUFFIXES)}")
+    refuse_to_write_over(path)
     content = _CONTENTS[path.suffix](tables, notes).encode()
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda file: file.write(content))
