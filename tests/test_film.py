@@ -26,7 +26,7 @@ from cprl.evaluation.film import Style, film, film_video, titles_of
 from cprl.evaluation.film_pictures import EpisodePicture
 from cprl.evaluation.fresh import fresh_episode
 from cprl.institutions import Monitoring, Quota
-from cprl.values import allowing
+from cprl.values import trusting
 
 LEFT = [5, 3, 2, 0]
 """Apples on the board at the start and after each turn."""
@@ -157,7 +157,7 @@ def test_titles_are_what_tells_runs_apart(runs, tmp_path):
         replace(CORRIDORS, institutions=limits),
         transforms=[Custom("one_road_parts:Gift", {"apples": 0.5})],
     )
-    with allowing(["one_road_parts:Gift"]):
+    with trusting(["one_road_parts:Gift"]):
         assert titles(runs / "greedy", own) == ["No rule", "Quota and monitoring and gift"]
 
 

@@ -20,6 +20,7 @@ from cprl.evaluation.fresh import fresh_episode
 from cprl.evaluation.show import show
 from cprl.institutions import Boundaries, Monitoring, Punishment, Quota, Tax
 from cprl.measuring.social import SOCIAL
+from cprl.values import trust
 
 COMMONS = presets.game("commons")
 GOVERNED = replace(
@@ -114,7 +115,8 @@ OWN_TARGETS = ("one_road_parts:Gift", "one_road_parts:largest_share")
 
 def test_rules_and_metrics_of_ones_own_are_named_on_the_page(runs, tmp_path):
     run = stored(tmp_path / "own", **OWN)
-    path, _ = show(run, tmp_path / "own.html", beside=[runs / "greedy"], allow=OWN_TARGETS)
+    trust(*OWN_TARGETS)
+    path, _ = show(run, tmp_path / "own.html", beside=[runs / "greedy"])
     own, plain = told(path)["populations"]
     rule = "Code of its own: transforms: one_road_parts:Gift (apples 0.5): Adds a part of an apple"
     assert rule in own["about"]

@@ -65,7 +65,7 @@ if TYPE_CHECKING:
     from cprl.training import train
     from cprl.training.agents import load
     from cprl.training.running import run
-    from cprl.values import Custom
+    from cprl.values import Custom, trust
 
     __version__: str
 
@@ -108,6 +108,7 @@ __all__ = [
     "theory",
     "train",
     "training",
+    "trust",
     "viewer",
 ]
 
@@ -132,6 +133,7 @@ _MODULES: Final = {
     "run_study": "cprl.studies",
     "study_main": "cprl.commands.studies",
     "train": "cprl.training",
+    "trust": "cprl.values",
 }
 """Where names are that no package is called. All are imported when they are used: torch alone takes seconds,
 which `cprl --help` and mistyped commands need not wait for."""

@@ -5,12 +5,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from cprl.commands.flags import NO_DEFAULT
+from cprl.commands.flags import NO_DEFAULT, FileFlags, Files, TableFlags, Tables
 from cprl.commons.published import Variant, check_board
 from cprl.system.defaults import (
     EGTA_RESAMPLES,
@@ -23,7 +24,7 @@ from cprl.system.defaults import (
     Diagonal,
     Fresh,
 )
-from cprl.system.output import printed, say
+from cprl.system.output import OUT, printed, say
 from cprl.system.process import prepare_process
 from cprl.system.working import working
 from cprl.values import Seed, checked
@@ -34,33 +35,7 @@ if TYPE_CHECKING:
     from cprl.terminal.tables import Cells
 
 
-@dataclass(frozen=True, kw_only=True)
-class Files:
-    """Which files are written; none is written over."""
-
-    out: Path | None = None
-    """A new .parquet, for every episode."""
-    figure: Path | None = None
-    """A new .png, .pdf or .svg, see docs/evaluation.md."""
-    figure_width: Literal["page", "column"] = "page"
-    """Of the figure: a page, or a column of a paper, 3.3 inches, with its caption in a file beside it."""
-
-    def check(self) -> None:
-        """Refuse what is there already before hours of work."""
-        if self.out is not None:
-            from cprl.runs.files import refuse_to_write_over
-
-            if self.out.suffix != ".parquet":
-                raise ValueError(f"--out is {self.out}; allowed: a name that ends in .parquet")
-            refuse_to_write_over(self.out)
-        if self.figure is not None:
-            from cprl.terminal.style import check_picture
-
-            check_picture(self.figure, "--figure")
-
-
 FreshFlags = Annotated[Fresh, tyro.conf.arg(name="")]
-FileFlags = Annotated[Files, tyro.conf.arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,14 +220,12 @@ def play(board: str, /, *, session: Annotated[Session, tyro.conf.arg(name="")] =
     play_in_terminal(open_session(board, **vars(session)))
 
 
-def evaluate(run: Path, /, *, fresh: FreshFlags = Fresh(), out: Path | None = None) -> None:
+def evaluate(run: Path, /, *, fresh: FreshFlags = Fresh(), files: TableFlags = Tables()) -> None:
     """Lets all replicas of a run play fresh worlds, and prints the social metrics beside the random policy's.
 
     Args:
         run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
-        out: a new parquet file, for every episode.
     """
-    files = Files(out=out)
     _begin(fresh.seed, run, files=files)
 
     from cprl.evaluation.evaluate import evaluate_run
@@ -493,7 +466,7 @@ def exploit(
     say(f"Episodes: {folder / TABLE}")
 
 
-def _begin(seed: int | None, *runs: Path | str, files: Files = Files()) -> None:
+def _begin(seed: int | None, *runs: Path | str, files: Tables = Tables()) -> None:
     """Refuse files that are there and runs that are not, before what plays agents is imported; prepare the
     process."""
     with working("starting"):
@@ -509,31 +482,34 @@ def _begin(seed: int | None, *runs: Path | str, files: Files = Files()) -> None:
 
 def _show(
     table: "pa.Table",
-    files: Files,
+    files: Tables,
     cells: "Iterable[Cells]",
     *,
     draw: Callable[..., Path] | None = None,
 ) -> None:
-    """Write every episode, print tables below the heading of what was played, and draw."""
+    """Print tables below the heading of what was played, or every row; write files, and draw."""
     from cprl.evaluation.lanes import said
     from cprl.terminal.tables import show
 
-    _write(table, files)
-    show([said(table, "heading"), *cells])
+    if files.csv:
+        _print_rows(table)
+        return
+    tables = list(cells)
+    show([said(table, "heading"), *tables])
     weights = said(table, "weights")
     if weights:
         say(f"Weights: {weights}")
-    if files.out is not None:
-        say(f"Episodes: {files.out}")
-    if files.figure is not None and draw is not None:
+    files.write(table, tables)
+    if isinstance(files, Files) and files.figure is not None and draw is not None:
         say(f"Figure: {draw(files.figure, width=files.figure_width)}")
 
 
-def _write(table: "pa.Table", files: Files) -> None:
-    if files.out is not None:
-        from cprl.runs.episodes import write_table
+def _print_rows(table: "pa.Table") -> None:
+    from pyarrow.csv import write_csv
 
-        write_table(files.out, table)
+    rows = BytesIO()
+    write_csv(table, rows)
+    OUT.write(rows.getvalue().decode())
 
 
 def _paths(named: Sequence[str] | Mapping[str, str]) -> Iterable[str]:

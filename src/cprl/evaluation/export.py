@@ -4,7 +4,7 @@ import csv
 import io
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Literal, NamedTuple
@@ -68,7 +68,6 @@ def export_episodes(
     episodes: int = 20,
     replica: int = 0,
     seed: int = SEED,
-    allow: Sequence[str] = (),
 ) -> list[Path]:
     """Play fresh episodes of a run's agents, with the exploration of evaluation; write what they did, and say
     how much that is.
@@ -92,7 +91,7 @@ def export_episodes(
     refuse_to_write_over(target)
     if format == "minari":
         _import_minari()
-    loaded = opened(run, allow)
+    loaded = opened(run)
     refuse_trained_in(seed, [loaded])  # before the folder is made
 
     def played() -> Iterator[tuple[Played, Any]]:

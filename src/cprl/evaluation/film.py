@@ -48,7 +48,6 @@ def film(
     replica: int | None = None,
     episode: int | None = None,
     seed: int | None = None,
-    allow: Sequence[str] = (),
 ) -> tuple[Path, Episode]:
     """Record an episode of a run's agents in a fresh world, with the exploration of evaluation; say which.
 
@@ -70,7 +69,7 @@ def film(
         raise refusal("out", str(out), "a .rrd; film_video makes a .gif or an .mp4")
     if out is not None:
         refuse_to_write_over(Path(out))
-    fresh = fresh_episode(run, replica=replica, episode=episode, seed=seed, allow=allow)
+    fresh = fresh_episode(run, replica=replica, episode=episode, seed=seed)
     which = f"{fresh.replica}-{fresh.episode}"
     target = Path(run) / f"film-{which}.rrd" if out is None else Path(out)
     refuse_to_write_over(target)
@@ -186,7 +185,6 @@ def film_video(
     episode: int | None = None,
     seed: int | None = None,
     style: Style = Style(),
-    allow: Sequence[str] = (),
 ) -> tuple[Path, tuple[Episode, ...]]:
     """Film an episode of a run's agents, beside the agents of other runs if there are any.
 
@@ -222,7 +220,7 @@ def film_video(
     refuse_to_write_over(path)
     if path.suffix == ".mp4":
         check_can_write_mp4(path)
-    fresh = fresh_episodes(runs, replica=replica, episode=episode, seed=seed, allow=allow)
+    fresh = fresh_episodes(runs, replica=replica, episode=episode, seed=seed)
     say_which(fresh)
     panels = _panels(fresh, style.titles or titles_of(fresh), width)
     length = max(len(panel.filmed.moments) for panel in panels)

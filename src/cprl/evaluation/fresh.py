@@ -101,10 +101,9 @@ def fresh_episode(
     replica: int | None = None,
     episode: int | None = None,
     seed: int | None = None,
-    allow: Sequence[str] = (),
 ) -> FreshEpisode:
     """Return the world and the agents of an episode that is filmed, see `fresh_episodes`."""
-    (fresh,) = fresh_episodes([run], replica=replica, episode=episode, seed=seed, allow=allow)
+    (fresh,) = fresh_episodes([run], replica=replica, episode=episode, seed=seed)
     return fresh
 
 
@@ -114,7 +113,6 @@ def fresh_episodes(
     replica: int | None = None,
     episode: int | None = None,
     seed: int | None = None,
-    allow: Sequence[str] = (),
 ) -> list[FreshEpisode]:
     """The worlds and the agents of episodes that are shown together; equal numbers give equal episodes.
 
@@ -134,7 +132,7 @@ def fresh_episodes(
         replica = checked("replica", replica, Natural)
     if seed is not None:
         seed = checked("seed", seed, Seed)
-    loaded = [opened(run, allow) for run in runs]
+    loaded = [opened(run) for run in runs]
     if seed is None:
         seed = fresh_seed(loaded)
     refuse_trained_in(seed, loaded)

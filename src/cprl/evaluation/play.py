@@ -3,7 +3,7 @@
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from math import isnan
@@ -41,7 +41,7 @@ from cprl.system.defaults import PLAY_SEED
 from cprl.system.output import OUT, console, say
 from cprl.system.working import working
 from cprl.training.agents import LoadedRun, Population, load
-from cprl.values import Range, checked, refusal, trust
+from cprl.values import Range, checked, refusal
 
 KEYS: Final = {
     "w": ("forward", "step forward"),
@@ -300,9 +300,7 @@ def board_text(session: Session) -> Text:
     return text
 
 
-def board_named(
-    board: str, variant: Variant = "published", *, allow: Sequence[str] = ()
-) -> tuple[Game, LoadedRun | None]:
+def board_named(board: str, variant: Variant = "published") -> tuple[Game, LoadedRun | None]:
     """A game, and the run that has it.
 
     Args:
@@ -317,7 +315,7 @@ def board_named(
         raise refusal("variant", variant, f'"published" with {board}, which names no preset')
     path = Path(board)
     if path.is_dir():
-        run = load(path, allow=allow)
+        run = load(path)
         return commons_game(run), run
     return Game(map=maps.read(path), rules=Rules()), None
 
@@ -333,7 +331,6 @@ def open_session(
     steps: int | None = None,
     seed: int | None = None,
     decision: int | None = None,
-    allow: Sequence[str] = (),
 ) -> Session:
     """An episode for a person and others.
 
@@ -348,7 +345,6 @@ def open_session(
         decision: what the person decides in a game with votes or elections, 0 to `Game.decisions` - 1; None
             for a choice by chance, as of a scripted agent.
     """
-    trust(*allow)
     game, run = board_named(board, variant)
     is_whole = steps is None and others in (None, board)
     if steps is not None:

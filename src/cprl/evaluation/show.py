@@ -67,7 +67,6 @@ def show(
     replica: int | None = None,
     episode: int | None = None,
     seed: int | None = None,
-    allow: Sequence[str] = (),
 ) -> tuple["Page", tuple[Episode, ...]]:
     """Show an episode of a run's agents, beside the agents of other runs if there are any, as one HTML page.
 
@@ -92,7 +91,7 @@ def show(
     check_titles(tuple(titles), len(runs))
     if out is not None:
         Page(out).refuse()
-    fresh = fresh_episodes(runs, replica=replica, episode=episode, seed=seed, allow=allow)
+    fresh = fresh_episodes(runs, replica=replica, episode=episode, seed=seed)
     by_default = Path(run) / f"show-{fresh[0].replica}-{fresh[0].episode}.html"
     path = Page(by_default if out is None else out)
     path.refuse()
