@@ -1,7 +1,7 @@
 """Film an episode of the agents of stored runs: as a recording, or side by side as a GIF or an MP4."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from cprl import keys
 from cprl.commons.readable import growth_of, in_lower_case, legend_of
 from cprl.commons.world import Bytes, Shown
-from cprl.envs.unwrap import clock_of, commons_of
+from cprl.envs.unwrap import commons_of
 from cprl.evaluation.film_pictures import (
     DEFAULT_WIDTH,
     LARGEST_WIDTH,
@@ -26,14 +26,14 @@ from cprl.evaluation.film_pictures import (
     write_mp4,
 )
 from cprl.evaluation.fresh import FreshEpisode, fresh_episode, fresh_episodes, say_which
-from cprl.evaluation.lanes import Turns, board_now, commons_game
+from cprl.evaluation.lanes import board_now, commons_game
 from cprl.measuring.episodes import Episode, tracker_of
+from cprl.measuring.evaluate import turns
 from cprl.runs.files import refuse_to_write_over
 from cprl.system.defaults import FILM_SUFFIXES as SUFFIXES
 from cprl.system.memory import check_memory
 from cprl.system.output import legible
-from cprl.system.working import say_how_far, working
-from cprl.training import train
+from cprl.system.working import working
 from cprl.training.agents import LoadedRun
 from cprl.values import Positive, Range, Value, Where, checked, refusal
 from cprl.viewer.callback import ViewerCallback
@@ -85,7 +85,8 @@ def film(
 
 @working("playing an episode")
 def _recorded(fresh: FreshEpisode, target: Path, title: str) -> Episode:
-    policies, env = fresh.policies, fresh.env
+    env = fresh.env
+    commons = commons_of(env)
     with ViewerCallback(
         target.parent,
         env,
@@ -95,51 +96,41 @@ def _recorded(fresh: FreshEpisode, target: Path, title: str) -> Episode:
         file_name=target.name,
         is_replay=True,
     ) as viewer:
-        log, scene, logger, commons = _Events(viewer), viewer.logger.scene, viewer.logger, commons_of(env)
-        views: list[Any] = []
+        logger = viewer.logger
+        scene = logger.scene
+        observers: list[Any] = [viewer]
         if scene is not None:
             actions = fresh.run.game.actions
-            views = [Decisions(logger, policies, actions=actions, names=scene.agents, window=scene.window)]
+            window = scene.window
+            observers.append(
+                Decisions(logger, fresh.policies, actions=actions, names=scene.agents, window=window)
+            )
             if commons is not None and scene.has_institutions:
-                views.append(Offences(logger, commons, names=scene.agents))
-        train(
-            env,
-            {},
-            others=dict(zip(policies.indices, policies.actors, strict=True)),
-            decisions=policies.decisions,
-            episodes=1,
-            callbacks=[viewer, *views, log],
-        )
-    assert log.episode is not None
-    return log.episode
+                observers.append(Offences(logger, commons, names=scene.agents))
+        tracker = tracker_of(env)
+        for step, batch in enumerate(turns(env, fresh.policies), start=1):
+            for observer in observers:
+                observer.on_step(batch)
+            for event in (*_tags_in(batch), *events(batch)):
+                _log(viewer, step, event)
+            for episode in tracker.add(batch):
+                for observer in observers:
+                    observer.on_episode(episode, {})
+                _log(viewer, step, f"the end; {episode.outcome}")
+    return episode
 
 
-class _Events:
-    """Logs every tag, violation and the outcome of the episode, and stores the episode."""
+def _tags_in(batch: TensorDictBase) -> list[str]:
+    """Return who was tagged out by whom in a turn, a sentence for each."""
+    tagged_by = batch.get(("next", *keys.TAGGED_BY), None)
+    pairs = [] if tagged_by is None else tagged_by[0].nonzero().tolist()
+    return [f"agent {tagged} is tagged out by agent {by}" for tagged, by in pairs]
 
-    def __init__(self, viewer: ViewerCallback) -> None:
-        self.viewer = viewer
-        self.episode: Episode | None = None
-        self._step = 0
 
-    def on_step(self, batch: TensorDictBase) -> None:
-        self._step += 1
-        say_how_far(self._step, clock_of(self.viewer.env), "turns")
-        tagged_by = batch.get(("next", *keys.TAGGED_BY), None)
-        tags = [] if tagged_by is None else tagged_by[0].nonzero().tolist()
-        for event in (
-            *(f"agent {tagged} is tagged out by agent {by}" for tagged, by in tags),
-            *events(batch),
-        ):
-            self._log(event)
-
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        self.episode = episode
-        self._log(f"the end; {episode.outcome}")
-
-    def _log(self, event: str) -> None:
-        self.viewer.logger.at(step=self._step, episode=0)
-        self.viewer.logger.log_text(f"step {self._step:,}: {event}")
+def _log(viewer: ViewerCallback, step: int, event: str) -> None:
+    """Log an event of the episode."""
+    viewer.logger.at(step=step, episode=0)
+    viewer.logger.log_text(f"step {step:,}: {event}")
 
 
 DEFAULT_FPS: Final = 15.0
@@ -315,15 +306,18 @@ def play_to_show(fresh: FreshEpisode) -> Filmed:
     commons_game(fresh.run)
     commons = commons_of(fresh.env)
     assert commons is not None
-    tracker, turns = tracker_of(fresh.env, fresh.run.metrics), Turns(fresh.env, fresh.policies)
+    tracker = tracker_of(fresh.env, fresh.run.metrics)
+    played = turns(fresh.env, fresh.policies)
+    moments = [board_now(commons)]
+    violators: list[set[int]] = [set()]
+    fines = [0.0]
     ended: list[Episode] = []
-    moments, violators, fines = [board_now(commons)], [set[int]()], [0.0]
-    while not ended:
-        batch = turns.play()
-        ended = tracker.add(batch)
+    for batch in played:
+        ended += tracker.add(batch)
         moments.append(board_now(commons))
-        violated, fined = (batch.get(("next", *key), None) for key in (keys.VIOLATED, keys.FINES))
+        violated = batch.get(("next", *keys.VIOLATED), None)
         violators.append(set() if violated is None else set(violated[0].nonzero()[:, 0].tolist()))
+        fined = batch.get(("next", *keys.FINES), None)
         fines.append(0.0 if fined is None else float(fined.sum()))
     return Filmed(moments, violators, np.cumsum(fines), ended[0])
 

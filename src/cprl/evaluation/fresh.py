@@ -12,10 +12,13 @@ from typing import Annotated, Final, NamedTuple
 import numpy as np
 from torchrl.envs import EnvBase
 
+from cprl.commons.game import Game
 from cprl.evaluation.evaluate import opened
 from cprl.evaluation.lanes import refuse_trained_in
+from cprl.experiment import Experiment
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.assignment import AgentPolicies
+from cprl.population import AgentSpec
 from cprl.runs.episodes import read_rows
 from cprl.system.defaults import FILM_SEED as SEED
 from cprl.system.output import say
@@ -93,6 +96,20 @@ def _listed(numbers: Sequence[float]) -> str:
     if len(texts) > _MOST_LISTED:
         return f"{min(numbers):,.0f} to {max(numbers):,.0f}"
     return " and ".join(filter(None, [", ".join(texts[:-1]), texts[-1]]))
+
+
+def unstored(game: Game, agents: Sequence[AgentSpec]) -> LoadedRun:
+    """Return a run of scripted agents that stands nowhere on the disk, to be played as stored ones are."""
+    experiment = Experiment(name="scripted", game=game, agents=tuple(agents), episodes=1, replicas=1)
+    nowhere = Path(experiment.name)
+    return LoadedRun(
+        path=nowhere,
+        experiment=experiment,
+        recipe={},
+        networks={},
+        weights_from=nowhere,
+        transforms_state={},
+    )
 
 
 def fresh_episode(

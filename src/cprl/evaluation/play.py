@@ -29,10 +29,10 @@ from cprl.commons.world import Shown, StepOutput
 from cprl.envs.make_env import make_env
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.fresh import averages_in_words, fresh_seed, typical_replica
-from cprl.evaluation.lanes import Turns, agent_named, board_now, commons_game, refuse_trained_in
+from cprl.evaluation.lanes import agent_named, board_now, commons_game, refuse_trained_in
 from cprl.experiment import presets
 from cprl.measuring import social
-from cprl.measuring.evaluate import Policy
+from cprl.measuring.evaluate import Policy, turns
 from cprl.measuring.metrics import title
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import Scripted
@@ -97,7 +97,7 @@ class Session:
                 raise refusal("decision", decision, "None: agents decide nothing in this game")
             checked("decision", decision, Annotated[int, Range(0, self.game.decisions - 1)])
         self._decision, self._action = decision, 0
-        self._turns = Turns(env, self._choose)
+        self._turns = turns(env, self._choose)
         self._played: list[TensorDictBase] = []
         self.moments: list[Shown] = [board_now(self._commons)]
         """The board as the episode began, then after each turn."""
@@ -109,7 +109,7 @@ class Session:
     @property
     def has_ended(self) -> bool:
         """Whether the episode has ended: no apple is left and none can grow, or time is over."""
-        return self._turns.has_ended
+        return bool(self._played) and bool(self._played[-1]["next", keys.DONE].any())
 
     @property
     def harvested(self) -> list[int]:
@@ -127,8 +127,10 @@ class Session:
         """
         if action not in self.game.actions:
             raise refusal("action", action, ", ".join(self.game.actions))
+        if self.has_ended:
+            raise ValueError("the episode has ended; allowed: turns up to its end")
         self._action = self.game.actions.index(action)
-        self._played.append(self._turns.play())
+        self._played.append(next(self._turns))
         self.moments.append(board_now(self._commons))
         return self._commons.output
 

@@ -24,13 +24,11 @@ from urllib.parse import parse_qsl, urlsplit
 
 from cprl.commons.game import Game
 from cprl.commons.published import game as published_game
-from cprl.evaluation.fresh import fresh_episode
+from cprl.evaluation.fresh import fresh_episodes, unstored
 from cprl.evaluation.show import page, shown
-from cprl.experiment import Experiment
 from cprl.population import Scripted
-from cprl.runs.recipe import start_run
-from cprl.runs.weights import save_weights
 from cprl.system.defaults import SANDBOX_EPISODES as EPISODES
+from cprl.training.agents import LoadedRun, load
 from cprl.values import Positive, Range, Value, checked, hints_of
 
 FOR_TRAINED: Final = "changes nothing for scripted agents"
@@ -191,17 +189,14 @@ class Sandbox:
         with self._playing:
             if number != self._asked:
                 raise SupersededError("a later question is answered instead")
-            game, greedy = sliders.game(), min(sliders.greedy, sliders.agents)
-            agents = (Scripted("greedy"),) * greedy + (Scripted("sustainable"),) * (game.agents - greedy)
-            experiment = Experiment(name="scripted", game=game, agents=agents, episodes=1, replicas=1)
-            with TemporaryDirectory() as folder:
-                run = Path(folder, "scripted")
-                save_weights(start_run(run, "scripted", experiment.to_recipe), {})
-                runs = {f"{greedy} greedy, {game.agents - greedy} restrained": run}
-                if trained and self._trained is not None:
-                    runs[f"Trained with {self._learned_under[self._trained]}"] = self._trained
-                fresh = [fresh_episode(run, replica=0, episode=0) for run in runs.values()]
-                data, _ = shown(fresh, list(runs))
+            game = sliders.game()
+            greedy = min(sliders.greedy, sliders.agents)
+            restrained = game.agents - greedy
+            agents = (Scripted("greedy"),) * greedy + (Scripted("sustainable"),) * restrained
+            runs: dict[str, LoadedRun] = {f"{greedy} greedy, {restrained} restrained": unstored(game, agents)}
+            if trained and self._trained is not None:
+                runs[f"Trained with {self._learned_under[self._trained]}"] = load(self._trained)
+            data, _ = shown(fresh_episodes(list(runs.values()), replica=0, episode=0), list(runs))
         data["populations"][0]["which"] = ""  # scripted agents have no replicas to choose from
         return data
 

@@ -18,14 +18,11 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import keys
 from cprl.envs.commons_env import CommonsEnv
-from cprl.measuring.evaluate import Policy
-from cprl.system.process import one_thread
+from cprl.measuring.evaluate import Policy, turns
 
 Array = NDArray[Any]
 
@@ -53,25 +50,25 @@ class Trace:
 
 
 def trace(env: CommonsEnv, policy: Policy, *, explore: bool = True) -> Trace:
-    """Plays the next episode of each world and records the positions of all agents."""
-    steps: list[tuple[Array, ...]] = []
+    """Play the next episode of each world, and record where all agents are."""
+    now = env.worlds.now
+    read = env.worlds.driver.read
+    played = turns(env, policy, explore=explore)
+    seen: dict[str, list[Array]] = {name: [] for name in ("row", "col", "in_play", "fired", "played")}
     tags: list[Array] = []
-    exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
-    now, read = env.worlds.now, env.worlds.driver.read
-    with torch.no_grad(), one_thread(), set_exploration_type(exploration):
-        moment = env.reset()
-        while not moment["done"].all():
-            places = read(now.row), read(now.col)
-            before = moment[keys.IN_PLAY].numpy(force=True), ~moment["done"][:, 0].numpy(force=True)
-            played = env.step(policy(moment))
-            moment = env.step_mdp(played)
-            hits = np.argwhere(moment[keys.TAGGED_BY].numpy(force=True))
-            tags.append(np.insert(hits, 0, len(steps), axis=1))
-            steps.append((*places, *before, moment[keys.FIRED].numpy(force=True)))
-    names = ("row", "col", "in_play", "played", "fired")
-    arrays = {name: np.stack(entries) for name, entries in zip(names, zip(*steps, strict=True), strict=True)}
-    board = env.game.map.height, env.game.map.width
-    return Trace(**arrays, board=board, tags=np.concatenate(tags))
+    row = read(now.row)
+    col = read(now.col)
+    for step, batch in enumerate(played):
+        seen["row"].append(row)
+        seen["col"].append(col)
+        seen["in_play"].append(batch[keys.IN_PLAY].numpy(force=True).copy())
+        seen["fired"].append(batch["next"][keys.FIRED].numpy(force=True).copy())
+        seen["played"].append(~batch[keys.DONE][:, 0].numpy(force=True))
+        tags.append(np.insert(np.argwhere(batch["next"][keys.TAGGED_BY].numpy(force=True)), 0, step, axis=1))
+        row = read(now.row)
+        col = read(now.col)
+    arrays = {name: np.stack(values) for name, values in seen.items()}
+    return Trace(**arrays, board=(env.game.map.height, env.game.map.width), tags=np.concatenate(tags))
 
 
 def visits(trace: Trace) -> Array:
