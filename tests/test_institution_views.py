@@ -21,7 +21,7 @@ from cprl.evaluation.pages import run_table
 from cprl.evaluation.film import Style, film, film_video
 from cprl.evaluation.film_pictures import EpisodePicture
 from cprl.institutions import Boundaries, GraduatedSanctions, Monitoring, Sanctioner, Tax, Vote
-from cprl.measuring.metrics import reported_by
+from cprl.measuring.registry import reported_by
 from cprl.measuring.statistics import form_for
 from cprl.measuring.statistics import estimates
 from cprl.measuring.table import where
@@ -103,7 +103,10 @@ def test_the_lines_of_institutions_are_each_replica_their_mean_and_its_running_m
     _, logged = column(path, "institutions/violations", "Scalars:scalars", "episode")
     for number, line in enumerate(logged):
         episodes = [episode for episode in seen.episodes if episode.episode == number]
-        each = [episode.institutions["violations"] for episode in sorted(episodes, key=lambda one: one.world)]
+        each = [
+            episode.metrics["institutions/violations"]
+            for episode in sorted(episodes, key=lambda one: one.world)
+        ]
         assert line[:3] == [*each, np.mean(each)]
     assert len(logged[0]) == 4
     names = static(path, "institutions/violations", "SeriesLines:names")
