@@ -260,7 +260,8 @@ def test_what_cannot_be_filmed_is_refused_before_anything_is_played(
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there.gif").touch()
-    monkeypatch.setattr("cprl.evaluation.film.turns", lambda *_: pytest.fail("played"))
+    for module in ("film", "fresh"):
+        monkeypatch.setattr(f"cprl.evaluation.{module}.turns", lambda *_: pytest.fail("played"))
     words = [word.format(random=runs / "random", meadow=runs / "meadow") for word in words]
     with pytest.raises(SystemExit, match=said):
         command(monkeypatch, capsys, "film", runs / "random", *words)
@@ -347,7 +348,7 @@ def test_a_csv_has_places_headings_stock_and_what_institutions_take_and_give(tmp
 
 
 def test_an_export_that_is_interrupted_leaves_no_file(runs, tmp_path, monkeypatch):
-    monkeypatch.setattr("cprl.evaluation.export.turns", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr("cprl.evaluation.fresh.turns", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         export_episodes(runs / "greedy", tmp_path / "episodes.csv")
     assert not [*tmp_path.iterdir()]

@@ -11,15 +11,12 @@ from typing import Any, BinaryIO, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
 
 from cprl import keys
 from cprl.commons.game import Game
-from cprl.envs.unwrap import commons_of
 from cprl.evaluation.evaluate import opened
-from cprl.evaluation.fresh import FreshEpisode, fresh_episode
-from cprl.evaluation.lanes import board_now, refuse_trained_in
-from cprl.measuring.evaluate import turns
+from cprl.evaluation.fresh import Recorded, fresh_episode, record
+from cprl.evaluation.lanes import refuse_trained_in
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.system.defaults import FILM_SEED as SEED
 from cprl.system.output import say
@@ -88,7 +85,8 @@ def export_episodes(
     def played() -> Iterator[Exported]:
         for episode in range(episodes):
             say_how_far(episode, episodes, "episodes")
-            yield _play(fresh_episode(loaded, replica=replica, episode=episode, seed=seed))
+            fresh = fresh_episode(loaded, replica=replica, episode=episode, seed=seed)
+            yield _exported(loaded.game, record(fresh))
 
     target.parent.mkdir(parents=True, exist_ok=True)
     if format == "csv":
@@ -96,37 +94,22 @@ def export_episodes(
     return _write_minari(target, list(played()), loaded.game)
 
 
-@working("playing an episode")
-def _play(fresh: FreshEpisode) -> Exported:
-    game = fresh.run.game
-    commons = commons_of(fresh.env)
-    batches: list[TensorDictBase] = []
-    boards = []
-    for batch in turns(fresh.env, fresh.policies):
-        batches.append(batch.clone())
-        if commons is not None:
-            boards.append(board_now(commons))
-
-    def stacked(*name: str) -> Any:
-        """Return an entry of all turns, None where the game has none."""
-        if batches[0].get(name, None) is None:
-            return None
-        return np.stack([batch[name][0].numpy(force=True) for batch in batches])
-
-    action = stacked(*keys.ACTION)
+def _exported(game: Any, played: Recorded) -> Exported:
+    action = played.entry(*keys.ACTION)
     nobody = np.zeros(action.shape, np.int64)
-    reward = stacked("next", *keys.REWARD)[..., 0]
-    tagged_by = stacked("next", *keys.TAGGED_BY)
+    reward = played.entry("next", *keys.REWARD)[..., 0]
+    tagged_by = played.entry("next", *keys.TAGGED_BY)
     columns = {
         "action": np.array(game.actions)[action] if isinstance(game, Game) else action,
         "reward": reward,
-        "harvest": stacked("next", *keys.HARVEST),
-        "in_play": stacked(*keys.IN_PLAY),
-        "fired": stacked("next", *keys.FIRED),
+        "harvest": played.entry("next", *keys.HARVEST),
+        "in_play": played.entry(*keys.IN_PLAY),
+        "fired": played.entry("next", *keys.FIRED),
         "tagged": None if tagged_by is None else tagged_by.any(-1),
     }
     lacking = {"harvest": reward, "in_play": nobody + 1, "fired": nobody, "tagged": nobody}
     columns = {name: lacking[name] if values is None else values for name, values in columns.items()}
+    boards = played.boards[1:]
     if boards:
         stock = np.array([board.stock.sum(dtype=np.int64) for board in boards])
         columns["row"] = np.stack([board.row for board in boards])
@@ -134,15 +117,15 @@ def _play(fresh: FreshEpisode) -> Exported:
         columns["heading"] = _HEADINGS[np.stack([board.heading for board in boards])]
         columns["stock"] = nobody + stock[:, None]
     for key in (keys.FINES, keys.TRANSFERS):
-        paid = stacked("next", *key)
+        paid = played.entry("next", *key)
         if paid is not None:
             columns[key[-1]] = paid
-    last = batches[-1]["next"]
+    after = played.batches[-1]["next"][keys.OBSERVATION].numpy(force=True)
     return Exported(
-        observation=np.concatenate([stacked(*keys.OBSERVATION), last[keys.OBSERVATION].numpy(force=True)]),
+        observation=np.concatenate([played.entry(*keys.OBSERVATION), after]),
         action=action,
         columns=columns,
-        terminated=bool(last["terminated"].any()),
+        terminated=played.episode.terminated,
     )
 
 
@@ -156,7 +139,7 @@ def _write_csv(path: Path, played: Iterable[Exported]) -> list[Path]:
         for episode, one in enumerate(played):
             if not episode:
                 table.writerow((*_INDICES, *one.columns))
-            turn, agent = list(np.indices(one.action.shape))
+            turn, agent = (np.asarray(index) for index in np.indices(one.action.shape))
             indices = (np.full_like(turn, episode), turn + 1, agent)
             columns = [_plain(values) for values in (*indices, *one.columns.values())]
             table.writerows(zip(*columns, strict=True))

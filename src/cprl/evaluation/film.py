@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 
 from cprl import keys
 from cprl.commons.readable import growth_of, in_lower_case, legend_of
-from cprl.commons.world import Bytes, Shown
+from cprl.commons.world import Bytes
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.film_pictures import (
     DEFAULT_WIDTH,
@@ -25,8 +25,8 @@ from cprl.evaluation.film_pictures import (
     write_gif,
     write_mp4,
 )
-from cprl.evaluation.fresh import FreshEpisode, fresh_episode, fresh_episodes, say_which
-from cprl.evaluation.lanes import board_now, commons_game
+from cprl.evaluation.fresh import FreshEpisode, Recorded, fresh_episode, fresh_episodes, record, say_which
+from cprl.evaluation.lanes import commons_game
 from cprl.measuring.episodes import Episode, tracker_of
 from cprl.measuring.evaluate import turns
 from cprl.runs.files import refuse_to_write_over
@@ -160,7 +160,7 @@ class Style(Value, stored=False):
     that has room. The height follows from the boards, each at most twice as high as its part is wide."""
 
     def width_of_each(self, runs: int) -> int:
-        """The width of the part of each run."""
+        """Return the width of the part of each run."""
         width = min(LARGEST_WIDTH, DEFAULT_WIDTH * runs) if self.width is None else self.width
         allowed = Annotated[int, Range(SMALLEST_WIDTH * runs, LARGEST_WIDTH)]
         return int(checked("width", width, allowed)) // runs
@@ -214,12 +214,12 @@ def film_video(
     fresh = fresh_episodes(runs, replica=replica, episode=episode, seed=seed)
     say_which(fresh)
     panels = _panels(fresh, style.titles or titles_of(fresh), width)
-    length = max(len(panel.filmed.moments) for panel in panels)
+    length = max(len(panel.played.boards) for panel in panels)
     every = style.every or (1 if path.suffix == ".mp4" else ceil(length / GIF_FRAMES))
     chosen = sorted({*range(0, length, every), length - 1})
 
     def draw(turns: Sequence[int]) -> Iterator[Bytes]:
-        """The pictures after these turns, and the end card."""
+        """Yield the pictures after these turns, and the end card."""
         for turn in turns:
             since = max((other for other in chosen if other < turn), default=-1) + 1
             yield joined([panel.draw(turn, since=since) for panel in panels])
@@ -243,7 +243,7 @@ def film_video(
         )
         samples = chosen[:: ceil(len(chosen) / _SAMPLES)]
         write_gif(path, draw(chosen), list(draw(samples)), fps=style.fps)
-    return path, tuple(panel.filmed.episode for panel in panels)
+    return path, tuple(panel.played.episode for panel in panels)
 
 
 def check_titles(titles: Sequence[str], runs: int) -> None:
@@ -273,92 +273,50 @@ def _rules_in(run: LoadedRun) -> list[str]:
     ]
 
 
-class Filmed(NamedTuple):
-    """An episode, as it is shown to people."""
-
-    moments: list[Shown]
-    """The board as the episode began, then after each turn; without what agents observe."""
-    violators: list[set[int]]
-    """The agents that broke a rule in the turn that led to each moment."""
-    fines: NDArray[np.float64]
-    """[moments], what all agents paid in fines so far."""
-    episode: Episode
-
-    @property
-    def left(self) -> int:
-        """Apples on the board at the end."""
-        return int(self.moments[-1].stock.sum())
-
-    @property
-    def apples(self) -> int:
-        """What all agents harvested."""
-        return int(self.moments[-1].harvested.sum())
-
-    @property
-    def is_dead(self) -> bool:
-        """Whether the board died, since no apple was left and none could grow."""
-        return self.episode.terminated and self.left == 0
-
-
-@working("playing an episode")
-def play_to_show(fresh: FreshEpisode) -> Filmed:
-    """Play an episode of a game with a board; raises a ValueError for others."""
-    commons_game(fresh.run)
-    commons = commons_of(fresh.env)
-    assert commons is not None
-    tracker = tracker_of(fresh.env, fresh.run.metrics)
-    played = turns(fresh.env, fresh.policies)
-    moments = [board_now(commons)]
-    violators: list[set[int]] = [set()]
-    fines = [0.0]
-    ended: list[Episode] = []
-    for batch in played:
-        ended += tracker.add(batch)
-        moments.append(board_now(commons))
-        violated = batch.get(("next", *keys.VIOLATED), None)
-        violators.append(set() if violated is None else set(violated[0].nonzero()[:, 0].tolist()))
-        fined = batch.get(("next", *keys.FINES), None)
-        fines.append(0.0 if fined is None else float(fined.sum()))
-    return Filmed(moments, violators, np.cumsum(fines), ended[0])
-
-
 class _Panel(NamedTuple):
     """What a film shows of one population."""
 
     title: str
     picture: EpisodePicture
-    filmed: Filmed
+    played: Recorded
+    violated: NDArray[np.bool_]
+    """[T + 1, N], which agents broke a rule in the turn that led to each board."""
     is_typical: bool
 
     def draw(self, turn: int, *, since: int, card: bool = False) -> Bytes:
-        """The population after a turn of the film's clock, or at its end if that was before.
+        """Draw the population after a turn of the film's clock, or at its end if that was before.
 
         Args:
             card: whether to say how the episode ended.
         """
-        filmed, sites = self.filmed, len(self.picture.board.sites)
-        last = len(filmed.moments) - 1
-        dead = f"gone for good at turn {last:,} of {self.picture.steps:,}" if filmed.is_dead else ""
-        outcome = dead or f"{filmed.left:,} of {sites:,} still on the board"
-        apples = f"{filmed.apples:,} apple{'' if filmed.apples == 1 else 's'} picked"
+        played = self.played
+        dead = ""
+        if played.is_dead:
+            dead = f"gone for good at turn {played.last:,} of {self.picture.steps:,}"
+        outcome = dead or f"{played.left:,} of {len(self.picture.board.sites):,} still on the board"
+        count = int(played.boards[-1].harvested.sum())
+        apples = f"{count:,} apple{'s' * (count != 1)} picked"
         which = "A typical episode" if self.is_typical else "This episode"
         return self.picture.draw(
-            filmed.moments[: turn + 1],
+            played.boards[: turn + 1],
             self.title,
             comes_to=f"{which}: {apples}, {outcome}",
-            end=dead if turn >= last else "",
+            end=dead if turn >= played.last else "",
             card=f"{apples} · {outcome}" if card else "",
-            violators=sorted(set().union(*filmed.violators[since : turn + 1])),
+            violators=np.flatnonzero(self.violated[since : turn + 1].any(0)).tolist(),
         )
 
 
 def _panels(fresh: Sequence[FreshEpisode], titles: Sequence[str], width: int) -> list[_Panel]:
     """Play the episodes; return what is shown of each, in panels of one size with one axis of harvests."""
     games = [commons_game(population.run) for population in fresh]
-    episodes = [play_to_show(population) for population in fresh]
-    most = max(int(filmed.moments[-1].harvested.max()) for filmed in episodes)
+    episodes = [record(population) for population in fresh]
+    most = max(int(played.boards[-1].harvested.max()) for played in episodes)
     height = max(EpisodePicture(game.map, steps=1, width=width).size[1] for game in games)
     sizes = {"width": width, "height": height, "most_harvested": most}
-    pictures = [EpisodePicture(game.map, steps=game.rules.episode_steps, **sizes) for game in games]
-    are_typical = [population.is_typical for population in fresh]
-    return [_Panel(*shown) for shown in zip(titles, pictures, episodes, are_typical, strict=True)]
+    panels = []
+    for title, population, game, played in zip(titles, fresh, games, episodes, strict=True):
+        picture = EpisodePicture(game.map, steps=game.rules.episode_steps, **sizes)
+        violated = played.since_the_start("next", *keys.VIOLATED) > 0
+        panels.append(_Panel(title, picture, played, violated, population.is_typical))
+    return panels

@@ -16,8 +16,6 @@ from torchrl.envs import EnvBase
 
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
-from cprl.commons.world import Shown
-from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.make_env import is_playable, make_env, spaces_of
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.table import BACKGROUND, FOCAL, ROLE, complete
@@ -254,9 +252,3 @@ def agent_named(who: str, agent: int, *, replica: int | None = None, name: str) 
     if not Path(who).is_dir():
         raise refusal(name, who, f"{', '.join(SCRIPTED_POLICIES)}, or a run's directory")
     return Frozen(who, agent, replica)
-
-
-def board_now(env: CommonsEnv) -> Shown:
-    """The board of one world without what agents observe."""
-    board = env.worlds.show(env.output)
-    return board._replace(observation=board.observation[:0])

@@ -94,14 +94,14 @@ class Sliders(Value, stored=False):
 
     @classmethod
     def of(cls, query: Mapping[str, str]) -> Self:
-        """The sliders of a query; raises a ValueError that names what is wrong."""
+        """Read the sliders of a query; raise a ValueError that names what is wrong."""
         kinds = {name: type(value) for name, value in vars(cls()).items()}
         if unknown := sorted(set(query) - set(kinds)):
             raise ValueError(f"{', '.join(unknown)}: no slider; allowed: {', '.join(kinds)}")
         return cls(**{name: kinds[name](text) for name, text in query.items()})
 
     def recipe(self, episodes: int = EPISODES) -> str:
-        """The recipe of the game, with agents that learn."""
+        """Return the recipe of the game, with agents that learn."""
         base = published_game(self.board)
         institutions = {
             "Quota": f"Quota(share={self.quota!r}, window_steps=50)" if self.quota else "",
@@ -131,7 +131,7 @@ class Sliders(Value, stored=False):
         return f"{self.agents} agents, {' and '.join(parts) or 'no rule'}{growth}, sight {self.sight}"
 
     def game(self) -> Game:
-        """The game of the recipe."""
+        """Return the game of the recipe."""
         namespace: dict[str, Any] = {"__name__": "sandbox"}
         exec(self.recipe(), namespace)
         game: Game = namespace["game"]()
@@ -179,7 +179,7 @@ class Sandbox:
         self._temporary.cleanup()
 
     def play(self, sliders: Sliders, *, trained: bool) -> dict[str, Any]:
-        """The data of `show.html` about an episode of scripted agents, and beside it one of trained ones.
+        """Return the data of `show.html` about an episode of scripted agents, and beside it of trained ones.
 
         Raises a SupersededError, and plays nothing, where another question has come while it waited.
         """
@@ -218,7 +218,7 @@ class Sandbox:
             self._training = run, process
 
     def state(self) -> dict[str, str]:
-        """How the training is: "none", "training", "trained" or "failed", and its last line."""
+        """Return how the training is: "none", "training", "trained" or "failed", and its last line."""
         if self._training is None:
             return {"state": "none", "line": ""}
         run, process = self._training
@@ -291,7 +291,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def sandbox_page() -> str:
-    """The page, without an episode yet."""
+    """Return the page, without an episode yet."""
     boards = "".join(f"<option>{board}</option>" for board in get_args(Board))
     sliders = "".join(
         _slider(name, *shown)
@@ -318,7 +318,7 @@ def sandbox_page() -> str:
 
 
 def _slider(name: str, words: str, step: float) -> str:
-    """A slider over the range of a field of `Sliders`."""
+    """Return a slider over the range of a field of `Sliders`."""
     (bounds,) = hints_of(Sliders)[name].__metadata__
     return (
         f'<label>{escape(words)} <span></span><input type="range" name="{name}" min="{bounds.low}" '
