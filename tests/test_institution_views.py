@@ -16,13 +16,15 @@ from torchrl.envs import TransformedEnv
 
 import cprl
 from cprl import CommonsEnv, Custom, Experiment, Game, Rules, maps
-from cprl.evaluation import evaluate_run
-from cprl.evaluation.evaluate import run_table
+from cprl.evaluation import Fresh, evaluate_run
+from cprl.evaluation.pages import run_table
 from cprl.evaluation.film import Style, film, film_video
 from cprl.evaluation.film_pictures import EpisodePicture
 from cprl.institutions import Boundaries, GraduatedSanctions, Monitoring, Sanctioner, Tax, Vote
 from cprl.measuring.registry import reported_by
 from cprl.measuring.statistics import form_for
+from cprl.measuring.statistics import estimates
+from cprl.measuring.table import where
 from cprl.policies.lanes import random_agents
 from cprl.population import Scripted
 from cprl.runs.episodes import read_episodes
@@ -240,7 +242,7 @@ def printed(what):
 @pytest.fixture(scope="module")
 def evaluation(whole):
     cprl.trust(*ALLOW)
-    return evaluate_run(whole, episodes=2)
+    return evaluate_run(whole, Fresh(episodes=2))
 
 
 def test_the_summary_has_a_table_of_institutions(evaluation):
@@ -276,15 +278,16 @@ def test_what_is_printed_at_the_end_says_it_too(whole, evaluation):
 
 
 def test_an_evaluation_reports_institutions(evaluation):
-    measures = evaluation.measures("random")
-    assert measures["institutions/detection_rate"].estimate.value == 1.0
-    paid = np.mean([episode.fines[2] for episodes in evaluation.random.values() for episode in episodes])
-    assert measures["agent_2/fines"].estimate.value == pytest.approx(paid)
+    numbers = ["institutions/detection_rate", "agent_2/fines", "income_equality"]
+    measures = estimates(evaluation, numbers, by="policy").of("random")
+    assert measures["institutions/detection_rate"].value == 1.0
+    paid = where(evaluation, policy="random", agent=2)["fines"].to_numpy().mean()
+    assert measures["agent_2/fines"].value == pytest.approx(paid)
     text = printed(run_table(evaluation))
-    assert "equality of incomes" in text or measures["income_equality"].estimate is None
+    assert "equality of incomes" in text or not measures["income_equality"].replicas
     assert "agent 2: fines, apples" in text
     assert "where one may bite" not in text, "undefined everywhere"
-    assert {"fines", "violations", "own_bites", "in_force_0"} <= set(evaluation.table().column_names)
+    assert {"fines", "violations", "own_bites", "in_force_0"} <= set(evaluation.column_names)
 
 
 def test_the_run_keeps_them_and_the_training_curve_shows_them(whole):

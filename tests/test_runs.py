@@ -36,6 +36,7 @@ from cprl.runs import loggers
 from cprl.runs.curves import as_curves, worlds_of
 from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
+from cprl.runs.length import Length
 from cprl.runs.recipe import read_recipe, refuse_another_run, resume_command, runs_in, start_run
 from cprl.studies.factors import changed
 from cprl.system.shipped import cprl_here
@@ -73,8 +74,8 @@ def edited(run, edit):
 def test_a_stopped_run_is_resumed_by_the_same_recipe(tmp_path):
     run = begin(tmp_path / "run")
     written = (run / "recipe.json").read_text()
-    assert resume(run) == 3
-    assert resume(run, replace(EXPERIMENT, episodes=5)) == 3, "it can be extended"
+    assert resume(run) == Length(3, "episodes")
+    assert resume(run, replace(EXPERIMENT, episodes=5)) == Length(3, "episodes"), "it can be extended"
     assert (run / "recipe.json").read_text() == written
 
 
@@ -116,7 +117,7 @@ def test_a_run_in_a_directory_of_any_name_is_trained_resumed_by_its_line_exporte
     among = replace(TINY, agents=(TINY.agents[0], Frozen(os.fspath(exported), 0)))
     loaded = cprl.load(cprl.run(among, Path(f"{name} among"), watch="off", figures=False))
     assert loaded.agent(1).network is not None
-    assert cprl.evaluate_run(exported, episodes=1).measures("trained")
+    assert len(cprl.evaluate_run(exported, cprl.Fresh(episodes=1)))
     assert film(started, Path("film.rrd"), replica=0, episode=0)[0].exists()
 
 
@@ -153,7 +154,7 @@ def test_fields_that_a_later_version_has_are_no_difference_while_they_have_their
         del recipe["experiment"]["game"]["rules"]["walls_block_sight"]
 
     edited(run, without_later_fields)
-    assert resume(run, default) == EXPERIMENT.episodes
+    assert resume(run, default) == EXPERIMENT.length
     with pytest.raises(ValueError, match=r"experiment\.update_every was not there, is 7"):
         resume(run, replace(default, update_every=7))
     with pytest.raises(ValueError, match=r"settings\.steps_per_update was not there, is 4$"):

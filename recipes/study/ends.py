@@ -15,11 +15,19 @@ import numpy as np
 import tyro
 
 import cprl
-from cprl.evaluation import exploitability, plan_responses, schelling, territory_of
-from cprl.evaluation.schelling import dilemma
+from cprl.evaluation import (
+    dilemma,
+    exploitability,
+    margins,
+    payoffs_of,
+    plan_responses,
+    schelling,
+    territory_of,
+)
 from cprl.measuring.phases import FEWEST_EPISODES, METRICS, UNNAMED, find_phases
 from cprl.measuring.series import Values
 from cprl.measuring.statistics import estimate
+from cprl.measuring.table import by_replica, where
 from cprl.measuring.windows import running_mean
 from cprl.runs.curves import curves_of
 from cprl.training.agents import LoadedRun, load
@@ -35,17 +43,16 @@ def together(values: list[dict[str, Values]]) -> dict[str, str]:
 
 def fresh(run: LoadedRun, episodes: int) -> dict[str, Values]:
     """Harvests and the like in fresh worlds, and where agents are, beside random play."""
-    evaluated = cprl.evaluate_run(run, episodes=episodes)
-    where = territory_of(run, episodes=episodes)
+    evaluated = cprl.evaluate_run(run, cprl.Fresh(episodes=episodes))
+    territory = territory_of(run, episodes=episodes)
     numbers = {}
     for name in METRICS:
         for policy in ("trained", "random"):
-            played = getattr(evaluated, policy)
-            means = [np.nanmean([one.metrics[name] for one in ended]) for ended in played.values()]
-            numbers[f"{name}, {policy}"] = np.array(means)
-    for name in where.trained.by_replica:
+            means = by_replica(where(evaluated, policy=policy), name)
+            numbers[f"{name}, {policy}"] = means["value"].to_numpy()
+    for name in territory.trained.by_replica:
         for policy in ("trained", "random"):
-            numbers[f"{name}, {policy}"] = where.of(policy).by_replica[name]
+            numbers[f"{name}, {policy}"] = territory.of(policy).by_replica[name]
     return numbers
 
 
@@ -62,12 +69,11 @@ def mixes(runs: list[LoadedRun], episodes: int, **policies: str) -> dict[str, st
     restrained, greedy = [], []
     for run in runs:
         both: dict[str, Any] = {"restrained": str(run.path), "greedy": str(run.path)} | policies
-        played = schelling(run, episodes=episodes, replicas=len(run.replicas), **both)
-        restrained.append(played.restrained_payoffs)
-        greedy.append(played.greedy_payoffs)
-    found = dilemma(np.concatenate(restrained), np.concatenate(greedy))
-    margins = {name: getattr(found, name) for name in ("restraint", "company", "fear", "greed")}
-    return {**{name: f"{margin:+}" for name, margin in margins.items()}, "dilemma": found.name}
+        payoffs = payoffs_of(schelling(run, cprl.Fresh(episodes=episodes), **both))
+        restrained.append(payoffs.restrained)
+        greedy.append(payoffs.greedy)
+    found = margins(np.concatenate(restrained), np.concatenate(greedy))
+    return {**{name: f"{margin:+}" for (name,), margin in found.items()}, "dilemma": dilemma(found)}
 
 
 def training(curves: dict[str, Values]) -> dict[str, Values]:

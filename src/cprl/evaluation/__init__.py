@@ -1,10 +1,11 @@
 """Evaluation: the agents of stored runs in fresh worlds, with their own run or among others.
 
 Modules, in the order in which one reads them:
-    lanes           stored and scripted agents of all replicas side by side, in fresh worlds; Results, what
-                    labelled populations did in the same worlds; play_population
+    lanes           stored and scripted agents of all replicas side by side, in fresh worlds; play, together:
+                    what they did, one tidy table; play_population
+    pages           what is printed and drawn of such a table, whatever its kind
     evaluate        evaluate_run: all replicas of a run, beside the random policy
-    cross_play      crossplay: a focal agent of one run among background agents of another, and what it gains
+    cross_play      crossplay: a focal agent of one run among background agents of another; gains
     schelling       what restrained and greedy agents get, by how many of the others are restrained
     empirical_game  play_empirical_game: the game whose strategies are runs; pairwise_game: of a cross-play;
                     analyse: which runs last in it, by alpha-rank, equilibria and replicator dynamics
@@ -22,7 +23,7 @@ Modules, in the order in which one reads them:
     play            a person among trained or scripted agents
 """
 
-from cprl.evaluation.cross_play import Cell, CrossPlay, Gain, crossplay, draw_gains, gains
+from cprl.evaluation.cross_play import by_focal_agent, crossplay, draw_gains, gains
 from cprl.evaluation.empirical_game import (
     Analysis,
     EmpiricalGame,
@@ -31,29 +32,27 @@ from cprl.evaluation.empirical_game import (
     pairwise_game,
     play_empirical_game,
 )
-from cprl.evaluation.evaluate import Evaluation, evaluate_run
+from cprl.evaluation.evaluate import evaluate_run
 from cprl.evaluation.exploit import Exploitability, Plan, exploitability, plan_responses, play_responses
 from cprl.evaluation.lanes import play_population
-from cprl.evaluation.scenarios import Scenario, Score, Scores, draw_scenarios, run_scenarios, scenarios_of
-from cprl.evaluation.schelling import SchellingDiagram, draw_schelling, schelling
+from cprl.evaluation.scenarios import Scenario, advantages, draw_scenarios, run_scenarios, scenarios_of
+from cprl.evaluation.schelling import dilemma, draw_schelling, margins, payoffs_of, schelling
 from cprl.evaluation.territory import Territory, draw_visits, territory_of
+from cprl.system.defaults import Fresh
 
 __all__ = [
     "Analysis",
-    "Cell",
-    "CrossPlay",
     "EmpiricalGame",
-    "Evaluation",
     "Exploitability",
-    "Gain",
+    "Fresh",
     "Plan",
     "Scenario",
-    "SchellingDiagram",
-    "Score",
-    "Scores",
     "Territory",
+    "advantages",
     "analyse",
+    "by_focal_agent",
     "crossplay",
+    "dilemma",
     "draw_egta",
     "draw_gains",
     "draw_scenarios",
@@ -63,6 +62,8 @@ __all__ = [
     "exploitability",
     "gains",
     "pairwise_game",
+    "margins",
+    "payoffs_of",
     "plan_responses",
     "play_empirical_game",
     "play_population",

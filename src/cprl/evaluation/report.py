@@ -14,8 +14,9 @@ from markdown_it import MarkdownIt
 
 from cprl.commons.game import Game
 from cprl.commons.readable import growth_of, meaning_of, rule_of, tag_of
-from cprl.evaluation.evaluate import evaluate_run, run_table
+from cprl.evaluation.evaluate import evaluate_run
 from cprl.evaluation.fresh import fresh_episode
+from cprl.evaluation.pages import run_table
 from cprl.evaluation.show import Page, page, shown
 from cprl.measuring.registry import INCOME, title, unit
 from cprl.measuring.series import Values
@@ -33,7 +34,7 @@ from cprl.studies.tables.comparing import (
 )
 from cprl.studies.tables.effects import effects_of, estimated
 from cprl.studies.tables.table import EVALUATION, StudyTable
-from cprl.system.defaults import SEED, STUDY_TABLE
+from cprl.system.defaults import SEED, STUDY_TABLE, Fresh
 from cprl.system.output import legible
 from cprl.system.working import working
 from cprl.terminal.figures import training_curve
@@ -81,7 +82,7 @@ def report(
 
 def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
     game, name = run.game, legible(run.experiment.name.replace("_", " "))
-    evaluation = evaluate_run(run, episodes=episodes, seed=seed)
+    played = evaluate_run(run, Fresh(episodes=episodes, seed=seed))
     is_commons = isinstance(game, Game)
     data = shown([fresh_episode(run)])[0] if is_commons else None
     before = [growth_of(game)] if is_commons else []
@@ -92,7 +93,7 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
         before.append("  \n".join([*facts, f"**{meaning}**"]))
     before.append(f"{learned(run.specs)}, {run.experiment.trained_for}.")
     before.append(run.experiment.own_code)
-    after = ["## Fresh episodes, beside random play", "", *markdown(run_table(evaluation))]
+    after = ["## Fresh episodes, beside random play", "", *markdown(run_table(played))]
     after += [
         "These episodes were played for this page, in other worlds than those above, so that means differ by "
         f"chance. The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`."

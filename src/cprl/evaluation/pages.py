@@ -1,0 +1,137 @@
+"""What is printed and drawn of the table of an evaluation, whatever its kind: cells, and a matrix."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import pyarrow as pa
+
+from cprl.evaluation.lanes import said
+from cprl.measuring.registry import METRICS, OF_AGENTS, with_unit
+from cprl.measuring.statistics import Estimate, Family, differences, estimates, notes_on
+from cprl.measuring.table import numbers_in, where
+from cprl.system.defaults import Fresh
+from cprl.terminal import style
+from cprl.terminal.panels import draw_matrix, matrix_height
+from cprl.terminal.tables import Cell, Cells, Change
+from cprl.training.agents import LoadedRun
+
+OVER_REPLICAS: Final = "mean over replicas [95 % interval by Student's t]"
+"""What a number on a page is."""
+
+
+def heading(what: str, fresh: Fresh, runs: Iterable[LoadedRun], each: str = "", end: str = "") -> str:
+    """Return what was played, with the epsilon of the agents that learned values, and what numbers are.
+
+    Args:
+        each: of what there are so many episodes, beside replicas.
+    """
+    agents = [run.agent(agent, replica=run.replicas[0]) for run in runs for agent in range(run.game.agents)]
+    epsilons = {agent.epsilon for agent in agents if agent.scripted is None and not agent.stochastic}
+    exploring = ", greedy" if fresh.greedy else "".join(f", epsilon {one:g}" for one in sorted(epsilons))
+    return f"{what}: {fresh}{each}, seed {fresh.seed}{exploring}{end}\n{OVER_REPLICAS}"
+
+
+def rewards_of(table: pa.Table) -> str:
+    """Return the unit of rewards: apples in a game that reports harvests; in another they have none."""
+    return "apples" if "harvest" in table.column_names else ""
+
+
+def says_nothing(number: str, family: Family) -> bool:
+    """Return whether a number is of institutions, and undefined or 0 in a whole family: what none of the game
+    does."""
+    metric = METRICS.get(number)
+    is_payment = number.rpartition("/")[2] in OF_AGENTS
+    is_of_institutions = is_payment if metric is None else metric.is_of_institutions
+    found = (one for key, one in family.items() if key[-1] == number)
+    return is_of_institutions and not any(one.replicas and one.value for one in found)
+
+
+def run_table(table: pa.Table) -> Cells:
+    """Return a row for each number, for a column for the run's agents, for random ones, and for the difference.
+
+    Numbers of institutions that are 0 or undefined everywhere are left out.
+    """
+    agents = range(len(table["agent"].unique()))
+    amounts = [name for name in ("return", *OF_AGENTS) if name in table.column_names]
+    numbers = [*numbers_in(table), *(f"agent_{agent}/{name}" for name in amounts for agent in agents)]
+    levels = estimates(table, numbers, "policy")
+    changes = differences(table, numbers, "policy", {"policy": "random"})
+    told = [name for name in numbers if not says_nothing(name, levels)]
+    rows: list[list[Cell]] = []
+    for name in told:
+        change = changes.get(("trained", name))
+        difference = "" if change is None else Change(change)
+        title = with_unit(name, rewards=rewards_of(table))
+        rows.append([title, levels["trained", name], levels["random", name], difference])
+    if "harvest" in table.column_names:
+        harvests = [where(table, policy=policy)["harvest"].to_pylist() for policy in ("trained", "random")]
+        counts = (f"{each.count(0)} of {len(each)}" for each in harvests)
+        rows.append(["agents without a harvest, not in sustainability", *counts, ""])
+    zeros = "Numbers of institutions that are 0 or undefined everywhere are left out."
+    notes = said(table, "left_out"), zeros * (len(told) < len(numbers)), *notes_on(levels.values())
+    head = ["", "run's agents", "random", "run's agents - random, paired"]
+    return Cells("numbers of an episode, beside random play", head, rows, "\n".join(filter(None, notes)))
+
+
+class Matrix(NamedTuple):
+    """A number by two labels, those of its rows and those of its columns."""
+
+    rows: list[str]
+    columns: list[str]
+    cells: Mapping[tuple[str, str], Estimate]
+
+    @property
+    def values(self) -> dict[tuple[str, str], float]:
+        return {pair: one.value for pair, one in self.cells.items()}
+
+
+def matrix_of(family: Family, number: str) -> Matrix:
+    """Return a number of a family that has two labels."""
+    cells = {(str(key[0]), str(key[1])): one for key, one in family.items() if key[-1] == number}
+    rows = list(dict.fromkeys(row for row, _ in cells))
+    columns = list(dict.fromkeys(column for _, column in cells))
+    return Matrix(rows, rows if set(rows) == set(columns) else columns, cells)
+
+
+def matrix_cells(family: Family, number: str, title: str, note: str = "") -> Cells:
+    """Return a row for each of the first labels, a column for each of the second, with a number of a family."""
+    rows, columns, cells = matrix_of(family, number)
+    shown = {pair: Change(one) if family.name else one for pair, one in cells.items()}
+    return Cells(
+        title,
+        [" \\ ".join(family.by), *columns],
+        [[row, *(shown.get((row, column), "") for column in columns)] for row in rows],
+        note or "\n".join(notes_on(cells.values())),
+    )
+
+
+def draw_matrices(
+    path: Path | str,
+    family: Family,
+    titles: Mapping[str, str],
+    *,
+    title: str,
+    caption: str,
+    more: Mapping[tuple[str, str], str] | None = None,
+    width: style.Width = "page",
+) -> Path:
+    """Draw numbers of a family that has two labels, a matrix each; a star where one is not 0.
+
+    Args:
+        titles: of the panels, by number.
+        more: texts of cells without a number.
+    """
+    with style.drawing(path, width=width, colours=style.SHADES) as sheet:
+        matrices = {number: matrix_of(family, number) for number in titles}
+        high = matrix_height(max(len(one.rows) for one in matrices.values()))
+        panels = sheet.panels(len(titles), high=high)
+        for axes, (number, one) in zip(panels, matrices.items(), strict=True):
+            texts = {pair: f"{cell.value:+.3g}" + " *" * cell.differs for pair, cell in one.cells.items()}
+            names = [{name: name for name in side} for side in (one.rows, one.columns)]
+            draw_matrix(sheet, axes, *names, one.values, {**texts, **(more or {})})
+            axes.set(xlabel=family.by[1], ylabel=family.by[0])
+            axes.set_title(titles[number])
+        sheet.title = title
+        sheet.caption = caption
+    return Path(path)
