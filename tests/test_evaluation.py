@@ -354,7 +354,10 @@ def test_runs_have_given_names_those_of_their_directories_or_their_paths(corrido
     found = cprl.crossplay([corridors["greedy"], copy], fresh)
     assert found["focal"].unique().to_pylist() == [str(corridors["greedy"]), str(copy)]
     found = cprl.crossplay({"bites": corridors["greedy"], "waits": corridors["sustainable"]}, fresh)
-    assert cprl.estimates(found, "background/return", by=PAIR)["waits", "bites", "background/return"].value == 2.5
+    assert (
+        cprl.estimates(found, "background/return", by=PAIR)["waits", "bites", "background/return"].value
+        == 2.5
+    )
 
 
 def exploited():
@@ -530,8 +533,8 @@ def test_a_command_prints_its_numbers_and_writes_its_files_once(
         with pytest.raises(SystemExit, match=rf"cprl: .*{path.name} exists and is not overwritten"):
             command(monkeypatch, capsys, *words, option, path)
     if episodes:
-        with pytest.raises(SystemExit, match=r"--out is .*a\.csv; allowed: .*\.parquet"):
-            command(monkeypatch, capsys, *words, "--out", tmp_path / "a.csv")
+        with pytest.raises(SystemExit, match=r"--out is .*a\.xls; allowed: .*\.parquet"):
+            command(monkeypatch, capsys, *words, "--out", tmp_path / "a.xls")
     if is_drawn:
         with pytest.raises(SystemExit, match=r"--figure is '.*a\.jpg'"):
             command(monkeypatch, capsys, *words, "--figure", tmp_path / "a.jpg")
@@ -604,7 +607,10 @@ TRAINED_IN = Fresh(seed=3)
     ("play", "answer"),
     [
         (lambda _: Fresh(episodes=0), "episodes is 0"),
-        (lambda runs: cprl.evaluate_run(runs["alike"], TRAINED_IN), r"seed is 3, the training seed of .*alike"),
+        (
+            lambda runs: cprl.evaluate_run(runs["alike"], TRAINED_IN),
+            r"seed is 3, the training seed of .*alike",
+        ),
         (lambda runs: cprl.evaluate_run(runs["alike"], Fresh(replicas=(1, 9, 3))), r"no replicas \[3, 9\]"),
         (lambda runs: cprl.crossplay([runs["alike"]]), "the number of runs is 1"),
         (lambda runs: cprl.crossplay([runs["alike"], runs["mixed"], runs["alike"]]), "alike is given twice"),
@@ -620,7 +626,10 @@ TRAINED_IN = Fresh(seed=3)
         (lambda _: play_population(MEADOW, [DQN, *RANDOM[1:]]), r"agents\[0\] is a Learning"),
         (lambda _: play_population(MEADOW, RANDOM[1:]), "1 agents are specified for a game of 2"),
         (lambda _: Fresh(replicas=(-1,)), "replicas"),
-        (lambda runs: play_population(MEADOW, among(runs["alike"]), TRAINED_IN), "seed is 3, the training seed"),
+        (
+            lambda runs: play_population(MEADOW, among(runs["alike"]), TRAINED_IN),
+            "seed is 3, the training seed",
+        ),
         (
             lambda runs: play_population(MEADOW, among(runs["alike"]), Fresh(replicas=(0, 3))),
             r"no replicas \[3\]",

@@ -26,7 +26,6 @@ from verdicts import prediction, share
 
 from cprl.commons.game import Game
 from cprl.envs.commons_env import CommonsEnv
-from cprl.evaluation.evaluate import SEED
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.phases import PHASES_BEGIN
 from cprl.measuring.statistics import difference, estimate

@@ -78,9 +78,7 @@ def crossplay(runs: Runs, fresh: Fresh = Fresh(), *, diagonal: Diagonal = "self"
         for agent, (agents, roles) in populations.items():
             say_how_far(len(parts), None, "populations")
             labels = {FOCAL: focal, BACKGROUND: background, "focal_agent": agent}
-            parts.append(
-                play(fresh, named[background], agents, labels, roles=roles, among=named.values())
-            )
+            parts.append(play(fresh, named[background], agents, labels, roles=roles, among=named.values()))
     each = " with focal agent at each index"
     return together(
         parts,

@@ -165,7 +165,10 @@ def play(
         policies = policies_of(fresh, place, agents, group)
         ended = evaluate(env, policies, explore=not fresh.greedy, metrics=metrics)
         firsts = range(0, len(ended), fresh.episodes)
-        parts += [(labels or {}, group[at], ended[first : first + fresh.episodes]) for at, first in enumerate(firsts)]
+        parts += [
+            (labels or {}, group[at], ended[first : first + fresh.episodes])
+            for at, first in enumerate(firsts)
+        ]
     table = labelled(parts)
     place_of_world = table.column_names.index("replica") + 1
     world = table["replica"].to_numpy() * fresh.episodes + table["episode"].to_numpy()

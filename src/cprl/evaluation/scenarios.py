@@ -340,7 +340,5 @@ def draw_scenarios(table: pa.Table, path: Path | str, *, width: style.Width = "p
         axes.set_yticks(rows, [style.wrapped(name.replace("_", " "), 0.3 * sheet.width_em) for name in names])
         axes.set(ylim=(len(rows) - 0.5, -0.5), xlabel="return per agent, apples")
         sheet.title = f"{said(table, 'run')}: returns by scenario"
-        sheet.caption = (
-            f"{said(table, 'fresh')} in each placement, the same worlds for all; {OVER_REPLICAS}."
-        )
+        sheet.caption = f"{said(table, 'fresh')} in each placement, the same worlds for all; {OVER_REPLICAS}."
     return Path(path)
