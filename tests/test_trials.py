@@ -370,12 +370,13 @@ def test_loading_evaluating_and_resuming_warn_of_other_code_and_the_recipe_keeps
     text = "class Callback:\n    is_extendable = True\n    def on_episode(self, episode, learning): ...\n"
     write_module(text)
     run = cprl.run(experiment, tmp_path / "run", watch="off", figures=False, keep_checkpoint=True)
-    cprl.load(run, allow=[target])
+    cprl.trust(target)
+    cprl.load(run)
     assert "own_callback" not in capsys.readouterr().err
     write_module(text + "# edited\n")
     for use in (
-        lambda: cprl.load(run, allow=[target]),
-        lambda: cprl.evaluate_run(run, episodes=1, allow=[target]),
+        lambda: cprl.load(run),
+        lambda: cprl.evaluate_run(run, episodes=1),
         lambda: cprl.run(replace(experiment, episodes=3), run, resume=True, watch="off", figures=False),
     ):
         use()

@@ -172,7 +172,7 @@ def parse(
     make_experiment: "Callable[..., Experiment]", command: Sequence[str]
 ) -> "tuple[Experiment, RunOptions]":
     """Return the experiment that a command line, script first, asks for, and how it is to be run."""
-    words, program = trusting(command[1:]), program_of(command[0])
+    words, program = trust_allowed(command[1:]), program_of(command[0])
     return parse_with(make_experiment, words, RunOptions(), program=program)
 
 
@@ -311,7 +311,7 @@ def _names_of(recipe: Recipe) -> set[str] | None:
     return {*flags, *(f"--no-{flag.removeprefix('--')}" for flag in flags), *_HELP}
 
 
-def trusting(words: Sequence[str]) -> list[str]:
+def trust_allowed(words: Sequence[str]) -> list[str]:
     """Trust the user's own code that words of a command line allow, which may stand in the working directory,
     and return the other words."""
     parser = ArgumentParser(add_help=False, allow_abbrev=False)

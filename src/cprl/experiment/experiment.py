@@ -1,6 +1,6 @@
 """Experiment: everything that decides a training, as a value that a run's recipe holds."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from html import escape
 from math import ceil
@@ -42,7 +42,6 @@ from cprl.values import (
     hints_of,
     shown,
     to_config,
-    trust,
 )
 
 LoggerName = Literal["tensorboard", "wandb"]
@@ -172,13 +171,8 @@ class Experiment(Value, stored=False, called="experiment"):
         return {name: to_config(value, f"experiment.{name}") for name, value in values.items()}
 
     @classmethod
-    def from_config(cls, table: Mapping[str, Any], *, allow: Iterable[str] = ()) -> "Experiment":
-        """The experiment that `to_config` gave; of the modules that it names only a game's is imported.
-
-        Args:
-            allow: the targets of `Custom` that it may hold, "module:Class" each.
-        """
-        trust(*allow)
+    def from_config(cls, table: Mapping[str, Any]) -> "Experiment":
+        """The experiment that `to_config` gave; of the modules that it names only a game's is imported."""
         read = build(cls, table, "experiment")
         return read if not isinstance(read.game, Custom) else replace(read, game=game_of(read.game))
 
@@ -193,19 +187,16 @@ class Experiment(Value, stored=False, called="experiment"):
         return {"format": RECIPE_FORMAT, "recipe": self.name, "experiment": table}
 
     @classmethod
-    def from_recipe(
-        cls, recipe: Mapping[str, Any], *, allow: Iterable[str] = (), directory: str | Path | None = None
-    ) -> "Experiment":
+    def from_recipe(cls, recipe: Mapping[str, Any], *, directory: str | Path | None = None) -> "Experiment":
         """The experiment of a recipe, as `recipe.json` holds it.
 
         Args:
-            allow: the targets of `Custom` that it may hold, "module:Class" each.
             directory: where the recipe is kept; runs of `Frozen` are then relative to where we stand.
         """
         try:
             table = recipe_config(recipe)
             table = table if directory is None else with_runs_moved(table, directory, ".")
-            return cls.from_config(table, allow=allow)
+            return cls.from_config(table)
         except ValueError as error:
             raise ValueError(f"{error}{written_by_another(recipe)}") from error
 

@@ -47,7 +47,7 @@ from cprl.studies.status import LOCKED, STOPPED, Status, StatusFile
 from cprl.studies.study import Block, Condition, Study
 from cprl.system.output import printed
 from cprl.system.shipped import cprl_here
-from cprl.values import allowed, custom_targets, differences, without_defaults
+from cprl.values import custom_targets, differences, trust, trusted, without_defaults
 
 State = Literal["missing", "unfinished", "finished", "refused"]
 ATTEMPTS: Final = 5
@@ -242,7 +242,7 @@ class Task:
     @property
     def targets(self) -> tuple[str, ...]:
         """The user's own code that it may import: of this experiment, and what this process trusts."""
-        return tuple(dict.fromkeys([*custom_targets(self.recipe["experiment"]), *allowed()]))
+        return tuple(dict.fromkeys([*custom_targets(self.recipe["experiment"]), *trusted()]))
 
     @property
     def words(self) -> list[str]:
@@ -358,6 +358,7 @@ class Task:
 
         name = str(read_recipe(self.directory)["experiment"]["name"])  # perhaps that of another study
         experiment = replace(self.trial.experiment, name=name)
+        trust(*self.targets)
         with (
             open(self.status.log, "a", encoding="utf-8", errors="replace") as log,
             redirect_stdout(log),
@@ -371,7 +372,6 @@ class Task:
                 keep_checkpoint=self.keep_checkpoint,
                 watch="off",
                 figures=False,
-                allow=self.targets,
                 callbacks=(status,),
             )
 

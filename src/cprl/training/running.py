@@ -68,7 +68,7 @@ from cprl.training.outcome import (
     write_evaluation,
 )
 from cprl.training.training import Training, check_callbacks, train
-from cprl.values import Custom, Range, checked, made, trust
+from cprl.values import Custom, Range, checked, made
 from cprl.viewer.page import check_watch
 from cprl.viewer.page import linger as stay_served
 
@@ -87,7 +87,6 @@ def run(
     watch: str = "file",
     linger: bool = False,
     threads: int = 1,
-    allow: Sequence[str] = (),
     callbacks: Sequence[object] = (),
     figures: bool = True,
 ) -> Path:
@@ -109,8 +108,6 @@ def run(
             `watch` "serve" or "spawn".
         threads: torch's threads. Several are faster for large minibatches of many worlds, if no other
             program wants the cores; numbers then differ in their last bits.
-        allow: the user's own code, "module:Class", that the process trusts from now on; stored runs of
-            `Frozen` agents may need it.
         callbacks: further callbacks of this process (see `cprl.training.Callback`), which the recipe does
             not hold; they may look, and change nothing.
         figures: whether the training curve is drawn; a study draws its own.
@@ -132,7 +129,6 @@ def run(
     check_watch(watch, linger=linger)
     for logger in experiment.loggers:
         check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
-    trust(*allow)
     threads = checked("threads", threads, Annotated[int, Range(1, MOST_THREADS)])
     prepare_process(experiment.seed, threads=threads)
     out = None if out is None else Path(out)
