@@ -670,7 +670,7 @@ def test_a_trial_says_its_speed_without_compiling_and_what_it_had_done_before(tm
 
 def test_a_trial_of_so_many_steps_is_as_far_as_its_steps_however_short_episodes_are(tmp_path):
     experiment = replace(TRIALS[0].experiment, episodes=None, steps=400, replicas=2, worlds=4)
-    expected = 2 * experiment.expected_episodes
+    expected = 2 * experiment.length.episodes
     file = StatusFile(Status(tmp_path, "trial"), experiment)
 
     def played():
@@ -701,7 +701,7 @@ def test_a_trial_runs_while_it_says_something_new_whatever_the_clock_says(says, 
 def test_trials_that_count_steps_are_shown_by_their_steps(tmp_path):
     (long,) = trials_of(Study(replace(TINY, episodes=None, steps=4000, replicas=2)))
     says = Status(tmp_path, long.name).path
-    expected = 2 * long.experiment.expected_episodes
+    expected = 2 * long.experiment.length.episodes
     overview = Overview([long], tmp_path, tmp_path)
     for beat in (1, 2):
         write_json(says, {"beat": beat, "episodes": expected // 2})

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 import tyro
 
 from cprl.commands.flags import RefusedError, Shape, ValueFlags, in_shape, numbered, shape_of
+from cprl.runs.length import UNITS, without_length
 from cprl.system.output import RESUMES, legible, say
 from cprl.system.process import at_signals
 from cprl.system.shipped import Recipe, program_of
@@ -234,13 +235,13 @@ def parse_with(
 
 
 def _of_length(experiment: "Experiment", words: Sequence[str]) -> "Experiment":
-    """An experiment whose length is counted in what words say, --episodes or --steps, however many these."""
+    """Return an experiment whose length is counted in what words say, --episodes or --steps, however many."""
     names = {word.partition("=")[0] for word in words}
-    if "--steps" in names and experiment.steps is None and "--episodes" not in names:
-        return replace(experiment, episodes=None, steps=1)
-    if "--episodes" in names and experiment.episodes is None and "--steps" not in names:
-        return replace(experiment, episodes=1, steps=None)
-    return experiment
+    said = [unit for unit in UNITS if f"--{unit}" in names]
+    if len(said) != 1 or said[0] == experiment.length.unit:
+        return experiment
+    length: Any = {**without_length({}), said[0]: 1}
+    return replace(experiment, **length)
 
 
 def _refuse_names(make_experiment: "Callable[..., Experiment]", taken: set[str]) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar
 import tyro
 
 from cprl.commands.recipe import ALLOW, Words, ended_by_sigterm, in_a_sentence, parse_with, trust_allowed
+from cprl.runs.length import UNITS, without_length
 from cprl.runs.recipe import read_recipe, without_directories, without_options
 from cprl.system.defaults import LAST
 from cprl.system.output import console, printed, say
@@ -150,12 +151,9 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
         words = trust_allowed(command[1:])
         options = tyro.cli(MainOptions, args=words, prog=script, description=_about(study), config=_CONFIG)
         changes = _given(options)
-        said = {
-            unit: number for unit in ("episodes", "steps") if (number := changes.pop(unit, None)) is not None
-        }
+        said = {unit: changes.pop(unit) for unit in UNITS if unit in changes}
         if said:
-            length = {"episodes": None, "steps": None, **said}
-            changes["experiment"] = replace(study.experiment, **length)
+            changes["experiment"] = replace(study.experiment, **without_length({}), **said)
         study = replace(study, **changes)
         for unit, number in said.items():
             for condition in study.all_conditions:
