@@ -128,11 +128,9 @@ def dilemma(margins: Family) -> str:
 
 def title_of(payoffs: Payoffs) -> str:
     """Return the name of the dilemma, and where between the ends it does not hold, or is not shown to."""
-    possible = candidates(margins(payoffs.restrained, payoffs.greedy))
-    name = dilemma(margins(payoffs.restrained, payoffs.greedy))
-    if len(possible) > 1 or name == _NAMES[-1]:
-        return name
-    return name + between_the_ends(payoffs.restrained, payoffs.greedy)
+    found = margins(payoffs.restrained, payoffs.greedy)
+    is_told = len(candidates(found)) == 1 and dilemma(found) != _NAMES[-1]
+    return dilemma(found) + (between_the_ends(payoffs.restrained, payoffs.greedy) if is_told else "")
 
 
 def between_the_ends(restrained: Values, greedy: Values) -> str:
