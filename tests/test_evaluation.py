@@ -47,8 +47,8 @@ from cprl.evaluation import (
     schelling,
     territory_of,
 )
-from cprl.evaluation.evaluate import refuse_unlike
 from cprl.evaluation.cross_play import PAIR, RETURNS
+from cprl.evaluation.evaluate import refuse_unlike
 from cprl.evaluation.lanes import agents_of, play, said, together
 from cprl.measuring.evaluate import evaluate, turns
 from cprl.measuring.movement import trace
@@ -281,8 +281,8 @@ def test_a_matrix_of_scripted_agents_gives_the_numbers_worked_by_hand(corridors)
     }
     levels = cprl.estimates(found, [*RETURNS, *numbers_in(found)], by=PAIR)
     assert set(levels.labels) == set(wanted)
-    for at, returns in wanted.items():
-        assert tuple(levels[(*at, number)].value for number in RETURNS) == returns
+    for at, means in wanted.items():
+        assert tuple(levels[(*at, number)].value for number in RETURNS) == means
     visit = where(found, focal="greedy", background="sustainable")
     of_agents = cprl.estimates(visit, ["focal/return", "stock_left"], by="focal_agent")
     assert [of_agents[agent, "focal/return"].value for agent in (0, 1)] == [2, 3]
@@ -354,7 +354,10 @@ def test_runs_have_given_names_those_of_their_directories_or_their_paths(corrido
     found = cprl.crossplay([corridors["greedy"], copy], fresh)
     assert found["focal"].unique().to_pylist() == [str(corridors["greedy"]), str(copy)]
     found = cprl.crossplay({"bites": corridors["greedy"], "waits": corridors["sustainable"]}, fresh)
-    assert cprl.estimates(found, "background/return", by=PAIR)["waits", "bites", "background/return"].value == 2.5
+    assert (
+        cprl.estimates(found, "background/return", by=PAIR)["waits", "bites", "background/return"].value
+        == 2.5
+    )
 
 
 def exploited():
@@ -604,7 +607,10 @@ TRAINED_IN = Fresh(seed=3)
     ("play", "answer"),
     [
         (lambda _: Fresh(episodes=0), "episodes is 0"),
-        (lambda runs: cprl.evaluate_run(runs["alike"], TRAINED_IN), r"seed is 3, the training seed of .*alike"),
+        (
+            lambda runs: cprl.evaluate_run(runs["alike"], TRAINED_IN),
+            r"seed is 3, the training seed of .*alike",
+        ),
         (lambda runs: cprl.evaluate_run(runs["alike"], Fresh(replicas=(1, 9, 3))), r"no replicas \[3, 9\]"),
         (lambda runs: cprl.crossplay([runs["alike"]]), "the number of runs is 1"),
         (lambda runs: cprl.crossplay([runs["alike"], runs["mixed"], runs["alike"]]), "alike is given twice"),
@@ -620,7 +626,10 @@ TRAINED_IN = Fresh(seed=3)
         (lambda _: play_population(MEADOW, [DQN, *RANDOM[1:]]), r"agents\[0\] is a Learning"),
         (lambda _: play_population(MEADOW, RANDOM[1:]), "1 agents are specified for a game of 2"),
         (lambda _: Fresh(replicas=(-1,)), "replicas"),
-        (lambda runs: play_population(MEADOW, among(runs["alike"]), TRAINED_IN), "seed is 3, the training seed"),
+        (
+            lambda runs: play_population(MEADOW, among(runs["alike"]), TRAINED_IN),
+            "seed is 3, the training seed",
+        ),
         (
             lambda runs: play_population(MEADOW, among(runs["alike"]), Fresh(replicas=(0, 3))),
             r"no replicas \[3\]",

@@ -17,7 +17,6 @@ from cprl.evaluation import analyse, draw_egta, pairwise_game, play_empirical_ga
 from cprl.evaluation.empirical_game import egta_tables
 from cprl.evaluation.lanes import shifted
 from cprl.evaluation.schelling import between_the_ends, candidates, dilemma, margins, payoffs_of
-from cprl.measuring.table import where
 from cprl.population import Frozen, Scripted
 from cprl.theory import PayoffTable, compositions
 

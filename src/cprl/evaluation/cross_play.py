@@ -78,9 +78,7 @@ def crossplay(runs: Runs, fresh: Fresh = Fresh(), *, diagonal: Diagonal = "self"
         for agent, (agents, roles) in populations.items():
             say_how_far(len(parts), None, "populations")
             labels = {FOCAL: focal, BACKGROUND: background, "focal_agent": agent}
-            parts.append(
-                play(fresh, named[background], agents, labels, roles=roles, among=named.values())
-            )
+            parts.append(play(fresh, named[background], agents, labels, roles=roles, among=named.values()))
     each = " with focal agent at each index"
     return together(
         parts,
@@ -154,6 +152,7 @@ def draw_gains(table: pa.Table, path: Path | str, *, width: style.Width = "page"
     gained = gains(table)
     at_home = {key[:-1]: one for key, one in estimates(table, OF_FOCAL, PAIR).items() if key[0] == key[1]}
     unit = f", {rewards_of(table)}".removesuffix(", ")
+    diagonal = said(table, "diagonal").replace("_", "-")
     return draw_matrices(
         path,
         gained,
@@ -161,7 +160,7 @@ def draw_gains(table: pa.Table, path: Path | str, *, width: style.Width = "page"
         title="Cross-play: who gains among whom",
         caption=(
             f"Difference in return{unit}; {said(table, 'fresh')} with focal agent at each index; diagonal "
-            f"({said(table, 'diagonal').replace('_', '-')}): an agent's return. {HOLM} for these {len(gained)}."
+            f"({diagonal}): an agent's return. {HOLM} for these {len(gained)}."
         ),
         more={pair: f"{one.value:.3g}" for pair, one in at_home.items()},
         width=width,

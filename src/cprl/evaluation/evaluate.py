@@ -1,5 +1,5 @@
-"""evaluate_run: the agents of a stored run beside the random policy in fresh worlds; and whether runs have the
-same game."""
+"""evaluate_run: the agents of a stored run beside the random policy in fresh worlds; and whether runs have
+the same game."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,7 +9,7 @@ import pyarrow as pa
 import torch
 
 from cprl.envs.make_env import stored_game
-from cprl.evaluation.lanes import agents_of, fresh_for, play, said, scripted, together
+from cprl.evaluation.lanes import agents_of, fresh_for, play, scripted, together
 from cprl.evaluation.pages import heading
 from cprl.system.defaults import Fresh
 from cprl.system.working import working

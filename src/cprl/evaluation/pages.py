@@ -48,7 +48,7 @@ def says_nothing(number: str, family: Family) -> bool:
 
 
 def run_table(table: pa.Table) -> Cells:
-    """Return a row for each number, for a column for the run's agents, for random ones, and for the difference.
+    """Return a row for each number, a column for the run's agents, for random ones, and for the difference.
 
     Numbers of institutions that are 0 or undefined everywhere are left out.
     """
@@ -75,7 +75,7 @@ def run_table(table: pa.Table) -> Cells:
 
 
 def matrix_cells(family: Family, number: str, title: str, note: str = "") -> Cells:
-    """Return a row for each of the first labels, a column for each of the second, with a number of a family."""
+    """Return a row for each of the first labels, a column for each of the second, of a number of a family."""
     rows, columns = _sides(family)
     cells = {key[:-1]: one for key, one in family.items() if key[-1] == number}
     shown = {pair: Change(one) if family.name else one for pair, one in cells.items()}

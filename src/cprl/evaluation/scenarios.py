@@ -176,8 +176,8 @@ def run_scenarios(
     *,
     scenarios: Sequence[str | Scenario] = (),
 ) -> pa.Table:
-    """Let the agents of a stored run play scenarios in the focal places, and random and greedy agents in these
-    places, in the same worlds.
+    """Let the agents of a stored run play scenarios in the focal places, and random and greedy agents in
+    these places, in the same worlds.
 
     Args:
         fresh: which episodes, in each placement.
@@ -340,7 +340,5 @@ def draw_scenarios(table: pa.Table, path: Path | str, *, width: style.Width = "p
         axes.set_yticks(rows, [style.wrapped(name.replace("_", " "), 0.3 * sheet.width_em) for name in names])
         axes.set(ylim=(len(rows) - 0.5, -0.5), xlabel="return per agent, apples")
         sheet.title = f"{said(table, 'run')}: returns by scenario"
-        sheet.caption = (
-            f"{said(table, 'fresh')} in each placement, the same worlds for all; {OVER_REPLICAS}."
-        )
+        sheet.caption = f"{said(table, 'fresh')} in each placement, the same worlds for all; {OVER_REPLICAS}."
     return Path(path)

@@ -114,10 +114,11 @@ def margins(restrained: Values, greedy: Values) -> Family:
 
 
 def candidates(margins: Family) -> tuple[str, ...]:
-    """Return the dilemmas that the intervals of margins allow, most likely first: one where they tell which it
-    is."""
+    """Return the dilemmas that the intervals of margins allow, most likely first: one where they tell which
+    it is."""
     likely = _name(*(one.value > 0 for one in margins.values()))
-    return tuple(dict.fromkeys((likely, *(_name(*signs) for signs in product(*map(_signs, margins.values()))))))
+    allowed = (_name(*signs) for signs in product(*map(_signs, margins.values())))
+    return tuple(dict.fromkeys((likely, *allowed)))
 
 
 def dilemma(margins: Family) -> str:
