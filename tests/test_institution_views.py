@@ -17,13 +17,12 @@ from torchrl.envs import TransformedEnv
 import cprl
 from cprl import CommonsEnv, Custom, Experiment, Game, Rules, maps
 from cprl.evaluation import Fresh, evaluate_run
-from cprl.evaluation.pages import run_table
 from cprl.evaluation.film import Style, film, film_video
 from cprl.evaluation.film_pictures import EpisodePicture
+from cprl.evaluation.pages import run_table
 from cprl.institutions import Boundaries, GraduatedSanctions, Monitoring, Sanctioner, Tax, Vote
 from cprl.measuring.registry import reported_by
-from cprl.measuring.statistics import form_for
-from cprl.measuring.statistics import estimates
+from cprl.measuring.statistics import estimates, form_for
 from cprl.measuring.table import where
 from cprl.policies.lanes import random_agents
 from cprl.population import Scripted

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from one_road_parts import Dilemma
 from same_runs import assert_same_training
+from stored_runs import episodes_of
 
 import cprl
 from cprl import Custom, Experiment, Game, Observation, Rules, maps
@@ -20,7 +21,6 @@ from cprl.runs.checkpoints import checkpoints_in
 from cprl.runs.episodes import read_episodes
 from cprl.runs.weights import load_weights
 from cprl.system.shipped import cprl_here
-from stored_runs import episodes_of
 
 HERE = Path(__file__).parent
 REPLAY = DQNSettings(

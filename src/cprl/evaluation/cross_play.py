@@ -152,6 +152,7 @@ def draw_gains(table: pa.Table, path: Path | str, *, width: style.Width = "page"
     gained = gains(table)
     at_home = {key[:-1]: one for key, one in estimates(table, OF_FOCAL, PAIR).items() if key[0] == key[1]}
     unit = f", {rewards_of(table)}".removesuffix(", ")
+    diagonal = said(table, "diagonal").replace("_", "-")
     return draw_matrices(
         path,
         gained,
@@ -159,7 +160,7 @@ def draw_gains(table: pa.Table, path: Path | str, *, width: style.Width = "page"
         title="Cross-play: who gains among whom",
         caption=(
             f"Difference in return{unit}; {said(table, 'fresh')} with focal agent at each index; diagonal "
-            f"({said(table, 'diagonal').replace('_', '-')}): an agent's return. {HOLM} for these {len(gained)}."
+            f"({diagonal}): an agent's return. {HOLM} for these {len(gained)}."
         ),
         more={pair: f"{one.value:.3g}" for pair, one in at_home.items()},
         width=width,

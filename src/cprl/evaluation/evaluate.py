@@ -1,5 +1,5 @@
-"""evaluate_run: the agents of a stored run beside the random policy in fresh worlds; and whether runs have the
-same game."""
+"""evaluate_run: the agents of a stored run beside the random policy in fresh worlds; and whether runs have
+the same game."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -153,7 +153,8 @@ class EpisodePicture:
         return left + col * across, top, left + (col + 1) * across, top + down
 
     def _caption(self, draw: ImageDraw.ImageDraw, title: str, comes_to: str, end: str, turn: str) -> None:
-        """Write the title on the left, the turn or the end on the right; below what the episode comes to."""
+        """Write the title on the left, the turn or the end on the right; below them what the episode comes
+        to."""
         edge = self._unit
         middle = 3 * self._unit // 2
         below = _fitting(comes_to, self.size[0] - 2 * edge, 5 * self._unit // 4)

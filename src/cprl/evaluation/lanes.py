@@ -93,8 +93,8 @@ def place_of(where: Any) -> Place:
 
 
 def fresh_for(runs: Iterable[LoadedRun], fresh: Fresh, *, among: Iterable[LoadedRun] = ()) -> Fresh:
-    """Return fresh episodes with the numbers of the replicas that play: those that are asked for, else all that
-    every run has.
+    """Return fresh episodes with the numbers of the replicas that play: those that are asked for, else all
+    that every run has.
 
     Args:
         runs: those whose replicas play; without any, agents are scripted.
@@ -164,11 +164,9 @@ def play(
     for group, env in worlds_of(fresh, place):
         policies = policies_of(fresh, place, agents, group)
         ended = evaluate(env, policies, explore=not fresh.greedy, metrics=metrics)
-        firsts = range(0, len(ended), fresh.episodes)
-        parts += [
-            (labels or {}, group[at], ended[first : first + fresh.episodes])
-            for at, first in enumerate(firsts)
-        ]
+        for place_in_group, replica in enumerate(group):
+            first = place_in_group * fresh.episodes
+            parts.append((labels or {}, replica, ended[first : first + fresh.episodes]))
     table = labelled(parts)
     place_of_world = table.column_names.index("replica") + 1
     world = table["replica"].to_numpy() * fresh.episodes + table["episode"].to_numpy()
@@ -201,8 +199,9 @@ def said(table: pa.Table, name: str) -> str:
 
 
 def shifted(counts: Sequence[int]) -> list[Who]:
-    """Return which kind plays at each index, where so many agents are of the first kind, of the second and so
-    on: shifted by an index at a time, so that all kinds have each index equally often; one way for one kind."""
+    """Return which kind plays at each index, where so many agents are of the first kind, of the second and
+    so on: shifted by an index at a time, so that all kinds have each index equally often; one way for one
+    kind."""
     first = tuple(np.repeat(np.arange(len(counts)), counts).tolist())
     shifts = range(len(first) if len(set(first)) > 1 else 1)
     return [first[len(first) - shift :] + first[: len(first) - shift] for shift in shifts]

@@ -2,13 +2,13 @@
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import pyarrow as pa
 
 from cprl.evaluation.lanes import said
 from cprl.measuring.registry import METRICS, OF_AGENTS, with_unit
-from cprl.measuring.statistics import Estimate, Family, differences, estimates, notes_on
+from cprl.measuring.statistics import Family, differences, estimates, notes_on
 from cprl.measuring.table import numbers_in, where
 from cprl.system.defaults import Fresh
 from cprl.terminal import style
@@ -48,7 +48,7 @@ def says_nothing(number: str, family: Family) -> bool:
 
 
 def run_table(table: pa.Table) -> Cells:
-    """Return a row for each number, for a column for the run's agents, for random ones, and for the difference.
+    """Return a row for each number, a column for the run's agents, for random ones, and for the difference.
 
     Numbers of institutions that are 0 or undefined everywhere are left out.
     """
@@ -74,29 +74,10 @@ def run_table(table: pa.Table) -> Cells:
     return Cells("numbers of an episode, beside random play", head, rows, "\n".join(filter(None, notes)))
 
 
-class Matrix(NamedTuple):
-    """A number by two labels, those of its rows and those of its columns."""
-
-    rows: list[str]
-    columns: list[str]
-    cells: Mapping[tuple[str, str], Estimate]
-
-    @property
-    def values(self) -> dict[tuple[str, str], float]:
-        return {pair: one.value for pair, one in self.cells.items()}
-
-
-def matrix_of(family: Family, number: str) -> Matrix:
-    """Return a number of a family that has two labels."""
-    cells = {(str(key[0]), str(key[1])): one for key, one in family.items() if key[-1] == number}
-    rows = list(dict.fromkeys(row for row, _ in cells))
-    columns = list(dict.fromkeys(column for _, column in cells))
-    return Matrix(rows, rows if set(rows) == set(columns) else columns, cells)
-
-
 def matrix_cells(family: Family, number: str, title: str, note: str = "") -> Cells:
-    """Return a row for each of the first labels, a column for each of the second, with a number of a family."""
-    rows, columns, cells = matrix_of(family, number)
+    """Return a row for each of the first labels, a column for each of the second, of a number of a family."""
+    rows, columns = _sides(family)
+    cells = {key[:-1]: one for key, one in family.items() if key[-1] == number}
     shown = {pair: Change(one) if family.name else one for pair, one in cells.items()}
     return Cells(
         title,
@@ -104,6 +85,12 @@ def matrix_cells(family: Family, number: str, title: str, note: str = "") -> Cel
         [[row, *(shown.get((row, column), "") for column in columns)] for row in rows],
         note or "\n".join(notes_on(cells.values())),
     )
+
+
+def _sides(family: Family) -> tuple[list[str], list[str]]:
+    """Return the first labels of a family and the second, in one order where they are the same."""
+    rows, columns = (list(dict.fromkeys(side)) for side in zip(*family.labels, strict=True))
+    return rows, rows if set(rows) == set(columns) else columns
 
 
 def draw_matrices(
@@ -122,16 +109,16 @@ def draw_matrices(
         titles: of the panels, by number.
         more: texts of cells without a number.
     """
+    rows, columns = ({name: name for name in side} for side in _sides(family))
     with style.drawing(path, width=width, colours=style.SHADES) as sheet:
-        matrices = {number: matrix_of(family, number) for number in titles}
-        high = matrix_height(max(len(one.rows) for one in matrices.values()))
-        panels = sheet.panels(len(titles), high=high)
-        for axes, (number, one) in zip(panels, matrices.items(), strict=True):
-            texts = {pair: f"{cell.value:+.3g}" + " *" * cell.differs for pair, cell in one.cells.items()}
-            names = [{name: name for name in side} for side in (one.rows, one.columns)]
-            draw_matrix(sheet, axes, *names, one.values, {**texts, **(more or {})})
+        panels = sheet.panels(len(titles), high=matrix_height(len(rows)))
+        for axes, (number, panel_title) in zip(panels, titles.items(), strict=True):
+            cells = {key[:-1]: one for key, one in family.items() if key[-1] == number}
+            texts = {pair: f"{one.value:+.3g}" + " *" * one.differs for pair, one in cells.items()}
+            values = {pair: one.value for pair, one in cells.items()}
+            draw_matrix(sheet, axes, rows, columns, values, {**texts, **(more or {})})
             axes.set(xlabel=family.by[1], ylabel=family.by[0])
-            axes.set_title(titles[number])
+            axes.set_title(panel_title)
         sheet.title = title
         sheet.caption = caption
     return Path(path)

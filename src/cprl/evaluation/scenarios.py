@@ -176,8 +176,8 @@ def run_scenarios(
     *,
     scenarios: Sequence[str | Scenario] = (),
 ) -> pa.Table:
-    """Let the agents of a stored run play scenarios in the focal places, and random and greedy agents in these
-    places, in the same worlds.
+    """Let the agents of a stored run play scenarios in the focal places, and random and greedy agents in
+    these places, in the same worlds.
 
     Args:
         fresh: which episodes, in each placement.

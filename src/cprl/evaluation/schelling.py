@@ -114,12 +114,11 @@ def margins(restrained: Values, greedy: Values) -> Family:
 
 
 def candidates(margins: Family) -> tuple[str, ...]:
-    """Return the dilemmas that the intervals of margins allow, most likely first: one where they tell which it
-    is."""
+    """Return the dilemmas that the intervals of margins allow, most likely first: one where they tell which
+    it is."""
     likely = _name(*(one.value > 0 for one in margins.values()))
-    return tuple(
-        dict.fromkeys((likely, *(_name(*signs) for signs in product(*map(_signs, margins.values())))))
-    )
+    allowed = (_name(*signs) for signs in product(*map(_signs, margins.values())))
+    return tuple(dict.fromkeys((likely, *allowed)))
 
 
 def dilemma(margins: Family) -> str:
@@ -130,11 +129,9 @@ def dilemma(margins: Family) -> str:
 
 def title_of(payoffs: Payoffs) -> str:
     """Return the name of the dilemma, and where between the ends it does not hold, or is not shown to."""
-    possible = candidates(margins(payoffs.restrained, payoffs.greedy))
-    name = dilemma(margins(payoffs.restrained, payoffs.greedy))
-    if len(possible) > 1 or name == _NAMES[-1]:
-        return name
-    return name + between_the_ends(payoffs.restrained, payoffs.greedy)
+    found = margins(payoffs.restrained, payoffs.greedy)
+    is_told = len(candidates(found)) == 1 and dilemma(found) != _NAMES[-1]
+    return dilemma(found) + (between_the_ends(payoffs.restrained, payoffs.greedy) if is_told else "")
 
 
 def between_the_ends(restrained: Values, greedy: Values) -> str:

@@ -95,8 +95,8 @@ def overlap(trace: Trace) -> Array:
 
 
 def visitors(visits: ArrayLike) -> Array:
-    """Return how many agents share a cell, float64 [...], 1..N: 1 if each has cells of its own, N if all$
-    equal shares of their time in each cell.
+    """Return how many agents share a cell, float64 [...], 1..N: 1 if each has cells of its own, N if all
+    spend equal shares of their time in each cell.
 
     It is exp H(agent | cell): with p(i, c) = visits[i, c] / N, of the N agents that were in play, the entropy
     of who it is that one meets in a cell, mean over the cells by how often one meets somebody there. NaN

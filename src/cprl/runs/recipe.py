@@ -22,7 +22,7 @@ from cprl.runs.length import Length, without_length
 from cprl.system.output import ERR, console, printed
 from cprl.system.process import cpu
 from cprl.system.shipped import PROGRAM, command_of, cprl_here
-from cprl.values import custom_targets, described, differences, refusal, shown, source_of
+from cprl.values import OWN_METRICS, custom_targets, described, differences, refusal, shown, source_of
 
 _RESUMES: Final = ("--resume", "--no-resume", "--take-over", "--no-take-over")
 _DIRECTORIES: Final = ("--out", "--runs")
@@ -155,6 +155,7 @@ def read_recipe(run: Path) -> dict[str, Any]:
         raise ValueError(f"{path} is not the recipe of a run: {error!r}") from error
     recipe_config(recipe, where=path)
     _refuse_odd_parts(recipe, path)
+    OWN_METRICS.update(recipe.get("metrics", {}))
     return recipe
 
 
@@ -168,6 +169,10 @@ def _refuse_odd_parts(recipe: Mapping[str, Any], path: Path) -> None:
         for name in ("versions", "code", "code_text", "frozen"):
             if not isinstance(part.get(name) or {}, Mapping):
                 raise ValueError(f"{path}: {name} is {shown(part[name])}; allowed: a table")
+    metrics = recipe.get("metrics", {})
+    tables = list(metrics.values()) if isinstance(metrics, Mapping) else [None]
+    if not all(isinstance(table, Mapping) and set(map(type, table.values())) <= {str} for table in tables):
+        raise ValueError(f"{path}: metrics is {shown(metrics)}; allowed: tables of texts by name")
 
 
 def parts_of(recipe: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -243,6 +248,14 @@ def write_on_nan(run: Path, on_nan: str) -> None:
     if recipe["experiment"].get("on_nan") != on_nan:
         recipe["experiment"]["on_nan"] = on_nan
         write_json(run / RECIPE_FILE, recipe)
+
+
+def write_metrics(run: Path, words: Mapping[str, Mapping[str, str]]) -> None:
+    """Write into a run's recipe what metrics of the user's own are called: "title" and "unit" by name."""
+    recipe = read_recipe(run)
+    if recipe.get("metrics", {}) != words:
+        write_json(run / RECIPE_FILE, {**recipe, "metrics": words})
+    OWN_METRICS.update(words)
 
 
 def write_circumstances(run: Path) -> list[str]:

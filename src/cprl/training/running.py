@@ -38,6 +38,7 @@ from cprl.runs.recipe import (
     say_changes,
     start_run,
     write_circumstances,
+    write_metrics,
     write_on_nan,
 )
 from cprl.runs.weights import (
@@ -69,7 +70,7 @@ from cprl.training.outcome import (
     write_evaluation,
 )
 from cprl.training.training import Training, check_callbacks, train
-from cprl.values import Custom, Range, checked, made
+from cprl.values import Custom, Range, checked, made, words_of_metric
 from cprl.viewer.page import check_watch
 from cprl.viewer.page import linger as stay_served
 
@@ -156,6 +157,7 @@ def run(
         with checkpointer:
             if resume:
                 _begin_again(directory, experiment, is_begun=is_begun, length=length)
+            write_metrics(directory, {own_name(one): words_of_metric(one) for one in experiment.metrics})
             viewer = closing.enter_context(_make_viewer(watch, directory, experiment, env, population))
             work = _Work(directory, experiment, env, population, viewer, resume)
             _carry_out(work, observers, checkpointer, times, figures=figures)

@@ -31,6 +31,7 @@ from typing import (
     get_type_hints,
 )
 
+from cprl.values.custom import OWN_METRICS as OWN_METRICS
 from cprl.values.custom import Custom as Custom
 from cprl.values.custom import custom_targets as custom_targets
 from cprl.values.custom import described as described
@@ -42,6 +43,7 @@ from cprl.values.custom import source_of as source_of
 from cprl.values.custom import trust as trust
 from cprl.values.custom import trusted as trusted
 from cprl.values.custom import trusting as trusting
+from cprl.values.custom import words_of_metric as words_of_metric
 
 T = TypeVar("T")
 

@@ -107,6 +107,25 @@ def trusted() -> tuple[str, ...]:
     return tuple(sorted(_TRUSTED))
 
 
+OWN_METRICS: Final[dict[str, Mapping[str, str]]] = {}
+"""What metrics of the user's own are called: "title" and "unit" by name, as the recipe that this process read
+last says."""
+
+
+def words_of_metric(metric: Custom) -> dict[str, str]:
+    """Return "title" and "unit" of a metric of the user's own, as far as its function has such attributes.
+
+    Raises:
+        ValueError: if one is no text.
+    """
+    function = metric.resolve()
+    words = {name: getattr(function, name) for name in ("title", "unit") if hasattr(function, name)}
+    for name, word in words.items():
+        if not isinstance(word, str):
+            raise ValueError(f"{metric.target}.{name} is {shown(word)}; allowed: a text")
+    return words
+
+
 def custom_targets(table: object) -> list[str]:
     return sorted({str(entry.get("target")) for entry in _tables_of_customs(table)})
 
