@@ -30,9 +30,10 @@ from cprl.commands import main as cli
 from cprl.evaluation.film import film
 from cprl.experiment import Experiment
 from cprl.measuring import EpisodeTracker
+from cprl.measuring.windows import last_of, mean_of_worlds, running_mean
 from cprl.population import Frozen, Learning
 from cprl.runs import loggers
-from cprl.runs.curves import as_curves, last_of, mean_of_worlds, running_mean, worlds_of
+from cprl.runs.curves import as_curves, worlds_of
 from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
 from cprl.runs.length import Length

@@ -70,7 +70,7 @@ from cprl.training.outcome import (
     write_evaluation,
 )
 from cprl.training.training import Training, check_callbacks, train
-from cprl.values import Custom, Range, checked, made, words_of_metric
+from cprl.values import Custom, Range, checked, made
 from cprl.viewer.page import check_watch
 from cprl.viewer.page import linger as stay_served
 
@@ -142,7 +142,7 @@ def run(
         env, population = make_agents(experiment, starts=not is_begun, weights=weights)
     observers: list[Any] = [*(made(callback) for callback in experiment.callbacks), *callbacks]
     check_callbacks(observers)
-    try_own_metrics(experiment.metrics, env)
+    words = try_own_metrics(experiment.metrics, env)
     length = refuse_another_run(out, experiment.to_recipe, Experiment) if resume else experiment.length
     is_shorter = length.is_shorter_than(experiment.length)
     if resumed is not None and not is_shorter and (resumed / REPORT).exists():
@@ -157,7 +157,7 @@ def run(
         with checkpointer:
             if resume:
                 _begin_again(directory, experiment, is_begun=is_begun, length=length)
-            write_metrics(directory, {own_name(one): words_of_metric(one) for one in experiment.metrics})
+            write_metrics(directory, words)
             viewer = closing.enter_context(_make_viewer(watch, directory, experiment, env, population))
             work = _Work(directory, experiment, env, population, viewer, resume)
             _carry_out(work, observers, checkpointer, times, figures=figures)
