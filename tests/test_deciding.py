@@ -17,11 +17,10 @@ from cprl.algorithms import DQN, VDN, DQNSettings, Tabular, TabularSettings
 from cprl.commands.recipe import parse
 from cprl.envs.make_env import make_env
 from cprl.evaluation.film import film, film_video
-from cprl.evaluation.lanes import Turns
 from cprl.evaluation.play import Session, open_session
 from cprl.institutions import Sanctioner, Tax, Vote
 from cprl.institutions.votes import choice_of
-from cprl.measuring.evaluate import evaluate
+from cprl.measuring.evaluate import evaluate, turns
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.decisions import UNTRIED, Bandit, BanditDecider, Decider, choices_of, decision_of
 from cprl.policies.lanes import random_agents
@@ -347,12 +346,12 @@ def test_the_exhibition_decides_beside_the_training_and_leaves_it_alone():
     population = Population(env, OWN.agents, seed=6)
     shown, world = exhibited(OWN, env, population)
     before = repr(population.decisions.state_dict())
-    seen = [tuple(Turns(world, shown).play()[keys.DECISION][0].tolist()) for _ in range(20)]
+    seen = [tuple(next(turns(world, shown))[keys.DECISION][0].tolist()) for _ in range(20)]
     assert len(set(seen)) > 4, "it explores as the training does"
     assert repr(population.decisions.state_dict()) == before
     population.decisions.values[0, :2] = [0.0, 1.0, 0.0, 0.0, 1.0]
     shown.is_trained = True
-    seen = [Turns(world, shown).play()[keys.DECISION][0, :2].tolist() for _ in range(5)]
+    seen = [next(turns(world, shown))[keys.DECISION][0, :2].tolist() for _ in range(5)]
     assert seen == [[5, 5]] * 5
 
 

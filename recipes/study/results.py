@@ -21,8 +21,8 @@ from published import PublishedExperiment, published_experiment
 
 from cprl import presets
 from cprl.algorithms import DQN
-from cprl.commons.batch import Batch
 from cprl.commons.game import Game
+from cprl.envs.commons_env import CommonsEnv
 from cprl.evaluation.evaluate import SEED
 from cprl.evaluation.lanes import Agent, Fresh, agents_of, scripted
 from cprl.experiment import Experiment
@@ -549,8 +549,8 @@ def _played(game: Game, first: int, worlds: int) -> Values:
     """An episode in each of these worlds."""
     rng = np.random.default_rng([SEED, first])
     size = worlds, game.agents
-    batch = Batch(game, worlds, seed=SEED, first_world=first)
-    return harvests(batch, lambda _: rng.integers(len(game.actions), size=size))
+    env = CommonsEnv(game, worlds, seed=SEED, first_world=first)
+    return harvests(env, lambda _: rng.integers(len(game.actions), size=size))
 
 
 _BAR: Final = "\\|"
