@@ -267,8 +267,8 @@ def export(
     Args:
         run: The run's directory.
         out: The folder of the results, the file of "csv", or the directory of the Minari data sets.
-        weights: Copy the trained weights too. Without them a report tells of the training alone, and nothing can
-            play the agents.
+        weights: Copy the trained weights too. Without them a report tells of the training alone, and nothing
+            can play the agents.
         format: "results"; "csv", a row for each episode, turn and agent, with what it did and got and where
             it stands; or "minari", a data set for each agent, of the extra "minari".
         episodes: Of "csv" and "minari": fresh episodes that are played.
