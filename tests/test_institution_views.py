@@ -284,7 +284,7 @@ def test_an_evaluation_reports_institutions(evaluation):
     assert "equality of incomes" in text or measures["income_equality"].estimate is None
     assert "agent 2: fines, apples" in text
     assert "where one may bite" not in text, "undefined everywhere"
-    assert {"fines", "violations", "own_bites", "in_force_0"} <= set(evaluation.table().column_names)
+    assert {"fines", "violations", "own_bites", "institutions/in_force_0"} <= set(evaluation.table().column_names)
 
 
 def test_the_run_keeps_them_and_the_training_curve_shows_them(whole):
