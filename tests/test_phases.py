@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-
-from cprl.measuring.phases import PHASES, change_points, phases
+from phases import PHASES, change_points, phases
 
 EPISODES = np.arange(5000)
 CORNERS = [0, 600, 1500, 2600, 4999]
