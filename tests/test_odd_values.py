@@ -4,6 +4,7 @@ import time
 from functools import partial
 
 import numpy as np
+import phases
 import pytest
 import torch
 

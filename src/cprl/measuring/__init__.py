@@ -8,8 +8,7 @@ Modules, in the order in which one reads them:
     evaluate      one fresh episode in every world, without learning
     statistics    estimates over replicas, with intervals by Student's t
     series        numbers while a training runs
-    now           what a group is doing at the moment
-    phases        change points of a whole training, and the phases between them
+    outcome       how a training goes, and how it went
     movement      where agents go, which cells they share or keep, and who tags whom
 """
 

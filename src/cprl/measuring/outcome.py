@@ -8,16 +8,16 @@ the worlds count alike. Those that ended last, of all worlds, would be the longe
 """
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, isfinite, nan
+from statistics import fmean
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from cprl.measuring.series import Values
-from cprl.runs.curves import mean_of_worlds, rounds_of
+from cprl.measuring.table import Numbers
+from cprl.measuring.windows import LAST_EPISODES, Values, mean_of_worlds, rounds_of
 
 BEGINS: Final = "begins"
 RISING: Final = "rising"
@@ -37,8 +37,6 @@ TRAGEDY: Final = "tragedy"
 PEAK_EPISODES: Final = 10
 """Episodes of the mean whose highest value is the peak of a training; before there are as many nothing is
 judged."""
-LAST_EPISODES: Final = 30
-"""Those at the end of a training, unless somebody says how many."""
 RECENT_SHARE: Final = 0.1
 """The share of the episodes so far whose mean is judged while a training runs."""
 LEARNED: Final = 1.5
@@ -252,8 +250,7 @@ class Outcome:
     last: float
     """The mean of the last 30 episodes."""
     lived: float
-    """How long boards lasted in the last 30 episodes, as a share of the longest life in the training; NaN where
-    the game does not report it."""
+    """How long boards lasted in the last 30 episodes, as a share of the longest life in the training."""
     random: float
     """What agents who act at random get, the mean."""
     agents: int
@@ -273,9 +270,8 @@ class Outcome:
         A tragedy in the sense of G. Hardin, "The tragedy of the commons" (1968): each of several has learned to
         take what pays, and what they share is ruined, so that all get less than if nobody had learned. That it
         is the ruin of a board, and no mere fall, is why boards have to die; that it is learned, why the peak is
-        well above random play. The numbers are ours. Where a game does not report how long boards last, the
-        returns alone decide. Whether a difference is more than chance is another question, which intervals over
-        replicas answer.
+        well above random play. The numbers are ours. Whether the difference is more than chance is another
+        question, which intervals over replicas answer.
         """
         if self.peak < LEARNED * self.random:
             return NO_BETTER
@@ -283,7 +279,7 @@ class Outcome:
         if has_fallen and is_regained(self.last, peak=self.peak, low=self.low):
             return RECOVERY
         if self.last <= BELOW_RANDOM * self.random:
-            is_ruin = self.agents > 1 and not self.lived > LIVED
+            is_ruin = self.agents > 1 and self.lived <= LIVED
             return TRAGEDY if is_ruin else DECLINE
         return DECLINE if is_lost(self.last, peak=self.peak, random=self.random) else HARVESTING
 
@@ -297,46 +293,39 @@ RULE: Final = (
 
 
 def outcome_of(
-    returns: ArrayLike,
+    returns: Sequence[Values],
+    steps: Sequence[Values],
+    worlds: Sequence[Numbers],
     *,
     random: float,
     agents: int,
-    steps: ArrayLike | None = None,
-    worlds: ArrayLike | None = None,
 ) -> Outcome:
-    """Return how a training went.
+    """Return how a training went, of one replica or over several.
 
     Args:
-        returns: What all agents got, [E] or [R, E], in the order in which episodes ended.
-        random: The mean of random play.
-        steps: How long boards lasted, likewise.
-        worlds: The world of each episode, likewise; by default each replica has one.
+        returns: What all agents got in the episodes of each replica, [E], in the order in which they ended.
+        steps: How long their boards lasted, likewise.
+        worlds: The world of each, likewise.
+        random: What agents who act at random get, the mean.
     """
-    got = np.atleast_2d(np.asarray(returns, np.float64))
-    world = np.zeros(got.shape, np.int64) if worlds is None else np.atleast_2d(np.asarray(worlds))
-
-    def means_of(values: Values, number: int) -> Values:
-        each = [mean_of_worlds(*of_replica, number) for of_replica in zip(values, world, strict=True)]
-        return np.asarray(np.mean(each, 0))
-
-    tens = means_of(got, PEAK_EPISODES)
-    thirties = means_of(got, LAST_EPISODES)
-    lanes = len(np.unique(world[0]))
+    tens, thirties, lives = (
+        [mean_of_worlds(*of_replica, number) for of_replica in zip(values, worlds, strict=True)]
+        for values, number in ((returns, PEAK_EPISODES), (returns, LAST_EPISODES), (steps, LAST_EPISODES))
+    )
+    episodes = min(map(len, returns))
+    short = np.mean([of_replica[:episodes] for of_replica in tens], 0)
+    long = np.mean([of_replica[:episodes] for of_replica in thirties], 0)
+    lanes = len(np.unique(worlds[0]))
     size = rounds_of(PEAK_EPISODES, lanes) * lanes
     later = rounds_of(LAST_EPISODES, lanes) * lanes - size
-    at = int(np.nanargmax(tens))
-    episodes = got.shape[1]
-    lived = nan
-    if steps is not None:
-        lives = np.atleast_2d(np.asarray(steps, np.float64))
-        lived = float(means_of(lives, LAST_EPISODES)[-1] / lives.max())
+    at = int(np.nanargmax(short))
     return Outcome(
-        begins=float(tens[~np.isnan(tens)][0]),
-        peak=float(tens[at]),
+        begins=float(short[~np.isnan(short)][0]),
+        peak=float(short[at]),
         around=min(at + 1 - min(size, episodes) + size // 2, episodes),
-        low=float(np.nanmin(thirties[min(at + later, len(thirties) - 1) :])),
-        last=float(thirties[-1]),
-        lived=lived,
+        low=float(np.nanmin(long[min(at + later, episodes - 1) :])),
+        last=fmean(of_replica[-1] for of_replica in thirties),
+        lived=fmean(of_replica[-1] for of_replica in lives) / max(float(of_one.max()) for of_one in steps),
         random=random,
         agents=agents,
     )
