@@ -1,11 +1,11 @@
 """How a training goes, episode by episode, without knowing what comes; and how it went."""
 
 import json
-import json
 from itertools import groupby
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from cprl.measuring.outcome import Course, outcome_of
@@ -147,17 +147,14 @@ def test_noise_around_random_play_is_neither_rise_nor_fall():
 def test_stored_runs_go_and_went_as_they_did(run):
     random = as_curves(read_rows(RESULTS / run / "evaluation" / "random.parquet"))
     level = float(random["collective_return"].mean())
-    table = where(read_episodes(RESULTS / run), agent=0)
-    replicas = [where(table, replica=replica) for replica in range(len(HELD[run]["endings"]))]
-    course, labels_of, endings = Course(len(replicas)), [], []
+    table, names = read_episodes(RESULTS / run), ("collective_return", "terminated")
+    course, labels_of, endings = Course(len(HELD[run]["endings"])), [], []
     course.random_play = level
-    for replica, rows in enumerate(replicas):
-        returns = rows["collective_return"].to_numpy()
-        steps = rows["steps"].to_numpy()
-        agents = sum(name.startswith("return_") for name in random)
-        went = outcome_of([returns], [steps], [np.zeros(len(steps), int)], random=level, agents=agents)
-        endings.append(went.word)
-        for apples, has_died in zip(returns, rows["terminated"].to_pylist(), strict=True):
+    for replica in range(len(HELD[run]["endings"])):
+        rows = where(table, replica=replica)
+        endings.append(outcome_of(rows, random=level).word)
+        ended = where(rows, agent=0)
+        for apples, has_died in zip(*(ended[name].to_pylist() for name in names), strict=True):
             labels_of.append(course.add(apples, replica=replica, has_died=has_died))
     assert endings == HELD[run]["endings"]
     assert [label for label, _ in groupby(labels_of)] == HELD[run]["labels"]
@@ -189,12 +186,20 @@ def test_the_recent_mean_is_of_a_share_of_the_values_so_far_but_of_some_at_least
 FALL = [*[100.0] * 20, *[400.0] * 20]
 
 
+def episodes_of(returns, lives, *, agents=2, worlds=None, replica=0):
+    """A table of episodes in which all agents got so much, and boards lasted so long."""
+    number = np.arange(len(returns))
+    columns = {"replica": np.full(len(number), replica), "episode": number, "collective_return": returns}
+    columns |= {"steps": np.broadcast_to(lives, len(number))}
+    columns |= {} if worlds is None else {"world": worlds}
+    one = {name: np.repeat(np.asarray(column), agents) for name, column in columns.items()}
+    return pa.table({**one, "agent": np.tile(np.arange(agents), len(number))})
+
+
 def word(returns, *, agents=4, worlds=None, lives=(1000, 400)):
     """How a training of one replica went whose boards lasted so long at first, and at the end."""
-    first, last = lives
-    steps = np.where(np.arange(len(returns)) < 40, float(first), float(last))
-    world = np.zeros(len(returns), int) if worlds is None else worlds
-    return outcome_of([np.array(returns)], [steps], [world], random=100.0, agents=agents).word
+    steps = np.where(np.arange(len(returns)) < 40, *lives)
+    return outcome_of(episodes_of(returns, steps, agents=agents, worlds=worlds), random=100.0).word
 
 
 @pytest.mark.parametrize(
@@ -228,9 +233,8 @@ def test_a_training_in_many_worlds_went_as_each_of_its_worlds_did():
 
 
 def test_the_outcome_over_replicas_is_of_their_mean():
-    returns = [np.array([*FALL, *[90.0] * 40]), np.array([*FALL, *[70.0] * 50])]
-    steps = [np.full(len(one), 500.0) for one in returns]
-    worlds = [np.zeros(len(one), int) for one in returns]
-    went = outcome_of(returns, steps, worlds, random=100.0, agents=2)
+    falls = [[*FALL, *[90.0] * 40], [*FALL, *[70.0] * 50]]
+    tables = [episodes_of(returns, 500, replica=replica) for replica, returns in enumerate(falls)]
+    went = outcome_of(pa.concat_tables(tables), random=100.0)
     assert (went.begins, went.peak, went.around, went.last) == (100.0, 400.0, 25, 80.0)
     assert went.lived == 1.0

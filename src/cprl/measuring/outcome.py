@@ -8,15 +8,18 @@ the worlds count alike. Those that ended last, of all worlds, would be the longe
 """
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import ceil, isfinite, nan
 from statistics import fmean
 from typing import Final
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
-from cprl.measuring.table import Numbers
+from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME
+from cprl.measuring.table import where, world_of
 from cprl.measuring.windows import LAST_EPISODES, Values, mean_of_worlds, rounds_of
 
 BEGINS: Final = "begins"
@@ -292,40 +295,39 @@ RULE: Final = (
 """How the word of an outcome is found, as tables say it."""
 
 
-def outcome_of(
-    returns: Sequence[Values],
-    steps: Sequence[Values],
-    worlds: Sequence[Numbers],
-    *,
-    random: float,
-    agents: int,
-) -> Outcome:
+def outcome_of(table: pa.Table, *, random: float) -> Outcome:
     """Return how a training went, of one replica or over several.
 
     Args:
-        returns: What all agents got in the episodes of each replica, [E], in the order in which they ended.
-        steps: How long their boards lasted, likewise.
-        worlds: The world of each, likewise.
+        table: Its episodes, those of each replica in the order in which they ended.
         random: What agents who act at random get, the mean.
     """
-    tens, thirties, lives = (
-        [mean_of_worlds(*of_replica, number) for of_replica in zip(values, worlds, strict=True)]
-        for values, number in ((returns, PEAK_EPISODES), (returns, LAST_EPISODES), (steps, LAST_EPISODES))
-    )
-    episodes = min(map(len, returns))
-    short = np.mean([of_replica[:episodes] for of_replica in tens], 0)
-    long = np.mean([of_replica[:episodes] for of_replica in thirties], 0)
+    rows = where(table, agent=0)
+    got = COLLECTIVE_RETURN if COLLECTIVE_RETURN in table.column_names else INCOME
+    replicas = [where(rows, replica=replica) for replica in rows["replica"].unique().to_pylist()]
+    worlds = [world_of(of_one) for of_one in replicas]
     lanes = len(np.unique(worlds[0]))
+
+    def means(number: str, episodes: int) -> list[Values]:
+        values = (of_one[number].to_numpy() for of_one in replicas)
+        return [mean_of_worlds(*of_one, episodes) for of_one in zip(values, worlds, strict=True)]
+
+    tens = means(got, PEAK_EPISODES)
+    thirties = means(got, LAST_EPISODES)
+    length = min(map(len, tens))
+    short = np.mean([of_one[:length] for of_one in tens], 0)
+    long = np.mean([of_one[:length] for of_one in thirties], 0)
     size = rounds_of(PEAK_EPISODES, lanes) * lanes
     later = rounds_of(LAST_EPISODES, lanes) * lanes - size
     at = int(np.nanargmax(short))
+    lives = fmean(of_one[-1] for of_one in means("steps", LAST_EPISODES))
     return Outcome(
         begins=float(short[~np.isnan(short)][0]),
         peak=float(short[at]),
-        around=min(at + 1 - min(size, episodes) + size // 2, episodes),
-        low=float(np.nanmin(long[min(at + later, episodes - 1) :])),
-        last=fmean(of_replica[-1] for of_replica in thirties),
-        lived=fmean(of_replica[-1] for of_replica in lives) / max(float(of_one.max()) for of_one in steps),
+        around=min(at + 1 - min(size, length) + size // 2, length),
+        low=float(np.nanmin(long[min(at + later, length - 1) :])),
+        last=fmean(of_one[-1] for of_one in thirties),
+        lived=lives / pc.max(rows["steps"]).as_py(),
         random=random,
-        agents=agents,
+        agents=pc.max(table["agent"]).as_py() + 1,
     )

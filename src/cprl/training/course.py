@@ -12,13 +12,12 @@ from typing import Final
 import numpy as np
 import pyarrow as pa
 
-from cprl.measuring.outcome import TRAGEDY, Outcome, outcome_of
+from cprl.measuring.outcome import TRAGEDY, outcome_of
 from cprl.measuring.registry import COLLECTIVE_RETURN
 from cprl.measuring.statistics import Estimate, Family, differences, estimates, form_for
-from cprl.measuring.table import by_replica, labelled, where
+from cprl.measuring.table import by_replica, labelled, where, world_of
 from cprl.measuring.windows import LAST_EPISODES, last_of
 from cprl.population import AgentSpec, any_learns, exploring
-from cprl.runs.curves import as_curves, worlds_of
 from cprl.runs.episodes import read_episodes, read_rows
 
 FEW_REPLICAS: Final = 5
@@ -60,7 +59,7 @@ def course_of(run: Path, agents: Sequence[AgentSpec]) -> str:
     if not learns:
         lines = [f"In fresh worlds they get {_got(levels, FRESH)}.", *_replicas(fresh), of_random]
         return "\n".join([*lines, _verdict(gaps, others)])
-    went = _outcome(table, levels[RANDOM, COLLECTIVE_RETURN].value)
+    went = outcome_of(table, random=levels[RANDOM, COLLECTIVE_RETURN].value)
     lines = [
         f"The agents began at {went.begins:.0f} apples an episode, all together, and reached "
         f"{went.peak:.0f} around episode {went.around}.",
@@ -74,26 +73,12 @@ def course_of(run: Path, agents: Sequence[AgentSpec]) -> str:
 
 def last_text(table: pa.Table, number: int = LAST_EPISODES) -> str:
     """Return which episodes `last_of` takes, e.g. "the last 2 episodes of each of 16 worlds"."""
-    worlds = len(np.unique(worlds_of(table)[0]))
     taken = where(last_of(table, number), agent=0)
-    replicas = len(np.unique(taken["replica"].to_numpy()))
+    replicas = len(taken["replica"].unique())
+    worlds = len(np.unique(world_of(taken))) // replicas
     episodes = len(taken) // replicas // worlds
     last = f"the last {episodes} episodes" if episodes > 1 else "the last episode"
     return last if worlds == 1 else f"{last} of each of {worlds} worlds"
-
-
-def _outcome(table: pa.Table, random: float) -> Outcome:
-    """Return how the training went, over its replicas."""
-    replica = table["replica"].to_numpy()
-    of_replicas = [table.filter(replica == number) for number in np.unique(replica)]
-    curves = [as_curves(rows) for rows in of_replicas]
-    return outcome_of(
-        [of_one[COLLECTIVE_RETURN][0] for of_one in curves],
-        [of_one[LIFE][0] for of_one in curves],
-        [worlds_of(rows)[0] for rows in of_replicas],
-        random=random,
-        agents=len(np.unique(table["agent"].to_numpy())),
-    )
 
 
 def _got(levels: Family, when: str) -> str:
@@ -102,7 +87,7 @@ def _got(levels: Family, when: str) -> str:
 
 def _differs(agents: Sequence[AgentSpec], table: pa.Table) -> str:
     """Return what is otherwise in fresh worlds than at the end of the training."""
-    replicas = len(np.unique(table["replica"].to_numpy()))
+    replicas = len(table["replica"].unique())
     steps = int(where(table, agent=0)["steps"].to_numpy().sum()) // replicas
     settings = exploring(agents)
     before = sorted({f"{one.epsilon(steps):.0%}" for one in settings})
