@@ -23,8 +23,8 @@ import cprl
 from cprl import Game, Rules, maps, presets
 from cprl.algorithms import DQN, IQL, MADDPG, PPO, PR2, SAC
 from cprl.learners.settings import DQNSettings, RolloutSettings
-from cprl.population import Learning, Scripted, Team, exploration_steps
 from cprl.measuring.windows import centres
+from cprl.population import Learning, Scripted, Team, exploration_steps
 from cprl.runs.curves import episode_of_turn
 from cprl.runs.episodes import as_table
 from cprl.terminal import style

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 from test_results import an_episode
 
-from cprl.measuring.metrics import NAMES, title, with_unit
+from cprl.measuring.registry import INCOME, METRICS, title, with_unit
 from cprl.runs.episodes import labelled
 from cprl.terminal.summary import summarise
 from cprl.terminal.tables import Cells
@@ -102,9 +102,7 @@ def test_a_policy_that_harvests_nothing_has_words_instead_of_nan(tmp_path):
 def test_the_outcome_comes_first_and_what_institutions_never_did_has_no_table(tmp_path):
     def governed(number, harvest, broken):
         nothing = {"fines": np.zeros(2), "transfers": np.zeros(2), "violations": np.array(broken)}
-        return replace(
-            episode(number, harvest), institutions={"fines": 0.0, "violations": sum(broken)}, **nothing
-        )
+        return replace(episode(number, harvest), **nothing)
 
     idle, busy = (governed(0, harvest, [0, 0]) for harvest in ([1, 1], [90, 30]))
     _, text = told_of(tmp_path, random=[idle], trained=[busy])
@@ -155,9 +153,9 @@ def test_units_are_those_of_the_docs():
     lines = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text().splitlines()
     table = [line.split("|")[1:3] for line in lines if line.startswith("| `social/")]
     units = {name.strip(" `").removeprefix("social/"): unit.strip() for name, unit in table}
-    assert set(units) == {name for name in NAMES if "/" not in name}
+    assert set(units) == {name for name in METRICS if "/" not in name} - {INCOME}
     for name, unit in units.items():
-        assert NAMES[name][1].startswith(unit.replace("0..1", "0 to 1"))
+        assert METRICS[name].unit.startswith(unit.replace("0..1", "0 to 1"))
 
 
 @pytest.mark.parametrize(
@@ -177,7 +175,9 @@ def test_a_metric_is_called_by_the_same_words_with_its_unit_everywhere(name, rew
 def test_episodes_with_an_undefined_equality_of_incomes_are_counted(tmp_path):
     fined = [
         replace(
-            episode(number, [2, 2]), fines=np.ones(2), institutions={"fines": 2.0, "income_equality": equality}
+            episode(number, [2, 2]),
+            fines=np.ones(2),
+            metrics={"institutions/fines": 2.0, "income_equality": equality},
         )
         for number, equality in enumerate([0.5, float("nan"), 0.7])
     ]

@@ -22,7 +22,7 @@ from results import (
 )
 from verdicts import curve_prediction, prediction
 
-from cprl.runs.curves import running_mean
+from cprl.measuring.windows import running_mean
 
 Values = NDArray[np.float64]
 
@@ -293,7 +293,9 @@ def phases_of(results: Sequence[Result]) -> list[str]:
         rows.append([result.name, *cells])
     head = ["curves", "second phase from", "third", "fourth", "phases by their pattern"]
     drawn = ", ".join(map(str, PHASES_BEGIN))
-    note = f"The study draws its phases from {drawn} on. See `recipes/study/phases.py` for how ours are found."
+    note = (
+        f"The study draws its phases from {drawn} on. See `recipes/study/phases.py` for how ours are found."
+    )
     return ["## Phases of experiment 5", "", note, "", *table(head, rows)]
 
 

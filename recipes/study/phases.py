@@ -1,5 +1,5 @@
-"""Phases of a training of the study of 2019: change points of the social metrics, labels for the phases between
-them, and how figures draw them.
+"""Phases of a training of the study of 2019: change points of the social metrics, labels for the phases
+between them, and how figures draw them.
 
 find_phases   the phases of curves
 phases_of     those of a run, of running means
@@ -21,7 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike, NDArray
 
-from cprl.runs.curves import SMOOTHED_EPISODES, centres, running_mean
+from cprl.measuring.windows import SMOOTHED_EPISODES, centres, running_mean
 from cprl.terminal.style import CHARACTER, Sheet
 
 Values = NDArray[np.float64]

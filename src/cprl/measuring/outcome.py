@@ -3,8 +3,8 @@
 Course       what a group of learners does at the moment, judged by its past alone: header and strip
 Outcome      how a training went, judged by the whole of it: sentences, tables of studies, reports
 
-"The mean of n episodes" of a replica in W worlds is that of the last ceil(n / W) episodes of each world, so that
-the worlds count alike. Those that ended last, of all worlds, would be the longest ones.
+"The mean of n episodes" of a replica in W worlds is that of the last ceil(n / W) episodes of each world, so
+that worlds count alike. Those that ended last, of all worlds, would be the longest ones.
 """
 
 from collections import deque
@@ -69,12 +69,12 @@ class Course:
     """The live label of a training, episode by episode.
 
     It is for people who watch. With m the mean over the last 10 % of the episodes of each replica so far (at
-    least 10), as a mean over replicas, p its peak since the last fall, low its lowest in a fall, and r the mean
-    of random play:
+    least 10), as a mean over replicas, p its peak since the last fall, low its lowest in a fall, and r the
+    mean of random play:
 
     - begins: before each world has ended its part of 10 episodes;
-    - dead: while m is below random play, from when all boards that m is a mean of died before the clock, until
-      fewer than nine of ten do;
+    - dead: while m is below random play, from when all boards that m is a mean of died before the clock,
+      until fewer than nine of ten do;
     - below random play: from m < r - 0.1 |r| on, until m >= r;
     - falling: from p - m >= (p - r) / 3 and p - m >= 0.15 p on;
     - recovering: after a fall, from m >= low + (p - low) / 4 on, until the next, or until m passes the
@@ -160,7 +160,9 @@ class Course:
             return
         self.mean = sum(recent.mean for recent in all_recent) / len(all_recent)
         fewest = min(map(len, all_recent))
-        if len(all_recent) == len(self._waiting) * self._worlds and fewest >= ceil(PEAK_EPISODES / self._worlds):
+        if len(all_recent) == len(self._waiting) * self._worlds and fewest >= ceil(
+            PEAK_EPISODES / self._worlds
+        ):
             self._course = self._followed(self._course)
             self.label = self._judged()
 
@@ -190,7 +192,9 @@ class Course:
             self._top = mean
             course = RECOVERING
         self._top = max(self._top, mean)
-        if is_lost(mean, peak=self._top, random=self._first if self.random_play is None else self.random_play):
+        if is_lost(
+            mean, peak=self._top, random=self._first if self.random_play is None else self.random_play
+        ):
             self._low = mean
             return FALLING
         if course == RECOVERING:
@@ -270,11 +274,11 @@ class Outcome:
         - decline: a fall that is not regained, or an end below random play that is no tragedy;
         - harvesting: else.
 
-        A tragedy in the sense of G. Hardin, "The tragedy of the commons" (1968): each of several has learned to
-        take what pays, and what they share is ruined, so that all get less than if nobody had learned. That it
-        is the ruin of a board, and no mere fall, is why boards have to die; that it is learned, why the peak is
-        well above random play. The numbers are ours. Whether the difference is more than chance is another
-        question, which intervals over replicas answer.
+        A tragedy in the sense of G. Hardin, "The tragedy of the commons" (1968): each of several has learned
+        to take what pays, and what they share is ruined, so that all get less than if nobody had learned.
+        That it is learned is why the peak is well above random play; that it is the ruin of a board, and no
+        mere fall, why boards have to die. The numbers are ours. Whether the difference is more than chance is
+        another question, which intervals over replicas answer.
         """
         if self.peak < LEARNED * self.random:
             return NO_BETTER
@@ -289,8 +293,8 @@ class Outcome:
 
 RULE: Final = (
     f"its last {LAST_EPISODES} episodes against its peak and random play ({NO_BETTER}: no mean of "
-    f"{PEAK_EPISODES} episodes reached {LEARNED} times random play; {TRAGEDY}: several agents end at "
-    f"{BELOW_RANDOM:.0%} of random play at most, and boards last {LIVED:.0%} of the steps that they can at most)"
+    f"{PEAK_EPISODES} episodes reached {LEARNED} times random play; {TRAGEDY}: several agents get at "
+    f"most {BELOW_RANDOM:.0%} of random play, and boards last at most {LIVED:.0%} of the longest life)"
 )
 """How the word of an outcome is found, as tables say it."""
 

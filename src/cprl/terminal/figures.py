@@ -103,9 +103,7 @@ def training_curve(
     return path
 
 
-def _panels(
-    run: Path, table: pa.Table, random: pa.Table | None, window: int, over: int
-) -> list[_Panel]:
+def _panels(run: Path, table: pa.Table, random: pa.Table | None, window: int, over: int) -> list[_Panel]:
     """Return collective return and survival, or the income of a game without a harvest; violations and fines
     of a game with institutions."""
     curves = as_curves(table)
@@ -150,9 +148,7 @@ def _draw(axes: Axes, panel: _Panel, dashed: str) -> None:
     label = "each episode, mean of the replicas" if several else "each episode"
     axes.plot(raw, color=style.RAW, linewidth=0.7, marker=dot, label=label, zorder=1.5)
     if several:
-        lines = axes.plot(
-            panel.at, panel.means.T, color=style.REPLICA, linewidth=0.9, alpha=0.75, zorder=2
-        )
+        lines = axes.plot(panel.at, panel.means.T, color=style.REPLICA, linewidth=0.9, alpha=0.75, zorder=2)
         lines[0].set_label("each replica, running mean")
     label = f"mean of the {replicas} replicas, running mean" if several else "running mean"
     mean = panel.means.mean(0)

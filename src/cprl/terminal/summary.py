@@ -19,13 +19,13 @@ from cprl.measuring.registry import (
     OF_AGENTS,
     with_unit,
 )
-from cprl.measuring.statistics import Estimate, Family, differences, estimates, notes_on, signed
+from cprl.measuring.statistics import HOLM, Estimate, Family, differences, estimates, notes_on
 from cprl.measuring.table import numbers_in, where
 from cprl.runs.episodes import LEFT_OUT
 from cprl.system.output import console as safe_console
 from cprl.system.output import printed
 from cprl.system.shipped import cprl_here
-from cprl.terminal.tables import Cells
+from cprl.terminal.tables import Cell, Cells, Change
 
 _FILES: Final = ("recipe.json", "episodes.parquet", "run.rrd", "checkpoints", "figures")
 INTERVALS: Final = "mean over replicas [95 % interval by Student's t]"
@@ -42,7 +42,7 @@ def summarise(
     note: str | None = None,
     console: Console | None = None,
 ) -> None:
-    """Print what became of the run, a table that compares policies, what is left out, and the files of the run.
+    """Print what became of the run, a table that compares policies, and the files of the run.
 
     Args:
         played: Episodes in fresh worlds, labelled by "policy"; the first policy is what others are compared
@@ -89,8 +89,8 @@ def compared(
     reference: str = "random",
     names: Mapping[str, str] | None = None,
 ) -> Cells:
-    """Return a table with a column for each policy, then one for what each has more than the reference, paired
-    by replica; a row for each number.
+    """Return a row for each number: a column for each policy, then one for what each has more than the
+    reference, paired by replica.
 
     Numbers of institutions that are 0 or undefined everywhere have no row, and incomes none where nobody is
     paid anything but the harvest.
@@ -109,10 +109,10 @@ def compared(
     words = {label: (names or {}).get(label, label) for label in columns}
     rewards = "apples" if "harvest" in table.column_names else ""
     told = [name for name in asked if _says_something(name, levels, columns)]
-    rows = []
+    rows: list[list[Cell]] = []
     for name in told:
-        values = [str(levels[label, name]) for label in columns]
-        gaps = [signed(more.get((label, name))) for label in others]
+        values = [levels[label, name] for label in columns]
+        gaps = [_change(more.get((label, name))) for label in others]
         rows.append([with_unit(name, rewards=rewards), *values, *gaps])
     of_columns = [where(table, **{by: label}) for label in columns]
     blank = [""] * len(others)
@@ -123,9 +123,14 @@ def compared(
     shown = [levels[label, name] for label in columns for name in told]
     left_out = (table.schema.metadata or {}).get(LEFT_OUT, b"").decode()
     zeros = ZEROS * any(_is_of_institutions(name) for name in {*asked} - {*told})
-    notes = [left_out, zeros, *_idle(levels, words), *notes_on(shown)]
+    holm = f"{HOLM} for {more.name}." * any(one.differs for one in more.values())
+    notes = [left_out, zeros, *_idle(levels, words), *notes_on(shown), holm]
     head = ["", *words.values(), *(f"{words[label]} - {words[reference]}, paired" for label in others)]
     return Cells(heading, head, rows, "\n".join(filter(None, notes)))
+
+
+def _change(difference: Estimate | None) -> Cell:
+    return "" if difference is None else Change(difference)
 
 
 def _says_something(name: str, levels: Family, columns: Sequence[str]) -> bool:

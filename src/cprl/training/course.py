@@ -99,7 +99,7 @@ def _differs(agents: Sequence[AgentSpec], table: pa.Table) -> str:
 
 
 def _replicas(fresh: pa.Table) -> list[str]:
-    """Return the replicas one by one, where they are few; and of how many most boards die, where they differ."""
+    """Return replicas one by one, where they are few; else in how many most boards die, where they differ."""
     apples = by_replica(fresh, COLLECTIVE_RETURN)["value"].to_pylist()
     steps = by_replica(fresh, LIFE)["value"].to_pylist()
     died = fresh.group_by("replica", use_threads=False).aggregate([("terminated", "mean")])
@@ -133,7 +133,8 @@ def _verdict(gaps: Family, others: str, *, is_tragedy: bool = False) -> str:
         return f"{whether}: one replica has no interval."
     beside = " and ".join(f"{one:+} {when}" for when, one in by_when.items())
     judged = {when: _judged(one) for when, one in by_when.items()}
-    return f"Beside random play, in apples, that is {beside}.\n{_meaning(judged, others, whether, is_tragedy)}"
+    meaning = _meaning(judged, others, whether, is_tragedy)
+    return f"Beside random play, in apples, that is {beside}.\n{meaning}"
 
 
 def _meaning(judged: Mapping[str, str], others: str, whether: str, is_tragedy: bool) -> str:
