@@ -10,8 +10,7 @@ Modules, in the order in which one reads them:
     statistics    estimates over replicas and differences, with intervals by Student's t, and Holm's families
     played        estimates of episodes by replica
     series        numbers while a training runs
-    now           what a group is doing at the moment
-    phases        change points of a whole training, and the phases between them
+    outcome       how a training goes, and how it went
     movement      where agents go, which cells they share or keep, and who tags whom
 """
 
