@@ -33,6 +33,7 @@ from cprl.evaluation.lanes import Fresh
 from cprl.measuring import EpisodeTracker, social
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.metrics import FIELDS, METRICS, OPTIONAL, available, left_out, reported_by
+from cprl.measuring.series import Observer
 from cprl.measuring.statistics import agents_without_harvest, social_measures
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
@@ -54,14 +55,13 @@ NO_HARVEST = "collective_return, efficiency, equality, sustainability, harvest (
 def play(env, policy, turns, *, callbacks=(), tracker=None):
     """Steps an environment as a training does; returns the episodes that ended."""
     tracker = tracker or EpisodeTracker(env.batch_size[0], 2)
+    observer = Observer(callbacks, env)
     ended = []
     for turn, batch in enumerate(StepCollector(env, policy), start=1):
-        for callback in callbacks:
-            callback.on_step(batch)
+        observer.on_step(batch)
         for episode in tracker.add(batch):
             ended.append(episode)
-            for callback in callbacks:
-                callback.on_episode(episode, {"agent_0/loss": 0.5})
+            observer.on_episode(episode, {"agent_0/loss": 0.5})
         if turn == turns:
             return ended
     raise AssertionError

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import rerun as rr
 import torch
-from recordings import GAME, SCENE, column, names, static, strict_rerun
+from recordings import GAME, SCENE, column, names, observing, static, strict_rerun
 from rerun.chunk import RrdReader
 from tensordict import TensorDict
 from test_now import SIXTEEN_WORLDS
@@ -53,12 +53,13 @@ def texts(path):
 def recorded(run, numbers, *, replicas=1, episodes=9, learning=lambda number: {}, finished=None, tagged=0):
     """The recording of a run whose agents harvest thirty apples in each episode of these numbers."""
     with ViewerCallback(run, CommonsEnv(GAME, replicas), title="run", episodes=episodes) as viewer:
+        observer = observing(viewer)
         if finished:
             viewer.random_play(finished["random"])
         for number in numbers:
             for world in range(replicas):
                 returned = 100.0 * world if replicas > 1 else 30.0
-                viewer.on_episode(fake(number, world, returned=returned, tagged=tagged), learning(number))
+                observer.on_episode(fake(number, world, returned=returned, tagged=tagged), learning(number))
         if finished:
             viewer.finished(finished)
             RrdReader(run / "run.rrd").store()  # closed, with its footer
@@ -133,10 +134,11 @@ def test_with_many_worlds_header_label_bold_line_and_new_bests_count_episodes(tm
     """The tragedy of sixteen worlds, as the viewer told it once: "steady, 333 apples" at 206."""
     with ViewerCallback(tmp_path, CommonsEnv(GAME, 16), title="run", episodes=288, worlds=16) as viewer:
         viewer.random_play([fake(0, 0, returned=280.0, tagged=0)] * 2)
+        observer = observing(viewer)
         for group, apples in enumerate(SIXTEEN_WORLDS):
             for world in range(16):
                 episode = fake(16 * group + world, world, returned=float(apples), tagged=0)
-                viewer.on_episode(replace(episode, replica=0), {})
+                observer.on_episode(replace(episode, replica=0), {})
     path = tmp_path / "run.rrd"
     said = [(at + 1, *text.split(" · ")[1:3]) for at, text in headers(path) if "random play 280" in text]
     assert [at for at, *_ in said] == list(range(16, 289, 16))
@@ -161,10 +163,11 @@ def test_the_header_of_a_finished_run_is_of_the_last_two_episodes_of_each_of_six
     fresh = [fake(0, 0, returned=280.0, tagged=0)] * 2
     with ViewerCallback(tmp_path, CommonsEnv(GAME, 16), title="run", episodes=64, worlds=16) as viewer:
         viewer.random_play(fresh)
+        observer = observing(viewer)
         for group, apples in enumerate((100, 200, 300, 400)):
             for world in range(16):
                 episode = fake(16 * group + world, world, returned=float(apples), tagged=0)
-                viewer.on_episode(replace(episode, replica=0), {})
+                observer.on_episode(replace(episode, replica=0), {})
         viewer.finished({"random": fresh, "trained": fresh})
     assert " · while learning 350 apples, trained 280, " in headers(tmp_path / "run.rrd")[-1][1]
 
@@ -173,12 +176,13 @@ def test_header_and_timelines_count_the_episodes_that_all_replicas_have_ended(tm
     """The first replica is far ahead; its last apples and frames stand where the header is."""
     env = CommonsEnv(GAME, 4)
     with ViewerCallback(tmp_path, env, title="run", episodes=20, worlds=2) as viewer:
+        observer = observing(viewer)
         for number, world in ((0, 0), (1, 1), (2, 0), (3, 1), (4, 0), (5, 0)):
-            viewer.on_episode(replace(fake(number, world, returned=30.0, tagged=0), replica=0), {})
+            observer.on_episode(replace(fake(number, world, returned=30.0, tagged=0), replica=0), {})
         for number, world in ((0, 2), (1, 3)):
-            viewer.on_episode(replace(fake(number, world, returned=30.0, tagged=0), replica=1), {})
+            observer.on_episode(replace(fake(number, world, returned=30.0, tagged=0), replica=1), {})
         assert viewer._episode == 2
-        viewer.on_episode(replace(fake(6, 0, returned=30.0, tagged=0), replica=0), {})
+        observer.on_episode(replace(fake(6, 0, returned=30.0, tagged=0), replica=0), {})
     path = tmp_path / "run.rrd"
     said = headers(path)
     assert said[1][1].startswith("#### Episode 2 of 20 ")
@@ -207,18 +211,21 @@ def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_g
     (tmp_path / "recipe.json").write_text("{}")
     env, common = CommonsEnv(GAME, 2), {"title": "run", "episodes": 70}
     with ViewerCallback(tmp_path, env, file_name="whole.rrd", **common) as whole:
-        play(range(70), whole)
+        play(range(70), observing(whole))
     with ViewerCallback(tmp_path, env, **common) as first:
+        observer = observing(first)
         with EpisodeTable(tmp_path / "episodes.parquet") as table:
-            play(range(49), first, table)
-            play([49], first, table, worlds=[0])
-        state = first.state_dict()
+            play(range(49), observer, table)
+            play([49], observer, table, worlds=[0])
+        state, observed = first.state_dict(), observer.state_dict()
     assert headers(tmp_path / "run.rrd")[-1][1].startswith("#### Stopped after 49 of 70 episodes")
     with ViewerCallback(tmp_path, env, live="serve", **common) as second:
         second.load_state_dict(state)
-        second.on_start(SimpleNamespace(steps=1000))
-        play([49], second, worlds=[1])
-        play(range(50, 70), second)
+        observer = observing(second)
+        observer.load_state_dict(observed)
+        observer.on_start(SimpleNamespace(steps=1000))
+        play([49], observer, worlds=[1])
+        play(range(50, 70), observer)
         second.flush()
         seen_by_viewers(second.logger, tmp_path / "seen", "social/collective_return", list(range(70)))
     files = [tmp_path / name for name in ("run.rrd", "run-2.rrd")]
@@ -364,8 +371,9 @@ def test_a_recording_of_a_matrix_game_has_the_sum_of_returns_and_shares_of_joint
         viewer.random_play([fake(0, 0, returned=-7.0, tagged=0)])
         for action in ([[0, 0], [1, 1]], [[0, 1], [1, 1]]):
             viewer.on_step(TensorDict({("agents", "action"): torch.tensor(action)}, [2]))
+        observer = observing(viewer)
         for world, returned in ((0, -5.0), (1, -8.0)):
-            viewer.on_episode(fake(0, world, returned=returned, tagged=0), {})
+            observer.on_episode(fake(0, world, returned=returned, tagged=0), {})
     path = tmp_path / "run.rrd"
     assert column(path, "joint_actions", "Scalars:scalars")[1] == [[0.25, 0.25, 0, 0.5]]
     assert column(path, "return_of_all", "Scalars:scalars")[1] == [[-5, -8, -6.5, -6.5]]
@@ -607,10 +615,11 @@ def test_the_numbers_of_an_evaluation_are_means_with_their_interval_over_replica
 
 def test_who_tagged_whom_is_a_matrix_of_tags_in_an_episode_of_the_last_fifty(tmp_path):
     with ViewerCallback(tmp_path, CommonsEnv(GAME, 2), title="run", episodes=60) as viewer:
+        observer = observing(viewer)
         for number in range(60):
             for world in (0, 1):
                 episode = fake(number, world, returned=30.0, tagged=2 if number < 10 else world)
-                viewer.on_episode(episode, {})
+                observer.on_episode(episode, {})
     path = tmp_path / "run.rrd"
     episodes, labels = column(path, "tags/counts", "Points2D:labels", "episode")
     assert episodes == [9, 19, 29, 39, 49, 59]

@@ -1,6 +1,5 @@
 """ViewerCallback: records a training for the Rerun viewer, and shows it live."""
 
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from math import ceil, gcd
 from operator import methodcaller
@@ -17,7 +16,7 @@ from cprl.envs.unwrap import agent_names, base_env, commons_of
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import Policy
 from cprl.measuring.metrics import reported_by
-from cprl.measuring.series import OF_AGENTS, Series, numbers_of
+from cprl.measuring.series import OF_AGENTS, Observer, Values
 from cprl.policies.present import PresentPolicy
 from cprl.runs.curves import as_curves
 from cprl.runs.episodes import metrics_in, read_episodes
@@ -95,9 +94,9 @@ class ViewerCallback:
         file_name: str | None = None,
         is_replay: bool = False,
     ) -> None:
-        self.env, self._run, self._agents = env, run, agent_names(env)
+        self.env, self._run = env, run
         reported, commons = reported_by(env), commons_of(env)
-        curves = curves_of(env, self._agents, reported, episodes=episodes, worlds=worlds, own=metrics)
+        curves = curves_of(env, agent_names(env), reported, episodes=episodes, worlds=worlds, own=metrics)
         scene = None if commons is None else scene_of(commons, curves, is_replay=is_replay)
         self._earlier = [] if file_name else recordings_of(run)
         self.logger = RerunLogger(
@@ -111,11 +110,9 @@ class ViewerCallback:
         )
         self.filming = Filming(commons, self.logger, scene, episodes=-(-episodes // worlds))
         """Which episodes of the first world are recorded frame by frame."""
-        self._series = Series(curves.replicas, worlds)
         self._turn = self._step = self._filmed = 0
         self._episode = 0
         """The episodes that all replicas have ended: what header, board and timelines say."""
-        self._rate_at, self._rate_step = time.perf_counter(), 0
         self.logger.log_hparams({"run": run.name, **(recipe or {})})
         self.logger.log_text(f"{title} begins")
         for missing in missing_in(reported, has_board=scene is not None):
@@ -187,11 +184,12 @@ class ViewerCallback:
 
     def _resume(self, step: int) -> None:
         """Gives the views the episodes that the run's table has, and viewers the recording so far."""
-        self._step = self._rate_step = step
-        self._turn = step // self._series.worlds
+        self._step = step
+        self._turn = step // self.logger.curves.worlds
+        again = Observer([self], self.env, worlds=self.logger.curves.worlds)
         with self.logger.silent():
             for episode in _stored_episodes(self._run):
-                self.on_episode(episode, {})
+                again.on_episode(episode, {})
         for view in self._views:
             view.resumed()
         for recording in self._earlier:
@@ -207,7 +205,7 @@ class ViewerCallback:
         Otherwise it only counts: reading a tensor each turn would cost a training some percent.
         """
         self._turn += 1
-        self._step += self._series.worlds
+        self._step += self.logger.curves.worlds
         if not self.filming.is_on and self._turn % self._sampled:
             return  # nothing is due; whatever runs here displaces a training's data from the fast caches
         self.filming.choose(self._filmed)
@@ -217,27 +215,22 @@ class ViewerCallback:
             view.on_batch(batch)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Logs the numbers of an episode, and its events, once all replicas have ended it."""
+        """Adds an episode of a replica, and logs its events."""
         self.logger.at(step=self._step, episode=self._episode)
         for view in self._views:
             view.on_episode(episode)
         if episode.world == 0:
             self._filmed, self.filming.shows_next = self._filmed + 1, False
-        of_all = self._series.add(episode, numbers_of(episode, learning, self._agents))
-        if of_all is not None:
-            self._episode += self._series.worlds
-            self.logger.at(step=self._step, episode=self._episode - 1)
-            with self.logger.together():
-                for view in self._views:
-                    view.on_all(self._episode - 1, of_all)
-                self._log_speed()
         self.filming.choose(self._filmed)
 
-    def _log_speed(self) -> None:
-        now, steps = time.perf_counter(), (self._step - self._rate_step) * self._series.replicas
-        if steps:
-            self.logger.log_scalar("time/env_steps_per_s", steps / (now - self._rate_at))
-            self._rate_at, self._rate_step = now, self._step
+    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
+        """Draws the numbers of an episode that all replicas have ended."""
+        self._episode = episode + 1
+        self.logger.at(step=self._step, episode=episode)
+        with self.logger.together():
+            for view in self._views:
+                view.on_numbers(episode, numbers)
+        self.filming.choose(self._filmed)
 
     def seen_at_random(self, env: EnvBase, policy: Policy) -> Policy:
         """Return the policy of random play; viewers see its first world until the training begins."""

@@ -21,7 +21,7 @@ from cprl.commons.decoding import UNSEEN
 from cprl.envs.commons_env import CommonsEnv
 from cprl.institutions import Boundaries
 from cprl.measuring.episodes import Episode
-from cprl.measuring.series import OF_AGENTS, Recent, Values, mean_of
+from cprl.measuring.series import OF_AGENTS, STEPS, Recent, Values, mean_of
 from cprl.viewer.board import RIM_CELLS, boards, image_form
 from cprl.viewer.layout import (
     JOINT,
@@ -57,7 +57,7 @@ class View:
     def on_episode(self, episode: Episode) -> None:
         """Add an episode of a replica."""
 
-    def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
         """Add an episode, counted from 0, that all replicas have ended; of replicas in W worlds the last of W
         whose means these are.
 
@@ -114,11 +114,13 @@ class Plots(View):
                 f"{RANDOM_PLAY}/{name}", ([0, 0], [0, 1], [0, 0]), points, live_only=True
             )
 
-    def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
         curves = self._logger.curves
         if curves.unit == "return":
             numbers = {**numbers, RETURN: np.sum([numbers[f"{name}/return"] for name in curves.agents], 0)}
         for name, values in numbers.items():
+            if name == STEPS:  # what its timeline says
+                continue
             is_social = name.startswith(("social/", "institutions/", RETURN))
             singles = values.tolist() if is_social and len(values) > 1 else []
             lines = [*singles, mean := mean_of(values)]
@@ -155,7 +157,7 @@ class JointActions(View):
             self._shares.setdefault(together, []).append(counts / counts.sum())
         counts[:] = 0
 
-    def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
         if shares := self._shares.pop(episode // self._logger.curves.worlds, None):
             means = zip(self._recent, np.mean(shares, 0), strict=True)
             self._logger.log_lines(JOINT, [recent.add(share) for recent, share in means])
@@ -189,7 +191,7 @@ class Tags(View):
             count, tags = self._last[-1]
             self._last[-1] = count + 1, tags + episode.tagged_by
 
-    def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
         self._groups += 1
         if self._groups % self._every == 0:
             counts, sums = zip(*self._last, strict=True)
@@ -297,7 +299,7 @@ class Picture(View):
         self._every = every
         self._ended = self._logged = 0
 
-    def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
         before, self._ended = self._ended, episode + 1
         if self._ended // self._every > before // self._every:
             self.close()

@@ -245,7 +245,7 @@ class Story(View):
             together = episode.episode // self._curves.worlds
             self._died[together] = self._died.get(together, 0) + died
 
-    def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
         before, self._ended = self._ended, episode + 1
         died = self._died.pop(episode // self._curves.worlds, None)
         means = {name: mean_of(values) for name, values in numbers.items()}
@@ -402,7 +402,7 @@ class CompilingNotice(View):
         self._before_s = CLOCK.total_s
         Thread(target=self._watch, daemon=True, name="cprl compiling").start()
 
-    def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
         self.close()
 
     def close(self) -> None:
