@@ -17,7 +17,7 @@ from cprl.measuring.series import Observer
 from cprl.policies.lanes import RandomActor
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.layout import Scene
+from cprl.viewer.scene import Scene
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),

@@ -30,9 +30,10 @@ from cprl.terminal.figures import training_curve
 from cprl.terminal.summary import institutions_table, summarise
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.layout import Curves, curves_of, layout, styles
+from cprl.viewer.layout import layout, styles
 from cprl.viewer.pictures import borders, regions_of
 from cprl.viewer.replay import Offences
+from cprl.viewer.scene import Curves, curves_of
 from cprl.viewer.story import in_words
 
 GAME = Game(

@@ -13,7 +13,8 @@ from cprl import Custom, Study
 from cprl.runs.curves import curves_of
 from cprl.runs.episodes import read_episodes, read_evaluations
 from cprl.studies import Search, StudyTable
-from cprl.viewer.layout import Curves, layout, styles
+from cprl.viewer.layout import layout, styles
+from cprl.viewer.scene import Curves
 
 KEYS = ("policy", "trained_episodes", "replica", "episode")
 SHARE, LOGGER = "one_road_parts:largest_share", "torchrl.record.loggers:CSVLogger"

@@ -16,24 +16,25 @@ from tensordict import TensorDict
 from test_now import SIXTEEN_WORLDS
 from test_watch import connected, fake, received
 
-from cprl import CommonsEnv, Game, Rules, maps, presets
+from cprl import CommonsEnv, Game, Rules, maps
 from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, agent_colour
 from cprl.commons.readable import rules_of
 from cprl.envs import make_env
 from cprl.envs.matrix import MatrixGame, chicken, matching_pennies, prisoners_dilemma
 from cprl.institutions import Quota, Tax, Vote
 from cprl.measuring import social
-from cprl.measuring.metrics import reported_by
-from cprl.measuring.phases import LONGEST, PHASES_BEGIN
 from cprl.policies.lanes import random_agents
 from cprl.runs.episodes import EpisodeTable
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.layout import Curves, Panels, curves_of, joint_actions, layout
+from cprl.viewer.frames import Filming, Wall
+from cprl.viewer.layout import layout
 from cprl.viewer.live import LiveStream, Stream
 from cprl.viewer.logger import RerunLogger, as_table, send_waiting
-from cprl.viewer.pictures import Lorenz, Plots, Turns, Visits, Wall, gini, lorenz_curve
-from cprl.viewer.story import CompilingNotice, Header, played, published_phases
+from cprl.viewer.pictures import Pictures, Samples, gini, lorenz_curve, visits_drawn
+from cprl.viewer.scene import Curves, Panels, curves_of, joint_actions, scene_of
+from cprl.viewer.story import CompilingNotice, Header, played
+from cprl.viewer.views import Plots
 
 __all__ = ["strict_rerun"]
 
@@ -88,7 +89,6 @@ def test_the_header_goes_from_the_beginning_to_the_end(tmp_path):
     assert said[-1] == (5, f"#### {line}")
     words = [text for text in texts(path) if "random play" in text]
     assert words == ["random play 282 [257, 307] apples; 0 of 2 boards died early"]
-    assert column(path, "phase/found", "StateChange:state") == ([], []), "too few episodes"
 
 
 def test_a_training_without_an_evaluation_or_that_was_stopped_ends_with_a_header_of_its_own(tmp_path):
@@ -266,23 +266,6 @@ def seen_by_viewers(logger, folder, entity, episodes):
         client.wait()
 
 
-def test_phases_of_the_published_game_stand_beside_those_found():
-    commons = presets.game("commons", variant="as_run")
-    assert published_phases(commons) == dict(
-        zip((0, *PHASES_BEGIN), ("exploration", "tragedy", "combat", "cultivation"), strict=True)
-    )
-    assert published_phases(presets.game("single_basic")) == published_phases(None) == {}
-
-
-def test_a_recording_of_a_training_too_long_for_the_search_has_no_phases():
-    env = CommonsEnv(GAME, 1)
-    shown = {
-        episodes: curves_of(env, GAME.agent_names, reported_by(env), episodes=episodes).has_phases
-        for episodes in (999, 1000, LONGEST, LONGEST + 1)
-    }
-    assert shown == {999: False, 1000: True, LONGEST: True, LONGEST + 1: False}
-
-
 def test_while_code_is_compiled_the_live_header_says_for_how_long(monkeypatch):
     clock, said, is_over = SimpleNamespace(is_running=True, total_s=3.0), [], Event()
     monkeypatch.setattr(CompilingNotice, "PERIOD_S", 0.02)
@@ -450,19 +433,18 @@ def test_before_the_first_point_viewers_see_random_play_and_read_when_curves_beg
         }
         sent.append((name, at[1], values))
 
-    curves = curves_of(CommonsEnv(GAME, 16), GAME.agent_names, ["harvest"], episodes=300, worlds=16)
+    env = CommonsEnv(GAME, 16)
+    curves = scene_of(env, curves_of(env, GAME.agent_names, ["harvest"], episodes=300, worlds=16))
     logger = SimpleNamespace(curves=curves, log_columns=log_columns, log_static=lambda *parts: None)
     Plots(logger).random_play([fake(0, 0, returned=280.0, tagged=0)])
     lines = {name: (at, values["Scalars:scalars"]) for name, at, values in sent}
     assert lines["random_play/collective_return"] == ([0, 1], [[280.0], [280.0]]), "a line needs two points"
-    sent.clear()
-    Turns(CommonsEnv(GAME, 16), logger, every=15)
-    Lorenz(logger, every=20)
-    said = [(name, values["Points2D:labels"]) for name, _, values in sent]
-    assert said == [
-        ("turn/title", [["lines from episode 16 on"]]),
-        ("lorenz/title", [["lines from episode 32 on"]]),
-    ]
+    for every, first in ((15, 16), (20, 32)):
+        sent.clear()
+        Pictures(logger, Samples(env, logger), every=every)
+        said = [(name, values["Points2D:labels"]) for name, _, values in sent]
+        words = [[f"lines from episode {first} on"]]
+        assert said == [("turn/title", words), ("lorenz/title", words)]
 
 
 def view_of(viewer, kind):
@@ -526,7 +508,7 @@ def test_the_line_of_a_replica_is_its_stock_turn_by_turn(run):
     steps = sum(own.steps for own in first[:-1])
     stocks = seen.stocks[steps : steps + first[-1].steps - 1]
     expected = [(0, len(SMALL.map.sites)), *enumerate(stocks, 1), (first[-1].steps, first[-1].stock_left)]
-    assert view_of(viewer, Turns).lines[0] == expected
+    assert view_of(viewer, Samples).lines[0] == expected
     _, colours = column(path, "turn/lines", "LineStrips2D:colors")
     died = [own.terminated for own in seen.episodes if own.episode == 5]
     assert len(set(colours[-1])) == len(set(died))
@@ -534,12 +516,12 @@ def test_the_line_of_a_replica_is_its_stock_turn_by_turn(run):
 
 def test_maps_show_where_agents_were_in_their_hues(run):
     path, viewer, _ = run
-    visits = view_of(viewer, Visits)
-    visits.counts[:] = 0
-    assert (visits.maps()[:, 1, 1:-1] == PALETTE[GROUND]).all()
-    assert (visits.maps()[:, 2, 3] == PALETTE[WALL]).all()
-    visits.counts[[0, 1], [0, 2], [0, 4]] = [9, 1]
-    drawn = visits.maps()
+    scene = viewer.logger.scene
+    visits = np.zeros((2, scene.height, scene.width), np.int64)
+    assert (visits_drawn(visits, scene)[:, 1, 1:-1] == PALETTE[GROUND]).all()
+    assert (visits_drawn(visits, scene)[:, 2, 3] == PALETTE[WALL]).all()
+    visits[[0, 1], [0, 2], [0, 4]] = [9, 1]
+    drawn = visits_drawn(visits, scene)
     assert drawn[0, 1, 1].tolist() == list(agent_colour(0)), "the longest stay is brightest"
     assert drawn[1, 3, 5].sum() < sum(agent_colour(1))
     assert drawn[1, 3, 5].argmax() == np.argmax(agent_colour(1))
@@ -574,33 +556,34 @@ def test_the_text_of_a_board_is_orange_after_an_episode_in_which_it_died(run):
 class Listener:
     """Takes what is logged, as a logger with viewers does."""
 
-    is_live, frames = True, 12
+    is_live, frames, episode = True, 12, 3
 
-    def __init__(self):
+    def __init__(self, scene):
+        self.scene = self.curves = scene
+        self.step = self.turn = 0
         self.rows, self.live_only = [], []
 
     def log_static(self, name, *what):
         """Nothing."""
 
-    def do(self, what, *, live_only=False):
+    def log_columns(self, entity, at, columns, *, live_only=False):
         self.live_only.append(live_only)
-        what(self)
-
-    def send_columns(self, entity, at, columns):
-        self.rows.append((entity, {line.timeline_name(): line.as_arrow_array().to_pylist() for line in at}))
+        self.rows.append((entity, dict(zip(("step", "episode", "frame"), map(list, at), strict=True))))
 
 
 def test_viewers_get_the_wall_every_two_seconds_and_the_file_does_not(run, monkeypatch):
     _, viewer, _ = run
-    clock, listener = iter(np.arange(10.0, 20.0, 0.8)), Listener()
+    clock, listener = iter(np.arange(10.0, 20.0, 0.8)), Listener(viewer.logger.scene)
     perf_counter = SimpleNamespace(perf_counter=lambda: next(clock))  # other threads have the clock itself
-    monkeypatch.setattr("cprl.viewer.pictures.time", perf_counter)
-    wall = Wall(viewer.env, listener, viewer.logger.scene, recorded_steps=100)
+    filming = Filming(None, listener, episodes=1)
+    monkeypatch.setattr("cprl.viewer.frames.time", perf_counter)
+    wall = Wall(viewer.env, listener, filming, listener.scene, recorded_steps=100)
     for step in range(1, 10):
-        wall.on_step(step, 3, None)
+        listener.step = listener.turn = step
+        wall.on_step(None)
     boards_at = [at for name, at in listener.rows if name == "wall/boards"]
     assert boards_at == [{"step": [step], "episode": [3], "frame": [12]} for step in (1, 4, 7)]
-    assert listener.live_only == [True] * 3
+    assert listener.live_only == [True] * 6
 
 
 def test_the_numbers_of_an_evaluation_are_means_with_their_interval_over_replicas():

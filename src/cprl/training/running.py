@@ -69,7 +69,6 @@ from cprl.training.outcome import (
 from cprl.training.training import Training, check_callbacks, train
 from cprl.values import Custom, Range, checked, made, trust
 from cprl.viewer.page import check_watch
-from cprl.viewer.page import linger as stay_served
 
 if TYPE_CHECKING:
     from cprl.viewer.callback import ViewerCallback
@@ -176,7 +175,7 @@ def run(
             if hasattr(callback, "on_finished"):
                 callback.on_finished(directory)
         if linger and viewer is not None:
-            stay_served(viewer.logger, viewer.play_on)
+            viewer.linger()
     return directory
 
 
