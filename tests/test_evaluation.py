@@ -47,9 +47,9 @@ from cprl.evaluation import (
 from cprl.evaluation.evaluate import refuse_unlike
 from cprl.evaluation.lanes import Fresh, Part, Turns, agents_of
 from cprl.measuring.evaluate import evaluate
-from cprl.measuring.metrics import with_unit
 from cprl.measuring.movement import trace
-from cprl.measuring.statistics import agents_without_harvest, over_replicas, social_measures
+from cprl.measuring.played import agents_without_harvest, over_replicas, social_measures
+from cprl.measuring.registry import with_unit
 from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import LaneActor, random_agents

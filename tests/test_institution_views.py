@@ -21,7 +21,7 @@ from cprl.evaluation.evaluate import run_table
 from cprl.evaluation.film import Style, film, film_video
 from cprl.evaluation.film_pictures import EpisodePicture
 from cprl.institutions import Boundaries, GraduatedSanctions, Monitoring, Sanctioner, Tax, Vote
-from cprl.measuring.metrics import reported_by
+from cprl.measuring.registry import reported_by
 from cprl.measuring.statistics import form_for
 from cprl.policies.lanes import random_agents
 from cprl.population import Scripted
@@ -101,7 +101,10 @@ def test_the_lines_of_institutions_are_each_replica_their_mean_and_its_running_m
     _, logged = column(path, "institutions/violations", "Scalars:scalars", "episode")
     for number, line in enumerate(logged):
         episodes = [episode for episode in seen.episodes if episode.episode == number]
-        each = [episode.institutions["violations"] for episode in sorted(episodes, key=lambda one: one.world)]
+        each = [
+            episode.metrics["institutions/violations"]
+            for episode in sorted(episodes, key=lambda one: one.world)
+        ]
         assert line[:3] == [*each, np.mean(each)]
     assert len(logged[0]) == 4
     names = static(path, "institutions/violations", "SeriesLines:names")
@@ -132,11 +135,11 @@ def test_only_games_with_institutions_have_their_tabs(run):
     curves = viewer.logger.curves
     tabs = {
         "Institutions",
-        "Violations of each, turns",
+        "Violations, turns",
         "Fines of each, apples",
         "Transfers to each, apples",
         "Shares of turns, bites, violations, tags",
-        "Equality of net incomes",
+        "Equality of incomes",
         "In force: decision 0",
     }
     assert tabs <= set(names(layout(curves).root_container))
@@ -275,7 +278,7 @@ def test_an_evaluation_reports_institutions(evaluation):
     paid = np.mean([episode.fines[2] for episodes in evaluation.random.values() for episode in episodes])
     assert measures["agent_2/fines"].estimate.value == pytest.approx(paid)
     text = printed(run_table(evaluation))
-    assert "equality of net incomes" in text or measures["institutions/net_equality"].estimate is None
+    assert "equality of incomes" in text or measures["income_equality"].estimate is None
     assert "agent 2: fines, apples" in text
     assert "where one may bite" not in text, "undefined everywhere"
     assert {"fines", "violations", "own_bites", "in_force_0"} <= set(evaluation.table().column_names)

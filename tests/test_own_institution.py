@@ -115,7 +115,7 @@ def test_what_an_own_rule_takes_is_measured_in_a_game_without_institutions(licen
     np.testing.assert_allclose(np.array(table["return"]), income, atol=1e-5)
     measured = cprl.evaluate_run(run, episodes=2, allow=ALLOW).measures("random")
     assert measured["institutions/fines"].estimate.value > 0
-    assert "institutions/net_equality" in measured
+    assert "income_equality" in measured
 
 
 @pytest.mark.integration

@@ -30,10 +30,11 @@ from cprl.evaluation.film import film
 from cprl.experiment import Experiment
 from cprl.measuring import EpisodeTracker
 from cprl.measuring.series import Observer
+from cprl.measuring.windows import last_of, mean_of_worlds, running_mean
 from cprl.policies.lanes import RandomActor
 from cprl.population import Frozen, Learning
 from cprl.runs import loggers
-from cprl.runs.curves import as_curves, last_of, mean_of_worlds, running_mean, worlds_of
+from cprl.runs.curves import as_curves, worlds_of
 from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
 from cprl.runs.recipe import read_recipe, refuse_another_run, resume_command, runs_in, start_run

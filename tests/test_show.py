@@ -19,7 +19,7 @@ from cprl.evaluation.film import play_to_show
 from cprl.evaluation.fresh import fresh_episode
 from cprl.evaluation.show import show
 from cprl.institutions import Boundaries, Monitoring, Punishment, Quota, Tax
-from cprl.measuring.social import SOCIAL
+from cprl.measuring.registry import SOCIAL
 
 COMMONS = presets.game("commons")
 GOVERNED = replace(

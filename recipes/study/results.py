@@ -29,15 +29,9 @@ from cprl.experiment import Experiment
 from cprl.measuring.movement import Trace, overlap, trace
 from cprl.measuring.phases import Phase
 from cprl.measuring.statistics import estimate
+from cprl.measuring.windows import SMOOTHED_EPISODES, running_mean
 from cprl.population import Learning, Scripted, Team, exploration_steps
-from cprl.runs.curves import (
-    SMOOTHED_EPISODES,
-    as_curves,
-    curves_of,
-    episode_reached,
-    phases_of,
-    running_mean,
-)
+from cprl.runs.curves import as_curves, curves_of, episode_reached, phases_of
 from cprl.runs.episodes import read_episodes
 from cprl.runs.files import read_json
 from cprl.runs.recipe import read_recipe

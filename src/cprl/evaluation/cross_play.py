@@ -30,8 +30,9 @@ from cprl.evaluation.evaluate import (
     unit_of_rewards,
 )
 from cprl.evaluation.lanes import Part, Played, Results, Whose, agents_of, fresh_of, more
-from cprl.measuring.metrics import with_unit
-from cprl.measuring.statistics import HOLM, Estimate, Measured, notes_on, starred
+from cprl.measuring.played import Measured, notes_on
+from cprl.measuring.registry import with_unit
+from cprl.measuring.statistics import HOLM, Estimate, starred
 from cprl.system.defaults import Diagonal
 from cprl.system.working import say_how_far, working
 from cprl.terminal import style

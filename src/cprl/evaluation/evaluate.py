@@ -13,10 +13,7 @@ import torch
 from cprl.envs.make_env import stored_game
 from cprl.envs.unwrap import agent_names
 from cprl.evaluation.lanes import Fresh, Part, Played, Results, agents_of, fresh_of, scripted
-from cprl.measuring.metrics import left_out, with_unit
-from cprl.measuring.series import OF_AGENTS, Values
-from cprl.measuring.statistics import (
-    Estimate,
+from cprl.measuring.played import (
     Measured,
     agents_without_harvest,
     by_metric,
@@ -24,8 +21,10 @@ from cprl.measuring.statistics import (
     difference_paired,
     notes_on,
     over_replicas,
-    signed,
 )
+from cprl.measuring.registry import left_out, with_unit
+from cprl.measuring.series import OF_AGENTS, Values
+from cprl.measuring.statistics import Estimate, signed
 from cprl.system.defaults import SEED as SEED
 from cprl.system.working import working
 from cprl.terminal.tables import Cells

@@ -25,15 +25,9 @@ from cprl.envs.make_env import is_playable, make_env, spaces_of
 from cprl.envs.unwrap import clock_of
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import Policy, evaluate
+from cprl.measuring.played import Measured, institution_measures, over_replicas, social_measures
 from cprl.measuring.series import Values
-from cprl.measuring.statistics import (
-    Estimate,
-    Measured,
-    difference,
-    institution_measures,
-    over_replicas,
-    social_measures,
-)
+from cprl.measuring.statistics import Estimate, difference
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
 from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent

@@ -33,7 +33,7 @@ from cprl.evaluation.lanes import Turns, agent_named, board_now, commons_game, r
 from cprl.experiment import presets
 from cprl.measuring import social
 from cprl.measuring.evaluate import Policy
-from cprl.measuring.metrics import title
+from cprl.measuring.registry import title
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import Scripted
 from cprl.runs.episodes import read_rows

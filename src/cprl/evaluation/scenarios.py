@@ -33,8 +33,9 @@ from cprl.evaluation.lanes import (
     scripted,
 )
 from cprl.experiment import presets
-from cprl.measuring.metrics import with_unit
-from cprl.measuring.statistics import HOLM, Estimate, Measured, estimate, notes_on, starred
+from cprl.measuring.played import Measured, notes_on
+from cprl.measuring.registry import with_unit
+from cprl.measuring.statistics import HOLM, Estimate, estimate, starred
 from cprl.population import Frozen, Scripted
 from cprl.system.working import say_how_far, working
 from cprl.terminal import style

@@ -43,8 +43,9 @@ from cprl.evaluation.lanes import (
     place_of,
     shifted,
 )
+from cprl.measuring.played import Measured
 from cprl.measuring.series import Values
-from cprl.measuring.statistics import Estimate, Measured, difference, estimate
+from cprl.measuring.statistics import Estimate, difference, estimate
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.system.working import say_how_far, working
 from cprl.terminal import style

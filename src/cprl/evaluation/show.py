@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from cprl.commons.colours import (
@@ -39,7 +38,7 @@ from cprl.evaluation.film import Filmed, check_titles, play_to_show, titles_of
 from cprl.evaluation.fresh import FreshEpisode, fresh_episodes, say_which
 from cprl.evaluation.lanes import commons_game
 from cprl.measuring.episodes import Episode
-from cprl.measuring.social import equality_of
+from cprl.measuring.social import equality
 from cprl.population import learned
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.system.working import working
@@ -263,7 +262,7 @@ def _turns(board: Map, filmed: Filmed) -> dict[str, NDArray[Any]]:
         "cell": np.stack([moment.row * board.width + moment.col for moment in moments]).astype(np.uint32),
         "pose": pose.astype(np.uint8),
         "harvested": harvested.astype(np.uint32),
-        "equality": equality_of(torch.as_tensor(harvested, dtype=torch.float64)).numpy().astype(np.float32),
+        "equality": equality(harvested).astype(np.float32),
         "beam_first": np.searchsorted(turns, np.arange(len(moments) + 1)).astype(np.uint32),
         "beams": lit.astype(np.uint32),
     }

@@ -7,21 +7,18 @@ from statistics import fmean
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl.envs.unwrap import agent_names
 from cprl.measuring.episodes import Episode
+from cprl.measuring.registry import OF_AGENTS
+from cprl.measuring.windows import Values
 from cprl.system.times import Speed
 
-Values = NDArray[np.float64]
-
-OF_AGENTS: Final = ("fines", "transfers", "violations")
-"""The fields of an episode that are numbers of each agent, where the game has institutions."""
-
-
-OF_GROUP: Final = ("social/", "institutions/")
+INSTITUTIONS: Final = "institutions/"
+"""How the names of metrics begin that are of institutions alone."""
+OF_GROUP: Final = ("social/", INSTITUTIONS)
 """How the names of numbers begin that are of all agents together."""
 STEPS: Final = "time/env_steps"
 SPEED: Final = "time/env_steps_per_s"
@@ -92,6 +89,11 @@ class Observer:
         self._series.load_state_dict(state)
 
 
+def logged(metric: str) -> str:
+    """Return the name by which a metric is logged."""
+    return metric if "/" in metric else f"social/{metric}"
+
+
 def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence[str]) -> dict[str, float]:
     """The numbers of an episode, by the names of docs/metrics.md; NaN where undefined.
 
@@ -99,10 +101,10 @@ def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence
         learning: the numbers of learning in it, by agent index: `agent_0/loss` and so on.
         agents: the agents' names, which replace `agent_0` and so on.
     """
-    numbers = {f"social/{name}": value for name, value in episode.social.items()}
+    metrics = episode.social | episode.of_institutions
+    numbers = {logged(name): value for name, value in metrics.items()}
     for agent, value in zip(agents, episode.return_, strict=True):
         numbers[f"{agent}/return"] = float(value)
-    numbers |= episode.of_institutions
     for name in OF_AGENTS:
         if (values := getattr(episode, name)) is not None:
             numbers |= {f"{agent}/{name}": float(value) for agent, value in zip(agents, values, strict=True)}

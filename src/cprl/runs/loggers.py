@@ -9,7 +9,8 @@ from typing import Any, Final, Self
 
 from torchrl.record.loggers import CSVLogger, Logger, get_logger
 
-from cprl.measuring.series import OF_GROUP, Values, mean_of
+from cprl.measuring.series import OF_GROUP, mean_of
+from cprl.measuring.windows import Values
 
 PACKAGES: Final = ("tensorboard", "wandb")
 """The loggers that have a name, which is that of the package that each needs."""

@@ -24,7 +24,8 @@ from cprl.experiment.experiment import OnNan
 from cprl.keys import Turn
 from cprl.learners.base import Learner
 from cprl.measuring.episodes import Episode, tracker_of
-from cprl.measuring.series import Observer, Values
+from cprl.measuring.series import Observer
+from cprl.measuring.windows import Values
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import Decider
 from cprl.runs.checkpoints import Checkpointer

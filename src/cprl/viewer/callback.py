@@ -8,7 +8,6 @@ from threading import Event
 from types import TracebackType
 from typing import Any, Final, Self
 
-import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
@@ -17,11 +16,11 @@ from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import agent_names, base_env, commons_of
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import Policy
-from cprl.measuring.metrics import reported_by
-from cprl.measuring.series import OF_AGENTS, Observer, Values
+from cprl.measuring.registry import reported_by
+from cprl.measuring.series import Observer
+from cprl.measuring.windows import Values
 from cprl.policies.present import PresentPolicy
-from cprl.runs.curves import as_curves
-from cprl.runs.episodes import metrics_in, read_episodes
+from cprl.runs.episodes import stored_episodes
 from cprl.runs.recipe import rules_of_own
 from cprl.system.output import console
 from cprl.system.process import at_signals
@@ -44,7 +43,7 @@ class ViewerCallback:
     """Logs the metrics of every episode, and the frames of the first world in some episodes.
 
     Views that need what the game does not report are left out: a game without a board has no frames; for
-    metrics see `cprl.measuring.metrics`. One event of the recording names them. With transforms, windows
+    metrics see `cprl.measuring.registry`. One event of the recording names them. With transforms, windows
     show the observations of the `CommonsEnv` itself.
 
     Frames are recorded for every k-th episode of that world, including the first and the last, and for the
@@ -174,7 +173,7 @@ class ViewerCallback:
         self._turn = training.steps // worlds
         again = Observer([self], self.env, worlds=worlds)
         with self.logger.silent():
-            for episode in _stored_episodes(self._run):
+            for episode in stored_episodes(self._run):
                 again.on_episode(episode, {})
         for recording in self._earlier:
             self.logger.do(methodcaller("log_file_from_path", recording), live_only=True)
@@ -273,47 +272,3 @@ class ViewerCallback:
         for view in self._views:
             view.close()
         self.logger.shutdown()
-
-
-def _stored_episodes(run: Path) -> Iterator[Episode]:
-    """The episodes of a run's table in the order in which they ended, without who tagged whom; none without a
-    table."""
-    try:
-        table = read_episodes(run).combine_chunks()
-    except FileNotFoundError:
-        return
-    if not table.num_rows:
-        return
-    columns = {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
-    curves = as_curves(table)
-    agents = int(columns["agent"].max()) + 1
-    metrics = [name for name in metrics_in(table.schema) if not name.startswith("institutions/")]
-    in_force = [name for name in columns if name.startswith("in_force_")]
-    for row in range(0, table.num_rows, agents):
-        replica, number = int(columns["replica"][row]), int(columns["episode"][row])
-
-        def of_agents(name: str, row: int = row) -> Any:
-            return columns[name][row : row + agents].astype(np.float64) if name in columns else None
-
-        def of_all(name: str, row: int = row) -> Any:
-            return int(columns[name][row]) if name in columns else None
-
-        yield Episode(
-            world=int(columns["world"][row]) if "world" in columns else replica,
-            replica=replica,
-            episode=number,
-            steps=int(columns["steps"][row]),
-            terminated=bool(columns["terminated"][row]),
-            return_=of_agents("return"),
-            metrics={name: float(columns[name][row]) for name in metrics},
-            harvest=of_agents("harvest"),
-            stock_left=of_all("stock_left"),
-            depletion_step=of_all("depletion_step"),
-            in_force=np.array([columns[name][row] for name in in_force]) if in_force else None,
-            institutions={
-                name.removeprefix("institutions/"): float(curve[replica, number])
-                for name, curve in curves.items()
-                if name.startswith("institutions/") and number < curve.shape[1]
-            },
-            **{name: of_agents(name) for name in OF_AGENTS},
-        )

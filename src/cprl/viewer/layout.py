@@ -5,7 +5,8 @@
     and the boards of all replicas, or the apples on the board over the turn in all worlds of one
     the live label and whether agents explore, as strips
 
-A new tab is a line of `_tabs`, and a new view a line in one of them.
+Metrics have the plots that `cprl.measuring.registry` says. A new tab is a line of `_tabs`, and a new view a
+line in one of them.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -36,8 +37,17 @@ from cprl.commons.colours import (
 )
 from cprl.commons.decoding import UNSEEN
 from cprl.commons.picture import EMPTY_SITE_COLOUR
-from cprl.measuring.metrics import NAMES, colour, is_own, title
-from cprl.measuring.series import OF_AGENTS, SPEED
+from cprl.measuring.registry import (
+    COLLECTIVE_RETURN,
+    EQUALITY,
+    IN_FORCE,
+    METRICS,
+    SHARE,
+    colour,
+    is_own,
+    title,
+)
+from cprl.measuring.series import INSTITUTIONS, SPEED, logged
 from cprl.viewer.board import OUT_STROKE_CELLS, board_form, board_styles, image_form, mosaic_size
 from cprl.viewer.names import (
     BACKGROUND,
@@ -66,22 +76,8 @@ from cprl.viewer.scene import (
     window_corners,
 )
 
-SHARES: Final = (
-    "violations_per_step",
-    "own_share_of_bites",
-    "detection_rate",
-    "recidivism",
-    "unjust_share_of_tags",
-)
-"""The metrics of institutions that share a plot; only their running means are shown there, as of those of
-net incomes."""
-INCOMES: Final = ("net_equality", "net_equality_within", "net_equality_between")
-PAYMENTS: Final = {
-    "violations": "Violations of each, turns",
-    "fines": "Fines of each, apples",
-    "transfers": "Transfers to each, apples",
-}
-"""The plots of what each agent breaks, pays and gets, by the name of their lines."""
+OVERVIEW: Final = (COLLECTIVE_RETURN, "stock_left")
+"""The metrics that the first tab shows."""
 
 
 def classes(curves: Curves, colour_of: Callable[[int], Colour] = picture_colour) -> Any:
@@ -109,23 +105,21 @@ def styles(curves: Curves) -> dict[str, Any]:
         lines[RETURN] = running(mean, ORANGE, replicas)
         lines[f"{RANDOM_PLAY}/{RETURN}"] = line("random play", GREY)
     for metric in curves.metrics:
-        lines[f"social/{metric}"] = running(mean, colour(metric), replicas)
+        is_alone = bool(metric in METRICS and METRICS[metric].plot)
+        words = METRICS[metric].words if is_alone or metric.startswith(INSTITUTIONS) else mean
+        lines[logged(metric)] = running(words, colour(metric), replicas, is_alone=is_alone)
         lines[f"{RANDOM_PLAY}/{metric}"] = line("random play", GREY)
         lines[f"{EVALUATION}/{metric}"] = line("greedy, evaluated", ORANGE)
-    for name in (f"institutions/{metric}" for metric in curves.institutions):
-        lines[f"{RANDOM_PLAY}/{name}"] = line("random play", GREY)
-        is_alone = name.removeprefix("institutions/") in (*SHARES, *INCOMES)
-        lines[name] = running(NAMES[name][0], colour(name), replicas, is_alone=is_alone)
     for ballot, decided in enumerate(curves.in_force):
         hue = (ORANGE, BLUE, GREEN, PURPLE)[ballot % 4]
-        lines[f"institutions/in_force_{ballot}"] = running(decided, hue, replicas)
+        lines[f"{IN_FORCE}{ballot}"] = running(decided, hue, replicas)
     for agent, name in enumerate(curves.agents):
         hue = line_colour(agent)
         for entity in ("loss", "q", "harvested"):
             lines[f"{name}/{entity}"] = line(name, hue)
         # Equal ones are seen as stripes.
         lines[f"{name}/epsilon"] = line(name, hue, width=1.0 + 2.0 * ((len(curves.agents) - 1 - agent) % 4))
-        for entity in ("return", *(kind for kind in OF_AGENTS if kind in curves.institutions)):
+        for entity in ("return", *curves.of_agents):
             lines[f"{name}/{entity}"] = running(name, hue, replicas=1, is_alone=len(curves.agents) > 4)
     if curves.joint:
         count = len(curves.joint)
@@ -138,7 +132,7 @@ def styles(curves: Curves) -> dict[str, Any]:
         colors=np.array(packed, np.uint32),  # 0xRRGGBBAA
         visible=[state != SETTLED for state in STATES],
     )
-    return lines | dict.fromkeys((NOW, EXPLORING), states)
+    return lines | {NOW: states, EXPLORING: states}
 
 
 def fixed(curves: Curves) -> dict[str, list[Any]]:
@@ -288,38 +282,30 @@ def _strips() -> Any:
 def _overview(curves: Curves, *, live: bool) -> Any:
     """What a newcomer sees: the board large, and beside it what the group gets and leaves."""
     if curves.unit == "apples":
-        gets = _social(curves, "collective_return", is_explained=True)
+        gets = _metric(curves, COLLECTIVE_RETURN, is_explained=True)
     else:
         entities = [RETURN, f"{RANDOM_PLAY}/{RETURN}", f"{EVALUATION}/return"]
         gets = _plot(f"Sum of all returns; {curves.bold}", entities, has_legend=False)
     if not isinstance(curves, Scene):
-        joint = (
-            _plot("Joint actions, share of turns; agent 0 first", [JOINT], share=True)
-            if curves.joint
-            else None
-        )
+        title = "Joint actions, share of turns; agent 0 first"
+        joint = _plot(title, [JOINT] if curves.joint else [], share=True)
         return rrb.Horizontal(rrb.Vertical(gets, _returns(curves)), *_present([joint]), name="Overview")
     board = _board("Live board", curves, origin="exhibition", below=4.2) if live else _board("Board", curves)
-    boards = _social(curves, "survival_steps")
+    boards = _metric(curves, "survival_steps")
     high = 1.0
     if curves.worlds > 1:
         boards = _turns()
         high = 1.4
     elif curves.boards > 1:
         boards = _wall(curves)
-    beside = _present([gets, _social(curves, "stock_left"), boards])
+    beside = _present([gets, _metric(curves, "stock_left"), boards])
     rows = rrb.Vertical(*beside, row_shares=[1.0, 1.0, high][-len(beside) :])
     return rrb.Horizontal(board, rows, column_shares=[3, 2], name="Overview")
 
 
 def _tabs(curves: Curves, *, live: bool) -> list[Any]:
-    """The tabs, with up to six views each; those of which the game has nothing are left out."""
+    """The tabs; what the game has nothing of is left out."""
     agents, several = curves.agents, len(curves.agents) > 1
-    decided = [f"institutions/in_force_{ballot}" for ballot in range(len(curves.in_force))]
-    shares, equalities = (
-        [f"institutions/{name}" for name in names if name in curves.institutions]
-        for names in (SHARES, INCOMES)
-    )
     recorded = None
     windows = None
     visits = None
@@ -332,6 +318,10 @@ def _tabs(curves: Curves, *, live: bool) -> list[Any]:
         wall = _wall(curves) if curves.worlds > 1 else None
         places = boards_of(curves, len(agents))
         visits = _panels(places, "Where agents go in the first replica, by episodes", "visits")
+    alone = [name for name in curves.metrics if name in METRICS and METRICS[name].plot == ""]
+    of_law = [name for name in alone if name.startswith(INSTITUTIONS)]
+    others = [name for name in alone if name not in (*of_law, *OVERVIEW) and (several or name != EQUALITY)]
+    decided = [f"{IN_FORCE}{ballot}" for ballot in range(len(curves.in_force))]
     tabs = {
         "Worlds": [wall],
         "Windows and events" if windows else "Events": [recorded, windows, _events()],
@@ -342,13 +332,9 @@ def _tabs(curves: Curves, *, live: bool) -> list[Any]:
             _tags(len(agents)) if curves.has_tags_between else None,
         ],
         "Institutions": [
-            *(
-                _plot(words, _of(agents, name))
-                for name, words in PAYMENTS.items()
-                if name in curves.institutions
-            ),
-            _plot("Shares of turns, bites, violations, tags", shares, share=True),
-            _plot("Equality of net incomes", equalities, share=True),
+            *(_of_each(curves, name) for name in curves.of_agents),
+            *(_plot(words, entities, share=True) for words, entities in _shared(curves).items()),
+            *(_metric(curves, name) for name in of_law),
             _plot(f"In force: {', '.join(curves.in_force)}", decided),
         ],
         "Learning": [
@@ -357,16 +343,8 @@ def _tabs(curves: Curves, *, live: bool) -> list[Any]:
             _plot("Epsilon, 0 to 1", _of(agents, "epsilon"), share=True),
             _plot("Steps per second", [SPEED]),
         ],
-        "More metrics": [
-            _social(curves, "survival_steps"),
-            _social(curves, "equality", share=True) if several else None,
-            stock,
-            *(
-                _social(curves, name)
-                for name in ("peacefulness", "peace", "efficiency", "sustainability", "yield_share")
-            ),
-        ],
-        "Your metrics": [_social(curves, name) for name in filter(is_own, curves.metrics)],
+        "More metrics": [stock, *(_metric(curves, name) for name in others)],
+        "Your metrics": [_metric(curves, name) for name in filter(is_own, curves.metrics)],
     }
     grids = [
         rrb.Grid(*views, grid_columns=len(views) if len(views) < 4 else ceil(len(views) / 2), name=name)
@@ -374,6 +352,21 @@ def _tabs(curves: Curves, *, live: bool) -> list[Any]:
         if (views := _present(tab))
     ]
     return [_overview(curves, live=live), *grids, _recipe()]
+
+
+def _of_each(curves: Curves, total: str) -> Any:
+    """The plot of what each agent pays, gets or breaks."""
+    words = METRICS[f"{INSTITUTIONS}{total}"].title.replace(" all,", " each,")
+    return _plot(_sentence(words), _of(curves.agents, total))
+
+
+def _shared(curves: Curves) -> dict[str, list[str]]:
+    """The entities of metrics that share a plot, by its title."""
+    plots: dict[str, list[str]] = {}
+    for name in curves.metrics:
+        if name in METRICS and (words := METRICS[name].plot):
+            plots.setdefault(words, []).append(logged(name))
+    return plots
 
 
 def _recipe() -> Any:
@@ -409,13 +402,18 @@ def _returns(curves: Curves) -> Any:
     return _plot(f"Return of each, {_rewards(curves)}", entities)
 
 
-def _social(curves: Curves, metric: str, *, share: bool = False, is_explained: bool = False) -> Any:
+def _metric(curves: Curves, metric: str, *, is_explained: bool = False) -> Any:
     """Return the plot of a metric with the lines of random play and of evaluations, whose name says what the
     bold line is if it is explained; None if the game does not report it."""
-    folders = ("social", RANDOM_PLAY, EVALUATION) if metric in curves.metrics else ()
-    name = metric if is_own(metric) else title(metric)[0].upper() + title(metric)[1:]
+    entities = [logged(metric), f"{RANDOM_PLAY}/{metric}", f"{EVALUATION}/{metric}"]
+    name = metric if is_own(metric) else _sentence(title(metric))
     name += f"; {curves.bold}" if is_explained else ""
-    return _plot(name, [f"{folder}/{metric}" for folder in folders], share=share, has_legend=False)
+    is_share = metric in METRICS and METRICS[metric].unit == SHARE
+    return _plot(name, entities if metric in curves.metrics else [], share=is_share, has_legend=False)
+
+
+def _sentence(words: str) -> str:
+    return words[0].upper() + words[1:]
 
 
 def _plot(name: str, entities: Sequence[str], *, share: bool = False, has_legend: bool = True) -> Any:

@@ -19,7 +19,7 @@ from cprl.commons.colours import GREEN, GREY, GROUND, ORANGE, PALETTE, PURPLE, W
 from cprl.envs.commons_env import CommonsEnv
 from cprl.institutions import Boundaries
 from cprl.measuring.episodes import Episode
-from cprl.measuring.series import Values
+from cprl.measuring.windows import Values
 from cprl.viewer.board import RIM_CELLS
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import DIED, TEXT

@@ -16,8 +16,9 @@ from cprl.commons.game import Game
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.matrix import MatrixGame
 from cprl.envs.unwrap import base_env
-from cprl.measuring.episodes import decisions_of, metrics_of, yield_of
-from cprl.measuring.metrics import FIELDS, METRICS, available, left_out
+from cprl.measuring.episodes import decisions_of, metrics_of
+from cprl.measuring.registry import COLLECTIVE_RETURN, EQUALITY, INCOME, OF_AGENTS, SOCIAL, left_out
+from cprl.measuring.series import INSTITUTIONS
 from cprl.viewer.names import TEXT
 
 MOST_JOINT: Final = 16
@@ -43,12 +44,10 @@ class Curves:
     """The worlds W of each replica."""
     mean_over: int = 10
     """The episodes of a replica whose mean is the bold line, a multiple of W."""
-    metrics: tuple[str, ...] = (*METRICS, "stock_left", "yield_share")
-    """The metrics that the game reports, without the prefix `social/`."""
+    metrics: tuple[str, ...] = tuple(name for name in SOCIAL if name != INCOME)
+    """The metrics that the game reports, and those of the user's own."""
     has_tags: bool = True
     """Whether the game reports who tagged whom."""
-    institutions: tuple[str, ...] = ()
-    """The metrics of institutions that the game reports, without the prefix `institutions/`."""
     in_force: tuple[str, ...] = ()
     """What is decided in an episode, in words, e.g. "the tax rate"."""
     joint: tuple[str, ...] = ()
@@ -63,7 +62,7 @@ class Curves:
     @property
     def has_lorenz(self) -> bool:
         """Whether there is a harvest, and somebody to share it with."""
-        return "equality" in self.metrics and len(self.agents) > 1
+        return EQUALITY in self.metrics and len(self.agents) > 1
 
     @property
     def has_tags_between(self) -> bool:
@@ -72,12 +71,17 @@ class Curves:
 
     @property
     def has_institutions(self) -> bool:
-        return bool(self.institutions or self.in_force)
+        return bool(self.of_agents or self.in_force)
+
+    @property
+    def of_agents(self) -> tuple[str, ...]:
+        """What each agent breaks, pays and gets, by the names of its lines."""
+        return tuple(name for name in OF_AGENTS if f"{INSTITUTIONS}{name}" in self.metrics)
 
     @property
     def unit(self) -> str:
         """Apples, or "return" for the sum of rewards in a game that reports no harvest."""
-        return "apples" if "collective_return" in self.metrics else "return"
+        return "apples" if COLLECTIVE_RETURN in self.metrics else "return"
 
     @property
     def bold(self) -> str:
@@ -123,17 +127,14 @@ def curves_of(
     own: Sequence[str] = (),
 ) -> Curves:
     """Return the numbers of an environment that are plotted, and metrics of the user's own by their names."""
-    metrics = available({**METRICS, "stock_left": FIELDS["stock_left"]}, reported)
-    metrics += ("yield_share",) if yield_of(env) and "harvest" in reported else ()
     game = getattr(base_env(env), "game", None)
     return Curves(
         agents=agents,
         replicas=env.batch_size.numel() // worlds,
         worlds=worlds,
         mean_over=window_of(episodes, worlds=worlds),
-        metrics=(*metrics, *own),
+        metrics=(*metrics_of(env, reported), *own),
         has_tags="tagged_by" in reported,
-        institutions=metrics_of(env, reported),
         in_force=decisions_of(env) if "in_force" in reported else (),
         joint=joint_actions(game) if isinstance(game, MatrixGame) else (),
     )

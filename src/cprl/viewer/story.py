@@ -12,9 +12,9 @@ import numpy as np
 
 from cprl.measuring.episodes import Episode
 from cprl.measuring.now import BEGINS, EXPLORING, Now
-from cprl.measuring.series import Values, mean_of
+from cprl.measuring.series import mean_of
 from cprl.measuring.statistics import Estimate, estimate_if_finite
-from cprl.runs.curves import LAST_EPISODES, rounds_of
+from cprl.measuring.windows import LAST_EPISODES, Values, rounds_of
 from cprl.system.times import CLOCK
 from cprl.viewer import names
 from cprl.viewer.frames import Filming

@@ -15,7 +15,9 @@ from tensordict import TensorDictBase
 
 from cprl import keys
 from cprl.measuring.episodes import Episode
-from cprl.measuring.series import OF_AGENTS, OF_GROUP, STEPS, Recent, Values, mean_of
+from cprl.measuring.registry import OF_AGENTS
+from cprl.measuring.series import OF_GROUP, STEPS, Recent, mean_of
+from cprl.measuring.windows import Values
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import JOINT, RANDOM_PLAY, RETURN
 
@@ -73,9 +75,7 @@ class Plots(View):
     def random_play(self, episodes: Sequence[Episode]) -> None:
         """Sets the lines of random play: the mean of each metric in these episodes, where it is defined."""
         curves = self._logger.curves
-        names = [*curves.metrics, *(f"institutions/{metric}" for metric in curves.institutions)]
-        if curves.unit == "return":
-            names.append(RETURN)
+        names = [*curves.metrics, *([RETURN] if curves.unit == "return" else [])]
         played = [
             {**episode.social, **episode.of_institutions, RETURN: float(episode.return_.sum())}
             for episode in episodes
