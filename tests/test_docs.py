@@ -180,6 +180,19 @@ def test_python_in_the_docs_runs(code, modules, tmp_path, monkeypatch):
         sys.modules.pop(name, None)
 
 
+@pytest.mark.parametrize("library", ["pandas", "polars"])
+def test_other_libraries_read_the_table_of_a_run_as_the_docs_say(library, tmp_path, monkeypatch, capsys):
+    pytest.importorskip(library)
+    (code,) = re.findall(
+        rf"```py\n(import {library}\n.*?)```", (ROOT / "docs/metrics.md").read_text(), re.DOTALL
+    )
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "commons").symlink_to(ROOT / "docs/results/commons")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "docs", "exec"), {"__name__": "docs"})
+    assert "0.878" in capsys.readouterr().out, "the equality of replica 0"
+
+
 @pytest.mark.integration
 def test_the_collector_of_several_processes_runs_as_a_script(tmp_path):
     (code,) = (code for code in codes(ROOT / "docs/studies.md") if '__name__ == "__main__"' in code)

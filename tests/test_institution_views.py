@@ -89,7 +89,8 @@ def whole(tmp_path_factory):
         transforms=(Custom("paying_game:Charges"),),
         evaluation_episodes=2,
     )
-    return cprl.run(experiment, out=tmp_path_factory.mktemp("whole") / "run", allow=ALLOW)
+    cprl.trust(*ALLOW)
+    return cprl.run(experiment, out=tmp_path_factory.mktemp("whole") / "run")
 
 
 def entities(path):
@@ -157,7 +158,8 @@ def test_a_recording_without_institutions_has_nothing_of_them(tmp_path):
 
 @pytest.mark.integration
 def test_a_replay_marks_who_breaks_a_rule_in_its_turn_and_shows_payments(whole, tmp_path):
-    path, episode = film(whole, tmp_path / "replay.rrd", allow=ALLOW)
+    cprl.trust(*ALLOW)
+    path, episode = film(whole, tmp_path / "replay.rrd")
     frames, marks = column(path, "world/violators", "LineStrips2D:strips", "frame")
     assert frames == list(range(episode.steps - 1)), "the last turn has no frame"
     _, texts = column(path, "log", "TextLog:text", "step")
@@ -192,7 +194,8 @@ def test_a_mark_is_a_diamond_around_the_agent(tmp_path):
 
 
 def test_a_film_marks_who_broke_a_rule_since_its_last_picture(whole, tmp_path):
-    path, (episode,) = film_video(whole, tmp_path / "film.gif", allow=ALLOW, style=Style(width=400, every=1))
+    cprl.trust(*ALLOW)
+    path, (episode,) = film_video(whole, tmp_path / "film.gif", style=Style(width=400, every=1))
     assert episode.violations.sum() > 0
     pictures, _ = frames_of(path)
     picture = EpisodePicture(GAME.map, steps=30, width=400)
@@ -237,7 +240,8 @@ def printed(what):
 
 @pytest.fixture(scope="module")
 def evaluation(whole):
-    return evaluate_run(whole, episodes=2, allow=ALLOW)
+    cprl.trust(*ALLOW)
+    return evaluate_run(whole, episodes=2)
 
 
 def test_the_summary_has_a_table_of_institutions(evaluation):

@@ -126,7 +126,6 @@ def evaluate_run(
     greedy: bool = False,
     seed: int = SEED,
     replicas: Sequence[int] = (),
-    allow: Sequence[str] = (),
 ) -> Evaluation:
     """Plays fresh episodes with every replica of a stored run, and with the random policy in the same worlds.
 
@@ -141,15 +140,15 @@ def evaluate_run(
         replicas: the indices of the replicas that play; by default all. A replica's episodes do not depend on
             the others.
     """
-    loaded = opened(run, allow)
+    loaded = opened(run)
     fresh = fresh_of([loaded], episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
     policies = {"trained": agents_of(loaded), "random": [scripted("random")] * loaded.game.agents}
     parts = [Part({"policy": policy}, fresh.play(loaded, agents)) for policy, agents in policies.items()]
     return Evaluation(run=loaded, fresh=fresh, parts=parts)
 
 
-def opened(run: str | Path | LoadedRun, allow: Sequence[str] = ()) -> LoadedRun:
-    return run if isinstance(run, LoadedRun) else load(run, allow=allow)
+def opened(run: str | Path | LoadedRun) -> LoadedRun:
+    return run if isinstance(run, LoadedRun) else load(run)
 
 
 def bars_of(estimates: Iterable[Estimate]) -> tuple[Values, Values]:

@@ -36,7 +36,7 @@ from cprl.system.defaults import SEED
 from cprl.system.process import one_thread
 from cprl.system.working import say_how_far
 from cprl.training.agents import LoadedRun, Population, StoredAgent, in_a_row, load, stored_policies
-from cprl.values import Custom, Positive, Seed, Value, Where, made, refusal, trust
+from cprl.values import Custom, Positive, Seed, Value, Where, made, refusal
 
 Played: TypeAlias = dict[int, list[Episode]]
 """Episodes by the number of the replica."""
@@ -275,7 +275,6 @@ def play_population(
     replicas: int = 8,
     greedy: bool = False,
     seed: int = SEED,
-    allow: Sequence[str] = (),
 ) -> Played:
     """Plays fresh episodes of a population that does not learn.
 
@@ -292,7 +291,6 @@ def play_population(
     Returns:
         Episodes by the index of the replica, 0 to R - 1.
     """
-    trust(*allow)
     place = place_of(where)
     fresh = Fresh(replicas=tuple(range(replicas)), episodes=episodes, seed=seed, greedy=greedy)
     return fresh.play(place, agents_specified(place, agents, fresh))

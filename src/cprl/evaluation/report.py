@@ -3,7 +3,7 @@
 import json
 import re
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from html import escape
 from math import isnan
 from pathlib import Path
@@ -51,7 +51,6 @@ def report(
     *,
     episodes: int = 20,
     seed: int = SEED,
-    allow: Sequence[str] = (),
 ) -> Page:
     """Write one HTML page about a run or a study, which opens from the disk without a network.
 
@@ -75,7 +74,7 @@ def report(
     for name, value, default in (("episodes", episodes, 20), ("seed", seed, SEED)):
         if is_study and value != default:
             raise ValueError(f"{name} is {value}, and {folder} is a study; allowed: of a run alone")
-    text = _of_study(folder) if is_study else _of_run(load(folder, allow=allow), episodes, seed)
+    text = _of_study(folder) if is_study else _of_run(load(folder), episodes, seed)
     page_path.write(text)
     return page_path
 

@@ -200,7 +200,6 @@ def run_scenarios(
     greedy: bool = False,
     seed: int = SEED,
     replicas: Sequence[int] = (),
-    allow: Sequence[str] = (),
 ) -> Scores:
     """Plays scenarios with the agents of a stored run in the focal places, and with random and with greedy
     agents in these places, in the same worlds.
@@ -210,7 +209,7 @@ def run_scenarios(
             default all that it has.
         greedy: whether stored agents take their best action, see `cprl.evaluate_run`.
     """
-    loaded = opened(run, allow)
+    loaded = opened(run)
     check_game(loaded.game)
     everyone = range(loaded.game.agents)
     check_scripted([(Scripted("greedy"), tuple(everyone))], loaded.spaces, loaded.game)

@@ -406,7 +406,7 @@ def _metric(curves: Curves, metric: str, *, is_explained: bool = False) -> Any:
     """Return the plot of a metric with the lines of random play and of evaluations, whose name says what the
     bold line is if it is explained; None if the game does not report it."""
     entities = [logged(metric), f"{RANDOM_PLAY}/{metric}", f"{EVALUATION}/{metric}"]
-    name = metric if is_own(metric) else _sentence(title(metric))
+    name = title(metric) if is_own(metric) else _sentence(title(metric))
     name += f"; {curves.bold}" if is_explained else ""
     is_share = metric in METRICS and METRICS[metric].unit == SHARE
     return _plot(name, entities if metric in curves.metrics else [], share=is_share, has_legend=False)
