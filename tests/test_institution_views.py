@@ -32,9 +32,10 @@ from cprl.terminal.figures import training_curve
 from cprl.terminal.summary import summarise
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.layout import Curves, curves_of, layout, styles
+from cprl.viewer.layout import layout, styles
 from cprl.viewer.pictures import borders, regions_of
 from cprl.viewer.replay import Offences
+from cprl.viewer.scene import Curves, curves_of
 from cprl.viewer.story import in_words
 
 GAME = Game(
@@ -137,11 +138,11 @@ def test_only_games_with_institutions_have_their_tabs(run):
     curves = viewer.logger.curves
     tabs = {
         "Institutions",
-        "Violations of each, turns",
+        "Violations, turns",
         "Fines of each, apples",
         "Transfers to each, apples",
         "Shares of turns, bites, violations, tags",
-        "Equality of net incomes",
+        "Equality of incomes",
         "In force: decision 0",
     }
     assert tabs <= set(names(layout(curves).root_container))
@@ -274,7 +275,9 @@ def test_an_evaluation_reports_institutions(evaluation):
     assert "equality of incomes" in text or measures["income_equality"].estimate is None
     assert "agent 2: fines, apples" in text
     assert "where one may bite" not in text, "undefined everywhere"
-    assert {"fines", "violations", "own_bites", "institutions/in_force_0"} <= set(evaluation.table().column_names)
+    assert {"fines", "violations", "own_bites", "institutions/in_force_0"} <= set(
+        evaluation.table().column_names
+    )
 
 
 def test_the_run_keeps_them_and_the_training_curve_shows_them(whole):

@@ -17,7 +17,8 @@ from cprl.runs.episodes import read_episodes, read_evaluations
 from cprl.runs.recipe import read_recipe
 from cprl.studies import Search, StudyTable
 from cprl.values import OWN_METRICS
-from cprl.viewer.layout import Curves, layout, styles
+from cprl.viewer.layout import layout, styles
+from cprl.viewer.scene import Curves
 
 KEYS = ("policy", "trained_episodes", "replica", "episode")
 SHARE, LOGGER = "one_road_parts:largest_share", "torchrl.record.loggers:CSVLogger"
