@@ -44,6 +44,8 @@ from cprl.measuring.registry import (
     measured,
     reported_by,
 )
+from cprl.measuring.series import Observer
+from cprl.measuring.table import where
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
 from cprl.runs.curves import curves_of
@@ -64,14 +66,13 @@ NO_HARVEST = "collective_return, efficiency, equality, sustainability, harvest (
 def play(env, policy, turns, *, callbacks=(), tracker=None):
     """Steps an environment as a training does; returns the episodes that ended."""
     tracker = tracker or EpisodeTracker(env.batch_size[0], 2)
+    observer = Observer(callbacks, env)
     ended = []
     for turn, batch in enumerate(StepCollector(env, policy), start=1):
-        for callback in callbacks:
-            callback.on_step(batch)
+        observer.on_step(batch)
         for episode in tracker.add(batch):
             ended.append(episode)
-            for callback in callbacks:
-                callback.on_episode(episode, {"agent_0/loss": 0.5})
+            observer.on_episode(episode, {"agent_0/loss": 0.5})
         if turn == turns:
             return ended
     raise AssertionError
@@ -271,8 +272,7 @@ def test_a_recording_of_it_names_its_agents_has_metrics_and_returns_and_says_wha
     events = [text[0] for text in column(path, "log", "TextLog:text")[1]]
     assert events[0] == "matrix begins"
     line = "; ".join(text for text in events if "left out" in text or "(the game reports no" in text)
-    assert NO_HARVEST.replace(" (the", ", the Lorenz curve (the") in line
-    assert "phases and new bests (the game reports no harvest and no in_play)" in line
+    assert NO_HARVEST.replace(" (the", ", new bests, the Lorenz curve (the") in line
     assert "who tagged whom" in line
     assert line.endswith("the board and what agents see (the game reports no board)")
     logged = {chunk.entity_path.strip("/") for chunk in RrdReader(path).stream()}
@@ -311,11 +311,10 @@ def test_the_terminal_shows_it_too(tmp_path, monkeypatch):
     ):
         episodes = play(MatrixGame(2), tit_for_tat, 12, callbacks=[table, bar])
     assert "return 12.5" in output.getvalue()
-    figure = training_curve(tmp_path, title="matrix", random=episodes)
+    played = labelled([({"policy": policy}, 0, episodes) for policy in ("random", "trained")])
+    figure = training_curve(tmp_path, title="matrix", random=where(played, policy="random"))
     assert figure.stat().st_size > 10_000
-    summarise(
-        tmp_path, title="matrix", played={"random": {0: episodes}, "trained": {0: episodes}}, console=console
-    )
+    summarise(tmp_path, title="matrix", played=played, console=console)
     text = output.getvalue()
     assert text.count("left out: collective_return") == 1
     assert re.search(r"survival, steps\s*│\s*5\.\d+ │", text)

@@ -35,9 +35,8 @@ from cprl.measuring.series import numbers_of
 from cprl.policies.lanes import random_agents
 from cprl.runs.curves import as_curves
 from cprl.runs.episodes import OF_INSTITUTIONS as COLUMNS
-from cprl.runs.episodes import EpisodeTable, as_table, read_episodes
+from cprl.runs.episodes import EpisodeTable, as_table, read_episodes, stored_episodes
 from cprl.training import train
-from cprl.viewer.callback import _stored_episodes
 
 NAN = float("nan")
 EVERYTHING = (*OPTIONAL, *OF_INSTITUTIONS)
@@ -234,7 +233,7 @@ def test_a_viewer_that_goes_on_with_a_run_has_the_measures_of_groups(tmp_path):
     (episode,) = played(*an_episode(), institutions=[Levies(groups=((0,), (1,)))])
     with EpisodeTable(tmp_path / "episodes.parquet") as table:
         table.add(episode)
-    (again,) = _stored_episodes(tmp_path)
+    (again,) = stored_episodes(tmp_path)
     assert again.metrics["institutions/income_equality_between"] == pytest.approx(1 - 2 / 30)
     np.testing.assert_equal(again.metrics, episode.metrics)
 

@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from phases import Phase, phases_of
 from planner import harvests
 from published import PublishedExperiment, published_experiment
 
@@ -26,11 +27,10 @@ from cprl.envs.commons_env import CommonsEnv
 from cprl.evaluation.lanes import Agent, agents_of, policies_of, scripted, worlds_of
 from cprl.experiment import Experiment
 from cprl.measuring.movement import Trace, overlap, trace
-from cprl.measuring.phases import Phase
 from cprl.measuring.statistics import estimate
 from cprl.measuring.windows import SMOOTHED_EPISODES, running_mean
 from cprl.population import Learning, Scripted, Team, exploration_steps
-from cprl.runs.curves import as_curves, curves_of, episode_reached, phases_of
+from cprl.runs.curves import as_curves, curves_of, episode_reached
 from cprl.runs.episodes import read_episodes
 from cprl.runs.files import read_json
 from cprl.runs.recipe import read_recipe
