@@ -18,7 +18,6 @@ from statistics import fmean
 
 import torch
 import tyro
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.data import Categorical, LazyTensorStorage, TensorDictReplayBuffer
@@ -34,11 +33,13 @@ from cprl.learners.settings import DQNSettings
 from cprl.learners.transitions import transitions_of
 from cprl.measuring.episodes import Episode, EpisodeTracker
 from cprl.measuring.evaluate import evaluate, mean_return
+from cprl.measuring.series import Observer
+from cprl.measuring.table import where
 from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
 from cprl.population import Learning, exploration_steps
-from cprl.runs.episodes import EpisodeTable
+from cprl.runs.episodes import EpisodeTable, labelled
 from cprl.runs.recipe import start_run
 from cprl.runs.weights import load_weights, save_weights
 from cprl.system.output import printed, say
@@ -78,9 +79,6 @@ class BestWeights:
         self.seed = int(env.worlds.now.seed[0, 0])
         self.path: Path | None = None
         self.best_return, self.best_episode, self._episodes = float("-inf"), -1, 0
-
-    def on_step(self, batch: TensorDictBase) -> None:
-        """Does nothing within an episode."""
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Counts an episode; every `every` episodes evaluates, and saves the weights if they are better."""
@@ -173,10 +171,11 @@ def main(
         network.load_state_dict(load_weights(best.path)["agent_0"])
         played[f"greedy, best (episode {best.best_episode})"] = evaluate(fresh, policy)
     ends = exploration_steps(experiment.agents)
-    figure = training_curve(run, title=title, random=played["random"], exploration_turns=ends)
+    table = labelled(({"policy": name}, 0, episodes) for name, episodes in played.items())
+    random = where(table, policy="random")
+    figure = training_curve(run, title=title, random=random, exploration_turns=ends)
     note = None if best.path else "No best weights: greedy play harvested nothing whenever it was tried"
-    of_one = {name: {0: episodes} for name, episodes in played.items()}  # replica
-    summarise(run, title=title, played=of_one, figure=figure, note=note)
+    summarise(run, title=title, played=table, figure=figure, note=note)
     published = printed([*cprl_here(), "run", "single_basic"])
     say(f"This was a shortened schedule. The published one, with 8 replicas: {published}")
     return run
@@ -199,6 +198,7 @@ def learn(
     # HardUpdate copies at every (interval + 1)-th step, and once when it is made.
     target = HardUpdate(loss, value_network_update_interval=settings.target_every_episodes - 1)
     tracker = EpisodeTracker(1, env.game.agents)
+    observer = Observer(callbacks, env)
     losses = []
     for step, turn in enumerate(StepCollector(env, policy), start=1):
         buffer.extend(transitions_of(0, turn))
@@ -209,8 +209,7 @@ def learn(
             error.backward()
             adam.step()
             losses.append(error.item())
-        for callback in callbacks:
-            callback.on_step(turn)
+        observer.on_step(turn)
         for episode in tracker.add(turn):
             with torch.no_grad():
                 values = network(turn["next", "agents", "observation"][:, 0])
@@ -221,8 +220,7 @@ def learn(
             }
             losses.clear()
             target.step()
-            for callback in callbacks:
-                callback.on_episode(episode, learning)
+            observer.on_episode(episode, learning)
             if episode.episode + 1 == episodes:
                 return
 

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 import tyro
+from phases import FEWEST_EPISODES, METRICS, UNNAMED, find_phases
 
 import cprl
 from cprl.evaluation import (
@@ -24,11 +25,9 @@ from cprl.evaluation import (
     schelling,
     territory_of,
 )
-from cprl.measuring.phases import FEWEST_EPISODES, METRICS, UNNAMED, find_phases
-from cprl.measuring.series import Values
 from cprl.measuring.statistics import estimate
 from cprl.measuring.table import by_replica, where
-from cprl.measuring.windows import running_mean
+from cprl.measuring.windows import Values, running_mean
 from cprl.runs.curves import curves_of
 from cprl.training.agents import LoadedRun, load
 

@@ -16,8 +16,9 @@ from cprl.measuring.episodes import Episode
 from cprl.policies.assignment import AgentPolicies, agent_indices
 from cprl.policies.lanes import LaneActor
 from cprl.viewer.board import centres_of
-from cprl.viewer.layout import APART, BACKGROUND, BAR, GIVEN, HIGH, PAID, decision_panels
 from cprl.viewer.logger import RerunLogger
+from cprl.viewer.names import BACKGROUND, GIVEN, PAID
+from cprl.viewer.scene import APART, BAR, HIGH, decision_panels
 
 ENTITY: Final = "decisions"
 SIGNS: Final = {  # the viewer ends at a sign that its font lacks
