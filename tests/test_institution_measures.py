@@ -29,10 +29,10 @@ from cprl.institutions import (
 from cprl.institutions.law import KINDS
 from cprl.measuring import EpisodeTracker, social
 from cprl.measuring.evaluate import evaluate
-from cprl.measuring.statistics import estimates
-from cprl.measuring.table import numbers_in
 from cprl.measuring.registry import METRICS, OF_INSTITUTIONS, OPTIONAL, left_out, measurable, measured
 from cprl.measuring.series import numbers_of
+from cprl.measuring.statistics import estimates
+from cprl.measuring.table import numbers_in
 from cprl.policies.lanes import random_agents
 from cprl.runs.curves import as_curves
 from cprl.runs.episodes import OF_INSTITUTIONS as COLUMNS

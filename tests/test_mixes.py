@@ -13,9 +13,9 @@ from stored_runs import CORRIDORS, MEADOW, SEED, command, episodes_of, ran, retu
 import cprl
 from cprl import Fresh, Game, Rules, maps
 from cprl.envs.matrix import stag_hunt
-from cprl.evaluation import analyse, draw_egta, pairwise_game, play_empirical_game, play_population, schelling
-from cprl.evaluation.empirical_game import egta_tables
-from cprl.evaluation.lanes import shifted
+from cprl.evaluation import draw_egta, pairwise_game, play_empirical_game, play_population, schelling
+from cprl.evaluation.empirical_game import analyse_games, egta_cells, games_in, mean_of
+from cprl.evaluation.lanes import said, shifted
 from cprl.evaluation.schelling import between_the_ends, candidates, dilemma, margins, payoffs_of
 from cprl.population import Frozen, Scripted
 from cprl.theory import PayoffTable, compositions
@@ -236,29 +236,18 @@ def three(tmp_path_factory):
     return scripted_runs(tmp_path_factory.mktemp("three"), THREE, "greedy", "random")
 
 
-@pytest.fixture(scope="module")
-def made(corridors):
-    """A game of two runs that is played for nothing but its fields, to put payoffs in."""
-    return play_empirical_game(corridors, episodes=1)
+def of_pairs(*matrices):
+    """Games of two agents with these payoffs, [S, S] by replica."""
+    return [PayoffTable.of_pairs(matrix) for matrix in matrices]
 
 
-def with_payoffs(made, names, matrices):
-    """A game of two agents with these payoffs, [S, S] by replica."""
-    run = next(iter(made.runs.values()))
-    return replace(
-        made,
-        runs=dict.fromkeys(names, run),
-        payoffs=np.array([PayoffTable.of_pairs(own).payoffs for own in matrices]),
-        fresh=replace(made.fresh, replicas=tuple(range(len(matrices)))),
-    )
-
-
-def test_payoffs_are_means_over_who_plays_where(made):
+def test_payoffs_are_means_over_who_plays_where(corridors):
     # A greedy agent bites all of its corridor, 2 or 3 apples, whoever plays in the other; others bite none.
-    assert made.payoffs == pytest.approx(np.array([[[2.5, np.nan], [2.5, 0], [np.nan, 0]]] * 2), nan_ok=True)
-    assert made.payoff_table().pure_equilibria == [(2, 0)]
-    assert made.names == ["greedy", "sustainable"]
-    assert not made.is_reduction
+    names, games = games_in(play_empirical_game(corridors, Fresh(episodes=1)))
+    assert names == ["greedy", "sustainable"]
+    payoffs = [game.payoffs for game in games]
+    assert payoffs == pytest.approx(np.array([[[2.5, np.nan], [2.5, 0], [np.nan, 0]]] * 2), nan_ok=True)
+    assert mean_of(games).pure_equilibria == [(2, 0)]
 
 
 def test_each_run_has_each_index_as_often_as_every_other():
@@ -273,50 +262,59 @@ def test_each_run_has_each_index_as_often_as_every_other():
 @pytest.mark.integration
 def test_of_two_agents_crossplay_makes_the_same_game(tmp_path):
     runs = scripted_runs(tmp_path, MEADOW, "greedy", "random")
-    whole = play_empirical_game(runs, episodes=2, seed=SEED)
-    pairs = pairwise_game(cprl.crossplay(runs, episodes=2, seed=SEED))
-    assert pairs.payoffs == pytest.approx(whole.payoffs, nan_ok=True)
-    assert not pairs.is_reduction
+    fresh = Fresh(episodes=2, seed=SEED)
+    _, whole = games_in(play_empirical_game(runs, fresh))
+    pairs = pairwise_game(cprl.crossplay(runs, fresh))
+    for game, of_whole in zip(games_in(pairs)[1], whole, strict=True):
+        assert game.payoffs == pytest.approx(of_whole.payoffs, nan_ok=True)
+    assert said(pairs, "heading").startswith("Empirical game: ")
 
 
 def test_of_more_agents_crossplay_makes_the_reduction(three):
-    whole = play_empirical_game(three, episodes=2, seed=SEED)
-    pairs = pairwise_game(cprl.crossplay(three, episodes=2, seed=SEED))
-    assert (whole.agents, pairs.agents, pairs.of_agents) == (3, 2, 3)
-    assert pairs.is_reduction
-    for place in range(2):
-        assert pairs.payoff_table([place]).pairs == pytest.approx(whole.payoff_table([place]).pairs)
+    fresh = Fresh(episodes=2, seed=SEED)
+    table = play_empirical_game(three, fresh)
+    _, whole = games_in(table)
+    pairs = pairwise_game(cprl.crossplay(three, fresh))
+    names, games = games_in(pairs)
+    assert names == ["greedy", "random"]
+    assert [(game.agents, of_whole.agents) for game, of_whole in zip(games, whole, strict=True)] == [
+        (2, 3)
+    ] * 2
+    assert said(pairs, "heading").startswith("Pairwise reduction of the empirical game: ")
+    for game, of_whole in zip(games, whole, strict=True):
+        assert game.pairs == pytest.approx(of_whole.pairs)
     # 3 (4 - 2) + 2 choices of who plays where, 2 replicas, 2 episodes, 3 agents.
-    assert len(whole.table()) == 8 * 2 * 2 * 3
-    assert "greedy greedy random" in whole.table()["runs"].to_pylist()
+    assert len(table) == 8 * 2 * 2 * 3
+    assert "greedy greedy random" in table["runs"].to_pylist()
+    assert "2 greedy, 1 random" in table["composition"].to_pylist()
 
 
 @pytest.mark.integration
-def test_certainty_is_the_share_of_resampled_replicas(made):
+def test_certainty_is_the_share_of_resampled_replicas():
     pytest.importorskip("open_spiel")
     pytest.importorskip("nashpy")
     # In two of three replicas the second strategy gains 1 over the first whatever the other plays, in the
     # third it loses 1: of the means it gains unless the third is drawn twice or more, with chance 7 / 27.
     gains = np.array([[0.0, 0.0], [1.0, 1.0]])
-    found = analyse(with_payoffs(made, ["a", "b"], [gains, gains, -gains]), resamples=400)
+    found = analyse_games(["a", "b"], of_pairs(gains, gains, -gains), resamples=400)
     assert found.rank.shares == pytest.approx([0, 1], abs=1e-4)
     assert found.pure == pytest.approx({(0, 2): 20 / 27}, abs=0.07)
     assert found.in_support == pytest.approx([7 / 27, 20 / 27], abs=0.07)
     assert (found.shares[1].low, found.shares[1].high) == pytest.approx((0, 1), abs=1e-4)
-    one = analyse(with_payoffs(made, ["a", "b"], [gains]))
+    one = analyse_games(["a", "b"], of_pairs(gains))
     assert np.isnan([one.shares[0].low, *one.pure.values(), *one.in_support]).all()
     assert one.resamples == 0
-    assert all(table.head for table in egta_tables(one))
+    assert all(table.head for table in egta_cells(one))
 
 
 @pytest.mark.integration
 @pytest.mark.parametrize("runs", [2, 3, 4])
-def test_analyses_are_drawn_for_any_number_of_runs(runs, made, tmp_path):
+def test_analyses_are_drawn_for_any_number_of_runs(runs, tmp_path):
     pytest.importorskip("open_spiel")
     pytest.importorskip("nashpy")
     rng = np.random.default_rng(runs)
-    game = with_payoffs(made, [f"run {own}" for own in range(runs)], rng.random((3, runs, runs)))
-    found = analyse(game, resamples=3)
+    names = [f"run {own}" for own in range(runs)]
+    found = analyse_games(names, of_pairs(*rng.random((3, runs, runs))), resamples=3)
     drawn = draw_egta(found, tmp_path / "new" / "game.png")
     height, width, _ = imread(drawn).shape
     assert width > 1000

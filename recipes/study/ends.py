@@ -25,6 +25,9 @@ from cprl.evaluation import (
     schelling,
     territory_of,
 )
+from cprl.evaluation.cross_play import OF_FOCAL
+from cprl.evaluation.exploit import BEST, compared
+from cprl.evaluation.territory import WORDS, number_of
 from cprl.measuring.statistics import estimate
 from cprl.measuring.table import by_replica, where
 from cprl.measuring.windows import Values, running_mean
@@ -43,23 +46,28 @@ def together(values: list[dict[str, Values]]) -> dict[str, str]:
 def fresh(run: LoadedRun, episodes: int) -> dict[str, Values]:
     """Harvests and the like in fresh worlds, and where agents are, beside random play."""
     evaluated = cprl.evaluate_run(run, cprl.Fresh(episodes=episodes))
-    territory = territory_of(run, episodes=episodes)
+    territory = territory_of(run, cprl.Fresh(episodes=episodes))
     numbers = {}
     for name in METRICS:
         for policy in ("trained", "random"):
             means = by_replica(where(evaluated, policy=policy), name)
             numbers[f"{name}, {policy}"] = means["value"].to_numpy()
-    for name in territory.trained.by_replica:
+    for name, words in WORDS.items():
         for policy in ("trained", "random"):
-            numbers[f"{name}, {policy}"] = territory.of(policy).by_replica[name]
+            numbers[f"{words}, {policy}"] = number_of(territory, name, policy)
     return numbers
 
 
 def gains(run: LoadedRun, episodes: int, training_episodes: int) -> dict[str, Values]:
     """What best responses gain that learn as the agent did whose place they take, three for each replica."""
-    plan = plan_responses(run, algorithms=("own",), training_episodes=training_episodes, episodes=episodes)
-    responses = exploitability(plan, run.path.parent / "responses" / run.path.name, progress=False)
-    own, best = responses.returns_of(0)
+    fresh = cprl.Fresh(episodes=episodes)
+    plan = plan_responses(run, fresh, algorithms=("own",), training_episodes=training_episodes)
+    out = run.path.parent / "responses" / run.path.name
+    responses = compared(exploitability(plan, out, progress=False))
+    own, best = (
+        by_replica(where(responses, response=name), OF_FOCAL).sort_by("replica")["value"].to_numpy()
+        for name in ("", BEST)
+    )
     return {"return of agent 0": own, "gain of the best of our responses in its place": best - own}
 
 

@@ -5,11 +5,9 @@ python tests/golden/stored.py KIND FOLDER      writes what that kind of evaluati
 
 import json
 import sys
-from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 from golden import checksum, columns
 
 import cprl
@@ -77,16 +75,23 @@ def scenarios() -> dict[str, object]:
 
 
 def territory() -> dict[str, object]:
-    from cprl.evaluation import territory_of
+    import cprl
+    from cprl.evaluation.territory import WORDS, maps_of, territory_of
+    from cprl.measuring.table import where
 
+    names = {"visits": "visits", "taggings": "tags_by_agent", "tagged_where": "tags_by_cell"}
     found = {}
     for name in ("commons", "two_complex"):
-        played = territory_of(RESULTS / name, episodes=1, replicas=(0, 1))
+        table = territory_of(RESULTS / name, cprl.Fresh(episodes=1, replicas=(0, 1)))
+        board = cprl.load(RESULTS / name).game.map
         for policy in ("trained", "random"):
-            stays = asdict(played.of(policy))
-            numbers = {key: list(map(float, value)) for key, value in stays.pop("by_replica").items()}
-            arrays = {key: checksum(np.asarray(value)) for key, value in stays.items()}
-            found[f"{name}, {policy}"] = {**arrays, **numbers}
+            rows = where(table, policy=policy, agent=0).sort_by("replica")
+            numbers = {words: rows[number].to_pylist() for number, words in WORDS.items()}
+            arrays = {key: maps_of(table, column, policy) for key, column in names.items()}
+            for key in ("visits", "tagged_where"):
+                arrays[key] = arrays[key].reshape(*arrays[key].shape[:2], board.height, board.width)
+            sums = {key: checksum(array) for key, array in arrays.items()}
+            found[f"{name}, {policy}"] = {**sums, **numbers}
     return found
 
 

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from io import BytesIO
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from cprl.commands.flags import NO_DEFAULT, FileFlags, Files, TableFlags, Tables
+from cprl.commands.flags import NO_DEFAULT, ROWS, FileFlags, Files, TableFlags, Tables
 from cprl.commons.published import Variant, check_board
 from cprl.system.defaults import (
     EGTA_RESAMPLES,
@@ -236,27 +236,28 @@ def evaluate(run: Path, /, *, fresh: FreshFlags = Fresh(), files: TableFlags = T
 
 
 def visits(
-    run: Path, /, *, fresh: FreshFlags = Fresh(), figure: Path | None = None, random: bool = False
+    run: Path, /, *, fresh: FreshFlags = Fresh(), files: FileFlags = Files(), random: bool = False
 ) -> None:
     """Lets all replicas of a run play fresh worlds, and prints how far agents keep to cells of their own.
 
+    The figure has a map for each agent of where it spends its time, in the first of the replicas.
+
     Args:
         run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
-        figure: a new .png, .pdf or .svg: a map for each agent of where it spends its time, in the first of
-            the replicas.
         random: draw random agents in the same worlds instead.
     """
-    if random and figure is None:
+    if random and files.figure is None:
         raise ValueError("--random says who is drawn; allowed: with --figure FILE")
-    files = Files(figure=figure)
     _begin(fresh.seed, run, files=files)
 
-    from cprl.evaluation.territory import draw_visits, territory_of, territory_table
+    from cprl.evaluation.territory import draw_visits, territory_cells, territory_of
+    from cprl.training.agents import load
 
-    territory = territory_of(run, **vars(fresh))
-    draw = partial(draw_visits, territory, policy="random" if random else "trained")
-    below = f"Weights: {territory.run.weights_from}"
-    _show(None, files, [territory_table(territory)], below=below, draw=draw)
+    loaded = load(run)
+    table = territory_of(loaded, fresh)
+    policy: Any = "random" if random else "trained"
+    draw = partial(draw_visits, table, loaded.game.map, policy=policy)
+    _show(table, files, [territory_cells(table)], draw=draw)
 
 
 def crossplay(
@@ -362,21 +363,19 @@ def egta(
     from cprl.evaluation.empirical_game import (
         analyse,
         draw_egta,
-        egta_heading,
-        egta_tables,
+        egta_cells,
         pairwise_game,
         play_empirical_game,
     )
     from cprl.theory.solutions import check_extras
 
     check_extras()
-    if pairwise:
-        game = pairwise_game(crossplay(named, **vars(fresh)))
-    else:
-        game = play_empirical_game(named, **vars(fresh))
-    _write(game, files)  # An analysis that fails loses no episodes.
+    game = pairwise_game(crossplay(named, fresh)) if pairwise else play_empirical_game(named, fresh)
+    rows = tuple(path for path in files.out if path.suffix == ROWS)
+    replace(files, out=rows).write(game)  # An analysis that fails loses no episodes.
     analysis = analyse(game, resamples=resamples)
-    _show(None, files, egta_tables(analysis), above=egta_heading(game), draw=partial(draw_egta, analysis))
+    rest = replace(files, out=tuple(path for path in files.out if path not in rows))
+    _show(game, rest, egta_cells(analysis), draw=partial(draw_egta, analysis))
 
 
 def scenarios(
@@ -406,7 +405,7 @@ def scenarios(
 
 @dataclass(frozen=True, kw_only=True)
 class Responses:
-    """Which best responses are trained, and how they are measured."""
+    """Which best responses are trained."""
 
     agents: tuple[int, ...] = (0,)
     """Indices of the agents that are replaced, one at a time; each costs as many trainings."""
@@ -417,12 +416,6 @@ class Responses:
     """Trainings by each algorithm."""
     training_episodes: int | None = None
     """Episodes of each training; by default a quarter of the run's, if somebody learned in it."""
-    replicas: int | None = None
-    """How many of the run's replicas are responded to, the first ones; by default all."""
-    episodes: int = 20
-    """Fresh episodes of each replica to choose a response by, and as many to measure its gain by."""
-    seed: int = SEED
-    """Of the worlds in which gains are measured; responses are chosen by the next seed."""
     device: str = "cpu"
     """Where responses learn, e.g. cpu or cuda:0."""
 
@@ -432,13 +425,16 @@ def exploit(
     /,
     *,
     responses: Annotated[Responses, tyro.conf.arg(name="")] = Responses(),
+    fresh: FreshFlags = Fresh(),
     out: Path | None = None,
     jobs: int | None = None,
     dry_run: bool = False,
 ) -> None:
     """Trains best responses to the agents of a run, and prints what they gain: how exploitable the run is.
 
-    You can stop it; the same command continues, and plays again with what is trained.
+    So many fresh episodes choose a response, in worlds of the next seed, and as many measure what it gains.
+    The replicas that are responded to are 0 and those that follow it. You can stop it; the same command
+    continues, and plays again with what is trained.
 
     Args:
         run: the directory of a run that has ended, or its results.
@@ -446,14 +442,14 @@ def exploit(
         jobs: processes that train at the same time, one for each place and algorithm.
         dry_run: list all trainings and their states; run and write nothing.
     """
-    _begin(responses.seed, run)
+    _begin(fresh.seed, run)
 
     from cprl.commands.studies import StudyOptions, carry_out, executor_of
-    from cprl.evaluation.exploit import TABLE, exploitability_tables, measure, plan_responses
+    from cprl.evaluation.exploit import TABLE, exploitability_cells, measure, plan_responses
     from cprl.studies.study import directory_of
     from cprl.terminal.tables import show
 
-    plan = plan_responses(run, **vars(responses))
+    plan = plan_responses(run, fresh, **vars(responses))
     folder = directory_of(plan.study, plan.out if out is None else out)
     options = StudyOptions(out=folder, jobs=jobs, dry_run=dry_run, figures=False)
     executor_of(options)
@@ -462,7 +458,7 @@ def exploit(
     carry_out(plan.study, options, ["cprl", *sys.argv[1:]])
     if dry_run:
         return
-    show(exploitability_tables(measure(plan, folder)))
+    show(exploitability_cells(measure(plan, folder)))
     say(f"Episodes: {folder / TABLE}")
 
 
@@ -506,9 +502,10 @@ def _show(
 
 def _print_rows(table: "pa.Table") -> None:
     from pyarrow.csv import write_csv
+    from pyarrow.types import is_list
 
     rows = BytesIO()
-    write_csv(table, rows)
+    write_csv(table.select([field.name for field in table.schema if not is_list(field.type)]), rows)
     OUT.write(rows.getvalue().decode())
 
 

@@ -11,8 +11,8 @@ Modules, in the order in which one reads them:
                     analyse: which runs last in it, by alpha-rank, equilibria and replicator dynamics
     scenarios       run_scenarios: a run among named backgrounds that it never met
     territory       territory_of: where the agents of a run go and whom they tag
-    exploit         exploitability: trains best responses, a study; play_responses: what they gain over the
-                    agents whose place they take
+    exploit         exploitability: trains best responses, a study; play_responses, response_gains: what they
+                    gain over the agents whose place they take
     fresh           fresh episodes that are shown, by default a typical one
     film            an episode, every step recorded, or as a GIF or an MP4
     film_pictures   the pictures of a film, and its files
@@ -24,30 +24,20 @@ Modules, in the order in which one reads them:
 """
 
 from cprl.evaluation.cross_play import by_focal_agent, crossplay, draw_gains, gains
-from cprl.evaluation.empirical_game import (
-    Analysis,
-    EmpiricalGame,
-    analyse,
-    draw_egta,
-    pairwise_game,
-    play_empirical_game,
-)
+from cprl.evaluation.empirical_game import Analysis, analyse, draw_egta, pairwise_game, play_empirical_game
 from cprl.evaluation.evaluate import evaluate_run
-from cprl.evaluation.exploit import Exploitability, Plan, exploitability, plan_responses, play_responses
+from cprl.evaluation.exploit import Plan, exploitability, plan_responses, play_responses, response_gains
 from cprl.evaluation.lanes import play_population
 from cprl.evaluation.scenarios import Scenario, advantages, draw_scenarios, run_scenarios, scenarios_of
 from cprl.evaluation.schelling import dilemma, draw_schelling, margins, payoffs_of, schelling
-from cprl.evaluation.territory import Territory, draw_visits, territory_of
+from cprl.evaluation.territory import draw_visits, territory_of
 from cprl.system.defaults import Fresh
 
 __all__ = [
     "Analysis",
-    "EmpiricalGame",
-    "Exploitability",
     "Fresh",
     "Plan",
     "Scenario",
-    "Territory",
     "advantages",
     "analyse",
     "by_focal_agent",
@@ -68,6 +58,7 @@ __all__ = [
     "play_empirical_game",
     "play_population",
     "play_responses",
+    "response_gains",
     "run_scenarios",
     "scenarios_of",
     "schelling",
