@@ -16,7 +16,6 @@ from cprl.commons.game import Game
 from cprl.commons.readable import growth_of, meaning_of, rule_of, tag_of
 from cprl.evaluation.evaluate import evaluate_run
 from cprl.evaluation.fresh import fresh_episode
-from cprl.evaluation.pages import run_table
 from cprl.evaluation.show import Page, page, shown
 from cprl.measuring.registry import INCOME, title, unit
 from cprl.measuring.statistics import Estimate, form_for
@@ -38,6 +37,7 @@ from cprl.system.defaults import SEED, STUDY_TABLE, Fresh
 from cprl.system.output import legible
 from cprl.system.working import working
 from cprl.terminal.figures import training_curve
+from cprl.terminal.summary import compared
 from cprl.terminal.tables import cell, markdown
 from cprl.training.agents import LoadedRun, load
 from cprl.training.course import course_of
@@ -93,7 +93,7 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
         before.append("  \n".join([*facts, f"**{meaning}**"]))
     before.append(f"{learned(run.specs)}, {run.experiment.trained_for}.")
     before.append(run.experiment.own_code)
-    after = ["## Fresh episodes, beside random play", "", *markdown(run_table(played))]
+    after = ["## Fresh episodes, beside random play", "", *markdown(compared(played, "", names={"trained": "run's agents"}))]
     after += [
         "These episodes were played for this page, in other worlds than those above, so that means differ by "
         f"chance. The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`."
