@@ -27,7 +27,7 @@ from cprl.studies.factors import Uniform
 from cprl.studies.status import Status
 from cprl.studies.tables.comparing import Cells, cells, compare, markdown, metrics_of
 from cprl.studies.tables.pooled import pooled_table
-from cprl.studies.tables.sources import circumstances_of, design_of, ending, study_table
+from cprl.studies.tables.sources import circumstances_of, design_of, study_table
 from cprl.studies.tables.table import METADATA, Design, StudyTable
 from cprl.studies.trials import trials_of
 from cprl.terminal.style import WIDTH_IN
@@ -439,37 +439,7 @@ def test_names_in_a_table_in_markdown_are_texts_and_take_one_line():
     assert lines == [f"| {written} | **1** |" for written in names.values()]
 
 
-# Phases
-
-
-FALL = [100] * 20 + [400] * 20
-
-
-@pytest.mark.parametrize(
-    ("course", "agents", "label"),
-    [
-        # Random play gets 100; the peak is 400, a third of its lead over random play is 100.
-        ([100] * 40, 4, "no better"),
-        ([*FALL, *[400] * 40], 4, "harvesting"),
-        ([*FALL, *[290] * 40], 4, "decline"),
-        ([*FALL, *[310] * 40], 4, "harvesting"),
-        ([*FALL, *[90] * 40], 4, "tragedy"),
-        ([*FALL, *[90] * 40], 1, "decline"),
-        # From 80 a quarter of the way back to 400 is 160.
-        ([*FALL, *[80] * 40, *[170] * 40], 4, "recovery"),
-        ([*FALL, *[80] * 40, *[150] * 40], 4, "decline"),
-    ],
-)
-def test_a_short_training_ends_in_the_phase_that_its_last_episodes_say(course, agents, label):
-    assert ending(np.array(course, float), random=100.0, agents=agents) == label
-
-
-def test_a_training_in_many_worlds_ends_as_each_of_its_worlds_does():
-    # Three worlds fall to nothing, in short episodes; in the time of twenty of them the fourth plays one.
-    worlds = np.array([*[0, 1, 2, 3] * 10, *[0, 1, 2] * 20])
-    returns = np.where(worlds == 3, 600.0, [*[100.0] * 20, *[400.0] * 20, *[0.0] * 60])
-    assert ending(returns, random=100.0, agents=4) == "tragedy"
-    assert ending(returns, random=100.0, agents=4, worlds=worlds) == "decline", "600 / 4 is above 95"
+# Windows and endings
 
 
 def test_windows_of_many_worlds_have_as_many_episodes_of_each(tmp_path):

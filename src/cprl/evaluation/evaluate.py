@@ -22,9 +22,9 @@ from cprl.measuring.played import (
     notes_on,
     over_replicas,
 )
-from cprl.measuring.registry import left_out, with_unit
-from cprl.measuring.series import OF_AGENTS, Values
+from cprl.measuring.registry import OF_AGENTS, left_out, with_unit
 from cprl.measuring.statistics import Estimate, signed
+from cprl.measuring.windows import Values
 from cprl.system.defaults import SEED as SEED
 from cprl.system.working import working
 from cprl.terminal.tables import Cells

@@ -26,8 +26,8 @@ from cprl.envs.unwrap import clock_of
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import Policy, evaluate
 from cprl.measuring.played import Measured, institution_measures, over_replicas, social_measures
-from cprl.measuring.series import Values
 from cprl.measuring.statistics import Estimate, difference
+from cprl.measuring.windows import Values
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
 from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent

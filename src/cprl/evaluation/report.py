@@ -18,8 +18,8 @@ from cprl.evaluation.evaluate import evaluate_run, run_table
 from cprl.evaluation.fresh import fresh_episode
 from cprl.evaluation.show import Page, page, shown
 from cprl.measuring.registry import INCOME, title, unit
-from cprl.measuring.series import Values
 from cprl.measuring.statistics import Estimate, form_for
+from cprl.measuring.windows import Values
 from cprl.population import learned
 from cprl.runs.curves import curves_of
 from cprl.studies.results import SUMMARY

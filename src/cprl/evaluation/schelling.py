@@ -44,8 +44,8 @@ from cprl.evaluation.lanes import (
     shifted,
 )
 from cprl.measuring.played import Measured
-from cprl.measuring.series import Values
 from cprl.measuring.statistics import Estimate, difference, estimate
+from cprl.measuring.windows import Values
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.system.working import say_how_far, working
 from cprl.terminal import style

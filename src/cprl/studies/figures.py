@@ -19,6 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize, to_hex
 from matplotlib.ticker import NullLocator
 
+from cprl.measuring.outcome import DECLINE, HARVESTING, NO_BETTER, RECOVERY, TRAGEDY
 from cprl.measuring.registry import bounds
 from cprl.measuring.statistics import Estimate, curve_interval, form_for
 from cprl.measuring.windows import SMOOTHED_EPISODES, running_mean
@@ -35,10 +36,8 @@ from cprl.studies.tables.comparing import (
     metric_title,
     metrics_of,
 )
-from cprl.studies.tables.sources import DECLINE, HARVESTING, NO_BETTER, RECOVERY
 from cprl.studies.tables.table import RANDOM, TRAINING, Design, StudyTable
 from cprl.system.defaults import LAST
-from cprl.terminal.figures import COLOURS as PHASE_COLOURS
 from cprl.terminal.style import (
     CHARACTER,
     DASHES,
@@ -446,14 +445,19 @@ def _draw_courses(
 
 # Maps of two factors
 
-PHASES: Final = {
-    **PHASE_COLOURS,
+ENDINGS: Final = {
+    TRAGEDY: "#f9cdbf",
     HARVESTING: "#c7e9c0",
     RECOVERY: "#c6dbef",
     DECLINE: "#d9c9b6",
     NO_BETTER: "#cfcfcf",
+    "exploration": "#e4e4e4",
+    "combat": "#faecb4",
+    "cultivation": "#e0d4f0",
+    "none of the four patterns": "#ffffff",
 }
-"""Colours of phases, light enough for text before them."""
+"""Colours of how trainings went, light enough for text before them; the last four are phases of 2019 in
+committed tables."""
 _CELL: Final = 4.4
 """The height of a cell in em."""
 _WORD_CHARACTERS: Final = 24
@@ -542,7 +546,7 @@ def phase_diagram(
         wide = (sheet.width_em - 10) / len(_levels_of(grid)[1])
         for name, counts in table.endings.items():
             label, number = next(iter(counts.items()))
-            phases[name] = PHASES[label], f"{wrapped(label, wide)}\n{number} of {sum(counts.values())}"
+            phases[name] = ENDINGS[label], f"{wrapped(label, wide)}\n{number} of {sum(counts.values())}"
         _draw_grid(sheet, axes, grid, factors, phases)
         sheet.title = f"{table.design.name}: phases at the end"
         rules = "; ".join(table.ending_rules)

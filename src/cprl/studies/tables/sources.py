@@ -13,21 +13,13 @@ from numpy.typing import NDArray
 
 from cprl.envs.unwrap import clock_in
 from cprl.experiment import Experiment
-from cprl.measuring.now import LEAST_LOSS, LOST, REGAINED
-from cprl.measuring.phases import FEWEST_EPISODES, UNNAMED
-from cprl.measuring.registry import INCOME, METRICS
-from cprl.measuring.table import Numbers
-from cprl.measuring.windows import (
-    LAST_EPISODES,
-    Values,
-    episodes_after,
-    mean_of_worlds,
-    rounds_of,
-    running_mean,
-)
+from cprl.measuring.outcome import RULE, outcome_of
+from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, METRICS
+from cprl.measuring.table import Numbers, where
+from cprl.measuring.windows import Values, episodes_after, rounds_of
 from cprl.population import any_learns
 from cprl.runs.checkpoints import REPORT
-from cprl.runs.curves import as_curves, phases_of, worlds_of
+from cprl.runs.curves import as_curves, worlds_of
 from cprl.runs.episodes import read_episodes, read_rows
 from cprl.runs.files import read_json
 from cprl.runs.recipe import parts_of, read_recipe
@@ -50,7 +42,6 @@ from cprl.studies.tables.table import (
 )
 from cprl.studies.trials import State, trials_of
 from cprl.system.output import legible
-from cprl.training.course import BELOW_RANDOM, PEAK_EPISODES, PEAK_OVER_RANDOM
 from cprl.values import Positive, checked
 
 REASONS: Final[dict[State, str]] = {
@@ -237,6 +228,7 @@ def _measured(source: Source, window: int) -> _Measured:
     windows: list[dict[tuple[str, str], Windows]] = [{} for _ in range(source.replicas)]
     curves: dict[str, list[dict[str, Values]]] = {}
     worlds: dict[str, list[Numbers]] = {}
+    tables: dict[str, pa.Table] = {}
     for part, name in PARTS.items():
         folder = source.run / "evaluation"
         table = read_episodes(source.run) if name is None else read_rows(folder / f"{name}.parquet")
@@ -245,15 +237,18 @@ def _measured(source: Source, window: int) -> _Measured:
         replica = table["replica"].to_numpy()
         of_replicas = [table.filter(replica == number) for number in range(source.replicas)]
         curves[part] = list(map(as_curves, of_replicas))
+        tables[part] = table
         worlds[part] = [worlds_of(rows)[0] for rows in of_replicas]
         for of_replica, by_name, world in zip(windows, curves[part], worlds[part], strict=True):
             for metric, values in by_name.items():
                 length = window if part == TRAINING or window == 1 else values.shape[1]
                 of_replica[part, metric] = _in_windows(values[0], length, world)
-    phases, rule = _phases(curves, worlds[TRAINING])
+    gained = COLLECTIVE_RETURN if COLLECTIVE_RETURN in curves[RANDOM][0] else INCOME
+    random = float(np.concatenate([by_name[gained][0] for by_name in curves[RANDOM]]).mean())
+    endings = _endings(tables[TRAINING], random, source.replicas)
     episodes = [by_name["return_0"].shape[1] for by_name in curves[TRAINING]]
     made = circumstances_of(source.run)
-    return _Measured(source, windows, phases, rule, made, episodes, _steps_of(source.run))
+    return _Measured(source, windows, endings, RULE, made, episodes, _steps_of(source.run))
 
 
 def _in_windows(values: Values, window: int, world: Numbers) -> Windows:
@@ -419,67 +414,6 @@ def marks(made: Mapping[str, Circumstances]) -> dict[str, str]:
     }
 
 
-HARVESTING, TRAGEDY, DECLINE = "harvesting", "tragedy", "decline"
-RECOVERY, NO_BETTER = "recovery", "no better"
-"""How short trainings end, see `ending`."""
-BY_PHASES: Final = f"the last phase of its course, from {FEWEST_EPISODES:,} episodes on"
-BY_RETURNS: Final = (
-    f"its last {LAST_EPISODES} episodes against its peak and random play ({NO_BETTER}: no mean of "
-    f"{PEAK_EPISODES} episodes reached {PEAK_OVER_RANDOM} times random play)"
-)
-
-
-def _phases(
-    curves: Mapping[str, Sequence[dict[str, Values]]], worlds: Sequence[Numbers]
-) -> tuple[list[str], str]:
-    """In which phase each replica ends, and by which rule; `curves` are those of each, by the parts of the
-    run, `worlds` those of the episodes of training."""
-    training = curves[TRAINING]
-    by_phases = [phases_of(by_name) for by_name in training]
-    if all(phases is not None for phases in by_phases):
-        return [phases[-1].label or UNNAMED for phases in by_phases if phases is not None], BY_PHASES
-    agents = sum(name.startswith("return_") for name in training[0])
-    random = float(np.concatenate([_harvest(by_name) for by_name in curves[RANDOM]]).mean())
-    ends = [
-        ending(_harvest(by_name)[0], random=random, agents=agents, worlds=world)
-        for by_name, world in zip(training, worlds, strict=True)
-    ]
-    return ends, BY_RETURNS
-
-
-def ending(returns: Values, *, random: float, agents: int, worlds: Numbers | None = None) -> str:
-    """In which phase a replica of a short training ends.
-
-    Args:
-        returns: of all agents together by episode, [E].
-        random: the mean of random play.
-        agents: how many there are.
-        worlds: that of each episode, [E], if there are several, which then count alike.
-    """
-    lanes = 1 if worlds is None else len(np.unique(worlds))
-    after = 0
-    if worlds is None or lanes == 1:
-        tens, means = running_mean(returns, PEAK_EPISODES), running_mean(returns, LAST_EPISODES)
-    else:
-        tens, means = (mean_of_worlds(returns, worlds, size) for size in (PEAK_EPISODES, LAST_EPISODES))
-        tens = tens[~np.isnan(means)]
-        means = means[~np.isnan(means)]
-        after = (rounds_of(LAST_EPISODES, lanes) - rounds_of(PEAK_EPISODES, lanes)) * lanes
-    peak, at, last = float(tens.max()), int(tens.argmax()), float(means[-1])
-    low = float(means[min(at + after, len(means) - 1) :].min())
-
-    def is_lost(mean: float) -> bool:
-        return bool(peak - mean >= max(LOST * (peak - random), LEAST_LOSS * peak))
-
-    if peak < PEAK_OVER_RANDOM * random:
-        return NO_BETTER
-    if is_lost(low) and last >= low + REGAINED * (peak - low):
-        return RECOVERY
-    if last <= BELOW_RANDOM * random:
-        return TRAGEDY if agents > 1 else DECLINE
-    return DECLINE if is_lost(last) else HARVESTING
-
-
-def _harvest(curves: Mapping[str, Values]) -> Values:
-    """The collective return, [R, E]; of games without a harvest the return of all agents."""
-    return curves.get("collective_return", curves[INCOME])
+def _endings(training: pa.Table, random: float, replicas: int) -> list[str]:
+    """Return how the training of each replica went, in a word."""
+    return [outcome_of(where(training, replica=one), random=random).word for one in range(replicas)]

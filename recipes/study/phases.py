@@ -1,4 +1,9 @@
-"""Phases of a training: the change points of the social metrics, and labels for the phases between them.
+"""Phases of a training of the study of 2019: change points of the social metrics, labels for the phases
+between them, and how figures draw them.
+
+find_phases   the phases of curves
+phases_of     those of a run, of running means
+draw_bands    behind curves; `draw_strip` above them
 
 In a phase every metric follows a straight line over the episodes; the lines of adjacent phases need not meet.
 The change points minimise the squared error summed over all metrics, each in units of its own standard
@@ -9,12 +14,17 @@ point detection methods" (2020)).
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike, NDArray
 
-from cprl.measuring.series import Values
+from cprl.measuring.windows import SMOOTHED_EPISODES, centres, running_mean
+from cprl.terminal.style import CHARACTER, Sheet
+
+Values = NDArray[np.float64]
 
 PHASES: Final = ("exploration", "tragedy", "combat", "cultivation")
 """The study's names of phases, in its order."""
@@ -183,3 +193,83 @@ def _costs_of_lines(signal: Values, ends: NDArray[np.int64]) -> Values:
         slopes = (by_place - middle * total) ** 2 / places
         costs[: len(starts), last] = (squares - total**2 / size - slopes).sum(1)
     return costs
+
+
+def phases_of(curves: Mapping[str, Values], *, centred: bool = False) -> list[Phase] | None:
+    """Return the phases of a training, of running means over `SMOOTHED_EPISODES`.
+
+    Args:
+        curves: Those of `cprl.runs.curves.curves_of`.
+        centred: Whether an episode is the centre of its running mean; else its first, as in the study.
+
+    Returns:
+        None for a number of episodes that is not in `EPISODES`, a single agent, a game that does not report
+        the metrics, or a metric that is undefined in a whole window.
+    """
+    if not set(METRICS) <= set(curves) or "return_1" not in curves:
+        return None
+    whole = curves["survival_steps"]
+    if whole.shape[1] not in EPISODES:
+        return None
+    smoothed = {name: running_mean(curves[name]) for name in METRICS}
+    if any(np.isnan(means).all(0).any() for means in smoothed.values()):
+        return None
+    at = centres(whole, SMOOTHED_EPISODES)
+    return find_phases(at if centred else at - at[0], smoothed)
+
+
+Bands = Sequence[tuple[float, float, str]]
+"""First episode, last episode and name of each phase."""
+
+COLOURS: Final = {
+    "exploration": "#e4e4e4",
+    "tragedy": "#f9cdbf",
+    "combat": "#faecb4",
+    "cultivation": "#e0d4f0",
+    UNNAMED: "#ffffff",
+}
+"""Light enough for curves before them; the four are apart under deuteranopia too."""
+STRIP: Final = 2.0
+"""The height of a row of a strip in em."""
+
+
+def bands_of(phases: Sequence[Phase]) -> Bands:
+    """Return the phases as bands of a figure."""
+    return [(phase.first, phase.last, phase.label or UNNAMED) for phase in phases]
+
+
+def draw_bands(panel: Axes, bands: Bands) -> None:
+    """Draw phases behind the curves of a panel."""
+    for first, last, name in bands:
+        if name != UNNAMED:  # which is white, and hatched in the strip alone
+            panel.axvspan(first, last, **_look(name, "#e6e6e6"), zorder=0, linewidth=0)
+        panel.axvline(last, color="#999999", linewidth=0.6, zorder=0.5)
+
+
+def add_keys(panel: Axes, *rows: Bands) -> None:
+    """Give a panel an entry for the legend of each phase in these bands, in the study's order."""
+    names = {name for bands in rows for _, _, name in bands}
+    for name in (known for known in COLOURS if known in names):
+        panel.add_patch(Rectangle((0, 0), 0, 0, label=f"phase: {name}", **_look(name, "#999999")))
+
+
+def _look(name: str, edge: str) -> dict[str, Any]:
+    hatch = {"hatch": "///"} if name == UNNAMED else {}
+    return {"facecolor": COLOURS[name], "edgecolor": edge, **hatch}
+
+
+def draw_strip(sheet: Sheet, panel: Axes, rows: Mapping[str, Bands]) -> None:
+    """Draw rows of named blocks into a panel of its own, above that of the curves.
+
+    A name that is wider than its block is left to the legend of the bands.
+    """
+    low, high = panel.get_xlim()
+    for at, bands in enumerate(rows.values()):
+        for first, last, name in bands:
+            panel.barh(at, last - first, left=first, height=0.9, **_look(name, "#777777"))
+            if CHARACTER * len(name) < (last - first) / (high - low) * (sheet.width_em - 8):
+                box = {"facecolor": COLOURS[name], "edgecolor": "none", "pad": 1}
+                panel.text((first + last) / 2, at, name, ha="center", va="center", bbox=box)
+    panel.set(yticks=range(len(rows)), yticklabels=list(rows), ylim=(len(rows) - 0.5, -0.5))
+    panel.tick_params(left=False, bottom=False, labelbottom=False)
+    panel.spines[:].set_visible(False)
