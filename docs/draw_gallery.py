@@ -22,8 +22,8 @@ import tyro
 from cprl import Experiment
 from cprl.commons.picture import world_image
 from cprl.commons.readable import legend_of
-from cprl.evaluation.film import fresh_episode, play_to_show
 from cprl.evaluation.film_pictures import write_gif
+from cprl.evaluation.fresh import fresh_episode, record
 from cprl.evaluation.lanes import commons_game
 from cprl.evaluation.show import about, begins, page, show
 from cprl.population import specs_by_agent
@@ -82,7 +82,7 @@ def main(*, runs: Path | None = None, out: Path = Path(__file__).parent / "galle
         path.unlink(missing_ok=True)
         show(runs / name, path, titles=[title])
         fresh = fresh_episode(runs / name)
-        moments = play_to_show(fresh).moments
+        moments = record(fresh).boards
         shown = [*moments[::EVERY], moments[-1]]
         board = commons_game(fresh.run).map
         pictures = [world_image(board, moment, cell_pixels=CELL_PIXELS) for moment in shown]

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from cprl.experiment import presets
 from cprl.measuring.statistics import Estimate, curve_interval, estimate, holm
-from cprl.runs.curves import as_curves, centres, curves_of, net_of, running_mean
+from cprl.measuring.windows import centres, running_mean
+from cprl.runs.curves import as_curves, curves_of
 from cprl.runs.episodes import read_table
 from cprl.terminal import style
 from cprl.terminal.style import INTERVAL, MEAN, RANDOM_LINE
@@ -40,13 +41,13 @@ NAMES: Final = {
 METRICS: Final = {
     "collective_return": "harvest, apples",
     "equality": "equality of the harvest",
-    "net": "income, apples",
+    "income": "income, apples",
     "income_equality": "equality of income",
     "sustainability": "sustainability, steps",
     "survival_steps": "survival, steps",
     "peacefulness": "peacefulness, steps",
 }
-WITHOUT_MONEY: Final = {"net": "collective_return", "income_equality": "equality"}
+WITHOUT_MONEY: Final = {"income": "collective_return", "income_equality": "equality"}
 """By the metric of income: that of the harvest, of which it is a copy where no apple is paid and lost."""
 LAST, SMOOTHED = 30, 10
 """Episodes at the end that are compared; episodes of a running mean."""
@@ -59,8 +60,7 @@ Values = NDArray[np.float64]
 def of_replicas(run: Path) -> dict[str, Values]:
     """The mean of the last episodes of each replica, [R] by metric."""
     curves = curves_of(run)
-    curves["net"] = net_of(curves)
-    curves["income_equality"] = curves.get("institutions/net_equality", curves["equality"])
+    curves.setdefault("income_equality", curves["equality"])
     return {name: np.nanmean(curves[name][:, -LAST:], 1) for name in METRICS}
 
 

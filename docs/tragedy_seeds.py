@@ -10,7 +10,8 @@ import sys
 from pathlib import Path
 
 from cprl.measuring.statistics import Estimate, estimate
-from cprl.runs.curves import as_curves, curves_of, running_mean
+from cprl.measuring.windows import running_mean
+from cprl.runs.curves import as_curves, curves_of
 from cprl.runs.episodes import read_table
 from cprl.training.agents import load
 from cprl.training.course import course_of

@@ -10,7 +10,7 @@ import cprl
 from cprl import presets
 from cprl.algorithms import DQN
 from cprl.population import Learning, Scripted
-from cprl.values import allowing
+from cprl.values import trusting
 
 
 @pytest.fixture(autouse=True)
@@ -23,7 +23,7 @@ def seeded_torch() -> None:
 @pytest.fixture(autouse=True)
 def trusted():
     """What a test allows to be imported is not allowed in the next one."""
-    with allowing(()):
+    with trusting(()):
         yield
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import cprl
 from cprl import Game, Rules, maps, presets
 from cprl.algorithms import DQN
-from cprl.measuring import Episode, social
+from cprl.measuring import Episode
+from cprl.measuring.registry import OPTIONAL, measurable
 from cprl.population import Learning
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.recipe import start_run
@@ -25,6 +26,8 @@ EXPERIMENT = cprl.Experiment(
     seed=7,
 )
 TIME_OUT = "game.rules.freeze_steps"
+
+STORED = measurable(OPTIONAL)[:-1]
 
 
 def an_episode(number, replica, apples, **metrics):
@@ -44,7 +47,7 @@ def an_episode(number, replica, apples, **metrics):
         tagged_by=np.zeros((2, 2), int),
         stock_left=1,
         depletion_step=-1,
-        metrics={**dict.fromkeys(social.METRICS, 0.5), "collective_return": apples, **metrics},
+        metrics={**dict.fromkeys(STORED, 0.5), "collective_return": apples, **metrics},
     )
 
 

@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -30,10 +31,19 @@ from cprl import CommonsEnv, Game, Rules, maps
 from cprl.envs import spaces_of
 from cprl.evaluation.evaluate import run_table
 from cprl.evaluation.lanes import Fresh
-from cprl.measuring import EpisodeTracker, social
+from cprl.measuring import EpisodeTracker
 from cprl.measuring.evaluate import evaluate
-from cprl.measuring.metrics import FIELDS, METRICS, OPTIONAL, available, left_out, reported_by
-from cprl.measuring.statistics import agents_without_harvest, social_measures
+from cprl.measuring.played import agents_without_harvest, social_measures
+from cprl.measuring.registry import (
+    METRICS,
+    NEEDS,
+    OPTIONAL,
+    SOCIAL,
+    left_out,
+    measurable,
+    measured,
+    reported_by,
+)
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
 from cprl.runs.curves import curves_of
@@ -71,6 +81,10 @@ def at_random():
     return AgentPolicies([RandomActor(8), RandomActor(8, seed=1)])
 
 
+STORED = measurable(OPTIONAL)[:-1]
+"""Without the stock that is left, which is a total."""
+
+
 def told(episodes):
     return [repr({**vars(episode), "world": None, "episode": None}) for episode in episodes]
 
@@ -84,21 +98,22 @@ def test_what_a_game_of_torchrl_reports_is_read_from_its_specs():
 
 def test_each_metric_needs_what_is_said_and_nothing_else():
     of_entry = {"harvest": ("harvest", "harvest_steps", "harvest_time"), "in_play": ("in_play_steps",)}
-    totals = {name: torch.rand(4, 2, dtype=torch.float64) for names in of_entry.values() for name in names}
-    steps = torch.full((4,), 9.0, dtype=torch.float64)
-    whole = social.measured(social.SOCIAL, social.Totals(steps=steps, **totals))
-    assert tuple(whole) == social.METRICS == tuple(METRICS)
+    rng = np.random.default_rng(1)
+    totals = {name: rng.random((4, 2)) for names in of_entry.values() for name in names}
+    steps = np.full(4, 9.0)
+    whole = measured({"steps": steps, **totals})
+    assert tuple(whole) == STORED
     for given in ((), ("harvest",), ("in_play",)):
         known = {name: totals[name] for entry in given for name in of_entry[entry]}
-        part = social.measured(social.SOCIAL, social.Totals(steps=steps, **known))
-        assert tuple(part) == available(METRICS, given)
-        assert all(torch.equal(part[name], whole[name]) for name in part)
+        part = measured({"steps": steps, **known})
+        assert tuple(part) == measurable(given)
+        assert all(np.array_equal(part[name], whole[name]) for name in part)
 
 
 def test_what_the_docs_say_is_left_out_is_what_needs_the_entry():
     text = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
     rows = dict(re.findall(r'^\| "(\w+)" \| (.*) \|$', text, re.MULTILINE))
-    needs = {**{name: metric.needs for name, metric in social.SOCIAL.items()}, **FIELDS}
+    needs = {**{name: METRICS[name].entries for name in SOCIAL}, **NEEDS}
     words = {name: set(re.findall(r"\w+", row)) for name, row in rows.items()}
     assert {entry: words[entry] & set(needs) for entry in rows} == {
         entry: {name for name, entries in needs.items() if entry in entries} - {"tagged_by"}
@@ -112,7 +127,7 @@ def test_a_game_that_reports_nothing_but_rewards_has_returns_and_steps():
     assert (first.return_.tolist(), first.steps, first.terminated) == ([4.0, 8.5], 5, False)
     assert (second.return_.tolist(), second.steps, second.world) == ([5.0, 9.5], 6, 1)
     assert first.metrics == {"survival_steps": 5.0}
-    assert [getattr(first, name) for name in FIELDS] == [None] * len(FIELDS)
+    assert [getattr(first, name) for name in NEEDS] == [None] * len(NEEDS)
     assert first.reported == ()
     assert first.outcome == "returns: 4, 8.5"
     line = left_out(first.reported)
@@ -125,7 +140,7 @@ def test_a_game_that_reports_nothing_but_rewards_has_returns_and_steps():
 def test_a_game_with_a_harvest_has_the_metrics_of_harvest():
     (episode,) = play(MatrixGame(1, with_harvest=True), tit_for_tat, 5)
     assert episode.harvest.tolist() == [4.0, 8.5]
-    assert tuple(episode.metrics) == available(METRICS, ["harvest"])
+    assert tuple(episode.metrics) == measurable(["harvest"])
     assert episode.metrics["collective_return"] == 12.5
     assert episode.reported == ("harvest",)
     assert left_out(OPTIONAL) == ""
@@ -176,7 +191,8 @@ def test_its_table_has_the_columns_that_there_are_and_says_what_is_left_out(tmp_
     assert kept.schema.metadata[LEFT_OUT].decode() == left_out(())
     assert kept["return"].to_pylist() == [4.0, 8.5, 5.0, 9.5, 4.0, 8.5, 5.0, 9.5]
     curves = curves_of(tmp_path)
-    assert sorted(curves) == ["return_0", "return_1", "survival_steps"]
+    assert sorted(curves) == ["income", "return_0", "return_1", "survival_steps"]
+    assert curves["income"].tolist() == [[12.5, 12.5], [14.5, 14.5]]
     assert curves["return_1"].tolist() == [[8.5, 8.5], [9.5, 9.5]]
     joined = labelled([({"policy": "a"}, 0, episodes[:2]), ({"policy": "b"}, 0, episodes[2:])])
     assert joined.column_names == ["policy", *columns]
@@ -188,7 +204,7 @@ def test_the_table_of_a_commons_has_all_columns():
     names = [
         (name, kind) for name, kind in COLUMNS.items() if name not in ("wanted_return", "world")
     ]  # of trainings
-    names += [(name, pa.float64()) for name in (*social.METRICS, "yield_share")]
+    names += [(name, pa.float64()) for name in (*STORED, "yield_share")]
     assert table.schema.equals(pa.schema(names), check_metadata=True)
 
 

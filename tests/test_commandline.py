@@ -29,7 +29,7 @@ from cprl.runs.recipe import resume_command, start_run
 from cprl.system import shipped
 from cprl.system.output import Output, console, printed
 from cprl.system.shipped import command_of, cprl_here, import_from, is_shipped, recipe_named, shipped_recipes
-from cprl.values import Custom, allowed, allowing
+from cprl.values import Custom, trusted, trusting
 
 ROOT = Path(__file__).parents[1]
 RECIPES = sorted(
@@ -330,9 +330,9 @@ def runs(monkeypatch):
 
 def test_a_recipe_runs_its_experiment(runs):
     line = ["recipes/mine.py", "--seed", "3", "--out", "here", "--resume", "--allow", "a:B", "--allow", "c:D"]
-    with allowing(()):
+    with trusting(()):
         assert recipe_main(experiment, line) == Path("a run")
-        assert {"a:B", "c:D"} <= set(allowed())
+        assert {"a:B", "c:D"} <= set(trusted())
     ((given, out, how),) = runs
     assert given == replace(experiment(), seed=3)
     assert out == Path("here")
@@ -358,7 +358,7 @@ def test_cprl_run_trains_the_experiment_of_a_recipe_or_resumes_its_run(runs, tmp
         f"{run} --allow my_game:Callback --resume",
     ):
         monkeypatch.setattr(sys, "argv", ["cprl", "run", *words.split()])
-        with allowing(()):
+        with trusting(()):
             cli.main()
     assert all(given == experiment() for given, _, _ in runs)
     assert [(out, how["resume"], how["watch"]) for _, out, how in runs] == [

@@ -17,11 +17,10 @@ from cprl.algorithms import DQN, VDN, DQNSettings, Tabular, TabularSettings
 from cprl.commands.recipe import parse
 from cprl.envs.make_env import make_env
 from cprl.evaluation.film import film, film_video
-from cprl.evaluation.lanes import Turns
 from cprl.evaluation.play import Session, open_session
 from cprl.institutions import Sanctioner, Tax, Vote
 from cprl.institutions.votes import choice_of
-from cprl.measuring.evaluate import evaluate
+from cprl.measuring.evaluate import evaluate, turns
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.decisions import UNTRIED, Bandit, BanditDecider, Decider, choices_of, decision_of
 from cprl.policies.lanes import random_agents
@@ -251,12 +250,14 @@ def test_the_table_of_episodes_says_what_each_agent_decided(in_one_go):
     table = read_episodes(in_one_go).to_pydict()
     assert set(table["decision"]) <= set(range(6))
     assert len(set(table["decision"])) > 2
-    assert cprl.load(in_one_go, allow=ALLOW).experiment == OWN
+    cprl.trust(*ALLOW)
+    assert cprl.load(in_one_go).experiment == OWN
 
 
 def test_agents_of_a_stored_run_decide_by_what_they_learned(in_one_go, tmp_path):
     exported = export_results(in_one_go, tmp_path / "small")
-    loaded = cprl.load(exported, allow=ALLOW)
+    cprl.trust(*ALLOW)
+    loaded = cprl.load(exported)
     for replica in range(2):
         kept = [loaded.decisions[f"replica_{replica}/agent_{agent}"].numpy() for agent in (0, 1)]
         best = [int(own[:2].argmax() + 2 * own[2:].argmax()) for own in kept]
@@ -282,8 +283,9 @@ def test_the_evaluation_after_a_training_begins_with_a_greedy_vote_and_random_pl
 @pytest.mark.integration
 def test_runs_play_with_each_other_as_they_decide(in_one_go, tmp_path):
     other = cprl.run(replace(OWN, seed=8, callbacks=()), tmp_path / "other", watch="off")
-    found = cprl.crossplay([in_one_go, other], episodes=2, allow=ALLOW)
-    first, second = (cprl.load(run, allow=ALLOW).policy(0).decisions.best()[0] for run in (in_one_go, other))
+    cprl.trust(*ALLOW)
+    found = cprl.crossplay([in_one_go, other], episodes=2)
+    first, second = (cprl.load(run).policy(0).decisions.best()[0] for run in (in_one_go, other))
     for episode in found.cell(in_one_go.name, "other").by_agent[1][0]:
         decided = choices_of(episode.decision, (2, 3))
         assert decided[0].tolist() == second[0].tolist()
@@ -294,19 +296,20 @@ def test_runs_play_with_each_other_as_they_decide(in_one_go, tmp_path):
 
 
 def test_films_and_people_who_play_have_decisions(in_one_go, tmp_path, monkeypatch):
-    best = cprl.load(in_one_go, allow=ALLOW).policy(0).decisions.best()[0]
-    _, filmed = film(in_one_go, tmp_path / "film.rrd", allow=ALLOW)
-    _, (drawn,) = film_video(in_one_go, tmp_path / "film.gif", allow=ALLOW)
+    cprl.trust(*ALLOW)
+    best = cprl.load(in_one_go).policy(0).decisions.best()[0]
+    _, filmed = film(in_one_go, tmp_path / "film.rrd")
+    _, (drawn,) = film_video(in_one_go, tmp_path / "film.gif")
     for episode in (filmed, drawn):
         assert choices_of(episode.decision, (2, 3))[:2].tolist() == best[:2].tolist()
-    session = open_session(str(in_one_go), agent=1, decision=5, allow=ALLOW)
+    session = open_session(str(in_one_go), agent=1, decision=5)
     session.act("stay")
     assert session.turn == 1
     with pytest.raises(ValueError, match="decision is 6"):
-        open_session(str(in_one_go), decision=6, allow=ALLOW)
+        open_session(str(in_one_go), decision=6)
     with pytest.raises(ValueError, match="decision is 0"):
         open_session("single_basic", decision=0)
-    open_session(str(in_one_go), allow=ALLOW).act("stay")
+    open_session(str(in_one_go)).act("stay")
 
 
 def test_a_person_who_decides_is_heard():
@@ -326,7 +329,8 @@ def test_a_person_who_decides_is_heard():
 def test_agents_of_an_earlier_run_decide_as_they_did_there(in_one_go, monkeypatch, tmp_path):
     monkeypatch.chdir(in_one_go.parent)
     frozen = [Frozen(in_one_go.name, agent, None) for agent in range(3)]
-    loaded = cprl.load(in_one_go, allow=ALLOW)
+    cprl.trust(*ALLOW)
+    loaded = cprl.load(in_one_go)
     population, _ = trained_for(13, frozen)
     for replica in range(2):
         best = loaded.policy(replica).decisions.best()[0, :2].tolist()
@@ -342,12 +346,12 @@ def test_the_exhibition_decides_beside_the_training_and_leaves_it_alone():
     population = Population(env, OWN.agents, seed=6)
     shown, world = exhibited(OWN, env, population)
     before = repr(population.decisions.state_dict())
-    seen = [tuple(Turns(world, shown).play()[keys.DECISION][0].tolist()) for _ in range(20)]
+    seen = [tuple(next(turns(world, shown))[keys.DECISION][0].tolist()) for _ in range(20)]
     assert len(set(seen)) > 4, "it explores as the training does"
     assert repr(population.decisions.state_dict()) == before
     population.decisions.values[0, :2] = [0.0, 1.0, 0.0, 0.0, 1.0]
     shown.is_trained = True
-    seen = [Turns(world, shown).play()[keys.DECISION][0, :2].tolist() for _ in range(5)]
+    seen = [next(turns(world, shown))[keys.DECISION][0, :2].tolist() for _ in range(5)]
     assert seen == [[5, 5]] * 5
 
 

@@ -16,8 +16,7 @@ from cprl import presets
 from cprl.commands import main as cli
 from cprl.commons.yields import sustainable_yield
 from cprl.institutions import Quota
-from cprl.measuring import institutions, social
-from cprl.measuring.series import OF_AGENTS
+from cprl.measuring.registry import INCOME, INCOME_EQUALITY, METRICS, OF_AGENTS, SOCIAL
 from cprl.runs.episodes import OF_INSTITUTIONS
 
 ROOT = Path(__file__).parents[1]
@@ -62,11 +61,11 @@ def rows_under(heading):
 @pytest.mark.parametrize(
     ("heading", "prefix", "metrics", "others"),
     [
-        ("Social metrics", "social", social.SOCIAL, ["social/stock_left"]),
+        ("Social metrics", "social/", [*(name for name in SOCIAL if name != INCOME), INCOME_EQUALITY], []),
         (
             "Institutions",
-            "institutions",
-            institutions.METRICS,
+            "",
+            [name for name in METRICS if name.startswith("institutions/")],
             ["institutions/in_force_<v>", *(f"agent_<i>/{name}" for name in OF_AGENTS)],
         ),
     ],
@@ -74,14 +73,14 @@ def rows_under(heading):
 def test_the_docs_have_each_metric_with_its_unit(heading, prefix, metrics, others):
     rows = rows_under(f"{heading}, one value per episode")
     units = {name: row[1] for row in rows for name in re.findall(r"`([^`]+)`", row[0])}
-    words = {f"{prefix}/{name}": metric.unit for name, metric in metrics.items()}
+    words = {f"{prefix}{name}": METRICS[name].unit for name in metrics}
     assert set(units) == {*words, *others}
     assert all(words[name] == units[name].replace("0..1", "0 to 1") for name in words)
 
 
 def test_the_docs_have_each_column_of_games_with_institutions():
     columns = [row[0] for row in rows_under("The table of a run")]
-    assert columns == [*OF_INSTITUTIONS, "in_force_<v>"]
+    assert columns == [*OF_INSTITUTIONS, "institutions/in_force_<v>"]
 
 
 def test_the_rules_of_the_readme_have_the_numbers_of_the_page_of_institutions():
@@ -179,6 +178,19 @@ def test_python_in_the_docs_runs(code, modules, tmp_path, monkeypatch):
     exec(compile(code, "docs", "exec"), {"__name__": "docs"})
     for name in modules:
         sys.modules.pop(name, None)
+
+
+@pytest.mark.parametrize("library", ["pandas", "polars"])
+def test_other_libraries_read_the_table_of_a_run_as_the_docs_say(library, tmp_path, monkeypatch, capsys):
+    pytest.importorskip(library)
+    (code,) = re.findall(
+        rf"```py\n(import {library}\n.*?)```", (ROOT / "docs/metrics.md").read_text(), re.DOTALL
+    )
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "commons").symlink_to(ROOT / "docs/results/commons")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "docs", "exec"), {"__name__": "docs"})
+    assert "0.878" in capsys.readouterr().out, "the equality of replica 0"
 
 
 @pytest.mark.integration

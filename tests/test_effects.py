@@ -60,7 +60,7 @@ def grid_of(*factors, **design):
 
 
 GRID = grid_of(("fine", FINES), ("prob", PROBS))
-BOTH = {"collective_return": harvest_of, "net": income_of}
+BOTH = {"collective_return": harvest_of, "income": income_of}
 
 
 def written(table, folder):
@@ -90,8 +90,8 @@ def test_an_interaction_is_the_same_whatever_the_other_factors_are():
     def value(a, b, c, replica):
         return replica + 5 * a + 7 * (a and b == "x") + 100 * c
 
-    table = table_of({"net": value}, conditions, reference="a=False, b=y, c=0.0")
-    found = estimated(table, compare(table, "net")).estimates
+    table = table_of({"income": value}, conditions, reference="a=False, b=y, c=0.0")
+    found = estimated(table, compare(table, "income")).estimates
     by_hand = {
         "a True against False": 5 + 7 / 2,
         "b x against y": 7 / 2,
@@ -106,22 +106,22 @@ def test_an_interaction_is_the_same_whatever_the_other_factors_are():
 def test_effects_are_of_whole_grids_of_paired_replicas_alone():
     assert effects_of(table_of(BOTH, GRID))
     assert not effects_of(table_of(BOTH, dict(list(GRID.items())[1:])))
-    assert not effects_of(table_of({"net": lambda fine, r: r}, grid_of(("fine", FINES))))
+    assert not effects_of(table_of({"income": lambda fine, r: r}, grid_of(("fine", FINES))))
     assert not effects_of(table_of(BOTH, GRID, is_grid=False))
     paired = table_of(BOTH, GRID)
     assert not effects_of(replace(paired, design=replace(paired.design, is_paired=False)))
-    assert effect_cells(table_of({"net": lambda r: r}, {"one": {}, "other": {}})) == []
+    assert effect_cells(table_of({"income": lambda r: r}, {"one": {}, "other": {}})) == []
 
 
 def test_any_contrast_of_conditions_has_an_interval_over_the_replicas_that_have_them():
-    table = table_of({"net": lambda level, r: level * r}, grid_of(("level", (1, 2, 4))))
-    found = contrast(compare(table, "net"), {"level=1": 1.0, "level=2": 1.0, "level=4": -0.5})
+    table = table_of({"income": lambda level, r: level * r}, grid_of(("level", (1, 2, 4))))
+    found = contrast(compare(table, "income"), {"level=1": 1.0, "level=2": 1.0, "level=4": -0.5})
     assert (found.value, found.replicas) == (1.5, REPLICAS), "the mean of r, 0 to 3"
 
 
 def test_so_many_interactions_that_they_would_hide_everything_are_left_out_and_counted():
     conditions = grid_of(("a", range(6)), ("b", range(7)))
-    table = table_of({"net": lambda a, b, r: a + b + r}, conditions, replicas=2)
+    table = table_of({"income": lambda a, b, r: a + b + r}, conditions, replicas=2)
     (found,) = effect_cells(table)
     assert len(found.rows) == 5 + 6
     assert "The 30 interactions of two factors are left out." in found.note
@@ -129,7 +129,9 @@ def test_so_many_interactions_that_they_would_hide_everything_are_left_out_and_c
 
 def test_the_summary_of_a_grid_has_its_effects_with_their_family(tmp_path):
     summary = write_summary(table_of(BOTH, GRID), tmp_path).read_text()
-    assert summary.count("| effect | collective return, apples | return of all agents together |") == 2
+    assert (
+        summary.count("| effect | collective return, apples | income of all agents together, apples |") == 2
+    )
     assert "| fine 4 against 0 | **+11.0 [+9.7, +12.3]** | **-19.0 [-20.3, -17.7]** |" in summary
     assert "Bold: not 0 by Holm's method for the 5 differences of a column (two-sided" in summary
 
@@ -142,7 +144,7 @@ def test_the_answer_of_a_grid_is_about_income_where_money_moves_with_the_harvest
     assert "Holm's method for the 5 effects on a metric" in income
     assert re.search(r"Income of all agents together.*less: fine 4 against 0 -19.0 \[", income, re.DOTALL)
     assert re.search(r"more: fine 4 against 0 \+11.0 \[\+9.7, \+12.3\]", harvest)
-    without = written(table_of({"collective_return": harvest_of, "net": harvest_of}, GRID), tmp_path / "b")
+    without = written(table_of({"collective_return": harvest_of, "income": harvest_of}, GRID), tmp_path / "b")
     assert "Income" not in without
 
 
@@ -182,13 +184,13 @@ def test_a_metric_that_is_another_by_construction_stands_and_counts_once():
     def steps(level, replica):
         return 1000 + 100 * level + replica
 
-    metrics = {"collective_return": steps, "net": steps, "survival_steps": steps, "peacefulness": steps}
+    metrics = {"collective_return": steps, "income": steps, "survival_steps": steps, "peacefulness": steps}
     conditions = grid_of(("level", (0, 1)))
     table = table_of(metrics, conditions)
     assert metrics_of(table) == ("collective_return", "survival_steps")
     levels, differences = compared_cells(table)
     assert levels.note == (
-        "Not shown: return of all agents together is the same as collective return; peacefulness is the same "
+        "Not shown: income of all agents together is the same as collective return; peacefulness is the same "
         "as survival here, in every replica."
     )
     assert "for the 2 differences of this table (two" in differences.note
@@ -211,14 +213,14 @@ def test_a_difference_that_two_columns_have_in_common_is_one_test():
         return harvest(level, replica) - 3 * (level == "penalty")
 
     conditions = {name: {"level": name} for name in ("none", "quota", "penalty")}
-    table = table_of({"collective_return": harvest, "net": income}, conditions)
+    table = table_of({"collective_return": harvest, "income": income}, conditions)
     levels, differences = compared_cells(table)
     assert len(levels.head) == 4
     assert (
         "for the 3 differences of this table, of which those that two columns have in comm"
         in differences.note
     )
-    rounded = {"collective_return": harvest, "net": lambda level, r: harvest(level, r) * (1 + 1e-8)}
+    rounded = {"collective_return": harvest, "income": lambda level, r: harvest(level, r) * (1 + 1e-8)}
     assert metrics_of(table_of(rounded, conditions)) == ("collective_return",), "payments are float32"
 
 
@@ -232,7 +234,7 @@ def test_what_an_institution_took_and_found_stands_beside_and_is_not_tested(tmp_
     assert measures.head == ["condition", "replicas", "fines of all, apples"], "nothing was violated"
     assert measures.rows[-1][2] == "40.0 [40.0, 40.0]"
     assert not [name for name in (*levels.head, *differences.head) if "fines" in name]
-    assert len(compared_cells(table, ["net"])) == 2
+    assert len(compared_cells(table, ["income"])) == 2
     by_condition(table, tmp_path / "levels.svg")
     assert "fines of all" in (tmp_path / "levels.svg").read_text()
 

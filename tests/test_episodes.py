@@ -11,6 +11,7 @@ from torchrl.envs.utils import RandomPolicy
 
 from cprl import CommonsEnv, Game, Map, Rules
 from cprl.measuring import EpisodeTracker, social
+from cprl.measuring.registry import OPTIONAL, measurable
 
 GAME = Game(
     map=Map(height=2, width=4, sites=((0, 0), (0, 1), (1, 3)), starts=((1, 0, 1), (1, 1, 3), (0, 3, 3))),
@@ -108,7 +109,6 @@ def test_an_episode_is_what_we_work_out_by_hand():
         "depletion_step": "2",
         **dict.fromkeys(("fines", "transfers", "violations", "counts", "decision", "in_force"), "None"),
         "wanted_return": "None",
-        "institutions": "{}",
     }
     # collective 3; equality 1 - 2 / (2 * 2 * 3); harvest at steps 1 and 3, and at 3; 5 agent-steps in play
     first_three = {"collective_return": 3.0, "efficiency": 1.0, "equality": 1 - 1 / 6}
@@ -196,7 +196,7 @@ def test_a_yield_adds_its_share_to_the_metrics_and_what_does_not_fit_is_named():
     tracker = EpisodeTracker(1, 2, sustainable_yield=1.5, first_stock=2.5)
     (episode,) = tracker.add(turn(harvest=[[1, 1]], done=[[True]]))
     assert episode.metrics["yield_share"] == 0.5
-    assert list(episode.metrics) == [*social.METRICS, "yield_share"]
+    assert list(episode.metrics) == [*measurable(OPTIONAL)[:-1], "yield_share"]
     tracker = EpisodeTracker(2, 2)
     with pytest.raises(ValueError, match=r"the batch is \[1\]; allowed: \[2\] or \[2, T\]"):
         tracker.add(turn(worlds=1))

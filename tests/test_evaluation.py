@@ -45,11 +45,11 @@ from cprl.evaluation import (
     territory_of,
 )
 from cprl.evaluation.evaluate import refuse_unlike
-from cprl.evaluation.lanes import Fresh, Part, Turns, agents_of
-from cprl.measuring.evaluate import evaluate
-from cprl.measuring.metrics import with_unit
+from cprl.evaluation.lanes import Fresh, Part, agents_of
+from cprl.measuring.evaluate import evaluate, turns
 from cprl.measuring.movement import trace
-from cprl.measuring.statistics import agents_without_harvest, over_replicas, social_measures
+from cprl.measuring.played import agents_without_harvest, over_replicas, social_measures
+from cprl.measuring.registry import with_unit
 from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import LaneActor, random_agents
@@ -198,7 +198,7 @@ def test_an_evaluation_computes_in_one_thread_and_leaves_their_number_as_it_was(
     try:
         evaluate(env, policy)
         trace(env, policy)
-        Turns(env, policy).play()
+        next(turns(env, policy))
         assert set(threads) == {1}
         assert torch.get_num_threads() == 2
     finally:

@@ -26,8 +26,9 @@ from cprl.algorithms import DQN, IQL, MADDPG, PPO, PR2, SAC
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.measuring import phases
 from cprl.measuring.phases import PHASES
+from cprl.measuring.windows import centres
 from cprl.population import Learning, Scripted, Team, exploration_steps
-from cprl.runs.curves import centres, episode_of_turn, phases_of
+from cprl.runs.curves import episode_of_turn, phases_of
 from cprl.terminal import style
 from cprl.terminal.figures import UNNAMED, bands_of, training_curve
 

@@ -26,7 +26,7 @@ from cprl.evaluation.film import Style, film, film_video, titles_of
 from cprl.evaluation.film_pictures import EpisodePicture
 from cprl.evaluation.fresh import fresh_episode
 from cprl.institutions import Monitoring, Quota
-from cprl.values import allowing
+from cprl.values import trusting
 
 LEFT = [5, 3, 2, 0]
 """Apples on the board at the start and after each turn."""
@@ -157,7 +157,7 @@ def test_titles_are_what_tells_runs_apart(runs, tmp_path):
         replace(CORRIDORS, institutions=limits),
         transforms=[Custom("one_road_parts:Gift", {"apples": 0.5})],
     )
-    with allowing(["one_road_parts:Gift"]):
+    with trusting(["one_road_parts:Gift"]):
         assert titles(runs / "greedy", own) == ["No rule", "Quota and monitoring and gift"]
 
 
@@ -227,7 +227,7 @@ def test_a_film_that_is_interrupted_leaves_no_file_and_can_be_made_again(runs, t
 
     with monkeypatch.context() as patch:
         patch.setattr(EpisodePicture, "draw", interrupted)
-        patch.setattr("cprl.evaluation.film._Events.on_step", interrupted)
+        patch.setattr("cprl.evaluation.film.events", interrupted)
         with pytest.raises(KeyboardInterrupt):
             make(runs / "random", tmp_path / name)
     assert list(tmp_path.iterdir()) == []
@@ -260,7 +260,8 @@ def test_what_cannot_be_filmed_is_refused_before_anything_is_played(
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there.gif").touch()
-    monkeypatch.setattr("cprl.evaluation.lanes.Turns.play", lambda *_: pytest.fail("played"))
+    for module in ("film", "fresh"):
+        monkeypatch.setattr(f"cprl.evaluation.{module}.turns", lambda *_: pytest.fail("played"))
     words = [word.format(random=runs / "random", meadow=runs / "meadow") for word in words]
     with pytest.raises(SystemExit, match=said):
         command(monkeypatch, capsys, "film", runs / "random", *words)
@@ -347,7 +348,7 @@ def test_a_csv_has_places_headings_stock_and_what_institutions_take_and_give(tmp
 
 
 def test_an_export_that_is_interrupted_leaves_no_file(runs, tmp_path, monkeypatch):
-    monkeypatch.setattr("cprl.evaluation.lanes.Turns.play", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr("cprl.evaluation.fresh.turns", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         export_episodes(runs / "greedy", tmp_path / "episodes.csv")
     assert not [*tmp_path.iterdir()]

@@ -27,12 +27,11 @@ from cprl.institutions import (
     Vote,
 )
 from cprl.institutions.law import KINDS
-from cprl.measuring import EpisodeTracker, institutions, social
+from cprl.measuring import EpisodeTracker, social
 from cprl.measuring.evaluate import evaluate
-from cprl.measuring.institutions import METRICS
-from cprl.measuring.metrics import OF_INSTITUTIONS, OPTIONAL, left_out
+from cprl.measuring.played import institution_measures, social_measures
+from cprl.measuring.registry import METRICS, OF_INSTITUTIONS, OPTIONAL, left_out, measurable, measured
 from cprl.measuring.series import numbers_of
-from cprl.measuring.statistics import institution_measures, social_measures
 from cprl.policies.lanes import random_agents
 from cprl.runs.curves import as_curves
 from cprl.runs.episodes import OF_INSTITUTIONS as COLUMNS
@@ -41,47 +40,49 @@ from cprl.training import train
 from cprl.viewer.callback import _stored_episodes
 
 NAN = float("nan")
+EVERYTHING = (*OPTIONAL, *OF_INSTITUTIONS)
 GROUPS = ((0, 1), (2, 3))
 # Four agents in one episode of 40 steps.
-HARVEST = torch.tensor([6.0, 2.0, 4.0, 0.0])
-FINES = torch.tensor([2.0, 0.0, 1.0, 0.0])
-TRANSFERS = torch.tensor([0.0, 1.0, 0.0, 2.0])
-IN_PLAY = torch.tensor([10, 10, 8, 4])
-TAGS = torch.tensor([2, 1, 1, 0])
-OF_GROUPS = {name for name in METRICS if name.endswith(("_within", "_between"))}
+HARVEST = np.array([6.0, 2.0, 4.0, 0.0])
+FINES = np.array([2.0, 0.0, 1.0, 0.0])
+TRANSFERS = np.array([0.0, 1.0, 0.0, 2.0])
+IN_PLAY = np.array([10, 10, 8, 4])
+TAGS = np.array([2, 1, 1, 0])
+OF_LAW = [name for name, metric in METRICS.items() if metric.is_of_institutions]
+OF_GROUPS = {name for name in OF_LAW if name.endswith(("_within", "_between"))}
 COUNTED = {
-    "own_bites": torch.tensor([5, 2, 3, 0]),
-    "foreign_bites": torch.tensor([1, 0, 1, 0]),
-    "trespasses": torch.tensor([2, 0, 3, 0]),
-    "excess_bites": torch.tensor([1, 0, 0, 0]),
-    "closed_bites": torch.tensor([0, 0, 2, 0]),
-    "unjust_tags": torch.tensor([1, 0, 0, 0]),
-    "violations": torch.tensor([3, 0, 5, 0]),
-    "detections": torch.tensor([2, 0, 2, 0]),
-    "sanctions": torch.tensor([2, 0, 1, 0]),
-    "returns_to_violation": torch.tensor([1, 0, 3, 0]),
+    "own_bites": np.array([5, 2, 3, 0]),
+    "foreign_bites": np.array([1, 0, 1, 0]),
+    "trespasses": np.array([2, 0, 3, 0]),
+    "excess_bites": np.array([1, 0, 0, 0]),
+    "closed_bites": np.array([0, 0, 2, 0]),
+    "unjust_tags": np.array([1, 0, 0, 0]),
+    "violations": np.array([3, 0, 5, 0]),
+    "detections": np.array([2, 0, 2, 0]),
+    "sanctions": np.array([2, 0, 1, 0]),
+    "returns_to_violation": np.array([1, 0, 3, 0]),
 }
 BY_HAND = {
-    "fines": 3.0,
-    "transfers": 3.0,
-    "violations": 8.0,
-    "violations_per_step": 0.25,  # 8 / (10 + 10 + 8 + 4)
-    "trespasses": 5.0,
-    "excess_bites": 1.0,
-    "closed_bites": 2.0,
-    "own_share_of_bites": 10 / 12,
-    "detection_rate": 0.5,  # 4 of 8
-    "recidivism": 0.5,  # (1 + 3) of 8
-    "sanctions_per_violation": 0.375,  # 3 / 8
-    "unjust_share_of_tags": 0.25,  # 1 of 4
+    "institutions/fines": 3.0,
+    "institutions/transfers": 3.0,
+    "institutions/violations": 8.0,
+    "institutions/violations_per_step": 0.25,  # 8 / (10 + 10 + 8 + 4)
+    "institutions/trespasses": 5.0,
+    "institutions/excess_bites": 1.0,
+    "institutions/closed_bites": 2.0,
+    "institutions/own_share_of_bites": 10 / 12,
+    "institutions/detection_rate": 0.5,  # 4 of 8
+    "institutions/recidivism": 0.5,  # (1 + 3) of 8
+    "institutions/sanctions_per_violation": 0.375,  # 3 / 8
+    "institutions/unjust_share_of_tags": 0.25,  # 1 of 4
     # net incomes 4, 3, 3, 2: gaps of pairs 1 + 1 + 2 + 0 + 1 + 1 = 6, twice; 1 - 12 / (2 * 4 agents * 12)
-    "net_equality": 0.875,
+    "income_equality": 0.875,
     # (6, 2): 1 - 8 / (2 * 2 * 8) = 3/4; (4, 0): 1 - 8 / (2 * 2 * 4) = 1/2
-    "equality_within": 0.625,
-    "equality_between": 5 / 6,  # means 4 and 2: 1 - 4 / (2 * 2 * 6)
+    "institutions/equality_within": 0.625,
+    "institutions/equality_between": 5 / 6,  # means 4 and 2: 1 - 4 / (2 * 2 * 6)
     # (4, 3): 1 - 2 / (2 * 2 * 7) = 13/14; (3, 2): 1 - 2 / (2 * 2 * 5) = 9/10
-    "net_equality_within": (13 / 14 + 9 / 10) / 2,
-    "net_equality_between": 11 / 12,  # means 3.5 and 2.5: 1 - 2 / (2 * 2 * 6)
+    "institutions/income_equality_within": (13 / 14 + 9 / 10) / 2,
+    "institutions/income_equality_between": 11 / 12,  # means 3.5 and 2.5: 1 - 2 / (2 * 2 * 6)
 }
 
 
@@ -90,61 +91,65 @@ def whole(**changes):
         "harvest": HARVEST,
         "fines": FINES,
         "transfers": TRANSFERS,
-        "violations": COUNTED["violations"],
-        "counts": COUNTED,
+        **COUNTED,
         "in_play_steps": IN_PLAY,
         "tags": TAGS,
         "groups": GROUPS,
     }
-    return social.measured(METRICS, social.Totals(**{**given, **changes}))
+    found = measured({**given, **changes})
+    return {name: found[name] for name in OF_LAW if name in found}
 
 
 def test_each_metric_is_what_we_work_out_by_hand():
     metrics = whole()
     assert {name: value.item() for name, value in metrics.items()} == pytest.approx(BY_HAND, rel=1e-15)
-    assert list(metrics) == list(METRICS) == list(BY_HAND)
-    assert all(value.dtype == torch.float64 and value.shape == () for value in metrics.values())
+    assert set(metrics) == set(OF_LAW) == set(BY_HAND)
+    assert all(value.dtype == np.float64 and value.shape == () for value in metrics.values())
 
 
 def test_batch_axes_come_through():
-    twice = {"harvest": torch.stack([HARVEST, 2 * HARVEST]), "fines": torch.stack([FINES, FINES])}
-    twice["transfers"] = torch.stack([TRANSFERS, TRANSFERS])
-    found = whole(**twice, **dict.fromkeys(("violations", "in_play_steps", "counts", "tags")))
+    twice = {"harvest": np.stack([HARVEST, 2 * HARVEST]), "fines": np.stack([FINES, FINES])}
+    twice["transfers"] = np.stack([TRANSFERS, TRANSFERS])
+    found = whole(**twice, **dict.fromkeys((*COUNTED, "in_play_steps", "tags")))
     assert {value.shape for value in found.values()} == {(2,)}
-    assert found["net_equality"][0].item() == BY_HAND["net_equality"]
-    assert found["equality_within"].tolist() == pytest.approx([0.625, 0.625]), "no matter in which unit"
+    assert found["income_equality"][0].item() == BY_HAND["income_equality"]
+    assert found["institutions/equality_within"].tolist() == pytest.approx([0.625, 0.625]), (
+        "no matter in which unit"
+    )
 
 
 def test_where_nothing_happened_shares_are_undefined_and_totals_are_zero():
-    entries = ("harvest", "fines", "transfers", "violations", "in_play_steps", "tags")
-    nothing = torch.zeros(4)
-    found = whole(**dict.fromkeys(entries, nothing), counts=dict.fromkeys(COUNTS, nothing))
+    entries = ("harvest", "fines", "transfers", "in_play_steps", "tags", *COUNTS)
+    found = whole(**dict.fromkeys(entries, np.zeros(4)))
     totals = {"fines", "transfers", "violations", "trespasses", "excess_bites", "closed_bites"}
+    totals = {f"institutions/{name}" for name in totals}
     assert {name for name, value in found.items() if value == 0} == totals
-    assert all(value.isnan() for name, value in found.items() if name not in totals)
+    assert all(np.isnan(value) for name, value in found.items() if name not in totals)
 
 
 def test_edges_of_equality():
-    harvest = torch.tensor([6.0, 2.0, 0.0, 0.0])
+    harvest = np.array([6.0, 2.0, 0.0, 0.0])
     found = whole(harvest=harvest)
-    assert found["equality_within"].item() == 0.75, "a group without income is left out of the mean"
-    assert institutions.equality_within(harvest, GROUPS)[1].isnan()
-    assert found["equality_between"].item() == 0.5, "means 4 and 0: one of two has everything"
-    assert institutions.equality(torch.tensor([3.0, -1.0])).isnan(), "an income below zero"
-    assert institutions.equality(torch.tensor([3.0, 3.0])).item() == 1
-    paid = torch.full((10,), 0.1).double().sum()  # 1.0000000149, a tenth paid ten times in float32
-    assert institutions.net_income(torch.ones(1), paid[None], torch.zeros(1)).tolist() == [0.0]
+    within = found["institutions/equality_within"].item()
+    assert within == 0.75, "a group without income is left out of the mean"
+    assert np.isnan(social.equality(harvest[list(GROUPS[1])]))
+    assert found["institutions/equality_between"].item() == 0.5, "means 4 and 0: one of two has everything"
+    assert np.isnan(social.equality([3.0, -1.0])), "an income below zero"
+    assert social.equality([3.0, 3.0]).item() == 1
+    paid = np.full(10, np.float32(0.1), np.float64).sum()  # 1.0000000149, a tenth paid ten times in float32
+    assert social.incomes_of(np.ones(1), [paid], np.zeros(1)).tolist() == [0.0]
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.integers(0, 50), min_size=1, max_size=6), st.integers(1, 9))
 def test_without_payments_and_in_one_group_of_all_equality_is_that_of_the_harvest(apples, unit):
-    harvest = torch.tensor(apples, dtype=torch.float64) / unit
-    none = torch.zeros_like(harvest)
-    net = institutions.equality(institutions.net_income(harvest, none, none))
-    (within,) = institutions.equality_within(harvest, [range(len(apples))])
-    wanted = social.equality_of(harvest) if any(apples) else torch.tensor(torch.nan)
-    assert net.nan_to_num(-1) == within.nan_to_num(-1) == wanted.nan_to_num(-1)
+    harvest = np.array(apples, np.float64) / unit
+    none = np.zeros_like(harvest)
+    of_income = social.equality(social.incomes_of(harvest, none, none))
+    within = social.equality_within(harvest, [range(len(apples))])
+    wanted = social.equality(harvest)
+    assert np.isnan(wanted) == (not any(apples))
+    assert np.nan_to_num(of_income, nan=-1) == np.nan_to_num(within, nan=-1) == np.nan_to_num(wanted, nan=-1)
 
 
 def paying(*, worlds=1, in_force=None, counted=None, **entries):
@@ -174,6 +179,10 @@ def an_episode():
     )
 
 
+def of_law(episode):
+    return {name: value for name, value in episode.metrics.items() if name in OF_LAW}
+
+
 def played(*turns, **options):
     tracker = EpisodeTracker(turns[0].batch_size[0], 2, **options)
     return [episode for batch in turns for episode in tracker.add(batch)]
@@ -189,14 +198,15 @@ def test_an_episode_has_what_was_paid_broken_counted_and_decided():
     assert episode.in_force.tolist() == [0.25], "that of the first turn"
     assert episode.reported == (*OPTIONAL, *OF_INSTITUTIONS)
     assert left_out(episode.reported) == ""
-    found = episode.institutions
-    assert set(METRICS) - set(found) == OF_GROUPS
-    assert (found["fines"], found["transfers"], found["violations"]) == (2.0, 1.5, 2.0)
-    assert found["violations_per_step"] == 2 / 6, "three turns of two agents"
-    assert (found["own_share_of_bites"], found["detection_rate"], found["recidivism"]) == (0.5, 0.5, 0.0)
-    assert np.isnan(found["unjust_share_of_tags"])
+    found = of_law(episode)
+    assert set(OF_LAW) - set(found) == OF_GROUPS
+    assert [found[f"institutions/{name}"] for name in ("fines", "transfers", "violations")] == [2.0, 1.5, 2.0]
+    assert found["institutions/violations_per_step"] == 2 / 6, "three turns of two agents"
+    shares = ("own_share_of_bites", "detection_rate", "recidivism")
+    assert [found[f"institutions/{name}"] for name in shares] == [0.5, 0.5, 0.0]
+    assert np.isnan(found["institutions/unjust_share_of_tags"])
     # net incomes 4 - 0.5 + 0.75 = 4.25 and 4 - 1.5 + 0.75 = 3.25: 1 - 2 / (2 * 2 * 7.5)
-    assert found["net_equality"] == pytest.approx(1 - 2 / 30)
+    assert found["income_equality"] == pytest.approx(1 - 2 / 30)
     assert episode.metrics["equality"] == 1.0, "of the harvest alone"
 
 
@@ -204,20 +214,20 @@ def test_a_table_has_the_counts_of_the_institutions_that_the_game_has_and_no_oth
     (episode,) = played(*an_episode(), institutions=[Quota(share=0.5, window_steps=10), Monitoring(prob=0.5)])
     table = as_table([episode], 0)
     assert set(COUNTS) & set(table.column_names) == {"excess_bites", "violations", "detections"}
-    of_counts = {name for name, metric in METRICS.items() if "counts" in metric.needs}
+    of_counts = {name for name, metric in METRICS.items() if "counts" in metric.entries}
     curves = as_curves(table)
-    measured = {name.removeprefix("institutions/") for name in curves}
-    assert measured & of_counts == {"excess_bites", "detection_rate"} == of_counts & set(episode.institutions)
+    known = {"institutions/excess_bites", "institutions/detection_rate"}
+    assert set(curves) & of_counts == known == of_counts & set(episode.metrics)
     assert curves["institutions/detection_rate"] == [[0.5]]
 
 
 def test_with_groups_inequality_within_and_between_them_is_measured():
     (episode,) = played(*an_episode(), institutions=[Levies(groups=((0,), (1,)))])
-    assert episode.institutions["net_equality_within"] == 1.0
-    assert episode.institutions["net_equality_between"] == pytest.approx(1 - 2 / 30)
+    assert episode.metrics["institutions/income_equality_within"] == 1.0
+    assert episode.metrics["institutions/income_equality_between"] == pytest.approx(1 - 2 / 30)
     curves = as_curves(as_table([episode], 0))
-    assert {"institutions/equality_between", "institutions/net_equality_within"} <= set(curves)
-    assert curves["institutions/net_equality_between"].item() == pytest.approx(1 - 2 / 30)
+    assert {"institutions/equality_between", "institutions/income_equality_within"} <= set(curves)
+    assert curves["institutions/income_equality_between"].item() == pytest.approx(1 - 2 / 30)
 
 
 def test_a_viewer_that_goes_on_with_a_run_has_the_measures_of_groups(tmp_path):
@@ -225,13 +235,13 @@ def test_a_viewer_that_goes_on_with_a_run_has_the_measures_of_groups(tmp_path):
     with EpisodeTable(tmp_path / "episodes.parquet") as table:
         table.add(episode)
     (again,) = _stored_episodes(tmp_path)
-    assert again.institutions["net_equality_between"] == pytest.approx(1 - 2 / 30)
-    assert not [name for name in again.metrics if "institutions" in name]
+    assert again.metrics["institutions/income_equality_between"] == pytest.approx(1 - 2 / 30)
+    np.testing.assert_equal(again.metrics, episode.metrics)
 
 
 def test_a_game_without_institutions_is_as_it_was():
     (episode,) = played(turn(done=[[True]]))
-    assert (episode.fines, episode.counts, episode.in_force, episode.institutions) == (None, None, None, {})
+    assert (episode.fines, episode.counts, episode.in_force, of_law(episode)) == (None, None, None, {})
     assert not set(as_table([episode], 0).column_names) & set(COLUMNS)
     assert not [name for name in numbers_of(episode, {}, ["a", "b"]) if "institutions" in name]
     assert institution_measures({0: [episode]}) == {}
@@ -287,7 +297,7 @@ def test_a_game_that_pays_without_counting_has_the_metrics_of_payments():
     del batch["next", "agents", "violated"]
     (episode,) = played(batch)
     assert (episode.violations, episode.counts) == (None, None)
-    assert list(episode.institutions) == ["fines", "transfers", "net_equality"]
+    assert list(of_law(episode)) == ["income_equality", "institutions/fines", "institutions/transfers"]
     assert [name for name in as_table([episode], 0).column_names if name in COLUMNS] == ["fines", "transfers"]
 
 
@@ -297,22 +307,23 @@ def test_the_table_has_a_column_for_each_number_and_keeps_it(tmp_path):
         table.add(episode)
     kept = read_episodes(tmp_path)
     of_this = [name for name in COLUMNS if name != "decision"]  # nobody reported one
-    expected = ["terminated", *of_this, "in_force_0", "collective_return"]
+    expected = ["terminated", *of_this, "collective_return"]
     first = kept.column_names.index("terminated")
     assert kept.column_names[first : first + len(expected)] == expected
-    numbers = {"fines": [0.5, 1.5], "violations": [0, 2], "own_bites": [2, 0], "in_force_0": [0.25, 0.25]}
+    numbers = {"fines": [0.5, 1.5], "violations": [0, 2], "own_bites": [2, 0]}
+    numbers["institutions/in_force_0"] = [0.25, 0.25]
     assert kept.select(list(numbers)).to_pydict() == numbers
-    measured = {f"institutions/{name}": [value, value] for name, value in episode.institutions.items()}
-    np.testing.assert_equal(kept.select(list(measured)).to_pydict(), measured)
+    found = {name: [value, value] for name, value in episode.metrics.items()}
+    np.testing.assert_equal(kept.select(list(found)).to_pydict(), found)
     without = as_table(played(turn(done=[[True]])), 0)
-    assert set(kept.column_names) - set(expected) - set(measured) <= set(without.column_names)
+    assert set(kept.column_names) - set(expected) - set(found) <= set(without.column_names)
 
 
 def test_curves_and_logged_numbers_are_those_of_the_episode():
     (episode,) = played(*an_episode())
     curves = as_curves(as_table([episode], 0))
-    for name, value in episode.institutions.items():
-        np.testing.assert_allclose(curves[f"institutions/{name}"], [[value]], err_msg=name)
+    for name, value in episode.metrics.items():
+        np.testing.assert_allclose(curves[name], [[value]], err_msg=name)
     assert curves["institutions/in_force_0"].tolist() == [[0.25]]
     assert not any("inst" in name for name in as_curves(as_table(played(turn(done=[[True]])), 0)))
     numbers = numbers_of(episode, {}, ["ann", "bob"])
@@ -323,7 +334,7 @@ def test_curves_and_logged_numbers_are_those_of_the_episode():
 
 def test_undefined_numbers_are_counted_apart():
     first, second = (played(*an_episode())[0] for _ in range(2))
-    first.institutions["detection_rate"] = NAN
+    first.metrics["institutions/detection_rate"] = NAN
     found = institution_measures({0: [first, second]})
     assert str(found["institutions/detection_rate"]) == "0.50, undefined in 1 of 2"
     assert not any(name.startswith("institutions") for name in social_measures({0: [first]}))
@@ -383,8 +394,9 @@ def test_what_a_game_pays_and_counts_is_what_an_episode_has():
 
 def test_a_game_with_all_institutions_has_all_metrics_and_others_those_that_concern_them():
     (episode, *_), _ = play(GAME, episodes=1)
-    assert list(episode.institutions) == list(METRICS)
-    always = {"fines", "transfers", "violations", "violations_per_step", "net_equality"}
+    assert list(of_law(episode)) == OF_LAW
+    always = {f"institutions/{name}" for name in ("fines", "transfers", "violations", "violations_per_step")}
+    always |= {"income_equality"}
     kinds = {
         Boundaries: {"trespasses", "own_share_of_bites"},
         Quota: {"excess_bites"},
@@ -396,17 +408,19 @@ def test_a_game_with_all_institutions_has_all_metrics_and_others_those_that_conc
         Mediation: {"unjust_share_of_tags"},
     }
     for institution in MANY:
-        assert set(institutions.metrics_for([institution])) == always | kinds[type(institution)]
-    assert "excess_bites" in institutions.metrics_for([Vote(on=Quota(), choices=(0.5, 1.0))])
+        own = kinds[type(institution)]
+        own = {name if name in OF_LAW else f"institutions/{name}" for name in own}
+        assert set(measurable(EVERYTHING, [institution])) & set(OF_LAW) == always | own
+    assert "institutions/excess_bites" in measurable(EVERYTHING, [Vote(on=Quota(), choices=(0.5, 1.0))])
     (taxed, *_), _ = play(dataclasses.replace(GAME, institutions=(Tax(rate=0.5),)), episodes=1)
-    assert set(taxed.institutions) == always
+    assert set(of_law(taxed)) == always
     assert taxed.fines.sum() == pytest.approx(taxed.harvest.sum() / 2)
     assert taxed.in_force is None
     assert {kind for kind in KINDS if not kind.counts} == {Tax, Levies, Vote, Sanctioner, Punishment}
 
 
 def test_trainings_and_evaluations_measure_what_concerns_the_game_behind_transforms():
-    names = {"institutions/net_equality_within", "institutions/own_share_of_bites", "agent_2/fines"}
+    names = {"institutions/income_equality_within", "institutions/own_share_of_bites", "agent_2/fines"}
     undecided = tuple(own for own in MANY if not isinstance(own, Vote))
     game = dataclasses.replace(GAME, institutions=undecided)
     env = TransformedEnv(CommonsEnv(game, 2, seed=2), StepCounter())
@@ -420,4 +434,4 @@ def test_trainings_and_evaluations_measure_what_concerns_the_game_behind_transfo
     train(env, {}, others=agents, episodes=1, callbacks=[Sees()])
     assert names <= set(seen[0])
     first, *_ = evaluate(env, RandomPolicy(env.action_spec))
-    assert "net_equality_between" in first.institutions
+    assert "institutions/income_equality_between" in first.metrics

@@ -21,7 +21,7 @@ from cprl.evaluation.evaluate import run_table
 from cprl.evaluation.film import Style, film, film_video
 from cprl.evaluation.film_pictures import EpisodePicture
 from cprl.institutions import Boundaries, GraduatedSanctions, Monitoring, Sanctioner, Tax, Vote
-from cprl.measuring.metrics import reported_by
+from cprl.measuring.registry import reported_by
 from cprl.measuring.statistics import form_for
 from cprl.policies.lanes import random_agents
 from cprl.population import Scripted
@@ -88,7 +88,8 @@ def whole(tmp_path_factory):
         transforms=(Custom("paying_game:Charges"),),
         evaluation_episodes=2,
     )
-    return cprl.run(experiment, out=tmp_path_factory.mktemp("whole") / "run", allow=ALLOW)
+    cprl.trust(*ALLOW)
+    return cprl.run(experiment, out=tmp_path_factory.mktemp("whole") / "run")
 
 
 def entities(path):
@@ -100,7 +101,10 @@ def test_the_lines_of_institutions_are_each_replica_their_mean_and_its_running_m
     _, logged = column(path, "institutions/violations", "Scalars:scalars", "episode")
     for number, line in enumerate(logged):
         episodes = [episode for episode in seen.episodes if episode.episode == number]
-        each = [episode.institutions["violations"] for episode in sorted(episodes, key=lambda one: one.world)]
+        each = [
+            episode.metrics["institutions/violations"]
+            for episode in sorted(episodes, key=lambda one: one.world)
+        ]
         assert line[:3] == [*each, np.mean(each)]
     assert len(logged[0]) == 4
     names = static(path, "institutions/violations", "SeriesLines:names")
@@ -153,7 +157,8 @@ def test_a_recording_without_institutions_has_nothing_of_them(tmp_path):
 
 @pytest.mark.integration
 def test_a_replay_marks_who_breaks_a_rule_in_its_turn_and_shows_payments(whole, tmp_path):
-    path, episode = film(whole, tmp_path / "replay.rrd", allow=ALLOW)
+    cprl.trust(*ALLOW)
+    path, episode = film(whole, tmp_path / "replay.rrd")
     frames, marks = column(path, "world/violators", "LineStrips2D:strips", "frame")
     assert frames == list(range(episode.steps - 1)), "the last turn has no frame"
     _, texts = column(path, "log", "TextLog:text", "step")
@@ -188,7 +193,8 @@ def test_a_mark_is_a_diamond_around_the_agent(tmp_path):
 
 
 def test_a_film_marks_who_broke_a_rule_since_its_last_picture(whole, tmp_path):
-    path, (episode,) = film_video(whole, tmp_path / "film.gif", allow=ALLOW, style=Style(width=400, every=1))
+    cprl.trust(*ALLOW)
+    path, (episode,) = film_video(whole, tmp_path / "film.gif", style=Style(width=400, every=1))
     assert episode.violations.sum() > 0
     pictures, _ = frames_of(path)
     picture = EpisodePicture(GAME.map, steps=30, width=400)
@@ -233,7 +239,8 @@ def printed(what):
 
 @pytest.fixture(scope="module")
 def evaluation(whole):
-    return evaluate_run(whole, episodes=2, allow=ALLOW)
+    cprl.trust(*ALLOW)
+    return evaluate_run(whole, episodes=2)
 
 
 def test_the_summary_has_a_table_of_institutions(evaluation):
@@ -274,7 +281,7 @@ def test_an_evaluation_reports_institutions(evaluation):
     paid = np.mean([episode.fines[2] for episodes in evaluation.random.values() for episode in episodes])
     assert measures["agent_2/fines"].estimate.value == pytest.approx(paid)
     text = printed(run_table(evaluation))
-    assert "equality of net incomes" in text or measures["institutions/net_equality"].estimate is None
+    assert "equality of incomes" in text or measures["income_equality"].estimate is None
     assert "agent 2: fines, apples" in text
     assert "where one may bite" not in text, "undefined everywhere"
     assert {"fines", "violations", "own_bites", "in_force_0"} <= set(evaluation.table().column_names)

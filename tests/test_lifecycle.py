@@ -158,8 +158,9 @@ def test_a_network_whose_module_is_not_there_is_missed_by_name_and_not_its_weigh
     experiment = replace(FIELD, agents=[Learning(DQN(settings=REPLAY, network=Custom("gone:Net")))] * 2)
     stored = start_run(tmp_path / "run", "field", experiment.to_recipe)
     save_weights(stored, {"replica_0/agent_0": torch.nn.Linear(2, 8)})
+    cprl.trust("gone:Net")
     with pytest.raises(ValueError, match=r"gone:Net.*No module named 'gone'.*PYTHONPATH") as missed:
-        cprl.load(stored, allow=["gone:Net"])
+        cprl.load(stored)
     assert "weights" not in str(missed.value)
 
 
@@ -311,12 +312,13 @@ def test_stored_agents_play_with_the_weights_they_had_when_the_run_began(tmp_pat
     assert repr(final("stopped")) == repr(final("whole"))
     export_results(Path("whole"), Path("deep/er/exported"))
     before = final("earlier", "final-5")["replica_0/agent_0"]
+    cprl.trust("one_road_parts:Stopping")
     for folder in ("whole", "stopped", "deep/er/exported"):
-        weights = cprl.load(folder, allow=["one_road_parts:Stopping"]).agent(1).network.state_dict()
+        weights = cprl.load(folder).agent(1).network.state_dict()
         assert all(torch.equal(weights[name], before[name]) for name in before), folder
     Path("earlier/checkpoints/final-5.pt").unlink()
     with pytest.raises(ValueError, match="earlier no longer has the weights that play in whole"):
-        cprl.load("whole", allow=["one_road_parts:Stopping"]).agent(1)
+        cprl.load("whole").agent(1)
 
 
 @pytest.mark.integration

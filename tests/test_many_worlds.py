@@ -487,7 +487,7 @@ def test_words_say_worlds_and_steps_in_place_of_episodes(monkeypatch):
     assert of("--episodes", "3").episodes == 3
     with pytest.raises(ValueError, match="episodes is 3 and steps 900"):
         of("--steps", "900", "--episodes", "3")
-    assert experiment(steps=30).expected_episodes == 3  # of 12 turns
+    assert experiment(steps=30).length.episodes == 3  # of 12 turns
 
 
 def test_numbers_of_many_worlds_are_means_over_the_episodes_of_each_in_turn():

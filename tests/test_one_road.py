@@ -77,10 +77,11 @@ def test_an_experiment_with_parts_of_its_own_is_stopped_resumed_evaluated_and_fi
     monkeypatch.setattr("sys.argv", ["cprl", "run", str(run), "--resume", *flags.split(), "--watch", "off"])
     cli.main()
     assert_same_training(run, in_one_go, ("final", "transforms"))
-    tables = [cprl.evaluate_run(each, episodes=2, allow=ALLOW).table() for each in (run, in_one_go)]
+    cprl.trust(*ALLOW)
+    tables = [cprl.evaluate_run(each, episodes=2).table() for each in (run, in_one_go)]
     assert repr(tables[0].to_pydict()) == repr(tables[1].to_pydict())
-    assert cprl.load(run, allow=ALLOW).experiment == MEADOW
-    recording, episode = film(run, allow=ALLOW)
+    assert cprl.load(run).experiment == MEADOW
+    recording, episode = film(run)
     assert episode.steps <= 20
     assert re.fullmatch(r"film-\d-\d\.rrd", recording.name), "a typical episode"
     assert (run / recording.name).stat().st_size > 10_000
@@ -99,7 +100,8 @@ def test_the_reward_is_what_the_transforms_make_of_it_and_the_harvest_is_not(in_
     bitten = [(own, paid) for own, paid in zip(table["harvest"], table["return"], strict=True) if own]
     assert bitten
     assert all(0 < paid < own / 2 for own, paid in bitten), "halved, and less with every step"
-    evaluated = cprl.evaluate_run(in_one_go, episodes=2, allow=ALLOW)
+    cprl.trust(*ALLOW)
+    evaluated = cprl.evaluate_run(in_one_go, episodes=2)
     steps = load_weights(in_one_go / "checkpoints" / "transforms.pt")
     (fatigue,) = [float(value) for name, value in steps.items() if name.endswith("steps")]
     assert fatigue >= 6 * 20 - 20, "as many as were played"
@@ -112,8 +114,9 @@ def test_no_command_imports_what_is_not_allowed(in_one_go, monkeypatch, capsys):
         monkeypatch.setattr("sys.argv", ["cprl", words[0], str(in_one_go), *words[1:]])
         with pytest.raises(SystemExit, match=r"one_road_parts:Bored.*--allow"):
             cli.main()
+    cprl.trust(*ALLOW[:1])
     with pytest.raises(ValueError, match="one_road_parts:Fatigue"):
-        cprl.load(in_one_go, allow=ALLOW[:1])
+        cprl.load(in_one_go)
 
 
 DILEMMA = Experiment(
@@ -144,15 +147,16 @@ def test_a_matrix_game_is_trained_stopped_resumed_evaluated_and_cross_played(tmp
     rows = read_episodes(whole).to_pylist()
     for first, second in zip(rows[::2], rows[1::2], strict=True):
         assert first["wanted_return"] == pytest.approx(0.75 * first["return"] + 0.25 * second["return"])
-    loaded = cprl.load(whole, allow=allow)
+    cprl.trust(*allow)
+    loaded = cprl.load(whole)
     assert loaded.experiment == experiment
     found = cprl.evaluate_run(loaded, episodes=4)
     assert 5 <= found.measures()["agent_0/return"].estimate.value <= 4.5 * 9
     other = cprl.run(replace(DILEMMA, seed=9), tmp_path / "other", watch="off")
-    played = cprl.crossplay([loaded, cprl.load(other, allow=allow)], episodes=2)
+    played = cprl.crossplay([loaded, cprl.load(other)], episodes=2)
     assert len(played.cells) == 4
     assert played.cell("whole", "other").measures()["focal/return"].estimate is not None
-    film(whole, allow=allow)
+    film(whole)
 
 
 FLAT = Custom(
@@ -193,7 +197,8 @@ def test_what_transforms_make_of_observations_is_learned_from_and_evaluated(
 ):
     changes = {"transforms": [transform], "callbacks": (), "loggers": (), "episodes": 2}
     run = cprl.run(replace(MEADOW, agents=[agent] * 2, **changes), tmp_path / "run", watch="off")
-    loaded = cprl.load(run, allow=[transform.target, *ALLOW])
+    cprl.trust(transform.target, *ALLOW)
+    loaded = cprl.load(run)
     assert {name: getattr(loaded.spaces, name) for name in spaces} == spaces
     assert cprl.evaluate_run(loaded, episodes=1).trained
 
@@ -220,7 +225,8 @@ def test_planes_are_learned_from_through_stop_resume_and_evaluation(of_agent, tm
     stopped(33, experiment, tmp_path / "parts")
     parts = cprl.run(experiment, tmp_path / "parts", watch="off", resume=True)
     assert_same_training(parts, whole)
-    loaded = cprl.load(parts, allow=ALLOW)
+    cprl.trust(*ALLOW)
+    loaded = cprl.load(parts)
     assert loaded.experiment == experiment
     assert loaded.spaces.observation_shape == (5, 3, 5)
     assert cprl.evaluate_run(loaded, episodes=1).trained.keys() == {0, 1}
@@ -229,11 +235,7 @@ def test_planes_are_learned_from_through_stop_resume_and_evaluation(of_agent, tm
     others = {"have observations": MEADOW.game, "have a scoreboard of so many agents: 2": three}
     for message, game in others.items():
         with pytest.raises(ValueError, match=message):
-            cprl.run(
-                replace(experiment, game=game, agents=[Frozen("whole", 1)] * game.agents),
-                "other",
-                allow=ALLOW,
-            )
+            cprl.run(replace(experiment, game=game, agents=[Frozen("whole", 1)] * game.agents), "other")
 
 
 @pytest.mark.integration

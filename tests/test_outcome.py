@@ -16,8 +16,9 @@ from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.learners.settings import DQNSettings
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.statistics import estimate
+from cprl.measuring.windows import LAST_EPISODES, last_of
 from cprl.population import Learning, Scripted
-from cprl.runs.curves import LAST_EPISODES, as_curves, last_of
+from cprl.runs.curves import as_curves
 from cprl.runs.episodes import read_episodes, read_table
 from cprl.training.outcome import evaluate_population, fresh_env, is_same_later, make_agents, random_play
 from cprl.values import Custom

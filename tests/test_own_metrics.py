@@ -38,7 +38,8 @@ def run(tmp_path_factory):
 
 @pytest.mark.integration
 def test_it_is_a_column_of_every_table_of_episodes(run):
-    evaluated = cprl.evaluate_run(run, episodes=2, allow=ALLOW)
+    cprl.trust(*ALLOW)
+    evaluated = cprl.evaluate_run(run, episodes=2)
     for table in (read_episodes(run), read_evaluations(run), evaluated.table()):
         by_episode = table.group_by([name for name in table.column_names if name in KEYS]).aggregate(
             [("harvest", "max"), ("harvest", "sum"), ("largest_share", "min"), ("largest_share", "max")]
@@ -91,8 +92,9 @@ def test_nothing_else_of_a_run_changes(tmp_path):
     tables = [read_episodes(measured).drop(["largest_share"]), read_episodes(plain)]
     assert repr(tables[0].to_pydict()) == repr(tables[1].to_pydict())
     again = copytree(measured, tmp_path / "again")
+    cprl.trust(*ALLOW)
     for others, has in ([measured, plain], False), ([plain, measured], False), ([measured, again], True):
-        played = cprl.crossplay(others, episodes=1, allow=ALLOW)
+        played = cprl.crossplay(others, episodes=1)
         assert ("largest_share" in played.table().column_names) == has
         assert ("largest_share" in played.cell(*(run.name for run in others)).estimates("focal")) == has
 
@@ -123,4 +125,5 @@ def test_a_recipe_with_one_is_read_where_it_is_allowed():
     recipe = experiment("largest_share").to_recipe()
     with pytest.raises(ValueError, match=f"--allow {SHARE}"):
         cprl.Experiment.from_recipe(recipe)
-    assert cprl.Experiment.from_recipe(recipe, allow=[SHARE]) == experiment("largest_share")
+    cprl.trust(SHARE)
+    assert cprl.Experiment.from_recipe(recipe) == experiment("largest_share")

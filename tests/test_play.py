@@ -59,14 +59,14 @@ def test_the_same_seed_and_keys_play_the_same_again(run):
 
 def test_the_metrics_are_those_of_an_episode(run):
     session, tracker, ended = open_session(str(run), others="greedy", seed=2), EpisodeTracker(1, 2), []
-    play = session._turns.play
+    played = session._turns
 
     def watched():
-        batch = play()
-        ended.extend(tracker.add(batch))
-        return batch
+        for batch in played:
+            ended.extend(tracker.add(batch))
+            yield batch
 
-    session._turns.play = watched
+    session._turns = watched()
     assert session.metrics() == {}
     for action in ("forward", "beam", "turn_right", "forward", "forward", "beam"):
         if not session.has_ended:

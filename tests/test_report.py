@@ -18,6 +18,7 @@ from cprl.evaluation.report import report
 from cprl.evaluation.show import show
 from cprl.institutions import Quota
 from cprl.training.agents import load
+from cprl.values import trust
 
 STUDY = Path(__file__).parents[1] / "docs" / "results" / "studies" / "beam"
 GOVERNED = replace(CORRIDORS, institutions=(Quota(share=0.5, window_steps=2),))
@@ -49,7 +50,8 @@ def test_a_report_names_what_is_of_ones_own_and_says_what_a_tag_does(tmp_path):
     game = replace(game, rules=replace(game.rules, episode_steps=5))
     own = Custom("one_road_parts:largest_share"), Custom("one_road_parts:Gift", {"apples": 0.5})
     run = stored(tmp_path / "run", game, metrics=own[:1], transforms=own[1:])
-    text = report(run, episodes=2, allow=[one.target for one in own]).read_text(encoding="utf-8")
+    trust(*[one.target for one in own])
+    text = report(run, episodes=2).read_text(encoding="utf-8")
     assert "Code of its own: transforms: one_road_parts:Gift (apples 0.5): Adds a part" in text
     assert "metrics: one_road_parts:largest_share" in text
     assert "<p>After 2 hits an agent leaves the board for 24 turns.</p>" in text

@@ -18,12 +18,14 @@ import pytest
 import torch
 from study_runs import an_episode as episode_of
 
-from cprl.measuring import social
+from cprl.measuring.registry import OPTIONAL, measurable
 from cprl.runs.episodes import COLUMNS, EpisodeTable, read_episodes, read_journal, read_table
 from cprl.runs.files import remove_listed, rename_listed, verify, write_listed
 from cprl.runs.recipe import git_state, start_run
 
 WHOLE = ["episodes.parquet", "manifest.json"]
+
+STORED = measurable(OPTIONAL)[:-1]
 
 
 def an_episode(number=0, **metrics):
@@ -89,13 +91,13 @@ def test_each_agent_of_each_episode_has_a_row(table):
     columns = [
         (name, kind) for name, kind in COLUMNS.items() if name not in ("wanted_return", "world")
     ]  # of trainings
-    assert rows.schema == pa.schema([*columns, *((name, pa.float64()) for name in social.METRICS)])
+    assert rows.schema == pa.schema([*columns, *((name, pa.float64()) for name in STORED)])
     assert rows["replica"].to_pylist() == [3, 3, 8, 8, 8, 8]
     assert rows["terminated"].to_pylist() == [False, False, True, True, False, False]
     second = rows.slice(1, 1).to_pylist()[0]
     assert np.isnan(second.pop("equality"))
     assert second == {
-        **dict.fromkeys(set(social.METRICS) - {"equality"}, 0.5),
+        **dict.fromkeys(set(STORED) - {"equality"}, 0.5),
         "collective_return": 4.0,
         "replica": 3,
         "episode": 0,

@@ -30,11 +30,13 @@ from cprl.commands import main as cli
 from cprl.evaluation.film import film
 from cprl.experiment import Experiment
 from cprl.measuring import EpisodeTracker
+from cprl.measuring.windows import last_of, mean_of_worlds, running_mean
 from cprl.population import Frozen, Learning
 from cprl.runs import loggers
-from cprl.runs.curves import as_curves, last_of, mean_of_worlds, running_mean, worlds_of
+from cprl.runs.curves import as_curves, worlds_of
 from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
+from cprl.runs.length import Length
 from cprl.runs.recipe import read_recipe, refuse_another_run, resume_command, runs_in, start_run
 from cprl.studies.factors import changed
 from cprl.system.shipped import cprl_here
@@ -72,8 +74,8 @@ def edited(run, edit):
 def test_a_stopped_run_is_resumed_by_the_same_recipe(tmp_path):
     run = begin(tmp_path / "run")
     written = (run / "recipe.json").read_text()
-    assert resume(run) == 3
-    assert resume(run, replace(EXPERIMENT, episodes=5)) == 3, "it can be extended"
+    assert resume(run) == Length(3, "episodes")
+    assert resume(run, replace(EXPERIMENT, episodes=5)) == Length(3, "episodes"), "it can be extended"
     assert (run / "recipe.json").read_text() == written
 
 
@@ -152,7 +154,7 @@ def test_fields_that_a_later_version_has_are_no_difference_while_they_have_their
         del recipe["experiment"]["game"]["rules"]["walls_block_sight"]
 
     edited(run, without_later_fields)
-    assert resume(run, default) == EXPERIMENT.episodes
+    assert resume(run, default) == EXPERIMENT.length
     with pytest.raises(ValueError, match=r"experiment\.update_every was not there, is 7"):
         resume(run, replace(default, update_every=7))
     with pytest.raises(ValueError, match=r"settings\.steps_per_update was not there, is 4$"):

@@ -250,7 +250,7 @@ def test_a_value_is_the_mean_over_replicas_of_the_episodes_asked_for(tmp_path, m
     trained = [curves_of(run)["return_1"][0, 2:] for run in runs]
     assert value_of(last, result.points[0], result.runs) == pytest.approx(np.mean(trained))
     net = sum((curves["return_0"] + curves["return_1"]).sum() for curves in played) / 6
-    assert value_of(replace(search, metric="net"), result.points[0], result.runs) == pytest.approx(net)
+    assert value_of(replace(search, metric="income"), result.points[0], result.runs) == pytest.approx(net)
     shutil.rmtree(runs[1])
     assert value_of(search, result.points[0], result.runs) is None
 

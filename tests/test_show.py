@@ -12,14 +12,14 @@ import pytest
 from stored_runs import CORRIDORS, command, stored
 from viewers import browser, wait_until
 
-from cprl import Custom, presets
+from cprl import Custom, keys, presets
 from cprl.commons.colours import BEAM
 from cprl.commons.readable import growth_of, legend_of, meaning_of
-from cprl.evaluation.film import play_to_show
-from cprl.evaluation.fresh import fresh_episode
+from cprl.evaluation.fresh import fresh_episode, record
 from cprl.evaluation.show import show
 from cprl.institutions import Boundaries, Monitoring, Punishment, Quota, Tax
-from cprl.measuring.social import SOCIAL
+from cprl.measuring.registry import SOCIAL
+from cprl.values import trust
 
 COMMONS = presets.game("commons")
 GOVERNED = replace(
@@ -66,23 +66,22 @@ def test_a_page_holds_the_episode_that_a_film_shows(runs, tmp_path):
     )
     data = told(path)
     greedy, governed = data["populations"]
-    filmed = play_to_show(fresh_episode(runs / "governed", episode=1))
-    cells = [moment.row * governed["width"] + moment.col for moment in filmed.moments]
+    filmed = record(fresh_episode(runs / "governed", episode=1))
+    cells = [moment.row * governed["width"] + moment.col for moment in filmed.boards]
     assert governed["cell"].tolist() == [row.tolist() for row in cells]
-    assert governed["harvested"].tolist() == [moment.harvested.tolist() for moment in filmed.moments]
+    assert governed["harvested"].tolist() == [moment.harvested.tolist() for moment in filmed.boards]
     stock = np.unpackbits(governed["stock"], axis=1)[:, : len(governed["sites"])]
-    assert stock.tolist() == [moment.stock.tolist() for moment in filmed.moments]
+    assert stock.tolist() == [moment.stock.tolist() for moment in filmed.boards]
     assert governed["stocked"][:, 0].tolist() == stock.sum(1).tolist()
     violators = [set(np.flatnonzero(row & 8).tolist()) for row in governed["pose"]]
-    assert violators == filmed.violators
+    broke = filmed.entry("next", *keys.VIOLATED)
+    assert violators == [set(), *(set(np.flatnonzero(row).tolist()) for row in broke)]
     assert any(violators)
-    assert (governed["pose"] & 3).tolist() == [moment.heading.tolist() for moment in filmed.moments]
-    assert (governed["pose"] & 4 > 0).tolist() == [moment.in_play.tolist() for moment in filmed.moments]
+    assert (governed["pose"] & 3).tolist() == [moment.heading.tolist() for moment in filmed.boards]
+    assert (governed["pose"] & 4 > 0).tolist() == [moment.in_play.tolist() for moment in filmed.boards]
     ends = governed["beam_first"][:, 0]
     lit = [set(governed["beams"][first:last].tolist()) for first, last in pairwise(ends)]
-    assert lit == [
-        set(np.flatnonzero(moment.board.reshape(-1) == BEAM).tolist()) for moment in filmed.moments
-    ]
+    assert lit == [set(np.flatnonzero(moment.board.reshape(-1) == BEAM).tolist()) for moment in filmed.boards]
     assert any(lit)
     assert governed["fined"][-1, 0] == pytest.approx(second.fines.sum(), rel=1e-6)
     assert second.fines.sum() > 0
@@ -114,7 +113,8 @@ OWN_TARGETS = ("one_road_parts:Gift", "one_road_parts:largest_share")
 
 def test_rules_and_metrics_of_ones_own_are_named_on_the_page(runs, tmp_path):
     run = stored(tmp_path / "own", **OWN)
-    path, _ = show(run, tmp_path / "own.html", beside=[runs / "greedy"], allow=OWN_TARGETS)
+    trust(*OWN_TARGETS)
+    path, _ = show(run, tmp_path / "own.html", beside=[runs / "greedy"])
     own, plain = told(path)["populations"]
     rule = "Code of its own: transforms: one_road_parts:Gift (apples 0.5): Adds a part of an apple"
     assert rule in own["about"]

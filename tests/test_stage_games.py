@@ -247,7 +247,8 @@ def test_a_worth_of_the_users_own_is_a_game_by_the_name_of_the_function_that_mak
     with pytest.raises(ValueError, match=r"^experiment\.game\.sharing\.worth is a CallableWorth, which a re"):
         replace(HERDERS, game=own_game())
     experiment = replace(HERDERS, game=Custom("test_stage_games:own_game"))
-    back = Experiment.from_recipe(experiment.to_recipe(), allow=["test_stage_games:own_game"])
+    cprl.trust("test_stage_games:own_game")
+    back = Experiment.from_recipe(experiment.to_recipe())
     assert make_env(back.game).game == own_game()
 
 
@@ -441,7 +442,8 @@ def test_a_population_trains_stops_resumes_loads_and_meets_another(
     stopped(23, stopping, tmp_path / "parts")
     parts = cprl.run(stopping, tmp_path / "parts", watch="off", resume=True)
     assert_same_training(parts, whole)
-    loaded = cprl.load(whole, allow=["one_road_parts:Stopping"])
+    cprl.trust("one_road_parts:Stopping")
+    loaded = cprl.load(whole)
     assert loaded.game == experiment.game
     value = cprl.evaluate_run(loaded, episodes=4).measures()["agent_0/return"].estimate.value
     assert least <= value <= most

@@ -23,8 +23,8 @@ from cprl.envs import make_env
 from cprl.envs.matrix import MatrixGame, chicken, matching_pennies, prisoners_dilemma
 from cprl.institutions import Quota, Tax, Vote
 from cprl.measuring import social
-from cprl.measuring.metrics import reported_by
 from cprl.measuring.phases import LONGEST, PHASES_BEGIN
+from cprl.measuring.registry import reported_by
 from cprl.policies.lanes import random_agents
 from cprl.runs.episodes import EpisodeTable
 from cprl.training import train

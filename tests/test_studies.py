@@ -27,7 +27,7 @@ from cprl.studies.study import CONDITION_FORMAT, Condition, apart, level_text, n
 from cprl.studies.tables.table import Design
 from cprl.studies.trials import trials_of
 from cprl.theory.growth import yield_bounds
-from cprl.values import KINDS, defaults_of
+from cprl.values import KINDS, defaults_of, trust
 
 OF_FIRST, OF_SECOND = (GAMMA.replace("*", agent) for agent in "01")
 OF_ALL = "agents.*.algorithm.settings"
@@ -42,10 +42,10 @@ def checksums(study):
     return [condition.checksum for condition in study.all_conditions]
 
 
-def there_and_back(study, directory=None, **options):
+def there_and_back(study, directory=None):
     """The study that is read from its JSON, which has the same conditions."""
     table = json.loads(json.dumps(study.to_config(directory)))
-    again = Study.from_config(table, directory=directory, **options)
+    again = Study.from_config(table, directory=directory)
     assert checksums(again) == checksums(study)
     return again
 
@@ -284,7 +284,8 @@ def test_a_study_becomes_json_and_comes_back_the_same(study):
     ],
 )
 def test_a_game_of_ones_own_is_a_level(study):
-    again = there_and_back(study, allow=["my_game:Dilemma"])
+    trust("my_game:Dilemma")
+    again = there_and_back(study)
     assert again == study
     assert again.all_conditions[1].experiment.game == OTHER, "no Custom, but the game"
 
@@ -326,12 +327,13 @@ def test_runs_are_kept_relative_to_the_study_and_other_texts_as_they_are(tmp_pat
         Study(experiment, {"transforms.0.arguments.run": ["runs/b", "runs/c"]}),
     ):
         monkeypatch.chdir(tmp_path)
-        assert there_and_back(study, directory="studies/x", allow=allow) == study
+        trust(*allow)
+        assert there_and_back(study, directory="studies/x") == study
         table = study.to_config("studies/x")
         assert "../../runs/b" in json.dumps(table) or "transforms.0.arguments.run" in study.columns
         monkeypatch.chdir(tmp_path / "sub")
         if study.reference is None:
-            elsewhere = Study.from_config(table, directory="../studies/x", allow=allow)
+            elsewhere = Study.from_config(table, directory="../studies/x")
             there, here = (each.all_conditions[1].experiment for each in (elsewhere, study))
             assert stored_of(there.agents[1]).run == f"../{stored_of(here.agents[1]).run}"
             assert there.transforms == here.transforms

@@ -848,15 +848,15 @@ def test_cprl_table_of_a_study_says_and_writes_what_its_table_alone_gives(table_
 def test_the_last_episodes_are_those_of_each_replica():
     windows = {0: [(0, 10, 1.0), (10, 10, 2.0), (20, 4, 3.0)], 1: [(0, 10, 4.0), (10, 3, 5.0)]}
     rows = [
-        {"condition": "a", "replica": replica, "part": "training", "metric": "net"}
+        {"condition": "a", "replica": replica, "part": "training", "metric": "income"}
         | {"episode": episode, "window_episodes": length, "undefined": 0, "value": value}
         for replica, of_replica in windows.items()
         for episode, length, value in of_replica
     ]
     design = Design(name="small", conditions={"a": {}}, reference="a", is_paired=True)
     table = StudyTable(design=design, rows=pa.Table.from_pylist(rows), window=10)
-    compared = compare(table, "net", last=10)
+    compared = compare(table, "income", last=10)
     assert compared.by_name["a"].values == {0: 3.0, 1: 5.0}
     assert (compared.last, compared.by_name["a"].episodes) == ((3, 4), 7)
-    compared = compare(table, "net", last=14)
+    compared = compare(table, "income", last=14)
     assert compared.by_name["a"].values == pytest.approx({0: (10 * 2.0 + 4 * 3.0) / 14, 1: 55 / 13})

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 from test_results import an_episode
 
-from cprl.measuring.metrics import NAMES, title, with_unit
+from cprl.measuring.registry import INCOME, METRICS, title, with_unit
 from cprl.terminal.summary import summarise
 from cprl.terminal.tables import Cells
 
@@ -140,9 +140,9 @@ def test_units_are_those_of_the_docs():
     lines = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text().splitlines()
     table = [line.split("|")[1:3] for line in lines if line.startswith("| `social/")]
     units = {name.strip(" `").removeprefix("social/"): unit.strip() for name, unit in table}
-    assert set(units) == {name for name in NAMES if "/" not in name}
+    assert set(units) == {name for name in METRICS if "/" not in name} - {INCOME}
     for name, unit in units.items():
-        assert NAMES[name][1].startswith(unit.replace("0..1", "0 to 1"))
+        assert METRICS[name].unit.startswith(unit.replace("0..1", "0 to 1"))
 
 
 @pytest.mark.parametrize(
@@ -159,13 +159,15 @@ def test_a_metric_is_called_by_the_same_words_with_its_unit_everywhere(name, rew
     assert title("of_ones_own") == "of_ones_own"
 
 
-def test_episodes_with_an_undefined_net_equality_are_counted(tmp_path):
+def test_episodes_with_an_undefined_equality_of_incomes_are_counted(tmp_path):
     fined = [
         replace(
-            episode(number, [2, 2]), fines=np.ones(2), institutions={"fines": 2.0, "net_equality": equality}
+            episode(number, [2, 2]),
+            fines=np.ones(2),
+            metrics={"institutions/fines": 2.0, "income_equality": equality},
         )
         for number, equality in enumerate([0.5, float("nan"), 0.7])
     ]
     rows, _ = told_of(tmp_path, trained=fined)
-    (cells,) = (cells for name, cells in rows.items() if "net" in name)
+    (cells,) = (cells for name, cells in rows.items() if "incomes" in name)
     assert cells == ["0.60, undefined in 1 of 3"]

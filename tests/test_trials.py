@@ -370,12 +370,13 @@ def test_loading_evaluating_and_resuming_warn_of_other_code_and_the_recipe_keeps
     text = "class Callback:\n    is_extendable = True\n    def on_episode(self, episode, learning): ...\n"
     write_module(text)
     run = cprl.run(experiment, tmp_path / "run", watch="off", figures=False, keep_checkpoint=True)
-    cprl.load(run, allow=[target])
+    cprl.trust(target)
+    cprl.load(run)
     assert "own_callback" not in capsys.readouterr().err
     write_module(text + "# edited\n")
     for use in (
-        lambda: cprl.load(run, allow=[target]),
-        lambda: cprl.evaluate_run(run, episodes=1, allow=[target]),
+        lambda: cprl.load(run),
+        lambda: cprl.evaluate_run(run, episodes=1),
         lambda: cprl.run(replace(experiment, episodes=3), run, resume=True, watch="off", figures=False),
     ):
         use()
@@ -669,7 +670,7 @@ def test_a_trial_says_its_speed_without_compiling_and_what_it_had_done_before(tm
 
 def test_a_trial_of_so_many_steps_is_as_far_as_its_steps_however_short_episodes_are(tmp_path):
     experiment = replace(TRIALS[0].experiment, episodes=None, steps=400, replicas=2, worlds=4)
-    expected = 2 * experiment.expected_episodes
+    expected = 2 * experiment.length.episodes
     file = StatusFile(Status(tmp_path, "trial"), experiment)
 
     def played():
@@ -700,7 +701,7 @@ def test_a_trial_runs_while_it_says_something_new_whatever_the_clock_says(says, 
 def test_trials_that_count_steps_are_shown_by_their_steps(tmp_path):
     (long,) = trials_of(Study(replace(TINY, episodes=None, steps=4000, replicas=2)))
     says = Status(tmp_path, long.name).path
-    expected = 2 * long.experiment.expected_episodes
+    expected = 2 * long.experiment.length.episodes
     overview = Overview([long], tmp_path, tmp_path)
     for beat in (1, 2):
         write_json(says, {"beat": beat, "episodes": expected // 2})

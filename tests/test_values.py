@@ -45,7 +45,7 @@ from cprl.runs.recipe import read_recipe
 from cprl.system.memory import TooLargeError
 from cprl.theory import appropriation, herders
 from cprl.training.running import run
-from cprl.values import KINDS, allowing, custom_targets, described, differences, from_config, to_config
+from cprl.values import KINDS, custom_targets, described, differences, from_config, to_config, trust, trusting
 
 GAME = presets.game("two_complex")
 REPLAY, ROLLOUTS, TABLES = DQNSettings(), RolloutSettings(), TabularSettings()
@@ -371,7 +371,7 @@ UNUSUAL = (
 def test_a_value_comes_back_from_its_table_as_it_was(value):
     table = json.loads(json.dumps(to_config(value), allow_nan=False))
     assert KINDS[table["kind"]] is type(value)
-    with allowing(custom_targets(table)):
+    with trusting(custom_targets(table)):
         back = from_config(table)
     assert back == value
     assert hash(back) == hash(value)
@@ -446,9 +446,9 @@ def test_what_would_be_imported_is_refused_unless_it_is_allowed():
     assert custom_targets(table) == ["a:B", "c:D"]
     with pytest.raises(ValueError, match=r"^a:B, c:D would be imported.*--allow a:B --allow c:D"):
         from_config(table)
-    with allowing(["a:B"]), pytest.raises(ValueError, match=r"^c:D would be imported"):
+    with trusting(["a:B"]), pytest.raises(ValueError, match=r"^c:D would be imported"):
         from_config(table)
-    with allowing(["a:B", "c:D"]):
+    with trusting(["a:B", "c:D"]):
         assert from_config(table)[0] == Custom("a:B")
     with pytest.raises(ValueError, match="would be imported"):
         from_config(table)
@@ -485,7 +485,8 @@ def as_stored(recipe):
 def test_an_experiment_equals_what_its_recipe_holds():
     recipe = as_stored(MIXED.to_recipe())
     assert (recipe["format"], recipe["recipe"]) == (2, "mixed")
-    again = Experiment.from_recipe(recipe, allow=OWN)
+    trust(*OWN)
+    again = Experiment.from_recipe(recipe)
     assert again == MIXED
     assert hash(again) == hash(MIXED)
     assert again.agents == MIXED.agents
@@ -542,14 +543,15 @@ def test_a_game_of_somebodys_own_is_stored_by_the_name_of_its_class():
     }
     with pytest.raises(ValueError, match="--allow my_game:Dilemma"):
         Experiment.from_recipe(recipe)
-    again = Experiment.from_recipe(recipe, allow=["my_game:Dilemma"])
+    trust("my_game:Dilemma")
+    again = Experiment.from_recipe(recipe)
     assert again.game == game
     assert again == experiment
     with pytest.raises(ValueError, match="1 agents are specified for a game of 2 agents"):
         replace(experiment, agents=[DQN_AGENT])
     recipe["experiment"]["game"]["arguments"]["temptation"] = 1
     with pytest.raises(ValueError, match=r"experiment\.game: my_game:Dilemma does not take its arguments"):
-        Experiment.from_recipe(recipe, allow=["my_game:Dilemma"])
+        Experiment.from_recipe(recipe)
 
 
 @pytest.mark.parametrize(
@@ -558,7 +560,8 @@ def test_a_game_of_somebodys_own_is_stored_by_the_name_of_its_class():
 )
 def test_a_custom_that_makes_a_game_stays_the_same_text(stored):
     experiment = Experiment(name="dilemma", game=stored, agents=[DQN_AGENT] * 2, episodes=5)
-    again = Experiment.from_recipe(as_stored(experiment.to_recipe()), allow=[stored.target])
+    trust(stored.target)
+    again = Experiment.from_recipe(as_stored(experiment.to_recipe()))
     assert again == experiment
     assert again.game == stored
 

@@ -19,7 +19,7 @@ from test_story import headers
 from viewers import browser, native_viewer, wait_until
 
 from cprl.commons.colours import APPLE, PALETTE, agent_colour
-from cprl.measuring.metrics import colour
+from cprl.measuring.registry import colour
 from cprl.training.outcome import exhibited
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.live import served

@@ -30,9 +30,9 @@ from cprl.evaluation.evaluate import SEED
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.phases import PHASES_BEGIN
 from cprl.measuring.statistics import difference, estimate
+from cprl.measuring.windows import running_mean
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.scripted import ScriptedActor
-from cprl.runs.curves import running_mean
 
 Values = NDArray[np.float64]
 

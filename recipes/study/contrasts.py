@@ -66,18 +66,18 @@ def with_rule(factor: str, *, metric: str, is_there: bool) -> Contrast:
 def contrasts() -> list[Contrast]:
     """All that the pages name."""
     found = []
-    for metric in ("net", "survival_steps"):
+    for metric in ("income", "survival_steps"):
         for factor in ("sanctions", "monitoring"):
             found.append(with_rule(factor, metric=metric, is_there=True))
-    found.append(with_rule("sanctions", metric="net", is_there=False))
-    found.append(with_rule("monitoring", metric="net", is_there=False))
+    found.append(with_rule("sanctions", metric="income", is_there=False))
+    found.append(with_rule("monitoring", metric="income", is_there=False))
     tax, quota = ["tax, best found"], ["quota, by hand"]
-    equality = "institutions/net_equality"
+    equality = "income_equality"
     best = ["quota, best found"]
     teams = ["VDN", "QMIX", "MAPPO"]
     alone = ["DQN", "PPO", "IPPO"]
     found += [
-        Contrast("best tax - quota by hand, income", "best_rules", "net", tax, quota),
+        Contrast("best tax - quota by hand, income", "best_rules", "income", tax, quota),
         Contrast("best tax - quota by hand, equality of income", "best_rules", equality, tax, quota),
         Contrast("best tax - best quota, equality of income", "best_rules", equality, tax, best),
         Contrast("three teams - three that learn alone", LEARNERS, "collective_return", teams, alone),
@@ -98,7 +98,7 @@ def contrasts() -> list[Contrast]:
             found.append(Contrast(label, "elsewhere", metric, more, less, 1_000))
     more = ["DQN, Melting Pot: quota"]
     less = ["DQN, Melting Pot: twice the apples"]
-    found.append(Contrast("Melting Pot, quota - twice the apples, income", "elsewhere", "net", more, less))
+    found.append(Contrast("Melting Pot, quota - twice the apples, income", "elsewhere", "income", more, less))
     return found
 
 
@@ -121,12 +121,12 @@ def side_by_side() -> list[str]:
         "|---|" + "---:|" * 5,
     ]
     for label, (study, condition) in SIDE_BY_SIDE.items():
-        learning = values_of(study, condition, "net", "training")
-        frozen = values_of(study, condition, "net", "evaluation")
+        learning = values_of(study, condition, "income", "training")
+        frozen = values_of(study, condition, "income", "evaluation")
         cells = [estimate(learning), estimate(frozen)]
         equalities = [
             estimate(values_of(study, condition, metric, "evaluation"))
-            for metric in ("equality", "institutions/net_equality")
+            for metric in ("equality", "income_equality")
         ]
         change = difference(frozen, learning, paired=True)
         texts = [*map(str, cells), f"{change:+}", *map(str, equalities)]

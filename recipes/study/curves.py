@@ -22,7 +22,7 @@ from verdicts import curve_prediction, prediction
 
 from cprl.measuring import phases
 from cprl.measuring.phases import PHASES_BEGIN
-from cprl.runs.curves import running_mean
+from cprl.measuring.windows import running_mean
 
 Values = NDArray[np.float64]
 

@@ -25,7 +25,7 @@ from cprl.measuring.statistics import Estimate, estimate, holm
 from cprl.studies import StudyTable
 from cprl.studies.tables.comparing import compare
 
-METRICS: Final = {"net": "income, apples", "survival_steps": "survival, turns"}
+METRICS: Final = {"income": "income, apples", "survival_steps": "survival, turns"}
 
 
 def measured(table: StudyTable, metric: str, part: str = "training") -> NDArray[np.float64]:

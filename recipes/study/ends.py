@@ -20,7 +20,8 @@ from cprl.evaluation.schelling import dilemma
 from cprl.measuring.phases import FEWEST_EPISODES, METRICS, UNNAMED, find_phases
 from cprl.measuring.series import Values
 from cprl.measuring.statistics import estimate
-from cprl.runs.curves import curves_of, running_mean
+from cprl.measuring.windows import running_mean
+from cprl.runs.curves import curves_of
 from cprl.training.agents import LoadedRun, load
 
 POINTS: Final = 2_000

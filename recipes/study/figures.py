@@ -12,9 +12,9 @@ from published import PHASED_RECIPE, curve
 from results import Result, Values, returns_by_chance
 from verdicts import curve_prediction
 
-from cprl.measuring.metrics import title, unit
 from cprl.measuring.phases import PHASES, PHASES_BEGIN
-from cprl.runs.curves import running_mean
+from cprl.measuring.registry import title, unit
+from cprl.measuring.windows import running_mean
 from cprl.terminal import style
 from cprl.terminal.figures import (
     STRIP,

@@ -23,7 +23,7 @@ from possible import KNOWN
 
 from cprl.commons.colours import BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION
 from cprl.measuring.statistics import Estimate, difference, estimate
-from cprl.runs.curves import as_curves, curves_of, net_of
+from cprl.runs.curves import as_curves, curves_of
 from cprl.runs.episodes import read_table
 from cprl.studies import StudyTable
 from cprl.studies.tables.comparing import compare
@@ -177,9 +177,9 @@ def table_of(study: str) -> StudyTable:
 def values_of(
     study: str, condition: str, metric: str, part: Part = "training", last: int = LAST
 ) -> NDArray[np.float64]:
-    """A metric of each replica; "net" is the income, and without money the harvest."""
+    """A metric of each replica; "income" is the income, and without money the harvest."""
     table = table_of(study)
-    without_money = {"net": "collective_return", "institutions/net_equality": "equality"}
+    without_money = {"income": "collective_return", "income_equality": "equality"}
     if metric in without_money:
         found = None if metric not in table.metrics else compare(table, metric, part=part, last=last)
         if found is not None and len(found.by_name[condition].defined):
@@ -191,14 +191,14 @@ def values_of(
 def nets(study: str, condition: str, part: Part = "training", last: int = LAST) -> NDArray[np.float64]:
     """The income of each replica, in apples."""
     if study == "institutions":
-        return np.nanmean(net_of(curves_of(RESULTS / study / condition))[:, -LAST:], 1)
-    return values_of(study, condition, "net", part, last)
+        return np.nanmean(curves_of(RESULTS / study / condition)["income"][:, -LAST:], 1)
+    return values_of(study, condition, "income", part, last)
 
 
 def of_study(group: str, study: str, condition: str, name: str) -> Row:
     """A condition of a study."""
-    income = values_of(study, condition, "net")
-    of_both = values_of(study, condition, "net", last=2 * LAST)
+    income = values_of(study, condition, "income")
+    of_both = values_of(study, condition, "income", last=2 * LAST)
     turns = values_of(study, condition, "survival_steps")
     of_all = values_of(study, condition, "survival_steps", last=EXPERIMENT.episodes)
     return Row(
@@ -206,11 +206,11 @@ def of_study(group: str, study: str, condition: str, name: str) -> Row:
         name=name,
         replicas=len(income),
         income=estimate(income),
-        frozen=estimate(values_of(study, condition, "net", "evaluation")),
+        frozen=estimate(values_of(study, condition, "income", "evaluation")),
         trend=estimate(2 * (income - of_both)),
         survival=estimate(turns),
         equality=estimate(values_of(study, condition, "equality")),
-        income_equality=estimate(values_of(study, condition, "institutions/net_equality")),
+        income_equality=estimate(values_of(study, condition, "income_equality")),
         turns=of_all.mean() * EXPERIMENT.episodes,
         exploration="of its policy" if study == "networks" else explored(of_all.mean(), turns.mean()),
     )
@@ -221,7 +221,7 @@ def of_run(group: str, folder: str, name: str) -> Row:
     run = RESULTS / "institutions" / folder
     curves = curves_of(run)
     fresh = as_curves(read_table(run / "evaluation" / "trained.parquet"))
-    income = net_of(curves)
+    income = curves["income"]
     ends = at_end(income)
     turns = curves["survival_steps"]
     return Row(
@@ -229,7 +229,7 @@ def of_run(group: str, folder: str, name: str) -> Row:
         name=name,
         replicas=len(income),
         income=estimate(ends),
-        frozen=estimate(net_of(fresh).mean(1)),
+        frozen=estimate(fresh["income"].mean(1)),
         trend=estimate(ends - income[:, -2 * LAST : -LAST].mean(1)),
         survival=estimate(at_end(turns)),
         equality=estimate(at_end(curves["equality"])),
@@ -241,7 +241,7 @@ def of_run(group: str, folder: str, name: str) -> Row:
 
 def income_equality(curves: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64]:
     """The equality of income by episode, which without money is that of the harvest."""
-    return curves.get("institutions/net_equality", curves["equality"])
+    return curves.get("income_equality", curves["equality"])
 
 
 def at_end(curve: NDArray[np.float64]) -> NDArray[np.float64]:

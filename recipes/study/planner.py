@@ -15,14 +15,18 @@ from functools import cache
 from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from tensordict import TensorDictBase
 
-from cprl.commons.batch import Batch, turn_of
+from cprl import keys
 from cprl.commons.compiled import kept_on_disk
 from cprl.commons.game import Game
 from cprl.commons.moves import WALK_TURN
 from cprl.commons.near import neighbours
 from cprl.commons.world import COL_STEP, ROW_STEP
+from cprl.envs.commons_env import CommonsEnv
+from cprl.measuring.evaluate import evaluate
 from cprl.values import Range, Value
 
 Array = NDArray[Any]
@@ -30,19 +34,18 @@ Array = NDArray[Any]
 FAR: Final = 1 << 30
 
 
-def harvests(batch: Batch, choose: Callable[[Batch], Array]) -> NDArray[np.float64]:
-    """The collective harvest of the next episode of each world, float64 [B], in apples.
+def harvests(env: CommonsEnv, choose: Callable[[CommonsEnv], Array]) -> NDArray[np.float64]:
+    """Return the collective harvest of the next episode of each world, float64 [B], in apples.
 
     Args:
-        batch: B worlds, without institutions, since these are paid for actions.
+        env: B worlds.
         choose: the actions of all agents, int64 [B, N], asked for in each turn until all worlds have ended.
     """
-    output = batch.begin(batch.new_output())
-    total = np.zeros(batch.size)
-    while not turn_of(output).done.all():
-        output = batch.play(choose(batch), output)
-        total += turn_of(output).harvest.sum(1, dtype=np.float64)
-    return total
+
+    def policy(moment: TensorDictBase) -> TensorDictBase:
+        return moment.set(keys.ACTION, torch.from_numpy(choose(env)))
+
+    return np.array([np.sum(episode.harvest) for episode in evaluate(env, policy)], np.float64)
 
 
 def _jit(function: Any) -> Any:
@@ -265,7 +268,7 @@ def planned_harvest(
     """
     game = replace(game, institutions=())
     lead = _Lead(game, planner or best_planner(game))
-    return harvests(Batch(game, episodes, seed=seed), lead)
+    return harvests(CommonsEnv(game, episodes, seed=seed), lead)
 
 
 @cache
@@ -293,9 +296,9 @@ class _Lead:
             queue=np.zeros((cells[0] * cells[1], 2), np.int32),
         )
 
-    def __call__(self, batch: Batch) -> NDArray[np.int64]:
+    def __call__(self, env: CommonsEnv) -> NDArray[np.int64]:
         """The actions of all agents, int64 [B, N]."""
-        state = batch.state()
+        state = env.worlds.state()
         actions = np.full(state["row"].shape, len(self.game.actions) - 1, np.int64)  # the last one stays
         for world, step in enumerate(state["step"][:, 0]):
             plan = Plan(

@@ -33,7 +33,7 @@ from possible import shares_of
 from results import PooledResult, Result, pooled, read_result, table, told, with_interval
 from tragedies import combat_section
 
-from cprl.commands.recipe import in_a_sentence, trusting
+from cprl.commands.recipe import in_a_sentence, trust_allowed
 from cprl.runs.files import write_atomically
 from cprl.runs.recipe import read_recipe
 from cprl.system.defaults import SEED
@@ -42,7 +42,7 @@ from cprl.system.process import prepare_process
 from cprl.system.shipped import is_cprl
 
 
-def write_report(runs: Sequence[Path], out: Path, *, pool: bool = False, allow: Sequence[str] = ()) -> Path:
+def write_report(runs: Sequence[Path], out: Path, *, pool: bool = False) -> Path:
     """Writes `tables.md`, and figures that `figures.md` shows.
 
     Args:
@@ -50,7 +50,6 @@ def write_report(runs: Sequence[Path], out: Path, *, pool: bool = False, allow: 
         out: The folder of the report; created if missing.
         pool: Whether runs whose experiments differ in nothing but name, seed, the number of replicas and
             `on_nan` are one, of all their replicas.
-        allow: See `cprl.load`.
 
     Returns:
         The path `out/tables.md`.
@@ -60,7 +59,7 @@ def write_report(runs: Sequence[Path], out: Path, *, pool: bool = False, allow: 
             same name; in a pool, if two runs of one experiment have the same seed.
         FileNotFoundError: If a run has no episodes or has not ended.
     """
-    results = [read_result(path, allow=allow) for path in runs]
+    results = [read_result(path) for path in runs]
     _refuse_equal_names(results)
     each = results
     if pool:
@@ -224,4 +223,4 @@ def main(runs: tuple[Path, ...], /, *, out: Path = Path("report"), pool: bool = 
 
 if __name__ == "__main__":
     with in_a_sentence("report.py"):
-        tyro.cli(main, args=trusting(sys.argv[1:]))
+        tyro.cli(main, args=trust_allowed(sys.argv[1:]))

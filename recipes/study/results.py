@@ -21,23 +21,17 @@ from published import PublishedExperiment, published_experiment
 
 from cprl import presets
 from cprl.algorithms import DQN
-from cprl.commons.batch import Batch
 from cprl.commons.game import Game
+from cprl.envs.commons_env import CommonsEnv
 from cprl.evaluation.evaluate import SEED
 from cprl.evaluation.lanes import Agent, Fresh, agents_of, scripted
 from cprl.experiment import Experiment
 from cprl.measuring.movement import Trace, overlap, trace
 from cprl.measuring.phases import Phase
 from cprl.measuring.statistics import estimate
+from cprl.measuring.windows import SMOOTHED_EPISODES, running_mean
 from cprl.population import Learning, Scripted, Team, exploration_steps
-from cprl.runs.curves import (
-    SMOOTHED_EPISODES,
-    as_curves,
-    curves_of,
-    episode_reached,
-    phases_of,
-    running_mean,
-)
+from cprl.runs.curves import as_curves, curves_of, episode_reached, phases_of
 from cprl.runs.episodes import read_episodes
 from cprl.runs.files import read_json
 from cprl.runs.recipe import read_recipe
@@ -72,21 +66,18 @@ class Measures:
     """Of the random policy in the same worlds; likewise."""
 
 
-def measures(
-    run: Path, *, window: int = SMOOTHED_EPISODES, seed: int = SEED, allow: Sequence[str] = ()
-) -> Measures:
+def measures(run: Path, *, window: int = SMOOTHED_EPISODES, seed: int = SEED) -> Measures:
     """All measures of a run: of its training curves, and of its trained agents in new worlds.
 
     Args:
         run: The directory of the run, or of its exported results.
         window: The window of the running means of which some measures are, in episodes.
         seed: The seed of the new worlds.
-        allow: See `cprl.load`.
     """
     training = of_training(curves_of(run), window=window)
     if lacks_weights(run):
         return Measures(training=training, trained={}, random={})
-    loaded = load(run, allow=allow)
+    loaded = load(run)
     fresh = Fresh(replicas=tuple(loaded.replicas), episodes=WORLDS, seed=seed, greedy=True)
     trained = _at_play(loaded, fresh, agents_of(loaded))
     return Measures(
@@ -274,8 +265,6 @@ class Result:
     curves: Mapping[str, Values]
     study: PublishedExperiment | None
     """The study's experiment that it repeats, see `study_of`."""
-    allow: Sequence[str] = ()
-    """The user's own code, "module:Class", that the run may import."""
 
     @property
     def name(self) -> str:
@@ -347,7 +336,7 @@ class Result:
     @cached_property
     def measures(self) -> Measures:
         """Measures of its training, and of its agents in new worlds."""
-        return measures(self.path, window=self.window, allow=self.allow)
+        return measures(self.path, window=self.window)
 
     def of_agents(self, column: str) -> Values | None:
         """A column of the table of episodes for each agent, float64 [R, E, N]; None if there is no such
@@ -386,12 +375,11 @@ class Result:
         return {name: running_mean(values, values.shape[1])[:, 0] for name, values in curves.items()}
 
 
-def read_result(path: Path, *, allow: Sequence[str] = ()) -> Result:
+def read_result(path: Path) -> Result:
     """Reads a run's directory, or its exported results.
 
     Args:
         path: The directory.
-        allow: See `cprl.load`.
 
     Raises:
         ValueError: If the path has no run, or one of a game without harvest; for code that is not allowed.
@@ -403,7 +391,7 @@ def read_result(path: Path, *, allow: Sequence[str] = ()) -> Result:
             f"{path} plays a game that reports no harvest; allowed in a report beside the published study: a "
             "commons; evaluate_run and crossplay measure the returns of others"
         )
-    experiment = Experiment.from_recipe(recipe, allow=allow, directory=path)
+    experiment = Experiment.from_recipe(recipe, directory=path)
     return Result(
         path=path,
         recipe=recipe,
@@ -411,7 +399,6 @@ def read_result(path: Path, *, allow: Sequence[str] = ()) -> Result:
         report=read_json(path / "report.json"),
         curves=curves,
         study=study_of(recipe["recipe"], experiment),
-        allow=allow,
     )
 
 
@@ -460,8 +447,7 @@ class PooledResult(Result):
             training = of_training(dict(self.curves), window=self.window)
             return Measures(training=training, trained={}, random={})
         each = [
-            measures(part.path, window=self.window, seed=SEED + nth, allow=part.allow)
-            for nth, part in enumerate(self.parts)
+            measures(part.path, window=self.window, seed=SEED + nth) for nth, part in enumerate(self.parts)
         ]
         return Measures(
             training=_joined([own.training for own in each]),
@@ -512,7 +498,6 @@ def _of(parts: Sequence[Result]) -> PooledResult:
         report=first.report,
         curves=_joined([part.curves for part in parts]),
         study=first.study,
-        allow=first.allow,
         parts=parts,
     )
 
@@ -564,8 +549,8 @@ def _played(game: Game, first: int, worlds: int) -> Values:
     """An episode in each of these worlds."""
     rng = np.random.default_rng([SEED, first])
     size = worlds, game.agents
-    batch = Batch(game, worlds, seed=SEED, first_world=first)
-    return harvests(batch, lambda _: rng.integers(len(game.actions), size=size))
+    env = CommonsEnv(game, worlds, seed=SEED, first_world=first)
+    return harvests(env, lambda _: rng.integers(len(game.actions), size=size))
 
 
 _BAR: Final = "\\|"

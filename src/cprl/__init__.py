@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     from cprl.training import train
     from cprl.training.agents import load
     from cprl.training.running import run
-    from cprl.values import Custom
+    from cprl.values import Custom, trust
 
     __version__: str
 
@@ -102,6 +102,7 @@ __all__ = [
     "theory",
     "train",
     "training",
+    "trust",
     "viewer",
 ]
 
@@ -122,6 +123,7 @@ _MODULES: Final = {
     "run_study": "cprl.studies",
     "study_main": "cprl.commands.studies",
     "train": "cprl.training",
+    "trust": "cprl.values",
 }
 """Where names are that no package is called. All are imported when they are used: torch alone takes seconds,
 which `cprl --help` and mistyped commands need not wait for."""

@@ -13,6 +13,7 @@ import pytest
 from golden import assert_held
 
 from cprl import Experiment, Study
+from cprl.values import trust
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "results"
@@ -103,13 +104,15 @@ def targets(value):
 @pytest.mark.parametrize("path", STORED, ids=lambda path: below(path, RESULTS))
 def test_a_stored_recipe_is_read_as_it_was(path):
     recipe = json.loads(path.read_text())
-    read = Experiment.from_recipe(recipe, allow=targets(recipe), directory=path.parent)
+    trust(*targets(recipe))
+    read = Experiment.from_recipe(recipe, directory=path.parent)
     assert_held("stored_recipes", {below(path.parent, RESULTS): shortened(read.to_config())}, may_gain=True)
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: below(path, RESULTS))
 def test_the_conditions_of_a_stored_study_keep_their_checksums(path):
     table = json.loads(path.read_text())
-    study = Study.from_config(table, allow=targets(table), directory=path.parent)
+    trust(*targets(table))
+    study = Study.from_config(table, directory=path.parent)
     conditions = {condition.name: condition.checksum for condition in study.all_conditions}
     assert_held("conditions", {below(path.parent, RESULTS): conditions})

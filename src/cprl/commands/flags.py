@@ -16,16 +16,23 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Union, get_arg
 import tyro
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
-from cprl.values import Custom, fits
+from cprl.system.output import say
+from cprl.values import Custom, fits, refusal
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+
     from cprl.experiment import Experiment
     from cprl.institutions import Institution
     from cprl.population import AgentSpec
+    from cprl.terminal.tables import Cells
 
 
 NO_DEFAULT: Final = tyro.conf.arg(help_behavior_hint="")
 """Of a flag whose default says nothing: its text says what happens without it."""
+
+
+_ROWS: Final = ".parquet"
 
 
 def _hint(default: str) -> str:
@@ -49,6 +56,65 @@ def _mark_empty(owner: Any, defaults: Mapping[str, Any]) -> None:
     owner.__annotations__ = {
         name: Annotated[hint, NO_DEFAULT] if name in empty else hint for name, hint in hints.items()
     }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tables:
+    """Which files of tables are written; none is written over."""
+
+    out: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
+    """A new file; may be repeated. By its suffix it has every row (.parquet), or the tables that are printed
+    (.txt, .md, .tex, or .csv with the bounds of intervals as columns)."""
+    csv: bool = False
+    """Print every row as CSV, and nothing else."""
+
+    def check(self) -> None:
+        """Refuse what cannot be written before hours of work."""
+        from cprl.runs.files import refuse_to_write_over
+        from cprl.terminal.tables import SUFFIXES
+
+        for path in self.out:
+            if path.suffix not in (_ROWS, *SUFFIXES):
+                raise refusal("--out", str(path), f"a name that ends in {', '.join((_ROWS, *SUFFIXES))}")
+            refuse_to_write_over(path)
+
+    def write(self, rows: "pa.Table", tables: "Sequence[Cells]" = (), *, notes: Sequence[str] = ()) -> None:
+        """Write the files, and say so.
+
+        Args:
+            rows: of a .parquet.
+            tables: of the other files, with notes below them.
+        """
+        from cprl.runs.episodes import write_table
+        from cprl.terminal.tables import write
+
+        for path in self.out:
+            if path.suffix == _ROWS:
+                write_table(path, rows)
+            else:
+                write(tables, path, notes=notes)
+            say(f"Written: {path}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Files(Tables):
+    """Which files of tables and figures are written; none is written over."""
+
+    figure: Path | None = None
+    """A new .png, .pdf or .svg, see docs/evaluation.md."""
+    figure_width: Literal["page", "column"] = "page"
+    """Of the figure: a page, or a column of a paper, 3.3 inches, with its caption in a file beside it."""
+
+    def check(self) -> None:
+        super().check()
+        if self.figure is not None:
+            from cprl.terminal.style import check_picture
+
+            check_picture(self.figure, "--figure")
+
+
+TableFlags = Annotated[Tables, tyro.conf.arg(name="")]
+FileFlags = Annotated[Files, tyro.conf.arg(name="")]
 
 
 class RefusedError(Exception):

@@ -23,7 +23,7 @@ from cprl.commands.recipe import (
     in_a_sentence,
     refuse_mistyped_flags,
     run_with,
-    trusting,
+    trust_allowed,
     wrapped,
 )
 from cprl.system.defaults import FILM_SEED
@@ -99,7 +99,7 @@ def main() -> None:
             function = without_empty_defaults(_function(words[0]))
             about = wrapped(f"{(getdoc(function) or '').partition(_ARGS)[0].strip()}\n\n{ALLOW}")
             config = (tyro.conf.HelptextFromCommentsOff, tyro.conf.DisallowNone)
-            others = trusting(words[1:])
+            others = trust_allowed(words[1:])
             if words[0] == "run" and "--trial" in others[:-1]:
                 place = others.index("--trial")
                 _TRIAL.set(Path(others[place + 1]))

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 import tyro
 
 from cprl.commands.flags import RefusedError, Shape, ValueFlags, in_shape, numbered, shape_of
+from cprl.runs.length import UNITS, without_length
 from cprl.system.output import RESUMES, legible, say
 from cprl.system.process import at_signals
 from cprl.system.shipped import Recipe, program_of
@@ -172,7 +173,7 @@ def parse(
     make_experiment: "Callable[..., Experiment]", command: Sequence[str]
 ) -> "tuple[Experiment, RunOptions]":
     """Return the experiment that a command line, script first, asks for, and how it is to be run."""
-    words, program = trusting(command[1:]), program_of(command[0])
+    words, program = trust_allowed(command[1:]), program_of(command[0])
     return parse_with(make_experiment, words, RunOptions(), program=program)
 
 
@@ -234,13 +235,13 @@ def parse_with(
 
 
 def _of_length(experiment: "Experiment", words: Sequence[str]) -> "Experiment":
-    """An experiment whose length is counted in what words say, --episodes or --steps, however many these."""
+    """Return an experiment whose length is counted in what words say, --episodes or --steps, however many."""
     names = {word.partition("=")[0] for word in words}
-    if "--steps" in names and experiment.steps is None and "--episodes" not in names:
-        return replace(experiment, episodes=None, steps=1)
-    if "--episodes" in names and experiment.episodes is None and "--steps" not in names:
-        return replace(experiment, episodes=1, steps=None)
-    return experiment
+    said = [unit for unit in UNITS if f"--{unit}" in names]
+    if len(said) != 1 or said[0] == experiment.length.unit:
+        return experiment
+    length: Any = {**without_length({}), said[0]: 1}
+    return replace(experiment, **length)
 
 
 def _refuse_names(make_experiment: "Callable[..., Experiment]", taken: set[str]) -> None:
@@ -311,7 +312,7 @@ def _names_of(recipe: Recipe) -> set[str] | None:
     return {*flags, *(f"--no-{flag.removeprefix('--')}" for flag in flags), *_HELP}
 
 
-def trusting(words: Sequence[str]) -> list[str]:
+def trust_allowed(words: Sequence[str]) -> list[str]:
     """Trust the user's own code that words of a command line allow, which may stand in the working directory,
     and return the other words."""
     parser = ArgumentParser(add_help=False, allow_abbrev=False)

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar
 
 import tyro
 
-from cprl.commands.recipe import ALLOW, Words, ended_by_sigterm, in_a_sentence, parse_with, trusting
+from cprl.commands.recipe import ALLOW, Words, ended_by_sigterm, in_a_sentence, parse_with, trust_allowed
+from cprl.runs.length import UNITS, without_length
 from cprl.runs.recipe import read_recipe, without_directories, without_options
 from cprl.system.defaults import LAST
 from cprl.system.output import console, printed, say
@@ -147,15 +148,12 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
     command = list(sys.argv if argv is None else argv)
     script = program_of(command[0])
     with in_a_sentence(script):
-        words = trusting(command[1:])
+        words = trust_allowed(command[1:])
         options = tyro.cli(MainOptions, args=words, prog=script, description=_about(study), config=_CONFIG)
         changes = _given(options)
-        said = {
-            unit: number for unit in ("episodes", "steps") if (number := changes.pop(unit, None)) is not None
-        }
+        said = {unit: changes.pop(unit) for unit in UNITS if unit in changes}
         if said:
-            length = {"episodes": None, "steps": None, **said}
-            changes["experiment"] = replace(study.experiment, **length)
+            changes["experiment"] = replace(study.experiment, **without_length({}), **said)
         study = replace(study, **changes)
         for unit, number in said.items():
             for condition in study.all_conditions:
@@ -215,7 +213,7 @@ def search(words: Sequence[str], /) -> None:
 
 def _read(words: Sequence[str], options: RecipeOptions, program: str) -> "tuple[Experiment, RecipeOptions]":
     """The experiment of a recipe and the options that stand after it; prints the help that they ask for."""
-    words = trusting(words)
+    words = trust_allowed(words)
     if not words or words[0] in ("-h", "--help"):
         _print_help(options, program)
     if words[0].startswith("-"):

@@ -30,8 +30,9 @@ from cprl.evaluation.evaluate import (
     unit_of_rewards,
 )
 from cprl.evaluation.lanes import Part, Played, Results, Whose, agents_of, fresh_of, more
-from cprl.measuring.metrics import with_unit
-from cprl.measuring.statistics import HOLM, Estimate, Measured, notes_on, starred
+from cprl.measuring.played import Measured, notes_on
+from cprl.measuring.registry import with_unit
+from cprl.measuring.statistics import HOLM, Estimate, starred
 from cprl.system.defaults import Diagonal
 from cprl.system.working import say_how_far, working
 from cprl.terminal import style
@@ -102,7 +103,6 @@ def crossplay(
     seed: int = SEED,
     replicas: Sequence[int] = (),
     diagonal: Diagonal = "self",
-    allow: Sequence[str] = (),
 ) -> CrossPlay:
     """Plays agents of each run with agents of each other run, one focal agent at a time.
 
@@ -114,7 +114,7 @@ def crossplay(
             "cross_seed", a focal agent of the run's next replica.
     """
     checked("diagonal", diagonal, Diagonal)
-    named = named_runs(runs, allow)
+    named = named_runs(runs)
     fresh = fresh_of(named.values(), episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
     numbers = fresh.replicas
     if diagonal == "cross_seed" and len(numbers) < 2:
@@ -136,13 +136,13 @@ def crossplay(
     return CrossPlay(runs=named, parts=parts, fresh=fresh, diagonal=diagonal)
 
 
-def named_runs(runs: Runs, allow: Sequence[str] = ()) -> dict[str, LoadedRun]:
+def named_runs(runs: Runs) -> dict[str, LoadedRun]:
     """Runs of the same game of several agents by given names, by names of their directories, or by their
     paths if those coincide."""
     names: list[str] = []
     if isinstance(runs, Mapping):
         names, runs = list(runs), list(runs.values())
-    loaded = [opened(run, allow) for run in runs]
+    loaded = [opened(run) for run in runs]
     if len(loaded) < 2:
         raise refusal("the number of runs", len(loaded), "at least two")
     paths = [run.path.resolve() for run in loaded]

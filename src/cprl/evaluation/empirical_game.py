@@ -101,7 +101,6 @@ def play_empirical_game(
     greedy: bool = False,
     seed: int = SEED,
     replicas: Sequence[int] = (),
-    allow: Sequence[str] = (),
 ) -> EmpiricalGame:
     """Plays all compositions of runs.
 
@@ -111,7 +110,7 @@ def play_empirical_game(
         episodes: episodes of each replica and choice of who plays where, each in its own world; the choices
             are N (C - S) + S.
     """
-    named = named_runs(runs, allow)
+    named = named_runs(runs)
     names = list(named)
     agents = named[names[0]].game.agents
     if (profiles := len(named) ** agents) > MOST_PROFILES:

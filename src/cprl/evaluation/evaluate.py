@@ -13,10 +13,7 @@ import torch
 from cprl.envs.make_env import stored_game
 from cprl.envs.unwrap import agent_names
 from cprl.evaluation.lanes import Fresh, Part, Played, Results, agents_of, fresh_of, scripted
-from cprl.measuring.metrics import left_out, with_unit
-from cprl.measuring.series import OF_AGENTS, Values
-from cprl.measuring.statistics import (
-    Estimate,
+from cprl.measuring.played import (
     Measured,
     agents_without_harvest,
     by_metric,
@@ -24,8 +21,10 @@ from cprl.measuring.statistics import (
     difference_paired,
     notes_on,
     over_replicas,
-    signed,
 )
+from cprl.measuring.registry import left_out, with_unit
+from cprl.measuring.series import OF_AGENTS, Values
+from cprl.measuring.statistics import Estimate, signed
 from cprl.system.defaults import SEED as SEED
 from cprl.system.working import working
 from cprl.terminal.tables import Cells
@@ -127,7 +126,6 @@ def evaluate_run(
     greedy: bool = False,
     seed: int = SEED,
     replicas: Sequence[int] = (),
-    allow: Sequence[str] = (),
 ) -> Evaluation:
     """Plays fresh episodes with every replica of a stored run, and with the random policy in the same worlds.
 
@@ -142,15 +140,15 @@ def evaluate_run(
         replicas: the indices of the replicas that play; by default all. A replica's episodes do not depend on
             the others.
     """
-    loaded = opened(run, allow)
+    loaded = opened(run)
     fresh = fresh_of([loaded], episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
     policies = {"trained": agents_of(loaded), "random": [scripted("random")] * loaded.game.agents}
     parts = [Part({"policy": policy}, fresh.play(loaded, agents)) for policy, agents in policies.items()]
     return Evaluation(run=loaded, fresh=fresh, parts=parts)
 
 
-def opened(run: str | Path | LoadedRun, allow: Sequence[str] = ()) -> LoadedRun:
-    return run if isinstance(run, LoadedRun) else load(run, allow=allow)
+def opened(run: str | Path | LoadedRun) -> LoadedRun:
+    return run if isinstance(run, LoadedRun) else load(run)
 
 
 def bars_of(estimates: Iterable[Estimate]) -> tuple[Values, Values]:

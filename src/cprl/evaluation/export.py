@@ -4,7 +4,7 @@ import csv
 import io
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Literal, NamedTuple
@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from cprl import keys
 from cprl.commons.game import Game
-from cprl.envs.unwrap import commons_of
 from cprl.evaluation.evaluate import opened
-from cprl.evaluation.fresh import fresh_episode
-from cprl.evaluation.lanes import Turns, board_now, refuse_trained_in
+from cprl.evaluation.fresh import Recorded, fresh_episode, record
+from cprl.evaluation.lanes import refuse_trained_in
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.system.defaults import FILM_SEED as SEED
 from cprl.system.output import say
@@ -25,36 +24,23 @@ from cprl.system.working import say_how_far, working
 from cprl.values import Positive, checked
 
 Format = Literal["csv", "minari"]
-COLUMNS: Final = ("episode", "turn", "agent", "action", "reward", "harvest", "in_play", "fired", "tagged")
-"""Of a CSV, a row for each episode, turn and agent, turns counted from 1; `in_play` says whether the action
-of the turn counted, `tagged` whether the agent was tagged in it. Then what the game has: `row`, `column` and
-`heading` of the agent and `stock`, the apples on the board, after the turn; its `fines` and `transfers`."""
-
-
-_PLACES: Final = ("row", "column", "heading", "stock")
-_HEADINGS: Final = ("up", "right", "down", "left")
+_INDICES: Final = ("episode", "turn", "agent")
+_HEADINGS: Final = np.array(["up", "right", "down", "left"])
 """By number, see `cprl.maps.Map.starts`."""
 
 
-class Played(NamedTuple):
+class Exported(NamedTuple):
     """An episode of T turns of N agents."""
 
     observation: NDArray[np.uint8]
     """[T + 1, N, ...], before each turn and after the last one."""
     action: NDArray[np.int64]
-    """[T, N]."""
-    reward: NDArray[np.float32]
-    """[T, N]."""
-    harvest: NDArray[np.float32]
-    """[T, N]; the reward where the game has none."""
-    in_play: NDArray[np.bool_]
-    """[T, N], before each turn."""
-    fired: NDArray[np.bool_]
-    """[T, N]."""
-    tagged: NDArray[np.bool_]
-    """[T, N]."""
-    more: dict[str, NDArray[Any]]
-    """[T, N] by the name of a column, what not every game has."""
+    """[T, N], by number."""
+    columns: dict[str, NDArray[Any]]
+    """[T, N] each, the columns of a CSV after episode, turn and agent: "action" by name where the game names
+    it; "reward"; "harvest", the reward where the game has none; "in_play", whether the action counted;
+    "fired"; "tagged" in this turn. Then what the game has: "row", "column" and "heading" of the agent and
+    "stock", the apples on the board, after the turn; "fines" and "transfers"."""
     terminated: bool
     """Whether the episode ended by itself, and not by the clock."""
 
@@ -68,16 +54,16 @@ def export_episodes(
     episodes: int = 20,
     replica: int = 0,
     seed: int = SEED,
-    allow: Sequence[str] = (),
 ) -> list[Path]:
     """Play fresh episodes of a run's agents, with the exploration of evaluation; write what they did, and say
     how much that is.
 
     Args:
-        out: of "csv", the file. Of "minari" a directory of Minari data sets, one for each agent:
-            `<name of out>/agent_0-v0` and so on, which `minari.load_dataset` finds where the environment
-            variable MINARI_DATASETS_PATH is the directory that `out` lies in. Actions and rewards of all
-            agents are in the infos of each, as "joint_action" and "joint_reward".
+        out: of "csv", the file: a row for each episode, turn and agent, turns counted from 1, see `Exported`.
+            Of "minari" a directory of Minari data sets, one for each agent: `<name of out>/agent_0-v0` and so
+            on, which `minari.load_dataset` finds where the environment variable MINARI_DATASETS_PATH is the
+            directory that `out` lies in. Actions and rewards of all agents are in the infos of each, as
+            "joint_action" and "joint_reward".
         episodes: which are those of `cprl film` with the same replica and seed, from 0 on.
 
     Returns:
@@ -88,78 +74,75 @@ def export_episodes(
         ModuleNotFoundError: for "minari" without that package.
     """
     format = checked("format", format, Format)
-    episodes, target = checked("episodes", episodes, Positive), Path(out)
+    episodes = checked("episodes", episodes, Positive)
+    target = Path(out)
     refuse_to_write_over(target)
     if format == "minari":
         _import_minari()
-    loaded = opened(run, allow)
+    loaded = opened(run)
     refuse_trained_in(seed, [loaded])  # before the folder is made
 
-    def played() -> Iterator[tuple[Played, Any]]:
+    def played() -> Iterator[Exported]:
         for episode in range(episodes):
             say_how_far(episode, episodes, "episodes")
             fresh = fresh_episode(loaded, replica=replica, episode=episode, seed=seed)
-            yield _play(Turns(fresh.env, fresh.policies)), fresh.run.game
+            yield _exported(loaded.game, record(fresh))
 
     target.parent.mkdir(parents=True, exist_ok=True)
-    return _write_csv(target, played()) if format == "csv" else _write_minari(target, list(played()))
+    if format == "csv":
+        return _write_csv(target, played())
+    return _write_minari(target, list(played()), loaded.game)
 
 
-@working("playing an episode")
-def _play(turns: Turns) -> Played:
-    batches = []
-    places = []
-    commons = commons_of(turns.env)
-    while not turns.has_ended:
-        batches.append(turns.play().clone())
-        if commons is not None:
-            now = board_now(commons)
-            headings = [_HEADINGS[heading] for heading in now.heading]
-            places.append((now.row, now.col, headings, [now.stock.sum(dtype=np.int64)] * len(headings)))
-    agents, last = keys.AGENTS, batches[-1]
-
-    def stacked(*name: str, lacking: Any = None) -> Any:
-        """An entry of all turns; the other value where the game has none."""
-        if batches[0].get(name, None) is None:
-            return lacking
-        return np.stack([batch[name][0].numpy(force=True) for batch in batches])
-
-    observed, action = stacked(agents, "observation"), stacked(agents, "action")
-    reward, nobody = stacked("next", agents, "reward")[..., 0], np.zeros(action.shape, np.bool_)
-    more = dict(zip(_PLACES, map(np.array, zip(*places, strict=True)), strict=True)) if places else {}
-    paid = {"fines": stacked("next", *keys.FINES), "transfers": stacked("next", *keys.TRANSFERS)}
-    more |= {name: values for name, values in paid.items() if values is not None}
-    return Played(
-        observation=np.concatenate([observed, last["next", agents, "observation"].numpy(force=True)]),
+def _exported(game: Any, played: Recorded) -> Exported:
+    action = played.entry(*keys.ACTION)
+    nobody = np.zeros(action.shape, np.int64)
+    reward = played.entry("next", *keys.REWARD)[..., 0]
+    tagged_by = played.entry("next", *keys.TAGGED_BY)
+    columns = {
+        "action": np.array(game.actions)[action] if isinstance(game, Game) else action,
+        "reward": reward,
+        "harvest": played.entry("next", *keys.HARVEST),
+        "in_play": played.entry(*keys.IN_PLAY),
+        "fired": played.entry("next", *keys.FIRED),
+        "tagged": None if tagged_by is None else tagged_by.any(-1),
+    }
+    lacking = {"harvest": reward, "in_play": nobody + 1, "fired": nobody, "tagged": nobody}
+    columns = {name: lacking[name] if values is None else values for name, values in columns.items()}
+    boards = played.boards[1:]
+    if boards:
+        stock = np.array([board.stock.sum(dtype=np.int64) for board in boards])
+        columns["row"] = np.stack([board.row for board in boards])
+        columns["column"] = np.stack([board.col for board in boards])
+        columns["heading"] = _HEADINGS[np.stack([board.heading for board in boards])]
+        columns["stock"] = nobody + stock[:, None]
+    for key in (keys.FINES, keys.TRANSFERS):
+        paid = played.entry("next", *key)
+        if paid is not None:
+            columns[key[-1]] = paid
+    after = played.batches[-1]["next"][keys.OBSERVATION].numpy(force=True)
+    return Exported(
+        observation=np.concatenate([played.entry(*keys.OBSERVATION), after]),
         action=action,
-        reward=reward,
-        harvest=stacked("next", *keys.HARVEST, lacking=reward),
-        in_play=stacked(agents, "in_play", lacking=~nobody),
-        fired=stacked("next", agents, "fired", lacking=nobody),
-        tagged=stacked("next", *keys.TAGGED_BY, lacking=nobody[..., None]).any(-1),
-        more=more,
-        terminated=bool(last["next", "terminated"].any()),
+        columns=columns,
+        terminated=played.episode.terminated,
     )
 
 
-def _write_csv(path: Path, played: Iterable[tuple[Played, Any]]) -> list[Path]:
+def _write_csv(path: Path, played: Iterable[Exported]) -> list[Path]:
     count = 0
 
     def write(file: BinaryIO) -> None:
         nonlocal count
         text = io.TextIOWrapper(file, encoding="utf-8", newline="")
         table = csv.writer(text)
-        for episode, (one, game) in enumerate(played):
+        for episode, one in enumerate(played):
             if not episode:
-                table.writerow((*COLUMNS, *one.more))
-            names = game.actions if isinstance(game, Game) else ()
-            for turn, agent in np.ndindex(one.action.shape):
-                action = int(one.action[turn, agent])
-                numbers = (float(one.reward[turn, agent]), float(one.harvest[turn, agent]))
-                flags = (int(flag[turn, agent]) for flag in (one.in_play, one.fired, one.tagged))
-                more = (values[turn, agent].item() for values in one.more.values())
-                called = names[action] if names else action
-                table.writerow((episode, turn + 1, agent, called, *numbers, *flags, *more))
+                table.writerow((*_INDICES, *one.columns))
+            turn, agent = (np.asarray(index) for index in np.indices(one.action.shape))
+            indices = (np.full_like(turn, episode), turn + 1, agent)
+            columns = [_plain(values) for values in (*indices, *one.columns.values())]
+            table.writerows(zip(*columns, strict=True))
             count += one.action.size
         text.flush()
         text.detach()  # the file is closed by who opened it
@@ -169,43 +152,55 @@ def _write_csv(path: Path, played: Iterable[tuple[Played, Any]]) -> list[Path]:
     return [path]
 
 
-def _write_minari(folder: Path, played: list[tuple[Played, Any]]) -> list[Path]:
+def _plain(values: NDArray[Any]) -> list[Any]:
+    """Return the values of a column one after the other, flags as 0 and 1."""
+    return list(values.ravel().astype(np.int64 if values.dtype == np.bool_ else values.dtype).tolist())
+
+
+def _write_minari(folder: Path, played: list[Exported], game: Any) -> list[Path]:
     import gymnasium
 
     minari = _import_minari()
     from minari.data_collector import EpisodeBuffer
 
-    first, game = played[0][0], played[0][1]
-    spaces = game.spaces if hasattr(game, "spaces") else None
-    actions = spaces.actions if spaces is not None else int(max(one.action.max() for one, _ in played)) + 1
-    seen = first.observation[0, 0]
-    high = float(spaces.observation_scale) if spaces is not None else float(np.inf)
-    observation_space = gymnasium.spaces.Box(0 if spaces else -np.inf, high, seen.shape, seen.dtype.type)
+    spaces = getattr(game, "spaces", None)
+    seen = played[0].observation[0, 0]
+    if spaces is None:
+        actions = int(max(one.action.max() for one in played)) + 1
+        low = -np.inf
+        high = np.inf
+    else:
+        actions = spaces.actions
+        low = 0
+        high = float(spaces.observation_scale)
     written = []
     with _minari_root(folder.parent):
-        for agent in range(first.action.shape[1]):
-            buffers = [
-                EpisodeBuffer(
-                    id=number,
-                    observations=list(one.observation[:, agent]),
-                    actions=list(one.action[:, agent]),
-                    rewards=one.reward[:, agent].tolist(),
-                    terminations=[False] * (len(one.action) - 1) + [one.terminated],
-                    truncations=[False] * (len(one.action) - 1) + [not one.terminated],
-                    infos={
-                        "joint_action": [one.action[0], *one.action],
-                        "joint_reward": [np.zeros_like(one.reward[0]), *one.reward],
-                    },
+        for agent in range(played[0].action.shape[1]):
+            buffers = []
+            for number, one in enumerate(played):
+                going_on = [False] * (len(one.action) - 1)
+                reward = one.columns["reward"]
+                buffers.append(
+                    EpisodeBuffer(
+                        id=number,
+                        observations=list(one.observation[:, agent]),
+                        actions=list(one.action[:, agent]),
+                        rewards=reward[:, agent].tolist(),
+                        terminations=[*going_on, one.terminated],
+                        truncations=[*going_on, not one.terminated],
+                        infos={
+                            "joint_action": [one.action[0], *one.action],
+                            "joint_reward": [np.zeros_like(reward[0]), *reward],
+                        },
+                    )
                 )
-                for number, (one, _) in enumerate(played)
-            ]
             with warnings.catch_warnings():  # of authors and addresses, which are the user's to add
                 warnings.simplefilter("ignore", UserWarning)
                 minari.create_dataset_from_buffers(
                     f"{folder.name}/agent_{agent}-v0",
                     buffers,
                     action_space=gymnasium.spaces.Discrete(actions),
-                    observation_space=observation_space,
+                    observation_space=gymnasium.spaces.Box(low, high, seen.shape, seen.dtype.type),
                     algorithm_name="cprl",
                     description=f"Agent {agent} of stored agents of cprl in a commons",
                     data_format="arrow",
@@ -225,8 +220,9 @@ def _import_minari() -> Any:
 
 @contextmanager
 def _minari_root(folder: Path) -> Iterator[None]:
-    """While it is open, Minari writes below a folder."""
-    name, before = "MINARI_DATASETS_PATH", os.environ.get("MINARI_DATASETS_PATH")
+    """Make Minari write below a folder while it is open."""
+    name = "MINARI_DATASETS_PATH"
+    before = os.environ.get(name)
     os.environ[name] = str(folder.resolve())
     try:
         yield

@@ -1,7 +1,7 @@
 """Film an episode of the agents of stored runs: as a recording, or side by side as a GIF or an MP4."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
@@ -13,8 +13,8 @@ from tensordict import TensorDictBase
 
 from cprl import keys
 from cprl.commons.readable import growth_of, in_lower_case, legend_of
-from cprl.commons.world import Bytes, Shown
-from cprl.envs.unwrap import clock_of, commons_of
+from cprl.commons.world import Bytes
+from cprl.envs.unwrap import commons_of
 from cprl.evaluation.film_pictures import (
     DEFAULT_WIDTH,
     LARGEST_WIDTH,
@@ -25,15 +25,15 @@ from cprl.evaluation.film_pictures import (
     write_gif,
     write_mp4,
 )
-from cprl.evaluation.fresh import FreshEpisode, fresh_episode, fresh_episodes, say_which
-from cprl.evaluation.lanes import Turns, board_now, commons_game
+from cprl.evaluation.fresh import FreshEpisode, Recorded, fresh_episode, fresh_episodes, record, say_which
+from cprl.evaluation.lanes import commons_game
 from cprl.measuring.episodes import Episode, tracker_of
+from cprl.measuring.evaluate import turns
 from cprl.runs.files import refuse_to_write_over
 from cprl.system.defaults import FILM_SUFFIXES as SUFFIXES
 from cprl.system.memory import check_memory
 from cprl.system.output import legible
-from cprl.system.working import say_how_far, working
-from cprl.training import train
+from cprl.system.working import working
 from cprl.training.agents import LoadedRun
 from cprl.values import Positive, Range, Value, Where, checked, refusal
 from cprl.viewer.callback import ViewerCallback
@@ -48,7 +48,6 @@ def film(
     replica: int | None = None,
     episode: int | None = None,
     seed: int | None = None,
-    allow: Sequence[str] = (),
 ) -> tuple[Path, Episode]:
     """Record an episode of a run's agents in a fresh world, with the exploration of evaluation; say which.
 
@@ -70,7 +69,7 @@ def film(
         raise refusal("out", str(out), "a .rrd; film_video makes a .gif or an .mp4")
     if out is not None:
         refuse_to_write_over(Path(out))
-    fresh = fresh_episode(run, replica=replica, episode=episode, seed=seed, allow=allow)
+    fresh = fresh_episode(run, replica=replica, episode=episode, seed=seed)
     which = f"{fresh.replica}-{fresh.episode}"
     target = Path(run) / f"film-{which}.rrd" if out is None else Path(out)
     refuse_to_write_over(target)
@@ -86,7 +85,8 @@ def film(
 
 @working("playing an episode")
 def _recorded(fresh: FreshEpisode, target: Path, title: str) -> Episode:
-    policies, env = fresh.policies, fresh.env
+    env = fresh.env
+    commons = commons_of(env)
     with ViewerCallback(
         target.parent,
         env,
@@ -96,51 +96,41 @@ def _recorded(fresh: FreshEpisode, target: Path, title: str) -> Episode:
         file_name=target.name,
         is_replay=True,
     ) as viewer:
-        log, scene, logger, commons = _Events(viewer), viewer.logger.scene, viewer.logger, commons_of(env)
-        views: list[Any] = []
+        logger = viewer.logger
+        scene = logger.scene
+        observers: list[Any] = [viewer]
         if scene is not None:
             actions = fresh.run.game.actions
-            views = [Decisions(logger, policies, actions=actions, names=scene.agents, window=scene.window)]
+            window = scene.window
+            observers.append(
+                Decisions(logger, fresh.policies, actions=actions, names=scene.agents, window=window)
+            )
             if commons is not None and scene.has_institutions:
-                views.append(Offences(logger, commons, names=scene.agents))
-        train(
-            env,
-            {},
-            others=dict(zip(policies.indices, policies.actors, strict=True)),
-            decisions=policies.decisions,
-            episodes=1,
-            callbacks=[viewer, *views, log],
-        )
-    assert log.episode is not None
-    return log.episode
+                observers.append(Offences(logger, commons, names=scene.agents))
+        tracker = tracker_of(env)
+        for step, batch in enumerate(turns(env, fresh.policies), start=1):
+            for observer in observers:
+                observer.on_step(batch)
+            for event in (*_tags_in(batch), *events(batch)):
+                _log(viewer, step, event)
+            for episode in tracker.add(batch):
+                for observer in observers:
+                    observer.on_episode(episode, {})
+                _log(viewer, step, f"the end; {episode.outcome}")
+    return episode
 
 
-class _Events:
-    """Logs every tag, violation and the outcome of the episode, and stores the episode."""
+def _tags_in(batch: TensorDictBase) -> list[str]:
+    """Return who was tagged out by whom in a turn, a sentence for each."""
+    tagged_by = batch.get(("next", *keys.TAGGED_BY), None)
+    pairs = [] if tagged_by is None else tagged_by[0].nonzero().tolist()
+    return [f"agent {tagged} is tagged out by agent {by}" for tagged, by in pairs]
 
-    def __init__(self, viewer: ViewerCallback) -> None:
-        self.viewer = viewer
-        self.episode: Episode | None = None
-        self._step = 0
 
-    def on_step(self, batch: TensorDictBase) -> None:
-        self._step += 1
-        say_how_far(self._step, clock_of(self.viewer.env), "turns")
-        tagged_by = batch.get(("next", *keys.TAGGED_BY), None)
-        tags = [] if tagged_by is None else tagged_by[0].nonzero().tolist()
-        for event in (
-            *(f"agent {tagged} is tagged out by agent {by}" for tagged, by in tags),
-            *events(batch),
-        ):
-            self._log(event)
-
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        self.episode = episode
-        self._log(f"the end; {episode.outcome}")
-
-    def _log(self, event: str) -> None:
-        self.viewer.logger.at(step=self._step, episode=0)
-        self.viewer.logger.log_text(f"step {self._step:,}: {event}")
+def _log(viewer: ViewerCallback, step: int, event: str) -> None:
+    """Log an event of the episode."""
+    viewer.logger.at(step=step, episode=0)
+    viewer.logger.log_text(f"step {step:,}: {event}")
 
 
 DEFAULT_FPS: Final = 15.0
@@ -170,7 +160,7 @@ class Style(Value, stored=False):
     that has room. The height follows from the boards, each at most twice as high as its part is wide."""
 
     def width_of_each(self, runs: int) -> int:
-        """The width of the part of each run."""
+        """Return the width of the part of each run."""
         width = min(LARGEST_WIDTH, DEFAULT_WIDTH * runs) if self.width is None else self.width
         allowed = Annotated[int, Range(SMALLEST_WIDTH * runs, LARGEST_WIDTH)]
         return int(checked("width", width, allowed)) // runs
@@ -186,7 +176,6 @@ def film_video(
     episode: int | None = None,
     seed: int | None = None,
     style: Style = Style(),
-    allow: Sequence[str] = (),
 ) -> tuple[Path, tuple[Episode, ...]]:
     """Film an episode of a run's agents, beside the agents of other runs if there are any.
 
@@ -222,15 +211,15 @@ def film_video(
     refuse_to_write_over(path)
     if path.suffix == ".mp4":
         check_can_write_mp4(path)
-    fresh = fresh_episodes(runs, replica=replica, episode=episode, seed=seed, allow=allow)
+    fresh = fresh_episodes(runs, replica=replica, episode=episode, seed=seed)
     say_which(fresh)
     panels = _panels(fresh, style.titles or titles_of(fresh), width)
-    length = max(len(panel.filmed.moments) for panel in panels)
+    length = max(len(panel.played.boards) for panel in panels)
     every = style.every or (1 if path.suffix == ".mp4" else ceil(length / GIF_FRAMES))
     chosen = sorted({*range(0, length, every), length - 1})
 
     def draw(turns: Sequence[int]) -> Iterator[Bytes]:
-        """The pictures after these turns, and the end card."""
+        """Yield the pictures after these turns, and the end card."""
         for turn in turns:
             since = max((other for other in chosen if other < turn), default=-1) + 1
             yield joined([panel.draw(turn, since=since) for panel in panels])
@@ -254,7 +243,7 @@ def film_video(
         )
         samples = chosen[:: ceil(len(chosen) / _SAMPLES)]
         write_gif(path, draw(chosen), list(draw(samples)), fps=style.fps)
-    return path, tuple(panel.filmed.episode for panel in panels)
+    return path, tuple(panel.played.episode for panel in panels)
 
 
 def check_titles(titles: Sequence[str], runs: int) -> None:
@@ -284,89 +273,50 @@ def _rules_in(run: LoadedRun) -> list[str]:
     ]
 
 
-class Filmed(NamedTuple):
-    """An episode, as it is shown to people."""
-
-    moments: list[Shown]
-    """The board as the episode began, then after each turn; without what agents observe."""
-    violators: list[set[int]]
-    """The agents that broke a rule in the turn that led to each moment."""
-    fines: NDArray[np.float64]
-    """[moments], what all agents paid in fines so far."""
-    episode: Episode
-
-    @property
-    def left(self) -> int:
-        """Apples on the board at the end."""
-        return int(self.moments[-1].stock.sum())
-
-    @property
-    def apples(self) -> int:
-        """What all agents harvested."""
-        return int(self.moments[-1].harvested.sum())
-
-    @property
-    def is_dead(self) -> bool:
-        """Whether the board died, since no apple was left and none could grow."""
-        return self.episode.terminated and self.left == 0
-
-
-@working("playing an episode")
-def play_to_show(fresh: FreshEpisode) -> Filmed:
-    """Play an episode of a game with a board; raises a ValueError for others."""
-    commons_game(fresh.run)
-    commons = commons_of(fresh.env)
-    assert commons is not None
-    tracker, turns = tracker_of(fresh.env, fresh.run.metrics), Turns(fresh.env, fresh.policies)
-    ended: list[Episode] = []
-    moments, violators, fines = [board_now(commons)], [set[int]()], [0.0]
-    while not ended:
-        batch = turns.play()
-        ended = tracker.add(batch)
-        moments.append(board_now(commons))
-        violated, fined = (batch.get(("next", *key), None) for key in (keys.VIOLATED, keys.FINES))
-        violators.append(set() if violated is None else set(violated[0].nonzero()[:, 0].tolist()))
-        fines.append(0.0 if fined is None else float(fined.sum()))
-    return Filmed(moments, violators, np.cumsum(fines), ended[0])
-
-
 class _Panel(NamedTuple):
     """What a film shows of one population."""
 
     title: str
     picture: EpisodePicture
-    filmed: Filmed
+    played: Recorded
+    violated: NDArray[np.bool_]
+    """[T + 1, N], which agents broke a rule in the turn that led to each board."""
     is_typical: bool
 
     def draw(self, turn: int, *, since: int, card: bool = False) -> Bytes:
-        """The population after a turn of the film's clock, or at its end if that was before.
+        """Draw the population after a turn of the film's clock, or at its end if that was before.
 
         Args:
             card: whether to say how the episode ended.
         """
-        filmed, sites = self.filmed, len(self.picture.board.sites)
-        last = len(filmed.moments) - 1
-        dead = f"gone for good at turn {last:,} of {self.picture.steps:,}" if filmed.is_dead else ""
-        outcome = dead or f"{filmed.left:,} of {sites:,} still on the board"
-        apples = f"{filmed.apples:,} apple{'' if filmed.apples == 1 else 's'} picked"
+        played = self.played
+        dead = ""
+        if played.is_dead:
+            dead = f"gone for good at turn {played.last:,} of {self.picture.steps:,}"
+        outcome = dead or f"{played.left:,} of {len(self.picture.board.sites):,} still on the board"
+        count = int(played.boards[-1].harvested.sum())
+        apples = f"{count:,} apple{'s' * (count != 1)} picked"
         which = "A typical episode" if self.is_typical else "This episode"
         return self.picture.draw(
-            filmed.moments[: turn + 1],
+            played.boards[: turn + 1],
             self.title,
             comes_to=f"{which}: {apples}, {outcome}",
-            end=dead if turn >= last else "",
+            end=dead if turn >= played.last else "",
             card=f"{apples} · {outcome}" if card else "",
-            violators=sorted(set().union(*filmed.violators[since : turn + 1])),
+            violators=np.flatnonzero(self.violated[since : turn + 1].any(0)).tolist(),
         )
 
 
 def _panels(fresh: Sequence[FreshEpisode], titles: Sequence[str], width: int) -> list[_Panel]:
     """Play the episodes; return what is shown of each, in panels of one size with one axis of harvests."""
     games = [commons_game(population.run) for population in fresh]
-    episodes = [play_to_show(population) for population in fresh]
-    most = max(int(filmed.moments[-1].harvested.max()) for filmed in episodes)
+    episodes = [record(population) for population in fresh]
+    most = max(int(played.boards[-1].harvested.max()) for played in episodes)
     height = max(EpisodePicture(game.map, steps=1, width=width).size[1] for game in games)
     sizes = {"width": width, "height": height, "most_harvested": most}
-    pictures = [EpisodePicture(game.map, steps=game.rules.episode_steps, **sizes) for game in games]
-    are_typical = [population.is_typical for population in fresh]
-    return [_Panel(*shown) for shown in zip(titles, pictures, episodes, are_typical, strict=True)]
+    panels = []
+    for title, population, game, played in zip(titles, fresh, games, episodes, strict=True):
+        picture = EpisodePicture(game.map, steps=game.rules.episode_steps, **sizes)
+        violated = played.since_the_start("next", *keys.VIOLATED) > 0
+        panels.append(_Panel(title, picture, played, violated, population.is_typical))
+    return panels

@@ -20,7 +20,9 @@ from cprl.commons.picture import world_image
 from cprl.commons.world import Bytes, Shown
 from cprl.runs.files import write_atomically
 
-SMALLEST_WIDTH, DEFAULT_WIDTH, LARGEST_WIDTH = 240, 640, 1920
+SMALLEST_WIDTH: Final = 240
+DEFAULT_WIDTH: Final = 640
+LARGEST_WIDTH: Final = 1920
 """Pixels."""
 
 SMALLEST_CELL_PIXELS: Final = 8
@@ -60,14 +62,18 @@ class EpisodePicture:
         height: int = 0,
     ) -> None:
         width -= width % 2  # which videos want
-        self.board, self.steps, self._most = board, steps, most_harvested
+        self.board = board
+        self.steps = steps
+        self._most = most_harvested
         self._unit = unit = max(10, width // 40)
-        self._font, self._large = _font(unit), _font(2 * unit)
+        self._font = _font(unit)
+        self._large = _font(2 * unit)
         highest = _BOARD_HEIGHT * width
         room = width - unit
         fitting = min((room - 1) // board.width, (highest - 1) // board.height)
         self._cell = max(SMALLEST_CELL_PIXELS, fitting)
-        wide, high = board.width * self._cell + 1, board.height * self._cell + 1
+        wide = board.width * self._cell + 1
+        high = board.height * self._cell + 1
         shrink = min(1.0, room / wide, highest / high)
         self._board_size = max(1, int(wide * shrink)), max(1, int(high * shrink))
         self._half = (width - 3 * unit) // 2
@@ -126,25 +132,29 @@ class EpisodePicture:
         return np.asarray(image)
 
     def _mark(self, draw: ImageDraw.ImageDraw, agent: int, now: Shown) -> None:
-        """A diamond around who broke a rule, as `cprl.viewer.replay` has it; with its number where it is
+        """Draw a diamond around who broke a rule, as `cprl.viewer.replay` has it; with its number where it is
         out of play, as a sanction can put it at once."""
         left, top, right, bottom = self.cell_box(int(now.row[agent]), int(now.col[agent]))
-        across, down, more = (left + right) / 2, (top + bottom) / 2, (right - left) * _DIAMOND_BEYOND
+        across = (left + right) / 2
+        down = (top + bottom) / 2
+        more = (right - left) * _DIAMOND_BEYOND
         corners = [(across, top - more), (right + more, down), (across, bottom + more), (left - more, down)]
         draw.line([*corners, *corners[:2]], _TEXT, max(1, self._unit // 5), joint="curve")
         if not now.in_play[agent]:
             draw.text((across, down), str(agent), agent_colour(agent), self._font, anchor="mm")
 
     def cell_box(self, row: int, col: int) -> tuple[float, float, float, float]:
-        """Where a cell is in the picture: left, top, right and bottom in pixels."""
+        """Return where a cell is in the picture: left, top, right and bottom in pixels."""
         wide, high = self._board_size
         left = (self.size[0] - wide) // 2
-        across, down = wide / self.board.width, high / self.board.height
+        across = wide / self.board.width
+        down = high / self.board.height
         top = self._board_top + row * down
         return left + col * across, top, left + (col + 1) * across, top + down
 
     def _caption(self, draw: ImageDraw.ImageDraw, title: str, comes_to: str, end: str, turn: str) -> None:
-        """The title on the left, the turn or the end on the right; below them what the episode comes to."""
+        """Write the title on the left, the turn or the end on the right; below them what the episode comes
+        to."""
         edge = self._unit
         middle = 3 * self._unit // 2
         below = _fitting(comes_to, self.size[0] - 2 * edge, 5 * self._unit // 4)
@@ -156,22 +166,25 @@ class EpisodePicture:
         draw.text((edge, middle), title, _TEXT, _fitting(title, room, 2 * self._unit), anchor="lm")
 
     def _card(self, draw: ImageDraw.ImageDraw, text: str, colour: Colour) -> None:
-        middle, deep = self._middle, 2 * self._unit
-        left, right = self._unit, self.size[0] - self._unit
-        draw.rectangle((left, middle - deep, right, middle + deep), PALETTE[GROUND], colour)
-        font = _fitting(text, right - left - 2 * self._unit, 2 * self._unit)
-        draw.text((self.size[0] / 2, middle), text, colour, font, anchor="mm")
+        edge = self._unit
+        right = self.size[0] - edge
+        draw.rectangle(
+            (edge, self._middle - 2 * edge, right, self._middle + 2 * edge), PALETTE[GROUND], colour
+        )
+        font = _fitting(text, right - 3 * edge, 2 * edge)
+        draw.text((self.size[0] / 2, self._middle), text, colour, font, anchor="mm")
 
     def _plot_stock(self, draw: ImageDraw.ImageDraw, stock: NDArray[np.int64]) -> None:
-        """The apples on the board, [T], as an area."""
-        left, sites = self._unit, len(self.board.sites)
+        """Draw the apples on the board, [T], as an area."""
+        left = self._unit
+        sites = len(self.board.sites)
         self._axes(draw, left, f"{stock[-1]:,} of {sites:,}", "apples on the board")
         path = self._points(left, stock, sites)
         floor = self._axes_top + self._plot_height
         draw.polygon([(path[0][0], floor), *path, (path[-1][0], floor)], PALETTE[APPLE], PALETTE[APPLE])
 
     def _plot_harvests(self, draw: ImageDraw.ImageDraw, harvests: NDArray[np.int32]) -> None:
-        """Each agent's harvest so far, [T, N], as lines in their colours, which a legend repeats."""
+        """Draw each agent's harvest so far, [T, N], as a line in its colour, which a legend repeats."""
         left = 2 * self._unit + self._half
         most = int(harvests.max(initial=0)) if self._most is None else self._most
         words = f"apples picked; below by each, 0 to {most:,}"
@@ -183,7 +196,9 @@ class EpisodePicture:
         line = int(self._font.getbbox("0")[3] * 1.3) + 1
         for agent, apples in enumerate(harvests[-1]):
             row, place = divmod(agent, self._in_a_row)
-            across, down, unit = left + place * self._item, top + row * line, self._unit
+            across = left + place * self._item
+            down = top + row * line
+            unit = self._unit
             wide = max(unit, int(self._font.getlength(f"{agent}")) + 4)
             draw.rectangle((across, down, across + wide, down + unit + 1), agent_colour(agent))
             middle = across + wide / 2, down + unit / 2 + 1
@@ -191,18 +206,21 @@ class EpisodePicture:
             draw.text((across + wide + unit // 3, middle[1]), f"{apples}", _TEXT, self._font, anchor="lm")
 
     def _axes(self, draw: ImageDraw.ImageDraw, left: int, number: str, words: str) -> None:
-        """The frame of a plot over turns; above it a large number and what it counts."""
-        top, high, wide, below = self._axes_top, self._plot_height, self._half, self._unit // 4
+        """Draw the frame of a plot over turns; above it a large number and what it counts."""
+        top = self._axes_top
+        floor = top + self._plot_height
+        right = left + self._half
+        below = floor + self._unit // 4
         draw.text((left, self._numbers_top), number, _TEXT, self._large)
         under = self._numbers_top + 5 * self._unit // 2
-        draw.text((left, under), words, _FAINT, _fitting(words, wide, self._unit))
-        draw.rectangle((left, top, left + wide, top + high), outline=_LINE)
-        draw.text((left, top + high + below), "0", _FAINT, self._font)
-        draw.text((left + wide / 2, top + high + below), "turn", _FAINT, self._font, anchor="ma")
-        draw.text((left + wide, top + high + below), f"{self.steps:,}", _FAINT, self._font, anchor="ra")
+        draw.text((left, under), words, _FAINT, _fitting(words, self._half, self._unit))
+        draw.rectangle((left, top, right, floor), outline=_LINE)
+        draw.text((left, below), "0", _FAINT, self._font)
+        draw.text((left + self._half / 2, below), "turn", _FAINT, self._font, anchor="ma")
+        draw.text((right, below), f"{self.steps:,}", _FAINT, self._font, anchor="ra")
 
     def _points(self, left: int, values: NDArray[Any], most: int) -> list[tuple[float, float]]:
-        """Where values [T] of 0 to `most` are in a plot; at least two points."""
+        """Return where values [T] of 0 to `most` are in a plot; at least two points."""
         high = self._plot_height
         columns = left + np.arange(len(values)) * (self._half / max(1, self.steps))
         rows = self._axes_top + high - values * (high / max(1, most))
@@ -217,15 +235,17 @@ def _font(pixels: int) -> ImageFont.FreeTypeFont:
 
 
 def _fitting(text: str, room: float, largest: int) -> ImageFont.FreeTypeFont:
-    """The font in the largest size, in pixels, in which a text has room."""
+    """Return the font in the largest size, in pixels, in which a text has room."""
     wide = _font(largest).getlength(text)
     return _font(largest if wide <= room else max(1, int(largest * room / wide)))
 
 
 def note(text: str, width: int) -> Bytes:
-    """A text in small type below pictures: uint8 [height, width, 3], the height even."""
-    edge, font = max(10, width // 96), _font(max(10, min(14, width // 60)))
-    lines, room = [""], width - 2 * edge
+    """Return a text in small type, to stand below pictures: uint8 [height, width, 3], the height even."""
+    edge = max(10, width // 96)
+    font = _font(max(10, min(14, width // 60)))
+    room = width - 2 * edge
+    lines = [""]
     for word in text.split():
         longer = f"{lines[-1]} {word}".strip()
         lines[-1:] = [longer] if font.getlength(longer) <= room else [lines[-1], word]
@@ -244,7 +264,7 @@ _COLOURS: Final = 127
 
 
 def check_can_write_mp4(path: Path) -> None:
-    """Raises a ModuleNotFoundError, saying how to install it, if imageio-ffmpeg is not installed."""
+    """Raise a ModuleNotFoundError, saying how to install it, if imageio-ffmpeg is not installed."""
     if find_spec("imageio_ffmpeg") is None:
         raise ModuleNotFoundError(
             f"{path}: an .mp4 needs imageio-ffmpeg, which is not installed; "
@@ -253,7 +273,7 @@ def check_can_write_mp4(path: Path) -> None:
 
 
 def write_gif(path: Path, pictures: Iterable[Bytes], samples: Sequence[Bytes], *, fps: float) -> None:
-    """Writes a GIF that repeats, with one palette for all pictures.
+    """Write a GIF that repeats, with one palette for all pictures.
 
     Args:
         pictures: uint8 [height, width, 3] each, RGB.

@@ -7,18 +7,28 @@ an episode near the middle, and words say so, and what the others do.
 from collections.abc import Mapping, Sequence
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
+from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
+from cprl import keys
+from cprl.commons.game import Game
+from cprl.commons.world import Shown
+from cprl.envs.commons_env import CommonsEnv
+from cprl.envs.unwrap import commons_of
 from cprl.evaluation.evaluate import opened
 from cprl.evaluation.lanes import refuse_trained_in
-from cprl.measuring.evaluate import evaluate
+from cprl.experiment import Experiment
+from cprl.measuring.episodes import Episode, tracker_of
+from cprl.measuring.evaluate import evaluate, turns
 from cprl.policies.assignment import AgentPolicies
+from cprl.population import AgentSpec
 from cprl.runs.episodes import read_rows
 from cprl.system.defaults import FILM_SEED as SEED
 from cprl.system.output import say
+from cprl.system.working import working
 from cprl.training.agents import LoadedRun
 from cprl.values import Natural, Range, Seed, checked
 
@@ -88,11 +98,25 @@ def averages_in_words(run: LoadedRun) -> str:
 
 
 def _listed(numbers: Sequence[float]) -> str:
-    """Numbers in words; of many the least and the greatest."""
+    """Return numbers in words; of many the least and the greatest."""
     texts = [f"{number:,.0f}" for number in numbers]
     if len(texts) > _MOST_LISTED:
         return f"{min(numbers):,.0f} to {max(numbers):,.0f}"
     return " and ".join(filter(None, [", ".join(texts[:-1]), texts[-1]]))
+
+
+def unstored(game: Game, agents: Sequence[AgentSpec]) -> LoadedRun:
+    """Return a run of scripted agents that stands nowhere on the disk, to be played as stored ones are."""
+    experiment = Experiment(name="scripted", game=game, agents=tuple(agents), episodes=1, replicas=1)
+    nowhere = Path(experiment.name)
+    return LoadedRun(
+        path=nowhere,
+        experiment=experiment,
+        recipe={},
+        networks={},
+        weights_from=nowhere,
+        transforms_state={},
+    )
 
 
 def fresh_episode(
@@ -101,10 +125,9 @@ def fresh_episode(
     replica: int | None = None,
     episode: int | None = None,
     seed: int | None = None,
-    allow: Sequence[str] = (),
 ) -> FreshEpisode:
     """Return the world and the agents of an episode that is filmed, see `fresh_episodes`."""
-    (fresh,) = fresh_episodes([run], replica=replica, episode=episode, seed=seed, allow=allow)
+    (fresh,) = fresh_episodes([run], replica=replica, episode=episode, seed=seed)
     return fresh
 
 
@@ -114,9 +137,8 @@ def fresh_episodes(
     replica: int | None = None,
     episode: int | None = None,
     seed: int | None = None,
-    allow: Sequence[str] = (),
 ) -> list[FreshEpisode]:
-    """The worlds and the agents of episodes that are shown together; equal numbers give equal episodes.
+    """Return the worlds and the agents of episodes that are shown together; equal numbers, equal episodes.
 
     Without `replica` and `episode` it is a typical one: of each run the replica whose average survival in the
     run's own evaluation is nearest to the median over replicas, and of the first five episodes the one whose
@@ -134,7 +156,7 @@ def fresh_episodes(
         replica = checked("replica", replica, Natural)
     if seed is not None:
         seed = checked("seed", seed, Seed)
-    loaded = [opened(run, allow) for run in runs]
+    loaded = [opened(run) for run in runs]
     if seed is None:
         seed = fresh_seed(loaded)
     refuse_trained_in(seed, loaded)
@@ -144,7 +166,7 @@ def fresh_episodes(
     are_known = [bool(averages_of(run)) for run in loaded]
 
     def played(tried: int) -> list[FreshEpisode]:
-        """An episode of all runs, each with its typical replica."""
+        """Return an episode of all runs, each with its typical replica."""
         each = zip(loaded, replicas, are_known, strict=True)
         return [_fresh(run, number, tried, seed)._replace(is_typical=known) for run, number, known in each]
 
@@ -187,6 +209,70 @@ def _distance(fresh: FreshEpisode) -> float:
     (played,) = evaluate(fresh.env, fresh.policies, explore=True)
     reached = np.array([played.steps, played.metrics["collective_return"]])
     return float(np.sum(np.abs(reached - median) / np.maximum(1.0, median)))
+
+
+class Recorded(NamedTuple):
+    """An episode of T turns of N agents that was played to be shown."""
+
+    batches: list[TensorDictBase]
+    """What happened in each turn, batch size [1]."""
+    boards: list[Shown]
+    """The board as the episode began, then after each turn, without what agents observe; none of a game
+    without a board."""
+    episode: Episode
+
+    def entry(self, *key: str) -> Any:
+        """Return an entry of all turns, [T, ...]; None where the game has none."""
+        if self.batches[0].get(key, None) is None:
+            return None
+        return np.stack([batch[key][0].numpy(force=True) for batch in self.batches])
+
+    @property
+    def last(self) -> int:
+        """The last turn."""
+        return len(self.batches)
+
+    @property
+    def left(self) -> int:
+        """Apples on the board at the end."""
+        return int(self.boards[-1].stock.sum())
+
+    @property
+    def is_dead(self) -> bool:
+        """Whether the board died, since no apple was left and none could grow."""
+        return self.episode.terminated and self.left == 0
+
+    def since_the_start(self, *key: str) -> Any:
+        """Return an entry of agents at the start and after each turn, [T + 1, N]; zeros where the game has
+        none."""
+        values = self.entry(*key)
+        agents = self.batches[0][keys.ACTION].shape[1]
+        if values is None:
+            return np.zeros((self.last + 1, agents))
+        return np.concatenate([np.zeros_like(values[:1]), values])
+
+
+@working("playing an episode")
+def record(fresh: FreshEpisode) -> Recorded:
+    """Play an episode, and keep all that happened."""
+    commons = commons_of(fresh.env)
+    tracker = tracker_of(fresh.env, fresh.run.metrics)
+    played = turns(fresh.env, fresh.policies)
+    boards = [] if commons is None else [board_now(commons)]
+    batches = []
+    ended: list[Episode] = []
+    for batch in played:
+        ended += tracker.add(batch)
+        batches.append(batch.clone())
+        if commons is not None:
+            boards.append(board_now(commons))
+    return Recorded(batches, boards, ended[0])
+
+
+def board_now(env: CommonsEnv) -> Shown:
+    """Return the board of one world without what agents observe."""
+    board = env.worlds.show(env.output)
+    return board._replace(observation=board.observation[:0])
 
 
 def say_which(fresh: Sequence[FreshEpisode]) -> None:

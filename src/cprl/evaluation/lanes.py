@@ -25,15 +25,9 @@ from cprl.envs.make_env import is_playable, make_env, spaces_of
 from cprl.envs.unwrap import clock_of
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import Policy, evaluate
+from cprl.measuring.played import Measured, institution_measures, over_replicas, social_measures
 from cprl.measuring.series import Values
-from cprl.measuring.statistics import (
-    Estimate,
-    Measured,
-    difference,
-    institution_measures,
-    over_replicas,
-    social_measures,
-)
+from cprl.measuring.statistics import Estimate, difference
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
 from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
@@ -42,7 +36,7 @@ from cprl.system.defaults import SEED
 from cprl.system.process import one_thread
 from cprl.system.working import say_how_far
 from cprl.training.agents import LoadedRun, Population, StoredAgent, in_a_row, load, stored_policies
-from cprl.values import Custom, Positive, Seed, Value, Where, made, refusal, trust
+from cprl.values import Custom, Positive, Seed, Value, Where, made, refusal
 
 Played: TypeAlias = dict[int, list[Episode]]
 """Episodes by the number of the replica."""
@@ -281,7 +275,6 @@ def play_population(
     replicas: int = 8,
     greedy: bool = False,
     seed: int = SEED,
-    allow: Sequence[str] = (),
 ) -> Played:
     """Plays fresh episodes of a population that does not learn.
 
@@ -298,7 +291,6 @@ def play_population(
     Returns:
         Episodes by the index of the replica, 0 to R - 1.
     """
-    trust(*allow)
     place = place_of(where)
     fresh = Fresh(replicas=tuple(range(replicas)), episodes=episodes, seed=seed, greedy=greedy)
     return fresh.play(place, agents_specified(place, agents, fresh))

@@ -3,7 +3,7 @@
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from math import isnan
@@ -28,12 +28,12 @@ from cprl.commons.rules import Rules
 from cprl.commons.world import Shown, StepOutput
 from cprl.envs.make_env import make_env
 from cprl.envs.unwrap import commons_of
-from cprl.evaluation.fresh import averages_in_words, fresh_seed, typical_replica
-from cprl.evaluation.lanes import Turns, agent_named, board_now, commons_game, refuse_trained_in
+from cprl.evaluation.fresh import averages_in_words, board_now, fresh_seed, typical_replica
+from cprl.evaluation.lanes import agent_named, commons_game, refuse_trained_in
 from cprl.experiment import presets
 from cprl.measuring import social
-from cprl.measuring.evaluate import Policy
-from cprl.measuring.metrics import title
+from cprl.measuring.evaluate import Policy, turns
+from cprl.measuring.registry import title
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import Scripted
 from cprl.runs.episodes import read_rows
@@ -41,7 +41,7 @@ from cprl.system.defaults import PLAY_SEED
 from cprl.system.output import OUT, console, say
 from cprl.system.working import working
 from cprl.training.agents import LoadedRun, Population, load
-from cprl.values import Range, checked, refusal, trust
+from cprl.values import Range, checked, refusal
 
 KEYS: Final = {
     "w": ("forward", "step forward"),
@@ -89,15 +89,18 @@ class Session:
     def __init__(self, env: EnvBase, others: Policy, *, agent: int = 0, decision: int | None = None) -> None:
         commons = commons_of(env)
         assert commons is not None
-        self._commons, self._others, self.game = commons, others, commons.game
+        self._commons = commons
+        self._others = others
+        self.game = commons.game
         self.agent = agent
         """The index of the person's agent."""
         if decision is not None:
             if not self.game.decisions:
                 raise refusal("decision", decision, "None: agents decide nothing in this game")
             checked("decision", decision, Annotated[int, Range(0, self.game.decisions - 1)])
-        self._decision, self._action = decision, 0
-        self._turns = Turns(env, self._choose)
+        self._decision = decision
+        self._action = 0
+        self._turns = turns(env, self._choose)
         self._played: list[TensorDictBase] = []
         self.moments: list[Shown] = [board_now(self._commons)]
         """The board as the episode began, then after each turn."""
@@ -109,7 +112,7 @@ class Session:
     @property
     def has_ended(self) -> bool:
         """Whether the episode has ended: no apple is left and none can grow, or time is over."""
-        return self._turns.has_ended
+        return bool(self._played) and bool(self._played[-1]["next", keys.DONE].any())
 
     @property
     def harvested(self) -> list[int]:
@@ -127,8 +130,10 @@ class Session:
         """
         if action not in self.game.actions:
             raise refusal("action", action, ", ".join(self.game.actions))
+        if self.has_ended:
+            raise ValueError("the episode has ended; allowed: turns up to its end")
         self._action = self.game.actions.index(action)
-        self._played.append(self._turns.play())
+        self._played.append(next(self._turns))
         self.moments.append(board_now(self._commons))
         return self._commons.output
 
@@ -164,7 +169,8 @@ def state(session: Session) -> str:
 
 def happened(session: Session, turn: StepOutput) -> Iterator[str]:
     """Yield what a turn brought the person, and who tagged whom."""
-    me, tagged_by = session.agent, turn.tagged_by[0]
+    me = session.agent
+    tagged_by = turn.tagged_by[0]
     if turn.harvest[0, me]:
         yield "you harvest an apple"
     if turn.fired[0, me] and not tagged_by[:, me].any():
@@ -273,9 +279,10 @@ def keys_of(pressed: str) -> str:
 
 
 def board_text(session: Session) -> Text:
-    """The board by rows: `A` an apple, `#` a wall, `~` and `H` a river's water and waste, `*` a beam, and
-    each agent's number with its heading."""
-    board, now = session.game.map, session.moments[-1]
+    """Return the board by rows: `A` an apple, `#` a wall, `~` and `H` a river's water and waste, `*` a beam,
+    and each agent's number with its heading."""
+    board = session.game.map
+    now = session.moments[-1]
     wide = len(str(session.game.agents - 1)) + 1
     cells: dict[tuple[int, int], tuple[str, Colour]] = {
         **dict.fromkeys(board.river, (maps.WATER, PALETTE[WATER])),
@@ -300,10 +307,8 @@ def board_text(session: Session) -> Text:
     return text
 
 
-def board_named(
-    board: str, variant: Variant = "published", *, allow: Sequence[str] = ()
-) -> tuple[Game, LoadedRun | None]:
-    """A game, and the run that has it.
+def board_named(board: str, variant: Variant = "published") -> tuple[Game, LoadedRun | None]:
+    """Return a game, and the run that has it.
 
     Args:
         board: the name of a published board, the directory of a run, whose game is played, or a file with a
@@ -317,7 +322,7 @@ def board_named(
         raise refusal("variant", variant, f'"published" with {board}, which names no preset')
     path = Path(board)
     if path.is_dir():
-        run = load(path, allow=allow)
+        run = load(path)
         return commons_game(run), run
     return Game(map=maps.read(path), rules=Rules()), None
 
@@ -333,9 +338,8 @@ def open_session(
     steps: int | None = None,
     seed: int | None = None,
     decision: int | None = None,
-    allow: Sequence[str] = (),
 ) -> Session:
-    """An episode for a person and others.
+    """Begin an episode for a person and others.
 
     Args:
         others: the directory of a run, whose agents with the same indices play, or a scripted policy; by
@@ -348,7 +352,6 @@ def open_session(
         decision: what the person decides in a game with votes or elections, 0 to `Game.decisions` - 1; None
             for a choice by chance, as of a scripted agent.
     """
-    trust(*allow)
     game, run = board_named(board, variant)
     is_whole = steps is None and others in (None, board)
     if steps is not None:
@@ -387,8 +390,8 @@ def _run_of(others: str, board: str, run: LoadedRun | None) -> LoadedRun | None:
 
 
 def _usual(run: LoadedRun, agent: int) -> str:
-    """What an agent gets on average in the run's own evaluation, trained and at random; "" where that is not
-    known."""
+    """Say what an agent gets on average in the run's own evaluation, trained and at random; "" where that is
+    not known."""
     apples = []
     for policy in ("trained", "random"):
         path = run.path / "evaluation" / f"{policy}.parquet"

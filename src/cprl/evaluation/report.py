@@ -3,7 +3,7 @@
 import json
 import re
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from html import escape
 from math import isnan
 from pathlib import Path
@@ -17,7 +17,7 @@ from cprl.commons.readable import growth_of, meaning_of, rule_of, tag_of
 from cprl.evaluation.evaluate import evaluate_run, run_table
 from cprl.evaluation.fresh import fresh_episode
 from cprl.evaluation.show import Page, page, shown
-from cprl.measuring.metrics import title, unit
+from cprl.measuring.registry import INCOME, title, unit
 from cprl.measuring.series import Values
 from cprl.measuring.statistics import Estimate, form_for
 from cprl.population import learned
@@ -32,7 +32,7 @@ from cprl.studies.tables.comparing import (
     metrics_of,
 )
 from cprl.studies.tables.effects import effects_of, estimated
-from cprl.studies.tables.table import EVALUATION, NET, StudyTable
+from cprl.studies.tables.table import EVALUATION, StudyTable
 from cprl.system.defaults import SEED, STUDY_TABLE
 from cprl.system.output import legible
 from cprl.system.working import working
@@ -51,7 +51,6 @@ def report(
     *,
     episodes: int = 20,
     seed: int = SEED,
-    allow: Sequence[str] = (),
 ) -> Page:
     """Write one HTML page about a run or a study, which opens from the disk without a network.
 
@@ -75,7 +74,7 @@ def report(
     for name, value, default in (("episodes", episodes, 20), ("seed", seed, SEED)):
         if is_study and value != default:
             raise ValueError(f"{name} is {value}, and {folder} is a study; allowed: of a run alone")
-    text = _of_study(folder) if is_study else _of_run(load(folder, allow=allow), episodes, seed)
+    text = _of_study(folder) if is_study else _of_run(load(folder), episodes, seed)
     page_path.write(text)
     return page_path
 
@@ -189,9 +188,9 @@ def _answer(table: StudyTable) -> str:
         return ""
     metrics = metrics_of(table, part=EVALUATION)
     comparisons = {metric: compare(table, metric, part=EVALUATION) for metric in metrics}
-    has_income = {NET, "collective_return"} <= set(metrics)
+    has_income = {INCOME, "collective_return"} <= set(metrics)
     compared = (
-        {NET: _INCOME, "collective_return": _HARVEST} if has_income else {metrics[0]: title(metrics[0])}
+        {INCOME: _INCOME, "collective_return": _HARVEST} if has_income else {metrics[0]: title(metrics[0])}
     )
     unit_of = "apples" if has_income else unit(metrics[0])
     first = comparisons[metrics[0]]

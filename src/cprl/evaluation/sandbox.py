@@ -24,13 +24,11 @@ from urllib.parse import parse_qsl, urlsplit
 
 from cprl.commons.game import Game
 from cprl.commons.published import game as published_game
-from cprl.evaluation.fresh import fresh_episode
+from cprl.evaluation.fresh import fresh_episodes, unstored
 from cprl.evaluation.show import page, shown
-from cprl.experiment import Experiment
 from cprl.population import Scripted
-from cprl.runs.recipe import start_run
-from cprl.runs.weights import save_weights
 from cprl.system.defaults import SANDBOX_EPISODES as EPISODES
+from cprl.training.agents import LoadedRun, load
 from cprl.values import Positive, Range, Value, checked, hints_of
 
 FOR_TRAINED: Final = "changes nothing for scripted agents"
@@ -96,14 +94,14 @@ class Sliders(Value, stored=False):
 
     @classmethod
     def of(cls, query: Mapping[str, str]) -> Self:
-        """The sliders of a query; raises a ValueError that names what is wrong."""
+        """Read the sliders of a query; raise a ValueError that names what is wrong."""
         kinds = {name: type(value) for name, value in vars(cls()).items()}
         if unknown := sorted(set(query) - set(kinds)):
             raise ValueError(f"{', '.join(unknown)}: no slider; allowed: {', '.join(kinds)}")
         return cls(**{name: kinds[name](text) for name, text in query.items()})
 
     def recipe(self, episodes: int = EPISODES) -> str:
-        """The recipe of the game, with agents that learn."""
+        """Return the recipe of the game, with agents that learn."""
         base = published_game(self.board)
         institutions = {
             "Quota": f"Quota(share={self.quota!r}, window_steps=50)" if self.quota else "",
@@ -133,7 +131,7 @@ class Sliders(Value, stored=False):
         return f"{self.agents} agents, {' and '.join(parts) or 'no rule'}{growth}, sight {self.sight}"
 
     def game(self) -> Game:
-        """The game of the recipe."""
+        """Return the game of the recipe."""
         namespace: dict[str, Any] = {"__name__": "sandbox"}
         exec(self.recipe(), namespace)
         game: Game = namespace["game"]()
@@ -181,7 +179,7 @@ class Sandbox:
         self._temporary.cleanup()
 
     def play(self, sliders: Sliders, *, trained: bool) -> dict[str, Any]:
-        """The data of `show.html` about an episode of scripted agents, and beside it one of trained ones.
+        """Return the data of `show.html` about an episode of scripted agents, and beside it of trained ones.
 
         Raises a SupersededError, and plays nothing, where another question has come while it waited.
         """
@@ -191,17 +189,14 @@ class Sandbox:
         with self._playing:
             if number != self._asked:
                 raise SupersededError("a later question is answered instead")
-            game, greedy = sliders.game(), min(sliders.greedy, sliders.agents)
-            agents = (Scripted("greedy"),) * greedy + (Scripted("sustainable"),) * (game.agents - greedy)
-            experiment = Experiment(name="scripted", game=game, agents=agents, episodes=1, replicas=1)
-            with TemporaryDirectory() as folder:
-                run = Path(folder, "scripted")
-                save_weights(start_run(run, "scripted", experiment.to_recipe), {})
-                runs = {f"{greedy} greedy, {game.agents - greedy} restrained": run}
-                if trained and self._trained is not None:
-                    runs[f"Trained with {self._learned_under[self._trained]}"] = self._trained
-                fresh = [fresh_episode(run, replica=0, episode=0) for run in runs.values()]
-                data, _ = shown(fresh, list(runs))
+            game = sliders.game()
+            greedy = min(sliders.greedy, sliders.agents)
+            restrained = game.agents - greedy
+            agents = (Scripted("greedy"),) * greedy + (Scripted("sustainable"),) * restrained
+            runs: dict[str, LoadedRun] = {f"{greedy} greedy, {restrained} restrained": unstored(game, agents)}
+            if trained and self._trained is not None:
+                runs[f"Trained with {self._learned_under[self._trained]}"] = load(self._trained)
+            data, _ = shown(fresh_episodes(list(runs.values()), replica=0, episode=0), list(runs))
         data["populations"][0]["which"] = ""  # scripted agents have no replicas to choose from
         return data
 
@@ -223,7 +218,7 @@ class Sandbox:
             self._training = run, process
 
     def state(self) -> dict[str, str]:
-        """How the training is: "none", "training", "trained" or "failed", and its last line."""
+        """Return how the training is: "none", "training", "trained" or "failed", and its last line."""
         if self._training is None:
             return {"state": "none", "line": ""}
         run, process = self._training
@@ -296,7 +291,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def sandbox_page() -> str:
-    """The page, without an episode yet."""
+    """Return the page, without an episode yet."""
     boards = "".join(f"<option>{board}</option>" for board in get_args(Board))
     sliders = "".join(
         _slider(name, *shown)
@@ -323,7 +318,7 @@ def sandbox_page() -> str:
 
 
 def _slider(name: str, words: str, step: float) -> str:
-    """A slider over the range of a field of `Sliders`."""
+    """Return a slider over the range of a field of `Sliders`."""
     (bounds,) = hints_of(Sliders)[name].__metadata__
     return (
         f'<label>{escape(words)} <span></span><input type="range" name="{name}" min="{bounds.low}" '

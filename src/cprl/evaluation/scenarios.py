@@ -33,8 +33,9 @@ from cprl.evaluation.lanes import (
     scripted,
 )
 from cprl.experiment import presets
-from cprl.measuring.metrics import with_unit
-from cprl.measuring.statistics import HOLM, Estimate, Measured, estimate, notes_on, starred
+from cprl.measuring.played import Measured, notes_on
+from cprl.measuring.registry import with_unit
+from cprl.measuring.statistics import HOLM, Estimate, estimate, starred
 from cprl.population import Frozen, Scripted
 from cprl.system.working import say_how_far, working
 from cprl.terminal import style
@@ -199,7 +200,6 @@ def run_scenarios(
     greedy: bool = False,
     seed: int = SEED,
     replicas: Sequence[int] = (),
-    allow: Sequence[str] = (),
 ) -> Scores:
     """Plays scenarios with the agents of a stored run in the focal places, and with random and with greedy
     agents in these places, in the same worlds.
@@ -209,7 +209,7 @@ def run_scenarios(
             default all that it has.
         greedy: whether stored agents take their best action, see `cprl.evaluate_run`.
     """
-    loaded = opened(run, allow)
+    loaded = opened(run)
     check_game(loaded.game)
     everyone = range(loaded.game.agents)
     check_scripted([(Scripted("greedy"), tuple(everyone))], loaded.spaces, loaded.game)

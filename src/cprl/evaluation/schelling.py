@@ -43,13 +43,14 @@ from cprl.evaluation.lanes import (
     place_of,
     shifted,
 )
+from cprl.measuring.played import Measured
 from cprl.measuring.series import Values
-from cprl.measuring.statistics import Estimate, Measured, difference, estimate
+from cprl.measuring.statistics import Estimate, difference, estimate
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.system.working import say_how_far, working
 from cprl.terminal import style
 from cprl.terminal.tables import Cells
-from cprl.values import refusal, trust
+from cprl.values import refusal
 
 _NAMES: Final = ("prisoner's dilemma", "chicken", "stag hunt", "no dilemma")
 
@@ -198,7 +199,6 @@ def schelling(
     episodes: int = 5,
     replicas: int = 8,
     seed: int = SEED,
-    allow: Sequence[str] = (),
 ) -> SchellingDiagram:
     """Plays all mixes of restrained and greedy agents: N (N - 1) + 2 populations.
 
@@ -210,7 +210,6 @@ def schelling(
         replicas: the number of replicas R; of scripted policies, of independent groups of episodes.
         seed: the seed of the worlds, in which all mixes play, and of all random numbers.
     """
-    trust(*allow)
     place = place_of(where)
     agents = place.game.agents
     if agents < 2:

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
+from cprl import keys
 from cprl.commons.colours import (
     APPLE,
     BEAM,
@@ -35,11 +35,11 @@ from cprl.commons.maps import Map
 from cprl.commons.picture import EMPTY_SITE_COLOUR
 from cprl.commons.readable import NO_RULES, growth_of, legend_of, meaning_of, rules_of
 from cprl.envs.unwrap import commons_of
-from cprl.evaluation.film import Filmed, check_titles, play_to_show, titles_of
-from cprl.evaluation.fresh import FreshEpisode, fresh_episodes, say_which
+from cprl.evaluation.film import check_titles, titles_of
+from cprl.evaluation.fresh import FreshEpisode, Recorded, fresh_episodes, record, say_which
 from cprl.evaluation.lanes import commons_game
 from cprl.measuring.episodes import Episode
-from cprl.measuring.social import equality_of
+from cprl.measuring.social import equality
 from cprl.population import learned
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.system.working import working
@@ -53,7 +53,8 @@ _COLOURS: Final = {
     **{name: PALETTE[kind] for name, kind in (("water", WATER), ("waste", WASTE), ("cleaning", CLEANING))},
     "empty": EMPTY_SITE_COLOUR,
 }
-_IN_PLAY, _VIOLATED = 4, 8
+_IN_PLAY: Final = 4
+_VIOLATED: Final = 8
 """Bits of a pose, beside the heading of 0 to 3."""
 
 
@@ -67,7 +68,6 @@ def show(
     replica: int | None = None,
     episode: int | None = None,
     seed: int | None = None,
-    allow: Sequence[str] = (),
 ) -> tuple["Page", tuple[Episode, ...]]:
     """Show an episode of a run's agents, beside the agents of other runs if there are any, as one HTML page.
 
@@ -92,14 +92,14 @@ def show(
     check_titles(tuple(titles), len(runs))
     if out is not None:
         Page(out).refuse()
-    fresh = fresh_episodes(runs, replica=replica, episode=episode, seed=seed, allow=allow)
+    fresh = fresh_episodes(runs, replica=replica, episode=episode, seed=seed)
     by_default = Path(run) / f"show-{fresh[0].replica}-{fresh[0].episode}.html"
     path = Page(by_default if out is None else out)
     path.refuse()
     say_which(fresh)
-    data, filmed = shown(fresh, titles)
+    data, episodes = shown(fresh, titles)
     path.write(page(_heading(fresh, data), begins(commons_game(fresh[0].run)), data))
-    return path, tuple(one.episode for one in filmed)
+    return path, tuple(episodes)
 
 
 def begins(game: Game) -> str:
@@ -108,7 +108,7 @@ def begins(game: Game) -> str:
 
 
 def _heading(fresh: Sequence[FreshEpisode], data: dict[str, Any]) -> str:
-    """The title of the population, or what differs between several."""
+    """Return the title of the population, or what differs between several."""
     if len(fresh) == 1:
         return str(data["populations"][0]["title"])
     runs = [population.run for population in fresh]
@@ -144,7 +144,7 @@ class Page(type(Path())):  # type: ignore[misc]
 def page(
     title: str, before: str, data: dict[str, Any] | None = None, after: str = "", *, live: str = ""
 ) -> str:
-    """The text of a page.
+    """Return the text of a page.
 
     Args:
         before, after: HTML above and below the episode.
@@ -159,53 +159,58 @@ def page(
 
 def shown(
     fresh: Sequence[FreshEpisode], titles: Sequence[str] = ()
-) -> tuple[dict[str, Any], Sequence[Filmed]]:
-    """The data of `show.html` about the episodes of these populations, and the episodes."""
-    filmed = [play_to_show(population) for population in fresh]
-    most = max(int(one.moments[-1].harvested.max()) for one in filmed)
+) -> tuple[dict[str, Any], Sequence[Episode]]:
+    """Play the episodes of these populations; return the data of `show.html` about them, and the episodes."""
     games = [commons_game(population.run) for population in fresh]
-    populations = [_population(*each) for each in zip(titles or titles_of(fresh), fresh, filmed, strict=True)]
+    recorded = [record(population) for population in fresh]
+    each = zip(titles or titles_of(fresh), fresh, recorded, strict=True)
     return {
-        "populations": populations,
+        "populations": [_population(*one) for one in each],
         "palette": _COLOURS,
-        "axis": max(len(one.moments) - 1 for one in filmed),
-        "most": most,
+        "axis": max(played.last for played in recorded),
+        "most": max(int(played.boards[-1].harvested.max()) for played in recorded),
         "legend": legend_of(games),
-    }, filmed
+    }, [played.episode for played in recorded]
 
 
-def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, Any]:
-    game, commons = commons_game(fresh.run), commons_of(fresh.env)
+def _population(title: str, fresh: FreshEpisode, played: Recorded) -> dict[str, Any]:
+    """Return what the page shows of a population."""
+    game = commons_game(fresh.run)
+    board = game.map
+    agents = range(game.agents)
+    commons = commons_of(fresh.env)
     assert commons is not None
-    board, agents, last = game.map, range(game.agents), len(filmed.moments) - 1
-    arrays = _turns(board, filmed)
+    arrays = _turns(board, played)
     counted = ["apples on the board", "picked by all", "how evenly shared (1: all alike)"]
-    if filmed.fines.any() or any(institution.can_be_broken for institution in game.institutions):
-        arrays["fined"] = filmed.fines.astype(np.float32)
+    fines = played.since_the_start("next", *keys.FINES).sum(1).cumsum()
+    if fines.any() or any(institution.can_be_broken for institution in game.institutions):
+        arrays["fined"] = fines.astype(np.float32)
         counted.append("apples paid as fines")
-    dead = f"gone for good at turn {last:,}: no apple is left"
-    lives = f"apples still grow after {last:,} turns"
+    outcome = f"apples still grow after {played.last:,} turns"
+    if played.is_dead:
+        outcome = f"gone for good at turn {played.last:,}: no apple is left"
+    regions = [
+        {
+            "colour": agent_colour(owners[0]) if len(owners) == 1 else GREY,
+            "cells": np.flatnonzero(inside).tolist(),
+        }
+        for owners, inside in regions_of(commons)
+    ]
     return {
         "title": title,
         "which": fresh.words,
         "about": about(fresh.run),
-        "outcome": dead if filmed.is_dead else lives,
-        "isDead": filmed.is_dead,
+        "outcome": outcome,
+        "isDead": played.is_dead,
         "counted": counted,
-        "turns": last + 1,
+        "turns": played.last + 1,
         "agents": game.agents,
         "width": board.width,
         "height": board.height,
         "walls": _cells(board, board.walls),
         "river": _cells(board, board.river),
         "sites": _cells(board, board.sites),
-        "regions": [
-            {
-                "colour": agent_colour(owners[0]) if len(owners) == 1 else GREY,
-                "cells": np.flatnonzero(inside).tolist(),
-            }
-            for owners, inside in regions_of(commons)
-        ],
+        "regions": regions,
         "colours": [agent_colour(agent) for agent in agents],
         "lines": [line_colour(agent) for agent in agents],
         "marks": [agent_mark(agent) for agent in agents],
@@ -214,12 +219,12 @@ def _population(title: str, fresh: FreshEpisode, filmed: Filmed) -> dict[str, An
 
 
 def about(run: LoadedRun) -> str:
-    """Who plays, under which rules, in sentences."""
+    """Say who plays, under which rules, in sentences."""
     return f"{_players(run)} {_rules(run)}"
 
 
 def _players(run: LoadedRun) -> str:
-    """Who plays, for readers who do not know what a learner is."""
+    """Say who plays, for readers who do not know what a learner is."""
     who = learned(run.specs)
     if not run.networks:
         return f"Computer players: {who}."
@@ -238,39 +243,41 @@ def _rules(run: LoadedRun) -> str:
 
 
 def _cells(board: Map, places: Sequence[Sequence[int]]) -> list[int]:
-    """The indices of cells, row by row."""
+    """Return the indices of cells, row by row."""
     return [row * board.width + col for row, col, *_ in places]
 
 
-def _turns(board: Map, filmed: Filmed) -> dict[str, NDArray[Any]]:
-    """What changes from turn to turn: arrays [turns, ...], bits packed.
+def _turns(board: Map, played: Recorded) -> dict[str, NDArray[Any]]:
+    """Return what changes from turn to turn: arrays [turns, ...], bits packed.
 
     `beams` has the cells of all turns one after the other, those of turn t from `beam_first[t]` on and before
     `beam_first[t + 1]`; the number of cells is added to those of a beam that cleans.
     """
-    moments = filmed.moments
-    harvested = np.stack([moment.harvested for moment in moments])
-    stock = np.stack([moment.stock for moment in moments])
-    agents = range(harvested.shape[1])
-    violated = np.array([[agent in broke for agent in agents] for broke in filmed.violators])
-    pose = np.stack([moment.heading + _IN_PLAY * moment.in_play for moment in moments]) + _VIOLATED * violated
-    boards = np.stack([moment.board.reshape(-1) for moment in moments])
+
+    def of_all(name: str) -> NDArray[Any]:
+        return np.stack([getattr(one, name) for one in played.boards])
+
+    harvested = of_all("harvested")
+    stock = of_all("stock")
+    boards = of_all("board").reshape(len(stock), -1)
+    is_violated = played.since_the_start("next", *keys.VIOLATED) > 0
+    pose = of_all("heading") + _IN_PLAY * of_all("in_play") + _VIOLATED * is_violated
     turns, lit = np.nonzero(np.concatenate([boards == BEAM, boards == CLEANING], 1))
     return {
         "stock": np.packbits(stock, axis=1),
         "waste": np.packbits(boards[:, _cells(board, board.river)] == WASTE, axis=1),
         "stocked": stock.sum(1, dtype=np.uint32),
-        "cell": np.stack([moment.row * board.width + moment.col for moment in moments]).astype(np.uint32),
+        "cell": (of_all("row") * board.width + of_all("col")).astype(np.uint32),
         "pose": pose.astype(np.uint8),
         "harvested": harvested.astype(np.uint32),
-        "equality": equality_of(torch.as_tensor(harvested, dtype=torch.float64)).numpy().astype(np.float32),
-        "beam_first": np.searchsorted(turns, np.arange(len(moments) + 1)).astype(np.uint32),
+        "equality": equality(harvested).astype(np.float32),
+        "beam_first": np.searchsorted(turns, np.arange(len(stock) + 1)).astype(np.uint32),
         "beams": lit.astype(np.uint32),
     }
 
 
 def _packed(arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
-    """Arrays one after the other as deflated bytes, and the name, type and length of each."""
+    """Return arrays one after the other as deflated bytes, and the name, type and length of each."""
     raw = b"".join(values.astype(values.dtype.newbyteorder("<")).tobytes() for values in arrays.values())
     lengths = [
         (name, f"{values.dtype.kind}{values.itemsize}", values.size) for name, values in arrays.items()

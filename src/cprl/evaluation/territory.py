@@ -73,13 +73,12 @@ def territory_of(
     greedy: bool = False,
     seed: int = SEED,
     replicas: Sequence[int] = (),
-    allow: Sequence[str] = (),
 ) -> Territory:
     """Plays fresh episodes with every replica of a stored run, and with random agents in the same worlds.
 
     The episodes are those of `cprl.evaluate_run` with the same arguments.
     """
-    loaded = opened(run, allow)
+    loaded = opened(run)
     commons_game(loaded)
     fresh = fresh_of([loaded], episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
     random = [scripted("random")] * loaded.game.agents

@@ -1,9 +1,8 @@
 """Experiment: everything that decides a training, as a value that a run's recipe holds."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from html import escape
-from math import ceil
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -25,6 +24,7 @@ from cprl.population import (
     stored_of,
 )
 from cprl.runs.files import RECIPE_FORMAT, written_by_another
+from cprl.runs.length import Length
 from cprl.runs.recipe import recipe_config, rules_of_own, with_runs_moved
 from cprl.system.memory import Device
 from cprl.values import (
@@ -42,7 +42,6 @@ from cprl.values import (
     hints_of,
     shown,
     to_config,
-    trust,
 )
 
 LoggerName = Literal["tensorboard", "wandb"]
@@ -101,7 +100,7 @@ class Experiment(Value, stored=False, called="experiment"):
 
     def __repr__(self) -> str:
         return (
-            f"Experiment({self.name!r}, {self.game!r}, {self.length} {self.unit}, {self.replicas} replicas, "
+            f"Experiment({self.name!r}, {self.game!r}, {self.length}, {self.replicas} replicas, "
             f"seed={self.seed})"
         )
 
@@ -128,7 +127,7 @@ class Experiment(Value, stored=False, called="experiment"):
     @property
     def trained_for(self) -> str:
         """How long it trains, in words."""
-        return f"trained for {self.length:,} {self.unit} in {self.trained_in}"
+        return f"trained for {self.length} in {self.trained_in}"
 
     @property
     def trained_in(self) -> str:
@@ -137,24 +136,10 @@ class Experiment(Value, stored=False, called="experiment"):
         return f"{self.replicas} replica{'s' * (self.replicas > 1)}{worlds}"
 
     @property
-    def unit(self) -> Literal["episodes", "steps"]:
-        """What its length is counted in."""
-        return "episodes" if self.steps is None else "steps"
-
-    @property
-    def length(self) -> int:
-        """How many episodes, or steps, each replica trains."""
-        length: int = getattr(self, self.unit)
-        return length
-
-    @property
-    def expected_episodes(self) -> int:
-        """The episodes of each replica; of one that trains so many steps, as many as these are where each
-        lasts as long as the clock lets it, and 1 in a game without a clock."""
-        if self.episodes is not None:
-            return self.episodes
-        clock = getattr(getattr(self.game, "rules", None), "episode_steps", self.length)
-        return ceil(self.length / clock)
+    def length(self) -> Length:
+        """How long each replica trains."""
+        clock = getattr(getattr(self.game, "rules", None), "episode_steps", None)
+        return Length.of(vars(self), clock)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -172,13 +157,8 @@ class Experiment(Value, stored=False, called="experiment"):
         return {name: to_config(value, f"experiment.{name}") for name, value in values.items()}
 
     @classmethod
-    def from_config(cls, table: Mapping[str, Any], *, allow: Iterable[str] = ()) -> "Experiment":
-        """The experiment that `to_config` gave; of the modules that it names only a game's is imported.
-
-        Args:
-            allow: the targets of `Custom` that it may hold, "module:Class" each.
-        """
-        trust(*allow)
+    def from_config(cls, table: Mapping[str, Any]) -> "Experiment":
+        """The experiment that `to_config` gave; of the modules that it names only a game's is imported."""
         read = build(cls, table, "experiment")
         return read if not isinstance(read.game, Custom) else replace(read, game=game_of(read.game))
 
@@ -193,19 +173,16 @@ class Experiment(Value, stored=False, called="experiment"):
         return {"format": RECIPE_FORMAT, "recipe": self.name, "experiment": table}
 
     @classmethod
-    def from_recipe(
-        cls, recipe: Mapping[str, Any], *, allow: Iterable[str] = (), directory: str | Path | None = None
-    ) -> "Experiment":
+    def from_recipe(cls, recipe: Mapping[str, Any], *, directory: str | Path | None = None) -> "Experiment":
         """The experiment of a recipe, as `recipe.json` holds it.
 
         Args:
-            allow: the targets of `Custom` that it may hold, "module:Class" each.
             directory: where the recipe is kept; runs of `Frozen` are then relative to where we stand.
         """
         try:
             table = recipe_config(recipe)
             table = table if directory is None else with_runs_moved(table, directory, ".")
-            return cls.from_config(table, allow=allow)
+            return cls.from_config(table)
         except ValueError as error:
             raise ValueError(f"{error}{written_by_another(recipe)}") from error
 
@@ -213,7 +190,7 @@ class Experiment(Value, stored=False, called="experiment"):
         return self.to_config() == other.to_config() if isinstance(other, Experiment) else NotImplemented
 
     def __hash__(self) -> int:
-        return hash((self.name, self.unit, self.length, self.replicas, self.seed))
+        return hash((self.name, self.length, self.replicas, self.seed))
 
 
 def changes(before: Experiment, now: Experiment) -> list[str]:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from math import isfinite, nan
 from types import MappingProxyType
@@ -21,14 +21,18 @@ from cprl.commons.yields import sustainable_yield
 from cprl.envs.unwrap import agent_count, commons_of
 from cprl.institutions import COUNTS, Institution
 from cprl.keys import Turn
-from cprl.measuring import institutions, social
-from cprl.measuring.metrics import (
-    FIELDS,
-    INSTITUTIONAL,
-    NAMES,
+from cprl.measuring.registry import (
+    IN_FORCE,
+    METRICS,
+    NEEDS,
     OF_INSTITUTIONS,
     OPTIONAL,
     PLACES,
+    TOTALS,
+    counts_for,
+    groups_of,
+    measurable,
+    measured,
     reported_in,
 )
 from cprl.values import Custom, Positive, checked
@@ -57,11 +61,12 @@ class Episode:
     return_: NDArray[np.float64]
     """[N], the undiscounted sum of rewards of each agent."""
     metrics: Mapping[str, float]
-    """`social.SOCIAL` of the episode, then those of the user's own; NaN where undefined. Metrics that need
-    entries that the game does not report are missing."""
+    """By the names of `cprl.measuring.registry.METRICS`, then what was decided, as "institutions/in_force_0",
+    and those of the user's own; NaN where undefined. Metrics that need entries that the game does not report
+    are missing."""
     harvest: NDArray[np.float64] | None = None
     """[N], apples harvested. This field and all below are None if the game does not report the entries that
-    they need, see `cprl.measuring.metrics.FIELDS`."""
+    they need, see `cprl.measuring.registry.NEEDS`."""
     in_play_steps: NDArray[np.int64] | None = None
     """[N], steps in which the agent was in play."""
     shots: NDArray[np.int64] | None = None
@@ -81,21 +86,18 @@ class Episode:
     """The first step that left no apple on the board, or -1."""
     fines: NDArray[np.float64] | None = None
     """[N], what institutions took from each agent, taxes included, in units of reward. This field and all
-    below are of games that report what institutions do, see `cprl.measuring.metrics.INSTITUTIONAL`."""
+    below are of games that report what institutions do."""
     transfers: NDArray[np.float64] | None = None
     """[N], what institutions gave each agent."""
     violations: NDArray[np.int64] | None = None
     """[N], steps in which the agent broke a rule of an institution."""
     counts: Mapping[str, NDArray[np.int64]] | None = None
-    """[N] by name, what the game's institutions counted, see `cprl.measuring.institutions.counts_for`."""
+    """[N] by name, what the game's institutions counted, see `cprl.measuring.registry.counts_for`."""
     decision: NDArray[np.int64] | None = None
     """[N], what each agent had decided, see `cprl.Game.ballots`; None in games that ask
     nothing."""
     in_force: NDArray[np.float64] | None = None
     """[V], what was decided for this episode: tax rates, quotas, the agent elected."""
-    institutions: Mapping[str, float] = field(default_factory=dict)
-    """`cprl.measuring.institutions.METRICS` of the episode; NaN where undefined, empty without
-    institutions."""
 
     def __post_init__(self) -> None:
         if self.replica < 0:
@@ -111,18 +113,15 @@ class Episode:
 
     @property
     def social(self) -> dict[str, float]:
-        """Each of "Social metrics" in docs/metrics.md that the game reports, and the user's own, by name; NaN
-        where undefined."""
         stock = {} if self.stock_left is None else {"stock_left": float(self.stock_left)}
-        return {**self.metrics, **stock}
+        metrics = {
+            name: value for name, value in self.metrics.items() if not name.startswith("institutions/")
+        }
+        return {**metrics, **stock}
 
     @property
     def of_institutions(self) -> dict[str, float]:
-        """Each of "Institutions" in docs/metrics.md, as `institutions/fines`, and what was decided, as
-        `institutions/in_force_0`; NaN where undefined, none of a game without institutions."""
-        in_force = () if self.in_force is None else enumerate(self.in_force.tolist())
-        values = {**self.institutions, **{f"in_force_{place}": value for place, value in in_force}}
-        return {f"institutions/{name}": value for name, value in values.items()}
+        return {name: value for name, value in self.metrics.items() if name.startswith("institutions/")}
 
     @property
     def outcome(self) -> str:
@@ -134,10 +133,12 @@ class Episode:
 
     @property
     def reported(self) -> tuple[str, ...]:
-        """The optional entries that the game reported, see `cprl.measuring.metrics`."""
-        missing = {entry for name, needs in FIELDS.items() if getattr(self, name) is None for entry in needs}
-        more = (entry for name, entry in INSTITUTIONAL.items() if getattr(self, name) is not None)
-        return (*(entry for entry in OPTIONAL if entry not in missing), *more)
+        """The optional entries that the game reported, see `cprl.measuring.registry`."""
+        lacking = {entry for name, needs in NEEDS.items() if getattr(self, name) is None for entry in needs}
+        present = {name for name, value in vars(self).items() if value is not None}
+        of_law = {TOTALS[name].entry for name in present & {*TOTALS} if TOTALS[name].is_of_institutions}
+        kept = [entry for entry in OPTIONAL if entry not in lacking]
+        return (*kept, *(entry for entry in OF_INSTITUTIONS if entry in of_law))
 
 
 def _read_only(array: Array) -> Array:
@@ -149,12 +150,10 @@ def _read_only(array: Array) -> Array:
 
 _TAKEN: Final = {
     *(entry.name for entry in fields(Episode)),
-    *NAMES,
-    *COUNTS,
-    "return",
+    *METRICS,
+    *TOTALS,
     "replica",
     "agent",
-    "net",
     *("policy", "trained_episodes", "focal", "focal_agent", "focal_agents", "background", "scenario"),
     *("restrained", "runs", "worlds", "response", "chosen"),
 }
@@ -186,7 +185,6 @@ def own_metrics(metrics: Sequence[Custom], episode: Episode) -> dict[str, float]
     seen = replace(
         episode,
         metrics=MappingProxyType(episode.metrics),
-        institutions=MappingProxyType(episode.institutions),
         counts=counts and MappingProxyType({name: _read_only(array) for name, array in counts.items()}),
     )
     values = {}
@@ -212,32 +210,12 @@ def try_own_metrics(metrics: Sequence[Custom], env: EnvBase) -> None:
         tracker_of(env, metrics).add(batch)
 
 
-_RUNNING: Final[Mapping[str, tuple[str, str, type]]] = {
-    "harvest": ("harvest", "N", np.float64),
-    "harvest_steps": ("harvest", "N", np.int64),
-    "harvest_time": ("harvest", "N", np.int64),
-    "in_play_steps": ("in_play", "N", np.int64),
-    "shots": ("fired", "N", np.int64),
-    "hit_by": ("hit_by", "NN", np.int64),
-    "tagged": ("tagged_by", "N", np.int64),
-    "tagged_by": ("tagged_by", "NN", np.int64),
-    "depletion_step": ("stock", "", np.int64),
-    "fines": ("fines", "N", np.float64),
-    "transfers": ("transfers", "N", np.float64),
-    "violations": ("violated", "N", np.int64),
-    "counts": ("counts", "NC", np.int64),
-    "in_force": ("in_force", "V", np.float64),
-}
-"""What a tracker adds up of each running episode, by name: the entry that it needs, its axes after that of
-worlds (N agents, C counts, V decisions), and its dtype."""
-
-
-_ADDED: Final = ("in_play_steps", "shots", "hit_by", "tagged_by", "fines", "transfers", "violations")
-"""Those to which the entry is added turn by turn."""
-_COPIED: Final = {entry.name for entry in fields(Episode)} & ({*_RUNNING} - {"depletion_step", "counts"})
-"""Those that an episode has unchanged."""
-_TOTALS: Final = {entry.name for entry in fields(social.Totals)} & ({"steps", *_RUNNING} - {"counts"})
-
+_RUNNING: Final = {name: total for name, total in TOTALS.items() if total.add is not None}
+"""What a tracker adds up of each running episode, beside its steps and returns."""
+_COPIED: Final = {entry.name for entry in fields(Episode)} & ({*TOTALS} - {"counts"})
+"""The totals that an episode has as they are."""
+_OF_ALL: Final = {name for name, total in TOTALS.items() if not total.axes}
+"""Those that are one number of the whole episode."""
 
 _ALWAYS: Final[Mapping[str, Any]] = {
     "reward": ("next", *keys.REWARD),
@@ -250,14 +228,14 @@ _ALWAYS: Final[Mapping[str, Any]] = {
 class EpisodeTracker:
     """Tracks the running episode of each world and returns it when it ends.
 
-    The first batch determines which optional entries (`cprl.measuring.metrics`) the game reports; every later
-    batch must have them. Fields and metrics that need other entries are left out of episodes.
+    The first batch determines which optional entries (`cprl.measuring.registry`) the game reports; every
+    later batch must have them. Fields and metrics that need other entries are left out of episodes.
 
     Args:
         sustainable_yield: apples per step that the map can sustain; with first_stock, adds yield_share.
         first_stock: apples on the board at the start of an episode.
         institutions: those of the game, which say what is measured of them, see
-            `cprl.measuring.institutions.metrics_for`.
+            `cprl.measuring.registry.measurable`.
         metrics: the user's own: each names a function of an `Episode` that returns a number.
 
     Raises:
@@ -278,11 +256,18 @@ class EpisodeTracker:
         self.agents = checked("agents", agents, Positive)
         self.reported: tuple[str, ...] | None = None
         """The optional entries of this game; None before the first batch."""
-        self._yield: dict[str, Any] = {"sustainable_yield": sustainable_yield, "first_stock": first_stock}
-        self._institutions, self._metrics = tuple(institutions), tuple(metrics)
+        self._constants: dict[str, Any] = {
+            "sustainable_yield": sustainable_yield,
+            "first_stock": first_stock,
+            "groups": groups_of(institutions),
+        }
+        self._counts = counts_for(institutions)
+        self._metrics = tuple(metrics)
         self._episode = np.zeros(worlds, np.int64)
         self._running: dict[str, Array] = {}
         self._places: list[tuple[str, Any, str]] = []
+        self._counted: list[tuple[str, bool, list[tuple[Any, Array]]]] = []
+        """Of each entry whether turns of zeros add nothing, and how it is added to which totals."""
         self._checked: torch.Size | None = None
 
     def add(self, batch: TensorDictBase | Turn) -> list[Episode]:
@@ -323,7 +308,7 @@ class EpisodeTracker:
         """
         reported, running = None, dict[str, Array]()
         if "steps" in state:  # else the tracker had seen no batch
-            entries = {entry for name, (entry, _, _) in _RUNNING.items() if name in state}
+            entries = {total.entry for name, total in _RUNNING.items() if name in state}
             reported = tuple(entry for entry in (*OPTIONAL, *OF_INSTITUTIONS) if entry in entries)
             if self.reported not in (None, reported):
                 raise ValueError(
@@ -346,6 +331,11 @@ class EpisodeTracker:
         self.reported, self._running = reported, running
         places = {**_ALWAYS, **{name: PLACES[name] for name in reported or ()}}
         self._places = [(name, key[:-1], key[-1]) for name, key in places.items()]
+        self._counted = []
+        for entry in reported or ():
+            totals = [total for total in _RUNNING.values() if total.entry == entry]
+            added = [(total.add, running[total.name]) for total in totals]
+            self._counted.append((entry, all(total.skips_zeros for total in totals), added))
 
     def _zeros(self, reported: Collection[str], widths: Mapping[str, int]) -> dict[str, Array]:
         """The totals of episodes that begin, of a game that reports these entries."""
@@ -354,9 +344,9 @@ class EpisodeTracker:
             "steps": np.zeros(self.worlds, np.int64),
             "return": np.zeros((self.worlds, self.agents), np.float64),
             **{
-                name: np.zeros((self.worlds, *(sizes[axis] for axis in axes)), dtype)
-                for name, (entry, axes, dtype) in _RUNNING.items()
-                if entry in reported
+                name: np.zeros((self.worlds, *(sizes[axis] for axis in total.axes)), total.dtype)
+                for name, total in _RUNNING.items()
+                if total.entry in reported
             },
         }
 
@@ -397,9 +387,9 @@ class EpisodeTracker:
         if len(size) not in (1, 2) or size[0] != self.worlds:
             raise ValueError(f"the batch is {list(size)}; allowed: [{self.worlds}] or [{self.worlds}, T]")
         shapes: dict[str, tuple[int, ...]] = {"reward": (self.agents, 1), "decision": (self.agents,)}
-        for name, (entry, _, _) in _RUNNING.items():
-            if name in self._running:
-                shapes[entry] = self._running[name].shape[1:] or (1,)
+        for name, total in _RUNNING.items():
+            if name in self._running and total.entry is not None:
+                shapes[total.entry] = self._running[name].shape[1:] or (1,)
         for name, array in turns.items():
             allowed = (*size, *shapes.get(name, (1,)))
             if array.shape != allowed:
@@ -420,73 +410,54 @@ class EpisodeTracker:
         return episodes
 
     def _count(self, turn: Turns) -> None:
-        running, steps = self._running, self._running["steps"]
+        steps = self._running["steps"]
         steps += 1
-        running["return"] += turn["reward"][..., 0]
-        if "harvest" in turn and np.count_nonzero(turn["harvest"]):
-            bites = turn["harvest"] > 0
-            running["harvest"] += turn["harvest"]
-            running["harvest_steps"] += bites
-            running["harvest_time"] += bites * steps[:, None]
-        for name in _ADDED:
-            entry, _, _ = _RUNNING[name]
-            if entry in turn and np.count_nonzero(turn[entry]):
-                running[name] += turn[entry]
-        if "tagged_by" in turn and np.count_nonzero(turn["tagged_by"]):
-            running["tagged"] += turn["tagged_by"].any(-1)
-        if "stock" in turn and np.count_nonzero(turn["stock"]) < turn["stock"].size:
-            depletion_step = running["depletion_step"]
-            just_now = (turn["stock"][:, 0] == 0) & (depletion_step == 0)
-            depletion_step[just_now] = steps[just_now]
-        if "counts" in turn:  # they are cumulative: the last turn's are those of the episode
-            running["counts"][:] = turn["counts"]
-        if "in_force" in turn and np.count_nonzero(first := steps == 1):
-            running["in_force"][first] = turn["in_force"][first]
+        self._running["return"] += turn["reward"][..., 0]
+        for entry, skips_zeros, totals in self._counted:
+            value = turn[entry]
+            if not skips_zeros or np.count_nonzero(value):
+                for add, total in totals:
+                    add(total, value, steps)
 
     def _measure(self, worlds: Array, turn: Turns) -> list[Episode]:
-        """The episodes of the E worlds, int64 [E], that end with this turn."""
-        ended = {name: array[worlds] for name, array in self._running.items()}
-        given: dict[str, Any] = {
-            name: torch.from_numpy(ended[name]).to(torch.float64) for name in _TOTALS if name in ended
-        }
-        if "tagged_by" in ended:
-            given["tags"] = torch.from_numpy(ended["tagged_by"].sum(1))
-        if "counts" in ended:
-            given["counts"] = dict(zip(COUNTS, torch.from_numpy(ended["counts"]).unbind(-1), strict=True))
-        totals = social.Totals(**given, **self._yield, groups=institutions.groups_of(self._institutions))
-        metrics = social.measured(social.SOCIAL, totals)
-        wanted = institutions.metrics_for(self._institutions)
-        of_institutions = social.measured({name: institutions.METRICS[name] for name in wanted}, totals)
-        columns: dict[str, Any] = {name: ended[name] for name in _COPIED if name in ended}
-        if "hit_by" in ended:
-            columns["hits"] = ended["hit_by"].sum(1)
-        if "decision" in turn:
-            columns["decision"] = turn["decision"][worlds]
-        if "stock" in turn:
-            steps = ended["depletion_step"]
-            columns["stock_left"] = turn["stock"][worlds, 0].tolist()
-            columns["depletion_step"] = np.where(steps > 0, steps, -1).tolist()
-        if "counts" in ended:
-            counted = institutions.counts_for(self._institutions)
-            counts = {name: ended["counts"][..., COUNTS.index(name)] for name in counted}
-            columns["counts"] = [
-                {name: counts[name][index] for name in counts} for index in range(len(worlds))
-            ]
+        """Return the episodes of the E worlds, int64 [E], that end with this turn."""
+        totals = self._ended(worlds, turn)
+        counts = dict[str, Array]()
+        if "counts" in totals:
+            counts = {name: totals["counts"][..., COUNTS.index(name)] for name in self._counts}
+        metrics = measured({**counts, **totals, **self._constants})
+        stored = {name: values for name, values in metrics.items() if METRICS[name].is_stored}
+        if "in_force" in totals:
+            stored |= {f"{IN_FORCE}{place}": values for place, values in enumerate(totals["in_force"].T)}
         episodes = []
         for index, world in enumerate(worlds):
+            copied = {name: totals[name][index] for name in _COPIED if name in totals}
+            copied |= {name: copied[name].item() for name in _COPIED & _OF_ALL if name in copied}
             episode = Episode(
                 world=int(world),
                 episode=int(self._episode[world]),
-                steps=int(ended["steps"][index]),
-                terminated=bool(turn["terminated"][world, 0]),
-                return_=ended["return"][index],
-                metrics={name: float(values[index]) for name, values in metrics.items()},
-                institutions={name: float(values[index]) for name, values in of_institutions.items()},
-                **{name: values[index] for name, values in columns.items()},
+                return_=totals["return"][index],
+                metrics={name: float(values[index]) for name, values in stored.items()},
+                counts={name: values[index] for name, values in counts.items()} or None,
+                **copied,
             )
             added = own_metrics(self._metrics, episode)
             episodes.append(replace(episode, metrics={**episode.metrics, **added}) if added else episode)
         return episodes
+
+    def _ended(self, worlds: Array, turn: Turns) -> dict[str, Array]:
+        """Return the totals of the episodes of the E worlds that end with this turn, [E, ...] by name."""
+        totals = {name: array[worlds] for name, array in self._running.items()}
+        totals["terminated"] = turn["terminated"][worlds, 0]
+        for name, pairs in (("hits", "hit_by"), ("tags", "tagged_by")):
+            if pairs in totals:
+                totals[name] = totals[pairs].sum(1)
+        if "decision" in turn:
+            totals["decision"] = turn["decision"][worlds]
+        if "stock" in turn:
+            totals["stock_left"] = turn["stock"][worlds, 0]
+            totals["depletion_step"] = np.where(totals["depletion_step"] > 0, totals["depletion_step"], -1)
+        return totals
 
 
 def tracker_of(env: EnvBase, metrics: Sequence[Custom] = ()) -> EpisodeTracker:
@@ -522,14 +493,10 @@ def institutions_of(env: EnvBase) -> tuple[Institution, ...]:
 
 
 def metrics_of(env: EnvBase, reported: Collection[str]) -> tuple[str, ...]:
-    """The metrics of institutions in episodes of an environment that reports these entries."""
-    if set(reported).isdisjoint(OF_INSTITUTIONS):
-        return ()
-    return tuple(
-        name
-        for name in institutions.metrics_for(institutions_of(env))
-        if set(institutions.METRICS[name].needs) <= set(reported)
-    )
+    """Return the metrics of episodes of an environment that reports these entries, but for the user's own and
+    what is decided."""
+    of_board = ("yield_share",) if commons_of(env) is not None else ()
+    return (*measurable(reported, institutions_of(env)), *of_board)
 
 
 def decisions_of(env: EnvBase) -> tuple[str, ...]:

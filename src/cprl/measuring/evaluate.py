@@ -1,13 +1,15 @@
-"""Evaluates a policy without learning: one fresh episode in every world of an environment."""
+"""Play episodes without learning: turn by turn for whoever looks on, or whole for their numbers."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from statistics import fmean, stdev
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from cprl import keys
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import clock_of
 from cprl.measuring.episodes import Episode, tracker_of
@@ -18,42 +20,70 @@ from cprl.values import Custom
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
+def turns(env: EnvBase, policy: Policy, *, explore: bool = True) -> Iterator[TensorDictBase]:
+    """Play the next episode of each world, turn by turn; torch computes in one thread.
+
+    All worlds are reset at once, before the first turn is asked for. A world of a `CommonsEnv` that has ended
+    does not change until all have ended. In any other environment, including one with transforms, it is reset
+    when the next turn is asked for, and plays on.
+
+    Args:
+        env: B worlds, batch size [B].
+        policy: writes the actions of all agents, e.g. `cprl.policies.assignment.AgentPolicies`.
+        explore: whether agents explore as in training and evaluation; else they take their best actions.
+
+    Returns:
+        The entries of each turn, batch size [B], see `cprl.keys`, up to the one in which the last world ends.
+    """
+    with torch.no_grad(), one_thread():
+        begun = env.reset()
+    return _turns(env, policy, begun, explore)
+
+
+def _turns(env: EnvBase, policy: Policy, moment: TensorDictBase, explore: bool) -> Iterator[TensorDictBase]:
+    exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
+    clock = clock_of(env)
+    has_ended = np.zeros((*env.batch_size, 1), np.bool_)
+    count = 0
+    while not has_ended.all():
+        with torch.no_grad(), one_thread(), set_exploration_type(exploration):
+            acted = policy(moment)
+            if isinstance(env, CommonsEnv):
+                batch, moment = env.lean_step(acted, resets=False)
+            else:
+                batch = env.step(acted)
+        count += 1
+        say_how_far(count, clock, "turns")
+        has_ended |= batch["next", keys.DONE].numpy(force=True)
+        yield batch
+        if not isinstance(env, CommonsEnv):
+            moment = env.maybe_reset(env.step_mdp(batch))
+
+
 def evaluate(
     env: EnvBase, policy: Policy, *, explore: bool = False, metrics: Sequence[Custom] = ()
 ) -> list[Episode]:
-    """Plays the next episode of each world to its end; torch computes in one thread.
+    """Play the next episode of each world to its end, see `turns`.
 
     Args:
-        env: B worlds, batch size [B]; all are reset. A world of a `CommonsEnv` that has ended does not change
-            until all have ended. In any other environment, including one with transforms, it is reset and
-            plays on, and only its first episode counts.
+        env: B worlds, batch size [B]. Of a world that is reset and plays on only the first episode counts.
         metrics: the user's own, see `EpisodeTracker`.
 
     Returns:
         B episodes, in the order of worlds.
     """
-    tracker, episodes = tracker_of(env, metrics), dict[int, Episode]()
-    exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
-    clock = clock_of(env)
-    turns = 0
+    tracker = tracker_of(env, metrics)
+    episodes: dict[int, Episode] = {}
     what = "playing an episode" if tracker.worlds == 1 else f"playing {tracker.worlds:,} episodes"
-    with torch.no_grad(), one_thread(), set_exploration_type(exploration), working(what):
-        moment = env.reset()
-        while len(episodes) < tracker.worlds:
-            say_how_far(turns, clock, "turns")
-            turns += 1
-            acted = policy(moment)
-            if isinstance(env, CommonsEnv):
-                batch, moment = env.lean_step(acted, resets=False)
-            else:
-                batch, moment = env.step_and_maybe_reset(acted)
+    with working(what):
+        for batch in turns(env, policy, explore=explore):
             for episode in tracker.add(batch):
                 episodes.setdefault(episode.world, episode)
     return [episodes[world] for world in range(tracker.worlds)]
 
 
 def mean_return(episodes: list[Episode]) -> tuple[float, float]:
-    """The mean over episodes of the agents' summed return, and its standard error; NaN for one episode."""
+    """Return the mean over episodes of the summed return, and its standard error; NaN for one episode."""
     returns = [float(episode.return_.sum()) for episode in episodes]
     error = stdev(returns) / len(returns) ** 0.5 if len(returns) > 1 else float("nan")
     return fmean(returns), error

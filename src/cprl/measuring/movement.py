@@ -18,14 +18,11 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import keys
 from cprl.envs.commons_env import CommonsEnv
-from cprl.measuring.evaluate import Policy
-from cprl.system.process import one_thread
+from cprl.measuring.evaluate import Policy, turns
 
 Array = NDArray[Any]
 
@@ -45,7 +42,7 @@ class Trace:
     """Every tag, int64 [K, 4] in order: its step and world, the agent that was tagged, and who tagged it."""
 
     def worlds(self, first: int, end: int) -> "Trace":
-        """The trace of some of its worlds, from `first` on and without `end`."""
+        """Return the trace of some of its worlds, from `first` on and without `end`."""
         tags = self.tags[(self.tags[:, 1] >= first) & (self.tags[:, 1] < end)]
         names = ("row", "col", "in_play", "fired", "played")
         arrays = {name: getattr(self, name)[:, first:end] for name in names}
@@ -53,29 +50,29 @@ class Trace:
 
 
 def trace(env: CommonsEnv, policy: Policy, *, explore: bool = True) -> Trace:
-    """Plays the next episode of each world and records the positions of all agents."""
-    steps: list[tuple[Array, ...]] = []
+    """Play the next episode of each world, and record where all agents are."""
+    now = env.worlds.now
+    read = env.worlds.driver.read
+    played = turns(env, policy, explore=explore)
+    seen: dict[str, list[Array]] = {name: [] for name in ("row", "col", "in_play", "fired", "played")}
     tags: list[Array] = []
-    exploration = ExplorationType.RANDOM if explore else ExplorationType.DETERMINISTIC
-    now, read = env.worlds.now, env.worlds.driver.read
-    with torch.no_grad(), one_thread(), set_exploration_type(exploration):
-        moment = env.reset()
-        while not moment["done"].all():
-            places = read(now.row), read(now.col)
-            before = moment[keys.IN_PLAY].numpy(force=True), ~moment["done"][:, 0].numpy(force=True)
-            played = env.step(policy(moment))
-            moment = env.step_mdp(played)
-            hits = np.argwhere(moment[keys.TAGGED_BY].numpy(force=True))
-            tags.append(np.insert(hits, 0, len(steps), axis=1))
-            steps.append((*places, *before, moment[keys.FIRED].numpy(force=True)))
-    names = ("row", "col", "in_play", "played", "fired")
-    arrays = {name: np.stack(entries) for name, entries in zip(names, zip(*steps, strict=True), strict=True)}
-    board = env.game.map.height, env.game.map.width
-    return Trace(**arrays, board=board, tags=np.concatenate(tags))
+    row = read(now.row)
+    col = read(now.col)
+    for step, batch in enumerate(played):
+        seen["row"].append(row)
+        seen["col"].append(col)
+        seen["in_play"].append(batch[keys.IN_PLAY].numpy(force=True).copy())
+        seen["fired"].append(batch["next"][keys.FIRED].numpy(force=True).copy())
+        seen["played"].append(~batch[keys.DONE][:, 0].numpy(force=True))
+        tags.append(np.insert(np.argwhere(batch["next"][keys.TAGGED_BY].numpy(force=True)), 0, step, axis=1))
+        row = read(now.row)
+        col = read(now.col)
+    arrays = {name: np.stack(values) for name, values in seen.items()}
+    return Trace(**arrays, board=(env.game.map.height, env.game.map.width), tags=np.concatenate(tags))
 
 
 def visits(trace: Trace) -> Array:
-    """The share of its steps in play that each agent spent in each cell, float64 [B, N, H, W]."""
+    """Return the share of its steps in play that each agent spent in each cell, float64 [B, N, H, W]."""
     counts = np.zeros((*trace.row.shape[1:], *trace.board))
     at = np.nonzero(trace.in_play & trace.played[..., None])
     np.add.at(counts, (*at[1:], trace.row[at], trace.col[at]), 1)
@@ -84,7 +81,7 @@ def visits(trace: Trace) -> Array:
 
 
 def overlap(trace: Trace) -> Array:
-    """The overlap of the cells that two agents visit, mean over all pairs, float64 [B], 0..1.
+    """Return the overlap of the cells that two agents visit, mean over all pairs, float64 [B], 0..1.
 
     The overlap of two agents is the sum over cells of the smaller of their two shares: 1 for equal visits, 0
     for disjoint ones. NaN for a single agent.
@@ -98,8 +95,8 @@ def overlap(trace: Trace) -> Array:
 
 
 def visitors(visits: ArrayLike) -> Array:
-    """How many agents share a cell, float64 [...], 1..N: 1 if each has cells of its own, N if all spend equal
-    shares of their time in each cell.
+    """Return how many agents share a cell, float64 [...], 1..N: 1 if each has cells of its own, N if all
+    spend equal shares of their time in each cell.
 
     It is exp H(agent | cell): with p(i, c) = visits[i, c] / N, of the N agents that were in play, the entropy
     of who it is that one meets in a cell, mean over the cells by how often one meets somebody there. NaN
@@ -116,8 +113,8 @@ def visitors(visits: ArrayLike) -> Array:
 
 
 def exclusion(visits: ArrayLike) -> Array:
-    """How far agents keep each other out of cells, float64 [...], 0..1: 1 if no cell has two visitors, 0 if
-    all agents spend equal shares of their time in each cell; NaN for fewer than two agents.
+    """Return how far agents keep each other out of cells, float64 [...], 0..1: 1 if no cell has two visitors,
+    0 if all agents spend equal shares of their time in each cell; NaN for fewer than two agents.
 
     It is 1 - H(agent | cell) / log N, or the information about who an agent is that its cell gives, as a
     share of all that there is; equal to the Jensen-Shannon divergence of the N distributions over cells,
@@ -132,15 +129,15 @@ def exclusion(visits: ArrayLike) -> Array:
 
 
 def owners(visits: ArrayLike) -> Array:
-    """The agent that spends the largest share of its time in each cell, int64 [..., H, W]; of equal ones the
-    first, and -1 where nobody was."""
+    """Return the agent that spends the largest share of its time in each cell, int64 [..., H, W]; of equal
+    ones the first, and -1 where nobody was."""
     shares = np.asarray(visits, np.float64)
     agents: Array = np.where(shares.any(-3), shares.argmax(-3), -1)
     return agents
 
 
 def taggings(trace: Trace) -> Array:
-    """How often each agent was tagged by each, int64 [B, N, N]: row the tagged, column who tagged it.
+    """Return how often each agent was tagged by each, int64 [B, N, N]: row the tagged, column who tagged it.
 
     An agent that several beams hit at once is counted for each of those who fired.
     """
@@ -151,7 +148,7 @@ def taggings(trace: Trace) -> Array:
 
 
 def tagged_where(trace: Trace) -> Array:
-    """How often each agent was tagged in each cell, int64 [B, N, H, W].
+    """Return how often each agent was tagged in each cell, int64 [B, N, H, W].
 
     The cell is that at the start of the step, before the agent moved in it. An agent that several beams hit
     at once is counted once.
@@ -165,7 +162,7 @@ def tagged_where(trace: Trace) -> Array:
 
 
 def defence(trace: Trace, visits: ArrayLike) -> Array:
-    """The share of tags with which an agent drives another one out of its own territory, float64 [B], 0..1.
+    """Return the share of tags with which an agent drives another out of its own territory, float64 [B].
 
     A tag counts as 1 if the one who fired spends a larger share of its time in the cell of the tagged, as in
     `tagged_where`, than the tagged itself, 0 if a smaller one, and 1/2 if they are equal. NaN where no agent
@@ -186,5 +183,5 @@ def defence(trace: Trace, visits: ArrayLike) -> Array:
 
 
 def _in_play(visits: ArrayLike) -> Array:
-    """How many agents were ever in play, int64 [...]."""
+    """Return how many agents were ever in play, int64 [...]."""
     return np.asarray(np.asarray(visits).any((-2, -1)).sum(-1))

@@ -6,19 +6,18 @@ samples have the degrees of freedom of B. L. Welch, "The generalization of 'Stud
 different population variances are involved" (1947).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import inf, isfinite, isnan
-from operator import attrgetter
-from statistics import fmean
-from typing import Final, Self
+from math import inf, isclose, isfinite, isnan, nan
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import ArrayLike, NDArray
 
-from cprl.measuring.episodes import Episode
-from cprl.measuring.metrics import bounds
-from cprl.measuring.series import Values
+from cprl.measuring.registry import METRICS, bounds
+from cprl.measuring.table import by_replica, clock_of, complete, numbers_in
+from cprl.measuring.windows import Values
 
 CONFIDENCE: Final = 0.95
 
@@ -32,12 +31,19 @@ class Estimate:
     high: float
     """The bounds of the interval; NaN for a single replica."""
     replicas: int
-    """Of all samples together; of paired differences, the pairs."""
+    """Of all samples together; of paired differences, the pairs; 0 of a number that is undefined in all
+    episodes, whose value is NaN."""
     p_value: float = float("nan")
     """How often a value at least as far from 0 would come by chance if it were 0, by the same t, two-sided;
     NaN for a single replica."""
     bounds: tuple[float, float] = (-inf, inf)
     """What the number can be. Student's t knows no bounds: `low` and `high` may pass them."""
+    episodes: int = 0
+    """Of all replicas together; 0 where nobody counted them."""
+    undefined: int = 0
+    """Episodes in which the number is undefined; they are no part of a mean."""
+    differs: bool = False
+    """Of a difference: whether it is not 0 by Holm's method in its family."""
 
     def of(self, metric: str, clock: float = inf) -> Self:
         """This estimate as one of a metric, whose `bounds` cut what is shown of the interval."""
@@ -63,11 +69,17 @@ class Estimate:
         return format(self)
 
     def __format__(self, form: str) -> str:
-        """The value with its interval, of a single replica the value alone; "" and "+" choose the digits."""
+        """Return the value with its interval, of a single replica the value alone, and in how many episodes
+        it is undefined; "" and "+" choose the digits."""
+        if not self.replicas:
+            return f"undefined in all {self.episodes} episodes"
         numbers = self.value, *self.interval
         form += form_for(*numbers) if form in ("", "+") else ""
         value, low, high = (f"{number:{form}}" for number in numbers)
-        return f"{value} [{low}, {high}]" if np.isfinite([self.low, self.high]).all() else value
+        text = f"{value} [{low}, {high}]" if np.isfinite([self.low, self.high]).all() else value
+        return (
+            f"{text}, undefined in {self.undefined} of {self.episodes} episodes" if self.undefined else text
+        )
 
 
 CUT: Final = "Bounds of a metric cut an interval where Student's t passes them."
@@ -204,73 +216,16 @@ def _sample(values: ArrayLike) -> Values:
     return sample
 
 
-@dataclass(frozen=True, kw_only=True)
-class Measured:
-    """A metric with one value per episode, over the episodes of several replicas."""
-
-    estimate: Estimate | None
-    """The estimate over replicas of each replica's mean over the episodes in which the metric is defined.
-    Replicas without such an episode are left out; None if no replica has one."""
-    undefined: int
-    """Episodes of all replicas in which the metric is undefined; they are not part of a mean."""
-    episodes: int
-    """Episodes of all replicas."""
-
-    def __str__(self) -> str:
-        if self.estimate is None:
-            return f"undefined in all {self.episodes}"
-        value = f"{self.estimate}"
-        return f"{value}, undefined in {self.undefined} of {self.episodes}" if self.undefined else value
-
-
 def signed(difference: Estimate | None) -> str:
     """Return a difference as a cell of a table; "" where there is none."""
     return "" if difference is None else f"{difference:+}"
 
 
-def notes_on(measures: Sequence[Measured]) -> list[str]:
-    """Return what a table of metrics says once of its intervals."""
-    estimates = [measured.estimate for measured in measures if measured.estimate is not None]
-    is_single = bool(estimates) and all(estimate.replicas == 1 for estimate in estimates)
-    return [ONE_REPLICA] * is_single + [CUT] * any(estimate.is_cut for estimate in estimates)
-
-
-ByReplica = Mapping[int, Sequence[float]]
-"""The values of a metric by replica, at least one per episode, NaN where undefined."""
-
-
-def over_replicas(values: ByReplica, metric: str = "", clock: float = inf) -> Measured:
-    """Estimate a metric, which may be named, see `bounds`; a mean that is not finite has no interval."""
-    means = list(_means(values).values())
-    return Measured(
-        estimate=estimate_if_finite(means).of(metric, clock) if means else None,
-        undefined=sum(isnan(value) for episodes in values.values() for value in episodes),
-        episodes=sum(map(len, values.values())),
-    )
-
-
-def difference_paired(
-    values: ByReplica, reference: ByReplica, metric: str = "", clock: float = inf
-) -> Estimate | None:
-    """Return how much more the mean of a metric is, paired by replica, over the replicas in which both are
-    defined; None if there is none."""
-    means = _means(values)
-    others = _means(reference)
-    pairs = [means[replica] - others[replica] for replica in means if replica in others]
-    return estimate_if_finite(pairs).between(metric, clock) if pairs else None
-
-
-def _means(values: ByReplica) -> dict[int, float]:
-    """Return the mean of each replica over the episodes in which the metric is defined, if there are any."""
-    defined = {
-        replica: [value for value in episodes if not isnan(value)] for replica, episodes in values.items()
-    }
-    with np.errstate(invalid="ignore"):  # of infinite values of both signs
-        return {
-            replica: fmean(episodes) if all(map(isfinite, episodes)) else float(np.mean(episodes))
-            for replica, episodes in defined.items()
-            if episodes
-        }
+def notes_on(estimates: Iterable[Estimate]) -> list[str]:
+    """Return what a table of numbers says once of their intervals."""
+    shown = [one for one in estimates if one.replicas]
+    is_single = bool(shown) and all(one.replicas == 1 for one in shown)
+    return [ONE_REPLICA] * is_single + [CUT] * any(one.is_cut for one in shown)
 
 
 def estimate_if_finite(means: Sequence[float]) -> Estimate:
@@ -279,48 +234,203 @@ def estimate_if_finite(means: Sequence[float]) -> Estimate:
         return estimate(means)
     with np.errstate(invalid="ignore"):
         value = float(np.mean(means))
-    return Estimate(value=value, low=float("nan"), high=float("nan"), replicas=len(means))
+    return Estimate(value=value, low=nan, high=nan, replicas=len(means))
 
 
-def institution_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measured]:
-    """Return the metrics of institutions over replicas, by name, of episodes by replica."""
-    return _measures(played, attrgetter("of_institutions"))
+Labels = tuple[Any, ...]
+Key = tuple[Any, ...]
+"""The labels of a row, then the name of a number."""
 
 
-def social_measures(played: Mapping[int, Sequence[Episode]]) -> dict[str, Measured]:
-    """Return the social metrics over replicas, by name, of episodes by replica."""
-    return _measures(played, attrgetter("social"))
+class Family(Mapping[Key, Estimate]):
+    """Estimates by labels and number, e.g. `family["trained", "equality"]`; of differences, those that Holm's
+    method judges together.
+
+    Args:
+        estimates: by their keys, in the order of pages.
+        by: the names of the labels.
+        name: of differences, which they are, e.g. "differences from random".
+    """
+
+    def __init__(self, estimates: Mapping[Key, Estimate], by: Sequence[str] = (), name: str = "") -> None:
+        self._estimates = dict(estimates)
+        self.by = tuple(by)
+        self.name = name
+
+    def __getitem__(self, key: Key | str) -> Estimate:
+        return self._estimates[key if isinstance(key, tuple) else (key,)]
+
+    def __iter__(self) -> Iterator[Key]:
+        return iter(self._estimates)
+
+    def __len__(self) -> int:
+        return len(self._estimates)
+
+    def __repr__(self) -> str:
+        lines = (f"{', '.join(map(str, key))}: {one}" for key, one in self.items())
+        return "\n".join(lines)
+
+    @property
+    def labels(self) -> list[Labels]:
+        """The labels of its rows, each once, in order."""
+        return list(dict.fromkeys(key[:-1] for key in self))
+
+    @property
+    def numbers(self) -> list[str]:
+        """The names of its numbers, each once, in order."""
+        return list(dict.fromkeys(key[-1] for key in self))
+
+    def of(self, *labels: Any) -> dict[str, Estimate]:
+        """Return the estimates with these labels by number."""
+        return {key[-1]: one for key, one in self.items() if key[:-1] == labels}
+
+    def table(self) -> pa.Table:
+        """Return a row for each estimate: its labels, "number", and the fields of `Estimate`, null where
+        undefined."""
+        rows = [
+            {**dict(zip(self.by, key, strict=False)), "number": key[-1], **_numbers_of(one)}
+            for key, one in self.items()
+        ]
+        return pa.Table.from_pylist(rows)
 
 
-def _measures(
-    played: Mapping[int, Sequence[Episode]], metrics_of: Callable[[Episode], dict[str, float]]
-) -> dict[str, Measured]:
-    clock = clock_of(played)
-    metrics = by_metric(played, metrics_of)
-    return {name: over_replicas(values, name, clock) for name, values in metrics.items()}
+def _numbers_of(one: Estimate) -> dict[str, float | None]:
+    names = ("value", "low", "high", "p_value", "replicas", "episodes", "undefined", "differs")
+    values = {name: getattr(one, name) for name in names}
+    return {name: None if isnan(value) else value for name, value in values.items()}
 
 
-def clock_of(played: Mapping[int, Sequence[Episode]]) -> float:
-    """Return the steps of an episode that the clock ended, infinity where none was."""
-    episodes = (episode for of_replica in played.values() for episode in of_replica)
-    return max((episode.steps for episode in episodes if not episode.terminated), default=inf)
+def estimates(table: pa.Table, numbers: Sequence[str] | str = (), by: Sequence[str] | str = ()) -> Family:
+    """Return the mean of numbers over replicas, each with its interval by Student's t.
 
+    A replica's value is its mean over the episodes in which a number is defined.
 
-def by_metric(
-    played: Mapping[int, Sequence[Episode]], metrics_of: Callable[[Episode], dict[str, float]]
-) -> dict[str, dict[int, list[float]]]:
-    """Return the values of each metric by replica, of episodes by replica."""
-    by_replica = {replica: list(map(metrics_of, episodes)) for replica, episodes in played.items()}
-    names = next(iter(by_replica.values()))[0]
-    return {
-        name: {replica: [one[name] for one in episodes] for replica, episodes in by_replica.items()}
+    Args:
+        table: of episodes or of windows, see `cprl.measuring.table`.
+        numbers: their names; by default all `numbers_in` the table.
+        by: the labels that are kept apart.
+    """
+    table = complete(table)
+    keys = (by,) if isinstance(by, str) else tuple(by)
+    names = [numbers] if isinstance(numbers, str) else list(numbers) or numbers_in(table)
+    clock = clock_of(table)
+    samples = {name: _samples(table, name, keys) for name in names}
+    labels = dict.fromkeys(each for of_number in samples.values() for each in of_number)
+    found = {
+        (*each, name): samples[name][each].estimate(name, clock)
+        for each in labels
         for name in names
+        if each in samples[name]
     }
+    return Family(found, keys)
 
 
-def agents_without_harvest(played: Mapping[int, Sequence[Episode]]) -> tuple[int, int] | None:
-    """Count the agents of all episodes without a harvest, which sustainability leaves out, and all agents;
-    None if the game reports no harvest."""
-    harvests = [episode.harvest for episodes in played.values() for episode in episodes]
-    apples = [apples for harvest in harvests if harvest is not None for apples in harvest.tolist()]
-    return (apples.count(0), len(apples)) if apples else None
+Reference = Mapping[str, Any] | Callable[[dict[str, Any]], Mapping[str, Any]]
+"""The labels of what a row is compared with: some with their values, or a function of the row's labels."""
+
+
+def differences(
+    table: pa.Table,
+    numbers: Sequence[str] | str,
+    by: Sequence[str] | str,
+    reference: Reference,
+    *,
+    paired: bool = True,
+    family: str = "",
+) -> Family:
+    """Return how much more each number is than that of its reference, with its interval by Student's t.
+
+    Rows whose reference is themselves, or is not there, have no difference.
+
+    Args:
+        table, numbers, by: as in `estimates`.
+        paired: whether replica r of both had the same chance: then the interval is that of the mean of the
+            replicas' differences, else Welch's.
+        family: what the differences of this call are, which Holm's method judges all together.
+    """
+    table = complete(table)
+    keys = (by,) if isinstance(by, str) else tuple(by)
+    clock = clock_of(table)
+    found: dict[Key, Estimate] = {}
+    for name in [numbers] if isinstance(numbers, str) else numbers:
+        samples = _samples(table, name, keys)
+        for labels, sample in samples.items():
+            row = dict(zip(keys, labels, strict=True))
+            other = {**row, **(reference(row) if callable(reference) else reference)}
+            home = tuple(other[key] for key in keys)
+            if home == labels or home not in samples:
+                continue
+            one = sample.minus(samples[home], paired=paired)
+            if one is not None:
+                found[(*labels, name)] = one.between(name, clock)
+    return judged(found, keys, family)
+
+
+class _Sample(NamedTuple):
+    """A number of some replicas."""
+
+    values: dict[int, float]
+    """The mean of each replica in which it is defined."""
+    episodes: int
+    undefined: int
+
+    def estimate(self, name: str, clock: float) -> Estimate:
+        if not self.values:
+            return Estimate(
+                value=nan, low=nan, high=nan, replicas=0, episodes=self.episodes, undefined=self.undefined
+            )
+        one = estimate_if_finite(list(self.values.values())).of(name, clock)
+        return replace(one, episodes=self.episodes, undefined=self.undefined)
+
+    def minus(self, other: Self, *, paired: bool) -> Estimate | None:
+        if paired:
+            pairs = [
+                value - other.values[replica]
+                for replica, value in self.values.items()
+                if replica in other.values
+            ]
+            return estimate_if_finite(pairs) if pairs else None
+        samples = [list(self.values.values()), list(other.values.values())]
+        return difference(*samples, paired=False) if all(samples) else None
+
+
+def _samples(table: pa.Table, number: str, by: Sequence[str]) -> dict[Labels, _Sample]:
+    """Return a number of the replicas of each choice of labels."""
+    samples: dict[Labels, _Sample] = {}
+    rows = by_replica(table, number, by).to_pydict()
+    for labels in zip(
+        *(rows[name] for name in (*by, "replica", "value", "episodes", "undefined")), strict=True
+    ):
+        *key, replica, value, episodes, undefined = labels
+        before = samples.get(tuple(key), _Sample({}, 0, 0))
+        values = before.values if value is None else {**before.values, replica: value}
+        samples[tuple(key)] = _Sample(values, before.episodes + episodes, before.undefined + undefined)
+    return samples
+
+
+def judged(found: Mapping[Key, Estimate], by: Sequence[str] = (), name: str = "") -> Family:
+    """Return differences as a family, each with whether it is not 0 by Holm's method for all of them.
+
+    One that equals that of the metric which its own is `same_as` is the same test, and counts once.
+    """
+    tests: dict[Key, list[Key]] = {}
+    for key, one in found.items():
+        if isnan(one.p_value):
+            continue
+        metric = METRICS.get(key[-1])
+        same = (*key[:-1], metric.same_as if metric else None)
+        is_same = same in tests and _is_same(one, found[same])
+        tests.setdefault(same if is_same else key, []).append(key)
+    differ = holm([found[key].p_value for key in tests])
+    marked = {key for keys, is_apart in zip(tests.values(), differ, strict=True) if is_apart for key in keys}
+    told = {key: replace(one, differs=key in marked) for key, one in found.items()}
+    return Family(told, by, name or f"these {len(tests)} differences")
+
+
+_ROUNDING: Final = 1e-6
+"""What payments of float32 round off, of a value."""
+
+
+def _is_same(one: Estimate, other: Estimate) -> bool:
+    pairs = zip((one.value, one.low, one.high), (other.value, other.low, other.high), strict=True)
+    return all(isclose(a, b, rel_tol=_ROUNDING, abs_tol=_ROUNDING) for a, b in pairs)

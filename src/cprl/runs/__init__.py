@@ -2,6 +2,7 @@
 
 Modules, in the order in which one reads them:
     files        files that are never left half written, their formats and checksums; one process writes a run
+    length       how long a training is: episodes or steps
     recipe       the run's directory and recipe.json
     episodes     the table of episodes and its journal, whose rows are safe as soon as they are written
     curves       tables as curves over episodes

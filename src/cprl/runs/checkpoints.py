@@ -22,6 +22,7 @@ from cprl.runs.files import (
     verify,
     write_atomically,
 )
+from cprl.runs.length import Length
 from cprl.runs.recipe import resume_command, write_length
 from cprl.system.output import RESUMES, say
 from cprl.system.process import at_signals
@@ -299,7 +300,7 @@ def depends_on_episodes(callback: Any) -> bool:
     return hasattr(callback, "on_start") and not getattr(callback, "is_extendable", False)
 
 
-def extend(run: Path, before: int, length: int) -> None:
+def extend(run: Path, before: Length, length: Length) -> None:
     """Make a run a longer one, to be resumed; results so far are kept under a name with the number of their
     episodes, or steps: `checkpoints/final-4800.pt`, `evaluation-4800/`, `report-4800.json`.
 
@@ -307,14 +308,15 @@ def extend(run: Path, before: int, length: int) -> None:
 
     Args:
         run: its directory, which `refuse_to_extend` has checked.
-        before: the number of episodes, or steps, so far.
-        length: the number to be.
+        before: how long it is so far.
+        length: how long it is to be.
     """
     weights = [f"{FOLDER}/{name}.pt" for name in ("final", "transforms", "decisions")]
     for name in (REPORT, *weights, "evaluation"):
         path = run / name
         if path.exists():
-            rename_listed(run, name, path.with_stem(f"{path.stem}-{before}").relative_to(run).as_posix())
+            kept = path.with_stem(f"{path.stem}-{before.number}")
+            rename_listed(run, name, kept.relative_to(run).as_posix())
     checkpoints = checkpoints_in(run / FOLDER)
     last = max((steps_of(path) for path in checkpoints if is_ending(path)), default=None)
     for path in checkpoints:

@@ -20,9 +20,8 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from tensordict import TensorDictBase
 
-from cprl.institutions import COUNTS
-from cprl.measuring import Episode, social
-from cprl.measuring.metrics import left_out
+from cprl.measuring import Episode
+from cprl.measuring.registry import METRICS, SOCIAL, TOTALS, left_out
 from cprl.runs.files import (
     RECIPE_FILE,
     RECIPE_FORMAT,
@@ -60,7 +59,7 @@ def read_journal(path: Path) -> pa.Table:
     batches = [batch for batch, _ in batches_in(path)]
     if batches:
         return pa.Table.from_batches(batches)
-    return _schema([*COLUMNS, *social.METRICS, "yield_share"]).empty_table()
+    return _schema([*COLUMNS, *(name for name in SOCIAL if METRICS[name].is_stored)]).empty_table()
 
 
 def _message(batch: pa.RecordBatch, *, is_first: bool) -> bytes:
@@ -279,53 +278,23 @@ def _reopen(path: Path, journal: Path) -> None:
     write_atomically(journal, lambda file: file.writelines(messages))
 
 
+_NUMBERED: Final = ("replica", "episode", "agent")
+"""The columns that say whose a row is."""
+
+_OF_TOTALS: Final = {name: total for name, total in TOTALS.items() if total.column is not None}
 COLUMNS: Final = {
-    "replica": pa.int32(),
-    "world": pa.int32(),
-    "episode": pa.int32(),
-    "agent": pa.int32(),
-    "return": pa.float32(),
-    "wanted_return": pa.float32(),
-    "harvest": pa.float32(),
-    "steps": pa.int32(),
-    "in_play_steps": pa.int32(),
-    "shots": pa.int32(),
-    "hits": pa.int32(),
-    "tagged": pa.int32(),
-    "stock_left": pa.int32(),
-    "depletion_step": pa.int32(),
-    "terminated": pa.bool_(),
+    **dict.fromkeys(("replica", "world", "episode", "agent"), pa.int32()),
+    **{name: total.column for name, total in _OF_TOTALS.items() if not total.is_of_institutions},
 }
-"""The columns of a table, as in `Episode`; the metrics follow, float64, NaN where undefined.
+"""The columns of a table, as in `Episode`; those of `OF_INSTITUTIONS` and the metrics follow, float64, NaN
+where undefined.
 
 Values of the whole episode are repeated in the row of each agent. Values that the game does not report have
 no column; nor have, outside of a training, the world, which counts through those of all replicas, and the
 wanted return. It is null for agents that do not learn."""
-
-_NUMBERED: Final = ("replica", "episode", "agent")
-"""The columns that say whose a row is."""
-
-OF_INSTITUTIONS: Final = {
-    "decision": pa.int32(),
-    "fines": pa.float64(),
-    "transfers": pa.float64(),
-    "violations": pa.int32(),
-    **{name: pa.int32() for name in COUNTS if name != "violations"},
-}
-"""The columns of a game with institutions, between those of `COLUMNS` and the metrics; those of counts only
-where `cprl.measuring.institutions.counts_for` has them. One for each decision in force follows, `in_force_0`
-and so on, float64."""
-
-
-def metrics_in(schema: pa.Schema) -> list[str]:
-    """Return the metrics among the columns of a table, those of the user's own included."""
-    return [
-        field.name
-        for field in schema
-        if pa.types.is_floating(field.type)
-        and field.name not in {**COLUMNS, **OF_INSTITUTIONS}
-        and not field.name.startswith("in_force_")
-    ]
+OF_INSTITUTIONS: Final = {name: one.column for name, one in _OF_TOTALS.items() if one.is_of_institutions}
+"""The columns of a game with institutions; those of counts only where
+`cprl.measuring.registry.counts_for` has them."""
 
 
 LEFT_OUT: Final = b"left_out"
@@ -366,7 +335,7 @@ def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema)
 
 
 def _columns(episode: Episode, replica: int | None = None) -> dict[str, Any]:
-    """The columns of an episode in order, [N] each."""
+    """Return the columns of an episode in order, [N] each."""
     agents = np.arange(len(episode.return_))
     entries: dict[str, Any] = dict(episode.counts or {})
     entries |= {name: value for name, value in vars(episode).items() if value is not None}
@@ -376,11 +345,9 @@ def _columns(episode: Episode, replica: int | None = None) -> dict[str, Any]:
     if episode.wanted_return is None:  # no training, of whose worlds it is one
         del entries["world"]
     values = {name: entries[name] for name in (*COLUMNS, *OF_INSTITUTIONS) if name in entries}
-    if episode.in_force is not None:
-        values |= {f"in_force_{place}": value for place, value in enumerate(episode.in_force.tolist())}
-    values |= episode.metrics
-    values |= {f"institutions/{name}": value for name, value in episode.institutions.items()}
-    return {name: np.broadcast_to(value, agents.shape) for name, value in values.items()}
+    values = {**episode.metrics, **values}
+    order = dict.fromkeys([name for name in (*COLUMNS, *OF_INSTITUTIONS) if name in values])
+    return {name: np.broadcast_to(values[name], agents.shape) for name in {**order, **values}}
 
 
 Label = Mapping[str, str | int]

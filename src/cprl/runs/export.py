@@ -14,7 +14,8 @@ import pyarrow as pa
 from cprl.runs.checkpoints import FOLDER, REPORT
 from cprl.runs.episodes import FILE_NAME, read_episodes, read_table, write_small
 from cprl.runs.files import LOCK_FILE, refuse_links, refuse_missing, remove_listed, verify, write_listed
-from cprl.runs.recipe import ANY_LENGTH, RECIPE_FILE, read_recipe, with_runs_moved
+from cprl.runs.length import without_length
+from cprl.runs.recipe import RECIPE_FILE, read_recipe, with_runs_moved
 from cprl.runs.weights import DECISIONS, TRANSFORMS
 from cprl.runs.weights import FIELD as FROZEN
 from cprl.values import differences
@@ -78,7 +79,7 @@ def _refuse_another(folder: Path, run: Path, recipe: Mapping[str, Any]) -> None:
             raise ValueError(f"folder is {folder}, a run of its own: it has {path.name}; {allowed}")
     if (folder / RECIPE_FILE).exists():
         there = _with_frozen_moved(read_recipe(folder), folder, run)
-        before, now = ({**table["experiment"], **ANY_LENGTH} for table in (there, recipe))
+        before, now = (without_length(table["experiment"]) for table in (there, recipe))
         differ = differences(before, now, "experiment")
         if differ:
             raise ValueError(f"folder is {folder}, which holds another run: {differ[0]}; {allowed}")

@@ -22,6 +22,7 @@ from pathlib import Path
 from shutil import copyfileobj
 from typing import Any, BinaryIO, Final, Self
 
+from cprl.runs.length import without_length
 from cprl.system.output import legible
 from cprl.values import refuse_other_keys, shown
 
@@ -178,10 +179,8 @@ def refuse_newer(what: object, table: Mapping[str, Any], newest: int) -> None:
         )
 
 
-ANY_LENGTH: Final = {"episodes": None, "steps": None}
-"""In place of how long experiments train, where their tables are compared without it."""
 FREE: Final = {"name": "", "on_nan": ""}
-"""In place of what else may differ in the experiments of one and the same run."""
+"""In place of what may differ in the experiments of one and the same run, beside their length."""
 
 MANIFEST_FILE: Final = "manifest.json"
 _NAMED_CHECKSUM: Final = re.compile(r"-([0-9a-f]{32})\.pt")
@@ -277,7 +276,7 @@ def _experiment_in(run: Path) -> str | None:
         return None
     if not isinstance(experiment, dict):
         return None
-    return digest_of(json.dumps({**experiment, **FREE, **ANY_LENGTH}, sort_keys=True))
+    return digest_of(json.dumps(without_length({**experiment, **FREE}), sort_keys=True))
 
 
 def _sound(run: Path) -> dict[str, str]:

@@ -84,7 +84,7 @@ class LoggerCallback:
     replicas have ended it: the mean over replicas as
     `social/equality`, and with several replicas the metrics and returns of each as
     `replica_0/social/equality`. Undefined values are not written, nor metrics that the game does not report,
-    see `cprl.measuring.metrics`.
+    see `cprl.measuring.registry`.
 
     After a resume, the episodes after the checkpoint are played again, with the same steps. TorchRL's
     CSVLogger does not get those that its files have; other loggers get them again.

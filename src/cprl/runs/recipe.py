@@ -16,13 +16,13 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.runs.files import ANY_LENGTH as ANY_LENGTH
 from cprl.runs.files import LOCK_FILE, RECIPE_FORMAT, RunLock, digest_of, read_json, refuse_newer, write_json
 from cprl.runs.files import RECIPE_FILE as RECIPE_FILE
+from cprl.runs.length import Length, without_length
 from cprl.system.output import ERR, console, printed
 from cprl.system.process import cpu
 from cprl.system.shipped import PROGRAM, command_of, cprl_here
-from cprl.values import custom_targets, described, differences, refusal, shown, source_of
+from cprl.values import OWN_METRICS, custom_targets, described, differences, refusal, shown, source_of
 
 _RESUMES: Final = ("--resume", "--no-resume", "--take-over", "--no-take-over")
 _DIRECTORIES: Final = ("--out", "--runs")
@@ -111,7 +111,7 @@ def _refuse_contents(directory: Path) -> None:
 
 def refuse_another_run(
     out: Path | None, to_recipe: Callable[[Path], Mapping[str, Any]], kind: Any = None
-) -> int:
+) -> Length:
     """Refuse to resume what was not begun with the same recipe; only its number of episodes, or of steps, may
     grow, and `on_nan` be another.
 
@@ -125,24 +125,18 @@ def refuse_another_run(
     if out is None:
         raise ValueError("resume requires the directory of the run as out")
     before, now = read_recipe(out)["experiment"], to_recipe(out)["experiment"]
-    free = {**ANY_LENGTH, "on_nan": ""}
+    free = {**without_length({}), "on_nan": ""}
     differ = differences({**before, **free}, {**now, **free}, "experiment", kind)
     if differ:
         more = f"; and {len(differ) - _NAMED} more" if len(differ) > _NAMED else ""
         raise ValueError(f"{out} was started with another recipe: {'; '.join(differ[:_NAMED])}{more}")
-    (unit, length), (unit_now, length_now) = length_in(before), length_in(now)
-    if unit != unit_now or not isinstance(length, int) or length > length_now:
+    length = Length.of(before)
+    length_now = Length.of(now)
+    if length != length_now and not length.is_shorter_than(length_now):
         raise ValueError(
-            f"{out} has {length} {unit}, which cannot become {length_now} {unit_now}; allowed: as many, or "
-            "more to extend it"
+            f"{out} has {length}, which cannot become {length_now}; allowed: as many, or more to extend it"
         )
     return length
-
-
-def length_in(experiment: Mapping[str, Any]) -> tuple[str, Any]:
-    """How long the table of an experiment says that it trains: "episodes" or "steps", and how many."""
-    unit = "episodes" if experiment.get("steps") is None else "steps"
-    return unit, experiment.get(unit)
 
 
 def read_recipe(run: Path) -> dict[str, Any]:
@@ -161,6 +155,7 @@ def read_recipe(run: Path) -> dict[str, Any]:
         raise ValueError(f"{path} is not the recipe of a run: {error!r}") from error
     recipe_config(recipe, where=path)
     _refuse_odd_parts(recipe, path)
+    OWN_METRICS.update(recipe.get("metrics", {}))
     return recipe
 
 
@@ -174,6 +169,10 @@ def _refuse_odd_parts(recipe: Mapping[str, Any], path: Path) -> None:
         for name in ("versions", "code", "code_text", "frozen"):
             if not isinstance(part.get(name) or {}, Mapping):
                 raise ValueError(f"{path}: {name} is {shown(part[name])}; allowed: a table")
+    metrics = recipe.get("metrics", {})
+    tables = list(metrics.values()) if isinstance(metrics, Mapping) else [None]
+    if not all(isinstance(table, Mapping) and set(map(type, table.values())) <= {str} for table in tables):
+        raise ValueError(f"{path}: metrics is {shown(metrics)}; allowed: tables of texts by name")
 
 
 def parts_of(recipe: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -233,12 +232,12 @@ def runs_in(paths: Iterable[Path | str]) -> list[Path]:
     return runs
 
 
-def write_length(run: Path, length: int) -> None:
-    """Write into a run's recipe that it is extended to so many episodes, or steps, and by which versions."""
+def write_length(run: Path, length: Length) -> None:
+    """Write into a run's recipe to which length it is extended, and by which versions."""
     recipe = read_recipe(run)
-    unit, before = length_in(recipe["experiment"])
-    earlier = {unit: before, **_circumstances(recipe)}
-    recipe["experiment"][unit] = length
+    before = Length.of(recipe["experiment"])
+    earlier = {before.unit: before.number, **_circumstances(recipe)}
+    recipe["experiment"][length.unit] = length.number
     recipe |= {**_code_text(recipe), "extended": [*recipe.get("extended", []), earlier]}
     write_json(run / RECIPE_FILE, recipe)
 
@@ -249,6 +248,14 @@ def write_on_nan(run: Path, on_nan: str) -> None:
     if recipe["experiment"].get("on_nan") != on_nan:
         recipe["experiment"]["on_nan"] = on_nan
         write_json(run / RECIPE_FILE, recipe)
+
+
+def write_metrics(run: Path, words: Mapping[str, Mapping[str, str]]) -> None:
+    """Write into a run's recipe what metrics of the user's own are called: "title" and "unit" by name."""
+    recipe = read_recipe(run)
+    if recipe.get("metrics", {}) != words:
+        write_json(run / RECIPE_FILE, {**recipe, "metrics": words})
+    OWN_METRICS.update(words)
 
 
 def write_circumstances(run: Path) -> list[str]:

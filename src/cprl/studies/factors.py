@@ -31,7 +31,6 @@ from cprl.values import (
     Custom,
     Range,
     Value,
-    allowing,
     checked,
     custom_targets,
     fits,
@@ -41,6 +40,7 @@ from cprl.values import (
     refusal,
     shown,
     to_config,
+    trusting,
     words,
 )
 
@@ -68,7 +68,7 @@ def changed(experiment: Experiment, changes: Mapping[str, Any]) -> Experiment:
                     raise ValueError(f"at the path {path}: {error}") from error
             holder[name] = to_config(stored_game(value), f"the value at the path {path}")
     try:
-        with allowing(custom_targets(table)):
+        with trusting(custom_targets(table)):
             return Experiment.from_config(table)
     except ValueError as error:
         raise ValueError(f"with {', '.join(changes)}: {error}") from error
@@ -77,7 +77,7 @@ def changed(experiment: Experiment, changes: Mapping[str, Any]) -> Experiment:
 def values_at(experiment: Experiment, path: str) -> list[Any]:
     """Return the values in the places that a path names, at least one."""
     tables = [holder[name] for holder, name in places(experiment.to_config(), path)]
-    with allowing(custom_targets(tables)):
+    with trusting(custom_targets(tables)):
         return [_value_of(path, table) for table in tables]
 
 

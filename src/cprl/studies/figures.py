@@ -19,9 +19,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize, to_hex
 from matplotlib.ticker import NullLocator
 
-from cprl.measuring.metrics import bounds
+from cprl.measuring.registry import bounds
 from cprl.measuring.statistics import Estimate, curve_interval, form_for
-from cprl.runs.curves import SMOOTHED_EPISODES, running_mean
+from cprl.measuring.windows import SMOOTHED_EPISODES, running_mean
 from cprl.studies.tables.comparing import (
     INTERVALS,
     Compared,

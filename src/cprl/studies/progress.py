@@ -53,7 +53,7 @@ class Row(NamedTuple):
     @property
     def unit(self) -> str:
         """What its experiment counts: "episodes" or "steps"."""
-        return self.trial.experiment.unit
+        return self.trial.experiment.length.unit
 
     @property
     def done(self) -> int:
@@ -63,7 +63,7 @@ class Row(NamedTuple):
     @property
     def whole(self) -> int:
         """How long it is, in its unit."""
-        return self.trial.experiment.length * self.trial.experiment.replicas
+        return self.trial.experiment.length.number * self.trial.experiment.replicas
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +121,7 @@ class Overview:
         return Snapshot(rows=tuple(rows), left_s=left_s)
 
     def _row(self, trial: Trial) -> Row:
-        of = trial.experiment.expected_episodes * trial.experiment.replicas
+        of = trial.experiment.length.episodes * trial.experiment.replicas
         state = "finished" if trial.name in self._finished else trial.state(self._runs)
         reason = self.failures.get(trial.name)
         if state == "finished" and reason is None:

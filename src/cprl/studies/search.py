@@ -20,9 +20,9 @@ import numpy as np
 
 from cprl.commons.game import Game
 from cprl.experiment import Experiment
-from cprl.measuring import social
 from cprl.measuring.episodes import own_name
-from cprl.runs.curves import as_curves, curves_of, net_of
+from cprl.measuring.registry import INCOME_EQUALITY, SOCIAL
+from cprl.runs.curves import as_curves, curves_of
 from cprl.runs.episodes import read_rows
 from cprl.runs.files import RunLock, digest_of
 from cprl.studies.executors import Executor
@@ -30,7 +30,6 @@ from cprl.studies.factors import Distribution, Factor, Integers, LogUniform, lev
 from cprl.studies.run import StudyResult, run_study
 from cprl.studies.study import RUNS, Replicas, Study, directory_of, level_text, named, short_names, unlike
 from cprl.studies.tables.comparing import LAST
-from cprl.studies.tables.table import NET
 from cprl.studies.trials import Outcome, trials_of
 from cprl.system.defaults import BLOCK
 from cprl.system.output import say
@@ -73,8 +72,8 @@ class Search(Value, stored=False):
         experiment: what every point is, but for its factors.
         factors: as those of a `Study`: distributions, lists of values, or tables of named levels.
         points: how many are tried, those that came twice included.
-        metric: by a name of docs/metrics.md, e.g. "collective_return"; "return_0" of an agent, or "net", the
-            return of all, which is the harvest after fines and transfers.
+        metric: by a name of docs/metrics.md, e.g. "collective_return"; "return_0" of an agent, or "income",
+            that of all agents, which is the harvest after fines and transfers.
         direction: which values of it are better.
         over: the episodes that count: those of the evaluation, or the last ones of the training.
         last: how many of the training.
@@ -100,10 +99,10 @@ class Search(Value, stored=False):
     def __post_init__(self) -> None:
         super().__post_init__()
         game = self.experiment.game
-        if isinstance(game, Game) and not (game.institutions and self.metric.startswith("institutions/")):
+        is_of_law = self.metric.startswith("institutions/") or self.metric == INCOME_EQUALITY
+        if isinstance(game, Game) and not (game.institutions and is_of_law):
             metrics = [
-                *social.METRICS,
-                NET,
+                *SOCIAL,
                 *map(own_name, self.experiment.metrics),
                 *(f"return_{agent}" for agent in range(game.agents)),
             ]
@@ -323,7 +322,6 @@ def value_of(search: Search, point: Point, runs: Path) -> float | None:
             curves = as_curves(read_rows(run / "evaluation" / "trained.parquet"))
         else:
             curves = curves_of(run, last=search.last)
-        curves[NET] = net_of(curves)
         if search.metric not in curves:
             raise refusal("metric", search.metric, f"what the game reports: {', '.join(sorted(curves))}")
         with warnings.catch_warnings():

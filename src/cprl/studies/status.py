@@ -96,12 +96,12 @@ class StatusFile:
             "host": socket.gethostname(),
             "cpu": cpu(),
             "episodes": 0,
-            "of": experiment.expected_episodes * experiment.replicas,
+            "of": experiment.length.episodes * experiment.replicas,
             "steps": 0,
             "beat": 0,
         }
         self._began, self._compiled_s, self._worlds = time.monotonic(), CLOCK.total_s, experiment.worlds
-        self._all_steps = experiment.steps
+        self._length = experiment.length
         self._first: tuple[int, float] | None = None
         """Episodes and seconds of work when this process began to train."""
         self._is_over = Event()
@@ -156,8 +156,8 @@ class StatusFile:
 
     def _count(self, steps: int, episodes: int) -> None:
         """Of a training of so many steps, the episodes that count are that share of those expected."""
-        if self._all_steps is not None:
-            episodes = self._table["of"] * steps // self._all_steps
+        if self._length.is_of_steps:
+            episodes = self._table["of"] * steps // self._length.number
         self._table.update(steps=steps, episodes=episodes)
 
 

@@ -1,7 +1,7 @@
 """Study: one experiment under several conditions, each repeated by the same replicas; a value."""
 
 import json
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from itertools import chain, count
@@ -26,7 +26,7 @@ from cprl.studies.factors import (
     grid,
 )
 from cprl.system.defaults import BLOCK
-from cprl.values import DirectoryName, Range, Value, meant, refusal, shown, trust, without_defaults
+from cprl.values import DirectoryName, Range, Value, meant, refusal, shown, without_defaults
 
 CONDITION_FORMAT: Final = 1
 """Of checksums: counted up when a default of any value of `cprl.values.KINDS`, or of `Experiment`, changes,
@@ -232,14 +232,8 @@ class Study(Value, stored=False):
         }
 
     @classmethod
-    def from_config(
-        cls, table: Mapping[str, Any], *, allow: Iterable[str] = (), directory: str | Path | None = None
-    ) -> "Study":
-        """Return the study that `to_config` gave in a directory.
-
-        Args:
-            allow: the targets of `Custom` that it may hold, "module:Class" each.
-        """
+    def from_config(cls, table: Mapping[str, Any], *, directory: str | Path | None = None) -> "Study":
+        """Return the study that `to_config` gave in a directory."""
         refuse_newer("the study", table, STUDY_FORMAT)
         if table.get("format") != STUDY_FORMAT:
             raise refusal("the study's format", table.get("format"), str(STUDY_FORMAT))
@@ -247,7 +241,6 @@ class Study(Value, stored=False):
         if unknown := [name for name in table if name not in known]:
             close = meant(unknown[0], known)
             raise ValueError(f"the study has no {shown(unknown[0])}{close}; allowed: {', '.join(known)}")
-        trust(*allow)
         try:
             values = {"experiment": table["experiment"]}
             values |= {name: dict(table[name]) for name in ("factors", "conditions")}
@@ -364,11 +357,11 @@ def directory_of(study: Study, out: Path | str | None) -> Path:
     return directory
 
 
-def read_study(out: Path | str, *, allow: Sequence[str] = ()) -> Study:
-    """Return the study of a directory; `allow` is the user's own code, "module:Class", that it may import."""
+def read_study(out: Path | str) -> Study:
+    """Return the study of a directory."""
     path = Path(out) / FILE_NAME
     try:
         table = read_json(path)
     except (OSError, ValueError) as error:
         raise ValueError(f"{path} is not the file of a study: {error!r}") from error
-    return Study.from_config(table, allow=allow, directory=out)
+    return Study.from_config(table, directory=out)

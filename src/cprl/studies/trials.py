@@ -32,11 +32,10 @@ from cprl.runs.files import (
     remove_partial,
     take_apart,
 )
+from cprl.runs.length import Length, without_length
 from cprl.runs.recipe import (
-    ANY_LENGTH,
     RECIPE_FILE,
     changed_code,
-    length_in,
     read_recipe,
     recipe_config,
     start_run,
@@ -47,7 +46,7 @@ from cprl.studies.status import LOCKED, STOPPED, Status, StatusFile
 from cprl.studies.study import Block, Condition, Study
 from cprl.system.output import printed
 from cprl.system.shipped import cprl_here
-from cprl.values import allowed, custom_targets, differences, without_defaults
+from cprl.values import custom_targets, differences, trust, trusted, without_defaults
 
 State = Literal["missing", "unfinished", "finished", "refused"]
 ATTEMPTS: Final = 5
@@ -113,10 +112,9 @@ class Trial:
         """
         stored = recipe_config(read_recipe(run))
         wanted = self.experiment.to_recipe(run)["experiment"]
-        (unit, length), (unit_wanted, length_wanted) = length_in(stored), length_in(wanted)
-        is_shorter = unit == unit_wanted and isinstance(length, int) and length < length_wanted
-        may_grow = state_of(run) != "finished" and is_shorter
-        free = {**FREE, **ANY_LENGTH} if may_grow else FREE
+        may_grow = Length.of(stored).is_shorter_than(self.experiment.length)
+        may_grow = may_grow and state_of(run) != "finished"
+        free = without_length(FREE) if may_grow else FREE
         if differ := differences({**stored, **free}, {**wanted, **free}, "experiment", Experiment):
             raise ValueError(
                 f"{run} was started as another trial than its name says: {differ[0]}; give it back its name, "
@@ -207,7 +205,7 @@ class FinishedRuns:
 
 def _content_of(config: Mapping[str, Any]) -> str:
     """Return what tells experiments from others that differ in more than their length."""
-    table = without_defaults({**config, **FREE, **ANY_LENGTH}, Experiment)
+    table = without_defaults(without_length({**config, **FREE}), Experiment)
     return digest_of(json.dumps(table, sort_keys=True))
 
 
@@ -242,7 +240,7 @@ class Task:
     @property
     def targets(self) -> tuple[str, ...]:
         """The user's own code that it may import: of this experiment, and what this process trusts."""
-        return tuple(dict.fromkeys([*custom_targets(self.recipe["experiment"]), *allowed()]))
+        return tuple(dict.fromkeys([*custom_targets(self.recipe["experiment"]), *trusted()]))
 
     @property
     def words(self) -> list[str]:
@@ -250,7 +248,7 @@ class Task:
         allow = [word for target in self.targets for word in ("--allow", target)]
         keep = "--keep-checkpoint" if self.keep_checkpoint else "--no-keep-checkpoint"
         experiment, directory = self.trial.experiment, os.path.abspath(self.directory)
-        length = f"--{experiment.unit}", str(experiment.length)
+        length = experiment.length.flag, str(experiment.length.number)
         return ["run", directory, "--resume", *length, "--watch", "off", keep, *allow]
 
     @property
@@ -358,6 +356,7 @@ class Task:
 
         name = str(read_recipe(self.directory)["experiment"]["name"])  # perhaps that of another study
         experiment = replace(self.trial.experiment, name=name)
+        trust(*self.targets)
         with (
             open(self.status.log, "a", encoding="utf-8", errors="replace") as log,
             redirect_stdout(log),
@@ -371,7 +370,6 @@ class Task:
                 keep_checkpoint=self.keep_checkpoint,
                 watch="off",
                 figures=False,
-                allow=self.targets,
                 callbacks=(status,),
             )
 
@@ -387,20 +385,19 @@ def begin_from_shorter(
     callbacks = [callback.resolve() for callback in experiment.callbacks]
     if any(not isinstance(callback, type) or depends_on_episodes(callback) for callback in callbacks):
         return None
-    free = {**FREE, **ANY_LENGTH}
-    wanted, beginnings = {**recipe["experiment"], **free}, []
+    wanted = without_length({**recipe["experiment"], **FREE})
+    beginnings = []
     for other in (finished or FinishedRuns(run.parent)).like(recipe["experiment"]):
         with suppress(ValueError, KeyError, TypeError):  # of a recipe that cannot be read
             stored = read_recipe(other)
             before = recipe_config(stored)
             if (
-                not differences({**before, **free}, wanted, "experiment", Experiment)
-                and length_in(before)[0] == experiment.unit
-                and length_in(before)[1] < experiment.length
+                not differences(without_length({**before, **FREE}), wanted, "experiment", Experiment)
+                and Length.of(before).is_shorter_than(experiment.length)
                 and not changed_code(stored)
                 and any(map(is_ending, checkpoints_in(other / FOLDER)))
             ):
-                beginnings.append((length_in(before)[1], other))
+                beginnings.append((Length.of(before).number, other))
     if not beginnings:
         return None
     _, shorter = max(beginnings)

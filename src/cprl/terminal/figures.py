@@ -11,23 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 
 from cprl.measuring.episodes import Episode
-from cprl.measuring.metrics import title as metric_title
-from cprl.measuring.metrics import unit
 from cprl.measuring.phases import UNNAMED as UNNAMED
 from cprl.measuring.phases import Phase
+from cprl.measuring.registry import title as metric_title
+from cprl.measuring.registry import unit
 from cprl.measuring.series import Values
-from cprl.runs.curves import (
-    SMOOTHED_EPISODES,
-    Numbers,
-    centres,
-    curves_of,
-    episode_of_turn,
-    mean_of_worlds,
-    phases_of,
-    rounds_of,
-    running_mean,
-    worlds_of,
-)
+from cprl.measuring.table import Numbers
+from cprl.measuring.windows import SMOOTHED_EPISODES, centres, mean_of_worlds, rounds_of, running_mean
+from cprl.runs.curves import curves_of, episode_of_turn, phases_of, worlds_of
 from cprl.runs.episodes import read_episodes, read_evaluations
 from cprl.terminal import style
 from cprl.terminal.style import CHARACTER, MARK, Sheet, Width

@@ -99,7 +99,7 @@ class ProgressBar:
         """Return the bar of an `Experiment`."""
         return cls(
             experiment.game,
-            episodes=experiment.expected_episodes,
+            episodes=experiment.length.episodes,
             steps=experiment.steps,
             replicas=experiment.replicas,
             worlds=experiment.worlds,

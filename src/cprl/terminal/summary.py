@@ -10,9 +10,7 @@ from rich.console import Console
 from rich.text import Text
 
 from cprl.measuring.episodes import Episode
-from cprl.measuring.metrics import DIGITS, INSTITUTIONAL, is_own, left_out, with_unit
-from cprl.measuring.metrics import title as metric_title
-from cprl.measuring.statistics import (
+from cprl.measuring.played import (
     ByReplica,
     Measured,
     by_metric,
@@ -20,8 +18,10 @@ from cprl.measuring.statistics import (
     difference_paired,
     notes_on,
     over_replicas,
-    signed,
 )
+from cprl.measuring.registry import METRICS, OF_INSTITUTIONS, is_own, left_out, with_unit
+from cprl.measuring.registry import title as metric_title
+from cprl.measuring.statistics import signed
 from cprl.system.output import console as safe_console
 from cprl.system.output import printed
 from cprl.system.shipped import cprl_here
@@ -97,7 +97,8 @@ def _table(title: str, played: Played) -> Cells:
     else:
         values[RETURN] = returns
     measured = [by_metric(episodes, attrgetter("social")) for episodes in played.values()]
-    metrics = [name for name in DIGITS if name in measured[0]] + list(filter(is_own, measured[0]))
+    metrics = [name for name, metric in METRICS.items() if metric.is_summarised and name in measured[0]]
+    metrics += filter(is_own, measured[0])
     values |= {metric_title(name): [of_policy[name] for of_policy in measured] for name in metrics}
     of_rows = dict(zip(values, [*[""] * (len(values) - len(metrics)), *metrics], strict=True))
     rows, measures = _rows(values, of_rows, played)
@@ -182,7 +183,7 @@ def institutions_table(played: Played) -> Cells | None:
     What is 0 under every policy has no row, nor have shares of something that never happened.
     """
     first = _first(played)
-    if all(getattr(first, name) is None for name in INSTITUTIONAL):
+    if set(OF_INSTITUTIONS).isdisjoint(first.reported):
         return None
     measured = [by_metric(episodes, attrgetter("of_institutions")) for episodes in played.values()]
     together = [[one for of_replica in by.values() for one in of_replica] for by in played.values()]

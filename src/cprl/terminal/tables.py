@@ -1,26 +1,74 @@
-"""Tables of texts for the terminal, which fit its width, and for Markdown."""
+"""Tables of texts and estimates: for the terminal, whose width they fit, for Markdown, LaTeX and CSV.
 
+table = Cells("Means over replicas.", ["condition", "equality"], [["vote", Estimate(...)]])
+show([table])
+write([table], "means.tex")
+"""
+
+import csv
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from io import StringIO
+from math import isnan
+from pathlib import Path
 from textwrap import TextWrapper
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Union
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.system.output import OUT, console
+from cprl.values import refusal
+
+if TYPE_CHECKING:
+    from cprl.measuring.statistics import Estimate
+
+SUFFIXES: Final = (".txt", ".md", ".tex", ".csv")
+"""Of the files that `write` writes."""
+_FILE_WIDTH: Final = 250
+"""Of tables in a file or pipe, in characters."""
+_LATEX: Final = str.maketrans(
+    {
+        "\\": r"\textbackslash{}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "<": r"\textless{}",
+        ">": r"\textgreater{}",
+        "|": r"\textbar{}",
+        **{sign: f"\\{sign}" for sign in "&%$#_{}"},
+    }
+)
+_OF_CSV: Final = ("value", "low", "high", "replicas", "episodes", "undefined", "p_value", "differs")
+
+
+@dataclass(frozen=True)
+class Change:
+    """A difference as a cell: with its sign, and bold where it `differs`."""
+
+    estimate: "Estimate"
+    more: str = ""
+    """What follows it, e.g. "(of 2)"."""
+
+    def __str__(self) -> str:
+        return " ".join(filter(None, (f"{self.estimate:+}", self.more)))
+
+
+Cell = Union[str, "Estimate", Change]
+"""A text that has no signs of its own, a number with its interval, or a difference."""
 
 
 class Cells(NamedTuple):
-    """A table of texts. In the terminal its names wrap and its intervals go to a second line where it is
-    too narrow for them; columns that still have no room follow in further tables."""
+    """A table. In the terminal its names wrap and its intervals go to a second line where it is too
+    narrow for them; columns that still have no room follow in further tables."""
 
     heading: str
     """What it shows, in a sentence."""
     head: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    rows: Sequence[Sequence[Cell]]
     note: str = ""
     """What its signs mean, below it."""
     texts: int = 1
@@ -28,7 +76,9 @@ class Cells(NamedTuple):
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
         yield Text(self.heading, style="bold")
-        room, rows = options.max_width, [list(row) for row in self.rows]
+        room = options.max_width
+        texts = [[_starred(cell) for cell in row] for row in self.rows]
+        rows = texts
         widths = [max(_longest(head), wide) for head, wide in zip(self.head, self._widths(rows), strict=True)]
         if _total(widths) > room:
             widths = self._widths(rows)
@@ -36,7 +86,7 @@ class Cells(NamedTuple):
             if _total(widths) > room:
                 rows = [
                     [lines_of(text, name) for text in row[: self.texts]] + _narrow(row[self.texts :])
-                    for row in self.rows
+                    for row in texts
                 ]
                 widths = self._widths(rows)
         for columns in _blocks(widths, self.texts, room):
@@ -44,14 +94,15 @@ class Cells(NamedTuple):
             for column in columns:
                 head = lines_of(self.head[column], widths[column])
                 table.add_column(head, justify="left" if column < self.texts else "right", overflow="fold")
-            for row in rows:
-                table.add_row(*(_bold(row[column]) for column in columns))
+            for row, cells in zip(rows, self.rows, strict=True):
+                styles = ("bold" if _is_bold(cells[column]) else "" for column in columns)
+                table.add_row(*map(Text, (row[column] for column in columns), styles))
             yield table
         if self.note:
             yield Text(self.note.replace("Bold:", "*"), style="italic")
 
     def _widths(self, rows: Sequence[Sequence[str]]) -> list[int]:
-        """Of the columns, whose heads wrap."""
+        """Return the widths of the columns, whose heads wrap."""
         widths = []
         for column, head in enumerate(self.head):
             word = max([min(len(head), 9), *map(len, head.split())])
@@ -61,14 +112,30 @@ class Cells(NamedTuple):
 
 def show(tables: Iterable[RenderableType]) -> None:
     """Print tables and texts; into a file or pipe as wide as they are, or as COLUMNS says."""
-    terminal = console(width=None if OUT.isatty() or "COLUMNS" in os.environ else 250)
+    terminal = console(width=None if OUT.isatty() or "COLUMNS" in os.environ else _FILE_WIDTH)
     for table in tables:
         terminal.print(table)
 
 
+def write(tables: Sequence[Cells], path: str | Path, *, notes: Sequence[str] = ()) -> Path:
+    """Write tables into a new file: as text, Markdown, LaTeX or CSV, by the suffix of its name.
+
+    Args:
+        notes: lines below all tables, which a CSV does not have.
+    """
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise refusal("path", str(path), f"a file whose name ends in {', '.join(SUFFIXES)}")
+    refuse_to_write_over(path)
+    content = _CONTENTS[path.suffix](tables, notes).encode()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, lambda file: file.write(content))
+    return path
+
+
 def markdown(table: Cells) -> list[str]:
     """Return the lines of a table, numbers to the right, each part followed by an empty line."""
-    rows = [[*map(cell, table.head)], *([cell(name), *texts] for name, *texts in table.rows)]
+    rows = [[*map(cell, table.head)], *(list(map(_in_markdown, row)) for row in table.rows)]
     lines = [f"| {' | '.join(row)} |" for row in rows]
     lines.insert(1, "|---|" + "---:|" * (len(table.head) - 1))
     return [*lines, "", *[table.note, ""] * bool(table.note)]
@@ -79,6 +146,112 @@ def cell(name: str) -> str:
     return re.sub(r"[\\`*<$|]", r"\\\g<0>", " ".join(name.splitlines()))
 
 
+def latex(table: Cells) -> list[str]:
+    """Return the lines of a table for LaTeX with the package booktabs."""
+    names = max(table.texts, 1)
+    rows = [" & ".join(map(_in_latex, row)) + r" \\" for row in (table.head, *table.rows)]
+    lines = [
+        r"\begin{table}",
+        rf"\caption{{{_in_latex(table.heading)}}}",
+        rf"\begin{{tabular}}{{{'l' * names}{'r' * (len(table.head) - names)}}}",
+        r"\toprule",
+        rows[0],
+        r"\midrule",
+        *rows[1:],
+        r"\bottomrule",
+        r"\end{tabular}",
+    ]
+    lines += [rf"\par\smallskip\footnotesize {_in_latex(table.note)}"] * bool(table.note)
+    return [*lines, r"\end{table}", ""]
+
+
+def csv_rows(tables: Iterable[Cells]) -> Iterator[dict[str, Any]]:
+    """Yield a row for each cell: "table" (its heading), "row" (its names), "column"; of an estimate its
+    numbers, of another cell its "text"."""
+    for table in tables:
+        names = max(table.texts, 1)
+        for row in table.rows:
+            name = ", ".join(map(str, row[:names]))
+            for head, part in zip(table.head[names:], row[names:], strict=True):
+                yield {
+                    "table": " ".join(table.heading.split()),
+                    "row": name,
+                    "column": head,
+                    **_numbers(part),
+                }
+
+
+def _numbers(part: Cell) -> dict[str, Any]:
+    if isinstance(part, str):
+        return {"text": part}
+    one = part.estimate if isinstance(part, Change) else part
+    numbers = {name: getattr(one, name) for name in _OF_CSV}
+    return {name: "" if isnan(number) else number for name, number in numbers.items()}
+
+
+def _as_text(tables: Sequence[Cells], notes: Sequence[str]) -> str:
+    drawn = StringIO()
+    terminal = Console(file=drawn, width=_FILE_WIDTH)
+    for part in (*tables, *map(Text, notes)):
+        terminal.print(part)
+    return drawn.getvalue()
+
+
+def _as_markdown(tables: Sequence[Cells], notes: Sequence[str]) -> str:
+    lines = [line for table in tables for line in (table.heading, "", *markdown(table))]
+    return "\n".join([*lines, *notes, ""])
+
+
+def _as_latex(tables: Sequence[Cells], notes: Sequence[str]) -> str:
+    lines = [line for table in tables for line in latex(table)]
+    return "\n".join([r"% \usepackage{booktabs}", *lines, *map(_in_latex, notes), ""])
+
+
+def _as_csv(tables: Sequence[Cells], notes: Sequence[str]) -> str:
+    written = StringIO(newline="")
+    writer = csv.DictWriter(
+        written, ["table", "row", "column", *_OF_CSV, "text"], restval="", lineterminator="\n"
+    )
+    writer.writeheader()
+    writer.writerows(csv_rows(tables))
+    return written.getvalue()
+
+
+_CONTENTS: Final = dict(zip(SUFFIXES, (_as_text, _as_markdown, _as_latex, _as_csv), strict=True))
+
+
+def _is_bold(part: Cell) -> bool:
+    if isinstance(part, str):
+        return part.startswith("**")
+    return isinstance(part, Change) and part.estimate.differs
+
+
+def _marked(part: Cell, mark: str) -> str:
+    """Return the text of a cell, with its number where a mark has {} if it is bold."""
+    if isinstance(part, str) and part.startswith("**"):  # until studies hand over numbers
+        bold, _, more = part.removeprefix("**").partition("**")
+        return mark.format(bold) + more
+    if isinstance(part, Change) and part.estimate.differs:
+        return " ".join(filter(None, (mark.format(f"{part.estimate:+}"), part.more)))
+    return str(part)
+
+
+def _starred(part: Cell) -> str:
+    return _marked(part, "{} *")
+
+
+def _in_markdown(part: Cell) -> str:
+    if isinstance(part, str) and not part.startswith("**"):
+        return cell(part)
+    return _marked(part, "**{}**")
+
+
+def _in_latex(part: Cell) -> str:
+    if isinstance(part, str):
+        return " ".join(part.split()).translate(_LATEX)
+    return re.sub(r"-(?=[\d.])", "$-$", _marked(part, r"\textbf{{{}}}"))
+
+
 class _Wrapper(TextWrapper):
     """Breaks lines after the signs that join the words of a name, too."""
 
@@ -86,7 +259,7 @@ class _Wrapper(TextWrapper):
 
 
 def lines_of(text: str, most: int) -> str:
-    """A text in lines of so many characters, broken within names only where they are longer than that."""
+    """Return a text in lines of so many characters, broken within names that are longer than that."""
     has_long = any(len(word) > most for word in text.split())
     fill = (_Wrapper if has_long else TextWrapper)(most, break_long_words=False).fill
     return "\n".join(fill(line) for line in text.splitlines())
@@ -97,7 +270,7 @@ def _total(widths: Sequence[int]) -> int:
 
 
 def _blocks(widths: Sequence[int], texts: int, room: int) -> Iterator[list[int]]:
-    """The columns of each table, all of which begin with the names."""
+    """Yield the columns of each table, all of which begin with the names."""
     names = list(range(texts))
     block = list(names)
     for column in range(texts, len(widths)):
@@ -109,15 +282,10 @@ def _blocks(widths: Sequence[int], texts: int, room: int) -> Iterator[list[int]]
 
 
 def _longest(text: str) -> int:
-    return max(map(len, _bold(text).plain.splitlines()), default=0)
+    return max(map(len, text.splitlines()), default=0)
 
 
 def _narrow(numbers: Sequence[str]) -> list[str]:
-    """Numbers with their intervals below them, and below these in how many episodes they are undefined."""
+    """Return numbers with their intervals below them, and below these in how many episodes they are
+    undefined."""
     return [re.sub(r",? ?(\[|undefined in)", r"\n\1", text).lstrip("\n") for text in numbers]
-
-
-def _bold(text: str) -> Text:
-    """The text of a cell; what is bold in Markdown has a star too."""
-    bold, mark, more = text.removeprefix("**").partition("**")
-    return Text(f"{bold} *{more}", style="bold") if mark and text.startswith("**") else Text(text)

@@ -185,7 +185,7 @@ class LoadedRun:
         return read_episodes(self.path)
 
 
-def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = ()) -> LoadedRun:
+def load(run: str | Path, *, weights: str | None = None) -> LoadedRun:
     """Builds a run again from its directory; runs no code that it holds.
 
     Warns on standard error where the user's own code is no longer what the run was made with.
@@ -197,14 +197,13 @@ def load(run: str | Path, *, weights: str | None = None, allow: Sequence[str] = 
         weights: which of those in its `checkpoints/`: "final", "best" where the recipe keeps them, or
             "final-4800" of a run that was extended from so many episodes; by default the final ones, or those
             of the newest readable checkpoint where the run has not ended.
-        allow: the user's own code, "module:Class", that the process trusts from now on.
     """
     run = Path(run)
     if weights is not None and (Path(weights).name != weights or weights in ("", "..")):
         raise ValueError(f'weights is {weights!r}; allowed: a name in {run / FOLDER}, such as "final"')
     recipe = read_recipe(run)
     try:
-        experiment = Experiment.from_recipe(recipe, directory=run, allow=allow)
+        experiment = Experiment.from_recipe(recipe, directory=run)
     except ValueError as error:
         raise ValueError(f"{run / RECIPE_FILE}: {error}") from error
     say_changes(run, [f"the text of {module}, which its recipe keeps" for module in changed_code(recipe)])

@@ -15,16 +15,9 @@ import pyarrow as pa
 
 from cprl.measuring.series import Values
 from cprl.measuring.statistics import Estimate, difference, estimate, form_for
+from cprl.measuring.windows import LAST_EPISODES, last_of, mean_of_worlds, rounds_of, running_mean
 from cprl.population import AgentSpec, Learning, Team, exploring
-from cprl.runs.curves import (
-    LAST_EPISODES,
-    as_curves,
-    last_of,
-    mean_of_worlds,
-    rounds_of,
-    running_mean,
-    worlds_of,
-)
+from cprl.runs.curves import as_curves, worlds_of
 from cprl.runs.episodes import read_episodes, read_rows
 
 PEAK_EPISODES: Final = 10

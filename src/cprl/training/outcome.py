@@ -109,7 +109,7 @@ def random_play(
 
 @contextmanager
 def _generators_kept(device: str) -> Iterator[None]:
-    """Puts the global generators back where they were: games of somebody else's may draw from them."""
+    """Put the global generators back where they were: games of somebody else's may draw from them."""
     of_python = random_of_python.getstate()
     of_numpy = np.random.get_state()  # noqa: NPY002  (the global generator is the point)
     gpus = [torch.device(device)] if torch.device(device).type == "cuda" else []
@@ -131,7 +131,10 @@ class Evaluations:
     """
 
     def __init__(self, run: Path, experiment: Experiment, env: EnvBase, population: Population) -> None:
-        self._run, self._experiment, self._env, self._population = run, experiment, env, population
+        self._run = run
+        self._experiment = experiment
+        self._env = env
+        self._population = population
         self._tables: list[pa.Table] = []
 
     def on_ended(self, ended: Sequence[tuple[Episode, dict[str, float]]]) -> None:
@@ -153,12 +156,15 @@ class Evaluations:
         write_listed(self._run, EVALUATIONS, lambda file: pq.write_table(table, file, compression="zstd"))
 
     def _play(self, replicas: Iterable[int]) -> dict[int, list[Episode]]:
-        experiment, worlds = self._experiment, self._experiment.evaluation_episodes
-        seed, played = experiment.seed + 1, dict[int, list[Episode]]()
+        experiment = self._experiment
+        worlds = experiment.evaluation_episodes
+        seed = experiment.seed + 1
+        played: dict[int, list[Episode]] = {}
         for group in in_a_row(sorted(replicas)):
             env = _worlds(experiment, len(group) * worlds, first=group[0] * worlds, fresh=True)
             load_transforms_state(env, transforms_state(self._env))
-            agents, playing = self._population.as_stored(group), self._population.playing
+            agents = self._population.as_stored(group)
+            playing = self._population.playing
             policies = stored_policies(agents, playing, replicas=group, worlds=worlds, seed=seed)
             episodes = evaluate(env, policies, metrics=experiment.metrics)
             for place, replica in enumerate(group):
@@ -166,14 +172,14 @@ class Evaluations:
         return played
 
     def state_dict(self) -> dict[str, Any]:
-        """The table so far, as the bytes of a file."""
+        """Return the table so far, as the bytes of a file."""
         file = BytesIO()
         if self._tables:
             pq.write_table(pa.concat_tables(self._tables), file, compression="zstd")
         return {"table": torch.tensor(np.frombuffer(file.getvalue(), np.uint8))}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues with the table of a state; what was evaluated after it is evaluated again."""
+        """Continue with the table of a state; what was evaluated after it is evaluated again."""
         table = state["table"].numpy().tobytes()
         self._tables = [pq.read_table(BytesIO(table))] if table else []
 
@@ -187,8 +193,8 @@ def _means(episodes: Sequence[Episode]) -> dict[str, float]:
 
 
 def is_same_later(experiment: Experiment) -> bool:
-    """Whether random play is the same before and after a training: the game is one of cprl's, whose chance
-    depends on seeds alone, and has no transforms, which may learn in between."""
+    """Return whether random play is the same before and after a training: the game is one of cprl's, whose
+    chance depends on seeds alone, and has no transforms, which may learn in between."""
     return isinstance(experiment.game, OF_CPRL) and not experiment.transforms
 
 
@@ -209,7 +215,8 @@ def evaluate_population(
     Returns:
         The episodes by policy: "random", and "trained", everybody as they are now.
     """
-    fresh, worlds = fresh_env(experiment), experiment.evaluation_episodes
+    fresh = fresh_env(experiment)
+    worlds = experiment.evaluation_episodes
     load_transforms_state(fresh, transforms_state(trained))
     if random is None or not is_same_later(experiment):
         random = evaluate(fresh, population.random_policy(worlds), metrics=experiment.metrics)

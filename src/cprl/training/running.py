@@ -29,6 +29,7 @@ from cprl.runs.checkpoints import (
 )
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.files import LOCK_FILE, RunLockedError, refuse_missing, write_json
+from cprl.runs.length import Length
 from cprl.runs.loggers import LoggerCallback, check_logger, make_logger
 from cprl.runs.recipe import (
     RECIPE_FILE,
@@ -37,6 +38,7 @@ from cprl.runs.recipe import (
     say_changes,
     start_run,
     write_circumstances,
+    write_metrics,
     write_on_nan,
 )
 from cprl.runs.weights import (
@@ -68,7 +70,7 @@ from cprl.training.outcome import (
     write_evaluation,
 )
 from cprl.training.training import Training, check_callbacks, train
-from cprl.values import Custom, Range, checked, made, trust
+from cprl.values import Custom, Range, checked, made, words_of_metric
 from cprl.viewer.page import check_watch
 from cprl.viewer.page import linger as stay_served
 
@@ -87,7 +89,6 @@ def run(
     watch: str = "file",
     linger: bool = False,
     threads: int = 1,
-    allow: Sequence[str] = (),
     callbacks: Sequence[object] = (),
     figures: bool = True,
 ) -> Path:
@@ -109,8 +110,6 @@ def run(
             `watch` "serve" or "spawn".
         threads: torch's threads. Several are faster for large minibatches of many worlds, if no other
             program wants the cores; numbers then differ in their last bits.
-        allow: the user's own code, "module:Class", that the process trusts from now on; stored runs of
-            `Frozen` agents may need it.
         callbacks: further callbacks of this process (see `cprl.training.Callback`), which the recipe does
             not hold; they may look, and change nothing.
         figures: whether the training curve is drawn; a study draws its own.
@@ -132,7 +131,6 @@ def run(
     check_watch(watch, linger=linger)
     for logger in experiment.loggers:
         check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
-    trust(*allow)
     threads = checked("threads", threads, Annotated[int, Range(1, MOST_THREADS)])
     prepare_process(experiment.seed, threads=threads)
     out = None if out is None else Path(out)
@@ -146,18 +144,20 @@ def run(
     check_callbacks(observers)
     try_own_metrics(experiment.metrics, env)
     length = refuse_another_run(out, experiment.to_recipe, Experiment) if resume else experiment.length
-    if resumed is not None and length >= experiment.length and (resumed / REPORT).exists():
+    is_shorter = length.is_shorter_than(experiment.length)
+    if resumed is not None and not is_shorter and (resumed / REPORT).exists():
         _tidy_up(resumed, experiment, keep_checkpoint=keep_checkpoint, take_over=take_over)
         return resumed
     directory = _start(experiment, out) if resumed is None else resumed
-    if length < experiment.length:
-        refuse_to_extend(directory, length if experiment.unit == "episodes" else None, observers)
+    if is_shorter:
+        refuse_to_extend(directory, None if length.is_of_steps else length.number, observers)
     checkpointer = Checkpointer(directory, keep_ending=keep_checkpoint, take_over=take_over)
     closing = ExitStack()  # of the viewer, which outlives the rest
     try:
         with checkpointer:
             if resume:
                 _begin_again(directory, experiment, is_begun=is_begun, length=length)
+            write_metrics(directory, {own_name(one): words_of_metric(one) for one in experiment.metrics})
             viewer = closing.enter_context(_make_viewer(watch, directory, experiment, env, population))
             work = _Work(directory, experiment, env, population, viewer, resume)
             _carry_out(work, observers, checkpointer, times, figures=figures)
@@ -268,11 +268,13 @@ def _draw(experiment: Experiment, directory: Path, training: Training, random: l
 
 def _write_report(directory: Path, training: Training, times: Times) -> None:
     """Writes `report.json`, the sign that a run is finished."""
+    length = training.length
+    episodes = training.episodes_by_replica if length.is_of_steps else length.number
     report: dict[str, Any] = {
         **times.report(training.times),
         "steps": training.steps,
         "finished": datetime.now().astimezone().isoformat(timespec="seconds"),
-        "episodes": training.episodes or training.episodes_by_replica,
+        "episodes": episodes,
         "worlds": training.worlds,
         "threads": torch.get_num_threads(),
     }
@@ -304,8 +306,7 @@ def _summarise(
 
 
 def _title(experiment: Experiment) -> str:
-    length = experiment.length if experiment.unit == "episodes" else f"{experiment.length:,}"
-    return f"{experiment.name}, {experiment.trained_in}, {length} {experiment.unit}"
+    return f"{experiment.name}, {experiment.trained_in}, {experiment.length}"
 
 
 def _weights_of_partners(experiment: Experiment, run: Path) -> dict[str, str]:
@@ -316,13 +317,13 @@ def _weights_of_partners(experiment: Experiment, run: Path) -> dict[str, str]:
     return {partner: name for partner, name in names.items() if name is not None}
 
 
-def _begin_again(directory: Path, experiment: Experiment, *, is_begun: bool, length: int) -> None:
+def _begin_again(directory: Path, experiment: Experiment, *, is_begun: bool, length: Length) -> None:
     """Says what is new since a run was begun, of such a length, and writes it into its recipe."""
     say_changes(directory, write_circumstances(directory))
     if not is_begun:
         say("No checkpoint yet: begins with the first episode")
     write_on_nan(directory, experiment.on_nan)
-    if length < experiment.length:
+    if length.is_shorter_than(experiment.length):
         extend(directory, length, experiment.length)
 
 
@@ -339,8 +340,8 @@ def _make_viewer(
         directory,
         env,
         title=_title(experiment),
-        episodes=experiment.expected_episodes,
-        is_about=experiment.unit == "steps",
+        episodes=experiment.length.episodes,
+        is_about=experiment.length.is_of_steps,
         worlds=experiment.worlds,
         metrics=[own_name(metric) for metric in experiment.metrics],
         recipe={**recipe["experiment"], **circumstances},
@@ -356,7 +357,7 @@ def _tidy_up(finished: Path, experiment: Experiment, *, keep_checkpoint: bool, t
         with Checkpointer(finished, keep_ending=keep_checkpoint, take_over=take_over) as checkpointer:
             checkpointer.done()
     keeps_state = any(map(is_ending, checkpoints_in(finished / FOLDER)))
-    more = f"with more --{experiment.unit} it is extended" if keeps_state else KEEPS_NO_STATE
+    more = f"with more {experiment.length.flag} it is extended" if keeps_state else KEEPS_NO_STATE
     text = f"{finished} is finished; {more}"
     console().print(text, soft_wrap=True)
 
@@ -375,5 +376,5 @@ def _remove(directory: Path, *, with_directory: bool) -> None:
 def _say_what_is_kept(directory: Path, experiment: Experiment) -> None:
     for checkpoint in checkpoints_in(directory / FOLDER):
         size = checkpoint.stat().st_size / 1e6
-        text = f"Kept to extend it by --resume with more --{experiment.unit}: {FOLDER}/ending-*.pt"
+        text = f"Kept to extend it by --resume with more {experiment.length.flag}: {FOLDER}/ending-*.pt"
         console().print(f"{text}, {size:,.0f} MB", style="dim", highlight=False, soft_wrap=True)

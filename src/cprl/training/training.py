@@ -28,6 +28,7 @@ from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import Decider
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.files import TRAINING_STATE_FORMAT
+from cprl.runs.length import Length
 from cprl.system.times import Times
 from cprl.training.finite import EVERY_TURNS, FiniteCheck
 from cprl.training.learning import (
@@ -132,10 +133,11 @@ class Training:
         check_env(env, env.batch_size.numel())
         check_callbacks(callbacks)
         self.env, self.callbacks = env, list(callbacks)
-        self.episodes, self.all_steps, self.worlds = episodes, steps, worlds
+        self.worlds = worlds
         self.update_every = update_every
         self.learners, self.others = dict(learners), dict(others or {})
         check_numbers(episodes, steps, worlds, update_every, self.learners)
+        self.length = Length.of({"episodes": episodes, "steps": steps})
         self.replicas = check_agents(env, spaces.agents, worlds, self.learners, self.others)
         actors: dict[AgentIndices, nn.Module] = {
             agents: learner.actor for agents, learner in self.learners.items()
@@ -158,18 +160,15 @@ class Training:
         self.times = Times()
 
     def __repr__(self) -> str:
-        length = f"{self.all_steps} steps" if self.episodes is None else f"{self.episodes} episodes"
-        return f"Training({self.env!r}, {self.steps} steps of {length})"
+        return f"Training({self.env!r}, {self.steps} steps of {self.length})"
 
     @property
     def is_over(self) -> bool:
-        if self.all_steps is not None:
-            return self.steps >= self.all_steps
-        return min(self._played) >= self._most_episodes
+        return self.length.is_over(episodes=min(self._played), steps=self.steps)
 
     @property
     def _most_episodes(self) -> float:
-        return inf if self.episodes is None else self.episodes
+        return inf if self.length.is_of_steps else self.length.number
 
     @property
     def is_sound(self) -> bool:
@@ -181,19 +180,19 @@ class Training:
         """Whether a replica may play its last episode in the next turn, in which each of its worlds can end
         one; episodes that it plays beyond are not recorded. Of a training of so many steps: whether it is
         over."""
-        if self.episodes is None:
+        if self.length.is_of_steps:
             return self.is_over
-        return max(self._played) > self.episodes - self.worlds
+        return max(self._played) > self.length.number - self.worlds
 
     @property
     def episodes_played(self) -> int:
-        """Episodes that all replicas together have ended so far, those beyond `episodes` left out."""
+        """Episodes that all replicas together have ended so far, those beyond its length left out."""
         return sum(self.episodes_by_replica)
 
     @property
     def episodes_by_replica(self) -> list[int]:
         """Likewise, of each replica."""
-        return [played if self.episodes is None else min(played, self.episodes) for played in self._played]
+        return [int(min(played, self._most_episodes)) for played in self._played]
 
     def start(self) -> None:
         """Calls `on_start` of the callbacks; `run` does before the first step."""

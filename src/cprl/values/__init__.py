@@ -31,9 +31,8 @@ from typing import (
     get_type_hints,
 )
 
+from cprl.values.custom import OWN_METRICS as OWN_METRICS
 from cprl.values.custom import Custom as Custom
-from cprl.values.custom import allowed as allowed
-from cprl.values.custom import allowing as allowing
 from cprl.values.custom import custom_targets as custom_targets
 from cprl.values.custom import described as described
 from cprl.values.custom import made as made
@@ -42,6 +41,9 @@ from cprl.values.custom import refuse_targets
 from cprl.values.custom import shown as shown
 from cprl.values.custom import source_of as source_of
 from cprl.values.custom import trust as trust
+from cprl.values.custom import trusted as trusted
+from cprl.values.custom import trusting as trusting
+from cprl.values.custom import words_of_metric as words_of_metric
 
 T = TypeVar("T")
 
@@ -374,8 +376,8 @@ def from_config(table: object, where: str = "value") -> Any:
     """Return the value that `to_config` gave; lists become tuples. Nothing is imported.
 
     Raises:
-        ValueError: for what is not known, with its place; for code of the user's own that is not allowed, see
-            `cprl.values.allowing`.
+        ValueError: for what is not known, with its place; for code of the user's own that this process
+            does not trust, see `cprl.trust`.
     """
     with _not_too_deep(where):
         refuse_targets(table)

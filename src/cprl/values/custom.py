@@ -1,7 +1,7 @@
 """Custom: something of the user's own, as a text that a run's recipe can keep; and what is allowed of it.
 
 A recipe that somebody else made names code that loading it would import. Such a recipe is refused unless this
-process trusts each name: `--allow module:Class` on the command line, `allow=` of `cprl.load`, `trust` here.
+process trusts each name: `--allow module:Class` on the command line, `cprl.trust` in Python.
 """
 
 import importlib
@@ -26,7 +26,7 @@ class Custom:
 
     An `Experiment` holds values only, so that its recipe says all of it: a transform, callback, logger,
     network, algorithm or game that is not one of cprl's is handed over like this. Nothing is imported before
-    `make` is called; the caller that loads a stored run names what it may import (`allow`).
+    `make` is called; who loads a stored run says what it may import (`cprl.trust`).
 
     Args:
         target: "module:Class" or "module:function".
@@ -79,29 +79,51 @@ class Custom:
             raise ValueError(f"Custom({self.target!r}) does not take its arguments: {error}") from error
 
 
-_ALLOWED: Final[set[str]] = set()
+_TRUSTED: Final[set[str]] = set()
 """The targets that this process trusts, besides those that its own program names."""
 
 
 def trust(*targets: str) -> None:
-    """Trust code of somebody's own, "module:Class" each: recipes that name it can be read from now on."""
-    _ALLOWED.update(targets)
+    """Trust code of somebody's own, "module:Class" each, from now on and in the whole process.
+
+    Recipes, runs and studies that name it can then be read, and may import it.
+    """
+    _TRUSTED.update(targets)
 
 
 @contextmanager
-def allowing(targets: Iterable[str]) -> Iterator[None]:
-    """Trust code of somebody's own, "module:Class" each, within a block."""
-    before = set(_ALLOWED)
-    _ALLOWED.update(targets)
+def trusting(targets: Iterable[str]) -> Iterator[None]:
+    """Trust code of somebody's own, "module:Class" each, only within a block: for tests."""
+    before = set(_TRUSTED)
+    _TRUSTED.update(targets)
     try:
         yield
     finally:
-        _ALLOWED.intersection_update(before)
+        _TRUSTED.intersection_update(before)
 
 
-def allowed() -> tuple[str, ...]:
+def trusted() -> tuple[str, ...]:
     """Return the targets that this process trusts, for processes that it starts."""
-    return tuple(sorted(_ALLOWED))
+    return tuple(sorted(_TRUSTED))
+
+
+OWN_METRICS: Final[dict[str, Mapping[str, str]]] = {}
+"""What metrics of the user's own are called: "title" and "unit" by name, as the recipe that this process read
+last says."""
+
+
+def words_of_metric(metric: Custom) -> dict[str, str]:
+    """Return "title" and "unit" of a metric of the user's own, as far as its function has such attributes.
+
+    Raises:
+        ValueError: if one is no text.
+    """
+    function = metric.resolve()
+    words = {name: getattr(function, name) for name in ("title", "unit") if hasattr(function, name)}
+    for name, word in words.items():
+        if not isinstance(word, str):
+            raise ValueError(f"{metric.target}.{name} is {shown(word)}; allowed: a text")
+    return words
 
 
 def custom_targets(table: object) -> list[str]:
@@ -132,12 +154,13 @@ def _in_words(custom: Custom) -> str:
 
 def refuse_targets(table: object) -> None:
     """Raise a ValueError for a table that would import what this process does not trust."""
-    refused = [target for target in custom_targets(table) if target not in _ALLOWED]
+    refused = [target for target in custom_targets(table) if target not in _TRUSTED]
     if refused:
         flags = " ".join(f"--allow {target}" for target in refused)
+        names = ", ".join(map(repr, refused))
         raise ValueError(
             f"{', '.join(refused)} would be imported, which is code of somebody's own; if you trust it: "
-            f"{flags} (in Python allow={refused!r})"
+            f"{flags} (in Python cprl.trust({names}))"
         )
 
 

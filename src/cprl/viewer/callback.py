@@ -16,11 +16,11 @@ from torchrl.envs import EnvBase
 from cprl.envs.unwrap import agent_names, base_env, commons_of
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import Policy
-from cprl.measuring.metrics import reported_by
+from cprl.measuring.registry import IN_FORCE, reported_by
 from cprl.measuring.series import OF_AGENTS, Series, numbers_of
+from cprl.measuring.table import metrics_in
 from cprl.policies.present import PresentPolicy
-from cprl.runs.curves import as_curves
-from cprl.runs.episodes import metrics_in, read_episodes
+from cprl.runs.episodes import read_episodes
 from cprl.runs.recipe import rules_of_own
 from cprl.viewer.board import Filming
 from cprl.viewer.exhibition import Exhibition
@@ -51,7 +51,7 @@ class ViewerCallback:
     """Logs the metrics of every episode, and the frames of the first world in some episodes.
 
     Views that need what the game does not report are left out: a game without a board has no frames; for
-    metrics see `cprl.measuring.metrics`. One event of the recording names them. With transforms, windows
+    metrics see `cprl.measuring.registry`. One event of the recording names them. With transforms, windows
     show the observations of the `CommonsEnv` itself.
 
     Frames are recorded for every k-th episode of that world, including the first and the last, and for the
@@ -295,10 +295,9 @@ def _stored_episodes(run: Path) -> Iterator[Episode]:
     if not table.num_rows:
         return
     columns = {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
-    curves = as_curves(table)
     agents = int(columns["agent"].max()) + 1
-    metrics = [name for name in metrics_in(table.schema) if not name.startswith("institutions/")]
-    in_force = [name for name in columns if name.startswith("in_force_")]
+    metrics = [name for name in metrics_in(table.schema) if name != "stock_left"]
+    in_force = [name for name in columns if name.startswith(IN_FORCE)]
     for row in range(0, table.num_rows, agents):
         replica, number = int(columns["replica"][row]), int(columns["episode"][row])
 
@@ -320,10 +319,5 @@ def _stored_episodes(run: Path) -> Iterator[Episode]:
             stock_left=of_all("stock_left"),
             depletion_step=of_all("depletion_step"),
             in_force=np.array([columns[name][row] for name in in_force]) if in_force else None,
-            institutions={
-                name.removeprefix("institutions/"): float(curve[replica, number])
-                for name, curve in curves.items()
-                if name.startswith("institutions/") and number < curve.shape[1]
-            },
             **{name: of_agents(name) for name in OF_AGENTS},
         )

@@ -43,8 +43,8 @@ from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.matrix import MatrixGame
 from cprl.envs.unwrap import base_env
 from cprl.measuring import now, phases
-from cprl.measuring.episodes import decisions_of, metrics_of, yield_of
-from cprl.measuring.metrics import FIELDS, METRICS, NAMES, available, colour, is_own, left_out, title
+from cprl.measuring.episodes import decisions_of, metrics_of
+from cprl.measuring.registry import METRICS, SOCIAL, colour, is_own, left_out, title
 from cprl.measuring.series import OF_AGENTS
 from cprl.viewer.live import HEADER
 
@@ -57,7 +57,7 @@ SHARES: Final = (
 )
 """The metrics of institutions that share a plot; only their running means are shown there, as of those of
 net incomes."""
-INCOMES: Final = ("net_equality", "net_equality_within", "net_equality_between")
+INCOMES: Final = ("income_equality", "income_equality_within", "income_equality_between")
 PAYMENTS: Final = {
     "violations": "Violations of each, turns",
     "fines": "Fines of each, apples",
@@ -127,7 +127,7 @@ class Curves:
     """The worlds W of each replica."""
     mean_over: int = 10
     """The episodes of a replica whose mean is the bold line, a multiple of W."""
-    metrics: tuple[str, ...] = (*METRICS, "stock_left", "yield_share")
+    metrics: tuple[str, ...] = tuple(name for name in SOCIAL if METRICS[name].is_stored)
     """The metrics that the game reports, without the prefix `social/`."""
     has_phases: bool = True
     """Whether phases are found when the run ends: it is long enough, these metrics tell, and the means of W
@@ -198,9 +198,8 @@ def curves_of(
     own: Sequence[str] = (),
 ) -> Curves:
     """The numbers of an environment that are plotted, and metrics of the user's own by their names."""
-    metrics = available({**METRICS, "stock_left": FIELDS["stock_left"]}, reported)
-    metrics += ("yield_share",) if yield_of(env) and "harvest" in reported else ()
-    metrics += tuple(own)
+    known = metrics_of(env, reported)
+    metrics = (*(name for name in known if not name.startswith("institutions/")), *own)
     game = getattr(base_env(env), "game", None)
     return Curves(
         agents=agents,
@@ -212,7 +211,9 @@ def curves_of(
             episodes in phases.EPISODES and worlds <= phases.GRID and set(phases.METRICS) <= set(metrics)
         ),
         has_tags="tagged_by" in reported,
-        institutions=metrics_of(env, reported),
+        institutions=tuple(
+            name.removeprefix("institutions/") for name in known if name.startswith("institutions/")
+        ),
         in_force=decisions_of(env) if "in_force" in reported else (),
         joint=joint_actions(game) if isinstance(game, MatrixGame) else (),
     )
@@ -255,7 +256,9 @@ def _caption(game: Game) -> str:
 
 
 _SHOWN: Final[Mapping[str, tuple[str, ...]]] = {
-    "phases and new bests": tuple(dict.fromkeys(entry for name in phases.METRICS for entry in METRICS[name])),
+    "phases and new bests": tuple(
+        dict.fromkeys(entry for name in phases.METRICS for entry in METRICS[name].entries)
+    ),
     "who tagged whom": ("tagged_by",),
     "the Lorenz curve": ("harvest",),
     "all boards side by side": ("board",),
@@ -297,13 +300,15 @@ def styles(curves: Curves) -> dict[str, Any]:
         lines[RETURN] = running(mean, ORANGE, replicas)
         lines[f"{RANDOM_PLAY}/{RETURN}"] = line("random play", GREY)
     for metric in curves.metrics:
-        lines[f"social/{metric}"] = running(mean, colour(metric), replicas)
+        is_alone = metric in INCOMES
+        words = METRICS[metric].words if is_alone else mean
+        lines[f"social/{metric}"] = running(words, colour(metric), replicas, is_alone=is_alone)
         lines[f"{RANDOM_PLAY}/{metric}"] = line("random play", GREY)
         lines[f"{EVALUATION}/{metric}"] = line("greedy, evaluated", ORANGE)
     for name in (f"institutions/{metric}" for metric in curves.institutions):
         lines[f"{RANDOM_PLAY}/{name}"] = line("random play", GREY)
         is_alone = name.removeprefix("institutions/") in (*SHARES, *INCOMES)
-        lines[name] = running(NAMES[name][0], colour(name), replicas, is_alone=is_alone)
+        lines[name] = running(METRICS[name].words, colour(name), replicas, is_alone=is_alone)
     for ballot, decided in enumerate(curves.in_force):
         hue = (ORANGE, BLUE, GREEN, PURPLE)[ballot % 4]
         lines[f"institutions/in_force_{ballot}"] = running(decided, hue, replicas)
@@ -555,10 +560,9 @@ def _tabs(curves: Curves, *, live: bool) -> list[Any]:
     """The tabs, with up to six views each; those of which the game has nothing are left out."""
     agents, several = curves.agents, len(curves.agents) > 1
     decided = [f"institutions/in_force_{ballot}" for ballot in range(len(curves.in_force))]
-    shares, equalities = (
-        [f"institutions/{name}" for name in names if name in curves.institutions]
-        for names in (SHARES, INCOMES)
-    )
+    shares = [f"institutions/{name}" for name in SHARES if name in curves.institutions]
+    equalities = [f"social/{name}" for name in INCOMES if name in curves.metrics]
+    equalities += [f"institutions/{name}" for name in INCOMES if name in curves.institutions]
     recorded = None
     windows = None
     visits = None

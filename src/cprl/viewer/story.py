@@ -19,7 +19,7 @@ from cprl.measuring.episodes import Episode
 from cprl.measuring.now import BEGINS, EXPLORING, Now
 from cprl.measuring.series import Values, mean_of
 from cprl.measuring.statistics import Estimate, estimate_if_finite
-from cprl.runs.curves import LAST_EPISODES, SMOOTHED_EPISODES, rounds_of, running_mean
+from cprl.measuring.windows import LAST_EPISODES, SMOOTHED_EPISODES, rounds_of, running_mean
 from cprl.system.times import CLOCK
 from cprl.viewer.board import Filming
 from cprl.viewer.layout import ANOTHER, SETTLED, STRIPS, Curves, legend_of

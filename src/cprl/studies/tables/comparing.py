@@ -15,20 +15,20 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from cprl.measuring.metrics import is_own, title
+from cprl.measuring.registry import INCOME, INCOME_EQUALITY, is_own, title
 from cprl.measuring.statistics import CONFIDENCE, CUT, Estimate, difference, estimate, holm
-from cprl.studies.tables.table import NET, PARTS, RANDOM, TRAINING, StudyTable
+from cprl.studies.tables.table import PARTS, RANDOM, TRAINING, StudyTable
 from cprl.system.defaults import LAST as LAST
 from cprl.terminal.tables import Cells as Cells
 from cprl.terminal.tables import markdown as markdown
 from cprl.values import Positive, checked, refusal
 
-METRICS: Final = ("collective_return", NET, "equality", "sustainability", "survival_steps", "peacefulness")
+METRICS: Final = ("collective_return", INCOME, "equality", "sustainability", "survival_steps", "peacefulness")
 """Metrics that are compared, unless others are asked for, where a table has them."""
 SAME_AS: Final = {
-    NET: "collective_return",
+    INCOME: "collective_return",
     "peacefulness": "survival_steps",
-    "institutions/net_equality": "equality",
+    INCOME_EQUALITY: "equality",
 }
 """Metrics that are another one by construction where nobody pays or gets anything, or is out of play."""
 MEASURES: Final = ("institutions/fines", "institutions/violations")
@@ -406,4 +406,4 @@ def difference_text(compared: Compared, *, is_marked: bool) -> str:
 
 def metric_title(metric: str) -> str:
     """Return what a metric is called, with its unit."""
-    return "return of all agents together" if metric == NET else title(metric)
+    return title(metric)

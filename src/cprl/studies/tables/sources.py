@@ -13,24 +13,21 @@ from numpy.typing import NDArray
 
 from cprl.envs.unwrap import clock_in
 from cprl.experiment import Experiment
-from cprl.measuring import social
 from cprl.measuring.now import LEAST_LOSS, LOST, REGAINED
 from cprl.measuring.phases import FEWEST_EPISODES, UNNAMED
-from cprl.population import any_learns
-from cprl.runs.checkpoints import REPORT
-from cprl.runs.curves import (
+from cprl.measuring.registry import INCOME, METRICS
+from cprl.measuring.table import Numbers
+from cprl.measuring.windows import (
     LAST_EPISODES,
-    Numbers,
     Values,
-    as_curves,
     episodes_after,
     mean_of_worlds,
-    net_of,
-    phases_of,
     rounds_of,
     running_mean,
-    worlds_of,
 )
+from cprl.population import any_learns
+from cprl.runs.checkpoints import REPORT
+from cprl.runs.curves import as_curves, phases_of, worlds_of
 from cprl.runs.episodes import read_episodes, read_rows
 from cprl.runs.files import read_json
 from cprl.runs.recipe import parts_of, read_recipe
@@ -39,7 +36,6 @@ from cprl.studies.study import Study, level_text, unlike
 from cprl.studies.tables.table import (
     COLUMNS,
     DAMAGED,
-    NET,
     PARTS,
     RANDOM,
     TRAINING,
@@ -251,7 +247,7 @@ def _measured(source: Source, window: int) -> _Measured:
         curves[part] = list(map(as_curves, of_replicas))
         worlds[part] = [worlds_of(rows)[0] for rows in of_replicas]
         for of_replica, by_name, world in zip(windows, curves[part], worlds[part], strict=True):
-            for metric, values in {**by_name, NET: net_of(by_name)}.items():
+            for metric, values in by_name.items():
                 length = window if part == TRAINING or window == 1 else values.shape[1]
                 of_replica[part, metric] = _in_windows(values[0], length, world)
     phases, rule = _phases(curves, worlds[TRAINING])
@@ -363,8 +359,8 @@ def _metrics(measured: Sequence[_Measured]) -> list[str]:
     """
     metrics = {metric for run in measured for _, metric in run.windows[0]}
     if "collective_return" in metrics and not any(name.startswith("institutions/") for name in metrics):
-        metrics.discard(NET)
-    order = [*social.METRICS, "yield_share", NET]
+        metrics.discard(INCOME)
+    order = [name for name in METRICS if not METRICS[name].is_of_institutions]
 
     def place(name: str) -> tuple[int, int, str]:
         if name in order:
@@ -486,4 +482,4 @@ def ending(returns: Values, *, random: float, agents: int, worlds: Numbers | Non
 
 def _harvest(curves: Mapping[str, Values]) -> Values:
     """The collective return, [R, E]; of games without a harvest the return of all agents."""
-    return curves["collective_return"] if "collective_return" in curves else net_of(curves)
+    return curves.get("collective_return", curves[INCOME])

@@ -8,7 +8,7 @@ Columns:
     marks            what of its versions, git commit and processor differs from most runs'; "" if nothing
     replica          its number in the study, int32
     part             "training", "evaluation" or "random", random play in the worlds of the evaluation
-    metric           its name, as in docs/metrics.md, without "social/"; "net" is the return of all agents
+    metric           its name, as in docs/metrics.md, without "social/"; "income" is the return of all agents
     episode          the first episode of the window, int32; in W worlds a window has as many consecutive
                      episodes of each, and its first is that after all earlier windows
     window_episodes  episodes of the window, int32
@@ -48,8 +48,6 @@ RANDOM: Final = "random"
 PARTS: Final = {TRAINING: None, EVALUATION: "trained", RANDOM: "random"}
 """The parts of a run: its training, its agents in fresh worlds afterwards, and random play in these worlds;
 with the name of the table that holds it."""
-NET: Final = "net"
-"""The return of all agents together: harvest - fines + transfers, where a game has institutions."""
 COLUMNS: Final = (
     *("condition", "checksum", "run", "marks", "replica", "part", "metric"),
     *("episode", "window_episodes", "undefined", "value"),

@@ -1,0 +1,102 @@
+"""Windows of episodes, in which every world of a replica counts alike.
+
+"The last n episodes" of a replica in W worlds are the last ceil(n / W) that each of its worlds has ended: of
+worlds that begin together, those who ended last are the longest episodes, those who ended first the shortest.
+"""
+
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from cprl.measuring.table import Numbers, world_of
+
+Values = NDArray[np.float64]
+
+LAST_EPISODES: Final = 30
+"""Those at the end of a training, unless somebody says how many."""
+SMOOTHED_EPISODES: Final = 100
+"""The window of running means in episodes, where nothing else is asked for."""
+
+
+def last_of(table: pa.Table, number: int) -> pa.Table:
+    """Return the rows of the last episodes of each replica: as many of each of its W worlds, and so many of
+    all together, or the next multiple of W.
+
+    The last that have ended, of all worlds, would be the longest ones where worlds began together. Where a
+    world has ended fewer, only as many of each world are there.
+    """
+    world = world_of(table)
+    episode = table["episode"].to_numpy().astype(np.int64)
+    size = int(episode.max(initial=0)) + 1
+    keys, row = np.unique(world * size + episode, return_inverse=True)
+    lanes, counts = np.unique(keys // size, return_counts=True)
+    each = rounds_of(number, len(lanes) // len(np.unique(table["replica"].to_numpy())))
+    is_last = episodes_after(keys // size) < min(each, counts.min())
+    return table.filter(pa.array(is_last[row]))
+
+
+def rounds_of(number: int, worlds: int) -> int:
+    """Return of how many episodes of each of W worlds a mean of so many episodes is."""
+    return -(-number // worlds)
+
+
+def episodes_after(world: Numbers) -> Numbers:
+    """Return how many later episodes its world has, of each episode of a replica, [E] in order."""
+    order = np.argsort(world, kind="stable")
+    counts = np.unique(world, return_counts=True)[1]
+    after = np.empty(len(world), np.int64)
+    after[order] = np.repeat(counts.cumsum(), counts) - 1 - np.arange(len(world))
+    return after
+
+
+def mean_of_worlds(values: Values, worlds: Numbers, window: int) -> Values:
+    """Return the mean of the last episodes at each episode of a replica, in which every world counts alike.
+
+    Args:
+        values: [E], in the order in which episodes ended.
+        worlds: [E], that of each.
+        window: of so many episodes, or the next multiple of the number of worlds; in one world it is the
+            `running_mean`.
+
+    Returns:
+        [E], at the last of the episodes that it is a mean of; NaN before each world has ended so many.
+    """
+    lanes = np.unique(worlds)
+    each = rounds_of(min(window, len(values)), len(lanes))
+    each = min(each, int(np.unique(worlds, return_counts=True)[1].min()))
+    means = np.full((len(lanes), len(values)), np.nan)
+    for lane, world in enumerate(lanes):
+        ended = np.flatnonzero(worlds == world)
+        of_world = running_mean(values[ended], each)
+        latest = np.searchsorted(ended, np.arange(len(values)), side="right") - each
+        means[lane, latest >= 0] = of_world[latest[latest >= 0]]
+    return np.asarray(means.mean(0))
+
+
+def running_mean(values: Values, window: int = SMOOTHED_EPISODES) -> Values:
+    """Return means over `window` consecutive values, each at the position of the first,
+    [..., len - window + 1].
+
+    With fewer values, the mean of all. Undefined values are skipped; NaN where no value is defined.
+    """
+    window = min(window, values.shape[-1])
+    is_defined = ~np.isnan(values)
+    sums = np.cumsum(_after_a_zero(np.where(is_defined, values, 0.0)), -1)
+    counts = np.cumsum(_after_a_zero(is_defined.astype(np.float64)), -1)
+    with np.errstate(invalid="ignore"):
+        means: Values = (sums[..., window:] - sums[..., :-window]) / (
+            counts[..., window:] - counts[..., :-window]
+        )
+    return means
+
+
+def centres(values: Values, window: int) -> Values:
+    """The episode at the centre of each running mean over `window` of these values, [..., E] to [...]."""
+    window = min(window, values.shape[-1])
+    return np.arange(values.shape[-1] - window + 1) + (window - 1) / 2
+
+
+def _after_a_zero(values: Values) -> Values:
+    return np.concatenate([np.zeros((*values.shape[:-1], 1)), values], -1)
