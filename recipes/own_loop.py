@@ -34,11 +34,12 @@ from cprl.learners.settings import DQNSettings
 from cprl.learners.transitions import transitions_of
 from cprl.measuring.episodes import Episode, EpisodeTracker
 from cprl.measuring.evaluate import evaluate, mean_return
+from cprl.measuring.table import where
 from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
 from cprl.population import Learning, exploration_steps
-from cprl.runs.episodes import EpisodeTable
+from cprl.runs.episodes import EpisodeTable, labelled
 from cprl.runs.recipe import start_run
 from cprl.runs.weights import load_weights, save_weights
 from cprl.system.output import printed, say
@@ -173,10 +174,11 @@ def main(
         network.load_state_dict(load_weights(best.path)["agent_0"])
         played[f"greedy, best (episode {best.best_episode})"] = evaluate(fresh, policy)
     ends = exploration_steps(experiment.agents)
-    figure = training_curve(run, title=title, random=played["random"], exploration_turns=ends)
+    table = labelled(({"policy": name}, 0, episodes) for name, episodes in played.items())
+    random = where(table, policy="random")
+    figure = training_curve(run, title=title, random=random, exploration_turns=ends)
     note = None if best.path else "No best weights: greedy play harvested nothing whenever it was tried"
-    of_one = {name: {0: episodes} for name, episodes in played.items()}  # replica
-    summarise(run, title=title, played=of_one, figure=figure, note=note)
+    summarise(run, title=title, played=table, figure=figure, note=note)
     published = printed([*cprl_here(), "run", "single_basic"])
     say(f"This was a shortened schedule. The published one, with 8 replicas: {published}")
     return run

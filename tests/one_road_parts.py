@@ -44,6 +44,22 @@ def largest_share(episode):
     return episode.harvest.max() / episode.harvest.sum()
 
 
+def gap(episode):
+    """How many apples the agent with most harvested more than the agent with least."""
+    return episode.harvest.max() - episode.harvest.min()
+
+
+gap.title = "most minus least"
+gap.unit = "apples"
+
+
+def nameless(episode):
+    return 1.0
+
+
+nameless.unit = 3
+
+
 def rewrites_harvest(episode):
     episode.harvest[:] = 99
     return 1.0

@@ -44,6 +44,7 @@ from cprl.measuring.registry import (
     measured,
     reported_by,
 )
+from cprl.measuring.table import where
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
 from cprl.runs.curves import curves_of
@@ -311,11 +312,10 @@ def test_the_terminal_shows_it_too(tmp_path, monkeypatch):
     ):
         episodes = play(MatrixGame(2), tit_for_tat, 12, callbacks=[table, bar])
     assert "return 12.5" in output.getvalue()
-    figure = training_curve(tmp_path, title="matrix", random=episodes)
+    played = labelled([({"policy": policy}, 0, episodes) for policy in ("random", "trained")])
+    figure = training_curve(tmp_path, title="matrix", random=where(played, policy="random"))
     assert figure.stat().st_size > 10_000
-    summarise(
-        tmp_path, title="matrix", played={"random": {0: episodes}, "trained": {0: episodes}}, console=console
-    )
+    summarise(tmp_path, title="matrix", played=played, console=console)
     text = output.getvalue()
     assert text.count("left out: collective_return") == 1
     assert re.search(r"survival, steps\s*│\s*5\.\d+ │", text)

@@ -45,7 +45,7 @@ def test_every_logged_name_has_its_line_in_the_docs_and_the_other_way_round(tmp_
         *("decisions", "decisions/labels"),
         *(name for name in told if name.startswith("institutions/")),
         *(f"agent_<i>/{name}" for name in (*OF_AGENTS, "paid", "given")),
-        *("world/regions", "world/violators"),
+        *("world/regions", "world/violators", "social/income_equality"),
     }
     because = "by BestWeights, of many episodes or agents, of replays, static, of games with institutions"
     assert logged == told - elsewhere, because

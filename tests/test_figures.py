@@ -1,4 +1,4 @@
-"""Figures: everything drawn is in the legend, which lies beside the data; phases only in long trainings."""
+"""Figures: everything drawn is in the legend, which lies beside the data."""
 
 import re
 from itertools import pairwise
@@ -10,7 +10,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from figures import published_bands
 from matplotlib.collections import PolyCollection
 from matplotlib.image import imread
 from matplotlib.text import Text
@@ -24,13 +23,12 @@ import cprl
 from cprl import Game, Rules, maps, presets
 from cprl.algorithms import DQN, IQL, MADDPG, PPO, PR2, SAC
 from cprl.learners.settings import DQNSettings, RolloutSettings
-from cprl.measuring import phases
-from cprl.measuring.phases import PHASES
 from cprl.measuring.windows import centres
 from cprl.population import Learning, Scripted, Team, exploration_steps
-from cprl.runs.curves import episode_of_turn, phases_of
+from cprl.runs.curves import episode_of_turn
+from cprl.runs.episodes import as_table
 from cprl.terminal import style
-from cprl.terminal.figures import UNNAMED, bands_of, training_curve
+from cprl.terminal.figures import training_curve
 
 
 def a_run(folder, metrics):
@@ -72,7 +70,7 @@ def see_that_the_legend_is_whole(figure):
     looks = {handle.get_color() for handle in legend.legend_handles if hasattr(handle, "get_color")}
     looks |= {tuple(np.round(handle.get_facecolor(), 3)) for handle in legend.get_patches()}
     for axes in curves_panels(figure):
-        boundaries = [line for line in axes.lines if line.get_color() == "#999999"]  # of bands
+        boundaries = [line for line in axes.lines if line.get_color() == "#999999"]  # of bands of phases
         for line in set(axes.lines) - set(boundaries):
             assert line.get_color() in looks
         for collection in axes.collections:
@@ -105,7 +103,7 @@ def see_that_it_can_be_read(figure, width_in=3.3):
 
 def test_a_short_training_shows_its_peak_its_end_random_play_and_where_exploration_ends(tmp_path, drawn):
     run = a_run(tmp_path / "run", the_tragedy(4, 200))
-    random = [an_episode(0, collective_return=282.0, survival_steps=1000.0)]
+    random = as_table([an_episode(0, collective_return=282.0, survival_steps=1000.0)], 0)
     training_curve(run, title="commons", random=random, exploration_turns=50_000)
     (figure,) = drawn
     above, below = curves_panels(figure)
@@ -122,7 +120,6 @@ def test_a_short_training_shows_its_peak_its_end_random_play_and_where_explorati
         "exploration ends, episode 5",
     ):
         assert words in told
-    assert "phase" not in told
     assert figure.caption == "Running means are over 10 episodes, centred."
     see_that_the_legend_is_whole(figure)
     levels = [line for line in above.lines if line.get_color() == style.RANDOM_LINE["color"]]
@@ -157,40 +154,6 @@ def test_what_is_not_over_by_the_last_episode_is_said(tmp_path, drawn):
     assert drawn[0].caption.endswith("Exploration was not over at the last episode.")
 
 
-@pytest.mark.parametrize(("episodes", "has_bands"), [(999, False), (1000, True), (1001, False)])
-def test_phases_are_drawn_from_a_thousand_episodes_to_the_longest(
-    episodes, has_bands, tmp_path, drawn, monkeypatch
-):
-    monkeypatch.setattr(phases, "EPISODES", range(phases.FEWEST_EPISODES, 1001))
-    run = a_run(tmp_path / "run", the_tragedy(2, episodes))
-    training_curve(run, title="commons")
-    (figure,) = drawn
-    strips = [axes for axes in figure.axes if axes not in curves_panels(figure)]
-    assert bool(strips) == has_bands
-    assert (f"phase: {UNNAMED}" in labels(figure)) == has_bands
-    see_that_the_legend_is_whole(figure)
-    if has_bands:
-        assert [label.get_text() for label in strips[0].get_yticklabels()] == ["this run"]
-
-
-def test_phases_need_a_group_and_numbers_in_every_window():
-    curves = {**the_tragedy(2, 1200), "return_0": np.ones((2, 1200)), "return_1": np.ones((2, 1200))}
-    found = phases_of(curves)
-    assert bands_of(found)[0][2] == "exploration"
-    assert {name for _, _, name in bands_of(found)} <= {*PHASES, UNNAMED}
-    centred = phases_of(curves, centred=True)
-    assert [phase.first for phase in centred] == [phase.first + 49.5 for phase in found]
-    nobody = curves["equality"].copy()
-    nobody[:, 300:450] = np.nan
-    assert phases_of({**curves, "equality": nobody}) is None
-    alone = {name: values for name, values in curves.items() if name != "return_1"}
-    assert phases_of(alone) is None
-
-
-def test_the_published_phases_end_with_the_figure():
-    assert published_bands(1600) == [(0, 450, "exploration"), (450, 1500, "tragedy"), (1500, 1600, "combat")]
-
-
 def test_exploration_ends_with_the_last_agents_epsilon():
     def dqn(hold, decay, **more):
         settings = DQNSettings(epsilon_hold_steps=hold, epsilon_decay_steps=decay, **more)
@@ -217,7 +180,7 @@ def test_a_game_without_a_harvest_has_one_panel_and_an_agents_colour_has_an_edge
     rows = pq.read_table(table / "episodes.parquet").drop(["collective_return", "equality", "peacefulness"])
     pq.write_table(rows, table / "episodes.parquet")
     training_curve(table, title="matrix")
-    assert [axes.get_ylabel() for axes in drawn[0].axes] == ["return of all agents together"]
+    assert [axes.get_ylabel() for axes in drawn[0].axes] == ["income of all agents together"]
     assert len(style.on_white(2)["path_effects"]) == 2
     assert style.on_white(0)["linestyle"] != style.on_white(4)["linestyle"], "its colour may be the same"
 
@@ -284,7 +247,7 @@ def test_names_in_figures_are_no_formulas(name, tmp_path):
 @pytest.mark.parametrize("width", ["page", "column"])
 def test_a_training_curve_can_be_read_at_every_width(width, tmp_path, drawn):
     run = a_run(tmp_path / "run", the_tragedy(4, 1200))
-    random = [an_episode(0, collective_return=282.0, survival_steps=1000.0)]
+    random = as_table([an_episode(0, collective_return=282.0, survival_steps=1000.0)], 0)
     training_curve(run, title="commons", random=random, exploration_turns=50_000, width=width)
     see_that_it_can_be_read(drawn[0], style.WIDTH_IN[width])
 

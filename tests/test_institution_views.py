@@ -1,5 +1,6 @@
 """Institutions in recordings, replays, tables and figures; games without them are shown as before."""
 
+import re
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -22,12 +23,13 @@ from cprl.evaluation.film import Style, film, film_video
 from cprl.evaluation.film_pictures import EpisodePicture
 from cprl.institutions import Boundaries, GraduatedSanctions, Monitoring, Sanctioner, Tax, Vote
 from cprl.measuring.registry import reported_by
-from cprl.measuring.statistics import form_for
+from cprl.measuring.statistics import estimates, form_for
+from cprl.measuring.table import where
 from cprl.policies.lanes import random_agents
 from cprl.population import Scripted
 from cprl.runs.episodes import read_episodes
 from cprl.terminal.figures import training_curve
-from cprl.terminal.summary import institutions_table, summarise
+from cprl.terminal.summary import summarise
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.layout import Curves, curves_of, layout, styles
@@ -243,36 +245,24 @@ def evaluation(whole):
     return evaluate_run(whole, episodes=2)
 
 
-def test_the_summary_has_a_table_of_institutions(evaluation):
-    played = {"random": {0: evaluation.random[0]}, "trained": {0: evaluation.trained[0]}}
-    text = printed(institutions_table(played))
-    paid = [
-        np.mean([episode.fines.sum() for episode in episodes])
-        for by in played.values()
-        for episodes in by.values()
+def test_the_page_of_a_run_has_a_row_for_each_number_of_institutions(whole, evaluation):
+    played = evaluation.table()
+    console = Console(width=140, record=True, file=StringIO())
+    summarise(whole, title="own", played=played, console=console)
+    text = console.export_text()
+    lines = (re.split("[│┃]", line)[1:-1] for line in text.splitlines())
+    rows = {cells[0].strip(): [cell.strip() for cell in cells[1:]] for cells in lines if cells}
+    policies = [where(played, policy=policy) for policy in ("trained", "random")]
+    paid = [where(rows, agent=0)["institutions/fines"].to_numpy().mean() for rows in policies]
+    assert [cell.split()[0] for cell in rows["fines of all, apples"][:2]] == [
+        f"{one:{form_for(one)}}" for one in paid
     ]
-    row = next(line for line in text.splitlines() if "fines of all, apples" in line)
-    assert row.replace("│", " ").split()[-3:-1] == [
-        f"{of_policy:{form_for(of_policy)}}" for of_policy in paid
-    ]
-    agent = next(line for line in text.splitlines() if "agent 1" in line)
-    fined, broke = (
-        np.mean([getattr(episode, name)[1] for episode in played["trained"][0]])
-        for name in ("fines", "violations")
-    )
-    assert f"{fined:.1f} / " in agent
-    assert f" / {broke:.1f} " in agent
-    assert "in force: decision 0" in text
+    of_agent = estimates(played, ["agent_1/fines", "agent_1/violations"], "policy").of("trained")
+    assert rows["agent 1: fines, apples"][0] == str(of_agent["agent_1/fines"])
+    assert rows["agent 1: violations"][0] == str(of_agent["agent_1/violations"])
+    assert "in force: decision 0" in rows
+    assert "violations per turn in play, 0 to 1" in rows
     assert "where one may bite" not in text, "nothing counted a bite"
-    nothing = dict.fromkeys(("fines", "transfers", "violations", "counts", "in_force"))
-    without = {"trained": {0: [replace(episode, **nothing) for episode in evaluation.trained[0]]}}
-    assert institutions_table(without) is None
-
-
-def test_what_is_printed_at_the_end_says_it_too(whole, evaluation):
-    console = Console(width=110, record=True, file=StringIO())
-    summarise(whole, title="own", played={"trained": {0: evaluation.trained[0]}}, console=console)
-    assert "violations per turn in play, 0 to 1" in console.export_text()
 
 
 def test_an_evaluation_reports_institutions(evaluation):
@@ -284,7 +274,7 @@ def test_an_evaluation_reports_institutions(evaluation):
     assert "equality of incomes" in text or measures["income_equality"].estimate is None
     assert "agent 2: fines, apples" in text
     assert "where one may bite" not in text, "undefined everywhere"
-    assert {"fines", "violations", "own_bites", "in_force_0"} <= set(evaluation.table().column_names)
+    assert {"fines", "violations", "own_bites", "institutions/in_force_0"} <= set(evaluation.table().column_names)
 
 
 def test_the_run_keeps_them_and_the_training_curve_shows_them(whole):

@@ -4,6 +4,7 @@ import time
 from functools import partial
 
 import numpy as np
+import phases
 import pytest
 import torch
 
@@ -12,7 +13,6 @@ from cprl.commons.batch import Batch
 from cprl.commons.near import neighbours
 from cprl.envs import CommonsGymnasiumEnv, parallel_env
 from cprl.evaluation.film import film
-from cprl.measuring import phases
 
 GAME = Game(map=maps.parse(">A.\n.A."), rules=Rules(may_fire=False))
 BOARD = partial(Map, height=3, width=3, sites=((0, 0),), starts=((1, 1, 0),))

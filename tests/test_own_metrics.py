@@ -1,6 +1,7 @@
 """A metric of the user's own, one function of an episode, appears wherever those of the library do."""
 
 from dataclasses import replace
+from math import inf
 from shutil import copytree
 
 import pytest
@@ -10,9 +11,12 @@ from tiny_study import TINY
 
 import cprl
 from cprl import Custom, Study
+from cprl.measuring.registry import bounds, title, unit, with_unit
 from cprl.runs.curves import curves_of
 from cprl.runs.episodes import read_episodes, read_evaluations
+from cprl.runs.recipe import read_recipe
 from cprl.studies import Search, StudyTable
+from cprl.values import OWN_METRICS
 from cprl.viewer.layout import Curves, layout, styles
 
 KEYS = ("policy", "trained_episodes", "replica", "episode")
@@ -63,6 +67,30 @@ def test_it_is_a_curve_of_the_recording_and_of_a_logger_and_a_row_of_what_is_eva
     assert column(run / "run.rrd", "random_play/largest_share", "Scalars:scalars")[1]
     words = ["evaluate", run, "--episodes", 2, "--allow", SHARE, "--allow", LOGGER]
     assert "largest_share" in command(monkeypatch, capsys, *words)
+
+
+def test_its_title_and_unit_come_from_its_function_and_stand_in_the_recipe_alone(tmp_path):
+    run = train(experiment("gap", "largest_share"), tmp_path / "run", watch="off")
+    assert read_recipe(run)["metrics"] == {"gap": {"title": "most minus least", "unit": "apples"}}
+    OWN_METRICS.clear()  # as in another process, which imports nothing
+    assert title("gap") == "gap"
+    assert read_recipe(run)
+    assert title("gap") == with_unit("gap") == "most minus least, apples"
+    assert unit("gap") == "apples"
+    assert title("largest_share") == "largest_share"
+
+
+def test_one_from_0_to_1_has_these_bounds():
+    assert bounds("gap") == (-inf, inf)
+    OWN_METRICS["of_all"] = {"unit": "0 to 1"}
+    assert (title("of_all"), unit("of_all"), bounds("of_all")) == ("of_all, 0 to 1", "", (0.0, 1.0))
+    del OWN_METRICS["of_all"]
+
+
+def test_a_unit_that_is_no_text_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(ValueError, match=r"one_road_parts:nameless\.unit is 3"):
+        train(experiment("nameless"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_it_has_a_plot_and_a_line_of_its_own_in_the_viewer():

@@ -1,9 +1,9 @@
-"""Change points and phases of artificial curves with known change points."""
+"""Change points and phases of artificial curves with known change points, and how figures draw them."""
 
 import numpy as np
 import pytest
-
-from cprl.measuring.phases import PHASES, change_points, phases
+from figures import published_bands
+from phases import PHASES, UNNAMED, bands_of, change_points, phases, phases_of
 
 EPISODES = np.arange(5000)
 CORNERS = [0, 600, 1500, 2600, 4999]
@@ -59,3 +59,26 @@ def test_curves_that_cannot_be_divided_are_refused():
         change_points(np.arange(701), {"peace": np.zeros(701)}, number=3)
     with pytest.raises(ValueError, match="a metric is NaN in some episode of all replicas"):
         change_points(EPISODES, {"peace": np.full(5000, np.nan)})
+
+
+def test_phases_need_enough_episodes_a_group_and_numbers_in_every_window(monkeypatch):
+    at = np.linspace(0, CORNERS[-1], 1200).astype(int)
+    curves = {name: values[:, at] for name, values in society(2, 0.05).items()}
+    curves |= {"return_0": np.ones((2, 1200)), "return_1": np.ones((2, 1200))}
+    found = phases_of(curves)
+    assert bands_of(found)[0][2] == "exploration"
+    assert {name for _, _, name in bands_of(found)} <= {*PHASES, UNNAMED}
+    centred = phases_of(curves, centred=True)
+    assert [phase.first for phase in centred] == [phase.first + 49.5 for phase in found]
+    nobody = curves["equality"].copy()
+    nobody[:, 300:450] = np.nan
+    assert phases_of({**curves, "equality": nobody}) is None
+    alone = {name: values for name, values in curves.items() if name != "return_1"}
+    assert phases_of(alone) is None
+    monkeypatch.setattr("phases.EPISODES", range(1000, 1001))
+    for episodes, has_phases in ((999, False), (1000, True), (1001, False)):
+        assert bool(phases_of({name: values[:, :episodes] for name, values in curves.items()})) == has_phases
+
+
+def test_the_published_phases_end_with_the_figure():
+    assert published_bands(1600) == [(0, 450, "exploration"), (450, 1500, "tragedy"), (1500, 1600, "combat")]

@@ -12,6 +12,7 @@ from rich.console import Console
 from test_results import an_episode
 
 from cprl.measuring.registry import INCOME, METRICS, title, with_unit
+from cprl.runs.episodes import labelled
 from cprl.terminal.summary import summarise
 from cprl.terminal.tables import Cells
 
@@ -22,11 +23,21 @@ def episode(number, harvest, **metrics):
     return replace(an_episode(number, **known), harvest=apples, return_=apples)
 
 
+def table_of(**played):
+    """The episodes of policies as a table; of one replica, or by replica."""
+    by_replica = {name: of if isinstance(of, dict) else {0: of} for name, of in played.items()}
+    return labelled(
+        ({"policy": name}, replica, episodes)
+        for name, of in by_replica.items()
+        for replica, episodes in of.items()
+    )
+
+
 def told_of(tmp_path, **played):
     """The cells of each row by its name, and all that was printed."""
     output = io.StringIO()
-    by_replica = {name: of if isinstance(of, dict) else {0: of} for name, of in played.items()}
-    summarise(tmp_path, title="a run", played=by_replica, console=Console(file=output, width=200))
+    table = table_of(**played)
+    summarise(tmp_path, title="a run", played=table, console=Console(file=output, width=200))
     text = output.getvalue()
     cells = [[cell.strip() for cell in re.split("[│┃]", line)[1:-1]] for line in text.splitlines()]
     return {row[0]: row[1:] for row in cells if row}, text
@@ -38,7 +49,7 @@ def test_the_line_that_watches_again_can_be_copied(tmp_path):
     (run / "run.rrd").touch()
     output = io.StringIO()
     console = Console(file=output, width=200, markup=False)
-    summarise(run, title="a run", played={"random": {0: [episode(0, [3, 1])]}}, console=console)
+    summarise(run, title="a run", played=table_of(random=[episode(0, [3, 1])]), console=console)
     (line,) = (line for line in output.getvalue().splitlines() if line.startswith("Watch again: "))
     assert shlex.split(line)[-2:] == ["watch", str(run)], "all recordings of a run that was resumed"
 
@@ -48,11 +59,11 @@ def test_rows_have_units_intervals_over_replicas_and_paired_differences(tmp_path
     random = {0: [episode(0, [3, 1])], 1: [episode(0, [1, 1])], 2: [episode(0, [2, 1]), episode(1, [2, 1])]}
     trained = {0: [episode(0, [9, 3])], 1: [episode(0, [5, 1])], 2: [episode(0, [7, 2]), episode(1, [7, 2])]}
     rows, text = told_of(tmp_path, random=random, trained=trained)
-    assert rows[""] == ["random (baseline)", "trained", "difference, paired"]
+    assert rows[""] == ["random", "trained", "trained - random, paired"]
     assert rows["collective return, apples"] == ["3.00 [0.52, 5.48]", "9.0 [1.5, 16.5]", "+6.0 [+1.0, +11.0]"]
     assert rows["survival, steps"] == ["900 [900, 900]", "900 [900, 900]", "+0 [+0, +0]"]
     assert rows["episodes"] == ["4", "4", ""]
-    assert "means over replicas [95 % interval by Student's t]" in text
+    assert "mean over replicas [95 % interval by Student's t]" in text
 
 
 def test_a_table_says_once_that_bounds_cut_intervals(tmp_path):
@@ -71,7 +82,7 @@ def test_returns_that_are_not_finite_are_shown_as_such(tmp_path):
         for r, value in enumerate([np.inf, -np.inf, 1.0])
     }
     rows, _ = told_of(tmp_path, random=endless, trained=dict.fromkeys(range(3), endless[0]))
-    assert rows["return of all agents together, rewards"] == ["nan", "inf", "+nan"]
+    assert rows["income of all agents together, apples"] == ["nan", "inf", "+nan"]
 
 
 def test_a_policy_that_harvests_nothing_has_words_instead_of_nan(tmp_path):
@@ -79,7 +90,11 @@ def test_a_policy_that_harvests_nothing_has_words_instead_of_nan(tmp_path):
     idle = [episode(number, [0, 0], equality=nan, sustainability=nan) for number in range(2)]
     busy = [episode(0, [2, 2], equality=1.0), episode(1, [0, 0], equality=nan, sustainability=nan)]
     rows, text = told_of(tmp_path, random=idle, trained=busy)
-    assert rows["equality (1 - Gini), 0 to 1"] == ["undefined in all 2", "1.00, undefined in 1 of 2", ""]
+    assert rows["equality (1 - Gini), 0 to 1"] == [
+        "undefined in all 2 episodes",
+        "1.00, undefined in 1 of 2 episodes",
+        "",
+    ]
     assert "nan" not in text
     assert "random: nobody harvested anything, so equality and sustainability are undefined" in text
 
@@ -87,17 +102,15 @@ def test_a_policy_that_harvests_nothing_has_words_instead_of_nan(tmp_path):
 def test_the_outcome_comes_first_and_what_institutions_never_did_has_no_table(tmp_path):
     def governed(number, harvest, broken):
         nothing = {"fines": np.zeros(2), "transfers": np.zeros(2), "violations": np.array(broken)}
-        return replace(
-            episode(number, harvest), institutions={"fines": 0.0, "violations": sum(broken)}, **nothing
-        )
+        return replace(episode(number, harvest), **nothing)
 
     idle, busy = (governed(0, harvest, [0, 0]) for harvest in ([1, 1], [90, 30]))
     _, text = told_of(tmp_path, random=[idle], trained=[busy])
     first = "trained: 120 (+118 beside random play); random play: 2.00 apples an episode, all agents together"
     assert text.splitlines()[0] == first
-    assert "institutions" not in text
+    assert "violations" not in text
     rows, text = told_of(tmp_path, random=[idle], trained=[governed(0, [9, 3], [2, 0])])
-    assert rows["agent 0: violations"] == ["0.0", "2.0", ""]
+    assert rows["agent 0: violations"] == ["0", "2.00", "+2.00"]
 
 
 @pytest.mark.parametrize("names", [["a"] * 9, ["commons_targets_10_decay_500k, gamma=0.997"] * 4, ["x" * 90]])
@@ -133,7 +146,7 @@ def test_rewards_that_are_no_apples_have_a_row_of_their_own(tmp_path):
     fined = replace(episode(0, [3, 1]), return_=np.array([-1.0, 1.0]))
     rows, _ = told_of(tmp_path, random=[fined])
     assert rows["collective return, apples"] == ["4.00"]
-    assert rows["return of all agents together, rewards"] == ["0"]
+    assert rows["income of all agents together, apples"] == ["0"]
 
 
 def test_units_are_those_of_the_docs():
@@ -169,5 +182,4 @@ def test_episodes_with_an_undefined_equality_of_incomes_are_counted(tmp_path):
         for number, equality in enumerate([0.5, float("nan"), 0.7])
     ]
     rows, _ = told_of(tmp_path, trained=fined)
-    (cells,) = (cells for name, cells in rows.items() if "incomes" in name)
-    assert cells == ["0.60, undefined in 1 of 3"]
+    assert rows["equality of incomes, 0 to 1"] == ["0.60, undefined in 1 of 3 episodes"]

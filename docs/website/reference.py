@@ -43,7 +43,7 @@ _MODULES: Final = {
     "envs": ("make_env",),
     "experiment": ("presets",),
     "learners": ("settings",),
-    "measuring": ("social", "phases", "statistics"),
+    "measuring": ("social", "outcome", "statistics"),
     "objectives": ("preferences",),
     "policies": ("scripted", "assignment", "decisions"),
     "training": ("training",),

@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 import verdicts
 from numpy.typing import NDArray
+from phases import PHASES_BEGIN
 from possible import possible
 from published import curve
 from results import (
@@ -28,7 +29,6 @@ from cprl.commons.game import Game
 from cprl.envs.commons_env import CommonsEnv
 from cprl.evaluation.evaluate import SEED
 from cprl.measuring.evaluate import evaluate
-from cprl.measuring.phases import PHASES_BEGIN
 from cprl.measuring.statistics import difference, estimate
 from cprl.measuring.windows import running_mean
 from cprl.policies.assignment import AgentPolicies

@@ -6,8 +6,10 @@ from itertools import zip_longest
 from typing import Final
 
 import numpy as np
+import phases
 import verdicts
 from numpy.typing import NDArray
+from phases import PHASES_BEGIN
 from published import EXPERIMENTS, agreement, curve, estimate_window, published_experiment
 from results import (
     EPISODES,
@@ -20,8 +22,6 @@ from results import (
 )
 from verdicts import curve_prediction, prediction
 
-from cprl.measuring import phases
-from cprl.measuring.phases import PHASES_BEGIN
 from cprl.measuring.windows import running_mean
 
 Values = NDArray[np.float64]
@@ -293,7 +293,9 @@ def phases_of(results: Sequence[Result]) -> list[str]:
         rows.append([result.name, *cells])
     head = ["curves", "second phase from", "third", "fourth", "phases by their pattern"]
     drawn = ", ".join(map(str, PHASES_BEGIN))
-    note = f"The study draws its phases from {drawn} on. See `cprl.measuring.phases` for how ours are found."
+    note = (
+        f"The study draws its phases from {drawn} on. See `recipes/study/phases.py` for how ours are found."
+    )
     return ["## Phases of experiment 5", "", note, "", *table(head, rows)]
 
 

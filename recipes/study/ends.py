@@ -13,11 +13,11 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 import tyro
+from phases import FEWEST_EPISODES, METRICS, UNNAMED, find_phases
 
 import cprl
 from cprl.evaluation import exploitability, plan_responses, schelling, territory_of
 from cprl.evaluation.schelling import dilemma
-from cprl.measuring.phases import FEWEST_EPISODES, METRICS, UNNAMED, find_phases
 from cprl.measuring.series import Values
 from cprl.measuring.statistics import estimate
 from cprl.measuring.windows import running_mean

@@ -8,23 +8,24 @@ from typing import Final
 import numpy as np
 from claims import undefined_in
 from matplotlib.axes import Axes
-from published import PHASED_RECIPE, curve
-from results import Result, Values, returns_by_chance
-from verdicts import curve_prediction
-
-from cprl.measuring.phases import PHASES, PHASES_BEGIN
-from cprl.measuring.registry import title, unit
-from cprl.measuring.windows import running_mean
-from cprl.terminal import style
-from cprl.terminal.figures import (
+from phases import (
+    PHASES,
+    PHASES_BEGIN,
     STRIP,
     Bands,
     add_keys,
     bands_of,
     draw_bands,
     draw_strip,
-    mark_exploration,
 )
+from published import PHASED_RECIPE, curve
+from results import Result, Values, returns_by_chance
+from verdicts import curve_prediction
+
+from cprl.measuring.registry import title, unit
+from cprl.measuring.windows import running_mean
+from cprl.terminal import style
+from cprl.terminal.figures import mark_exploration
 
 TITLES: Final = {
     "return_0": "return of the learner, apples",

@@ -12,6 +12,7 @@ The modules of the report, in the order in which one reads them:
     curves      published numbers and curves beside ours
     claims      the study's claims on its five experiments
     tragedies   tragedy and combat, replica by replica
+    phases      the phases of a training, and how figures draw them
     possible    what share of the possible runs got; planner and exact_yields say what is possible
     figures     a metric of a run beside the published curve
 """

@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from phases import Phase, phases_of
 from planner import harvests
 from published import PublishedExperiment, published_experiment
 
@@ -27,11 +28,10 @@ from cprl.evaluation.evaluate import SEED
 from cprl.evaluation.lanes import Agent, Fresh, agents_of, scripted
 from cprl.experiment import Experiment
 from cprl.measuring.movement import Trace, overlap, trace
-from cprl.measuring.phases import Phase
 from cprl.measuring.statistics import estimate
 from cprl.measuring.windows import SMOOTHED_EPISODES, running_mean
 from cprl.population import Learning, Scripted, Team, exploration_steps
-from cprl.runs.curves import as_curves, curves_of, episode_reached, phases_of
+from cprl.runs.curves import as_curves, curves_of, episode_reached
 from cprl.runs.episodes import read_episodes
 from cprl.runs.files import read_json
 from cprl.runs.recipe import read_recipe

@@ -1,6 +1,6 @@
 """Combat: whether a training, after a tragedy, earns more again while its agents still tag each other.
 
-The phases of `cprl.measuring.phases` depend on the number of change points and on a threshold of a line's
+The phases of `phases` depend on the number of change points and on a threshold of a line's
 slope: between the lines that the study draws, its own collective return rises by a hair too little to be
 called combat, and with four or five change points the pattern breaks. This measure has neither. It looks at
 running means over `LONG` episodes, long enough that a level that only wanders does not pass for a fall and a

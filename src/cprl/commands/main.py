@@ -1,4 +1,4 @@
-"""The command `cprl`: trains agents by recipes, and watches, measures and compares stored runs."""
+"""The command `cprl`: train agents by recipes; watch, measure and compare stored runs."""
 
 import os
 import subprocess
@@ -131,16 +131,16 @@ def run(
     episodes: int | None = None,
     steps: int | None = None,
 ) -> None:
-    """Trains the experiment of a recipe or of a run anew, or resumes a run that was stopped.
+    """Train the experiment of a recipe or of a run anew, or resume a run that was stopped.
 
     A recipe that comes with cprl is run by its name, followed by its own flags: cprl run commons --episodes
     200; cprl run commons --help lists them, and cprl recipe lists the names. What follows is for the others.
 
     Args:
-        recipe: a recipe.json, or the directory of a run.
+        recipe: A recipe.json, or the directory of a run.
         options: --out is with --resume the run itself.
-        episodes: how many, instead of the recipe's number; with --resume more of them extend the run.
-        steps: likewise, of a recipe that trains so many steps.
+        episodes: How many, instead of the recipe's number; with --resume more of them extend the run.
+        steps: How many, of a recipe that trains so many steps.
     """
     trial = _TRIAL.get()
     if trial is not None:
@@ -201,10 +201,10 @@ def _refuse_unknown(path: Path) -> None:
 
 
 def recipe(name: str | None = None, /) -> None:
-    """Lists the recipes that come with cprl, or prints one to be copied: cprl recipe commons > mine.py.
+    """List the recipes that come with cprl, or print one to be copied: cprl recipe commons > mine.py.
 
     Args:
-        name: of the recipe that is printed.
+        name: The recipe that is printed.
     """
     if name is not None:
         OUT.write(recipe_named(name).text())
@@ -217,11 +217,11 @@ def recipe(name: str | None = None, /) -> None:
 
 
 def watch(run: Path, /, *, serve: bool = False) -> None:
-    """Opens the recording of a run in the Rerun viewer, all files of it as one.
+    """Open the recording of a run in the Rerun viewer, all files of it as one.
 
     Args:
-        run: the run's directory, or a single .rrd file.
-        serve: serve it for browsers on 127.0.0.1 instead, until Ctrl-C, as without a display.
+        run: The run's directory, or a single .rrd file.
+        serve: Serve it for browsers on 127.0.0.1 instead, until Ctrl-C, as without a display.
     """
     if run.is_file() and run.suffix != ".rrd":
         raise ValueError(f"{run} is no recording; allowed: a run's directory, or a file that ends in .rrd")
@@ -261,18 +261,19 @@ def export(
     replica: int = 0,
     seed: int = FILM_SEED,
 ) -> None:
-    """Copies what a report needs of a finished run, small enough to be committed, or plays fresh episodes of
-    its agents and writes them for other programs.
+    """Copy what a report needs of a finished run, small enough to be committed, or play fresh episodes of its
+    agents and write them for other programs.
 
     Args:
-        out: the folder of the results, the file of "csv", or the directory of the Minari data sets.
-        weights: also the trained weights. Without them a report tells of the training alone, and nothing can
-            play the agents.
+        run: The run's directory.
+        out: The folder of the results, the file of "csv", or the directory of the Minari data sets.
+        weights: Copy the trained weights too. Without them a report tells of the training alone, and nothing
+            can play the agents.
         format: "results"; "csv", a row for each episode, turn and agent, with what it did and got and where
             it stands; or "minari", a data set for each agent, of the extra "minari".
-        episodes: of "csv" and "minari": fresh episodes that are played.
-        replica: likewise: whose agents.
-        seed: likewise: of the worlds and all chance, see cprl film; not that of the training.
+        episodes: Of "csv" and "minari": fresh episodes that are played.
+        replica: Of "csv" and "minari": whose agents play.
+        seed: Of "csv" and "minari": of the worlds and all chance, see cprl film; not that of the training.
     """
     from cprl.runs.recipe import read_recipe
 

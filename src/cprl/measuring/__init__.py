@@ -1,15 +1,16 @@
-"""From what happened to what it meant: the social metrics, and whole episodes out of collected batches.
+"""From what happened to what it meant: one registry of what is measured, and functions of tables.
 
 Modules, in the order in which one reads them:
-    social        the social metrics, from the totals of an episode
-    institutions  metrics of institutions, likewise
-    metrics       their names, words and units, and what is left out where a game does not report an entry
+    social        the formulas of the metrics
+    registry      every total and every metric, each said once: words, unit, formula, bounds, colour
     episodes      Episode, and EpisodeTracker, which makes them of batches of turns; metrics of the user's own
-    evaluate      one fresh episode in every world, without learning
-    statistics    estimates over replicas, with intervals by Student's t
+    evaluate      one fresh episode in every world, without learning, turn by turn
+    table         tidy tables of episodes: their rows, labels and numbers
+    windows       means over windows of episodes, in which every world counts alike
+    statistics    estimates over replicas and differences, with intervals by Student's t, and Holm's families
+    played        estimates of episodes by replica
     series        numbers while a training runs
-    now           what a group is doing at the moment
-    phases        change points of a whole training, and the phases between them
+    outcome       how a training goes, and how it went
     movement      where agents go, which cells they share or keep, and who tags whom
 """
 

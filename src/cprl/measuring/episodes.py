@@ -35,7 +35,7 @@ from cprl.measuring.registry import (
     measured,
     reported_in,
 )
-from cprl.values import Custom, Positive, checked
+from cprl.values import Custom, Positive, checked, words_of_metric
 
 Array = NDArray[Any]
 Turns = dict[str, Array]
@@ -201,13 +201,19 @@ def own_metrics(metrics: Sequence[Custom], episode: Episode) -> dict[str, float]
     return values
 
 
-def try_own_metrics(metrics: Sequence[Custom], env: EnvBase) -> None:
+def try_own_metrics(metrics: Sequence[Custom], env: EnvBase) -> dict[str, dict[str, str]]:
     """Refuse metrics of the user's own that fail on an episode of one turn of an environment: one in which
-    nothing happens, and one in which each entry that the game reports is 1."""
+    nothing happens, and one in which each entry that the game reports is 1.
+
+    Returns:
+        "title" and "unit" by their names, of those whose functions have such attributes.
+    """
     for entry in (0, 1) if metrics else ():
         batch = env.fake_tensordict().apply(partial(torch.full_like, fill_value=entry))
         batch["done"], batch["next", "done"] = batch["done"] & False, batch["next", "done"] | True
         tracker_of(env, metrics).add(batch)
+    words = {own_name(metric): words_of_metric(metric) for metric in metrics}
+    return {name: word for name, word in words.items() if word}
 
 
 _RUNNING: Final = {name: total for name, total in TOTALS.items() if total.add is not None}

@@ -35,6 +35,7 @@ from cprl.measuring.social import (
     mean_of_defined,
     share_of,
 )
+from cprl.values import OWN_METRICS
 
 Array = NDArray[Any]
 
@@ -516,16 +517,26 @@ def is_own(name: str) -> bool:
     return not (name in METRICS or "/" in name or name.startswith("return_"))
 
 
+def _metric(name: str) -> Metric | None:
+    """Return a metric, of the user's own as far as its words are known; None of another number."""
+    if name in METRICS or not is_own(name):
+        return METRICS.get(name)
+    words = OWN_METRICS.get(name, {})
+    return Metric(
+        name=name, words=words.get("title", name), unit=words.get("unit", ""), of=float, colour=ORANGE
+    )
+
+
 def title(name: str) -> str:
     """Return words and unit of a metric, e.g. "survival, steps"; the name itself if it is none."""
-    return METRICS[name].title if name in METRICS else name
+    metric = _metric(name)
+    return name if metric is None else metric.title
 
 
 def colour(name: str) -> Colour:
     """Return the colour of a metric's lines."""
-    if name in METRICS:
-        return METRICS[name].colour
-    return ORANGE if is_own(name) else GREY
+    metric = _metric(name)
+    return GREY if metric is None else metric.colour
 
 
 def unit(name: str) -> str:
@@ -533,8 +544,8 @@ def unit(name: str) -> str:
     is in apples."""
     if name.startswith("return_"):
         return APPLES
-    word = METRICS[name].unit if name in METRICS else ""
-    return "" if word == SHARE else word
+    metric = _metric(name)
+    return "" if metric is None or metric.unit == SHARE else metric.unit
 
 
 def with_unit(name: str, *, rewards: str = "") -> str:
@@ -546,7 +557,7 @@ def with_unit(name: str, *, rewards: str = "") -> str:
     """
     if name == INCOME:
         return ", ".join(filter(None, (METRICS[name].words, rewards)))
-    if name in METRICS:
+    if _metric(name) is not None:
         return title(name)
     who, slash, what = name.rpartition("/")
     if name.startswith(IN_FORCE):
@@ -561,14 +572,13 @@ def bounds(name: str, clock: float = inf) -> tuple[float, float]:
     Args:
         clock: the steps of the longest episode that the game allows.
     """
-    metric = METRICS.get(name)
-    if metric is None:
+    metric = _metric(name)
+    if metric is not None and metric.unit == SHARE:
+        return 0.0, 1.0
+    if metric is None or name == INCOME or name not in METRICS:
         is_amount = name.rpartition("/")[2] in OF_AGENTS
         return 0.0 if is_amount else -inf, inf
-    if name == INCOME:
-        return -inf, inf
-    most = clock if metric.is_time else inf
-    return 0.0, 1.0 if metric.unit == SHARE else most
+    return 0.0, clock if metric.is_time else inf
 
 
 def left_out(reported: Collection[str], *, more: Mapping[str, tuple[str, ...]] | None = None) -> str:

@@ -318,15 +318,19 @@ class Family(Mapping[Key, Estimate]):
         """Return a row for each estimate: its labels, "number", and the fields of `Estimate`, null where
         undefined."""
         rows = [
-            {**dict(zip(self.by, key, strict=False)), "number": key[-1], **_numbers_of(one)}
+            {**dict(zip(self.by, key, strict=False)), "number": key[-1], **numbers_of(one)}
             for key, one in self.items()
         ]
         return pa.Table.from_pylist(rows)
 
 
-def _numbers_of(one: Estimate) -> dict[str, float | None]:
-    names = ("value", "low", "high", "p_value", "replicas", "episodes", "undefined", "differs")
-    values = {name: getattr(one, name) for name in names}
+NUMBERS: Final = ("value", "low", "high", "p_value", "replicas", "episodes", "undefined", "differs")
+"""What a row of a table has of an estimate."""
+
+
+def numbers_of(one: Estimate) -> dict[str, float | None]:
+    """Return the `NUMBERS` of an estimate, None where one is NaN."""
+    values = {name: getattr(one, name) for name in NUMBERS}
     return {name: None if isnan(value) else value for name, value in values.items()}
 
 

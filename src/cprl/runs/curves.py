@@ -9,9 +9,8 @@ import pyarrow as pa
 import pyarrow.compute
 from numpy.typing import NDArray
 
-from cprl.measuring import phases
 from cprl.measuring.table import Numbers, complete, metrics_in, world_of
-from cprl.measuring.windows import SMOOTHED_EPISODES, Values, centres, last_of, running_mean
+from cprl.measuring.windows import Values, last_of
 from cprl.runs.episodes import read_episodes
 
 
@@ -70,28 +69,6 @@ def _places(table: pa.Table) -> tuple[Numbers, Numbers, tuple[int, int]]:
     firsts = np.searchsorted(keys // size, np.arange(len(replicas)))
     counts = np.diff(np.append(firsts, len(keys)))
     return replica, row - firsts[replica], (len(replicas), int(counts.min()))
-
-
-def phases_of(curves: dict[str, Values], *, centred: bool = False) -> list[phases.Phase] | None:
-    """Return the phases of a training, of running means over `SMOOTHED_EPISODES`.
-
-    Args:
-        centred: whether an episode is the centre of its running mean; else its first, as in the study.
-
-    Returns:
-        None for a number of episodes that is not in `phases.EPISODES`, a single agent, a game that does not
-        report the metrics, or a metric that is undefined in a whole window.
-    """
-    if not set(phases.METRICS) <= set(curves) or "return_1" not in curves:
-        return None
-    whole = curves["survival_steps"]
-    if whole.shape[1] not in phases.EPISODES:
-        return None
-    smoothed = {name: running_mean(curves[name]) for name in phases.METRICS}
-    if any(np.isnan(means).all(0).any() for means in smoothed.values()):
-        return None
-    at = centres(whole, SMOOTHED_EPISODES)
-    return phases.find_phases(at if centred else at - at[0], smoothed)
 
 
 def episode_of_turn(table: pa.Table, turn: float) -> float | None:

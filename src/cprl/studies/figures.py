@@ -490,8 +490,9 @@ ENDINGS: Final = {
     "exploration": "#e4e4e4",
     "combat": "#faecb4",
     "cultivation": "#e0d4f0",
+    "none of the four patterns": "#ffffff",
 }
-"""Colours of how trainings went, light enough for text before them; the last three are phases of 2019 in
+"""Colours of how trainings went, light enough for text before them; the last four are phases of 2019 in
 committed tables."""
 _CELL: Final = 4.4
 """The height of a cell in em."""
@@ -600,7 +601,7 @@ def phase_diagram(
             if counts:
                 word, number = next(iter(counts.items()))
                 text = f"{wrapped(word, wide)}\n{number} of {sum(counts.values())}"
-                cells[pair] = ENDINGS.get(word, "#ffffff"), text
+                cells[pair] = ENDINGS[word], text
         draw_cells(sheet, axes, rows, columns, cells, upward=True)
         axes.set(xlabel=short(factors[1]), ylabel=short(factors[0]))
         sheet.title = f"{table.design.name}: phases at the end"

@@ -1,213 +1,183 @@
-"""The results of a run, printed in the terminal: first what they come to, then tables and files."""
+"""The results of a run, printed in the terminal: first what they come to, then a table and files."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from operator import attrgetter
+from math import isclose
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+import pyarrow as pa
 from rich.console import Console
 from rich.text import Text
 
-from cprl.measuring.episodes import Episode
-from cprl.measuring.played import (
-    ByReplica,
-    Measured,
-    by_metric,
-    clock_of,
-    difference_paired,
-    notes_on,
-    over_replicas,
+from cprl.measuring.registry import (
+    COLLECTIVE_RETURN,
+    IN_FORCE,
+    INCOME,
+    INCOME_EQUALITY,
+    METRICS,
+    OF_AGENTS,
+    with_unit,
 )
-from cprl.measuring.registry import METRICS, OF_INSTITUTIONS, is_own, left_out, with_unit
-from cprl.measuring.registry import title as metric_title
-from cprl.measuring.statistics import signed
+from cprl.measuring.statistics import HOLM, Estimate, Family, differences, estimates, notes_on
+from cprl.measuring.table import numbers_in, where
+from cprl.runs.episodes import LEFT_OUT
 from cprl.system.output import console as safe_console
 from cprl.system.output import printed
 from cprl.system.shipped import cprl_here
-from cprl.terminal.tables import Cells
+from cprl.terminal.tables import Cell, Cells, Change
 
-_OF_AGENTS: Final = {"fines": "fined", "transfers": "given", "violations": "violations"}
 _FILES: Final = ("recipe.json", "episodes.parquet", "run.rrd", "checkpoints", "figures")
-RETURN: Final = "return of all agents together"
-INTERVALS: Final = "means over replicas [95 % interval by Student's t]"
-
-Played = Mapping[str, Mapping[int, Sequence[Episode]]]
-"""Episodes by the name of the policy, then by replica."""
+INTERVALS: Final = "mean over replicas [95 % interval by Student's t]"
+ZEROS: Final = "Numbers of institutions that are 0 or undefined everywhere are left out."
 
 
 def summarise(
     run: Path,
     *,
     title: str,
-    played: Played,
+    played: pa.Table,
     course: str = "",
     figure: Path | None = None,
     note: str | None = None,
     console: Console | None = None,
 ) -> None:
-    """Prints what became of the run, tables that compare policies, the metrics that are left out, and the
-    files of the run.
+    """Print what became of the run, a table that compares policies, and the files of the run.
 
     Args:
-        played: episodes in fresh worlds by the name of the policy; the first policy is the baseline.
-        course: see `cprl.training.course`; by default what each policy gets.
+        played: Episodes in fresh worlds, labelled by "policy"; the first policy is what others are compared
+            with.
+        course: See `cprl.training.course`; by default what each policy gets.
     """
     console = console or safe_console()
-    console.print(Text(course or _verdict(played), style="bold"))
-    console.print(_table(title, played))
-    of_institutions = institutions_table(played)
-    if of_institutions is not None:
-        console.print(of_institutions)
-    lines = [*_notes(played), note, left_out(_first(played).reported)]
+    baseline = played["policy"][0].as_py()
+    told = [name for name in every_number(played) if _is_summarised(name)]
+    console.print(Text(course or _verdict(played, baseline), style="bold"))
+    console.print(compared(played, f"{title}\n{INTERVALS}", numbers=told, reference=baseline))
     files = [name for name in _FILES if (run / name).exists()]
-    lines += [f"Saved in {run}: {', '.join(files)}", f"Training curve: {figure}" if figure else None]
+    lines = [note, f"Saved in {run}: {', '.join(files)}", f"Training curve: {figure}" if figure else None]
     if any(run.glob("run*.rrd")):
         lines.append(f"Watch again: {printed([*cprl_here(), 'watch', str(run)])}")
     for line in filter(None, lines):
         console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
-def _first(played: Played) -> Episode:
-    return next(iter(next(iter(played.values())).values()))[0]
+def every_number(table: pa.Table) -> list[str]:
+    """Return the names of all numbers in the order of pages: of whole episodes, then of each agent."""
+    together = [name for name in numbers_in(table) if name != INCOME]
+    has_harvest = COLLECTIVE_RETURN in together
+    together.insert(int(has_harvest), INCOME)
+    agents = range(int(np.max(table["agent"].to_numpy())) + 1)
+    amounts = [name for name in ("return", *OF_AGENTS) if name in table.column_names]
+    return [*together, *(f"agent_{agent}/{name}" for name in amounts for agent in agents)]
 
 
-def _verdict(played: Played) -> str:
-    """Return what each policy gets, and how much more than the first, if it is more over replicas."""
-    gains = [_gains(episodes) for episodes in played.values()]
-    is_harvest = all(_harvests(episodes) for episodes in played.values())
-    what = f"{'apples' if is_harvest else 'of return'} an episode, all agents together"
-    parts = [f"{_called(name)}: {over_replicas(gain)}" for name, gain in zip(played, gains, strict=True)]
-    for place, gain in enumerate(gains[1:], 1):
-        more = difference_paired(gain, gains[0])
-        parts[place] += f" ({more:+} beside {_called(next(iter(played)))})" if more is not None else ""
-    return f"{'; '.join([parts[-1], *parts[:-1]])} {what}"
+def _is_summarised(name: str) -> bool:
+    metric = METRICS.get(name)
+    if metric is None:
+        return not name.endswith("/return")
+    is_gain = name in (COLLECTIVE_RETURN, INCOME)
+    return is_gain or metric.is_summarised or metric.is_of_institutions
 
 
-def _table(title: str, played: Played) -> Cells:
-    """A column for each policy, then one for what each has more than the first; a row for each number."""
-    names = [name if place or len(played) == 1 else f"{name} (baseline)" for place, name in enumerate(played)]
-    returns = [_returns(episodes) for episodes in played.values()]
-    harvests = [_harvests(episodes) for episodes in played.values()]
-    values: dict[str, Sequence[ByReplica]] = {}
-    if all(harvests):
-        values[with_unit("collective_return")] = harvests
-        if not all(_are_close(*both) for both in zip(harvests, returns, strict=True)):  # as under fines
-            values[f"{RETURN}, rewards"] = returns
-    else:
-        values[RETURN] = returns
-    measured = [by_metric(episodes, attrgetter("social")) for episodes in played.values()]
-    metrics = [name for name, metric in METRICS.items() if metric.is_summarised and name in measured[0]]
-    metrics += filter(is_own, measured[0])
-    values |= {metric_title(name): [of_policy[name] for of_policy in measured] for name in metrics}
-    of_rows = dict(zip(values, [*[""] * (len(values) - len(metrics)), *metrics], strict=True))
-    rows, measures = _rows(values, of_rows, played)
-    counts = (str(sum(map(len, episodes.values()))) for episodes in played.values())
-    rows.append(["episodes", *counts, *[""] * (len(played) - 1)])
-    notes = "\n".join([INTERVALS, *notes_on(measures)])
-    return Cells(title, ["", *names, *_differences(played)], rows, notes)
+def compared(
+    table: pa.Table,
+    heading: str,
+    *,
+    numbers: Sequence[str] = (),
+    by: str = "policy",
+    reference: str = "random",
+    names: Mapping[str, str] | None = None,
+) -> Cells:
+    """Return a row for each number: a column for each policy, then one for what each has more than the
+    reference, paired by replica.
 
-
-def _rows(
-    values: Mapping[str, Sequence[ByReplica]], metrics: Mapping[str, str], played: Played
-) -> tuple[list[list[str]], list[Measured]]:
-    """A row for each number by its words, but for those that are undefined everywhere; and all that is in
-    them.
+    Numbers of institutions that are 0 or undefined everywhere have no row, and incomes none where nobody is
+    paid anything but the harvest.
 
     Args:
-        values: of each policy.
-        metrics: the name of the metric, where it is one.
+        table: Of episodes, labelled by policy, see `cprl.measuring.table`.
+        numbers: Their names; by default `every_number`.
+        by: The label that the policies are called by.
+        names: What columns are called instead of their label.
     """
-    clock = max(clock_of(episodes) for episodes in played.values())
-    rows = []
-    all_measures = list[Measured]()
-    for words, of_policies in values.items():
-        measures = [over_replicas(of_policy, metrics[words], clock) for of_policy in of_policies]
-        if all(measured.estimate is None for measured in measures):
-            continue
-        name = metrics[words]
-        more = (difference_paired(of_policy, of_policies[0], name, clock) for of_policy in of_policies[1:])
-        rows.append([words, *map(str, measures), *map(signed, more)])
-        all_measures += measures
-    return rows, all_measures
+    asked = list(numbers or every_number(table))
+    levels = estimates(table, asked, by)
+    more = differences(table, asked, by, {by: reference})
+    columns = [label for (label,) in levels.labels]
+    others = [label for label in columns if label != reference]
+    words = {label: (names or {}).get(label, label) for label in columns}
+    rewards = "apples" if "harvest" in table.column_names else ""
+    told = [name for name in asked if _says_something(name, levels, columns)]
+    rows: list[list[Cell]] = []
+    for name in told:
+        values = [levels[label, name] for label in columns]
+        gaps = [_change(more.get((label, name))) for label in others]
+        rows.append([with_unit(name, rewards=rewards), *values, *gaps])
+    of_columns = [where(table, **{by: label}) for label in columns]
+    blank = [""] * len(others)
+    rows.append(["episodes", *(str(len(where(one, agent=0))) for one in of_columns), *blank])
+    if rewards:
+        idle = [_without_harvest(one) for one in of_columns]
+        rows.append(["agents without a harvest, not in sustainability", *idle, *blank])
+    shown = [levels[label, name] for label in columns for name in told]
+    left_out = (table.schema.metadata or {}).get(LEFT_OUT, b"").decode()
+    zeros = ZEROS * any(_is_of_institutions(name) for name in {*asked} - {*told})
+    holm = f"{HOLM} for {more.name}." * any(one.differs for one in more.values())
+    notes = [left_out, zeros, *_idle(levels, words), *notes_on(shown), holm]
+    head = ["", *words.values(), *(f"{words[label]} - {words[reference]}, paired" for label in others)]
+    return Cells(heading, head, rows, "\n".join(filter(None, notes)))
 
 
-def _differences(played: Played) -> list[str]:
-    """Return what the columns of differences are called."""
-    baseline, *others = played
-    return [f"{name} - {baseline}" if len(others) > 1 else "difference, paired" for name in others]
+def _change(difference: Estimate | None) -> Cell:
+    return "" if difference is None else Change(difference)
+
+
+def _says_something(name: str, levels: Family, columns: Sequence[str]) -> bool:
+    values = [levels[label, name] for label in columns]
+    if name in (INCOME, INCOME_EQUALITY):
+        same = METRICS[name].same_as
+        pairs = ((one, levels.get((label, same))) for label, one in zip(columns, values, strict=True))
+        return not all(other is not None and _are_close(one, other) for one, other in pairs)
+    return not _is_of_institutions(name) or any(one.value > 0 or one.value < 0 for one in values)
+
+
+def _is_of_institutions(name: str) -> bool:
+    is_amount = name.rpartition("/")[2] in OF_AGENTS
+    return (name.startswith("institutions/") or is_amount) and not name.startswith(IN_FORCE)
+
+
+def _are_close(one: Estimate, other: Estimate) -> bool:
+    return isclose(one.value, other.value, rel_tol=1e-6, abs_tol=1e-3) or one.replicas == other.replicas == 0
+
+
+def _without_harvest(rows: pa.Table) -> str:
+    harvests = rows["harvest"].to_numpy()
+    return f"{np.count_nonzero(harvests == 0)} of {len(harvests)}"
+
+
+def _idle(levels: Family, words: Mapping[str, str]) -> Iterator[str]:
+    """Say why metrics are undefined."""
+    for label, policy in words.items():
+        harvest = levels.get((label, COLLECTIVE_RETURN))
+        if harvest is not None and harvest.value == 0:
+            yield f"{policy}: nobody harvested anything, so equality and sustainability are undefined"
+
+
+def _verdict(played: pa.Table, baseline: str) -> str:
+    """Return what each policy gets, and how much more than the baseline over replicas."""
+    has_harvest = COLLECTIVE_RETURN in played.column_names
+    name = COLLECTIVE_RETURN if has_harvest else INCOME
+    levels = estimates(played, name, "policy")
+    more = differences(played, name, "policy", {"policy": baseline})
+    parts = []
+    for (policy, _), level in levels.items():
+        gap = more.get((policy, name))
+        beside = "" if gap is None else f" ({gap:+} beside {_called(baseline)})"
+        parts.append(f"{_called(policy)}: {level}{beside}")
+    unit = "apples" if has_harvest else "of return"
+    return f"{'; '.join([parts[-1], *parts[:-1]])} {unit} an episode, all agents together"
 
 
 def _called(policy: str) -> str:
     return "random play" if policy == "random" else policy
-
-
-def _returns(episodes: Mapping[int, Sequence[Episode]]) -> dict[int, list[float]]:
-    return {replica: [float(one.return_.sum()) for one in played] for replica, played in episodes.items()}
-
-
-def _harvests(episodes: Mapping[int, Sequence[Episode]]) -> dict[int, list[float]]:
-    """Of all agents in each episode; {} in a game that reports none."""
-    harvests = {
-        replica: [float(one.harvest.sum()) for one in played if one.harvest is not None]
-        for replica, played in episodes.items()
-    }
-    return harvests if all(harvests.values()) else {}
-
-
-def _gains(episodes: Mapping[int, Sequence[Episode]]) -> dict[int, list[float]]:
-    return _harvests(episodes) or _returns(episodes)
-
-
-def _are_close(values: ByReplica, others: ByReplica) -> bool:
-    return all(np.allclose(values[replica], others[replica], rtol=0, atol=1e-3) for replica in values)
-
-
-def _notes(played: Played) -> Iterator[str]:
-    """Say why metrics are undefined."""
-    for policy, episodes in played.items():
-        harvests = _harvests(episodes)
-        if harvests and not any(map(any, harvests.values())):
-            yield f"{policy}: nobody harvested anything, so equality and sustainability are undefined"
-
-
-def _is_any(name: str, episodes: Sequence[Episode]) -> bool:
-    values = [episode.of_institutions[name] for episode in episodes]
-    return any(value > 0 or value < 0 for value in values)
-
-
-def institutions_table(played: Played) -> Cells | None:
-    """A column for each policy; a row for each metric, then for each agent what it was fined and given, and
-    its violations. None for a game without institutions, and where all of it is 0.
-
-    What is 0 under every policy has no row, nor have shares of something that never happened.
-    """
-    first = _first(played)
-    if set(OF_INSTITUTIONS).isdisjoint(first.reported):
-        return None
-    measured = [by_metric(episodes, attrgetter("of_institutions")) for episodes in played.values()]
-    together = [[one for of_replica in by.values() for one in of_replica] for by in played.values()]
-    seen = {
-        name
-        for name in first.of_institutions
-        if "in_force_" in name or any(_is_any(name, episodes) for episodes in together)
-    }
-    if all("equality" in name for name in seen):
-        return None
-    names = [name for name in first.of_institutions if name in seen or "equality" in name]
-    values = {with_unit(name): [metrics[name] for metrics in measured] for name in names}
-    rows, measures = _rows(values, dict(zip(values, names, strict=True)), played)
-    of_agents = {
-        word: [np.mean([getattr(episode, name) for episode in episodes], 0) for episodes in together]
-        for name, word in _OF_AGENTS.items()
-        if getattr(first, name) is not None
-    }
-    of_agents = {word: means for word, means in of_agents.items() if np.any(means)}
-    for agent in range(len(first.return_)) if of_agents else ():
-        texts = (
-            " / ".join(f"{means[place][agent]:.1f}" for means in of_agents.values())
-            for place in range(len(played))
-        )
-        rows.append([f"agent {agent}: {' / '.join(of_agents)}", *texts, *[""] * (len(played) - 1)])
-    notes = "\n".join([f"{INTERVALS}; of agents, means", *notes_on(measures)])
-    return Cells("institutions", ["", *played, *_differences(played)], rows, notes)

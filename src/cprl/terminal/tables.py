@@ -11,7 +11,6 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from io import StringIO
-from math import isnan
 from pathlib import Path
 from textwrap import TextWrapper
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Union
@@ -42,7 +41,6 @@ _LATEX: Final = str.maketrans(
         **{sign: f"\\{sign}" for sign in "&%$#_{}"},
     }
 )
-_OF_CSV: Final = ("value", "low", "high", "replicas", "episodes", "undefined", "p_value", "differs")
 
 
 @dataclass(frozen=True)
@@ -173,20 +171,16 @@ def csv_rows(tables: Iterable[Cells]) -> Iterator[dict[str, Any]]:
         for row in table.rows:
             name = ", ".join(map(str, row[:names]))
             for head, part in zip(table.head[names:], row[names:], strict=True):
-                yield {
-                    "table": " ".join(table.heading.split()),
-                    "row": name,
-                    "column": head,
-                    **_numbers(part),
-                }
+                place = {"table": " ".join(table.heading.split()), "row": name, "column": head}
+                yield {**place, **_numbers(part)}
 
 
 def _numbers(part: Cell) -> dict[str, Any]:
+    from cprl.measuring.statistics import numbers_of
+
     if isinstance(part, str):
         return {"text": part}
-    one = part.estimate if isinstance(part, Change) else part
-    numbers = {name: getattr(one, name) for name in _OF_CSV}
-    return {name: "" if isnan(number) else number for name, number in numbers.items()}
+    return dict(numbers_of(part.estimate if isinstance(part, Change) else part))
 
 
 def _as_text(tables: Sequence[Cells], notes: Sequence[str]) -> str:
@@ -208,10 +202,10 @@ def _as_latex(tables: Sequence[Cells], notes: Sequence[str]) -> str:
 
 
 def _as_csv(tables: Sequence[Cells], notes: Sequence[str]) -> str:
+    from cprl.measuring.statistics import NUMBERS
+
     written = StringIO(newline="")
-    writer = csv.DictWriter(
-        written, ["table", "row", "column", *_OF_CSV, "text"], restval="", lineterminator="\n"
-    )
+    writer = csv.DictWriter(written, ["table", "row", "column", *NUMBERS, "text"], lineterminator="\n")
     writer.writeheader()
     writer.writerows(csv_rows(tables))
     return written.getvalue()

@@ -8,6 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
+import pyarrow as pa
 import torch
 from torchrl.envs import EnvBase
 
@@ -16,6 +17,7 @@ from cprl.envs.state import transforms_state
 from cprl.envs.unwrap import agent_names
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode, own_name, try_own_metrics
+from cprl.measuring.table import where
 from cprl.population import exploration_steps, partners_in
 from cprl.runs.checkpoints import (
     FOLDER,
@@ -27,7 +29,7 @@ from cprl.runs.checkpoints import (
     is_ending,
     refuse_to_extend,
 )
-from cprl.runs.episodes import EpisodeTable
+from cprl.runs.episodes import EpisodeTable, labelled
 from cprl.runs.files import LOCK_FILE, RunLockedError, refuse_missing, write_json
 from cprl.runs.length import Length
 from cprl.runs.loggers import LoggerCallback, check_logger, make_logger
@@ -70,7 +72,7 @@ from cprl.training.outcome import (
     write_evaluation,
 )
 from cprl.training.training import Training, check_callbacks, train
-from cprl.values import Custom, Range, checked, made, words_of_metric
+from cprl.values import Custom, Range, checked, made
 from cprl.viewer.page import check_watch
 from cprl.viewer.page import linger as stay_served
 
@@ -142,7 +144,7 @@ def run(
         env, population = make_agents(experiment, starts=not is_begun, weights=weights)
     observers: list[Any] = [*(made(callback) for callback in experiment.callbacks), *callbacks]
     check_callbacks(observers)
-    try_own_metrics(experiment.metrics, env)
+    words = try_own_metrics(experiment.metrics, env)
     length = refuse_another_run(out, experiment.to_recipe, Experiment) if resume else experiment.length
     is_shorter = length.is_shorter_than(experiment.length)
     if resumed is not None and not is_shorter and (resumed / REPORT).exists():
@@ -157,7 +159,7 @@ def run(
         with checkpointer:
             if resume:
                 _begin_again(directory, experiment, is_begun=is_begun, length=length)
-            write_metrics(directory, {own_name(one): words_of_metric(one) for one in experiment.metrics})
+            write_metrics(directory, words)
             viewer = closing.enter_context(_make_viewer(watch, directory, experiment, env, population))
             work = _Work(directory, experiment, env, population, viewer, resume)
             _carry_out(work, observers, checkpointer, times, figures=figures)
@@ -206,9 +208,10 @@ def _carry_out(
         work.viewer.random_play(random)
     training = _train(work, observers, checkpointer)
     played = _evaluate(work, random)
-    figure = _draw(work.experiment, work.directory, training, played["random"]) if figures else None
+    table = _table(work, played)
+    figure = _draw(work.experiment, work.directory, training, table) if figures else None
     _write_report(work.directory, training, times)
-    _summarise(work, training, played, figure)
+    _summarise(work, training, table, figure)
     checkpointer.done()
     _say_what_is_kept(work.directory, work.experiment)
 
@@ -256,13 +259,30 @@ def _evaluate(work: _Work, random: list[Episode] | None) -> dict[str, list[Episo
     return played
 
 
+def _table(work: _Work, played: Mapping[str, list[Episode]]) -> pa.Table:
+    """Return the episodes of the evaluation as one table, labelled by "policy": random play, and
+    trained, where any agent learns, with the probability with which those with action values explore;
+    others draw from a policy."""
+    learners = work.population.learners.values()
+    chances = {learner.settings.epsilon_evaluation for learner in learners if not learner.actor.stochastic}
+    trained = "trained" + "".join(f", epsilon {chance:g}" for chance in sorted(chances))
+    columns = {"random": played["random"], trained if learners else "agents": played["trained"]}
+    each = work.experiment.evaluation_episodes
+    return labelled(
+        ({"policy": name}, *of_replica)
+        for name, episodes in columns.items()
+        for of_replica in by_replica(episodes, each).items()
+    )
+
+
 @working("drawing the training curve")
-def _draw(experiment: Experiment, directory: Path, training: Training, random: list[Episode]) -> Path | None:
+def _draw(experiment: Experiment, directory: Path, training: Training, played: pa.Table) -> Path | None:
     if not all(training.episodes_by_replica):
         say(f"No training curve: a replica has ended no episode in {training.steps:,} steps")
         return None
     steps = exploration_steps(experiment.agents)
     ends = None if steps is None else steps / experiment.worlds
+    random = where(played, policy="random")
     return training_curve(directory, title=_title(experiment), random=random, exploration_turns=ends)
 
 
@@ -283,22 +303,14 @@ def _write_report(directory: Path, training: Training, times: Times) -> None:
     write_json(directory / REPORT, report)
 
 
-def _summarise(
-    work: _Work, training: Training, played: Mapping[str, list[Episode]], figure: Path | None
-) -> None:
-    """Prints the outcome. Agents are called trained, where any learns, with the probability with which those
-    with action values explore; others draw from a policy."""
-    learners = work.population.learners.values()
-    chances = {learner.settings.epsilon_evaluation for learner in learners if not learner.actor.stochastic}
-    heading = "trained" + "".join(f", epsilon {chance:g}" for chance in sorted(chances))
-    columns = {"random": played["random"], heading if learners else "agents": played["trained"]}
+def _summarise(work: _Work, training: Training, played: pa.Table, figure: Path | None) -> None:
+    """Print the outcome."""
     notes = filter(None, (summary(training.finite.reported), work.experiment.own_code))
-    each = work.experiment.evaluation_episodes
-    has_course = all(training.episodes_by_replica) and set(NEEDED) <= set(played["trained"][0].social)
+    has_course = all(training.episodes_by_replica) and set(NEEDED) <= set(played.column_names)
     summarise(
         work.directory,
         title=_title(work.experiment),
-        played={name: by_replica(episodes, each) for name, episodes in columns.items()},
+        played=played,
         course=course_of(work.directory, work.experiment.agents) if has_course else "",
         figure=figure,
         note="\n".join(notes) or None,

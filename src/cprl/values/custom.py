@@ -58,7 +58,7 @@ class Custom:
         return hash((self.target, json.dumps(self.arguments, sort_keys=True)))
 
     def resolve(self) -> Any:
-        """What the target names, imported."""
+        """Import the target and return it."""
         module, _, name = self.target.partition(":")
         try:
             target: Any = importlib.import_module(module)
@@ -72,6 +72,7 @@ class Custom:
         return target
 
     def make(self, *positional: Any) -> Any:
+        """Call the target with its arguments and return what it makes."""
         target = self.resolve()
         try:
             return target(*positional, **{name: _with_keys(value) for name, value in self.arguments.items()})
@@ -127,6 +128,7 @@ def words_of_metric(metric: Custom) -> dict[str, str]:
 
 
 def custom_targets(table: object) -> list[str]:
+    """Return the targets of all `Custom` in a table, sorted."""
     return sorted({str(entry.get("target")) for entry in _tables_of_customs(table)})
 
 
@@ -223,7 +225,7 @@ def shown(value: object) -> str:
 
 
 def made(value: Any, *positional: Any) -> Any:
-    """What a `Custom` makes; anything else as it is."""
+    """Return what a `Custom` makes; anything else as it is."""
     return value.make(*positional) if isinstance(value, Custom) else value
 
 

@@ -44,7 +44,7 @@ from cprl.envs.matrix import MatrixGame
 from cprl.envs.unwrap import base_env
 from cprl.measuring import now, phases
 from cprl.measuring.episodes import decisions_of, metrics_of
-from cprl.measuring.registry import METRICS, SOCIAL, colour, is_own, left_out, title
+from cprl.measuring.registry import INCOME, METRICS, SOCIAL, colour, is_own, left_out, title
 from cprl.measuring.series import OF_AGENTS
 from cprl.viewer.live import HEADER
 
@@ -127,7 +127,7 @@ class Curves:
     """The worlds W of each replica."""
     mean_over: int = 10
     """The episodes of a replica whose mean is the bold line, a multiple of W."""
-    metrics: tuple[str, ...] = tuple(name for name in SOCIAL if METRICS[name].is_stored)
+    metrics: tuple[str, ...] = tuple(name for name in SOCIAL if name != INCOME)
     """The metrics that the game reports, without the prefix `social/`."""
     has_phases: bool = True
     """Whether phases are found when the run ends: it is long enough, these metrics tell, and the means of W
