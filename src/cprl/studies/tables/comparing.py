@@ -61,9 +61,9 @@ def differences_of(
 
 
 def values_of(rows: pa.Table, metric: str) -> dict[str, dict[int, float]]:
-    """Return the mean of each replica in which a metric is defined, by condition and replica."""
+    """Return the mean of each replica in which a metric is defined, by condition and replica, in order."""
     values: dict[str, dict[int, float]] = {}
-    for row in by_replica(rows, metric, ["condition"]).to_pylist():
+    for row in by_replica(rows, metric, ["condition"]).sort_by("replica").to_pylist():
         of_condition = values.setdefault(row["condition"], {})
         if row["value"] is not None:
             of_condition[row["replica"]] = row["value"]
