@@ -20,7 +20,6 @@ from cprl import CommonsEnv, Custom, Experiment, Game, Rules, maps
 from cprl.evaluation import Fresh, evaluate_run
 from cprl.evaluation.film import Style, film, film_video
 from cprl.evaluation.film_pictures import EpisodePicture
-from cprl.evaluation.pages import run_table
 from cprl.institutions import Boundaries, GraduatedSanctions, Monitoring, Sanctioner, Tax, Vote
 from cprl.measuring.registry import reported_by
 from cprl.measuring.statistics import estimates, form_for
@@ -29,7 +28,7 @@ from cprl.policies.lanes import random_agents
 from cprl.population import Scripted
 from cprl.runs.episodes import read_episodes
 from cprl.terminal.figures import training_curve
-from cprl.terminal.summary import summarise
+from cprl.terminal.summary import compared, summarise
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.layout import layout, styles
@@ -272,7 +271,7 @@ def test_an_evaluation_reports_institutions(evaluation):
     assert measures["institutions/detection_rate"].value == 1.0
     paid = where(evaluation, policy="random", agent=2)["fines"].to_numpy().mean()
     assert measures["agent_2/fines"].value == pytest.approx(paid)
-    text = printed(run_table(evaluation))
+    text = printed(compared(evaluation, ""))
     assert "equality of incomes" in text or not measures["income_equality"].replicas
     assert "agent 2: fines, apples" in text
     assert "where one may bite" not in text, "undefined everywhere"

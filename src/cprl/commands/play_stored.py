@@ -229,10 +229,10 @@ def evaluate(run: Path, /, *, fresh: FreshFlags = Fresh(), files: TableFlags = T
     _begin(fresh.seed, run, files=files)
 
     from cprl.evaluation.evaluate import evaluate_run
-    from cprl.evaluation.pages import run_table
+    from cprl.terminal.summary import compared
 
     table = evaluate_run(run, fresh)
-    _show(table, files, [run_table(table)])
+    _show(table, files, [compared(table, "beside random play", names={"trained": "run's agents"})])
 
 
 def visits(

@@ -6,14 +6,12 @@ from typing import Final
 
 import pyarrow as pa
 
-from cprl.evaluation.lanes import said
-from cprl.measuring.registry import METRICS, OF_AGENTS, with_unit
-from cprl.measuring.statistics import Family, differences, estimates, notes_on
-from cprl.measuring.table import numbers_in, where
+from cprl.measuring.registry import METRICS, OF_AGENTS
+from cprl.measuring.statistics import Family, notes_on
 from cprl.system.defaults import Fresh
 from cprl.terminal import style
 from cprl.terminal.panels import draw_matrix, matrix_height
-from cprl.terminal.tables import Cell, Cells, Change
+from cprl.terminal.tables import Cells, Change
 from cprl.training.agents import LoadedRun
 
 OVER_REPLICAS: Final = "mean over replicas [95 % interval by Student's t]"
@@ -45,33 +43,6 @@ def says_nothing(number: str, family: Family) -> bool:
     is_of_institutions = is_payment if metric is None else metric.is_of_institutions
     found = (one for key, one in family.items() if key[-1] == number)
     return is_of_institutions and not any(one.replicas and one.value for one in found)
-
-
-def run_table(table: pa.Table) -> Cells:
-    """Return a row for each number, a column for the run's agents, for random ones, and for the difference.
-
-    Numbers of institutions that are 0 or undefined everywhere are left out.
-    """
-    agents = range(len(table["agent"].unique()))
-    amounts = [name for name in ("return", *OF_AGENTS) if name in table.column_names]
-    numbers = [*numbers_in(table), *(f"agent_{agent}/{name}" for name in amounts for agent in agents)]
-    levels = estimates(table, numbers, "policy")
-    changes = differences(table, numbers, "policy", {"policy": "random"})
-    told = [name for name in numbers if not says_nothing(name, levels)]
-    rows: list[list[Cell]] = []
-    for name in told:
-        change = changes.get(("trained", name))
-        difference = "" if change is None else Change(change)
-        title = with_unit(name, rewards=rewards_of(table))
-        rows.append([title, levels["trained", name], levels["random", name], difference])
-    if "harvest" in table.column_names:
-        harvests = [where(table, policy=policy)["harvest"].to_pylist() for policy in ("trained", "random")]
-        counts = (f"{each.count(0)} of {len(each)}" for each in harvests)
-        rows.append(["agents without a harvest, not in sustainability", *counts, ""])
-    zeros = "Numbers of institutions that are 0 or undefined everywhere are left out."
-    notes = said(table, "left_out"), zeros * (len(told) < len(numbers)), *notes_on(levels.values())
-    head = ["", "run's agents", "random", "run's agents - random, paired"]
-    return Cells("numbers of an episode, beside random play", head, rows, "\n".join(filter(None, notes)))
 
 
 def matrix_cells(family: Family, number: str, title: str, note: str = "") -> Cells:
