@@ -97,8 +97,8 @@ def test_nothing_is_written_over(suffix, tmp_path):
 def test_names_of_users_mean_nothing_in_markdown():
     names = {"a|b": r"a\|b", "pay_$1_$_": r"pay_\$1_\$_", "*a*": r"\*a\*", "<b>": r"\<b>", "a\nb": "a b"}
     assert [cell(name) for name in names] == list(names.values())
-    _, _, line, _ = markdown(Cells("", ["condition", "x"], [["*a*", Change(SAME)]]))
-    assert line.startswith(r"| \*a\* |")
+    _, _, line, _ = markdown(Cells("", ["condition", "x"], [["**a**", Change(SAME)]]))
+    assert line.startswith(r"| \*\*a\*\* |")
 
 
 def test_a_command_writes_what_it_prints_as_the_suffix_says(alike, tmp_path, monkeypatch, capsys):
