@@ -33,6 +33,7 @@ from cprl import CommonsEnv, presets
 from cprl.algorithms.off_policy import DQN
 from cprl.learners.base import LearningAgents
 from cprl.measuring import Episode
+from cprl.measuring.series import Observer
 from cprl.policies.lanes import random_agents
 from cprl.policies.present import PresentPolicy
 from cprl.system.process import prepare_process
@@ -95,8 +96,7 @@ def cost(run: Path, repeats: int) -> Cost:
     clock = Watched()
 
     def seconds(watch: ViewerCallback | None) -> float:
-        training.callbacks = [watch] if watch else []
-        training._on_step = [watch.on_step] if watch else []
+        training.observer = Observer([watch] if watch else [], env)
         started = time.perf_counter()
         clock.began = started if watch else None
         for _ in range(BLOCK):
@@ -162,6 +162,7 @@ def size(run: Path, episodes: int) -> tuple[int, int]:
     at_random = random_agents(game.spaces, AGENTS, replicas=REPLICAS, seed=0)
     with ViewerCallback(run, env, title="size", episodes=episodes) as watch:
         witness = Witness(watch)
+        observer = Observer([watch], env)
         training = Training(env, {}, others=at_random, episodes=10**9, callbacks=[witness])
         unseen = TensorDict({}, [REPLICAS])
         for number in range(episodes):
@@ -177,9 +178,9 @@ def size(run: Path, episodes: int) -> tuple[int, int]:
                     **episode.metrics,
                     "collective_return": better * episode.metrics["collective_return"],
                 }
-                told = replace(episode, world=replica, episode=number, metrics=metrics)
+                told = replace(episode, world=replica, replica=replica, episode=number, metrics=metrics)
                 names = [f"agent_{agent}/{name}" for agent in AGENTS for name in ("loss", "epsilon", "q")]
-                watch.on_episode(told, dict(zip(names, chance.random(len(names)).tolist(), strict=True)))
+                observer.on_episode(told, dict(zip(names, chance.random(len(names)).tolist(), strict=True)))
             if number % FLUSHED_EVERY == 0:
                 watch.logger.flush()
     return watch.logger.path.stat().st_size, watch.logger.frames

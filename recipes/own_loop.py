@@ -18,7 +18,6 @@ from statistics import fmean
 
 import torch
 import tyro
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.data import Categorical, LazyTensorStorage, TensorDictReplayBuffer
@@ -34,6 +33,7 @@ from cprl.learners.settings import DQNSettings
 from cprl.learners.transitions import transitions_of
 from cprl.measuring.episodes import Episode, EpisodeTracker
 from cprl.measuring.evaluate import evaluate, mean_return
+from cprl.measuring.series import Observer
 from cprl.measuring.table import where
 from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
@@ -79,9 +79,6 @@ class BestWeights:
         self.seed = int(env.worlds.now.seed[0, 0])
         self.path: Path | None = None
         self.best_return, self.best_episode, self._episodes = float("-inf"), -1, 0
-
-    def on_step(self, batch: TensorDictBase) -> None:
-        """Does nothing within an episode."""
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Counts an episode; every `every` episodes evaluates, and saves the weights if they are better."""
@@ -201,6 +198,7 @@ def learn(
     # HardUpdate copies at every (interval + 1)-th step, and once when it is made.
     target = HardUpdate(loss, value_network_update_interval=settings.target_every_episodes - 1)
     tracker = EpisodeTracker(1, env.game.agents)
+    observer = Observer(callbacks, env)
     losses = []
     for step, turn in enumerate(StepCollector(env, policy), start=1):
         buffer.extend(transitions_of(0, turn))
@@ -211,8 +209,7 @@ def learn(
             error.backward()
             adam.step()
             losses.append(error.item())
-        for callback in callbacks:
-            callback.on_step(turn)
+        observer.on_step(turn)
         for episode in tracker.add(turn):
             with torch.no_grad():
                 values = network(turn["next", "agents", "observation"][:, 0])
@@ -223,8 +220,7 @@ def learn(
             }
             losses.clear()
             target.step()
-            for callback in callbacks:
-                callback.on_episode(episode, learning)
+            observer.on_episode(episode, learning)
             if episode.episode + 1 == episodes:
                 return
 

@@ -13,10 +13,11 @@ from cprl.algorithms import DQN
 from cprl.commons.colours import COLOURS
 from cprl.commons.decoding import classes_seen
 from cprl.learners.settings import DQNSettings
+from cprl.measuring.series import Observer
 from cprl.policies.lanes import RandomActor
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.layout import Scene
+from cprl.viewer.scene import Scene
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -59,6 +60,11 @@ def names(view):
     for inner in getattr(view, "contents", None) or ():
         found += names(inner) if not isinstance(inner, str) else []
     return found
+
+
+def observing(viewer):
+    """An observer of a training that this viewer alone watches."""
+    return Observer([viewer], viewer.env, worlds=viewer.logger.curves.worlds)
 
 
 def frames(count, *, first_step=1):

@@ -11,8 +11,8 @@ from cprl.policies.lanes import LaneActor
 from cprl.policies.scripted import scripted_lanes
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.layout import APART, BAR, HIGH, decision_panels
 from cprl.viewer.replay import Decisions
+from cprl.viewer.scene import APART, BAR, HIGH, decision_panels
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A#A.\nv.<.>"), rules=Rules(window_rows=3, window_columns=5, episode_steps=9)

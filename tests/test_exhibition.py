@@ -25,8 +25,8 @@ from cprl.training.outcome import exhibited, fresh_env, random_play
 from cprl.viewer import exhibition
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.exhibition import BATCH_S, BATCH_STEPS, Exhibition
-from cprl.viewer.layout import curves_of, scene_of
 from cprl.viewer.live import Stream
+from cprl.viewer.scene import curves_of, scene_of
 
 REPLAY = DQNSettings(buffer_size=300, batch_size=4, hidden_cells=(8,), epsilon_hold_steps=10)
 ROLLOUT = RolloutSettings(rollout_steps=20, minibatch_size=10, hidden_cells=(8,))
@@ -109,22 +109,23 @@ class Kept:
         env, population = population_of(ALONE)
         policy, self.world = exhibited(ALONE, env, population)
         curves = curves_of(env.base_env, ALONE.game.agent_names, [], episodes=3)
+        live = SimpleNamespace(stream=self.fixed, exhibition=self.newest)
+        self.logger = SimpleNamespace(scene=scene_of(env.base_env, curves), live=live, episode=0)
         self.exhibition = Exhibition(
             policy,
             self.world,
             trained=env,
-            scene=scene_of(env.base_env, curves),
-            kept=self.fixed,
-            newest=self.newest,
+            logger=self.logger,
             clock=lambda: self.now,
             wait=lambda seconds: self.waits.append(seconds),
         )
 
     def step(self, count=1, episode=0):
         """So many steps of the training, each when the exhibition is due."""
+        self.logger.episode = episode
         for _ in range(count):
             self.now += exhibition.BATCH_S
-            self.exhibition.on_step(0, episode, None)
+            self.exhibition.on_step(None)
 
     def rows(self, component, entity="board"):
         """The values that viewers were sent."""
@@ -195,9 +196,10 @@ def test_the_present_policy_computes_its_own_replica_alone_and_acts_as_in_evalua
 
 def test_it_plays_ten_to_twelve_steps_a_second_however_often_the_training_asks(kept):
     assert 10 <= BATCH_STEPS / BATCH_S <= 12
+    kept.logger.episode = 7
     for thousandth in range(round(3000 * BATCH_S)):
         kept.now = thousandth / 1000
-        kept.exhibition.on_step(0, 7, None)
+        kept.exhibition.on_step(None)
     boards = kept.rows("SegmentationImage:buffer")
     assert abs(len(boards) - 3 * BATCH_STEPS) <= 2
     assert len({repr(board) for board in boards}) > len(boards) / 2, "the board moves"
@@ -236,7 +238,7 @@ def test_a_slow_exhibition_takes_one_percent_of_the_time(seconds, kept, monkeypa
     monkeypatch.setattr(Exhibition, "_step", slowly)
     while kept.now < 200:
         kept.now += 0.01
-        kept.exhibition.on_step(0, 0, None)
+        kept.exhibition.on_step(None)
     later = len(played) - BATCH_STEPS  # the first ones compile, which is not counted
     assert 0.007 * kept.now <= later * seconds <= 0.011 * kept.now
 

@@ -26,8 +26,9 @@ from cprl import CommonsEnv, Observation
 from cprl.commons.colours import APPLE, BEAM, COLOURS, FIRST_AGENT, GROUND, OTHER, PALETTE, SELF, WALL
 from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.viewer.board import boards, mosaic
-from cprl.viewer.layout import EMPTY_SITE, Scene, window_corners
 from cprl.viewer.logger import RerunLogger
+from cprl.viewer.names import EMPTY_SITE
+from cprl.viewer.scene import Scene, window_corners
 
 __all__ = ["strict_rerun"]
 

@@ -10,7 +10,6 @@ import sys
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from shutil import copytree
-from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -30,7 +29,9 @@ from cprl.commands import main as cli
 from cprl.evaluation.film import film
 from cprl.experiment import Experiment
 from cprl.measuring import EpisodeTracker
+from cprl.measuring.series import Observer
 from cprl.measuring.windows import last_of, mean_of_worlds, running_mean
+from cprl.policies.lanes import RandomActor
 from cprl.population import Frozen, Learning
 from cprl.runs import loggers
 from cprl.runs.curves import as_curves, worlds_of
@@ -40,7 +41,7 @@ from cprl.runs.length import Length
 from cprl.runs.recipe import read_recipe, refuse_another_run, resume_command, runs_in, start_run
 from cprl.studies.factors import changed
 from cprl.system.shipped import cprl_here
-from cprl.training.training import StepCollector
+from cprl.training.training import StepCollector, Training
 from cprl.values import Custom
 
 AGENT = Learning(DQN(settings=presets.dqn_settings("commons")))
@@ -117,7 +118,7 @@ def test_a_run_in_a_directory_of_any_name_is_trained_resumed_by_its_line_exporte
     among = replace(TINY, agents=(TINY.agents[0], Frozen(os.fspath(exported), 0)))
     loaded = cprl.load(cprl.run(among, Path(f"{name} among"), watch="off", figures=False))
     assert loaded.agent(1).network is not None
-    assert cprl.evaluate_run(exported, episodes=1).measures("trained")
+    assert len(cprl.evaluate_run(exported, cprl.Fresh(episodes=1)))
     assert film(started, Path("film.rrd"), replica=0, episode=0)[0].exists()
 
 
@@ -411,8 +412,10 @@ def files(folder):
 
 
 def test_each_episode_is_written_as_the_mean_of_the_replicas_and_of_each(tmp_path):
-    with loggers.LoggerCallback(csv_of(tmp_path), replicas=2, agents=("row", "column")) as callback:
-        play(MatrixGame(2), tit_for_tat, 12, callbacks=[callback])
+    named = MatrixGame(2)
+    named.group_map = {"agents": ["row", "column"]}
+    with loggers.LoggerCallback(csv_of(tmp_path)) as callback:
+        play(named, tit_for_tat, 12, callbacks=[callback])
     # Worlds play 5 and 6 turns: the first two episodes of both have ended after turns 6 and 12.
     assert files(tmp_path) == {
         "social/survival_steps": "0,5.5\n1,5.5\n",
@@ -434,15 +437,16 @@ def test_each_episode_is_written_as_the_mean_of_the_replicas_and_of_each(tmp_pat
 def course(run, batches, *, first=0, state=None, resumes=False):
     """Logs batches; returns the states of tracker and callback after each."""
     tracker = EpisodeTracker(2, 2)
-    callback = loggers.LoggerCallback(csv_of(run), replicas=2, resumes=resumes)
-    for each, before in zip((tracker, callback), state or (), strict=False):
+    callback = loggers.LoggerCallback(csv_of(run), resumes=resumes)
+    observer = Observer([callback], MatrixGame(2))
+    for each, before in zip((tracker, callback, observer), state or (), strict=False):
         each.load_state_dict(before)
     states = []
     for batch in batches[first:]:
-        callback.on_step(batch)
+        observer.on_step(batch)
         for episode in tracker.add(batch):
-            callback.on_episode(episode, {"agent_0/loss": float(episode.steps)})
-        states.append((tracker.state_dict(), callback.state_dict()))
+            observer.on_episode(episode, {"agent_0/loss": float(episode.steps)})
+        states.append((tracker.state_dict(), callback.state_dict(), observer.state_dict()))
     return states
 
 
@@ -472,33 +476,43 @@ def test_another_training_into_the_same_folder_is_written_behind_the_first(tmp_p
     assert files(tmp_path)["agent_0/return"].count("\n") == 4
 
 
-def test_a_callback_of_a_logger_takes_replicas_and_worlds_from_the_training(tmp_path):
-    callback = loggers.LoggerCallback(csv_of(tmp_path))
-    callback.on_start(SimpleNamespace(replicas=2, worlds=3))
-    callback.on_step(None)
-    assert callback.state_dict()["steps"] == 3
-    assert (callback._series.replicas, callback._series.worlds) == (2, 3)
-    for given in ({"replicas": 1}, {"worlds": 2}):
-        with pytest.raises(ValueError, match=f"{next(iter(given))}=.*leave it out"):
-            loggers.LoggerCallback(csv_of(tmp_path), **given).on_start(SimpleNamespace(replicas=2, worlds=3))
+def test_a_training_hands_out_numbers_of_its_replicas_and_worlds():
+    class Keeps:
+        def on_numbers(self, episode, numbers):
+            kept.append((episode, numbers))
+
+    kept = []
+    agents = {agent: RandomActor(2, seed=agent) for agent in (0, 1)}
+    training = Training(MatrixGame(6), {}, others=agents, episodes=6, worlds=3, callbacks=[Keeps()])
+    training.run()
+    assert [episode for episode, _ in kept] == [2, 5]
+    for _, numbers in kept:
+        assert {name: len(values) for name, values in numbers.items()} == {
+            "social/survival_steps": 2,
+            "agent_0/return": 2,
+            "agent_1/return": 2,
+            "time/env_steps": 1,
+            "time/env_steps_per_s": 1,
+        }
+    assert kept[-1][1]["time/env_steps"] == training.steps
 
 
-def test_an_episode_of_a_replica_that_a_logger_does_not_expect_is_refused_by_name(tmp_path):
-    tracker, callback = EpisodeTracker(2, 2), loggers.LoggerCallback(csv_of(tmp_path))
+def test_an_episode_of_a_replica_that_an_observer_does_not_expect_is_refused_by_name():
+    tracker = EpisodeTracker(2, 2)
     turns = list(itertools.islice(StepCollector(MatrixGame(2), tit_for_tat), 7))
     episodes = [episode for turn in turns for episode in tracker.add(turn)]
     (of_another, *_) = (episode for episode in episodes if episode.replica == 1)
     with pytest.raises(ValueError, match=r"replica 1; allowed: of replicas 0 to 0, as replicas says"):
-        callback.on_episode(of_another, {})
+        Observer([], MatrixGame(1)).on_episode(of_another, {})
 
 
 def test_numbers_that_are_undefined_are_not_written(tmp_path):
-    class Undefined(loggers.LoggerCallback):
+    class Undefined:
         def on_episode(self, episode, learning):
-            super().on_episode(episode, {"agent_0/loss": float("nan"), "agent_0/epsilon": 0.25})
+            learning |= {"agent_0/loss": float("nan"), "agent_0/epsilon": 0.25}
 
-    with Undefined(csv_of(tmp_path)) as callback:
-        play(MatrixGame(1), tit_for_tat, 5, callbacks=[callback])
+    with loggers.LoggerCallback(csv_of(tmp_path)) as callback:
+        play(MatrixGame(1), tit_for_tat, 5, callbacks=[callback, Undefined()])
     assert "agent_0/loss" not in files(tmp_path)
     assert files(tmp_path)["agent_0/epsilon"] == "0,0.25\n"
 

@@ -10,30 +10,31 @@ import numpy as np
 import pytest
 import rerun as rr
 import torch
-from recordings import GAME, SCENE, column, names, static, strict_rerun
+from recordings import GAME, SCENE, column, names, observing, static, strict_rerun
 from rerun.chunk import RrdReader
 from tensordict import TensorDict
-from test_now import SIXTEEN_WORLDS
+from test_how_it_goes import SIXTEEN_WORLDS
 from test_watch import connected, fake, received
 
-from cprl import CommonsEnv, Game, Rules, maps, presets
+from cprl import CommonsEnv, Game, Rules, maps
 from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, agent_colour
 from cprl.commons.readable import rules_of
 from cprl.envs import make_env
 from cprl.envs.matrix import MatrixGame, chicken, matching_pennies, prisoners_dilemma
 from cprl.institutions import Quota, Tax, Vote
 from cprl.measuring import social
-from cprl.measuring.phases import LONGEST, PHASES_BEGIN
-from cprl.measuring.registry import reported_by
 from cprl.policies.lanes import random_agents
 from cprl.runs.episodes import EpisodeTable
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.layout import Curves, Panels, curves_of, joint_actions, layout
+from cprl.viewer.frames import Filming, Wall
+from cprl.viewer.layout import layout
 from cprl.viewer.live import LiveStream, Stream
 from cprl.viewer.logger import RerunLogger, as_table, send_waiting
-from cprl.viewer.pictures import Lorenz, Plots, Turns, Visits, Wall, gini, lorenz_curve
-from cprl.viewer.story import CompilingNotice, Header, played, published_phases
+from cprl.viewer.pictures import Pictures, Samples, gini, lorenz_curve, visits_drawn
+from cprl.viewer.scene import Curves, Panels, curves_of, joint_actions, scene_of
+from cprl.viewer.story import CompilingNotice, Header, played
+from cprl.viewer.views import Plots
 
 __all__ = ["strict_rerun"]
 
@@ -53,12 +54,13 @@ def texts(path):
 def recorded(run, numbers, *, replicas=1, episodes=9, learning=lambda number: {}, finished=None, tagged=0):
     """The recording of a run whose agents harvest thirty apples in each episode of these numbers."""
     with ViewerCallback(run, CommonsEnv(GAME, replicas), title="run", episodes=episodes) as viewer:
+        observer = observing(viewer)
         if finished:
             viewer.random_play(finished["random"])
         for number in numbers:
             for world in range(replicas):
                 returned = 100.0 * world if replicas > 1 else 30.0
-                viewer.on_episode(fake(number, world, returned=returned, tagged=tagged), learning(number))
+                observer.on_episode(fake(number, world, returned=returned, tagged=tagged), learning(number))
         if finished:
             viewer.finished(finished)
             RrdReader(run / "run.rrd").store()  # closed, with its footer
@@ -87,7 +89,6 @@ def test_the_header_goes_from_the_beginning_to_the_end(tmp_path):
     assert said[-1] == (5, f"#### {line}")
     words = [text for text in texts(path) if "random play" in text]
     assert words == ["random play 282 [257, 307] apples; 0 of 2 boards died early"]
-    assert column(path, "phase/found", "StateChange:state") == ([], []), "too few episodes"
 
 
 def test_a_training_without_an_evaluation_or_that_was_stopped_ends_with_a_header_of_its_own(tmp_path):
@@ -133,10 +134,11 @@ def test_with_many_worlds_header_label_bold_line_and_new_bests_count_episodes(tm
     """The tragedy of sixteen worlds, as the viewer told it once: "steady, 333 apples" at 206."""
     with ViewerCallback(tmp_path, CommonsEnv(GAME, 16), title="run", episodes=288, worlds=16) as viewer:
         viewer.random_play([fake(0, 0, returned=280.0, tagged=0)] * 2)
+        observer = observing(viewer)
         for group, apples in enumerate(SIXTEEN_WORLDS):
             for world in range(16):
                 episode = fake(16 * group + world, world, returned=float(apples), tagged=0)
-                viewer.on_episode(replace(episode, replica=0), {})
+                observer.on_episode(replace(episode, replica=0), {})
     path = tmp_path / "run.rrd"
     said = [(at + 1, *text.split(" · ")[1:3]) for at, text in headers(path) if "random play 280" in text]
     assert [at for at, *_ in said] == list(range(16, 289, 16))
@@ -161,10 +163,11 @@ def test_the_header_of_a_finished_run_is_of_the_last_two_episodes_of_each_of_six
     fresh = [fake(0, 0, returned=280.0, tagged=0)] * 2
     with ViewerCallback(tmp_path, CommonsEnv(GAME, 16), title="run", episodes=64, worlds=16) as viewer:
         viewer.random_play(fresh)
+        observer = observing(viewer)
         for group, apples in enumerate((100, 200, 300, 400)):
             for world in range(16):
                 episode = fake(16 * group + world, world, returned=float(apples), tagged=0)
-                viewer.on_episode(replace(episode, replica=0), {})
+                observer.on_episode(replace(episode, replica=0), {})
         viewer.finished({"random": fresh, "trained": fresh})
     assert " · while learning 350 apples, trained 280, " in headers(tmp_path / "run.rrd")[-1][1]
 
@@ -173,12 +176,13 @@ def test_header_and_timelines_count_the_episodes_that_all_replicas_have_ended(tm
     """The first replica is far ahead; its last apples and frames stand where the header is."""
     env = CommonsEnv(GAME, 4)
     with ViewerCallback(tmp_path, env, title="run", episodes=20, worlds=2) as viewer:
+        observer = observing(viewer)
         for number, world in ((0, 0), (1, 1), (2, 0), (3, 1), (4, 0), (5, 0)):
-            viewer.on_episode(replace(fake(number, world, returned=30.0, tagged=0), replica=0), {})
+            observer.on_episode(replace(fake(number, world, returned=30.0, tagged=0), replica=0), {})
         for number, world in ((0, 2), (1, 3)):
-            viewer.on_episode(replace(fake(number, world, returned=30.0, tagged=0), replica=1), {})
+            observer.on_episode(replace(fake(number, world, returned=30.0, tagged=0), replica=1), {})
         assert viewer._episode == 2
-        viewer.on_episode(replace(fake(6, 0, returned=30.0, tagged=0), replica=0), {})
+        observer.on_episode(replace(fake(6, 0, returned=30.0, tagged=0), replica=0), {})
     path = tmp_path / "run.rrd"
     said = headers(path)
     assert said[1][1].startswith("#### Episode 2 of 20 ")
@@ -207,18 +211,21 @@ def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_g
     (tmp_path / "recipe.json").write_text("{}")
     env, common = CommonsEnv(GAME, 2), {"title": "run", "episodes": 70}
     with ViewerCallback(tmp_path, env, file_name="whole.rrd", **common) as whole:
-        play(range(70), whole)
+        play(range(70), observing(whole))
     with ViewerCallback(tmp_path, env, **common) as first:
+        observer = observing(first)
         with EpisodeTable(tmp_path / "episodes.parquet") as table:
-            play(range(49), first, table)
-            play([49], first, table, worlds=[0])
-        state = first.state_dict()
+            play(range(49), observer, table)
+            play([49], observer, table, worlds=[0])
+        state, observed = first.state_dict(), observer.state_dict()
     assert headers(tmp_path / "run.rrd")[-1][1].startswith("#### Stopped after 49 of 70 episodes")
     with ViewerCallback(tmp_path, env, live="serve", **common) as second:
         second.load_state_dict(state)
-        second.on_start(SimpleNamespace(steps=1000))
-        play([49], second, worlds=[1])
-        play(range(50, 70), second)
+        observer = observing(second)
+        observer.load_state_dict(observed)
+        observer.on_start(SimpleNamespace(steps=1000))
+        play([49], observer, worlds=[1])
+        play(range(50, 70), observer)
         second.flush()
         seen_by_viewers(second.logger, tmp_path / "seen", "social/collective_return", list(range(70)))
     files = [tmp_path / name for name in ("run.rrd", "run-2.rrd")]
@@ -257,23 +264,6 @@ def seen_by_viewers(logger, folder, entity, episodes):
     finally:
         client.terminate()
         client.wait()
-
-
-def test_phases_of_the_published_game_stand_beside_those_found():
-    commons = presets.game("commons", variant="as_run")
-    assert published_phases(commons) == dict(
-        zip((0, *PHASES_BEGIN), ("exploration", "tragedy", "combat", "cultivation"), strict=True)
-    )
-    assert published_phases(presets.game("single_basic")) == published_phases(None) == {}
-
-
-def test_a_recording_of_a_training_too_long_for_the_search_has_no_phases():
-    env = CommonsEnv(GAME, 1)
-    shown = {
-        episodes: curves_of(env, GAME.agent_names, reported_by(env), episodes=episodes).has_phases
-        for episodes in (999, 1000, LONGEST, LONGEST + 1)
-    }
-    assert shown == {999: False, 1000: True, LONGEST: True, LONGEST + 1: False}
 
 
 def test_while_code_is_compiled_the_live_header_says_for_how_long(monkeypatch):
@@ -364,8 +354,9 @@ def test_a_recording_of_a_matrix_game_has_the_sum_of_returns_and_shares_of_joint
         viewer.random_play([fake(0, 0, returned=-7.0, tagged=0)])
         for action in ([[0, 0], [1, 1]], [[0, 1], [1, 1]]):
             viewer.on_step(TensorDict({("agents", "action"): torch.tensor(action)}, [2]))
+        observer = observing(viewer)
         for world, returned in ((0, -5.0), (1, -8.0)):
-            viewer.on_episode(fake(0, world, returned=returned, tagged=0), {})
+            observer.on_episode(fake(0, world, returned=returned, tagged=0), {})
     path = tmp_path / "run.rrd"
     assert column(path, "joint_actions", "Scalars:scalars")[1] == [[0.25, 0.25, 0, 0.5]]
     assert column(path, "return_of_all", "Scalars:scalars")[1] == [[-5, -8, -6.5, -6.5]]
@@ -442,19 +433,18 @@ def test_before_the_first_point_viewers_see_random_play_and_read_when_curves_beg
         }
         sent.append((name, at[1], values))
 
-    curves = curves_of(CommonsEnv(GAME, 16), GAME.agent_names, ["harvest"], episodes=300, worlds=16)
+    env = CommonsEnv(GAME, 16)
+    curves = scene_of(env, curves_of(env, GAME.agent_names, ["harvest"], episodes=300, worlds=16))
     logger = SimpleNamespace(curves=curves, log_columns=log_columns, log_static=lambda *parts: None)
     Plots(logger).random_play([fake(0, 0, returned=280.0, tagged=0)])
     lines = {name: (at, values["Scalars:scalars"]) for name, at, values in sent}
     assert lines["random_play/collective_return"] == ([0, 1], [[280.0], [280.0]]), "a line needs two points"
-    sent.clear()
-    Turns(CommonsEnv(GAME, 16), logger, every=15)
-    Lorenz(logger, every=20)
-    said = [(name, values["Points2D:labels"]) for name, _, values in sent]
-    assert said == [
-        ("turn/title", [["lines from episode 16 on"]]),
-        ("lorenz/title", [["lines from episode 32 on"]]),
-    ]
+    for every, first in ((15, 16), (20, 32)):
+        sent.clear()
+        Pictures(logger, Samples(env, logger), every=every)
+        said = [(name, values["Points2D:labels"]) for name, _, values in sent]
+        words = [[f"lines from episode {first} on"]]
+        assert said == [("turn/title", words), ("lorenz/title", words)]
 
 
 def view_of(viewer, kind):
@@ -468,7 +458,7 @@ def run(tmp_path_factory):
 
 def test_the_gini_coefficient_of_a_lorenz_curve_is_one_minus_equality():
     for harvest in ([4.0, 1.0, 0.0], [2.0, 2.0], [0.0, 0.0, 0.0, 9.0], [5.0]):
-        equality = float(social.equality(harvest))
+        equality = float(social.equality(np.array(harvest)))
         assert gini(lorenz_curve(np.array(harvest))) == pytest.approx(1 - equality)
     assert np.isnan(lorenz_curve(np.zeros(3))).all()
 
@@ -518,7 +508,7 @@ def test_the_line_of_a_replica_is_its_stock_turn_by_turn(run):
     steps = sum(own.steps for own in first[:-1])
     stocks = seen.stocks[steps : steps + first[-1].steps - 1]
     expected = [(0, len(SMALL.map.sites)), *enumerate(stocks, 1), (first[-1].steps, first[-1].stock_left)]
-    assert view_of(viewer, Turns).lines[0] == expected
+    assert view_of(viewer, Samples).lines[0] == expected
     _, colours = column(path, "turn/lines", "LineStrips2D:colors")
     died = [own.terminated for own in seen.episodes if own.episode == 5]
     assert len(set(colours[-1])) == len(set(died))
@@ -526,12 +516,12 @@ def test_the_line_of_a_replica_is_its_stock_turn_by_turn(run):
 
 def test_maps_show_where_agents_were_in_their_hues(run):
     path, viewer, _ = run
-    visits = view_of(viewer, Visits)
-    visits.counts[:] = 0
-    assert (visits.maps()[:, 1, 1:-1] == PALETTE[GROUND]).all()
-    assert (visits.maps()[:, 2, 3] == PALETTE[WALL]).all()
-    visits.counts[[0, 1], [0, 2], [0, 4]] = [9, 1]
-    drawn = visits.maps()
+    scene = viewer.logger.scene
+    visits = np.zeros((2, scene.height, scene.width), np.int64)
+    assert (visits_drawn(visits, scene)[:, 1, 1:-1] == PALETTE[GROUND]).all()
+    assert (visits_drawn(visits, scene)[:, 2, 3] == PALETTE[WALL]).all()
+    visits[[0, 1], [0, 2], [0, 4]] = [9, 1]
+    drawn = visits_drawn(visits, scene)
     assert drawn[0, 1, 1].tolist() == list(agent_colour(0)), "the longest stay is brightest"
     assert drawn[1, 3, 5].sum() < sum(agent_colour(1))
     assert drawn[1, 3, 5].argmax() == np.argmax(agent_colour(1))
@@ -566,33 +556,34 @@ def test_the_text_of_a_board_is_orange_after_an_episode_in_which_it_died(run):
 class Listener:
     """Takes what is logged, as a logger with viewers does."""
 
-    is_live, frames = True, 12
+    is_live, frames, episode = True, 12, 3
 
-    def __init__(self):
+    def __init__(self, scene):
+        self.scene = self.curves = scene
+        self.step = self.turn = 0
         self.rows, self.live_only = [], []
 
     def log_static(self, name, *what):
         """Nothing."""
 
-    def do(self, what, *, live_only=False):
+    def log_columns(self, entity, at, columns, *, live_only=False):
         self.live_only.append(live_only)
-        what(self)
-
-    def send_columns(self, entity, at, columns):
-        self.rows.append((entity, {line.timeline_name(): line.as_arrow_array().to_pylist() for line in at}))
+        self.rows.append((entity, dict(zip(("step", "episode", "frame"), map(list, at), strict=True))))
 
 
 def test_viewers_get_the_wall_every_two_seconds_and_the_file_does_not(run, monkeypatch):
     _, viewer, _ = run
-    clock, listener = iter(np.arange(10.0, 20.0, 0.8)), Listener()
+    clock, listener = iter(np.arange(10.0, 20.0, 0.8)), Listener(viewer.logger.scene)
     perf_counter = SimpleNamespace(perf_counter=lambda: next(clock))  # other threads have the clock itself
-    monkeypatch.setattr("cprl.viewer.pictures.time", perf_counter)
-    wall = Wall(viewer.env, listener, viewer.logger.scene, recorded_steps=100)
+    filming = Filming(None, listener, episodes=1)
+    monkeypatch.setattr("cprl.viewer.frames.time", perf_counter)
+    wall = Wall(viewer.env, listener, filming, listener.scene, recorded_steps=100)
     for step in range(1, 10):
-        wall.on_step(step, 3, None)
+        listener.step = listener.turn = step
+        wall.on_step(None)
     boards_at = [at for name, at in listener.rows if name == "wall/boards"]
     assert boards_at == [{"step": [step], "episode": [3], "frame": [12]} for step in (1, 4, 7)]
-    assert listener.live_only == [True] * 3
+    assert listener.live_only == [True] * 6
 
 
 def test_the_numbers_of_an_evaluation_are_means_with_their_interval_over_replicas():
@@ -607,10 +598,11 @@ def test_the_numbers_of_an_evaluation_are_means_with_their_interval_over_replica
 
 def test_who_tagged_whom_is_a_matrix_of_tags_in_an_episode_of_the_last_fifty(tmp_path):
     with ViewerCallback(tmp_path, CommonsEnv(GAME, 2), title="run", episodes=60) as viewer:
+        observer = observing(viewer)
         for number in range(60):
             for world in (0, 1):
                 episode = fake(number, world, returned=30.0, tagged=2 if number < 10 else world)
-                viewer.on_episode(episode, {})
+                observer.on_episode(episode, {})
     path = tmp_path / "run.rrd"
     episodes, labels = column(path, "tags/counts", "Points2D:labels", "episode")
     assert episodes == [9, 19, 29, 39, 49, 59]

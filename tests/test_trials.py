@@ -376,7 +376,7 @@ def test_loading_evaluating_and_resuming_warn_of_other_code_and_the_recipe_keeps
     write_module(text + "# edited\n")
     for use in (
         lambda: cprl.load(run),
-        lambda: cprl.evaluate_run(run, episodes=1),
+        lambda: cprl.evaluate_run(run, cprl.Fresh(episodes=1)),
         lambda: cprl.run(replace(experiment, episodes=3), run, resume=True, watch="off", figures=False),
     ):
         use()
@@ -651,8 +651,8 @@ def test_the_time_left_is_that_of_the_speed_at_which_trials_say_they_play(says, 
 
 def test_a_trial_says_its_speed_without_compiling_and_what_it_had_done_before(tmp_path, monkeypatch):
     now, clock = SimpleNamespace(s=0.0), SimpleNamespace(total_s=0.0, is_running=False)
-    monkeypatch.setattr("cprl.studies.status.time", SimpleNamespace(monotonic=lambda: now.s))
-    monkeypatch.setattr("cprl.studies.status.CLOCK", clock)
+    monkeypatch.setattr("cprl.system.times.time", SimpleNamespace(perf_counter=lambda: now.s))
+    monkeypatch.setattr("cprl.system.times.CLOCK", clock)
     file = StatusFile(Status(tmp_path, "trial"), TRIALS[0].experiment)
 
     def speed():

@@ -29,6 +29,7 @@ from cprl.evaluation.fresh import FreshEpisode, Recorded, fresh_episode, fresh_e
 from cprl.evaluation.lanes import commons_game
 from cprl.measuring.episodes import Episode, tracker_of
 from cprl.measuring.evaluate import turns
+from cprl.measuring.series import Observer
 from cprl.runs.files import refuse_to_write_over
 from cprl.system.defaults import FILM_SUFFIXES as SUFFIXES
 from cprl.system.memory import check_memory
@@ -98,24 +99,23 @@ def _recorded(fresh: FreshEpisode, target: Path, title: str) -> Episode:
     ) as viewer:
         logger = viewer.logger
         scene = logger.scene
-        observers: list[Any] = [viewer]
+        views: list[Any] = [viewer]
         if scene is not None:
             actions = fresh.run.game.actions
             window = scene.window
-            observers.append(
+            views.append(
                 Decisions(logger, fresh.policies, actions=actions, names=scene.agents, window=window)
             )
             if commons is not None and scene.has_institutions:
-                observers.append(Offences(logger, commons, names=scene.agents))
+                views.append(Offences(logger, commons, names=scene.agents))
+        observer = Observer(views, env)
         tracker = tracker_of(env)
         for step, batch in enumerate(turns(env, fresh.policies), start=1):
-            for observer in observers:
-                observer.on_step(batch)
+            observer.on_step(batch)
             for event in (*_tags_in(batch), *events(batch)):
                 _log(viewer, step, event)
             for episode in tracker.add(batch):
-                for observer in observers:
-                    observer.on_episode(episode, {})
+                observer.on_episode(episode, {})
                 _log(viewer, step, f"the end; {episode.outcome}")
     return episode
 

@@ -12,18 +12,19 @@ from markdown_it import MarkdownIt
 
 from cprl.commons.game import Game
 from cprl.commons.readable import growth_of, meaning_of, rule_of, tag_of
-from cprl.evaluation.evaluate import evaluate_run, run_table
+from cprl.evaluation.evaluate import evaluate_run
 from cprl.evaluation.fresh import fresh_episode
 from cprl.evaluation.show import Page, page, shown
-from cprl.measuring.series import Values
+from cprl.measuring.windows import Values
 from cprl.population import learned
 from cprl.runs.curves import curves_of
 from cprl.studies.results import SUMMARY, answer_of
 from cprl.studies.tables.table import StudyTable
-from cprl.system.defaults import SEED, STUDY_TABLE
+from cprl.system.defaults import SEED, STUDY_TABLE, Fresh
 from cprl.system.output import legible
 from cprl.system.working import working
 from cprl.terminal.figures import training_curve
+from cprl.terminal.summary import compared
 from cprl.terminal.tables import markdown
 from cprl.training.agents import LoadedRun, load
 from cprl.training.course import course_of
@@ -68,7 +69,7 @@ def report(
 
 def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
     game, name = run.game, legible(run.experiment.name.replace("_", " "))
-    evaluation = evaluate_run(run, episodes=episodes, seed=seed)
+    played = evaluate_run(run, Fresh(episodes=episodes, seed=seed))
     is_commons = isinstance(game, Game)
     data = shown([fresh_episode(run)])[0] if is_commons else None
     before = [growth_of(game)] if is_commons else []
@@ -79,7 +80,7 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
         before.append("  \n".join([*facts, f"**{meaning}**"]))
     before.append(f"{learned(run.specs)}, {run.experiment.trained_for}.")
     before.append(run.experiment.own_code)
-    after = ["## Fresh episodes, beside random play", "", *markdown(run_table(evaluation))]
+    after = ["## Fresh episodes, beside random play", "", *markdown(compared(played, "", names={"trained": "run's agents"}))]
     after += [
         "These episodes were played for this page, in other worlds than those above, so that means differ by "
         f"chance. The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`."

@@ -1,20 +1,97 @@
-"""Numbers that come episode by episode: of all replicas once each has ended it, and their recent mean."""
+"""Observer: what happens in a training, handed to all who show or write it; recent means of its numbers."""
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import ceil, isnan
 from statistics import fmean
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
 
+from cprl.envs.unwrap import agent_names
 from cprl.measuring.episodes import Episode
+from cprl.measuring.registry import OF_AGENTS
+from cprl.measuring.windows import Values
+from cprl.system.times import Speed
 
-Values = NDArray[np.float64]
+INSTITUTIONS: Final = "institutions/"
+"""How the names of metrics begin that are of institutions alone."""
+OF_GROUP: Final = ("social/", INSTITUTIONS)
+"""How the names of numbers begin that are of all agents together."""
+STEPS: Final = "time/env_steps"
+SPEED: Final = "time/env_steps_per_s"
+"""The environment steps of each replica so far, and those of all per second, compiling left out."""
 
-OF_AGENTS: Final = ("fines", "transfers", "violations")
-"""The fields of an episode that are numbers of each agent, where the game has institutions."""
+
+class Observer:
+    """Watches a training, and hands its callbacks turns, episodes, and numbers by name.
+
+    It is what calls callbacks. Numbers of an episode, by the names of docs/metrics.md, are handed out once
+    all replicas have ended it, and their speed with them: loggers and the viewer write or draw what they get.
+    A `Training` has one; a loop of your own makes one, and calls `on_step` and `on_episode`.
+
+    Args:
+        callbacks: Each has some of the methods of `cprl.training.Callback`.
+        env: The worlds of all replicas R, and the names of the agents.
+        worlds: The worlds W of each replica. Numbers are then means over every W episodes.
+    """
+
+    def __init__(self, callbacks: Sequence[Any], env: EnvBase, *, worlds: int = 1) -> None:
+        self.callbacks = list(callbacks)
+        self.steps = 0
+        """Steps of each replica so far."""
+        self._agents = agent_names(env)
+        self._series = Series(env.batch_size.numel() // worlds, worlds)
+        self._speed = Speed()
+        self._on_step = self._hooks("on_step")
+
+    def _hooks(self, name: str) -> list[Callable[..., None]]:
+        return [getattr(callback, name) for callback in self.callbacks if hasattr(callback, name)]
+
+    def on_start(self, training: Any) -> None:
+        """Go on where a training is."""
+        self.steps = training.steps
+        self._speed = Speed(self.steps * self._series.replicas)
+        for on_start in self._hooks("on_start"):
+            on_start(training)
+
+    def on_step(self, batch: TensorDictBase) -> None:
+        self.steps += self._series.worlds
+        for on_step in self._on_step:
+            on_step(batch)
+
+    def on_ended(self, ended: Sequence[tuple[Episode, dict[str, float]]]) -> None:
+        for on_ended in self._hooks("on_ended"):
+            on_ended(ended)
+        for episode, learning in ended:
+            self.on_episode(episode, learning)
+
+    def on_episode(self, episode: Episode, learning: dict[str, float]) -> None:
+        """Hand out an episode, and its numbers if all replicas have ended it."""
+        for on_episode in self._hooks("on_episode"):
+            on_episode(episode, learning)
+        numbers = self._series.add(episode, numbers_of(episode, learning, self._agents))
+        if numbers is None:
+            return
+        if self.steps:
+            numbers[STEPS] = np.array([float(self.steps)])
+            numbers[SPEED] = np.array([self._speed.lap(self.steps * self._series.replicas)])
+        for on_numbers in self._hooks("on_numbers"):
+            on_numbers(episode.episode, numbers)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"steps": self.steps, **self._series.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self.steps = int(state["steps"])
+        self._series.load_state_dict(state)
+
+
+def logged(metric: str) -> str:
+    """Return the name by which a metric is logged."""
+    return metric if "/" in metric else f"social/{metric}"
 
 
 def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence[str]) -> dict[str, float]:
@@ -24,10 +101,10 @@ def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence
         learning: the numbers of learning in it, by agent index: `agent_0/loss` and so on.
         agents: the agents' names, which replace `agent_0` and so on.
     """
-    numbers = {f"social/{name}": value for name, value in episode.social.items()}
+    metrics = episode.social | episode.of_institutions
+    numbers = {logged(name): value for name, value in metrics.items()}
     for agent, value in zip(agents, episode.return_, strict=True):
         numbers[f"{agent}/return"] = float(value)
-    numbers |= episode.of_institutions
     for name in OF_AGENTS:
         if (values := getattr(episode, name)) is not None:
             numbers |= {f"{agent}/{name}": float(value) for agent, value in zip(agents, values, strict=True)}
@@ -100,32 +177,20 @@ def mean_of(values: Values) -> float:
 
 
 class Recent:
-    """The mean of the last values: of a share of those so far, but of `least` at least.
+    """The mean of the last values.
 
     Args:
-        least: how many episodes at least; with fewer, the mean is that of all.
-        share: of the values so far, 0..1; 0 for a window of always `least`.
+        episodes: how many episodes it is of; with fewer, of all.
         each: the number of episodes that each value is the mean of.
     """
 
-    def __init__(self, least: int, *, share: float = 0.0, each: int = 1) -> None:
-        self.least = ceil(least / each)
-        """Values at least."""
-        self.share = share
-        self.count = 0
-        """Values so far."""
-        self._last: deque[float] = deque()
-
-    @property
-    def window(self) -> int:
-        """How many values the mean is of, at most."""
-        return max(self.least, ceil(self.share * self.count))
+    def __init__(self, episodes: int, *, each: int = 1) -> None:
+        self.window = ceil(episodes / each)
+        """How many values it is of, at most."""
+        self._last: deque[float] = deque(maxlen=self.window)
 
     def add(self, value: float) -> float:
         """Adds a value; returns the mean of the last ones that are defined, NaN if none is."""
-        self.count += 1
         self._last.append(float(value))
-        while len(self._last) > self.window:
-            self._last.popleft()
         defined = [value for value in self._last if not isnan(value)]
         return fmean(defined) if defined else float("nan")

@@ -61,6 +61,12 @@ class Estimate:
         most = max(self.bounds[1], self.value)
         return max(self.low, least), min(self.high, most)  # NaN stays NaN
 
+    def __neg__(self) -> Self:
+        """Return this difference the other way round."""
+        least, most = self.bounds
+        bounds_of_it = (-most, -least)
+        return replace(self, value=0.0 - self.value, low=-self.high, high=-self.low, bounds=bounds_of_it)
+
     @property
     def reach(self) -> float:
         """How far its interval goes on each side: of a difference, the smallest that so many replicas with as

@@ -7,7 +7,7 @@ it to `episodes.parquet`; `read_episodes` reads either.
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from errno import EIO, ENOENT
 from functools import partial
 from io import BytesIO, FileIO
@@ -21,7 +21,8 @@ import pyarrow.parquet as pq
 from tensordict import TensorDictBase
 
 from cprl.measuring import Episode
-from cprl.measuring.registry import METRICS, SOCIAL, TOTALS, left_out
+from cprl.measuring.registry import IN_FORCE, METRICS, SOCIAL, TOTALS, left_out
+from cprl.measuring.table import metrics_in, world_of
 from cprl.runs.files import (
     RECIPE_FILE,
     RECIPE_FORMAT,
@@ -208,6 +209,32 @@ def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
         return read_rows(path)
     _refuse_other_columns(path.with_suffix(".arrows"), table)
     return table
+
+
+def stored_episodes(run: Path) -> Iterator[Episode]:
+    """Yield the episodes of a run in the order in which they ended, without what its table lacks: who tagged
+    whom, and what institutions counted. A run without a table has none."""
+    try:
+        table = read_episodes(run)
+    except FileNotFoundError:
+        return
+    columns = {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
+    columns["world"] = world_of(table)
+    metrics = [name for name in metrics_in(table.schema) if name != "stock_left"]
+    in_force = [name for name in metrics if name.startswith(IN_FORCE)]
+    agents = int(max(columns["agent"], default=0)) + 1
+    for first in range(0, table.num_rows, agents):
+        rows = {name: values[first : first + agents] for name, values in columns.items()}
+        fields_of: dict[str, Any] = {name: int(rows[name][0]) for name in ("world", "replica", "episode")}
+        for field in fields(Episode):
+            name = field.name.removesuffix("_")
+            if name in rows and name in TOTALS:
+                fields_of[field.name] = rows[name] if TOTALS[name].axes == "N" else rows[name][0].item()
+        yield Episode(
+            **fields_of,
+            metrics={name: float(rows[name][0]) for name in metrics},
+            in_force=np.array([rows[name][0] for name in in_force]) if in_force else None,
+        )
 
 
 def read_rows(path: str | os.PathLike[str]) -> pa.Table:

@@ -1,18 +1,16 @@
 """LoggerCallback: writes the metrics of each episode to a TorchRL logger, e.g. TensorBoard or W&B."""
 
-import time
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib.util import find_spec
+from math import isnan
 from pathlib import Path
 from typing import Any, Final, Self
 
-import numpy as np
-from tensordict import TensorDictBase
 from torchrl.record.loggers import CSVLogger, Logger, get_logger
 
-from cprl.measuring.episodes import Episode
-from cprl.measuring.series import Series, Values, mean_of, numbers_of
+from cprl.measuring.series import OF_GROUP, mean_of
+from cprl.measuring.windows import Values
 
 PACKAGES: Final = ("tensorboard", "wandb")
 """The loggers that have a name, which is that of the package that each needs."""
@@ -81,10 +79,9 @@ class LoggerCallback:
 
     A callback of `cprl.training`, and a context manager. The step of every number is the episode, counted
     from 0; of replicas in W worlds every W episodes are written together. An episode is written once all
-    replicas have ended it: the mean over replicas as
-    `social/equality`, and with several replicas the metrics and returns of each as
-    `replica_0/social/equality`. Undefined values are not written, nor metrics that the game does not report,
-    see `cprl.measuring.registry`.
+    replicas have ended it: the mean over replicas as `social/equality`, and with several replicas the metrics
+    and returns of each as `replica_0/social/equality`. Undefined values are not written, nor metrics that the
+    game does not report.
 
     After a resume, the episodes after the checkpoint are played again, with the same steps. TorchRL's
     CSVLogger does not get those that its files have; other loggers get them again.
@@ -92,71 +89,30 @@ class LoggerCallback:
     Args:
         logger: any TorchRL logger, see `make_logger`. It is flushed at each checkpoint, and closed when the
             block ends, also by an error.
-        replicas: the number of replicas R; by default that of the training, and 1 outside of one.
-        worlds: the worlds W of each, likewise; a turn of them is W steps.
-        agents: the names of the agents; by default agent_0 and so on.
         resumes: whether an earlier process may have written episodes of the same training.
     """
 
     is_extendable = True
 
-    def __init__(
-        self,
-        logger: Logger,
-        *,
-        replicas: int | None = None,
-        worlds: int | None = None,
-        agents: Sequence[str] | None = None,
-        resumes: bool = False,
-    ) -> None:
+    def __init__(self, logger: Logger, *, resumes: bool = False) -> None:
         for method in ("log_metrics", "flush", "shutdown"):
             if not callable(getattr(logger, method, None)):
                 kind = type(logger).__name__
                 raise TypeError(f"logger is a {kind} without {method}; allowed: a TorchRL logger")
         self.logger = logger
-        self._agents = agents
         self._resumes = resumes
-        self._given = {"replicas": replicas, "worlds": worlds}
-        self._series = Series(replicas or 1, worlds or 1)
         self._last: dict[str, int] = {}
         """The last step that the logger has of each number, where it resumes."""
-        self._steps, self._steps_then, self._then = 0, 0, time.perf_counter()
 
-    def on_start(self, training: Any) -> None:
-        """Take the numbers of replicas and worlds from the training; others are refused."""
-        for name, given in self._given.items():
-            number = getattr(training, name)
-            if given not in (None, number):
-                raise ValueError(
-                    f"LoggerCallback has {name}={given}, and the training has {number}; leave it out"
-                )
-            setattr(self._series, name, number)
-
-    def on_step(self, batch: TensorDictBase) -> None:
-        """Count the environment steps of each replica."""
-        self._steps += self._series.worlds
-
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Write the numbers of an episode once all replicas have ended it."""
-        agents = self._agents or [f"agent_{agent}" for agent in range(len(episode.return_))]
-        numbers = numbers_of(episode, learning, agents)
-        by_replica = self._series.add(episode, numbers)
-        if by_replica is not None:
-            self._log(episode.episode, by_replica)
-
-    def _log(self, episode: int, by_replica: Mapping[str, Values]) -> None:
-        written = {name: mean_of(values) for name, values in by_replica.items()}
-        if self._series.replicas > 1:
-            for name, values in by_replica.items():
-                if name.startswith(("social/", "institutions/")) or name.endswith("/return"):
-                    for replica, value in enumerate(values):
-                        written[f"replica_{replica}/{name}"] = float(value)
-        if self._steps:
-            now, steps = time.perf_counter(), (self._steps - self._steps_then) * self._series.replicas
-            written["time/env_steps"] = float(self._steps)
-            written["time/env_steps_per_s"] = steps / (now - self._then)
-            self._then, self._steps_then = now, self._steps
-        defined = {name: value for name, value in written.items() if not np.isnan(value)}
+    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
+        """Write the numbers of an episode that all replicas have ended."""
+        written = {name: mean_of(values) for name, values in numbers.items()}
+        for name, values in numbers.items():
+            if len(values) > 1 and (name.startswith(OF_GROUP) or name.endswith("/return")):
+                written |= {
+                    f"replica_{replica}/{name}": value for replica, value in enumerate(values.tolist())
+                }
+        defined = {name: value for name, value in written.items() if not isnan(value)}
         if self._resumes:
             defined = {name: value for name, value in defined.items() if episode > self._last_step(name)}
         if defined:
@@ -168,15 +124,12 @@ class LoggerCallback:
         return self._last[name]
 
     def state_dict(self) -> dict[str, Any]:
-        """The number of steps and episodes; flushes the logger first."""
+        """Flush the logger; there is nothing else to keep."""
         self.logger.flush()
-        return {"steps": self._steps, "series": self._series.state_dict()}
+        return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self._resumes = True
-        self._steps = self._steps_then = int(state["steps"])
-        self._then = time.perf_counter()
-        self._series.load_state_dict(state["series"])
 
     def __enter__(self) -> Self:
         return self

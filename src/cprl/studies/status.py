@@ -20,7 +20,7 @@ from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
 from cprl.runs.files import RunLockedError, write_json
 from cprl.system.process import cpu
-from cprl.system.times import CLOCK
+from cprl.system.times import CLOCK, Speed
 from cprl.training import Training
 
 PATIENCE_S: Final = 60.0
@@ -102,8 +102,8 @@ class StatusFile:
         }
         self._began, self._compiled_s, self._worlds = time.monotonic(), CLOCK.total_s, experiment.worlds
         self._length = experiment.length
-        self._first: tuple[int, float] | None = None
-        """Episodes and seconds of work when this process began to train."""
+        self._speed = Speed()
+        """How fast episodes are played since this process began to train."""
         self._is_over = Event()
         self._thread = Thread(target=self._write_on, daemon=True)
 
@@ -129,13 +129,12 @@ class StatusFile:
     def write(self) -> None:
         self._table["beat"] += 1
         running_s, compiling_s = time.monotonic() - self._began, CLOCK.total_s - self._compiled_s
-        episodes, work_s = self._first or (self._table["episodes"], 0.0)
-        played, worked_s = self._table["episodes"] - episodes, running_s - compiling_s - work_s
+        per_s = self._speed.mean(self._table["episodes"])
         times = {
             "running_s": round(running_s, 1),
             "compiling_s": round(compiling_s, 1),
             "is_compiling": CLOCK.is_running,
-            "episodes_per_s": round(played / worked_s, 4) if played and worked_s > 0 else None,
+            "episodes_per_s": None if per_s is None else round(per_s, 4),
             "peak_bytes": peak_bytes(),
         }
         with suppress(OSError):  # of a full disk the run itself says more
@@ -144,8 +143,7 @@ class StatusFile:
     def on_start(self, training: Training) -> None:
         """Continues counting where the training does."""
         self._count(training.steps, training.episodes_played)
-        work_s = time.monotonic() - self._began - (CLOCK.total_s - self._compiled_s)
-        self._first = self._table["episodes"], work_s
+        self._speed = Speed(self._table["episodes"])
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Counts the steps of a replica: a turn of each of its worlds."""

@@ -1,8 +1,9 @@
-"""Where the time of a training goes, in seconds; CLOCK: that of compiling in this process."""
+"""Where the time of a training goes, in seconds, and how fast it is; CLOCK: compiling in this process."""
 
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from math import nan
 from typing import Any, Final
 
 from cprl.system.working import working
@@ -49,6 +50,42 @@ class CompileClock:
 
 
 CLOCK: Final = CompileClock()
+
+
+def running_s() -> float:
+    """Return the seconds of a clock that stands still while code is compiled."""
+    return time.perf_counter() - CLOCK.total_s
+
+
+class Speed:
+    """How fast something is counted, by a clock that stands still while code is compiled.
+
+    Args:
+        count: How many there are already; they took no time.
+    """
+
+    def __init__(self, count: float = 0) -> None:
+        self._began = self._then = running_s()
+        self._before = self._last = count
+
+    @property
+    def waited_s(self) -> float:
+        """Seconds since the last `lap`."""
+        return running_s() - self._then
+
+    def lap(self, count: float) -> float:
+        """Return how many came per second since the last lap, of so many by now; NaN for no time."""
+        waited_s = self.waited_s
+        came = count - self._last
+        self._then += waited_s
+        self._last = count
+        return came / waited_s if waited_s > 0 else nan
+
+    def mean(self, count: float) -> float | None:
+        """Return how many came per second from the beginning on; None if none came."""
+        spent_s = running_s() - self._began
+        came = count - self._before
+        return came / spent_s if came > 0 and spent_s > 0 else None
 
 
 class Times:

@@ -120,7 +120,7 @@ def _panels(run: Path, table: pa.Table, random: pa.Table | None, window: int, ov
             _Panel(
                 number=number,
                 values=values,
-                at=np.flatnonzero(is_there) - (over - 1) / 2,
+                at=np.asarray(np.flatnonzero(is_there) - (over - 1) / 2, np.float64),
                 means=means[:, is_there],
                 random=level,
                 evaluated=None if evaluations is None else _evaluated(evaluations, number),

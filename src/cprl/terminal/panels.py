@@ -9,7 +9,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from numpy.typing import ArrayLike
 
-from cprl.measuring.statistics import Estimate, Values
+from cprl.measuring.statistics import Estimate
+from cprl.measuring.windows import Values
 from cprl.terminal.style import CHARACTER, EMPTY, MEAN, Sheet, draw_cell, wrapped
 
 _BAND: Final = 0.2

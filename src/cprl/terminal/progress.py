@@ -1,6 +1,5 @@
 """The progress of a training in the terminal."""
 
-import time
 from collections import deque
 from collections.abc import Mapping
 from threading import Event, Thread
@@ -16,7 +15,7 @@ from tensordict import TensorDictBase
 from cprl.measuring.episodes import Episode
 from cprl.system.output import NotebookLine
 from cprl.system.output import console as safe_console
-from cprl.system.times import CLOCK
+from cprl.system.times import CLOCK, Speed
 from cprl.system.working import silent
 
 _BAR_PERIOD_S: Final = 0.25
@@ -84,9 +83,11 @@ class ProgressBar:
         self._all_steps = steps
         self._task = self._progress.add_task(title, total=steps or episodes, values="")
         self._latest = {"return": "-", "epsilon": ""}
-        self._turns = self._steps = self._steps_then = self._steps_running = self._episodes = 0
-        self._started = self._then = _running_s()
-        self._left_of, self._replicas, self._before = steps or episodes, replicas, 0.0
+        self._turns = self._steps = self._steps_running = self._episodes = 0
+        self._speed = Speed()
+        self._course = Speed()
+        """How fast steps, and episodes or steps of each replica, are done."""
+        self._left_of, self._replicas = steps or episodes, replicas
         self._worlds = replicas * worlds
         self._returns: deque[float] = deque(maxlen=self._worlds)
         self._notebook_line = NotebookLine()
@@ -107,20 +108,18 @@ class ProgressBar:
 
     def on_start(self, training: Any) -> None:
         """Continues where the training does."""
-        self._steps = self._steps_then = training.steps * self._replicas
+        self._steps = training.steps * self._replicas
         self._episodes = training.episodes_played
-        self._before = self._done()
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Counts the turns of a batch and updates the bar if it is due."""
         if not self._turns:  # do not count the time before the first step
-            self._started = self._then = _running_s()
+            self._speed, self._course = Speed(self._steps), Speed(self._done())
         self._turns += 1
         self._steps += batch.numel()
         self._steps_running += batch.numel()
-        waited = _running_s() - self._then
-        if waited > self._period_s:
-            self._show(waited)
+        if self._speed.waited_s > self._period_s:
+            self._show()
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         self._episodes += 1
@@ -133,13 +132,11 @@ class ProgressBar:
         if any(epsilons):
             self._latest["epsilon"] = f"{max(epsilons):.2f}"
 
-    def _show(self, waited: float) -> None:
-        rate = (self._steps - self._steps_then) / waited
-        self._steps_then, self._then = self._steps, _running_s()
+    def _show(self) -> None:
         values = f"return {self._latest['return']}"
         if self._latest["epsilon"]:
             values += f"  epsilon {self._latest['epsilon']}"
-        values += f"  {rate:,.0f} steps/s"
+        values += f"  {self._speed.lap(self._steps):,.0f} steps/s"
         done = self._done()
         values += self._time_left(done)
         self._progress.update(self._task, completed=done, values=values)
@@ -167,11 +164,10 @@ class ProgressBar:
 
     def _time_left(self, done: float) -> str:
         """The time left after so many episodes, in words; empty before enough steps were timed."""
-        since = done - self._before
-        if self._turns < TIMED_STEPS or not since:
+        per_s = self._course.mean(done)
+        if self._turns < TIMED_STEPS or per_s is None:
             return ""
-        left_s = (_running_s() - self._started) / since * (self._left_of - done)
-        return f"  {in_words(max(0.0, left_s))} left"
+        return f"  {in_words((self._left_of - done) / per_s)} left"
 
     def _say_compiling(self) -> None:
         """Prints lines while code is compiled; in a terminal the bar shows it."""
@@ -212,8 +208,3 @@ class _Now(ProgressColumn):
         if CLOCK.is_running:
             return Text(f"compiling, {CLOCK.total_s:.0f} s so far")
         return Text(str(task.fields["values"]))
-
-
-def _running_s() -> float:
-    """Seconds of a clock that stands still while code is compiled."""
-    return time.perf_counter() - CLOCK.total_s

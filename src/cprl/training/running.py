@@ -14,7 +14,6 @@ from torchrl.envs import EnvBase
 
 from cprl.commons.threads import MOST_THREADS
 from cprl.envs.state import transforms_state
-from cprl.envs.unwrap import agent_names
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode, own_name, try_own_metrics
 from cprl.measuring.table import where
@@ -74,7 +73,6 @@ from cprl.training.outcome import (
 from cprl.training.training import Training, check_callbacks, train
 from cprl.values import Custom, Range, checked, made
 from cprl.viewer.page import check_watch
-from cprl.viewer.page import linger as stay_served
 
 if TYPE_CHECKING:
     from cprl.viewer.callback import ViewerCallback
@@ -179,7 +177,7 @@ def run(
             if hasattr(callback, "on_finished"):
                 callback.on_finished(directory)
         if linger and viewer is not None:
-            stay_served(viewer.logger, viewer.play_on)
+            viewer.linger()
     return directory
 
 
@@ -220,13 +218,12 @@ def _train(work: _Work, observers: Sequence[Any], checkpointer: Checkpointer) ->
     """Trains with the callbacks that write the table of episodes, show the progress and write to loggers, and
     saves what was learned."""
     directory, experiment, env, population, viewer, _ = work
-    names = agent_names(env)
     watching = [] if viewer is None else [viewer]
     with ExitStack() as stack:
         table = stack.enter_context(EpisodeTable(directory / "episodes.parquet", resumable=True))
         bar = stack.enter_context(ProgressBar.of(experiment))
         loggers = [make_logger(made(logger), directory) for logger in experiment.loggers]
-        logging = [LoggerCallback(logger, agents=names, resumes=work.resumes) for logger in loggers]
+        logging = [LoggerCallback(logger, resumes=work.resumes) for logger in loggers]
         evaluations = Evaluations(directory, experiment, env, population)
         training = train(
             env,

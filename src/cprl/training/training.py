@@ -24,6 +24,8 @@ from cprl.experiment.experiment import OnNan
 from cprl.keys import Turn
 from cprl.learners.base import Learner
 from cprl.measuring.episodes import Episode, tracker_of
+from cprl.measuring.series import Observer
+from cprl.measuring.windows import Values
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import Decider
 from cprl.runs.checkpoints import Checkpointer
@@ -132,7 +134,7 @@ class Training:
         spaces = spaces_of(env)
         check_env(env, env.batch_size.numel())
         check_callbacks(callbacks)
-        self.env, self.callbacks = env, list(callbacks)
+        self.env = env
         self.worlds = worlds
         self.update_every = update_every
         self.learners, self.others = dict(learners), dict(others or {})
@@ -153,7 +155,8 @@ class Training:
         for learner in self.learners.values():
             learner.begin()
         self.finite = FiniteCheck(self.learners, spaces, worlds=worlds, on_nan=on_nan)
-        self._on_step = self._hooks("on_step")
+        self.observer = Observer(callbacks, env, worlds=worlds)
+        """What calls the callbacks."""
         self._played = [0] * self.replicas
         self.steps = 0
         """Steps of each replica so far."""
@@ -194,10 +197,13 @@ class Training:
         """Likewise, of each replica."""
         return [int(min(played, self._most_episodes)) for played in self._played]
 
+    @property
+    def callbacks(self) -> list[Any]:
+        return self.observer.callbacks
+
     def start(self) -> None:
         """Calls `on_start` of the callbacks; `run` does before the first step."""
-        for on_start in self._hooks("on_start"):
-            on_start(self)
+        self.observer.on_start(self)
 
     def run(self, checkpointer: Checkpointer | None = None) -> None:
         """Takes all steps, from the newest checkpoint on if there is one."""
@@ -209,9 +215,6 @@ class Training:
             self.step()
             if checkpointer is not None:
                 checkpointer.after_step(self)
-
-    def _hooks(self, name: str) -> list[Callable[..., None]]:
-        return [getattr(callback, name) for callback in self.callbacks if hasattr(callback, name)]
 
     def step(self) -> None:
         """The turns that the collector yields, one as a rule: act, store, update, measure, record."""
@@ -235,8 +238,7 @@ class Training:
                 for agents, learner in self.learners.items():
                     self._losses[agents].add(self._update(learner))
         self.times.busy_s += time.perf_counter() - began
-        for on_step in self._on_step:
-            on_step(batch)
+        self.observer.on_step(batch)
         ended = self._tracker.add(turn)
         if ended:
             self._end(ended, turn)
@@ -280,11 +282,8 @@ class Training:
             self._played[replica] += 1
             if number < self._most_episodes:
                 recorded.append((episode, of_agents))
-        for on_ended in self._hooks("on_ended") if recorded else ():
-            on_ended(recorded)
-        for episode, of_agents in recorded:
-            for on_episode in self._hooks("on_episode"):
-                on_episode(episode, of_agents)
+        if recorded:
+            self.observer.on_ended(recorded)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the future depends on, in tensors, numbers, lists and dicts; not copies.
@@ -309,6 +308,7 @@ class Training:
             "losses": [losses.state_dict() for losses in self._losses.values()],
             "wanted": self._wanted.state_dict(),
             "tracker": self._tracker.state_dict(),
+            "observer": self.observer.state_dict(),
             "callbacks": {name: callback.state_dict() for name, callback in self._with_state().items()},
             "not_finite": self.finite.state_dict(),
             "torch": torch.get_rng_state(),
@@ -355,6 +355,7 @@ class Training:
         if self.decisions is not None:
             self.decisions.load_state_dict(state["decisions"])
         self._tracker.load_state_dict(state["tracker"])
+        self.observer.load_state_dict(state["observer"])
         self.finite.load_state_dict(state["not_finite"], step=self.steps)
         for name, callback in self._with_state().items():
             if name in state["callbacks"]:  # a viewer may be added or left out from now on
@@ -410,11 +411,18 @@ class Callback(Protocol):
         loggers and the viewer of a run, and by callbacks that come later in a `Training`.
         """
 
+    def on_numbers(self, episode: int, numbers: dict[str, Values]) -> None:
+        """All replicas have ended an episode, counted from 0: its numbers by name, [R] of each replica, NaN
+        where undefined; of replicas in W worlds the last of W, whose means these are.
+
+        Those of the whole training, `time/env_steps` and `time/env_steps_per_s`, are of length 1.
+        """
+
     def on_finished(self, run: Path) -> None:
         """All of a run is written and said; by `cprl.run` alone, with the run's directory."""
 
 
-HOOKS: Final = ("on_start", "on_step", "on_ended", "on_episode", "on_finished")
+HOOKS: Final = ("on_start", "on_step", "on_ended", "on_episode", "on_numbers", "on_finished")
 
 
 def check_callbacks(callbacks: Sequence[Any]) -> None:

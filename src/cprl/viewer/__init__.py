@@ -1,16 +1,22 @@
 """The Rerun recording of a training.
 
 Modules, in the order in which one reads them:
-    callback   ViewerCallback: logs a training while it runs, by a list of views
-    story      header, live label, events, and the phases when it ends
-    pictures   View; lines, tags, all boards at once, where agents go, stock over the turn, Lorenz curve
-    board      which episodes are recorded frame by frame, and how a board looks
-    replay     what policies say of their actions, who breaks a rule, and what is paid
-    exhibition a world that the current policy plays, for viewers alone
-    layout     what a recording shows, with names and colours, and where the viewer shows it
-    logger     RerunLogger: TorchRL's logger interface on a recording
+    names      entities, and colours that several parts share
+    scene      the numbers and the board that a recording shows, and where parts of pictures stand
+    board      how a board looks, frame by frame: from frames to Rerun's columns
+    layout     how lines look, and where the viewer shows what
+    page       Rerun's viewers, native and in a browser
     live       the streams of a recording, to a file and served live, each of which may fail without harm
-    page       Rerun's viewers, native and in a browser; a finished run stays served until Ctrl-C
+    logger     RerunLogger: TorchRL's logger interface on a recording
+    views      View, a part of a recording: lines over episodes
+    frames     which episodes are recorded turn by turn; the boards of all replicas
+    pictures   who tagged whom, where agents go, stock over the turn, Lorenz curve: functions of what was seen
+    story      header, live label, and events
+    exhibition a world that the current policy plays, for viewers alone
+    replay     what policies say of their actions, who breaks a rule, and what is paid
+    callback   ViewerCallback: shows a training while it runs, by a list of views
+
+Each imports only from those above it.
 """
 
 from importlib import import_module

@@ -1,146 +1,23 @@
-"""The board of one world, frame by frame: which are recorded, and how they look in Rerun."""
+"""How the board of one world looks in Rerun, frame by frame."""
 
-import time
 from collections.abc import Mapping
 from functools import cache
-from math import ceil
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
 
-from cprl import keys
-from cprl.commons.colours import (
-    APPLE,
-    BEAM,
-    FIRST_AGENT,
-    GROUND,
-    PALETTE,
-    WALL,
-    agent_colour,
-    agent_mark,
-    class_colour,
-)
-from cprl.commons.decoding import UNSEEN, classes_seen
+from cprl.commons.colours import APPLE, BEAM, FIRST_AGENT, GROUND, PALETTE, WALL, agent_colour, agent_mark
+from cprl.commons.decoding import UNSEEN
 from cprl.commons.picture import DIGIT_HIGH, INK_COLOUR, MARK_COLOUR, POINTS, number_paths
 from cprl.commons.world import Bytes
-from cprl.envs.commons_env import CommonsEnv
-from cprl.viewer.layout import EMPTY_SITE, TEXT, Curves, Scene, classes, styles, window_corners
-from cprl.viewer.live import HEADER
-
-if TYPE_CHECKING:
-    from cprl.viewer.logger import RerunLogger
+from cprl.viewer.names import EMPTY_SITE, TEXT
+from cprl.viewer.scene import Scene, window_corners
 
 Floats = NDArray[np.float32]
 Frames = Mapping[str, NDArray[Any]]
 """Columns of `FrameRecorder.take`, [T, ...] each, with windows as classes of `classes_seen`."""
-
-FRAMES_BYTES: Final = 45_000_000
-"""The target size of a file's regular frames, about; the frames after new bests come on top."""
-_PERIOD_S: Final = 1.0
-_FEWEST_FRAMES, _MOST_FRAMES = 50, 5000
-"""Frames are sent when an episode ends, when there are many, or after a second if there are some: each chunk
-has overhead."""
-
-
-class FrameRecorder:
-    """Copies the state of the first world after each step, and returns the frames when they are due.
-
-    Windows show the observations of the `CommonsEnv` itself, without transforms.
-    """
-
-    def __init__(self, env: CommonsEnv, scene: Scene, *, has_windows: bool = True) -> None:
-        self._env, self._has_tags, self._has_windows = env, scene.has_tags, has_windows
-        self._frames: list[dict[str, NDArray[Any]]] = []
-        self._tagged_by = np.full(env.game.agents, -1, np.int32)
-        """Who tagged each agent last; -1 if unknown."""
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def add(self, batch: TensorDictBase, *, step: int = 0, episode: int = 0) -> None:
-        """Copy a frame; `batch` is the latest step, and `step` counts those of the whole run."""
-        if self._has_tags:  # of several shooters the first
-            tagged_by = batch["next"][keys.TAGGED_BY][0].cpu().numpy()
-            tagged = tagged_by.any(1)
-            self._tagged_by[tagged] = tagged_by.argmax(1)[tagged]
-        self.add_board(step=step, episode=episode)
-
-    def add_board(self, *, step: int = 0, episode: int = 0) -> None:
-        """Copy a frame of the board as it is, e.g. when an episode begins."""
-        board = self._env.worlds.show(self._env.output)
-        frame = {"step": step, "episode": episode, "beams": board.board == BEAM, "tagged_by": self._tagged_by}
-        for name in ("stock", "row", "col", "heading", "in_play", "harvested"):
-            frame[name] = getattr(board, name)
-        if self._has_windows:
-            frame["windows"] = board.observation
-        self._frames.append({name: np.array(value) for name, value in frame.items()})
-
-    def take(self) -> Frames | None:
-        """Return all frames as columns, [T, ...] each, for `RerunLogger.log_frames`, or None."""
-        taken, self._frames = self._frames, []
-        if not taken:
-            return None
-        frames = {name: np.stack([frame[name] for frame in taken]) for name in taken[0]}
-        if self._has_windows:
-            frames["windows"] = classes_seen(self._env.game, frames["windows"])
-        return frames
-
-
-class Filming:
-    """Logs the frames of the first world in every k-th episode, including the first and the last, and in the
-    episode after each new best."""
-
-    def __init__(
-        self, env: CommonsEnv | None, logger: "RerunLogger", scene: Scene | None, *, episodes: int
-    ) -> None:
-        self._logger, self._last, self._sent = logger, episodes - 1, time.perf_counter()
-        self._recorder: FrameRecorder | None = None
-        self.every = 0
-        """Episodes from one with frames to the next; 0 for no frames."""
-        if env is not None and scene is not None:
-            self._recorder = FrameRecorder(env, scene)
-            rows, columns = mosaic_size(len(scene.agents), scene.window)
-            # The largest size of a frame, about; with a trained population on `commons` it is 500 bytes.
-            size = 80 + 45 * len(scene.agents) + 0.35 * (rows * columns + scene.height * scene.width)
-            self.every = max(1, ceil(episodes * env.game.rules.episode_steps * size / FRAMES_BYTES))
-        self.shows_next = False
-        """Whether the running episode is recorded in any case."""
-        self.is_on = False
-        """Whether frames are recorded now; `choose` decides it."""
-
-    def is_shown(self, episode: int) -> bool:
-        """Whether the frames of an episode that runs now are recorded."""
-        is_chosen = self.every > 0 and (episode % self.every == 0 or self.shows_next or episode == self._last)
-        return is_chosen and episode <= self._last
-
-    def choose(self, episode: int) -> None:
-        self.is_on = self.is_shown(episode)
-
-    def add(self, batch: TensorDictBase, *, step: int, episode: int) -> int | None:
-        """Copies a frame if this episode's are recorded; returns its number, None if there is none."""
-        if self._recorder is None or not self.is_on:
-            return None
-        # Where an episode ends, the board is already that of the next one.
-        if keys.entry(keys.entry(batch, "next"), keys.DONE)[0, 0]:
-            self.send()
-            return None
-        self._recorder.add(batch, step=step, episode=episode)
-        count = len(self._recorder)
-        frame = self._logger.frames + count - 1
-        waited = time.perf_counter() - self._sent
-        if count >= _MOST_FRAMES or (waited > _PERIOD_S and count >= _FEWEST_FRAMES):
-            self.send()
-        return frame
-
-    def send(self) -> None:
-        self._sent = time.perf_counter()
-        frames = None if self._recorder is None else self._recorder.take()
-        if frames is not None:
-            self._logger.log_frames(frames)
-
 
 RADIUS_CELLS: Final = 0.045
 """Half the width of a line, in cells."""
@@ -278,38 +155,6 @@ def image_form(size: tuple[int, int]) -> Any:
 
 def board_form(scene: Scene) -> Any:
     return image_form((scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS))
-
-
-def fixed(curves: Curves) -> dict[str, list[Any]]:
-    """The static parts of a recording, by entity: names and colours of what it shows, and of a `Scene` also
-    sizes of images and the agents' frames."""
-    parts = {
-        "/": [classes(curves)],
-        **{entity: [style] for entity, style in styles(curves).items()},
-        HEADER: [rr.TextDocument.from_fields(media_type=rr.MediaType.MARKDOWN)],
-    }
-    if not isinstance(curves, Scene):
-        return parts
-    for name, styles_of_part in board_styles().items():
-        parts[f"world/{name}"] = styles_of_part
-    parts["world/board"].append(rr.SegmentationImage.from_fields(format=board_form(curves)))
-    agents, (rows, columns) = len(curves.agents), curves.window
-    corners = np.array(window_corners(agents, curves.window), np.float32)[:, ::-1]
-    parts["windows"] = [
-        classes(curves, class_colour),
-        rr.SegmentationImage.from_fields(format=image_form(mosaic_size(agents, curves.window)), opacity=1.0),
-    ]
-    parts["windows/frames"] = [
-        rr.Boxes2D(
-            mins=corners - 0.2,
-            sizes=np.full((agents, 2), (columns + 0.4, rows + 0.4)),
-            colors=[agent_colour(agent) for agent in range(agents)],
-            radii=2 * OUT_STROKE_CELLS,
-            labels=list(curves.agents),
-            show_labels=False,
-        )
-    ]
-    return parts
 
 
 def board_styles() -> dict[str, list[Any]]:

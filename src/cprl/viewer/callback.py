@@ -1,6 +1,5 @@
 """ViewerCallback: records a training for the Rerun viewer, and shows it live."""
 
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from math import ceil, gcd
 from operator import methodcaller
@@ -9,37 +8,30 @@ from threading import Event
 from types import TracebackType
 from typing import Any, Final, Self
 
-import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
+from cprl.commons.readable import rules_of
+from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import agent_names, base_env, commons_of
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import Policy
-from cprl.measuring.registry import IN_FORCE, reported_by
-from cprl.measuring.series import OF_AGENTS, Series, numbers_of
-from cprl.measuring.table import metrics_in
+from cprl.measuring.registry import reported_by
+from cprl.measuring.series import Observer
+from cprl.measuring.windows import Values
 from cprl.policies.present import PresentPolicy
-from cprl.runs.episodes import read_episodes
+from cprl.runs.episodes import stored_episodes
 from cprl.runs.recipe import rules_of_own
-from cprl.viewer.board import Filming
+from cprl.system.output import console
+from cprl.system.process import at_signals
 from cprl.viewer.exhibition import Exhibition
-from cprl.viewer.layout import curves_of, missing_in, scene_of
+from cprl.viewer.frames import Filming, Wall
 from cprl.viewer.logger import RerunLogger, recording_id
 from cprl.viewer.page import FILE_NAME, recordings_of
-from cprl.viewer.pictures import (
-    JointActions,
-    Lorenz,
-    Plots,
-    Tags,
-    Turns,
-    View,
-    Visits,
-    Wall,
-    borders,
-    regions_of,
-)
+from cprl.viewer.pictures import Pictures, Samples, borders, regions_of
+from cprl.viewer.scene import curves_of, missing_in, scene_of
 from cprl.viewer.story import CompilingNotice, Events, Story
+from cprl.viewer.views import JointActions, Plots, View
 
 LONGEST: Final = 50
 """Episodes from one image of visits, stock and Lorenz curve to the next, at most."""
@@ -95,9 +87,9 @@ class ViewerCallback:
         file_name: str | None = None,
         is_replay: bool = False,
     ) -> None:
-        self.env, self._run, self._agents = env, run, agent_names(env)
+        self.env, self._run = env, run
         reported, commons = reported_by(env), commons_of(env)
-        curves = curves_of(env, self._agents, reported, episodes=episodes, worlds=worlds, own=metrics)
+        curves = curves_of(env, agent_names(env), reported, episodes=episodes, worlds=worlds, own=metrics)
         scene = None if commons is None else scene_of(commons, curves, is_replay=is_replay)
         self._earlier = [] if file_name else recordings_of(run)
         self.logger = RerunLogger(
@@ -109,13 +101,10 @@ class ViewerCallback:
             file_name=file_name or (f"run-{len(self._earlier) + 1}.rrd" if self._earlier else FILE_NAME),
             recording_id=recording_id(run, file_name or FILE_NAME),
         )
-        self.filming = Filming(commons, self.logger, scene, episodes=-(-episodes // worlds))
+        self.filming = Filming(commons, self.logger, episodes=-(-episodes // worlds))
         """Which episodes of the first world are recorded frame by frame."""
-        self._series = Series(curves.replicas, worlds)
-        self._turn = self._step = self._filmed = 0
-        self._episode = 0
-        """The episodes that all replicas have ended: what header, board and timelines say."""
-        self._rate_at, self._rate_step = time.perf_counter(), 0
+        self._turn = self._episode = 0
+        """Turns, and episodes that all replicas have ended: what header, board and timelines say."""
         self.logger.log_hparams({"run": run.name, **(recipe or {})})
         self.logger.log_text(f"{title} begins")
         for missing in missing_in(reported, has_board=scene is not None):
@@ -125,119 +114,103 @@ class ViewerCallback:
         self.story: Story | None = None
         self.exhibition: Exhibition | None = None
         """What the current policy plays for viewers; None where nothing is exhibited."""
-        own_rules = rules_of_own(recipe or {})
-        self._views = self._make_views(episodes, exhibited, own_rules, is_about=is_about, is_replay=is_replay)
+        every = max(1, min(LONGEST, episodes // _IMAGES))
+        self._views: list[View] = [
+            self.filming,
+            Plots(self.logger),
+            Events(self.logger, self.filming, every=ceil(every / worlds)),
+        ]
+        if curves.joint:
+            self._views.append(JointActions(self.logger, actions=base_env(env).game.actions))
+        if commons is not None:
+            self._views += self._views_of_boards(commons, exhibited)
+        if not is_replay:
+            rules = rules_of_own(recipe or {})
+            self._views += self._views_of_a_training(commons, episodes, every, rules, is_about=is_about)
         self._sampled = gcd(*(view.stride for view in self._views)) or 1
         """Turns from one look at the worlds to the next where no frame is recorded."""
-        self.filming.choose(0)
 
-    def _make_views(
-        self,
-        episodes: int,
-        exhibited: tuple[PresentPolicy, EnvBase] | None,
-        own_rules: str,
-        *,
-        is_about: bool,
-        is_replay: bool,
-    ) -> list[View]:
-        logger, commons = self.logger, commons_of(self.env)
-        curves, scene, live = logger.curves, logger.scene, logger.live
-        every = max(1, min(LONGEST, episodes // _IMAGES))
-        of_world = ceil(every / curves.worlds)
-        views: list[View] = [Plots(logger), Events(logger, self.filming, every=of_world)]
-        if curves.joint:
-            views.append(JointActions(logger, actions=base_env(self.env).game.actions))
-        if curves.has_tags_between:
-            views.append(Tags(logger))
-        if commons is not None and scene is not None:
-            if regions := regions_of(commons):
-                logger.log_static("world/regions", borders(regions))
-            if exhibited is not None and live is not None and live.exhibition is not None:
-                self.exhibition = Exhibition(
-                    *exhibited, trained=self.env, scene=scene, kept=live.stream, newest=live.exhibition
-                )
-                views.append(self.exhibition)
-        if is_replay:
-            return views
+    def _views_of_boards(
+        self, commons: CommonsEnv, exhibited: tuple[PresentPolicy, EnvBase] | None
+    ) -> Iterator[View]:
+        if regions := regions_of(commons):
+            self.logger.log_static("world/regions", borders(regions))
+        live = self.logger.live
+        if exhibited is not None and live is not None and live.exhibition is not None:
+            self.exhibition = Exhibition(*exhibited, trained=self.env, logger=self.logger)
+            yield self.exhibition
+
+    def _views_of_a_training(
+        self, commons: CommonsEnv | None, episodes: int, every: int, own_rules: str, *, is_about: bool
+    ) -> Iterator[View]:
+        logger, scene = self.logger, self.logger.scene
+        samples = None
         if commons is not None and scene is not None:
             if scene.boards > 1:
                 recorded = episodes // scene.worlds // max(1, self.filming.every) + 1
                 steps = commons.game.rules.episode_steps * recorded
-                views.append(Wall(commons, logger, scene, recorded_steps=steps))
-            views += [Visits(commons, logger, scene, every=every), Turns(commons, logger, every=every)]
-        if curves.has_lorenz:
-            views.append(Lorenz(logger, every=every))
+                yield Wall(commons, logger, self.filming, scene, recorded_steps=steps)
+            samples = Samples(commons, logger)
+            yield samples
+        yield Pictures(logger, samples, every=every)
         game = None if commons is None else commons.game
-        self.story = Story(
-            logger, self.filming, episodes=episodes, is_about=is_about, game=game, own_rules=own_rules
-        )
-        views.append(self.story)
-        if live is not None:
-            views.append(CompilingNotice(self._show_status))
-        return views
+        rules = ", ".join(filter(None, (rules_of(game), own_rules)))
+        self.story = Story(logger, self.filming, episodes=episodes, is_about=is_about, rules=rules)
+        yield self.story
+        if logger.live is not None:
+            yield CompilingNotice(self._show_status)
 
     def _show_status(self, status: str) -> None:
         if self.story is not None and self._episode == 0:
             self.story.begins(status)
 
     def on_start(self, training: Any) -> None:
-        """Goes on where a `Training` that is resumed is."""
-        if training.steps:
-            self._resume(training.steps)
-
-    def _resume(self, step: int) -> None:
-        """Gives the views the episodes that the run's table has, and viewers the recording so far."""
-        self._step = self._rate_step = step
-        self._turn = step // self._series.worlds
+        """Goes on where a `Training` that is resumed is: views get the episodes that the run's table has, and
+        viewers the recording so far."""
+        if not training.steps:
+            return
+        worlds = self.logger.curves.worlds
+        self._turn = training.steps // worlds
+        again = Observer([self], self.env, worlds=worlds)
         with self.logger.silent():
-            for episode in _stored_episodes(self._run):
-                self.on_episode(episode, {})
-        for view in self._views:
-            view.resumed()
+            for episode in stored_episodes(self._run):
+                again.on_episode(episode, {})
         for recording in self._earlier:
             self.logger.do(methodcaller("log_file_from_path", recording), live_only=True)
-        self.logger.at(step=step, episode=self._episode)
-        if self.story is not None:
-            self.story.resume()
-        self.logger.log_text(f"resumed from step {step:,}")
+        self._set_time(self._episode)
+        for view in self._views:
+            view.resumed()
+        self.logger.log_text(f"resumed from step {training.steps:,}")
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Copies the state of the first world after the turn, if this episode's frames are recorded.
+        """Lets the views look at the worlds after the turn, if the first one's frames are recorded or one of
+        them needs to.
 
-        Otherwise it only counts: reading a tensor each turn would cost a training some percent.
+        Otherwise it only counts: whatever runs here displaces a training's data from the fast caches.
         """
         self._turn += 1
-        self._step += self._series.worlds
         if not self.filming.is_on and self._turn % self._sampled:
-            return  # nothing is due; whatever runs here displaces a training's data from the fast caches
-        self.filming.choose(self._filmed)
-        frame = self.filming.add(batch, step=self._step, episode=self._episode)
+            return
+        self._set_time(self._episode)
         for view in self._views:
-            view.on_step(self._turn, self._episode, frame)
-            view.on_batch(batch)
+            view.on_step(batch)
+
+    def _set_time(self, episode: int) -> None:
+        self.logger.at(step=self._turn * self.logger.curves.worlds, episode=episode)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Logs the numbers of an episode, and its events, once all replicas have ended it."""
-        self.logger.at(step=self._step, episode=self._episode)
+        """Adds an episode of a replica, and logs its events."""
+        self._set_time(self._episode)
         for view in self._views:
-            view.on_episode(episode)
-        if episode.world == 0:
-            self._filmed, self.filming.shows_next = self._filmed + 1, False
-        of_all = self._series.add(episode, numbers_of(episode, learning, self._agents))
-        if of_all is not None:
-            self._episode += self._series.worlds
-            self.logger.at(step=self._step, episode=self._episode - 1)
-            with self.logger.together():
-                for view in self._views:
-                    view.on_all(self._episode - 1, of_all)
-                self._log_speed()
-        self.filming.choose(self._filmed)
+            view.on_episode(episode, learning)
 
-    def _log_speed(self) -> None:
-        now, steps = time.perf_counter(), (self._step - self._rate_step) * self._series.replicas
-        if steps:
-            self.logger.log_scalar("time/env_steps_per_s", steps / (now - self._rate_at))
-            self._rate_at, self._rate_step = now, self._step
+    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
+        """Draws the numbers of an episode that all replicas have ended."""
+        self._episode = episode + 1
+        self._set_time(episode)
+        with self.logger.together():
+            for view in self._views:
+                view.on_numbers(episode, numbers)
 
     def seen_at_random(self, env: EnvBase, policy: Policy) -> Policy:
         """Return the policy of random play; viewers see its first world until the training begins."""
@@ -250,10 +223,27 @@ class ViewerCallback:
 
     def finished(self, played: Mapping[str, Sequence[Episode]]) -> None:
         """Shows that the run is finished, and closes the file; a live view stays open until the end."""
-        self.filming.send()
+        self.filming.close()
         for view in self._views:
             view.finished(played)
         self.logger.close_file()
+
+    def linger(self) -> None:
+        """Says where the recording stays served, exhibits the trained policy, waits for Ctrl-C (SIGINT) or
+        SIGTERM, and closes the recording; a second signal in the meantime changes nothing."""
+        if not self.logger.is_live:
+            console().print("The recording is no longer served.")
+            return
+        stopping = Event()
+        with at_signals(lambda number: stopping.set()):
+            where = self.logger.addresses["browser"]
+            console().print(
+                f"The recording stays served at {where} until Ctrl-C", soft_wrap=True, highlight=False
+            )
+            self.play_on(stopping)
+            while not stopping.wait(1.0):
+                pass
+            self.logger.shutdown()
 
     def play_on(self, stop: Event) -> None:
         """Exhibits the trained policy until the event is set; returns at once where nothing is exhibited."""
@@ -262,7 +252,7 @@ class ViewerCallback:
 
     def flush(self) -> None:
         """Sends all that waits, to the file and to viewers."""
-        self.filming.send()
+        self.filming.close()
         self.logger.flush()
 
     def state_dict(self) -> dict[str, Any]:
@@ -279,45 +269,6 @@ class ViewerCallback:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self.filming.send()
         for view in self._views:
             view.close()
         self.logger.shutdown()
-
-
-def _stored_episodes(run: Path) -> Iterator[Episode]:
-    """The episodes of a run's table in the order in which they ended, without who tagged whom; none without a
-    table."""
-    try:
-        table = read_episodes(run).combine_chunks()
-    except FileNotFoundError:
-        return
-    if not table.num_rows:
-        return
-    columns = {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
-    agents = int(columns["agent"].max()) + 1
-    metrics = [name for name in metrics_in(table.schema) if name != "stock_left"]
-    in_force = [name for name in columns if name.startswith(IN_FORCE)]
-    for row in range(0, table.num_rows, agents):
-        replica, number = int(columns["replica"][row]), int(columns["episode"][row])
-
-        def of_agents(name: str, row: int = row) -> Any:
-            return columns[name][row : row + agents].astype(np.float64) if name in columns else None
-
-        def of_all(name: str, row: int = row) -> Any:
-            return int(columns[name][row]) if name in columns else None
-
-        yield Episode(
-            world=int(columns["world"][row]) if "world" in columns else replica,
-            replica=replica,
-            episode=number,
-            steps=int(columns["steps"][row]),
-            terminated=bool(columns["terminated"][row]),
-            return_=of_agents("return"),
-            metrics={name: float(columns[name][row]) for name in metrics},
-            harvest=of_agents("harvest"),
-            stock_left=of_all("stock_left"),
-            depletion_step=of_all("depletion_step"),
-            in_force=np.array([columns[name][row] for name in in_force]) if in_force else None,
-            **{name: of_agents(name) for name in OF_AGENTS},
-        )

@@ -20,17 +20,11 @@ from cprl.envs.unwrap import commons_of
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import Policy
 from cprl.policies.present import PresentPolicy
-from cprl.viewer.board import (
-    RIM_CELLS,
-    FrameRecorder,
-    Frames,
-    board_columns,
-    board_form,
-    board_styles,
-)
-from cprl.viewer.layout import Scene
-from cprl.viewer.live import LiveStream
-from cprl.viewer.pictures import View
+from cprl.viewer.board import RIM_CELLS, Frames, board_columns, board_form, board_styles
+from cprl.viewer.frames import FrameRecorder
+from cprl.viewer.logger import RerunLogger
+from cprl.viewer.scene import Scene
+from cprl.viewer.views import View
 
 BATCH_S: Final = 2.1
 """Seconds whose steps are played at once, because many steps in a row take a quarter of the time of as many
@@ -56,8 +50,8 @@ class Exhibition(View):
     Args:
         env: one world that no training or evaluation plays, with the transforms of the training.
         trained: the environment of the training; what its transforms learn is taken over.
-        kept: the stream of the recording, whose server keeps what never changes for viewers that come later.
-        newest: the stream of the frames, of which viewers need the newest alone.
+        logger: the recording of the training, which is live. The server of its own stream keeps what never
+            changes for viewers that come later; that of the exhibition keeps the newest frame alone.
         clock: seconds of wall time.
         wait: waits so many seconds between two frames, in the thread that sends them; returns whether to
             leave out the rest. By default until `close`.
@@ -69,16 +63,18 @@ class Exhibition(View):
         env: EnvBase,
         *,
         trained: EnvBase,
-        scene: Scene,
-        kept: LiveStream,
-        newest: LiveStream,
+        logger: RerunLogger,
         clock: Callable[[], float] = time.perf_counter,
         wait: Callable[[float], bool] | None = None,
     ) -> None:
-        commons = commons_of(env)
+        commons, scene, live = commons_of(env), logger.scene, logger.live
         assert commons is not None
+        assert scene is not None
+        assert live is not None
+        assert live.exhibition is not None
         self._policy, self._env, self._trained, self._scene = policy, env, trained, scene
-        self._stream, self._clock, self._closing = newest, clock, Event()
+        self._logger, self._stream = logger, live.exhibition
+        self._clock, self._closing = clock, Event()
         self._wait = wait or self._slept
         self._at_random: FrameRecorder | None = None
         self._recorder = FrameRecorder(commons, scene, has_windows=False)
@@ -89,16 +85,16 @@ class Exhibition(View):
         """Steps played so far."""
         self.is_over = False
         """Whether it has ended, because it failed."""
-        kept.do(partial(_send_fixed, scene=scene))
+        live.stream.do(partial(_send_fixed, scene=scene))
         # Compiling may take half a minute, and of a run that is resumed no policy is loaded yet.
         self._send(_before_the_first_step(commons.game), _beginning(commons.game))
 
-    def on_step(self, turn: int, episode: int, frame: int | None) -> None:
-        """Plays the steps of a batch if they are due; `episode` is the training's, for the caption."""
+    def on_step(self, batch: TensorDictBase) -> None:
+        """Plays the steps of a batch if they are due."""
         now = self._clock()
         if now >= self._due and not self.is_over:
             self._due = now + BATCH_S
-            self._play(episode)
+            self._play(self._logger.episode)
 
     def seen(self, env: EnvBase, policy: Policy) -> Policy:
         """Return the policy of random play, whose first world viewers see until the training begins."""

@@ -21,6 +21,7 @@ from rerun.chunk import RrdReader
 from cprl.system.compat import StoredLayout, keep_native
 from cprl.system.output import legible
 from cprl.values import checked
+from cprl.viewer.names import HEADER
 from cprl.viewer.page import LOCALHOST, Served, WebViewer, free_port, has_display, viewer
 
 STALL_S: Final = 2.0
@@ -51,8 +52,6 @@ LOADING_S: Final = 20.0
 _STALLED: Final[list[Any]] = []
 """Recordings whose viewers do not answer: the end of the last reference to one would wait for them."""
 
-HEADER: Final = "header"
-"""The entity of the text that people read first."""
 Row: TypeAlias = tuple[int, int, int, list[float] | str]
 """Step, episode, frame, and a number for each line or a Markdown text."""
 

@@ -21,10 +21,11 @@ from cprl.runs.recipe import RECIPE_FILE
 from cprl.system.compat import end_recordings
 from cprl.system.output import console, legible
 from cprl.values import shown
-from cprl.viewer.board import Frames, columns, fixed
-from cprl.viewer.layout import Curves, Scene, layout
+from cprl.viewer.board import Frames, columns
+from cprl.viewer.layout import fixed, layout
 from cprl.viewer.live import FLUSH_TIMEOUT_S, REPLAY, RUN, Live, LiveStream, Stream, open_file
 from cprl.viewer.page import FILE_NAME
+from cprl.viewer.scene import Curves, Scene
 
 TIMELINES: Final = ("step", "episode", "frame")
 """The timelines of every row: environment steps of the run, episodes, and frames recorded so far."""
@@ -165,7 +166,8 @@ class RerunLogger(Logger):
         self._streams: list[Stream] = []
         self.frames = 0
         """Frames recorded so far, including those in earlier files of the recording."""
-        self._now = (0, 0)
+        self.step = self.episode = 0
+        """The time of what is logged; see `at`."""
         self._is_together = False
         self._clips_end: dict[str, int] = {}
         super().__init__(exp_name, str(log_dir))
@@ -214,6 +216,11 @@ class RerunLogger(Logger):
         """Whether viewers can connect: the live stream is open and served."""
         return self.live is not None and self.live.stream.is_open
 
+    @property
+    def turn(self) -> int:
+        """The turn of what is logged."""
+        return self.step // self.curves.worlds
+
     def do(self, what: Callable[[Any], object], *, live_only: bool = False) -> None:
         """Calls a function with each recording, or with that to viewers alone, in the thread that sends."""
         for stream in self._streams:
@@ -250,7 +257,7 @@ class RerunLogger(Logger):
 
     def log_row(self, name: str, what: Any, *, step: int | None = None) -> None:
         """Logs an archetype at the time set by `at`, or at another step."""
-        at = self._now[0] if step is None else step, self._now[1], self.frames
+        at = self.step if step is None else step, self.episode, self.frames
 
         def log(recording: Any) -> None:
             for timeline, number in zip(TIMELINES, at, strict=True):
@@ -269,22 +276,23 @@ class RerunLogger(Logger):
 
     def at(self, *, step: int, episode: int) -> None:
         """Sets the time of subsequent logs that have no step of their own."""
-        self._now = step, episode
+        self.step = step
+        self.episode = episode
 
     def log_scalar(self, name: str, value: Any, step: int | None = None, **kwargs: Any) -> None:
         """Logs a number, or a list, array or tensor of numbers as name/0, name/1 and so on."""
         numbers = _numbers_in(value)
         for index, number in enumerate(numbers.tolist()):
             entity = name if numbers.size == 1 else f"{name}/{index}"
-            self._wait(entity, self._now[0] if step is None else int(step), [float(number)])
+            self._wait(entity, self.step if step is None else int(step), [float(number)])
 
     def log_lines(self, name: str, values: Sequence[float]) -> None:
         """Logs the numbers of several lines of one plot, equally many each time; NaN leaves a gap."""
-        self._wait(name, self._now[0], [float(value) for value in values])
+        self._wait(name, self.step, [float(value) for value in values])
 
     def log_document(self, name: str, text: str) -> None:
         """Logs a Markdown text in place of the one before, live at all times; it is sent with the numbers."""
-        self._wait(name, self._now[0], text)
+        self._wait(name, self.step, text)
 
     def show_live(self, name: str, text: str) -> None:
         """`log_document` in the live view alone, and at once; from any thread."""
@@ -294,12 +302,12 @@ class RerunLogger(Logger):
 
     def _wait(self, name: str, step: int, values: list[float] | str) -> None:
         for stream in self._streams:
-            stream.waiting.setdefault(name, []).append((step, self._now[1], self.frames, values))
+            stream.waiting.setdefault(name, []).append((step, self.episode, self.frames, values))
         self._send_due()
 
     def log_states(self, name: str, states: Mapping[int, str], *, live_only: bool = False) -> None:
         """Logs states by the episode from which they hold; their step is the one set by `at`."""
-        at = [self._now[0]] * len(states), list(states), [self.frames] * len(states)
+        at = [self.step] * len(states), list(states), [self.frames] * len(states)
         what = rr.StateChange.columns(state=list(states.values()))
         self.log_columns(name, at, what, live_only=live_only)
 
@@ -313,7 +321,7 @@ class RerunLogger(Logger):
             self.log_columns(entity, (frames["step"][rows], frames["episode"][rows], numbers[rows]), what)
 
     def log_text(self, text: str) -> None:
-        at = [self._now[0]], [self._now[1]], [self.frames]
+        at = [self.step], [self.episode], [self.frames]
         self.log_columns("log", at, rr.TextLog.columns(text=[text], level=["INFO"]))
 
     def log_hparams(self, cfg: Any) -> None:
@@ -332,7 +340,7 @@ class RerunLogger(Logger):
         if clip.ndim != 4:
             raise ValueError(f"the video is {list(video.shape)}; allowed: [T, C, H, W] or [1, T, C, H, W]")
         count, channels, height, width = clip.shape
-        first = max(self._now[0] if step is None else int(step), self._clips_end.get(name, 0))
+        first = max(self.step if step is None else int(step), self._clips_end.get(name, 0))
         self._clips_end[name] = first + count
         form = rr.components.ImageFormat(
             width=width,
@@ -341,7 +349,7 @@ class RerunLogger(Logger):
             channel_datatype=rr.ChannelDatatype.U8,
         )
         buffer = clip.permute(0, 2, 3, 1).to(torch.uint8).numpy().reshape(count, -1).copy()
-        at = range(first, first + count), [self._now[1]] * count, [self.frames] * count
+        at = range(first, first + count), [self.episode] * count, [self.frames] * count
         self.log_columns(name, at, rr.Image.columns(buffer=buffer, format=[form] * count))
 
     def log_histogram(
@@ -355,12 +363,6 @@ class RerunLogger(Logger):
         """Sends all buffered numbers to the file and to the viewer."""
         for stream in self._streams:
             send_waiting(stream)
-
-    def show_end(self) -> None:
-        """Gives the live view the layout of a run that has ended, with its phases."""
-        if self.curves.has_phases:
-            ended = layout(self.curves, live=True, ended=True)
-            self.do(lambda recording: recording.send_blueprint(ended), live_only=True)
 
     def close_file(self) -> None:
         """Flushes and closes the file, which gets its footer; the live stream goes on."""

@@ -1,4 +1,4 @@
-"""How recordings are opened: Rerun's viewers, native and in a browser, and a run that stays served."""
+"""How recordings are opened: Rerun's viewers, native and in a browser."""
 
 import itertools
 import os
@@ -14,17 +14,13 @@ from http import HTTPStatus
 from http.client import HTTPException
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Event, Thread, current_thread, main_thread
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+from threading import Thread, current_thread, main_thread
+from typing import Any, Final, Literal, get_args
 from urllib.parse import quote
 from urllib.request import ProxyHandler, build_opener
 
-from cprl.system.output import console, printed
-from cprl.system.process import at_signals
+from cprl.system.output import printed
 from cprl.values import checked
-
-if TYPE_CHECKING:
-    from cprl.viewer.logger import RerunLogger
 
 FILE_NAME: Final = "run.rrd"
 LOCALHOST: Final = "127.0.0.1"
@@ -189,22 +185,3 @@ def check_watch(watch: str, *, linger: bool = False, can_be_off: bool = True) ->
         )
     if linger and current_thread() is not main_thread():
         raise ValueError("linger is True in another thread than the main one, which alone gets signals")
-
-
-def linger(logger: "RerunLogger", play_on: Callable[[Event], None] | None = None) -> None:
-    """Says where the recording stays served, waits for Ctrl-C (SIGINT) or SIGTERM, and closes the recording;
-    a second signal in the meantime changes nothing."""
-    if not logger.is_live:
-        console().print("The recording is no longer served.")
-        return
-    stopping = Event()
-    with at_signals(lambda number: stopping.set()):
-        where = logger.addresses["browser"]
-        console().print(
-            f"The recording stays served at {where} until Ctrl-C", soft_wrap=True, highlight=False
-        )
-        if play_on is not None:
-            play_on(stopping)
-        while not stopping.wait(1.0):
-            pass
-        logger.shutdown()

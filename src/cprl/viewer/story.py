@@ -1,31 +1,29 @@
-"""Story: the header, the live label, events, and at the end the phases of a training."""
+"""Story: the header, the live label, and events of a training."""
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import ceil, isfinite, isnan, nan
+from math import ceil, isnan, nan
 from statistics import fmean
 from threading import Event, Thread
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from cprl.commons.game import Game
-from cprl.commons.published import GAMES
-from cprl.commons.published import game as published_game
-from cprl.commons.readable import rules_of
-from cprl.measuring import phases
 from cprl.measuring.episodes import Episode
-from cprl.measuring.now import BEGINS, EXPLORING, Now
-from cprl.measuring.series import Values, mean_of
+from cprl.measuring.outcome import BEGINS, EXPLORING, Course
+from cprl.measuring.series import mean_of
 from cprl.measuring.statistics import Estimate, estimate_if_finite
-from cprl.measuring.windows import LAST_EPISODES, SMOOTHED_EPISODES, rounds_of, running_mean
+from cprl.measuring.windows import LAST_EPISODES, Values, rounds_of
 from cprl.system.times import CLOCK
-from cprl.viewer.board import Filming
-from cprl.viewer.layout import ANOTHER, SETTLED, STRIPS, Curves, legend_of
-from cprl.viewer.live import HEADER
+from cprl.viewer import names
+from cprl.viewer.frames import Filming
 from cprl.viewer.logger import RerunLogger
-from cprl.viewer.pictures import View, has_died
+from cprl.viewer.names import HEADER, SETTLED
+from cprl.viewer.scene import Curves
+from cprl.viewer.views import View, has_died
+
+HARVEST: Final = "social/collective_return"
 
 
 class Played(NamedTuple):
@@ -80,7 +78,7 @@ class Header:
         return f"of {'about ' * self.is_about}{self.episodes:,}"
 
     def begins(self, status: str, random_play: float | None = None) -> str:
-        beside = "" if random_play is None else f"random play {self._amount(random_play)}"
+        beside = "" if random_play is None else f"random play {self.amount(random_play)}"
         return self._text(f"Episode 1 {self._of}", status, beside)
 
     def line(
@@ -89,37 +87,35 @@ class Header:
         """After an episode, in which so many boards died early; None for a game without stock."""
         beside = "" if random_play is None else f", random play {_number(random_play)}"
         deaths = "" if died is None else self._died(died, self.boards)
-        return self._text(f"Episode {episode:,} {self._of}", label, f"{self._amount(mean)}{beside}", deaths)
+        return self._text(f"Episode {episode:,} {self._of}", label, f"{self.amount(mean)}{beside}", deaths)
 
     def finished(self, learning: float, trained: Played, random: Played) -> str:
         """After the evaluation of a run: what agents got at the end of its training, and in fresh worlds the
         trained policy, which explores less there, and random play."""
-        amounts = {"trained": trained.harvest.value, "random play": random.harvest.value}
-        if not isnan(learning):
-            amounts = {"while learning": learning, **amounts}
-        (first, amount), *others = amounts.items()
+        amounts = {
+            "while learning": learning,
+            "trained": trained.harvest.value,
+            "random play": random.harvest.value,
+        }
+        (first, amount), *others = [of_one for of_one in amounts.items() if not isnan(of_one[1])]
         beside = ", ".join(f"{name} {_number(value)}" for name, value in others)
-        beside = f"{first} {self._amount(amount)}, {beside}"
         died = "" if trained.died is None else self._died(trained.died, trained.episodes)
-        return self._text(self._finished, beside, died)
+        return self.ended(f"{first} {self.amount(amount)}, {beside}", died)
 
-    def ended(self, mean: float) -> str:
-        return self._text(self._finished, f"{self._amount(mean)} at the end")
-
-    @property
-    def _finished(self) -> str:
-        return "Finished" if self.is_about else f"Finished, {self.episodes:,} episodes"
+    def ended(self, *parts: str) -> str:
+        return self._text("Finished" if self.is_about else f"Finished, {self.episodes:,} episodes", *parts)
 
     def stopped(self, episode: int, mean: float) -> str:
         """At the end of a run that was stopped after so many episodes; it can be resumed."""
-        amount = "" if isnan(mean) else self._amount(mean)
-        return self._text(f"Stopped after {episode:,} {self._of} episodes", amount)
+        return self._text(f"Stopped after {episode:,} {self._of} episodes", self.amount(mean))
 
     def _text(self, *parts: str) -> str:
         line = f"#### {' · '.join(part for part in (*parts, self.rules) if part)}"
         return f"{line}\n\n{self.legend}" if self.legend else line
 
-    def _amount(self, value: float) -> str:
+    def amount(self, value: float) -> str:
+        if isnan(value):
+            return ""
         return f"{_number(value)} apples" if self.unit == "apples" else f"{self.unit} {_number(value)}"
 
     def _died(self, died: int, boards: int) -> str:
@@ -132,51 +128,35 @@ def _number(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
-class Course:
-    """The course of the metrics that tell new bests and phases, as means over replicas and, of replicas in W
-    worlds, over W episodes of each."""
+class Bests:
+    """Tells when agents harvest clearly more than ever before, as a mean over replicas and episodes."""
 
-    BEST_OVER = 50
-    """Episodes of the mean return that is compared with the best, at least."""
+    OVER = 50
+    """Episodes of the mean that is compared with the best, at least."""
     BETTER = 1.05
     """The factor by which a new best must exceed the last reported one."""
 
     def __init__(self, worlds: int = 1) -> None:
         self._worlds = worlds
-        self._means: list[list[float]] = []
+        self._apples: list[float] = []
         self._best = 0.0
 
-    def new_best(self, means: Mapping[str, float]) -> str | None:
-        """Adds the means of an episode, or of W; returns the new best in words if there is one."""
-        self._means.append([means[f"social/{name}"] for name in phases.METRICS])
-        count = ceil(self.BEST_OVER / self._worlds)
-        if len(self._means) % count:
+    def add(self, apples: float) -> str | None:
+        """Adds the mean harvest of an episode, or of W; returns a new best in words if it is one."""
+        self._apples.append(apples)
+        count = ceil(self.OVER / self._worlds)
+        if len(self._apples) < count:
             return None
-        reached = float(np.mean([mean[0] for mean in self._means[-count:]]))
+        reached = float(np.mean(self._apples))
+        self._apples.clear()
         if not reached > self.BETTER * self._best:
             return None
         self._best = reached
         return f"new best: {reached:.1f} apples per episode, mean of the last {count * self._worlds}"
 
-    def phases(self) -> list[phases.Phase]:
-        """The phases so far, four at most; empty until there are enough episodes for one.
-
-        They are of running means, in which an undefined metric repeats its last value.
-        """
-        if len(self._means) * self._worlds < phases.SHORTEST:
-            return []
-        smoothed = running_mean(np.array(self._means).T, ceil(SMOOTHED_EPISODES / self._worlds))
-        episodes = self._worlds * np.arange(smoothed.shape[1])
-        for row in smoothed:
-            defined = np.flatnonzero(~np.isnan(row))
-            row[:] = np.interp(episodes, defined, row[defined]) if len(defined) else 0.0
-        number = max(0, min(3, len(episodes) * self._worlds // phases.SHORTEST - 1))
-        return phases.find_phases(episodes, dict(zip(phases.METRICS, smoothed, strict=True)), number=number)
-
 
 MOST_HEADERS: Final = 5000
 """Rows of the header in a recording, about; in longer runs some episodes have none of their own."""
-_NOW, _EXPLORING, _FOUND, _PUBLISHED = STRIPS
 
 
 class Story(View):
@@ -186,8 +166,7 @@ class Story(View):
         filming: which episodes are recorded; that after a new best is.
         episodes: of each replica.
         is_about: whether it is only about as many.
-        game: the game, if it is one of cprl's; the published one has the study's phases beside those found.
-        own_rules: rules of the user's own, in words.
+        rules: the institutions in force, in words.
     """
 
     def __init__(
@@ -197,22 +176,21 @@ class Story(View):
         *,
         episodes: int,
         is_about: bool = False,
-        game: Game | None = None,
-        own_rules: str = "",
+        rules: str = "",
     ) -> None:
-        self._logger, self._filming, self._curves, self._game = logger, filming, logger.curves, game
+        self._logger, self._filming, self._curves = logger, filming, logger.curves
         self._episodes = episodes
         self.header = Header(
             episodes=episodes,
             boards=self._curves.replicas * self._curves.worlds,
             unit=self._curves.unit,
-            rules=", ".join(filter(None, (rules_of(game), own_rules))),
-            legend=legend_of(self._curves),
+            rules=rules,
+            legend=self._curves.legend,
             is_about=is_about,
         )
-        self.now = Now(self._curves.worlds)
-        has_course = set(phases.METRICS) <= set(self._curves.metrics)
-        self._course = Course(self._curves.worlds) if has_course else None
+        self.course = Course(self._curves.replicas, self._curves.worlds)
+        self._label = BEGINS
+        self._bests = Bests(self._curves.worlds)
         self._random: Played | None = None
         self._ended = 0
         self._died: dict[int, int] = {}
@@ -221,48 +199,70 @@ class Story(View):
         """What all agents got in the last episodes of each world of each replica."""
         self._is_over = False
         # A file of a resumed run must not say so: it is shown with those before it.
-        logger.log_states(_NOW, {0: BEGINS}, live_only=True)
+        logger.log_states(names.NOW, {0: BEGINS}, live_only=True)
         logger.log_document(HEADER, self.header.begins("begins"))
         logger.flush()
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
         """Sets what the group is compared with, and logs it as an event."""
         self._random = played(episodes, replicas=self._curves.replicas)
-        self.now.random_play = self._random.harvest.value
+        self.course.random_play = self._random.harvest.value
         self._logger.log_text(f"random play {self._in_words(self._random)}")
         if not self._ended:
             self.begins(BEGINS)
 
     def begins(self, status: str) -> None:
         """Says live what is done before the first episode ends, e.g. "compiling, 12 s so far"."""
-        self._logger.show_live(HEADER, self.header.begins(status, self.now.random_play))
+        self._logger.show_live(HEADER, self.header.begins(status, self.course.random_play))
 
-    def on_episode(self, episode: Episode) -> None:
+    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+        of_world = episode.replica, episode.world
+        gained, died = _gained(episode), has_died(episode)
+        self.course.add(gained, replica=episode.replica, world=episode.world, has_died=died)
         each = rounds_of(LAST_EPISODES, self._curves.worlds)
-        last = self._last.setdefault((episode.replica, episode.world), deque(maxlen=each))
-        last.append(_gained(episode))
-        if (died := has_died(episode)) is not None:
+        self._last.setdefault(of_world, deque(maxlen=each)).append(gained)
+        if died is not None:
             together = episode.episode // self._curves.worlds
             self._died[together] = self._died.get(together, 0) + died
 
-    def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
         before, self._ended = self._ended, episode + 1
         died = self._died.pop(episode // self._curves.worlds, None)
-        means = {name: mean_of(values) for name, values in numbers.items()}
-        events = self._label(episode, means)
-        if self._course is not None and (best := self._course.new_best(means)):
-            events.append(best)
-            self._filming.shows_next = True
+        events = self._look(episode, {name: mean_of(values) for name, values in numbers.items()})
         for event in events:
             self._logger.log_text(f"episode {episode:,}: {event}")
         apart = -(-self._episodes // MOST_HEADERS)
         if -(-self._ended // apart) > -(-before // apart) or self._ended == self._episodes:
             self._show_episode(died)
 
-    def resume(self) -> None:
+    def _look(self, episode: int, means: Mapping[str, float]) -> list[str]:
+        """Logs the live label, and whether agents explore, where an episode changes them; returns what is
+        new in words."""
+        events = []
+        explored = self.course.explores
+        explores = self.course.explore(
+            {name: mean for name, mean in means.items() if name.endswith("/epsilon")}
+        )
+        if explores != explored:
+            self._logger.log_states(names.EXPLORING, {episode: EXPLORING if explores else SETTLED})
+            if explored:
+                events.append("exploration ends: no epsilon falls any more")
+        label = self.course.label
+        if label != self._label or episode < self._curves.worlds:
+            self._logger.log_states(names.NOW, {episode: label})
+        if label != self._label:
+            events.append(f"now {label}")
+            self._label = label
+        best = self._bests.add(means[HARVEST]) if HARVEST in means else None
+        if best is not None:
+            events.append(best)
+            self._filming.show()
+        return events
+
+    def resumed(self) -> None:
         """Shows where a run is that goes on after the episodes so far."""
         if self._ended:
-            self._logger.log_states(_NOW, {self._ended - 1: self.now.label})
+            self._logger.log_states(names.NOW, {self._ended - 1: self._label})
             self._show_episode(None)
             self._logger.flush()
 
@@ -270,30 +270,12 @@ class Story(View):
         """Says in the header where the run is after an episode."""
         text = self.header.line(
             episode=self._ended,
-            label=f"{self.now.label}, {EXPLORING}" if self.now.explores else self.now.label,
-            mean=self.now.mean,
-            random_play=self.now.random_play,
+            label=f"{self._label}, {EXPLORING}" if self.course.explores else self._label,
+            mean=self.course.mean,
+            random_play=self.course.random_play,
             died=died,
         )
         self._logger.log_document(HEADER, text)
-
-    def _label(self, episode: int, means: Mapping[str, float]) -> list[str]:
-        """Logs the live label where an episode's means change it, and whether agents explore; returns the
-        changes in words."""
-        value = means.get("social/collective_return")
-        if value is None:
-            value = sum(means.get(f"{agent}/return", 0.0) for agent in self._curves.agents)
-        if not isfinite(value):
-            return []
-        before, explored, events = self.now.label, self.now.explores, []
-        label = self.now.add(value, {name: mean for name, mean in means.items() if name.endswith("/epsilon")})
-        if label != before or episode < self._curves.worlds:
-            self._logger.log_states(_NOW, {episode: label})
-        if self.now.explores != explored:
-            self._logger.log_states(_EXPLORING, {episode: EXPLORING if self.now.explores else SETTLED})
-            if explored:
-                events.append("exploration ends: no epsilon falls any more")
-        return [*events, f"now {label}"] if label != before else events
 
     @property
     def _learning(self) -> float:
@@ -303,7 +285,7 @@ class Story(View):
         return fmean(value for last in self._last.values() for value in list(last)[-each:]) if each else nan
 
     def finished(self, played_by: Mapping[str, Sequence[Episode]]) -> None:
-        """Logs the evaluation of a run that is over, and its phases."""
+        """Logs the evaluation of a run that is over."""
         replicas = self._curves.replicas
         trained = played(played_by["trained"], replicas=replicas)
         random = played(played_by["random"], replicas=replicas)
@@ -315,32 +297,17 @@ class Story(View):
         if self._is_over:
             return
         if self._ended + self._curves.worlds <= self._episodes and not self.header.is_about:
-            self._logger.log_document(HEADER, self.header.stopped(self._ended, self.now.mean))
+            self._logger.log_document(HEADER, self.header.stopped(self._ended, self.course.mean))
         else:
-            self._end(self.header.ended(self._learning))
+            self._end(self.header.ended(f"{self.header.amount(self._learning)} at the end"))
 
     def _end(self, header: str) -> None:
         self._is_over = True
-        if self._course is not None and self._curves.has_phases:
-            found = {round(phase.first): phase.label or ANOTHER for phase in self._course.phases()}
-            self._logger.log_states(_FOUND, found)
-            published = published_phases(self._game).items()
-            if within := {first: label for first, label in published if first < self._ended}:
-                self._logger.log_states(_PUBLISHED, within)
-            self._logger.show_end()
         self._logger.log_document(HEADER, header)
 
     def _in_words(self, numbers: Played) -> str:
         died = "" if numbers.died is None else f"; {numbers.died:,} of {numbers.episodes:,} boards died early"
         return f"{numbers.harvest} {self.header.unit}{died}"
-
-
-def published_phases(game: Game | None) -> dict[int, str]:
-    """The phases of the study's figures by the episode in which they begin; empty for another game."""
-    variants = [variant for board, variant in GAMES if board == "commons"]
-    if all(game != published_game("commons", variant=variant) for variant in variants):
-        return {}
-    return dict(zip((0, *phases.PHASES_BEGIN), phases.PHASES, strict=True))
 
 
 class Events(View):
@@ -355,7 +322,7 @@ class Events(View):
         self._logger, self._filming, self._every = logger, filming, every
         self._has_seen_death, self._ended = False, 0
 
-    def on_episode(self, episode: Episode) -> None:
+    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         if episode.world:
             return
         number, self._ended = self._ended, self._ended + 1
@@ -363,7 +330,7 @@ class Events(View):
         if words:
             self._logger.log_text(f"episode {episode.episode:,}: {words}")
         step = episode.depletion_step or -1
-        if step > 0 and (self._filming.is_shown(number) or not self._has_seen_death):
+        if step > 0 and (self._filming.was_on or not self._has_seen_death):
             self._logger.log_text(f"episode {episode.episode:,}: last apple taken in step {step}")
             self._has_seen_death = True
 
@@ -402,7 +369,7 @@ class CompilingNotice(View):
         self._before_s = CLOCK.total_s
         Thread(target=self._watch, daemon=True, name="cprl compiling").start()
 
-    def on_all(self, episode: int, numbers: Mapping[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
         self.close()
 
     def close(self) -> None:
