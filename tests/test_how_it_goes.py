@@ -5,7 +5,6 @@ from itertools import groupby
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from cprl.measuring.outcome import Course, outcome_of
