@@ -12,13 +12,15 @@ import csv
 from pathlib import Path
 from typing import Any, Final
 
+import pyarrow as pa
 import pyarrow.csv
 import tyro
 from scipy import stats
 
-from cprl.evaluation import draw_scenarios, run_scenarios
-from cprl.evaluation.scenarios import estimates
+import cprl
+from cprl.evaluation import advantages, draw_scenarios, run_scenarios
 from cprl.measuring.statistics import CONFIDENCE, holm
+from cprl.measuring.table import numbers_in
 from cprl.runs.files import write_atomically
 from cprl.system.process import prepare_process
 
@@ -47,11 +49,29 @@ COLUMNS: Final = {
 
 def play(name: str, *, episodes: int) -> None:
     """Plays a population's scenarios, and writes the estimates and the figure."""
-    scores = run_scenarios(DOCS / "results" / name, episodes=episodes, seed=SEED)
+    played = run_scenarios(DOCS / "results" / name, cprl.Fresh(episodes=episodes, seed=SEED))
     OUT.mkdir(exist_ok=True)
-    draw_scenarios(scores, OUT / f"{name}.png")
-    found = estimates(scores)
+    draw_scenarios(played, OUT / f"{name}.png")
+    found = estimates_of(played)
     write_atomically(OUT / f"{name}.csv", lambda file: pyarrow.csv.write_csv(found, file))
+
+
+def estimates_of(played: pa.Table) -> pa.Table:
+    """Every number of every scenario as a row: "scenario", "focal" (who takes the focal places), "metric",
+    "value", "low" and "high", and how many "replicas", "episodes" and "undefined" episodes there were.
+
+    Metrics "focal/advantage" and "background/advantage" of "random" and "greedy" are what the run's agents,
+    or the background among them, get more.
+    """
+    returns = ("focal/return", "background/return")
+    levels = cprl.estimates(played, [*returns, *numbers_in(played)], by=("scenario", "focal")).table()
+    more = advantages(played).table()
+    renamed = [name.replace("return", "advantage") for name in more["number"].to_pylist()]
+    more = more.set_column(more.column_names.index("number"), "number", pa.array(renamed))
+    found = pa.concat_tables([levels, more], promote_options="default").select(
+        ["scenario", "focal", "number", "value", "low", "high", "replicas", "episodes", "undefined"]
+    )
+    return found.rename_columns({"number": "metric"})
 
 
 def table(name: str) -> str:

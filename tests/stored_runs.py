@@ -5,6 +5,8 @@ from test_population import ALGORITHMS
 import cprl
 from cprl import Experiment, Game, Rules, maps
 from cprl.commands import main as cli
+from cprl.measuring.statistics import estimates
+from cprl.measuring.table import labels_of, numbers_in, where
 from cprl.population import Learning, Scripted
 from cprl.runs.recipe import start_run
 from cprl.runs.weights import save_weights
@@ -66,18 +68,38 @@ def stored(folder, game=CORRIDORS, policy="greedy", *, name="", replicas=1, **pa
     return folder
 
 
-def values(measures):
-    """Numbers by name; None where undefined in all episodes."""
-    return {name: one.estimate and one.estimate.value for name, one in measures.items()}
+def values(table, numbers=(), **labels):
+    """Means over replicas of the rows with these labels, by name; None where undefined in all episodes."""
+    rows = where(table, **labels)
+    agents = len(rows["agent"].unique())
+    names = numbers or [*numbers_in(rows), *(f"agent_{agent}/return" for agent in range(agents))]
+    found = estimates(rows, names)
+    return {name: one.value if one.replicas else None for (name,), one in found.items()}
 
 
-def returns(played):
-    return {replica: [episode.return_.tolist() for episode in own] for replica, own in played.items()}
+def episodes_of(table, column, **labels):
+    """What a column holds of the agents of each episode with these labels, by replica."""
+    found = {}
+    for row in where(table, **labels).to_pylist():
+        key = tuple(row[name] for name in (*labels_of(table), "episode"))
+        found.setdefault(row["replica"], {}).setdefault(key, []).append(row[column])
+    return {replica: list(episodes.values()) for replica, episodes in found.items()}
 
 
-def told(episodes):
-    """What tells episodes apart."""
-    return [(one.steps, one.return_.tolist(), one.shots.tolist(), one.stock_left) for one in episodes]
+def returns(table, **labels):
+    return episodes_of(table, "return", **labels)
+
+
+def told(played, replica=None, **labels):
+    """What tells episodes apart, of a list of them, or of a replica in a table."""
+    if isinstance(played, list):
+        return [(one.steps, one.return_.tolist(), one.shots.tolist(), one.stock_left) for one in played]
+    columns = ("steps", "return", "shots", "stock_left")
+    of_each = [episodes_of(played, column, replica=replica, **labels)[replica] for column in columns]
+    return [
+        (steps[0], returns, shots, stock_left[0])
+        for steps, returns, shots, stock_left in zip(*of_each, strict=True)
+    ]
 
 
 def command(monkeypatch, capsys, *words):

@@ -3,7 +3,6 @@
 import io
 import re
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -29,11 +28,8 @@ from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.envs import spaces_of
-from cprl.evaluation.evaluate import run_table
-from cprl.evaluation.lanes import Fresh
 from cprl.measuring import EpisodeTracker
 from cprl.measuring.evaluate import evaluate
-from cprl.measuring.played import agents_without_harvest, social_measures
 from cprl.measuring.registry import (
     METRICS,
     NEEDS,
@@ -45,6 +41,7 @@ from cprl.measuring.registry import (
     reported_by,
 )
 from cprl.measuring.series import Observer
+from cprl.measuring.statistics import estimates
 from cprl.measuring.table import where
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
@@ -52,7 +49,7 @@ from cprl.runs.curves import curves_of
 from cprl.runs.episodes import COLUMNS, LEFT_OUT, EpisodeTable, as_table, labelled, read_episodes
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
-from cprl.terminal.summary import summarise
+from cprl.terminal.summary import compared, summarise
 from cprl.training.training import StepCollector
 from cprl.viewer.callback import ViewerCallback
 
@@ -213,10 +210,9 @@ def test_a_game_that_must_not_be_stepped_when_it_has_ended_is_evaluated():
     episodes = evaluate(MatrixGame(3), tit_for_tat)
     ends = [(episode.world, episode.episode, episode.steps) for episode in episodes]
     assert ends == [(0, 0, 5), (1, 0, 6), (2, 0, 7)]
-    measures = social_measures({0: episodes})
-    assert list(measures) == ["survival_steps"]
-    assert measures["survival_steps"].estimate.value == 6.0
-    assert agents_without_harvest({0: episodes}) is None
+    measures = estimates(as_table(episodes, 0))
+    assert measures.numbers == ["income", "survival_steps"]
+    assert measures["survival_steps"].value == 6.0
 
 
 def test_an_environment_whose_rewards_are_not_of_agents_in_worlds_is_refused():
@@ -323,20 +319,8 @@ def test_the_terminal_shows_it_too(tmp_path, monkeypatch):
 
 def test_the_table_of_an_evaluation_says_what_is_left_out():
     episodes = evaluate(MatrixGame(2), tit_for_tat)
-
-    class Evaluation:
-        nobody = SimpleNamespace(agents=0)
-        run = SimpleNamespace(path=Path("run"), game=nobody, replicas=[0])
-        trained, random, played = {0: episodes}, {0: episodes}, {0: episodes}
-        fresh = Fresh(replicas=(0,), episodes=2, seed=1, greedy=True)
-
-        def measures(self, policy):
-            return social_measures({0: episodes})
-
-        def differences(self):
-            return dict.fromkeys(self.measures("trained"))
-
-    table = run_table(Evaluation())
+    played = labelled([({"policy": policy}, 0, episodes) for policy in ("trained", "random")])
+    table = compared(played, "")
     assert table.note.startswith("left out: collective_return")
     assert [name for name, *_ in table.rows] == ["survival, steps"]
     assert "One replica: no interval." in table.note

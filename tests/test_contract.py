@@ -26,7 +26,8 @@ from test_teams import TEAMS
 import cprl
 from cprl import CommonsEnv, Experiment
 from cprl.algorithms import DQN, Tabular, TabularSettings
-from cprl.evaluation import crossplay, evaluate_run
+from cprl.evaluation import Fresh, crossplay, evaluate_run
+from cprl.measuring.table import where
 from cprl.objectives.preferences import InequityAversion
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in
@@ -81,7 +82,8 @@ def test_a_run_is_stored_loaded_and_evaluated_plays_frozen_and_others_start_from
     loaded = cprl.load(first)
     assert loaded.experiment == replace(experiment, engine="eager")
     assert len(loaded.networks) == 8
-    assert len(evaluate_run(first, episodes=3).trained[1]) == 3
+    played = evaluate_run(first, Fresh(episodes=3))
+    assert len(where(played, policy="trained", replica=1, agent=0)) == 3
     frozen = population([Frozen(str(first), 1, replica=1), *[Scripted()] * 3])
     assert len(frozen.others) == 2
     begun = population([replace(one, start_from=Frozen(str(first), 0, replica=1)) for one in STORED[name]])
@@ -89,7 +91,7 @@ def test_a_run_is_stored_loaded_and_evaluated_plays_frozen_and_others_start_from
     theirs = loaded.networks["replica_1/agent_0"].state_dict()
     assert all(torch.equal(ours[key], value) for key, value in theirs.items())
     _, second = run([Frozen(str(first), 2, replica=1), *[Scripted("greedy")] * 3], "second")
-    crossplay([first, second], episodes=1)
+    crossplay([first, second], Fresh(episodes=1))
 
 
 WAYS = {

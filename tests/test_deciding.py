@@ -9,6 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from stock_collector import stock_collector
+from stored_runs import episodes_of
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import cprl
@@ -261,10 +262,11 @@ def test_agents_of_a_stored_run_decide_by_what_they_learned(in_one_go, tmp_path)
     for replica in range(2):
         kept = [loaded.decisions[f"replica_{replica}/agent_{agent}"].numpy() for agent in (0, 1)]
         best = [int(own[:2].argmax() + 2 * own[2:].argmax()) for own in kept]
-        found = cprl.evaluate_run(loaded, episodes=8)
-        assert {tuple(own.decision[:2]) for own in found.trained[replica]} == {tuple(best)}
-        assert len({int(own.decision[2]) for own in found.trained[replica]}) > 1, "scripted: by chance"
-        assert len({tuple(own.decision) for own in found.random[replica]}) > 4
+        found = cprl.evaluate_run(loaded, cprl.Fresh(episodes=8))
+        trained = episodes_of(found, "decision", policy="trained")[replica]
+        assert {tuple(decision[:2]) for decision in trained} == {tuple(best)}
+        assert len({decision[2] for decision in trained}) > 1, "scripted: by chance"
+        assert len(set(map(tuple, episodes_of(found, "decision", policy="random")[replica]))) > 4
     assert "replica_0/agent_2" not in loaded.decisions
 
 
@@ -284,10 +286,11 @@ def test_the_evaluation_after_a_training_begins_with_a_greedy_vote_and_random_pl
 def test_runs_play_with_each_other_as_they_decide(in_one_go, tmp_path):
     other = cprl.run(replace(OWN, seed=8, callbacks=()), tmp_path / "other", watch="off")
     cprl.trust(*ALLOW)
-    found = cprl.crossplay([in_one_go, other], episodes=2)
+    found = cprl.crossplay([in_one_go, other], cprl.Fresh(episodes=2))
     first, second = (cprl.load(run).policy(0).decisions.best()[0] for run in (in_one_go, other))
-    for episode in found.cell(in_one_go.name, "other").by_agent[1][0]:
-        decided = choices_of(episode.decision, (2, 3))
+    cell = {"focal": in_one_go.name, "background": "other", "focal_agent": 1}
+    for decision in episodes_of(found, "decision", **cell)[0]:
+        decided = choices_of(np.array(decision), (2, 3))
         assert decided[0].tolist() == second[0].tolist()
         assert decided[1].tolist() == first[1].tolist()
     taxed = replace(OWN, game=replace(MEADOW, institutions=(VOTE,)), callbacks=(), episodes=1)

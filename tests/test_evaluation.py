@@ -4,11 +4,12 @@ import json
 import os
 import shutil
 from dataclasses import replace
-from math import isnan
+from math import isnan, nan
 from pathlib import Path
 
 import matplotlib
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
@@ -24,17 +25,19 @@ from stored_runs import (
     an_experiment,
     command,
     ran,
+    returns,
     stored,
     told,
     values,
 )
 
 import cprl
-from cprl import CommonsEnv, Game, Observation, maps, presets
+from cprl import CommonsEnv, Fresh, Game, Observation, maps, presets
 from cprl.envs.make_env import spaces_of
 from cprl.envs.matrix import prisoners_dilemma
 from cprl.evaluation import (
     Scenario,
+    by_focal_agent,
     draw_gains,
     gains,
     play_empirical_game,
@@ -44,12 +47,14 @@ from cprl.evaluation import (
     schelling,
     territory_of,
 )
+from cprl.evaluation.cross_play import PAIR, RETURNS
 from cprl.evaluation.evaluate import refuse_unlike
-from cprl.evaluation.lanes import Fresh, Part, agents_of
+from cprl.evaluation.lanes import agents_of, play, said, together
 from cprl.measuring.evaluate import evaluate, turns
 from cprl.measuring.movement import trace
-from cprl.measuring.played import agents_without_harvest, over_replicas, social_measures
-from cprl.measuring.registry import with_unit
+from cprl.measuring.registry import INCOME_EQUALITY, with_unit
+from cprl.measuring.statistics import estimates
+from cprl.measuring.table import numbers_in, where
 from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import LaneActor, random_agents
@@ -70,10 +75,11 @@ def learned(alike, tmp_path_factory):
 
 
 def test_a_run_of_scripted_agents_gives_the_numbers_worked_by_hand(corridors):
-    found = cprl.evaluate_run(corridors["greedy"], episodes=4)
-    assert list(found.trained) == list(found.random) == [0, 1]
-    measures = found.measures()
-    assert values(measures) == pytest.approx(
+    found = cprl.evaluate_run(corridors["greedy"], Fresh(episodes=4))
+    assert set(zip(*(found[name].to_pylist() for name in ("policy", "replica")), strict=True)) == {
+        (policy, replica) for policy in ("trained", "random") for replica in (0, 1)
+    }
+    assert values(found, policy="trained") == pytest.approx(
         {
             "collective_return": 5,
             "efficiency": 5 / 3,
@@ -88,37 +94,48 @@ def test_a_run_of_scripted_agents_gives_the_numbers_worked_by_hand(corridors):
             "agent_1/return": 3,
         }
     )
-    assert measures["equality"].estimate.low == measures["equality"].estimate.high == pytest.approx(0.9)
-    assert {one.episodes for one in measures.values()} == {8}
+    levels = cprl.estimates(found, by="policy")
+    equality = levels["trained", "equality"]
+    assert equality.low == equality.high == pytest.approx(0.9)
+    assert {one.episodes for one in levels.values()} == {8}
 
 
 def test_what_is_undefined_is_counted_apart_and_in_no_mean(corridors):
-    found = cprl.evaluate_run(corridors["sustainable"], episodes=3, replicas=[1])
-    measures = found.measures()
-    assert values(measures)["collective_return"] == 0
+    found = cprl.evaluate_run(corridors["sustainable"], Fresh(episodes=3, replicas=(1,)))
+    levels = cprl.estimates(found, by="policy")
+    assert levels["trained", "collective_return"].value == 0
     for name in ("equality", "sustainability"):
-        assert measures[name].estimate is None
-        assert str(measures[name]) == "undefined in all 3"
-    assert agents_without_harvest(found.trained) == (6, 6)
-    some = over_replicas({0: [1.0, float("nan")], 4: [float("nan")] * 2, 5: [2.0, 5.0]})
-    assert (some.undefined, some.episodes, some.estimate.replicas) == (3, 6, 2)
-    assert some.estimate.value == (1 + 3.5) / 2, "the mean of means of replicas, not 8 / 3 nor anything / 6"
-    assert str(some).endswith("], undefined in 3 of 6")
-    assert str(over_replicas({0: [2.0, float("nan")]})) == "2.00, undefined in 1 of 2", "without an interval"
+        assert isnan(levels["trained", name].value)
+        assert str(levels["trained", name]).startswith("undefined in all 3")
+    some = own_estimate({0: [1.0, nan], 4: [nan] * 2, 5: [2.0, 5.0]})
+    assert (some.undefined, some.episodes, some.replicas) == (3, 6, 2)
+    assert some.value == (1 + 3.5) / 2, "the mean of means of replicas, not 8 / 3 nor anything / 6"
+    assert "], undefined in 3 of 6" in str(some)
+    assert str(own_estimate({0: [2.0, nan]})).startswith("2.00, undefined in 1 of 2"), "without an interval"
+
+
+def own_estimate(by_replica):
+    """The estimate of an own metric, from its values in the episodes of each replica."""
+    rows = [
+        {"replica": replica, "episode": episode, "agent": 0, "own": value}
+        for replica, values in by_replica.items()
+        for episode, value in enumerate(values)
+    ]
+    return estimates(pa.Table.from_pylist(rows), "own")["own"]
 
 
 @pytest.mark.integration
 @pytest.mark.parametrize("name", ["alike", "mixed"])
 def test_greedy_agents_play_what_the_policy_of_the_loaded_run_plays(name, learned):
-    found = cprl.evaluate_run(learned[name], episodes=4, greedy=True, seed=SEED)
+    found = cprl.evaluate_run(learned[name], Fresh(episodes=4, greedy=True, seed=SEED))
     loaded = cprl.load(learned[name])
     means = []
     for replica in loaded.replicas:
         env = CommonsEnv(MEADOW, 4, seed=SEED, first_world=4 * replica)
         alone = evaluate(env, loaded.policy(replica, worlds=4))
-        assert told(alone) == told(found.trained[replica])
+        assert told(alone) == told(found, replica, policy="trained")
         means.append(np.mean([episode.harvest.sum() for episode in alone]))
-    assert values(found.measures())["collective_return"] == pytest.approx(np.mean(means))
+    assert values(found, policy="trained")["collective_return"] == pytest.approx(np.mean(means))
 
 
 @pytest.mark.parametrize(("worlds", "of_policy"), [(4, 1), (2, 4)])
@@ -145,9 +162,10 @@ def test_networks_that_do_not_stack_play_the_same(learned):
     loaded = cprl.load(learned["alike"])
     own = replace(loaded, networks={lane: Own(network) for lane, network in loaded.networks.items()})
     for greedy in (True, False):
-        one, other = (cprl.evaluate_run(run, episodes=2, greedy=greedy) for run in (loaded, own))
+        fresh = Fresh(episodes=2, greedy=greedy)
+        one, other = (cprl.evaluate_run(run, fresh) for run in (loaded, own))
         for replica in loaded.replicas:
-            assert told(one.trained[replica]) == told(other.trained[replica])
+            assert told(one, replica, policy="trained") == told(other, replica, policy="trained")
 
 
 def test_agents_explore_with_the_runs_epsilon_for_evaluation(learned, tmp_path):
@@ -159,9 +177,11 @@ def test_agents_explore_with_the_runs_epsilon_for_evaluation(learned, tmp_path):
     manifest = json.loads((always / "manifest.json").read_text())
     del manifest["experiment"]  # which is of the recipe before
     (always / "manifest.json").write_text(json.dumps(manifest))
-    by_chance = cprl.evaluate_run(always, episodes=2)
-    assert told(by_chance.trained[0]) == told(by_chance.random[0]), "with epsilon 1 every action is random"
-    assert told(by_chance.trained[0]) != told(cprl.evaluate_run(always, episodes=2, greedy=True).trained[0])
+    by_chance = cprl.evaluate_run(always, Fresh(episodes=2))
+    explored = told(by_chance, 0, policy="trained")
+    assert explored == told(by_chance, 0, policy="random"), "with epsilon 1 every action is random"
+    greedy = cprl.evaluate_run(always, Fresh(episodes=2, greedy=True))
+    assert explored != told(greedy, 0, policy="trained")
 
 
 class Undecided(torch.nn.Module):
@@ -178,11 +198,11 @@ def test_agents_that_learned_a_policy_draw_from_it(learned):
         experiment=replace(loaded.experiment, agents=[PPO, PPO]),
         networks={f"replica_{replica}/agent_{agent}": Undecided() for replica in (0, 1) for agent in (0, 1)},
     )
-    found = cprl.evaluate_run(undecided, episodes=2)
+    found = cprl.evaluate_run(undecided, Fresh(episodes=2))
     for replica in (0, 1):
-        assert told(found.trained[replica]) == told(found.random[replica])
-    greedy = cprl.evaluate_run(undecided, episodes=2, greedy=True)
-    assert told(greedy.trained[0]) != told(greedy.random[0])
+        assert told(found, replica, policy="trained") == told(found, replica, policy="random")
+    greedy = cprl.evaluate_run(undecided, Fresh(episodes=2, greedy=True))
+    assert told(greedy, 0, policy="trained") != told(greedy, 0, policy="random")
 
 
 def test_an_evaluation_computes_in_one_thread_and_leaves_their_number_as_it_was():
@@ -244,39 +264,38 @@ def test_a_run_that_has_not_ended_plays_by_its_newest_checkpoint(tmp_path):
 
     with pytest.raises(Stopped), Stops(run) as checkpoints:
         train(env, agents.learners, others=agents.others, episodes=9, checkpointer=checkpoints)
-    found = cprl.evaluate_run(run, episodes=3, greedy=True)
-    assert found.run.weights_from.name.startswith("training-000000000030")
-    fresh = CommonsEnv(MEADOW, 6, seed=found.fresh.seed)
-    now = evaluate(fresh, agents.policy(3))
-    assert told(now) == told(found.trained[0] + found.trained[1])
+    fresh = Fresh(episodes=3, greedy=True)
+    found = cprl.evaluate_run(run, fresh)
+    assert "training-000000000030" in said(found, "weights")
+    now = evaluate(CommonsEnv(MEADOW, 6, seed=fresh.seed), agents.policy(3))
+    assert told(now) == [*told(found, 0, policy="trained"), *told(found, 1, policy="trained")]
 
 
 def test_a_matrix_of_scripted_agents_gives_the_numbers_worked_by_hand(corridors):
-    found = cprl.crossplay(list(corridors.values()), episodes=2)
-    wanted = {  # focal, background, group: each the mean of focal agents 0 and 1
+    found = cprl.crossplay(list(corridors.values()), Fresh(episodes=2))
+    wanted = {  # focal, background, all together: each the mean of focal agents 0 and 1
         ("greedy", "greedy"): ((2 + 3) / 2, (3 + 2) / 2, 5),
         ("greedy", "sustainable"): ((2 + 3) / 2, 0, (2 + 3) / 2),
         ("sustainable", "greedy"): (0, (3 + 2) / 2, (3 + 2) / 2),
         ("sustainable", "sustainable"): (0, 0, 0),
     }
-    assert set(found.cells) == set(wanted)
-    for at, returns in wanted.items():
-        measures = values(found.cell(*at).measures())
-        assert tuple(measures[f"{who}/return"] for who in ("focal", "background", "group")) == returns
-    visit = found.cell("greedy", "sustainable")
-    of_agents = [values(visit.measures(agent)) for agent in (0, 1)]
-    assert [(one["focal/return"], one["stock_left"]) for one in of_agents] == [(2, 3), (3, 2)]
-    assert visit.measures()["equality"].estimate.value == 0.5, "one of two has everything"
-    assert visit.measures()["collective_return"].episodes == 2 * 2 * 2
-    at_home = found.cell("sustainable", "sustainable").measures()
-    assert (at_home["equality"].undefined, at_home["equality"].episodes) == (4, 4), "each episode once"
-    focal_agents = found.where(focal="greedy", background="greedy").table()["focal_agent"]
-    assert set(focal_agents.to_pylist()) == {-1}
-    with pytest.raises(ValueError, match=r"the cell is \('greedy', 'DQN'\)"):
-        found.cell("greedy", "DQN")
-    for cell in (visit, found.cell("greedy", "greedy")):
-        with pytest.raises(ValueError, match="agent is 2"):
-            cell.measures(2)
+    levels = cprl.estimates(found, [*RETURNS, *numbers_in(found)], by=PAIR)
+    assert set(levels.labels) == set(wanted)
+    for at, means in wanted.items():
+        assert tuple(levels[(*at, number)].value for number in RETURNS) == means
+    visit = where(found, focal="greedy", background="sustainable")
+    of_agents = cprl.estimates(visit, ["focal/return", "stock_left"], by="focal_agent")
+    assert [of_agents[agent, "focal/return"].value for agent in (0, 1)] == [2, 3]
+    assert [of_agents[agent, "stock_left"].value for agent in (0, 1)] == [3, 2]
+    assert levels["greedy", "sustainable", "equality"].value == 0.5, "one of two has everything"
+    assert levels["greedy", "sustainable", "collective_return"].episodes == 2 * 2 * 2
+    at_home = levels["sustainable", "sustainable", "equality"]
+    assert (at_home.undefined, at_home.episodes) == (4, 4), "each episode once"
+    self_play = where(found, focal="greedy", background="greedy")
+    assert set(self_play["focal_agent"].to_pylist()) == {-1}
+    in_turn = cprl.estimates(by_focal_agent(found), RETURNS, by=(*PAIR, "focal_agent"))
+    assert [in_turn["greedy", "greedy", agent, "focal/return"].value for agent in (0, 1)] == [2, 3]
+    assert [in_turn["greedy", "greedy", agent, "background/return"].value for agent in (0, 1)] == [3, 2]
 
 
 def test_games_are_unlike_in_fields_that_a_refusal_names():
@@ -288,55 +307,61 @@ def test_games_are_unlike_in_fields_that_a_refusal_names():
 
 
 def test_each_cell_is_what_the_loaded_runs_agents_play_with_one_focal_agent(learned):
-    found = cprl.crossplay(learned.values(), episodes=3, seed=SEED, greedy=True)
+    fresh = Fresh(episodes=3, seed=SEED, greedy=True)
+    found = cprl.crossplay(learned.values(), fresh)
+    names = ("focal/return", "background/return", "stock_left")
     loaded = {name: cprl.load(run) for name, run in learned.items()}
     for focal, background in (("alike", "mixed"), ("mixed", "alike")):
-        cell, means = found.cell(focal, background), []
+        cell, means = where(found, focal=focal, background=background), []
         for replica in range(3):
             numbers = []
             for agent in range(2):
                 mixed = agents_of(loaded[background])
                 mixed[agent] = agents_of(loaded[focal])[agent]
-                fresh = Fresh(replicas=(replica,), episodes=3, seed=SEED, greedy=True)
-                alone = fresh.play(loaded[background], mixed)[replica]
-                assert told(alone) == told(cell.by_agent[agent][replica])
-                numbers += [(one.return_[agent], one.return_[1 - agent], one.stock_left) for one in alone]
+                alone = play(replace(fresh, replicas=(replica,)), loaded[background], mixed)
+                assert told(alone, replica) == told(cell, replica, focal_agent=agent)
+                numbers += [
+                    (returns[agent], returns[1 - agent], stock_left)
+                    for _, returns, _, stock_left in told(alone, replica)
+                ]
             means.append(np.mean(numbers, 0))
-        names = ("focal/return", "background/return", "stock_left")
-        assert [values(cell.measures())[name] for name in names] == pytest.approx(np.mean(means, 0))
-        assert {cell.measures()[name].estimate.replicas for name in names} == {3}
-    diagonal = found.cell("mixed", "mixed")
-    at_home = cprl.evaluate_run(learned["mixed"], episodes=3, seed=SEED, greedy=True)
-    assert told(diagonal.by_agent[1][2]) == told(at_home.trained[2])
+        assert [*values(cell, names).values()] == pytest.approx(np.mean(means, 0))
+        assert {one.replicas for one in cprl.estimates(cell, names).values()} == {3}
+    at_home = cprl.evaluate_run(learned["mixed"], fresh)
+    diagonal = where(found, focal="mixed", background="mixed")
+    assert told(diagonal, 2) == told(at_home, 2, policy="trained")
 
 
 @pytest.mark.integration
 def test_on_the_diagonal_a_cross_seed_agent_is_of_the_next_replica(learned):
     runs = list(learned.values())
-    how = {"episodes": 2, "seed": SEED, "greedy": True}
-    found = cprl.crossplay(runs, diagonal="cross_seed", replicas=[0, 2], **how)
-    loaded, cell = cprl.load(learned["alike"]), found.cell("alike", "alike")
+    fresh = Fresh(episodes=2, seed=SEED, greedy=True, replicas=(0, 2))
+    found = cprl.crossplay(runs, fresh, diagonal="cross_seed")
+    loaded = cprl.load(learned["alike"])
+    cell = where(found, focal="alike", background="alike")
     for background, focal in ((0, 2), (2, 0)):
         mixed = [agents_of(loaded)[0], agents_of(loaded, {background: focal})[1]]
-        fresh = Fresh(replicas=(background,), episodes=2, seed=SEED, greedy=True)
-        alone = fresh.play(loaded, mixed)[background]
-        assert told(alone) == told(cell.by_agent[1][background])
-    usual = cprl.crossplay(runs, replicas=[0, 2], **how)
-    for at in (("alike", "mixed"), ("mixed", "alike")):
-        assert values(usual.cell(*at).measures()) == values(found.cell(*at).measures())
+        alone = play(replace(fresh, replicas=(background,)), loaded, mixed)
+        assert told(alone, background) == told(cell, background, focal_agent=1)
+    usual = cprl.crossplay(runs, fresh)
+    for at in ({"focal": "alike", "background": "mixed"}, {"focal": "mixed", "background": "alike"}):
+        assert returns(usual, **at) == returns(found, **at)
 
 
 def test_runs_have_given_names_those_of_their_directories_or_their_paths(corridors, tmp_path):
     copy = shutil.copytree(corridors["greedy"], tmp_path / "greedy")
-    found = cprl.crossplay([corridors["greedy"], copy], episodes=1)
-    assert list(found.runs) == [str(corridors["greedy"]), str(copy)]
-    found = cprl.crossplay({"bites": corridors["greedy"], "waits": corridors["sustainable"]}, episodes=1)
-    assert found.cell("waits", "bites").measures()["background/return"].estimate.value == 2.5
+    fresh = Fresh(episodes=1)
+    found = cprl.crossplay([corridors["greedy"], copy], fresh)
+    assert found["focal"].unique().to_pylist() == [str(corridors["greedy"]), str(copy)]
+    found = cprl.crossplay({"bites": corridors["greedy"], "waits": corridors["sustainable"]}, fresh)
+    assert (
+        cprl.estimates(found, "background/return", by=PAIR)["waits", "bites", "background/return"].value
+        == 2.5
+    )
 
 
-def exploited(corridors):
+def exploited():
     """A cross-play of two replicas in which greedy agents exploit sustainable ones."""
-    played = cprl.crossplay(list(corridors.values()), episodes=1, replicas=[0, 1])
     among_their_like = {0: [[5, 5], [7, 7]], 1: [[5, 5], [7, 7]]}
     returns = {
         # focal agents 0 and 1, each in replicas 0 and 1; the focal agent's return stands at its index
@@ -345,41 +370,48 @@ def exploited(corridors):
         ("sustainable", "sustainable"): among_their_like,
         ("greedy", "greedy"): {0: [[2, 2], [2, 2]], 1: [[2, 2], [2, 2]]},
     }
-    parts = []
-    for (focal, background), by_agent in returns.items():
-        for agent, of_replicas in by_agent.items():
-            (episode,) = played.cell(focal, background).by_agent[agent][0]
-            episodes = {
-                replica: [replace(episode, replica=replica, return_=np.array(both, dtype=float))]
-                for replica, both in enumerate(of_replicas)
-            }
-            labels = {"focal": focal, "background": background, "focal_agent": agent}
-            parts.append(Part(labels, episodes, ((agent,),)))
-    return replace(played, parts=parts)
+    rows = [
+        {
+            "focal": focal,
+            "background": background,
+            "focal_agent": focal_agent,
+            "replica": replica,
+            "episode": 0,
+            "agent": agent,
+            "role": "focal" if agent == focal_agent else "background",
+            "return": float(value),
+        }
+        for (focal, background), by_agent in returns.items()
+        for focal_agent, of_replicas in by_agent.items()
+        for replica, both in enumerate(of_replicas)
+        for agent, value in enumerate(both)
+    ]
+    return together([pa.Table.from_pylist(rows)], fresh="2 replicas, 1 episode each", diagonal="self")
 
 
-def test_gains_are_differences_from_the_diagonal_paired_by_replica(corridors):
-    found = gains(exploited(corridors))
-    assert set(found) == {("greedy", "sustainable"), ("sustainable", "greedy")}
+def test_gains_are_differences_from_the_diagonal_paired_by_replica():
+    found = gains(exploited())
+    assert set(found.labels) == {("greedy", "sustainable"), ("sustainable", "greedy")}
     # Greedy among sustainable agents: focal (9 + 9) / 2 - 5 = 4 and (12 + 10) / 2 - 7 = 4 in replicas 0 and
     # 1; background (2 + 3) / 2 - 5 = -2.5 and (4 + 4) / 2 - 7 = -3.
-    greedy = found["greedy", "sustainable"]
-    assert (greedy.focal.value, greedy.focal.low, greedy.focal.high) == (4, 4, 4)
-    assert greedy.background.value == -2.75
+    greedy = found.of("greedy", "sustainable")
+    focal, background = greedy["focal/return"], greedy["background/return"]
+    assert (focal.value, focal.low, focal.high) == (4, 4, 4)
+    assert background.value == -2.75
     # Student's t for 1 degree of freedom at 97.5 % is 12.706; the standard error is 0.25.
-    assert greedy.background.high == pytest.approx(-2.75 + 12.706 * 0.25, abs=1e-3)
+    assert background.high == pytest.approx(-2.75 + 12.706 * 0.25, abs=1e-3)
     # Sustainable among greedy agents: focal 1 - 2; background 2 - 2 = 0 and 3 - 2 = 1.
-    sustainable = found["sustainable", "greedy"]
-    assert (sustainable.focal.value, sustainable.background.value) == (-1, 0.5)
-    at_home = [exploited(corridors).cell(name, name).mean_returns("focal").mean() for name in corridors]
-    assert at_home == [2, 6]
+    sustainable = found.of("sustainable", "greedy")
+    assert [one.value for one in sustainable.values()] == [-1, 0.5]
+    at_home = cprl.estimates(exploited(), "focal/return", by=PAIR)
+    assert [at_home[name, name, "focal/return"].value for name in ("greedy", "sustainable")] == [2, 6]
 
 
 @pytest.mark.integration
-def test_the_picture_of_gains_has_a_row_for_each_focal_run(corridors, tmp_path):
-    path = draw_gains(exploited(corridors), tmp_path / "new" / "gains.png")
+def test_the_picture_of_gains_has_a_row_for_each_focal_run(tmp_path):
+    path = draw_gains(exploited(), tmp_path / "new" / "gains.png")
     with pytest.raises(ValueError, match=r"path is '.*gains\.jpg'"):
-        draw_gains(exploited(corridors), tmp_path / "gains.jpg")
+        draw_gains(exploited(), tmp_path / "gains.jpg")
     with Image.open(path) as picture:
         assert min(picture.size) > 500
         colours = np.asarray(picture.convert("RGB")).reshape(-1, 3)
@@ -418,7 +450,7 @@ WRITTEN = [
         [
             "2 replicas, 1 episode each with focal agent at each index, seed 30011, diagonal: self",
             "focal: return, apples",
-            "group: return, apples",
+            "income of all agents together, apples",
             "sustainability, steps",
             "* not 0 by Holm's method for all 4 differences",
         ],
@@ -426,18 +458,18 @@ WRITTEN = [
             ["bites", "2.50 [2.50, 2.50]", "2.50 [2.50, 2.50]"],
             ["sustainable", "0 [0, 0]", "0 [0, 0]"],
             ["bites", "sustainable", "1", "3.00 [3.00, 3.00]", "0 [0, 0]", "3.00 [3.00, 3.00]"],
-            ["sustainable", "0.50 [0.50, 0.50]", "undefined in all 2"],  # equality
+            ["sustainable", "0.50 [0.50, 0.50]", "undefined in all 2 episodes"],  # equality
             # In place of a sustainable agent, which gets nothing, a greedy one gets 2.5; the other as before.
             # Replicas are alike, so that of four differences those have a star that are not 0.
-            ["bites", "", "2.50 [2.50, 2.50] *"],
+            ["bites", "", "+2.50 [+2.50, +2.50] *"],
             ["sustainable", "-2.50 [-2.50, -2.50] *", ""],
-            ["bites", "", "0 [0, 0]"],
+            ["bites", "", "+0 [+0, +0]"],
         ],
         (1 + 2 + 2 + 1) * 2 * 2,  # visits, replicas, agents
         True,
     ),
     (
-        ["schelling", "{drawing}", "--episodes", 1, "--replicas", 2],
+        ["schelling", "{drawing}", "--episodes", 1, "--replicas", 0, 1],
         ["fear, G(0) - R(0)", "2 replicas, 1 episode each for each choice of restrained agents"],
         [],
         (1 + 2 + 1) * 2 * 2,
@@ -501,8 +533,8 @@ def test_a_command_prints_its_numbers_and_writes_its_files_once(
         with pytest.raises(SystemExit, match=rf"cprl: .*{path.name} exists and is not overwritten"):
             command(monkeypatch, capsys, *words, option, path)
     if episodes:
-        with pytest.raises(SystemExit, match=r"--out is .*a\.csv; allowed: .*\.parquet"):
-            command(monkeypatch, capsys, *words, "--out", tmp_path / "a.csv")
+        with pytest.raises(SystemExit, match=r"--out is .*a\.json'; allowed: .*\.parquet"):
+            command(monkeypatch, capsys, *words, "--out", tmp_path / "a.json")
     if is_drawn:
         with pytest.raises(SystemExit, match=r"--figure is '.*a\.jpg'"):
             command(monkeypatch, capsys, *words, "--figure", tmp_path / "a.jpg")
@@ -511,18 +543,21 @@ def test_a_command_prints_its_numbers_and_writes_its_files_once(
 def test_the_table_of_an_evaluation_has_every_metric_and_its_file_every_episode(
     alike, tmp_path, monkeypatch, capsys
 ):
-    found, out = cprl.evaluate_run(alike, episodes=1), tmp_path / "episodes.parquet"
+    found, out = cprl.evaluate_run(alike, Fresh(episodes=1)), tmp_path / "episodes.parquet"
     rows = rows_of(command(monkeypatch, capsys, "evaluate", alike, "--episodes", 1, "--out", out))
-    assert pq.read_table(out).equals(found.table())
-    more = found.differences()
-    for name, random in found.measures("random").items():
-        trained, of_difference = found.measures()[name], "" if more[name] is None else f"{more[name]:+}"
-        assert [with_unit(name, rewards="apples"), str(trained), str(random), of_difference] in rows
-    values = [
-        np.mean([one.return_.sum() for one in trained]) - np.mean([one.return_.sum() for one in random])
-        for trained, random in zip(found.trained.values(), found.random.values(), strict=True)
-    ]
-    assert more["collective_return"].value == pytest.approx(np.mean(values))
+    rows = [[cell.removesuffix(" *") for cell in row] for row in rows]
+    assert pq.read_table(out).equals(found)
+    numbers = [*numbers_in(found), "agent_0/return", "agent_1/return"]
+    levels = cprl.estimates(found, numbers, by="policy")
+    more = cprl.differences(found, numbers, by="policy", reference={"policy": "random"})
+    for name in numbers:
+        trained, random = (str(levels[policy, name]) for policy in ("trained", "random"))
+        change = more.get(("trained", name))
+        of_difference = "" if change is None else f"{change:+}"
+        assert [with_unit(name, rewards="apples"), trained, random, of_difference] in rows
+    both = [returns(found, policy=policy) for policy in ("trained", "random")]
+    values = [np.sum(both[0][replica]) - np.sum(both[1][replica]) for replica in both[0]]
+    assert more["trained", "collective_return"].value == pytest.approx(np.mean(values))
 
 
 @pytest.mark.parametrize(
@@ -538,9 +573,9 @@ def test_words_that_do_not_fit_are_refused(words, answer, corridors, monkeypatch
 
 
 PLAYS = {
-    "evaluate_run": lambda runs, **fresh: cprl.evaluate_run(runs["mixed"], **fresh),
-    "run_scenarios": lambda runs, **fresh: run_scenarios(
-        runs["alike"], scenarios=["minority_among_greedy"], **fresh
+    "evaluate_run": lambda runs, fresh: cprl.evaluate_run(runs["mixed"], fresh),
+    "run_scenarios": lambda runs, fresh: run_scenarios(
+        runs["alike"], fresh, scenarios=["minority_among_greedy"]
     ),
     "crossplay": cprl.crossplay,
     "play_empirical_game": play_empirical_game,
@@ -549,44 +584,56 @@ PLAYS = {
 
 @pytest.mark.parametrize("play", PLAYS.values(), ids=PLAYS)
 def test_replicas_play_the_same_alone_and_whoever_drew_before(play, learned):
-    everything = play(learned, episodes=2).table()
+    everything = play(learned, Fresh(episodes=2))
     torch.manual_seed(7)
     state = torch.get_rng_state()
-    alone = play(learned, episodes=2, replicas=[2, 0])
+    alone = play(learned, Fresh(episodes=2, replicas=(2, 0)))
     assert torch.equal(torch.get_rng_state(), state), "nothing of ours draws from torch's generator"
-    assert list(alone.played) == [0, 2]
+    assert alone["replica"].unique().to_pylist() == [0, 2]
     replica = np.array(everything["replica"])
-    assert repr(alone.table().to_pydict()) == repr(everything.filter(replica != 1).to_pydict())
+    assert repr(alone.to_pydict()) == repr(everything.filter(replica != 1).to_pydict())
     first, second = (everything.filter(replica == number)["return"] for number in (0, 1))
     assert first != second, "replicas play different worlds"
-    assert play(learned, episodes=2, seed=SEED).table()["return"] != everything["return"]
+    assert play(learned, Fresh(episodes=2, seed=SEED))["return"] != everything["return"]
 
 
 FULL = replace(MEADOW, observation=Observation(area="full"))
 ALONE = presets.game("single_basic")
 RANDOM = [Scripted("random")] * 2
+TRAINED_IN = Fresh(seed=3)
 
 
 @pytest.mark.parametrize(
     ("play", "answer"),
     [
-        (lambda runs: cprl.evaluate_run(runs["alike"], episodes=0), "episodes is 0"),
-        (lambda runs: cprl.evaluate_run(runs["alike"], seed=3), r"seed is 3, the training seed of .*alike"),
-        (lambda runs: cprl.evaluate_run(runs["alike"], replicas=[1, 9, 3]), r"no replicas \[3, 9\]"),
+        (lambda _: Fresh(episodes=0), "episodes is 0"),
+        (
+            lambda runs: cprl.evaluate_run(runs["alike"], TRAINED_IN),
+            r"seed is 3, the training seed of .*alike",
+        ),
+        (lambda runs: cprl.evaluate_run(runs["alike"], Fresh(replicas=(1, 9, 3))), r"no replicas \[3, 9\]"),
         (lambda runs: cprl.crossplay([runs["alike"]]), "the number of runs is 1"),
         (lambda runs: cprl.crossplay([runs["alike"], runs["mixed"], runs["alike"]]), "alike is given twice"),
         (lambda runs: cprl.crossplay([runs["alike"], runs["greedy"]]), "alike and greedy .* Game.map"),
         (lambda runs: cprl.crossplay([runs["lonely"], runs["alone"]]), "the game has 1 agent"),
         (
-            lambda runs: cprl.crossplay([runs["alike"], runs["mixed"]], diagonal="cross_seed", replicas=[1]),
+            lambda runs: cprl.crossplay(
+                [runs["alike"], runs["mixed"]], Fresh(replicas=(1,)), diagonal="cross_seed"
+            ),
             r"the replicas are \[1\]",
         ),
         (lambda _: play_population("meadow", RANDOM), "where is 'meadow'"),
         (lambda _: play_population(MEADOW, [DQN, *RANDOM[1:]]), r"agents\[0\] is a Learning"),
         (lambda _: play_population(MEADOW, RANDOM[1:]), "1 agents are specified for a game of 2"),
-        (lambda _: play_population(MEADOW, RANDOM, replicas=0), "replicas is"),
-        (lambda runs: play_population(MEADOW, among(runs["alike"]), seed=3), "seed is 3, the training seed"),
-        (lambda runs: play_population(MEADOW, among(runs["alike"]), replicas=4), "network of replica_3"),
+        (lambda _: Fresh(replicas=(-1,)), "replicas"),
+        (
+            lambda runs: play_population(MEADOW, among(runs["alike"]), TRAINED_IN),
+            "seed is 3, the training seed",
+        ),
+        (
+            lambda runs: play_population(MEADOW, among(runs["alike"]), Fresh(replicas=(0, 3))),
+            r"no replicas \[3\]",
+        ),
         (lambda _: schelling(ALONE), "the game has 1 agent"),
         (lambda _: schelling(CORRIDORS, restrained="kind"), "restrained is 'kind'"),
         (lambda _: schelling(CORRIDORS, greedy="sustainable"), "greedy is 'sustainable'"),
@@ -635,11 +682,11 @@ def its_like(game, run):
 
 
 def test_social_measures_are_those_of_the_docs(corridors):
-    found = cprl.evaluate_run(corridors["greedy"], episodes=1)
+    found = where(cprl.evaluate_run(corridors["greedy"], Fresh(episodes=1)), policy="trained")
     text = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
     documented = [line.split("`")[1] for line in text.splitlines() if line.startswith("| `social/")]
-    of_institutions = {"social/income_equality"}
-    assert {f"social/{name}" for name in social_measures(found.trained)} | of_institutions == set(documented)
-    (single,) = [one for name, one in social_measures({0: found.trained[0]}).items() if name == "peace"]
+    of_institutions = {f"social/{INCOME_EQUALITY}"}
+    assert {f"social/{name}" for name in numbers_in(found)} == set(documented) - of_institutions
+    single = cprl.estimates(where(found, replica=0), "peace")["peace"]
     assert str(single) == "2.00", "one replica alone has no interval"
-    assert isnan(single.estimate.low)
+    assert isnan(single.low)

@@ -13,6 +13,7 @@ from cprl import Custom, Game, Rules, maps
 from cprl.algorithms import DQN, PPO, VDN, DQNSettings, RolloutSettings, Tabular, TabularSettings
 from cprl.commands.recipe import parse
 from cprl.institutions import Tax, Vote
+from cprl.measuring.table import where
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.episodes import read_episodes, read_evaluations
 from cprl.runs.weights import load_weights
@@ -110,10 +111,9 @@ def test_agents_play_as_a_greedy_evaluation_of_a_run_of_so_many_episodes(tmp_pat
     even = experiment(game=EVEN)
     table = read_evaluations(run(even, tmp_path / "run"))
     short = run(replace(even, episodes=2), tmp_path / "short")
-    greedy = cprl.evaluate_run(short, episodes=3, greedy=True, seed=even.seed + 1).table()
-    wanted = greedy.filter(np.array(greedy["policy"]) == "trained").drop(["policy"])
-    after_two = table.filter(np.array(table["trained_episodes"]) == 2).drop(["trained_episodes"])
-    assert rows(after_two) == rows(wanted)
+    greedy = cprl.evaluate_run(short, cprl.Fresh(episodes=3, greedy=True, seed=even.seed + 1))
+    after_two = where(table, trained_episodes=2).drop(["trained_episodes"])
+    assert rows(after_two) == rows(where(greedy, policy="trained").select(after_two.column_names))
 
 
 @pytest.mark.integration

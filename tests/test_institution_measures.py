@@ -29,13 +29,14 @@ from cprl.institutions import (
 from cprl.institutions.law import KINDS
 from cprl.measuring import EpisodeTracker, social
 from cprl.measuring.evaluate import evaluate
-from cprl.measuring.played import institution_measures, social_measures
 from cprl.measuring.registry import METRICS, OF_INSTITUTIONS, OPTIONAL, left_out, measurable, measured
 from cprl.measuring.series import numbers_of
+from cprl.measuring.statistics import estimates
+from cprl.measuring.table import numbers_in
 from cprl.policies.lanes import random_agents
 from cprl.runs.curves import as_curves
 from cprl.runs.episodes import OF_INSTITUTIONS as COLUMNS
-from cprl.runs.episodes import EpisodeTable, as_table, read_episodes, stored_episodes
+from cprl.runs.episodes import EpisodeTable, as_table, labelled, read_episodes, stored_episodes
 from cprl.training import train
 
 NAN = float("nan")
@@ -243,7 +244,7 @@ def test_a_game_without_institutions_is_as_it_was():
     assert (episode.fines, episode.counts, episode.in_force, of_law(episode)) == (None, None, None, {})
     assert not set(as_table([episode], 0).column_names) & set(COLUMNS)
     assert not [name for name in numbers_of(episode, {}, ["a", "b"]) if "institutions" in name]
-    assert institution_measures({0: [episode]}) == {}
+    assert not any("institutions" in name for name in numbers_in(as_table([episode], 0)))
     assert not {"fines", "counts"} & set(EpisodeTracker(1, 2).state_dict())
 
 
@@ -334,9 +335,9 @@ def test_curves_and_logged_numbers_are_those_of_the_episode():
 def test_undefined_numbers_are_counted_apart():
     first, second = (played(*an_episode())[0] for _ in range(2))
     first.metrics["institutions/detection_rate"] = NAN
-    found = institution_measures({0: [first, second]})
-    assert str(found["institutions/detection_rate"]) == "0.50, undefined in 1 of 2"
-    assert not any(name.startswith("institutions") for name in social_measures({0: [first]}))
+    rows = labelled([({}, 0, [first, second])])
+    found = estimates(rows, "institutions/detection_rate")["institutions/detection_rate"]
+    assert str(found) == "0.50, undefined in 1 of 2 episodes"
 
 
 MANY = (

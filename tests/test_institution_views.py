@@ -17,8 +17,7 @@ from torchrl.envs import TransformedEnv
 
 import cprl
 from cprl import CommonsEnv, Custom, Experiment, Game, Rules, maps
-from cprl.evaluation import evaluate_run
-from cprl.evaluation.evaluate import run_table
+from cprl.evaluation import Fresh, evaluate_run
 from cprl.evaluation.film import Style, film, film_video
 from cprl.evaluation.film_pictures import EpisodePicture
 from cprl.institutions import Boundaries, GraduatedSanctions, Monitoring, Sanctioner, Tax, Vote
@@ -29,7 +28,7 @@ from cprl.policies.lanes import random_agents
 from cprl.population import Scripted
 from cprl.runs.episodes import read_episodes
 from cprl.terminal.figures import training_curve
-from cprl.terminal.summary import summarise
+from cprl.terminal.summary import compared, summarise
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.layout import layout, styles
@@ -243,11 +242,11 @@ def printed(what):
 @pytest.fixture(scope="module")
 def evaluation(whole):
     cprl.trust(*ALLOW)
-    return evaluate_run(whole, episodes=2)
+    return evaluate_run(whole, Fresh(episodes=2))
 
 
 def test_the_page_of_a_run_has_a_row_for_each_number_of_institutions(whole, evaluation):
-    played = evaluation.table()
+    played = evaluation
     console = Console(width=140, record=True, file=StringIO())
     summarise(whole, title="own", played=played, console=console)
     text = console.export_text()
@@ -267,17 +266,16 @@ def test_the_page_of_a_run_has_a_row_for_each_number_of_institutions(whole, eval
 
 
 def test_an_evaluation_reports_institutions(evaluation):
-    measures = evaluation.measures("random")
-    assert measures["institutions/detection_rate"].estimate.value == 1.0
-    paid = np.mean([episode.fines[2] for episodes in evaluation.random.values() for episode in episodes])
-    assert measures["agent_2/fines"].estimate.value == pytest.approx(paid)
-    text = printed(run_table(evaluation))
-    assert "equality of incomes" in text or measures["income_equality"].estimate is None
+    numbers = ["institutions/detection_rate", "agent_2/fines", "income_equality"]
+    measures = estimates(evaluation, numbers, by="policy").of("random")
+    assert measures["institutions/detection_rate"].value == 1.0
+    paid = where(evaluation, policy="random", agent=2)["fines"].to_numpy().mean()
+    assert measures["agent_2/fines"].value == pytest.approx(paid)
+    text = printed(compared(evaluation, ""))
+    assert "equality of incomes" in text or not measures["income_equality"].replicas
     assert "agent 2: fines, apples" in text
     assert "where one may bite" not in text, "undefined everywhere"
-    assert {"fines", "violations", "own_bites", "institutions/in_force_0"} <= set(
-        evaluation.table().column_names
-    )
+    assert {"fines", "violations", "own_bites", "institutions/in_force_0"} <= set(evaluation.column_names)
 
 
 def test_the_run_keeps_them_and_the_training_curve_shows_them(whole):

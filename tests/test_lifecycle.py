@@ -481,7 +481,7 @@ def test_a_run_that_lost_a_file_of_its_manifest_is_refused_by_that_file(name, wh
     before = contents(lost)
     for use in (
         lambda: cprl.load(lost),
-        lambda: cprl.evaluate_run(lost, episodes=1),
+        lambda: cprl.evaluate_run(lost, cprl.Fresh(episodes=1)),
         lambda: resumed(FIELD, lost),
         lambda: resumed(longer, lost),
         lambda: export_results(lost, tmp_path / "results"),

@@ -8,13 +8,16 @@ import pytest
 import torch
 from matplotlib.image import imread
 from results import distance_to_nearest, rounds, shooting_distance
-from stored_runs import SEED
+from stored_runs import CORRIDORS, SEED
 
 import cprl
-from cprl import CommonsEnv, Game, Rules, keys, maps
+from cprl import CommonsEnv, Fresh, Game, Rules, keys, maps
 from cprl.evaluation import territory_of
-from cprl.evaluation.territory import DEFENCE, EXCLUSION, OVERLAP, TAGS, VISITORS, draw_visits
+from cprl.evaluation.lanes import agents_of, fresh_for, policies_of, scripted, worlds_of
+from cprl.evaluation.territory import WORDS, draw_visits, maps_of, number_of
 from cprl.measuring import movement
+from cprl.measuring.evaluate import evaluate
+from cprl.measuring.table import where
 
 FORWARD, BEAM, STAY = 0, 6, 7
 
@@ -173,49 +176,53 @@ def test_to_defend_is_to_tag_whom_one_finds_in_ones_own_cells():
 
 
 def test_agents_in_corridors_of_their_own_exclude_each_other(corridors):
-    found = territory_of(corridors["greedy"], episodes=4)
-    measured = found.trained.measures()
-    assert measured[EXCLUSION].value == measured[VISITORS].value == 1
-    assert measured[OVERLAP].value == measured[TAGS].value == 0
-    assert DEFENCE not in measured, "nobody can fire"
+    table = territory_of(corridors["greedy"], Fresh(episodes=4))
+    found = cprl.estimates(table, list(WORDS), "policy").of("trained")
+    assert found["exclusion"].value == found["visitors"].value == 1
+    assert found["overlap"].value == found["tag_rate"].value == 0
+    assert not found["defence"].replicas, "nobody can fire"
     # Agent 0 starts at (0, 0) and bites at columns 1 and 3 in steps 1 and 3; the cell of step t is that at
     # its start. Agent 1 starts at (2, 4) and walks left. After step 3 the board is dead.
-    assert found.trained.visits.shape == (2, 2, 3, 5)
-    np.testing.assert_allclose(found.trained.visits[0, 0, 0], [1 / 3, 1 / 3, 1 / 3, 0, 0])
-    np.testing.assert_allclose(found.trained.visits[1, 1, 2], [0, 0, 1 / 3, 1 / 3, 1 / 3])
+    visits = maps_of(table, "visits").reshape(2, 2, 3, 5)
+    np.testing.assert_allclose(visits[0, 0, 0], [1 / 3, 1 / 3, 1 / 3, 0, 0])
+    np.testing.assert_allclose(visits[1, 1, 2], [0, 0, 1 / 3, 1 / 3, 1 / 3])
 
 
 def test_the_episodes_are_those_of_an_evaluation(alike):
-    found, played = (ask(alike, episodes=5, seed=SEED) for ask in (territory_of, cprl.evaluate_run))
-    for policy in ("trained", "random"):
-        stays = found.of(policy)
-        for place, replica in enumerate(found.fresh.replicas):
-            episodes = getattr(played, policy)[replica]
+    run = cprl.load(alike)
+    fresh = fresh_for([run], Fresh(episodes=5, seed=SEED))
+    table = territory_of(run, fresh)
+    played = {"trained": agents_of(run), "random": [scripted("random")] * 2}
+    for policy, agents in played.items():
+        ((group, env),) = worlds_of(fresh, run)
+        ended = evaluate(env, policies_of(fresh, run, agents, group), explore=True)
+        taggings = maps_of(table, "tags_by_agent", policy)
+        for place in range(len(group)):
+            episodes = ended[5 * place : 5 * place + 5]
             tagged_by = sum(own.tagged_by for own in episodes)
-            assert stays.taggings[place].tolist() == tagged_by.tolist()
+            assert taggings[place].tolist() == tagged_by.tolist()
             tagged = sum(own.tagged for own in episodes)
-            assert stays.tagged_where[place].sum((1, 2)).tolist() == tagged.tolist()
+            assert maps_of(table, "tags_by_cell", policy)[place].sum(1).tolist() == tagged.tolist()
             per_1000 = 1000 * tagged_by.sum() / sum(own.steps for own in episodes)
-            assert stays.by_replica[TAGS][place] == pytest.approx(per_1000)
-    assert found.random.taggings.sum() > 0
+            assert number_of(table, "tag_rate", policy)[place] == pytest.approx(per_1000)
+    assert maps_of(table, "tags_by_agent", "random").sum() > 0
 
 
 def test_a_replica_alone_stays_where_it_stays_among_all(alike):
-    both, alone = (territory_of(alike, episodes=3, replicas=replicas) for replicas in ((), [2]))
-    np.testing.assert_array_equal(alone.trained.visits[0], both.trained.visits[2])
-    np.testing.assert_array_equal(alone.random.tagged_where[0], both.random.tagged_where[2])
-    for name, values in both.random.by_replica.items():
-        np.testing.assert_array_equal(alone.random.by_replica[name], values[2:])
+    both, alone = (territory_of(alike, Fresh(episodes=3, replicas=replicas)) for replicas in ((), (2,)))
+    among_all = where(both, replica=2).to_pydict()
+    for name, values in alone.to_pydict().items():
+        np.testing.assert_array_equal(values, among_all[name], name)
 
 
 def test_the_maps_show_where_each_agent_was_and_are_not_written_over(corridors, tmp_path):
-    found = territory_of(corridors["greedy"], episodes=2)
-    path = draw_visits(found, tmp_path / "new" / "visits.png", replica=1)
+    found = territory_of(corridors["greedy"], Fresh(episodes=2))
+    path = draw_visits(found, CORRIDORS.map, tmp_path / "new" / "visits.png", replica=1)
     picture = (imread(path)[..., :3] * 255).round()
     for agent, colour in ((0, (86, 180, 233)), (1, (230, 97, 0))):
         assert (np.abs(picture - colour).max(-1) < 2).sum() > 1000, f"agent {agent} in its hue"
     with pytest.raises(FileExistsError, match=r"visits\.png exists and is not overwritten"):
-        draw_visits(found, path)
+        draw_visits(found, CORRIDORS.map, path)
 
 
 @pytest.mark.parametrize(
@@ -227,7 +234,7 @@ def test_the_maps_show_where_each_agent_was_and_are_not_written_over(corridors, 
     ],
 )
 def test_what_cannot_be_drawn_is_refused(more, message, corridors, tmp_path):
-    found = territory_of(corridors["greedy"], episodes=1)
+    found = territory_of(corridors["greedy"], Fresh(episodes=1))
     with pytest.raises(ValueError, match=message):
-        draw_visits(found, **{"path": tmp_path / "visits.png", **more})
+        draw_visits(found, CORRIDORS.map, **{"path": tmp_path / "visits.png", **more})
     assert not list(tmp_path.iterdir())

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from one_road_parts import Dilemma
 from same_runs import assert_same_training
+from stored_runs import episodes_of
 
 import cprl
 from cprl import Custom, Experiment, Game, Observation, Rules, maps
@@ -78,7 +79,7 @@ def test_an_experiment_with_parts_of_its_own_is_stopped_resumed_evaluated_and_fi
     cli.main()
     assert_same_training(run, in_one_go, ("final", "transforms"))
     cprl.trust(*ALLOW)
-    tables = [cprl.evaluate_run(each, episodes=2).table() for each in (run, in_one_go)]
+    tables = [cprl.evaluate_run(each, cprl.Fresh(episodes=2)) for each in (run, in_one_go)]
     assert repr(tables[0].to_pydict()) == repr(tables[1].to_pydict())
     assert cprl.load(run).experiment == MEADOW
     recording, episode = film(run)
@@ -101,12 +102,13 @@ def test_the_reward_is_what_the_transforms_make_of_it_and_the_harvest_is_not(in_
     assert bitten
     assert all(0 < paid < own / 2 for own, paid in bitten), "halved, and less with every step"
     cprl.trust(*ALLOW)
-    evaluated = cprl.evaluate_run(in_one_go, episodes=2)
+    evaluated = cprl.evaluate_run(in_one_go, cprl.Fresh(episodes=2))
     steps = load_weights(in_one_go / "checkpoints" / "transforms.pt")
     (fatigue,) = [float(value) for name, value in steps.items() if name.endswith("steps")]
     assert fatigue >= 6 * 20 - 20, "as many as were played"
-    for episode in evaluated.trained[0]:
-        assert episode.return_.sum() <= episode.harvest.sum() / 2 / (1 + 0.01 * fatigue)
+    both = [episodes_of(evaluated, name, policy="trained")[0] for name in ("return", "harvest")]
+    for paid, bitten in zip(*both, strict=True):
+        assert sum(paid) <= sum(bitten) / 2 / (1 + 0.01 * fatigue)
 
 
 def test_no_command_imports_what_is_not_allowed(in_one_go, monkeypatch, capsys):
@@ -150,12 +152,13 @@ def test_a_matrix_game_is_trained_stopped_resumed_evaluated_and_cross_played(tmp
     cprl.trust(*allow)
     loaded = cprl.load(whole)
     assert loaded.experiment == experiment
-    found = cprl.evaluate_run(loaded, episodes=4)
-    assert 5 <= found.measures()["agent_0/return"].estimate.value <= 4.5 * 9
+    found = cprl.estimates(cprl.evaluate_run(loaded, cprl.Fresh(episodes=4)), "agent_0/return", by="policy")
+    assert 5 <= found["trained", "agent_0/return"].value <= 4.5 * 9
     other = cprl.run(replace(DILEMMA, seed=9), tmp_path / "other", watch="off")
-    played = cprl.crossplay([loaded, cprl.load(other)], episodes=2)
-    assert len(played.cells) == 4
-    assert played.cell("whole", "other").measures()["focal/return"].estimate is not None
+    played = cprl.crossplay([loaded, cprl.load(other)], cprl.Fresh(episodes=2))
+    levels = cprl.estimates(played, "focal/return", by=("focal", "background"))
+    assert len(levels) == 4
+    assert levels["whole", "other", "focal/return"].replicas
     film(whole)
 
 
@@ -200,7 +203,7 @@ def test_what_transforms_make_of_observations_is_learned_from_and_evaluated(
     cprl.trust(transform.target, *ALLOW)
     loaded = cprl.load(run)
     assert {name: getattr(loaded.spaces, name) for name in spaces} == spaces
-    assert cprl.evaluate_run(loaded, episodes=1).trained
+    assert len(cprl.evaluate_run(loaded, cprl.Fresh(episodes=1)))
 
 
 @pytest.mark.integration
@@ -229,7 +232,7 @@ def test_planes_are_learned_from_through_stop_resume_and_evaluation(of_agent, tm
     loaded = cprl.load(parts)
     assert loaded.experiment == experiment
     assert loaded.spaces.observation_shape == (5, 3, 5)
-    assert cprl.evaluate_run(loaded, episodes=1).trained.keys() == {0, 1}
+    assert set(cprl.evaluate_run(loaded, cprl.Fresh(episodes=1))["replica"].to_pylist()) == {0, 1}
     monkeypatch.chdir(tmp_path)
     three = replace(experiment.game, map=maps.with_agents(MEADOW.game.map, 3))
     others = {"have observations": MEADOW.game, "have a scoreboard of so many agents: 2": three}

@@ -100,7 +100,7 @@ def test_a_run_that_is_stopped_and_resumed_equals_the_undisturbed_one_bit_for_bi
     parts = cprl.run(experiment(), tmp_path / "parts", watch="off", resume=True)
     assert_same_training(parts, whole, ("final", "transforms"))
     cprl.trust(*ALLOW)
-    one, two = (cprl.evaluate_run(run, episodes=2).table() for run in (parts, whole))
+    one, two = (cprl.evaluate_run(run, cprl.Fresh(episodes=2)) for run in (parts, whole))
     assert repr(one.to_pydict()) == repr(two.to_pydict())
     assert cprl.load(parts).experiment == experiment()
 
@@ -115,9 +115,9 @@ def test_what_an_own_rule_takes_is_measured_in_a_game_without_institutions(licen
     income = np.array(table["harvest"]) - np.array(table["fines"]) + np.array(table["transfers"])
     np.testing.assert_allclose(np.array(table["return"]), income, atol=1e-5)
     cprl.trust(*ALLOW)
-    measured = cprl.evaluate_run(run, episodes=2).measures("random")
-    assert measured["institutions/fines"].estimate.value > 0
-    assert "income_equality" in measured
+    measured = cprl.estimates(cprl.evaluate_run(run, cprl.Fresh(episodes=2)), by="policy")
+    assert measured["random", "institutions/fines"].value > 0
+    assert ("random", "income_equality") in measured
 
 
 @pytest.mark.integration

@@ -12,6 +12,7 @@ from tiny_study import TINY
 import cprl
 from cprl import Custom, Study
 from cprl.measuring.registry import bounds, title, unit, with_unit
+from cprl.measuring.table import numbers_in
 from cprl.runs.curves import curves_of
 from cprl.runs.episodes import read_episodes, read_evaluations
 from cprl.runs.recipe import read_recipe
@@ -44,8 +45,8 @@ def run(tmp_path_factory):
 @pytest.mark.integration
 def test_it_is_a_column_of_every_table_of_episodes(run):
     cprl.trust(*ALLOW)
-    evaluated = cprl.evaluate_run(run, episodes=2)
-    for table in (read_episodes(run), read_evaluations(run), evaluated.table()):
+    evaluated = cprl.evaluate_run(run, cprl.Fresh(episodes=2))
+    for table in (read_episodes(run), read_evaluations(run), evaluated):
         by_episode = table.group_by([name for name in table.column_names if name in KEYS]).aggregate(
             [("harvest", "max"), ("harvest", "sum"), ("largest_share", "min"), ("largest_share", "max")]
         )
@@ -123,9 +124,9 @@ def test_nothing_else_of_a_run_changes(tmp_path):
     again = copytree(measured, tmp_path / "again")
     cprl.trust(*ALLOW)
     for others, has in ([measured, plain], False), ([plain, measured], False), ([measured, again], True):
-        played = cprl.crossplay(others, episodes=1)
-        assert ("largest_share" in played.table().column_names) == has
-        assert ("largest_share" in played.cell(*(run.name for run in others)).estimates("focal")) == has
+        played = cprl.crossplay(others, cprl.Fresh(episodes=1))
+        assert ("largest_share" in played.column_names) == has
+        assert ("largest_share" in numbers_in(played)) == has
 
 
 @pytest.mark.parametrize("target", ["no_number", "fails", "of_another_game", "missing"])

@@ -12,7 +12,7 @@ from cprl import CommonsEnv, Experiment, Game, Observation, Rules, maps
 from cprl.algorithms.base import OffPolicy
 from cprl.algorithms.off_policy import CQL, DQN, IQL, PR2, SAC, DistributionalDQN, Tabular
 from cprl.algorithms.on_policy import A2C, PPO, Reinforce
-from cprl.evaluation import evaluate_run
+from cprl.evaluation import Fresh, evaluate_run
 from cprl.learners.replay import ReplayLearner
 from cprl.learners.rollouts import RolloutLearner
 from cprl.learners.settings import DQNSettings, RolloutSettings, TabularSettings
@@ -298,7 +298,7 @@ def test_a_tabular_agent_is_a_member_like_any_other(tmp_path, capsys):
     seen, network = torch.from_numpy(table["observation"]), loaded.networks["replica_1/agent_2"]
     assert torch.equal(network(seen.unsqueeze(0))[0], torch.from_numpy(table["values"]))
     assert not network(torch.full_like(seen, 7)).any(), "of what was never met"
-    assert set(evaluate_run(run, episodes=2).trained) == {0, 1}
+    assert set(evaluate_run(run, Fresh(episodes=2))["replica"].to_pylist()) == {0, 1}
 
     chosen = first_of(Frozen(run, 2, replica=1)).choose(seen[:2].unsqueeze(1))
     assert chosen[:, 0].tolist() == table["values"][:2].argmax(1).tolist()

@@ -10,6 +10,7 @@ import torch
 from dqn_parts import make_learner
 from recall_game import Recall
 from stock_collector import stock_collector
+from stored_runs import returns
 from tensordict import TensorDict
 from test_networks import VECTORS
 from test_population import GAME, Returns, population
@@ -399,15 +400,16 @@ def test_a_stored_run_is_loaded_evaluated_filmed_and_played_against(ran):
     experiment, run = ran
     loaded = cprl.load(run)
     assert loaded.experiment == experiment
-    found = cprl.evaluate_run(run, episodes=3)
+    fresh = cprl.Fresh(episodes=3)
+    found = cprl.evaluate_run(run, fresh)
     for replica in (0, 1):
         alone = evaluate(
-            loaded.env(3, seed=found.fresh.seed, first_world=3 * replica),
-            loaded.policy(replica, worlds=3, seed=found.fresh.seed),
+            loaded.env(3, seed=fresh.seed, first_world=3 * replica),
+            loaded.policy(replica, worlds=3, seed=fresh.seed),
             explore=True,
         )
-        for one, other in zip(found.trained[replica], alone, strict=True):
-            assert np.array_equal(one.return_, other.return_)
+        for one, other in zip(returns(found, policy="trained")[replica], alone, strict=True):
+            assert np.array_equal(one, other.return_)
     recording, _ = film(run)
     assert recording.stat().st_size > 10_000
     session = open_session(str(run), agent=2, steps=5)

@@ -13,10 +13,11 @@ from viewers import browser, wait_until
 
 from cprl import Custom, presets
 from cprl.envs.matrix import prisoners_dilemma
-from cprl.evaluation.evaluate import evaluate_run, run_table
+from cprl.evaluation import Fresh, evaluate_run
 from cprl.evaluation.report import report
 from cprl.evaluation.show import show
 from cprl.institutions import Quota
+from cprl.terminal.summary import compared
 from cprl.training.agents import load
 from cprl.values import trust
 
@@ -31,9 +32,9 @@ def cells_of(page):
 def test_a_report_of_a_run_has_its_numbers_rules_episode_and_recipe(tmp_path):
     run = stored(tmp_path / "governed", GOVERNED, replicas=3)
     text = report(run, episodes=4, seed=5).read_text(encoding="utf-8")
-    table = run_table(evaluate_run(run, episodes=4, seed=5))
+    table = compared(evaluate_run(run, Fresh(episodes=4, seed=5)), "")
     for row in table.rows:
-        assert [*row][1:] == cells_of(text)[cells_of(text).index(row[0]) + 1 :][: len(row) - 1], row
+        assert [*map(str, row)][1:] == cells_of(text)[cells_of(text).index(row[0]) + 1 :][: len(row) - 1], row
     assert "<strong>quota (share 0.5" in text
     assert "<code>regrow_prob</code>" in text
     shown, _ = show(run)

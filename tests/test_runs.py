@@ -118,7 +118,7 @@ def test_a_run_in_a_directory_of_any_name_is_trained_resumed_by_its_line_exporte
     among = replace(TINY, agents=(TINY.agents[0], Frozen(os.fspath(exported), 0)))
     loaded = cprl.load(cprl.run(among, Path(f"{name} among"), watch="off", figures=False))
     assert loaded.agent(1).network is not None
-    assert cprl.evaluate_run(exported, episodes=1).measures("trained")
+    assert len(cprl.evaluate_run(exported, cprl.Fresh(episodes=1)))
     assert film(started, Path("film.rrd"), replica=0, episode=0)[0].exists()
 
 

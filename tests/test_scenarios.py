@@ -8,11 +8,12 @@ from boards import module_at
 from stored_runs import CORRIDORS, DQN, MEADOW, SEED, ran, returns
 
 import cprl
-from cprl import Experiment, maps, presets
-from cprl.evaluation import Scenario, run_scenarios, scenarios_of
+from cprl import Experiment, Fresh, maps, presets
+from cprl.evaluation import Scenario, advantages, run_scenarios, scenarios_of
 from cprl.evaluation import scenarios as module
-from cprl.evaluation.lanes import Fresh, agents_of, scripted
-from cprl.evaluation.scenarios import estimates, scenario_tables
+from cprl.evaluation.lanes import agents_of, play, scripted
+from cprl.evaluation.scenarios import scenario_cells
+from cprl.measuring.table import where
 from cprl.population import Frozen, Learning, Scripted
 from cprl.runs.recipe import read_recipe
 
@@ -42,17 +43,16 @@ def runs(alike, tmp_path_factory):
     return {**by_script, "learned": alike}
 
 
+DOCS = Path(__file__).parents[1] / "docs"
 FRESH = Fresh(replicas=(0, 1, 2), episodes=2, seed=SEED)
-
-
-def value(measured):
-    return measured.estimate.value
+BY = ("scenario", "focal")
+RETURNS = ("focal/return", "background/return")
 
 
 @pytest.mark.integration
 def test_scores_are_those_worked_by_hand(runs):
-    scores = run_scenarios(runs["greedy"], episodes=2)
-    assert list(scores.by_scenario) == [
+    table = run_scenarios(runs["greedy"], Fresh(episodes=2))
+    assert table["scenario"].unique().to_pylist() == [
         f"{focal}_among_{background}"
         for background in ("greedy", "sustainable")
         for focal in ("majority", "minority")
@@ -60,41 +60,44 @@ def test_scores_are_those_worked_by_hand(runs):
     # The focal agents are 1 and 2, 0 and 2, 0 and 1: ((3 + 1) / 2 + (2 + 1) / 2 + (2 + 3) / 2) / 3 = 2, and
     # all together 4, 3 and 5. As a minority they get 2, 3 and 1.
     for name, together in (("majority_among_sustainable", 4), ("minority_among_sustainable", 2)):
-        measures = scores.by_scenario[name].measures()
-        assert [value(measures[whose]) for whose in ("focal/return", "background/return")] == [2, 0]
-        assert value(measures["collective_return"]) == pytest.approx(together)
-        assert measures["focal/return"].episodes == 2 * 2 * 3, "replicas, episodes, placements"
-        assert measures["focal/return"].estimate.replicas == 2
-    assert value(scores.by_scenario["minority_among_greedy"].measures()["background/return"]) == 2
+        levels = cprl.estimates(table, [*RETURNS, "collective_return"], by=BY).of(name, "run")
+        assert [levels[number].value for number in RETURNS] == [2, 0]
+        assert levels["collective_return"].value == pytest.approx(together)
+        assert levels["focal/return"].episodes == 2 * 2 * 3, "replicas, episodes, placements"
+        assert levels["focal/return"].replicas == 2
+    levels = cprl.estimates(table, RETURNS, by=BY)
+    assert levels["minority_among_greedy", "run", "background/return"].value == 2
 
 
 def test_a_run_is_held_against_others_in_its_place(runs):
-    score = run_scenarios(runs["sustainable"], episodes=1).by_scenario["minority_among_greedy"]
+    name = "minority_among_greedy"
+    table = run_scenarios(runs["sustainable"], Fresh(episodes=1))
     # Sustainable agents get nothing, greedy ones in their place 2 on average; the others have corridors of
     # their own, and get (3 + 1) / 2, (2 + 1) / 2 and (2 + 3) / 2 in either case.
-    ahead = score.advantage("greedy")
+    found = advantages(table)
+    ahead = found[name, "greedy", "focal/return"]
     assert (ahead.value, ahead.low, ahead.high, ahead.replicas) == (-2, -2, -2, 2)
-    assert score.advantage("greedy", whose="background").value == 0
-    assert value(score.measures("greedy")["focal/return"]) == 2
-    assert value(score.measures("random")["focal/return"]) == -score.advantage("random").value
+    assert found[name, "greedy", "background/return"].value == 0
+    levels = cprl.estimates(table, RETURNS, by=BY)
+    assert levels[name, "greedy", "focal/return"].value == 2
+    assert levels[name, "random", "focal/return"].value == -found[name, "random", "focal/return"].value
 
 
 def test_a_stored_background_is_of_the_next_replica(runs):
     learned = runs["learned"]
     background = tuple(Frozen(str(learned), agent, replica=None) for agent in range(2))
     own = Scenario(name="its_like", game=MEADOW, focal="minority", background=background)
-    score = run_scenarios(learned, scenarios=[own], episodes=2, seed=SEED).by_scenario["its_like"]
+    table = run_scenarios(learned, FRESH, scenarios=[own])
     run = cprl.load(learned)
     mine, theirs = agents_of(run), agents_of(run, {0: 1, 1: 2, 2: 0})
     for focal, agents in ((0, [mine[0], theirs[1]]), (1, [theirs[0], mine[1]])):
-        found = score.where(focal="run", focal_agents=str(focal)).played
-        assert returns(found) == returns(FRESH.play(run, agents))
-        one = run_scenarios(learned, scenarios=[own], episodes=2, seed=SEED, replicas=[2])
-        alone = one.where(focal="run", focal_agents=str(focal)).played
-        assert returns(alone) == {2: returns(found)[2]}, "alone as among all"
+        at_index = {"focal": "run", "focal_agents": str(focal)}
+        assert returns(table, **at_index) == returns(play(FRESH, run, agents))
+        one = run_scenarios(learned, replace(FRESH, replicas=(2,)), scenarios=[own])
+        assert returns(one, **at_index) == {2: returns(table, **at_index)[2]}, "alone as among all"
     # Random agents in its place meet the same background of the same replica.
-    expected = FRESH.play(run, [scripted("random"), theirs[1]])
-    assert returns(score.where(focal="random", focal_agents="0").played) == returns(expected)
+    expected = play(FRESH, run, [scripted("random"), theirs[1]])
+    assert returns(table, focal="random", focal_agents="0") == returns(expected)
 
 
 def keeping(run, *replicas):
@@ -115,10 +118,10 @@ def test_a_run_of_a_single_replica_is_not_its_own_background(runs, monkeypatch):
     own = Scenario(name="itself", game=MEADOW, focal="minority", background=background)
     answer = "the scenario itself has the background .*alike, which keeps the single replica 1"
     with pytest.raises(ValueError, match=answer):
-        run_scenarios(keeping(run, 1), scenarios=[own], episodes=1)
-    assert run_scenarios(run, scenarios=[own], episodes=1, replicas=[0]).by_scenario, "another replica"
+        run_scenarios(keeping(run, 1), Fresh(episodes=1), scenarios=[own])
+    assert len(run_scenarios(run, Fresh(episodes=1, replicas=(0,)), scenarios=[own])), "another replica"
     asked = replace(own, background=tuple(replace(spec, replica=1) for spec in background))
-    assert run_scenarios(keeping(run, 1), scenarios=[asked], episodes=1).by_scenario, "asked for"
+    assert len(run_scenarios(keeping(run, 1), Fresh(episodes=1), scenarios=[asked])), "asked for"
 
 
 def test_two_agents_have_minorities_alone_and_without_a_beam_no_background_that_fires():
@@ -153,15 +156,15 @@ def test_without_a_checkout_stored_backgrounds_are_left_out_and_named(tmp_path, 
 
 
 def test_the_table_and_the_estimates_hold_every_number(runs):
-    scores = run_scenarios(runs["greedy"], scenarios=["minority_among_sustainable"], episodes=2)
-    table = scores.table().to_pylist()
+    table = run_scenarios(runs["greedy"], Fresh(episodes=2), scenarios=["minority_among_sustainable"])
     assert len(table) == 3 * 3 * 2 * 2 * 3, "who is focal, placements, replicas, episodes, agents"
-    own = [row for row in table if (row["focal"], row["focal_agents"], row["episode"]) == ("run", "1", 0)]
-    assert [(row["replica"], row["agent"], row["return"]) for row in own if row["agent"] == 1] == [
-        (0, 1, 3.0),
-        (1, 1, 3.0),
+    own = where(table, focal="run", focal_agents="1", episode=0, agent=1).to_pylist()
+    assert [(row["replica"], row["role"], row["return"]) for row in own] == [
+        (0, "focal", 3.0),
+        (1, "focal", 3.0),
     ]
-    rows = {(row["focal"], row["metric"]): row for row in estimates(scores).to_pylist()}
+    baseline = module_at(DOCS / "scenarios_baseline.py")
+    rows = {(row["focal"], row["metric"]): row for row in baseline.estimates_of(table).to_pylist()}
     assert rows["run", "focal/return"] == {
         "scenario": "minority_among_sustainable",
         "focal": "run",
@@ -176,8 +179,8 @@ def test_the_table_and_the_estimates_hold_every_number(runs):
     assert rows["greedy", "focal/advantage"]["value"] == 0
     # A single agent of three harvests: 1 - (4 x its harvest) / (2 x 3 x its harvest).
     assert rows["run", "equality"]["value"] == pytest.approx(1 / 3)
-    returns_table, social_table = scenario_tables(scores)
-    assert [table.rows[0][1] for table in (returns_table, social_table)] == ["2.00 [2.00, 2.00]"] * 2
+    shown = [str(cells.rows[0][1]) for cells in scenario_cells(table)]
+    assert shown == ["2.00 [2.00, 2.00]"] * 2
 
 
 @pytest.mark.parametrize(
@@ -198,8 +201,7 @@ def test_odd_scenarios_are_refused(given, answer):
 
 
 def test_the_tables_have_the_numbers_of_the_committed_estimates():
-    docs = Path(__file__).parents[1] / "docs"
-    baseline = module_at(docs / "scenarios_baseline.py")
+    baseline = module_at(DOCS / "scenarios_baseline.py")
     tables = (baseline.OUT / "table.md").read_text()
     played = sorted(path.stem for path in baseline.OUT.glob("*.csv"))
     assert played

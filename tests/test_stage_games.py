@@ -33,6 +33,7 @@ from cprl.envs import make_env, spaces_of
 from cprl.envs.matrix import MatrixGame, chicken, matching_pennies, prisoners_dilemma, stag_hunt
 from cprl.envs.taking import TakingGame
 from cprl.experiment import changes
+from cprl.measuring.table import by_replica, where
 from cprl.population import Learning, Team
 from cprl.studies.trials import trials_of
 from cprl.theory import CallableWorth, PowerWorth, SharingGame, appropriation, herders
@@ -445,16 +446,17 @@ def test_a_population_trains_stops_resumes_loads_and_meets_another(
     cprl.trust("one_road_parts:Stopping")
     loaded = cprl.load(whole)
     assert loaded.game == experiment.game
-    value = cprl.evaluate_run(loaded, episodes=4).measures()["agent_0/return"].estimate.value
-    assert least <= value <= most
+    found = cprl.estimates(cprl.evaluate_run(loaded, cprl.Fresh(episodes=4)), "agent_0/return", by="policy")
+    assert least <= found["trained", "agent_0/return"].value <= most
     second = cprl.load(cprl.run(replace(experiment, seed=9), tmp_path / "second", watch="off"))
-    played = cprl.crossplay([loaded, second], episodes=2)
-    assert played.cell("whole", "second").measures()["focal/return"].estimate is not None
+    played = cprl.crossplay([loaded, second], cprl.Fresh(episodes=2))
+    levels = cprl.estimates(played, "focal/return", by=("focal", "background"))
+    assert levels["whole", "second", "focal/return"].replicas
     with pytest.raises(ValueError, match=r"plays a game that reports no harvest; allowed in a report"):
         write_report([whole], tmp_path / "report")
     other_game = cprl.load(cprl.run(third, tmp_path / "third", watch="off"))
     with pytest.raises(ValueError, match=rf"have different games: {differing}"):
-        cprl.crossplay([loaded, other_game], episodes=2)
+        cprl.crossplay([loaded, other_game], cprl.Fresh(episodes=2))
 
 
 @pytest.mark.parametrize(
@@ -497,8 +499,8 @@ def test_their_numbers_are_flags_of_a_command_line():
 def test_learners_of_every_kind_play_it(agents, engine, tmp_path):
     experiment = replace(HERDERS, agents=agents, episodes=3, engine=engine)
     run = cprl.load(cprl.run(experiment, tmp_path / "run", watch="off"))
-    evaluated = cprl.evaluate_run(run, episodes=2).measures()["agent_1/return"].estimate
-    assert -10 <= evaluated.value <= 50
+    found = cprl.estimates(cprl.evaluate_run(run, cprl.Fresh(episodes=2)), "agent_1/return", by="policy")
+    assert -10 <= found["trained", "agent_1/return"].value <= 50
 
 
 @pytest.mark.slow
@@ -515,8 +517,8 @@ def test_independent_tables_end_at_the_equilibrium_and_one_agent_at_the_optimum(
             episodes=200,
         )
         run = cprl.load(cprl.run(experiment, tmp_path / str(agents), watch="off"))
-        episodes = cprl.evaluate_run(run, episodes=1).trained
-        paid = np.mean([episode.return_.sum() for replica in episodes.values() for episode in replica]) / 50
+        played = where(cprl.evaluate_run(run, cprl.Fresh(episodes=1)), policy="trained")
+        paid = by_replica(played, "income")["value"].to_numpy().mean() / 50
         rent = paid - agents * sharing.payment
         assert rent == pytest.approx(sharing.surplus(total), rel=0.03)
 
@@ -530,7 +532,5 @@ def test_dqn_learns_to_defect_in_the_one_shot_dilemma(tmp_path):
     agents = [Learning(DQN(settings=settings))] * 2
     experiment = replace(DILEMMA, game=prisoners_dilemma(), agents=agents, replicas=5, episodes=2000)
     run = cprl.load(cprl.run(experiment, tmp_path / "run", watch="off"))
-    episodes = cprl.evaluate_run(run, episodes=5).trained
-    assert all(
-        episode.return_.tolist() == [-2.0, -2.0] for replica in episodes.values() for episode in replica
-    )
+    played = where(cprl.evaluate_run(run, cprl.Fresh(episodes=5)), policy="trained")
+    assert set(played["return"].to_pylist()) == {-2.0}

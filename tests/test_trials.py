@@ -376,7 +376,7 @@ def test_loading_evaluating_and_resuming_warn_of_other_code_and_the_recipe_keeps
     write_module(text + "# edited\n")
     for use in (
         lambda: cprl.load(run),
-        lambda: cprl.evaluate_run(run, episodes=1),
+        lambda: cprl.evaluate_run(run, cprl.Fresh(episodes=1)),
         lambda: cprl.run(replace(experiment, episodes=3), run, resume=True, watch="off", figures=False),
     ):
         use()

@@ -27,12 +27,12 @@ from verdicts import prediction, share
 
 from cprl.commons.game import Game
 from cprl.envs.commons_env import CommonsEnv
-from cprl.evaluation.evaluate import SEED
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.statistics import difference, estimate
 from cprl.measuring.windows import running_mean
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.scripted import ScriptedActor
+from cprl.system.defaults import SEED
 
 Values = NDArray[np.float64]
 

@@ -16,9 +16,20 @@ import tyro
 from phases import FEWEST_EPISODES, METRICS, UNNAMED, find_phases
 
 import cprl
-from cprl.evaluation import exploitability, plan_responses, schelling, territory_of
-from cprl.evaluation.schelling import dilemma
+from cprl.evaluation import (
+    dilemma,
+    exploitability,
+    margins,
+    payoffs_of,
+    plan_responses,
+    schelling,
+    territory_of,
+)
+from cprl.evaluation.cross_play import OF_FOCAL
+from cprl.evaluation.exploit import BEST, compared
+from cprl.evaluation.territory import WORDS, number_of
 from cprl.measuring.statistics import estimate
+from cprl.measuring.table import by_replica, where
 from cprl.measuring.windows import Values, running_mean
 from cprl.runs.curves import curves_of
 from cprl.training.agents import LoadedRun, load
@@ -34,25 +45,29 @@ def together(values: list[dict[str, Values]]) -> dict[str, str]:
 
 def fresh(run: LoadedRun, episodes: int) -> dict[str, Values]:
     """Harvests and the like in fresh worlds, and where agents are, beside random play."""
-    evaluated = cprl.evaluate_run(run, episodes=episodes)
-    where = territory_of(run, episodes=episodes)
+    evaluated = cprl.evaluate_run(run, cprl.Fresh(episodes=episodes))
+    territory = territory_of(run, cprl.Fresh(episodes=episodes))
     numbers = {}
     for name in METRICS:
         for policy in ("trained", "random"):
-            played = getattr(evaluated, policy)
-            means = [np.nanmean([one.metrics[name] for one in ended]) for ended in played.values()]
-            numbers[f"{name}, {policy}"] = np.array(means)
-    for name in where.trained.by_replica:
+            means = by_replica(where(evaluated, policy=policy), name)
+            numbers[f"{name}, {policy}"] = means["value"].to_numpy()
+    for name, words in WORDS.items():
         for policy in ("trained", "random"):
-            numbers[f"{name}, {policy}"] = where.of(policy).by_replica[name]
+            numbers[f"{words}, {policy}"] = number_of(territory, name, policy)
     return numbers
 
 
 def gains(run: LoadedRun, episodes: int, training_episodes: int) -> dict[str, Values]:
     """What best responses gain that learn as the agent did whose place they take, three for each replica."""
-    plan = plan_responses(run, algorithms=("own",), training_episodes=training_episodes, episodes=episodes)
-    responses = exploitability(plan, run.path.parent / "responses" / run.path.name, progress=False)
-    own, best = responses.returns_of(0)
+    fresh = cprl.Fresh(episodes=episodes)
+    plan = plan_responses(run, fresh, algorithms=("own",), training_episodes=training_episodes)
+    out = run.path.parent / "responses" / run.path.name
+    responses = compared(exploitability(plan, out, progress=False))
+    own, best = (
+        by_replica(where(responses, response=name), OF_FOCAL).sort_by("replica")["value"].to_numpy()
+        for name in ("", BEST)
+    )
     return {"return of agent 0": own, "gain of the best of our responses in its place": best - own}
 
 
@@ -61,12 +76,11 @@ def mixes(runs: list[LoadedRun], episodes: int, **policies: str) -> dict[str, st
     restrained, greedy = [], []
     for run in runs:
         both: dict[str, Any] = {"restrained": str(run.path), "greedy": str(run.path)} | policies
-        played = schelling(run, episodes=episodes, replicas=len(run.replicas), **both)
-        restrained.append(played.restrained_payoffs)
-        greedy.append(played.greedy_payoffs)
-    found = dilemma(np.concatenate(restrained), np.concatenate(greedy))
-    margins = {name: getattr(found, name) for name in ("restraint", "company", "fear", "greed")}
-    return {**{name: f"{margin:+}" for name, margin in margins.items()}, "dilemma": found.name}
+        payoffs = payoffs_of(schelling(run, cprl.Fresh(episodes=episodes), **both))
+        restrained.append(payoffs.restrained)
+        greedy.append(payoffs.greedy)
+    found = margins(np.concatenate(restrained), np.concatenate(greedy))
+    return {**{name: f"{margin:+}" for (name,), margin in found.items()}, "dilemma": dilemma(found)}
 
 
 def training(curves: dict[str, Values]) -> dict[str, Values]:

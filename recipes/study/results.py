@@ -24,8 +24,7 @@ from cprl import presets
 from cprl.algorithms import DQN
 from cprl.commons.game import Game
 from cprl.envs.commons_env import CommonsEnv
-from cprl.evaluation.evaluate import SEED
-from cprl.evaluation.lanes import Agent, Fresh, agents_of, scripted
+from cprl.evaluation.lanes import Agent, agents_of, policies_of, scripted, worlds_of
 from cprl.experiment import Experiment
 from cprl.measuring.movement import Trace, overlap, trace
 from cprl.measuring.statistics import estimate
@@ -37,6 +36,7 @@ from cprl.runs.files import read_json
 from cprl.runs.recipe import read_recipe
 from cprl.runs.weights import lacks_weights
 from cprl.studies.study import UNNAMED, Condition
+from cprl.system.defaults import SEED, Fresh
 from cprl.training.agents import LoadedRun, load
 
 Values = NDArray[np.float64]
@@ -101,8 +101,8 @@ def _by_chance(run: LoadedRun, fresh: Fresh) -> dict[str, Values]:
 def _at_play(run: LoadedRun, fresh: Fresh, agents: Sequence[Agent]) -> dict[str, Values]:
     """`of_play` of a game in the same fresh worlds, whoever plays."""
     found: dict[str, list[Values]] = {}
-    for group, env in fresh.worlds(run):
-        played = trace(env, fresh.policies(run, agents, group))
+    for group, env in worlds_of(fresh, run):
+        played = trace(env, policies_of(fresh, run, agents, group))
         for name, values in of_play(played, len(group)).items():
             found.setdefault(name, []).append(values)
     return {name: np.concatenate(values) for name, values in found.items()}

@@ -57,9 +57,11 @@ if TYPE_CHECKING:
     from cprl.commons.observation import Observation
     from cprl.commons.rules import Rules
     from cprl.envs import CommonsEnv
-    from cprl.evaluation import crossplay, evaluate_run
+    from cprl.evaluation import crossplay, evaluate_run, gains
     from cprl.experiment import Experiment, presets
+    from cprl.measuring.statistics import differences, estimates
     from cprl.studies import Study, run_study
+    from cprl.system.defaults import Fresh
     from cprl.training import train
     from cprl.training.agents import load
     from cprl.training.running import run
@@ -71,6 +73,7 @@ __all__ = [
     "CommonsEnv",
     "Custom",
     "Experiment",
+    "Fresh",
     "Game",
     "Map",
     "Observation",
@@ -80,9 +83,12 @@ __all__ = [
     "algorithms",
     "commons",
     "crossplay",
+    "differences",
     "envs",
+    "estimates",
     "evaluate_run",
     "evaluation",
+    "gains",
     "institutions",
     "keys",
     "learners",
@@ -110,13 +116,17 @@ _MODULES: Final = {
     "CommonsEnv": "cprl.envs",
     "Custom": "cprl.values",
     "Experiment": "cprl.experiment",
+    "Fresh": "cprl.system.defaults",
     "Game": "cprl.commons.game",
     "Map": "cprl.commons.maps",
     "Observation": "cprl.commons.observation",
     "Rules": "cprl.commons.rules",
     "Study": "cprl.studies",
     "crossplay": "cprl.evaluation",
+    "differences": "cprl.measuring.statistics",
+    "estimates": "cprl.measuring.statistics",
     "evaluate_run": "cprl.evaluation",
+    "gains": "cprl.evaluation",
     "load": "cprl.training.agents",
     "recipe_main": "cprl.commands.recipe",
     "run": "cprl.training.running",

@@ -5,12 +5,13 @@ python tests/golden/stored.py KIND FOLDER      writes what that kind of evaluati
 
 import json
 import sys
-from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 from golden import checksum, columns
+
+import cprl
+from cprl.measuring.table import numbers_in, where
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 TEN_TARGETS = "commons_targets_10"
@@ -22,34 +23,38 @@ def runs() -> dict[str, Path]:
     return {path.relative_to(RESULTS).as_posix(): path for path in found}
 
 
+def twice() -> cprl.Fresh:
+    """An episode of each of two replicas."""
+    return cprl.Fresh(episodes=1, replicas=(0, 1))
+
+
 def evaluated() -> dict[str, object]:
-    import cprl
 
     found = {}
     for name, path in runs().items():
         for greedy in (False, True):
-            played = cprl.evaluate_run(path, episodes=1, greedy=greedy)
+            played = cprl.evaluate_run(path, cprl.Fresh(episodes=1, greedy=greedy))
             label = f"{name}{', greedy' * greedy}"
-            found[label] = columns(played.table())
+            found[label] = columns(played)
+            trained = where(played, policy="trained")
+            agents = range(len(trained["agent"].unique()))
+            numbers = [*numbers_in(trained), *(f"agent_{agent}/return" for agent in agents)]
             found[f"{label}, estimates"] = {
-                metric: [measured.estimate.value, measured.estimate.low, measured.estimate.high]
-                for metric, measured in played.measures("trained").items()
-                if measured.estimate is not None
+                metric: [estimate.value, estimate.low, estimate.high]
+                for (metric,), estimate in cprl.estimates(trained, numbers).items()
+                if estimate.replicas
             }
     return found
 
 
 def crossed() -> dict[str, object]:
     """Cross-play of neighbours among the six ways of `swap_the_loss`, and of two runs of `commons`."""
-    import cprl
-
     names = [name for name in runs() if name.startswith("swap_the_loss")]
     pairs = [*pairwise(names), ("commons", TEN_TARGETS)]
     played = {
-        f"{one}, {other}": cprl.crossplay([RESULTS / one, RESULTS / other], episodes=1, replicas=(0, 1))
-        for one, other in pairs
+        f"{one}, {other}": cprl.crossplay([RESULTS / one, RESULTS / other], twice()) for one, other in pairs
     }
-    return {name: columns(cross.table()) for name, cross in played.items()}
+    return {name: columns(table) for name, table in played.items()}
 
 
 def schelling() -> dict[str, object]:
@@ -57,29 +62,36 @@ def schelling() -> dict[str, object]:
     from cprl.evaluation import schelling
 
     boards = {board: presets.game(board, variant="as_run") for board in ("two_complex", "commons")}
-    return {board: columns(schelling(game, episodes=1, replicas=2).table()) for board, game in boards.items()}
+    return {board: columns(schelling(game, twice())) for board, game in boards.items()}
 
 
 def scenarios() -> dict[str, object]:
     from cprl.evaluation import run_scenarios
 
     return {
-        name: columns(run_scenarios(RESULTS / name, episodes=1, replicas=(0, 1)).table())
+        name: columns(run_scenarios(RESULTS / name, twice()))
         for name in ("two_complex", "commons", "swap_the_loss/ppo")
     }
 
 
 def territory() -> dict[str, object]:
-    from cprl.evaluation import territory_of
+    import cprl
+    from cprl.evaluation.territory import WORDS, maps_of, territory_of
+    from cprl.measuring.table import where
 
+    names = {"visits": "visits", "taggings": "tags_by_agent", "tagged_where": "tags_by_cell"}
     found = {}
     for name in ("commons", "two_complex"):
-        played = territory_of(RESULTS / name, episodes=1, replicas=(0, 1))
+        table = territory_of(RESULTS / name, cprl.Fresh(episodes=1, replicas=(0, 1)))
+        board = cprl.load(RESULTS / name).game.map
         for policy in ("trained", "random"):
-            stays = asdict(played.of(policy))
-            numbers = {key: list(map(float, value)) for key, value in stays.pop("by_replica").items()}
-            arrays = {key: checksum(np.asarray(value)) for key, value in stays.items()}
-            found[f"{name}, {policy}"] = {**arrays, **numbers}
+            rows = where(table, policy=policy, agent=0).sort_by("replica")
+            numbers = {words: rows[number].to_pylist() for number, words in WORDS.items()}
+            arrays = {key: maps_of(table, column, policy) for key, column in names.items()}
+            for key in ("visits", "tagged_where"):
+                arrays[key] = arrays[key].reshape(*arrays[key].shape[:2], board.height, board.width)
+            sums = {key: checksum(array) for key, array in arrays.items()}
+            found[f"{name}, {policy}"] = {**sums, **numbers}
     return found
 
 

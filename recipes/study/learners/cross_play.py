@@ -31,8 +31,8 @@ def main(
     Files(out=table, figure=figure).check()
     out.mkdir(parents=True, exist_ok=True)
     trained = {own.condition.name: (runs or comparison / "runs") / own.name for own in trials_of(study)}
-    played = cprl.crossplay(trained, episodes=episodes)
-    write_table(table, played.table())
+    played = cprl.crossplay(trained, cprl.Fresh(episodes=episodes))
+    write_table(table, played)
     print(draw_gains(played, figure))
 
 

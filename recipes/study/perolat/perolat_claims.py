@@ -18,27 +18,34 @@ import numpy as np
 import perolat_open
 import perolat_unequal
 import perolat_walls
+import pyarrow as pa
 import tyro
 from numpy.typing import NDArray
 from perolat_base import BEAMS
 
 from cprl import Study, maps
 from cprl.commands.recipe import in_a_sentence
-from cprl.evaluation.territory import DEFENCE, EXCLUSION, OVERLAP, TAGS, Territory, territory_of
+from cprl.evaluation.territory import WORDS, maps_of, number_of, territory_of
 from cprl.measuring.statistics import Estimate, difference, estimate
 from cprl.runs.curves import as_curves
 from cprl.runs.episodes import read_table
 from cprl.studies.tables.sources import sources_of
+from cprl.system.defaults import Fresh
 
 Values = NDArray[np.float64]
 EPISODES: Final = 20
 """Of each replica, as many as the evaluation of a run."""
 
 
+OVERLAP: Final = WORDS["overlap"]
+DEFENCE: Final = WORDS["defence"]
+TAGS: Final = WORDS["tag_rate"]
+
+
 @cache
-def played(run: Path) -> Territory:
+def played(run: Path) -> pa.Table:
     """Where the agents of a run go, and random ones."""
-    return territory_of(run, episodes=EPISODES)
+    return territory_of(run, Fresh(episodes=EPISODES))
 
 
 @cache
@@ -69,8 +76,9 @@ def rich_share(run: Path, policy: str) -> Values:
 
 def in_own_room(run: Path, policy: str) -> Values:
     """The share of its time that an agent spends in the room in which it begins."""
-    visits = played(run).of(policy).visits
     cells = maps.room_cells()
+    flat = maps_of(played(run), "visits", policy)
+    visits = flat.reshape(*flat.shape[:2], *cells.shape[1:])
     own = np.stack([cells[agent % len(cells)] for agent in range(visits.shape[1])])
     inside = (visits * own).sum((-2, -1))
     shares: Values = np.where(visits.any((-2, -1)), inside, np.nan).mean(1)
@@ -79,7 +87,7 @@ def in_own_room(run: Path, policy: str) -> Values:
 
 def of_territory(name: str) -> Callable[[Path, str], Values]:
     """A measure of territory."""
-    return lambda run, policy: played(run).of(policy).by_replica[name]
+    return lambda run, policy: number_of(played(run), name, policy)
 
 
 def beyond_random(measure: Callable[[Path, str], Values]) -> Callable[[Path, str], Values]:
@@ -92,11 +100,11 @@ MEASURES: Final[dict[str, Callable[[Path, str], Values]]] = {
     "survival, steps": metric("survival_steps"),
     "mean time of harvest, steps": metric("sustainability"),
     "equality": metric("equality"),
-    "exclusion beyond random": beyond_random(of_territory(EXCLUSION)),
+    "exclusion beyond random": beyond_random(of_territory("exclusion")),
     "time in one's own room, beyond random": beyond_random(in_own_room),
-    OVERLAP: of_territory(OVERLAP),
-    DEFENCE: of_territory(DEFENCE),
-    TAGS: of_territory(TAGS),
+    OVERLAP: of_territory("overlap"),
+    DEFENCE: of_territory("defence"),
+    TAGS: of_territory("tag_rate"),
     "share of apples of those who begin in the north-west room": rich_share,
 }
 

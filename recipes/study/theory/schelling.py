@@ -16,11 +16,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+import pyarrow as pa
 import tyro
 
-from cprl import Game, presets
+from cprl import Fresh, Game, presets
 from cprl.commands.recipe import in_a_sentence
-from cprl.evaluation import SchellingDiagram, draw_schelling, schelling
+from cprl.evaluation import dilemma, draw_schelling, margins, payoffs_of, schelling
 from cprl.institutions import GraduatedSanctions, Quota, Tax
 from cprl.measuring.statistics import estimate
 from cprl.policies.scripted import SCRIPTED_POLICIES
@@ -52,15 +53,16 @@ def game_of(board: str, rules: str) -> Game:
     return replace(game, rules=replace(game.rules, **RULES[rules]), institutions=INSTITUTIONS.get(rules, ()))
 
 
-def row_of(board: str, rules: str, found: SchellingDiagram) -> list[str]:
+def row_of(board: str, rules: str, greedy: str, table: pa.Table) -> list[str]:
     """A line of the table."""
-    ends = [of_kind[:, at] for at in (-1, 0) for of_kind in (found.restrained_payoffs, found.greedy_payoffs)]
-    dilemma = found.dilemma()
+    payoffs = payoffs_of(table)
+    ends = [of_kind[:, at] for at in (-1, 0) for of_kind in (payoffs.restrained, payoffs.greedy)]
+    found = margins(payoffs.restrained, payoffs.greedy)
     return [
-        *(f"`{board}`", rules, found.greedy if found.greedy in SCRIPTED_POLICIES else "trained DQN"),
+        *(f"`{board}`", rules, greedy if greedy in SCRIPTED_POLICIES else "trained DQN"),
         *(f"{estimate(values):.4g}" for values in ends),
-        *(f"{margin:.4g}" for margin in (dilemma.restraint, dilemma.fear, dilemma.greed)),
-        dilemma.name,
+        *(f"{found[name]:.4g}" for name in ("restraint", "fear", "greed")),
+        dilemma(found),
     ]
 
 
@@ -93,7 +95,13 @@ def diagrams(trained: Path) -> Iterator[tuple[str, str, str]]:
                     say(f"{run} holds no run; the diagram of {board} with trained agents is left out")
 
 
-def main(*, out: Path, trained: Path = Path("docs/results"), episodes: int = 5, replicas: int = 8) -> None:
+def main(
+    *,
+    out: Path,
+    trained: Path = Path("docs/results"),
+    episodes: int = 5,
+    replicas: tuple[int, ...] = (),
+) -> None:
     """Measures all diagrams; restrained agents are the scripted "sustainable".
 
     Args:
@@ -101,7 +109,7 @@ def main(*, out: Path, trained: Path = Path("docs/results"), episodes: int = 5, 
         trained: a directory of runs by the names of boards, whose agents play greedy in further diagrams;
             a board without a run there has none.
         episodes: of each replica and choice of restrained agents.
-        replicas: of trained agents, those from 0 on; of scripted ones, groups of episodes.
+        replicas: which ones, by number; by default all of trained agents, and 0 to 7 of scripted ones.
     """
     asked = []
     for board, rules, who in diagrams(trained):
@@ -111,9 +119,10 @@ def main(*, out: Path, trained: Path = Path("docs/results"), episodes: int = 5, 
     out.mkdir(parents=True, exist_ok=True)
     rows = []
     for board, rules, who, figure in asked:
-        found = schelling(game_of(board, rules), greedy=who, episodes=episodes, replicas=replicas)
-        draw_schelling(found, figure)
-        rows.append(row_of(board, rules, found))
+        fresh = Fresh(episodes=episodes, replicas=replicas)
+        table = schelling(game_of(board, rules), fresh, greedy=who)
+        draw_schelling(table, figure)
+        rows.append(row_of(board, rules, who, table))
         say("; ".join(rows[-1]))
     lines = [f"| {' | '.join(cells)} |" for cells in (HEADINGS, ["---"] * len(HEADINGS), *rows)]
     (out / "table.md").write_text("\n".join([*lines, ""]), encoding="utf-8")

@@ -32,7 +32,7 @@ NO_DEFAULT: Final = tyro.conf.arg(help_behavior_hint="")
 """Of a flag whose default says nothing: its text says what happens without it."""
 
 
-_ROWS: Final = ".parquet"
+ROWS: Final = ".parquet"
 
 
 def _hint(default: str) -> str:
@@ -74,8 +74,8 @@ class Tables:
         from cprl.terminal.tables import SUFFIXES
 
         for path in self.out:
-            if path.suffix not in (_ROWS, *SUFFIXES):
-                raise refusal("--out", str(path), f"a name that ends in {', '.join((_ROWS, *SUFFIXES))}")
+            if path.suffix not in (ROWS, *SUFFIXES):
+                raise refusal("--out", str(path), f"a name that ends in {', '.join((ROWS, *SUFFIXES))}")
             refuse_to_write_over(path)
 
     def write(self, rows: "pa.Table", tables: "Sequence[Cells]" = (), *, notes: Sequence[str] = ()) -> None:
@@ -89,7 +89,7 @@ class Tables:
         from cprl.terminal.tables import write
 
         for path in self.out:
-            if path.suffix == _ROWS:
+            if path.suffix == ROWS:
                 write_table(path, rows)
             else:
                 write(tables, path, notes=notes)

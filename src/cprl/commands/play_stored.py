@@ -2,15 +2,16 @@
 
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
+from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from cprl.commands.flags import NO_DEFAULT
+from cprl.commands.flags import NO_DEFAULT, ROWS, FileFlags, Files, TableFlags, Tables
 from cprl.commons.published import Variant, check_board
 from cprl.system.defaults import (
     EGTA_RESAMPLES,
@@ -21,58 +22,20 @@ from cprl.system.defaults import (
     SEED,
     STUDY_TABLE,
     Diagonal,
+    Fresh,
 )
-from cprl.system.output import printed, say
+from cprl.system.output import OUT, printed, say
 from cprl.system.process import prepare_process
 from cprl.system.working import working
 from cprl.values import Seed, checked
 
 if TYPE_CHECKING:
-    from cprl.evaluation.lanes import Results
+    import pyarrow as pa
+
     from cprl.terminal.tables import Cells
 
 
-@dataclass(frozen=True, kw_only=True)
-class Fresh:
-    """Which fresh worlds are played, and how."""
-
-    episodes: int = 20
-    """Episodes of each replica, in each choice of who plays where."""
-    greedy: bool = False
-    """Whether stored agents take their best action, without exploring or drawing."""
-    seed: int = SEED
-    """Of the worlds and all chance; the same one gives the same numbers."""
-    replicas: tuple[int, ...] = ()
-    """Which replicas, by number; by default all that every run has."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Files:
-    """Which files are written; none is written over."""
-
-    out: Path | None = None
-    """A new .parquet, for every episode."""
-    figure: Path | None = None
-    """A new .png, .pdf or .svg, see docs/evaluation.md."""
-    figure_width: Literal["page", "column"] = "page"
-    """Of the figure: a page, or a column of a paper, 3.3 inches, with its caption in a file beside it."""
-
-    def check(self) -> None:
-        """Refuse what is there already before hours of work."""
-        if self.out is not None:
-            from cprl.runs.files import refuse_to_write_over
-
-            if self.out.suffix != ".parquet":
-                raise ValueError(f"--out is {self.out}; allowed: a name that ends in .parquet")
-            refuse_to_write_over(self.out)
-        if self.figure is not None:
-            from cprl.terminal.style import check_picture
-
-            check_picture(self.figure, "--figure")
-
-
 FreshFlags = Annotated[Fresh, tyro.conf.arg(name="")]
-FileFlags = Annotated[Files, tyro.conf.arg(name="")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,44 +220,44 @@ def play(board: str, /, *, session: Annotated[Session, tyro.conf.arg(name="")] =
     play_in_terminal(open_session(board, **vars(session)))
 
 
-def evaluate(run: Path, /, *, fresh: FreshFlags = Fresh(), out: Path | None = None) -> None:
+def evaluate(run: Path, /, *, fresh: FreshFlags = Fresh(), files: TableFlags = Tables()) -> None:
     """Lets all replicas of a run play fresh worlds, and prints the social metrics beside the random policy's.
 
     Args:
         run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
-        out: a new parquet file, for every episode.
     """
-    files = Files(out=out)
     _begin(fresh.seed, run, files=files)
 
-    from cprl.evaluation.evaluate import evaluate_run, run_table
+    from cprl.evaluation.evaluate import evaluate_run
+    from cprl.terminal.summary import compared
 
-    evaluation = evaluate_run(run, **vars(fresh))
-    _show(evaluation, files, [run_table(evaluation)], below=f"Weights: {evaluation.run.weights_from}")
+    table = evaluate_run(run, fresh)
+    _show(table, files, [compared(table, "beside random play", names={"trained": "run's agents"})])
 
 
 def visits(
-    run: Path, /, *, fresh: FreshFlags = Fresh(), figure: Path | None = None, random: bool = False
+    run: Path, /, *, fresh: FreshFlags = Fresh(), files: FileFlags = Files(), random: bool = False
 ) -> None:
     """Lets all replicas of a run play fresh worlds, and prints how far agents keep to cells of their own.
 
+    The figure has a map for each agent of where it spends its time, in the first of the replicas.
+
     Args:
         run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
-        figure: a new .png, .pdf or .svg: a map for each agent of where it spends its time, in the first of
-            the replicas.
         random: draw random agents in the same worlds instead.
     """
-    if random and figure is None:
+    if random and files.figure is None:
         raise ValueError("--random says who is drawn; allowed: with --figure FILE")
-    files = Files(figure=figure)
     _begin(fresh.seed, run, files=files)
 
-    from cprl.evaluation.territory import draw_visits, territory_of, territory_table
+    from cprl.evaluation.territory import draw_visits, territory_cells, territory_of
+    from cprl.training.agents import load
 
-    territory = territory_of(run, **vars(fresh))
-    draw = partial(draw_visits, territory, policy="random" if random else "trained")
-    below = f"Weights: {territory.run.weights_from}"
-    _show(None, files, [territory_table(territory)], below=below, draw=draw)
+    loaded = load(run)
+    table = territory_of(loaded, fresh)
+    policy: Any = "random" if random else "trained"
+    draw = partial(draw_visits, table, loaded.game.map, policy=policy)
+    _show(table, files, [territory_cells(table)], draw=draw)
 
 
 def crossplay(
@@ -318,16 +281,10 @@ def crossplay(
     _begin(fresh.seed, *_paths(named), files=files)
 
     from cprl.evaluation.cross_play import crossplay as play_each_other
-    from cprl.evaluation.cross_play import crossplay_heading, crossplay_tables, draw_gains
+    from cprl.evaluation.cross_play import crossplay_cells, draw_gains
 
-    played = play_each_other(named, diagonal=diagonal, **vars(fresh))
-    _show(
-        played,
-        files,
-        crossplay_tables(played),
-        above=crossplay_heading(played),
-        draw=partial(draw_gains, played),
-    )
+    table = play_each_other(named, fresh, diagonal=diagonal)
+    _show(table, files, crossplay_cells(table), draw=partial(draw_gains, table))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -341,8 +298,8 @@ class Mixes:
     """Who plays greedy, of the same."""
     episodes: int = 5
     """Of each replica and choice of restrained agents; with N agents these are N (N - 1) + 2."""
-    replicas: int = 8
-    """Of runs, their replicas from 0 on; of scripted agents, independent groups of episodes."""
+    replicas: tuple[int, ...] = ()
+    """Which replicas, by number; by default all that every run has, and 0 to 7 of scripted agents."""
     seed: int = SEED
     """Of the worlds and all chance; the same one gives the same numbers."""
 
@@ -369,12 +326,14 @@ def schelling(
     _begin(mixes.seed, files=files)
 
     from cprl.evaluation.play import board_named
-    from cprl.evaluation.schelling import draw_schelling, schelling_tables
+    from cprl.evaluation.schelling import draw_schelling, schelling_cells
     from cprl.evaluation.schelling import schelling as play_all_mixes
 
     game, run = board_named(board, variant)
-    diagram = play_all_mixes(game if run is None else run, **vars(mixes))
-    _show(diagram, files, schelling_tables(diagram), draw=partial(draw_schelling, diagram))
+    fresh = Fresh(episodes=mixes.episodes, replicas=mixes.replicas, seed=mixes.seed)
+    players = {"restrained": mixes.restrained, "greedy": mixes.greedy}
+    table = play_all_mixes(game if run is None else run, fresh, **players)
+    _show(table, files, schelling_cells(table), draw=partial(draw_schelling, table))
 
 
 def egta(
@@ -404,21 +363,19 @@ def egta(
     from cprl.evaluation.empirical_game import (
         analyse,
         draw_egta,
-        egta_heading,
-        egta_tables,
+        egta_cells,
         pairwise_game,
         play_empirical_game,
     )
     from cprl.theory.solutions import check_extras
 
     check_extras()
-    if pairwise:
-        game = pairwise_game(crossplay(named, **vars(fresh)))
-    else:
-        game = play_empirical_game(named, **vars(fresh))
-    _write(game, files)  # An analysis that fails loses no episodes.
+    game = pairwise_game(crossplay(named, fresh)) if pairwise else play_empirical_game(named, fresh)
+    rows = tuple(path for path in files.out if path.suffix == ROWS)
+    replace(files, out=rows).write(game)  # An analysis that fails loses no episodes.
     analysis = analyse(game, resamples=resamples)
-    _show(None, files, egta_tables(analysis), above=egta_heading(game), draw=partial(draw_egta, analysis))
+    rest = replace(files, out=tuple(path for path in files.out if path not in rows))
+    _show(game, rest, egta_cells(analysis), draw=partial(draw_egta, analysis))
 
 
 def scenarios(
@@ -440,23 +397,15 @@ def scenarios(
     """
     _begin(fresh.seed, run, files=files)
 
-    from cprl.evaluation.scenarios import draw_scenarios, run_scenarios, scenario_heading, scenario_tables
+    from cprl.evaluation.scenarios import draw_scenarios, run_scenarios, scenario_cells
 
-    scores = run_scenarios(run, scenarios=scenarios, **vars(fresh))
-    below = f"Weights: {scores.run.weights_from}"
-    _show(
-        scores,
-        files,
-        scenario_tables(scores),
-        above=scenario_heading(scores),
-        below=below,
-        draw=partial(draw_scenarios, scores),
-    )
+    table = run_scenarios(run, fresh, scenarios=scenarios)
+    _show(table, files, scenario_cells(table), draw=partial(draw_scenarios, table))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Responses:
-    """Which best responses are trained, and how they are measured."""
+    """Which best responses are trained."""
 
     agents: tuple[int, ...] = (0,)
     """Indices of the agents that are replaced, one at a time; each costs as many trainings."""
@@ -467,12 +416,6 @@ class Responses:
     """Trainings by each algorithm."""
     training_episodes: int | None = None
     """Episodes of each training; by default a quarter of the run's, if somebody learned in it."""
-    replicas: int | None = None
-    """How many of the run's replicas are responded to, the first ones; by default all."""
-    episodes: int = 20
-    """Fresh episodes of each replica to choose a response by, and as many to measure its gain by."""
-    seed: int = SEED
-    """Of the worlds in which gains are measured; responses are chosen by the next seed."""
     device: str = "cpu"
     """Where responses learn, e.g. cpu or cuda:0."""
 
@@ -482,13 +425,16 @@ def exploit(
     /,
     *,
     responses: Annotated[Responses, tyro.conf.arg(name="")] = Responses(),
+    fresh: FreshFlags = Fresh(),
     out: Path | None = None,
     jobs: int | None = None,
     dry_run: bool = False,
 ) -> None:
     """Trains best responses to the agents of a run, and prints what they gain: how exploitable the run is.
 
-    You can stop it; the same command continues, and plays again with what is trained.
+    So many fresh episodes choose a response, in worlds of the next seed, and as many measure what it gains.
+    The replicas that are responded to are 0 and those that follow it. You can stop it; the same command
+    continues, and plays again with what is trained.
 
     Args:
         run: the directory of a run that has ended, or its results.
@@ -496,14 +442,14 @@ def exploit(
         jobs: processes that train at the same time, one for each place and algorithm.
         dry_run: list all trainings and their states; run and write nothing.
     """
-    _begin(responses.seed, run)
+    _begin(fresh.seed, run)
 
     from cprl.commands.studies import StudyOptions, carry_out, executor_of
-    from cprl.evaluation.exploit import TABLE, exploitability_tables, measure, plan_responses
+    from cprl.evaluation.exploit import TABLE, exploitability_cells, measure, plan_responses
     from cprl.studies.study import directory_of
     from cprl.terminal.tables import show
 
-    plan = plan_responses(run, **vars(responses))
+    plan = plan_responses(run, fresh, **vars(responses))
     folder = directory_of(plan.study, plan.out if out is None else out)
     options = StudyOptions(out=folder, jobs=jobs, dry_run=dry_run, figures=False)
     executor_of(options)
@@ -512,11 +458,11 @@ def exploit(
     carry_out(plan.study, options, ["cprl", *sys.argv[1:]])
     if dry_run:
         return
-    show(exploitability_tables(measure(plan, folder)))
+    show(exploitability_cells(measure(plan, folder)))
     say(f"Episodes: {folder / TABLE}")
 
 
-def _begin(seed: int | None, *runs: Path | str, files: Files = Files()) -> None:
+def _begin(seed: int | None, *runs: Path | str, files: Tables = Tables()) -> None:
     """Refuse files that are there and runs that are not, before what plays agents is imported; prepare the
     process."""
     with working("starting"):
@@ -531,34 +477,36 @@ def _begin(seed: int | None, *runs: Path | str, files: Files = Files()) -> None:
 
 
 def _show(
-    played: "Results | None",
-    files: Files,
-    tables: "Iterable[Cells]",
+    table: "pa.Table",
+    files: Tables,
+    cells: "Iterable[Cells]",
     *,
-    above: str = "",
-    below: str = "",
     draw: Callable[..., Path] | None = None,
 ) -> None:
-    """Write every episode, print tables with a line above and below them, and draw."""
+    """Print tables below the heading of what was played, or every row; write files, and draw."""
+    from cprl.evaluation.lanes import said
     from cprl.terminal.tables import show
 
-    if played is not None:
-        _write(played, files)
-    show([above] * bool(above))
-    show(tables)
-    if below:
-        say(below)
-    if files.out is not None:
-        say(f"Episodes: {files.out}")
-    if files.figure is not None and draw is not None:
+    if files.csv:
+        _print_rows(table)
+        return
+    tables = list(cells)
+    show([said(table, "heading"), *tables])
+    weights = said(table, "weights")
+    if weights:
+        say(f"Weights: {weights}")
+    files.write(table, tables)
+    if isinstance(files, Files) and files.figure is not None and draw is not None:
         say(f"Figure: {draw(files.figure, width=files.figure_width)}")
 
 
-def _write(played: "Results", files: Files) -> None:
-    if files.out is not None:
-        from cprl.runs.episodes import write_table
+def _print_rows(table: "pa.Table") -> None:
+    from pyarrow.csv import write_csv
+    from pyarrow.types import is_list
 
-        write_table(files.out, played.table())
+    rows = BytesIO()
+    write_csv(table.select([field.name for field in table.schema if not is_list(field.type)]), rows)
+    OUT.write(rows.getvalue().decode())
 
 
 def _paths(named: Sequence[str] | Mapping[str, str]) -> Iterable[str]:

@@ -1,17 +1,18 @@
 """Evaluation: the agents of stored runs in fresh worlds, with their own run or among others.
 
 Modules, in the order in which one reads them:
-    lanes           stored and scripted agents of all replicas side by side, in fresh worlds; Results, what
-                    labelled populations did in the same worlds; play_population
+    lanes           stored and scripted agents of all replicas side by side, in fresh worlds; play, together:
+                    what they did, one tidy table; play_population
+    pages           what is printed and drawn of such a table, whatever its kind
     evaluate        evaluate_run: all replicas of a run, beside the random policy
-    cross_play      crossplay: a focal agent of one run among background agents of another, and what it gains
+    cross_play      crossplay: a focal agent of one run among background agents of another; gains
     schelling       what restrained and greedy agents get, by how many of the others are restrained
     empirical_game  play_empirical_game: the game whose strategies are runs; pairwise_game: of a cross-play;
                     analyse: which runs last in it, by alpha-rank, equilibria and replicator dynamics
     scenarios       run_scenarios: a run among named backgrounds that it never met
     territory       territory_of: where the agents of a run go and whom they tag
-    exploit         exploitability: trains best responses, a study; play_responses: what they gain over the
-                    agents whose place they take
+    exploit         exploitability: trains best responses, a study; play_responses, response_gains: what they
+                    gain over the agents whose place they take
     fresh           fresh episodes that are shown, by default a typical one
     film            an episode, every step recorded, or as a GIF or an MP4
     film_pictures   the pictures of a film, and its files
@@ -22,38 +23,26 @@ Modules, in the order in which one reads them:
     play            a person among trained or scripted agents
 """
 
-from cprl.evaluation.cross_play import Cell, CrossPlay, Gain, crossplay, draw_gains, gains
-from cprl.evaluation.empirical_game import (
-    Analysis,
-    EmpiricalGame,
-    analyse,
-    draw_egta,
-    pairwise_game,
-    play_empirical_game,
-)
-from cprl.evaluation.evaluate import Evaluation, evaluate_run
-from cprl.evaluation.exploit import Exploitability, Plan, exploitability, plan_responses, play_responses
+from cprl.evaluation.cross_play import by_focal_agent, crossplay, draw_gains, gains
+from cprl.evaluation.empirical_game import Analysis, analyse, draw_egta, pairwise_game, play_empirical_game
+from cprl.evaluation.evaluate import evaluate_run
+from cprl.evaluation.exploit import Plan, exploitability, plan_responses, play_responses, response_gains
 from cprl.evaluation.lanes import play_population
-from cprl.evaluation.scenarios import Scenario, Score, Scores, draw_scenarios, run_scenarios, scenarios_of
-from cprl.evaluation.schelling import SchellingDiagram, draw_schelling, schelling
-from cprl.evaluation.territory import Territory, draw_visits, territory_of
+from cprl.evaluation.scenarios import Scenario, advantages, draw_scenarios, run_scenarios, scenarios_of
+from cprl.evaluation.schelling import dilemma, draw_schelling, margins, payoffs_of, schelling
+from cprl.evaluation.territory import draw_visits, territory_of
+from cprl.system.defaults import Fresh
 
 __all__ = [
     "Analysis",
-    "Cell",
-    "CrossPlay",
-    "EmpiricalGame",
-    "Evaluation",
-    "Exploitability",
-    "Gain",
+    "Fresh",
     "Plan",
     "Scenario",
-    "SchellingDiagram",
-    "Score",
-    "Scores",
-    "Territory",
+    "advantages",
     "analyse",
+    "by_focal_agent",
     "crossplay",
+    "dilemma",
     "draw_egta",
     "draw_gains",
     "draw_scenarios",
@@ -62,11 +51,14 @@ __all__ = [
     "evaluate_run",
     "exploitability",
     "gains",
+    "margins",
     "pairwise_game",
+    "payoffs_of",
     "plan_responses",
     "play_empirical_game",
     "play_population",
     "play_responses",
+    "response_gains",
     "run_scenarios",
     "scenarios_of",
     "schelling",

@@ -16,24 +16,27 @@ certain as the share of these games that have it. With few replicas such interva
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import permutations
 from math import isnan, nan
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from matplotlib.axes import Axes
 
-from cprl.evaluation.cross_play import CrossPlay, Runs, draw_matrix, matrix_height, matrix_table, named_runs
-from cprl.evaluation.evaluate import SEED, heading
-from cprl.evaluation.lanes import Part, Played, Results, Who, agents_of, fresh_of, shifted
-from cprl.measuring.statistics import CONFIDENCE, HOLM, Estimate, estimate, starred
-from cprl.system.defaults import EGTA_RESAMPLES
+from cprl.evaluation.cross_play import OF_FOCAL, PAIR, Runs, named_runs
+from cprl.evaluation.lanes import agents_of, fresh_for, play, said, shifted, together
+from cprl.evaluation.pages import heading, matrix_cells
+from cprl.measuring.statistics import CONFIDENCE, HOLM, Estimate, Family, curve_interval, estimate, judged
+from cprl.measuring.table import FOCAL, ROLE, by_replica
+from cprl.system.defaults import EGTA_RESAMPLES, Fresh
 from cprl.system.working import say_how_far, working
 from cprl.terminal import style
+from cprl.terminal.panels import draw_line, draw_matrix, matrix_height
 from cprl.terminal.tables import Cells
 from cprl.theory.payoff_table import PayoffTable, Values, compositions
 from cprl.theory.solutions import (
@@ -47,134 +50,119 @@ from cprl.theory.solutions import (
     replicator,
     replicator_ends,
 )
-from cprl.training.agents import LoadedRun
 from cprl.values import Range, checked
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class EmpiricalGame(Results):
-    """A game of N agents whose strategies are S runs, with the episodes by "runs", the names of all agents'
-    runs, or as `CrossPlay` has them; see the docstring of this module."""
-
-    runs: Mapping[str, LoadedRun]
-    """The S runs by name."""
-    agents: int
-    """N of this game: 2 of a pairwise one."""
-    of_agents: int
-    """The agents of the game that was played."""
-    payoffs: Values
-    """float64 [R, C, S]: the mean return of an agent of a run by replica and composition, in the rows of
-    `cprl.theory.compositions(agents, S)`; NaN where nobody plays as the run."""
-
-    def __repr__(self) -> str:
-        return f"EmpiricalGame({', '.join(self.runs)}; {self.agents} agents, {self.fresh})"
-
-    @property
-    def names(self) -> list[str]:
-        return list(self.runs)
-
-    @property
-    def is_reduction(self) -> bool:
-        """Whether more agents played than this game has."""
-        return self.agents < self.of_agents
-
-    def payoff_table(self, replicas: Sequence[int] | None = None) -> PayoffTable:
-        """The mean payoffs over replicas.
-
-        Args:
-            replicas: their places in `payoffs`, e.g. a resample; by default all once.
-        """
-        payoffs = self.payoffs if replicas is None else self.payoffs[list(replicas)]
-        return PayoffTable(agents=self.agents, payoffs=payoffs.mean(0))
-
-    @cached_property
-    def pairs(self) -> Values:
-        """Of a game of two agents, or of the reduction to pairs, float64 [R, S, S]."""
-        return np.array([self.payoff_table([place]).pairs for place in range(len(self.payoffs))])
+COMPOSITION: Final = "composition"
+"""The label that says how many agents play as each run."""
+_EACH: Final = " for each choice of who plays where"
 
 
 @working("playing all compositions")
-def play_empirical_game(
-    runs: Runs,
-    *,
-    episodes: int = 5,
-    greedy: bool = False,
-    seed: int = SEED,
-    replicas: Sequence[int] = (),
-) -> EmpiricalGame:
-    """Plays all compositions of runs.
+def play_empirical_game(runs: Runs, fresh: Fresh = Fresh(episodes=5)) -> pa.Table:
+    """Let agents of runs play in all compositions.
 
     Args:
         runs: at least two runs of the same game, as for `crossplay`. With S runs and N agents up to 256
-            profiles S^N are allowed, e.g. four runs of four agents; `pairwise_game` has no such bound.
-        episodes: episodes of each replica and choice of who plays where, each in its own world; the choices
-            are N (C - S) + S.
+            profiles S^N are allowed, e.g. four runs of four agents; `crossplay` has no such bound.
+        fresh: which episodes, for each choice of who plays where; the choices are N (C - S) + S.
+
+    Returns:
+        A row for each choice, replica, episode and agent, see `cprl.measuring.table`, by "composition", how
+        many agents play as each run, and "runs", the names of all agents' runs; "role" is the name of the
+        agent's own.
     """
     named = named_runs(runs)
     names = list(named)
     agents = named[names[0]].game.agents
-    if (profiles := len(named) ** agents) > MOST_PROFILES:
+    profiles = len(named) ** agents
+    if profiles > MOST_PROFILES:
         raise ValueError(
             f"{len(named)} runs of {agents} agents have {profiles:,} profiles; allowed: at most "
             f"{MOST_PROFILES}; crossplay and pairwise_game (cprl egta --pairwise) take more"
         )
-    fresh = fresh_of(named.values(), episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
+    fresh = fresh_for(named.values(), fresh)
     of_runs = [agents_of(run) for run in named.values()]
-    parts: list[Part] = []
-    payoffs = []
+    parts: list[pa.Table] = []
     for counts in compositions(agents, len(named)).tolist():
-        played = {}
         for who in shifted(counts):
             say_how_far(len(parts), None, "populations")
             mixed = [of_runs[run][agent] for agent, run in enumerate(who)]
-            played[who] = fresh.play(named[names[who[0]]], mixed, among=named.values())
-            parts.append(Part({"runs": " ".join(names[run] for run in who)}, played[who]))
-        payoffs.append(_payoffs(len(named), played))
-    return EmpiricalGame(
-        runs=named, agents=agents, of_agents=agents, payoffs=np.stack(payoffs, 1), fresh=fresh, parts=parts
-    )
+            roles = [names[run] for run in who]
+            labels = {COMPOSITION: composition_text(counts, names), "runs": " ".join(roles)}
+            parts.append(play(fresh, named[roles[0]], mixed, labels, roles=roles, among=named.values()))
+    title = heading("Empirical game", fresh, named.values(), _EACH)
+    return together(parts, heading=title, fresh=fresh)
 
 
-def pairwise_game(played: CrossPlay) -> EmpiricalGame:
-    """The game of two agents that a cross-play makes; see the docstring of this module.
+def pairwise_game(played: pa.Table) -> pa.Table:
+    """Return the table of a cross-play as that of the game of two agents that it makes, see the docstring of
+    this module.
+
+    The diagonal of the cross-play says who plays where both play as one run.
+    """
+    kind = "Empirical game" if _agents_in(played) == 2 else "Pairwise reduction of the empirical game"
+    title = said(played, "heading").replace("Cross-play", kind, 1)
+    return played.replace_schema_metadata({**(played.schema.metadata or {}), b"heading": title.encode()})
+
+
+def games_in(table: pa.Table) -> tuple[list[str], list[PayoffTable]]:
+    """Return the names of the strategies of a table's game, and what it pays in each replica.
 
     Args:
-        played: the cross-play; its `diagonal` says who plays where both play as one run.
+        table: of `play_empirical_game` or `pairwise_game`.
     """
-    count, cells = len(played.runs), played.cells
-    returns = np.stack([cell.mean_returns("focal") for cell in cells.values()], 1).reshape(-1, count, count)
-    return EmpiricalGame(
-        runs=played.runs,
-        agents=2,
-        of_agents=next(iter(played.runs.values())).game.agents,
-        payoffs=np.array(
-            [PayoffTable.of_pairs(pairs).payoffs for pairs in returns.reshape(-1, count, count)]
-        ),
-        fresh=played.fresh,
-        parts=played.parts,
-    )
+    replicas = sorted(table["replica"].unique().to_pylist())
+    if FOCAL in table.column_names:
+        names = table[FOCAL].unique().to_pylist()
+        found = _values(by_replica(table, OF_FOCAL, PAIR), ("replica", *PAIR), "value")
+        return names, [
+            PayoffTable.of_pairs([[found[replica, one, other] for other in names] for one in names])
+            for replica in replicas
+        ]
+    names = table[ROLE].unique().to_pylist()
+    agents = _agents_in(table)
+    keys = ("replica", COMPOSITION, ROLE)
+    means = table.group_by(keys, use_threads=False).aggregate([("return", "mean")])
+    found = _values(means, keys, "return_mean")
+    every = [composition_text(counts, names) for counts in compositions(agents, len(names)).tolist()]
+    games = []
+    for replica in replicas:
+        payoffs = [[found.get((replica, played, name), nan) for name in names] for played in every]
+        games.append(PayoffTable(agents=agents, payoffs=np.array(payoffs)))
+    return names, games
 
 
-def _payoffs(runs: int, played: Mapping[Who, Played]) -> Values:
-    """The mean return of an agent of each run, [R, S]; NaN for a run that does not play."""
-    replicas = next(iter(played.values()))
-    payoffs = np.full((len(replicas), runs), np.nan)
-    for place, replica in enumerate(replicas):
-        for run in {run for who in played for run in who}:
-            of_run = [
-                one.return_[np.array(who) == run] for who, all_ in played.items() for one in all_[replica]
-            ]
-            payoffs[place, run] = np.concatenate(of_run).mean()
-    return payoffs
+def _values(table: pa.Table, keys: Sequence[str], value: str) -> dict[tuple[Any, ...], float]:
+    """Return a column by the values of others."""
+    columns = (table[name].to_pylist() for name in keys)
+    return dict(zip(zip(*columns, strict=True), table[value].to_pylist(), strict=True))
+
+
+def _agents_in(table: pa.Table) -> int:
+    """Return how many agents play in each episode of a table."""
+    return int(pc.max(table["agent"]).as_py()) + 1
+
+
+def mean_of(games: Sequence[PayoffTable]) -> PayoffTable:
+    """Return the game of the mean payoffs."""
+    payoffs = np.mean([game.payoffs for game in games], 0)
+    return PayoffTable(agents=games[0].agents, payoffs=payoffs)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Analysis:
-    """What an empirical game amounts to; see the docstring of this module."""
+    """What an empirical game of S runs amounts to; see the docstring of this module."""
 
-    game: EmpiricalGame
-    table: PayoffTable = field(repr=False)
-    """The means over replicas."""
+    names: Sequence[str]
+    """Of the runs."""
+    games: Sequence[PayoffTable] = field(repr=False)
+    """What each replica pays."""
+    of_agents: int
+    """The agents of the game that was played; more than those of `games` where these are a reduction."""
+    played: str
+    """What was played, in words."""
+    mean: PayoffTable = field(repr=False)
+    """What replicas pay on average."""
     resamples: int
     """Of the bootstrap; 0 for a single replica."""
     rank: AlphaRank = field(repr=False)
@@ -191,119 +179,142 @@ class Analysis:
     ends: Ends = field(repr=False)
     """Where replicator dynamics end."""
 
+    @property
+    def pairs(self) -> Values:
+        """What an agent of a run gets where all others play as another, float64 [R, S, S]."""
+        return np.array([game.pairs for game in self.games])
+
+    @property
+    def is_reduction(self) -> bool:
+        return self.of_agents > self.mean.agents
+
 
 @working("analysing the game")
-def analyse(game: EmpiricalGame, *, resamples: int = EGTA_RESAMPLES, seed: int = 0) -> Analysis:
-    """Analyses an empirical game.
+def analyse(table: pa.Table, *, resamples: int = EGTA_RESAMPLES, seed: int = 0) -> Analysis:
+    """Analyse an empirical game.
 
     Args:
+        table: of `play_empirical_game` or `pairwise_game`.
         resamples: the number of bootstrap resamples of the replicas.
         seed: the seed of the resampling, and of the starts of the replicator dynamics.
 
     Raises:
         ModuleNotFoundError: if OpenSpiel or nashpy is not installed.
     """
+    names, games = games_in(table)
+    found = analyse_games(names, games, resamples=resamples, seed=seed)
+    return replace(found, of_agents=_agents_in(table), played=said(table, "fresh") + _EACH)
+
+
+def analyse_games(
+    names: Sequence[str], games: Sequence[PayoffTable], *, resamples: int = EGTA_RESAMPLES, seed: int = 0
+) -> Analysis:
+    """Analyse the game that replicas measured, see `analyse`."""
     resamples = checked("resamples", resamples, Annotated[int, Range(1, 100_000)])
-    rng, replicas, table = np.random.default_rng(seed), len(game.payoffs), game.payoff_table()
+    replicas = len(games)
+    mean = mean_of(games)
+    rng = np.random.default_rng(seed)
     drawn = rng.integers(replicas, size=(resamples if replicas > 1 else 0, replicas))
     # Few replicas have few resamples that differ: each is analysed once.
     times = Counter(tuple(sorted(places)) for places in drawn.tolist())
-    again = [game.payoff_table(places) for places in times]
-    is_small, rank = table.strategies <= MOST_STRATEGIES, alpha_rank(table)
-    bounds = np.full((2, table.strategies), np.nan)
-    pure, in_support = dict.fromkeys(table.pure_equilibria, nan), np.full(table.strategies, nan)
+    again = [mean_of([games[place] for place in places]) for places in times]
+    rank = alpha_rank(mean)
+    is_small = mean.strategies <= MOST_STRATEGIES
+    bounds = np.full((2, mean.strategies), np.nan)
+    pure = dict.fromkeys(mean.pure_equilibria, nan)
+    in_support = np.full(mean.strategies, nan)
     if again:
-        weights = np.array(list(times.values())) / len(drawn)
-        ranks = np.repeat([alpha_rank(resample).shares for resample in again], list(times.values()), axis=0)
+        counts = list(times.values())
+        weights = np.array(counts) / len(drawn)
+        ranks = np.repeat([alpha_rank(resample).shares for resample in again], counts, axis=0)
         margin = (1 - CONFIDENCE) / 2
         bounds = np.quantile(ranks, [margin, 1 - margin], axis=0)
         pure = {counts: float(weights @ [counts in one.pure_equilibria for one in again]) for counts in pure}
-        if table.agents == 2 and is_small:
+        if mean.agents == 2 and is_small:
             in_support = weights @ np.array([_is_played(resample) for resample in again], float)
+    shares = (
+        Estimate(value=float(share), low=float(low), high=float(high), replicas=replicas)
+        for share, low, high in zip(rank.shares, *bounds, strict=True)
+    )
     return Analysis(
-        game=game,
-        table=table,
+        names=names,
+        games=games,
+        of_agents=mean.agents,
+        played="",
+        mean=mean,
         resamples=len(drawn),
         rank=rank,
-        shares=tuple(
-            Estimate(value=float(share), low=float(low), high=float(high), replicas=replicas)
-            for share, low, high in zip(rank.shares, *bounds, strict=True)
-        ),
+        shares=tuple(shares),
         pure=pure,
-        equilibria=equilibria(table.reduced) if is_small else (),
+        equilibria=equilibria(mean.reduced) if is_small else (),
         in_support=in_support,
-        ends=replicator_ends(table, seed=seed),
+        ends=replicator_ends(mean, seed=seed),
     )
 
 
-def _is_played(table: PayoffTable) -> list[bool]:
-    """Whether each run is played in a symmetric equilibrium."""
-    symmetric = [equilibrium for equilibrium in equilibria(table) if equilibrium.is_symmetric]
+def _is_played(game: PayoffTable) -> list[bool]:
+    """Return whether each run is played in a symmetric equilibrium."""
+    symmetric = [equilibrium for equilibrium in equilibria(game) if equilibrium.is_symmetric]
     played = {run for equilibrium in symmetric for run in equilibrium.support}
-    return [run in played for run in range(table.strategies)]
+    return [run in played for run in range(game.strategies)]
 
 
 _LEAST: Final = 0.005
-"""Smaller shares are not told."""
-_CHOICES: Final = " for each choice of who plays where"
+"""Smaller shares are not listed."""
 
 
-def egta_heading(game: EmpiricalGame) -> str:
-    kind = "Pairwise reduction of the empirical game" if game.is_reduction else "Empirical game"
-    return heading(kind, game.fresh, game.runs.values(), _CHOICES)
-
-
-def egta_tables(analysis: Analysis) -> Iterator[Cells]:
-    """The payoffs, the runs by alpha-rank, the equilibria, and where replicator dynamics end."""
-    yield _payoff_table(analysis.game)
+def egta_cells(analysis: Analysis) -> Iterator[Cells]:
+    """Yield the payoffs, the runs by alpha-rank, the equilibria, and where replicator dynamics end."""
+    yield _payoff_cells(analysis)
     title = "alpha-rank at the limit of infinite alpha: share of the agents in the long run"
     if analysis.resamples:
         title += f" [95 % interval, {analysis.resamples} resamples of the replicas]"
-    is_certain = not np.isnan(analysis.in_support).any()
-    columns = ["run", "share", *["resamples in which a symmetric equilibrium plays it"] * is_certain]
-    rows = [
-        (
-            name,
-            f"{share.value:.2f}" + f" [{share.low:.2f}, {share.high:.2f}]" * (not isnan(share.low)),
-            *[f"{certain:.0%}"] * is_certain,
-        )
-        for name, share, certain in zip(
-            analysis.game.names, analysis.shares, analysis.in_support, strict=True
-        )
-    ]
-    yield Cells(title, columns, rows)
+    head = ["run", "share"]
+    rows = []
+    for name, share in zip(analysis.names, analysis.shares, strict=True):
+        interval = "" if isnan(share.low) else f" [{share.low:.2f}, {share.high:.2f}]"
+        rows.append([name, f"{share.value:.2f}{interval}"])
+    if not np.isnan(analysis.in_support).any():
+        head.append("resamples in which a symmetric equilibrium plays it")
+        for row, certain in zip(rows, analysis.in_support, strict=True):
+            row.append(f"{certain:.0%}")
+    yield Cells(title, head, rows)
     yield Cells("equilibria", ["", "what is played", "how certain"], list(_ends(analysis)), texts=2)
 
 
-def _payoff_table(game: EmpiricalGame) -> Cells:
-    """By the runs of both of two agents, else by how many agents play as each."""
-    if game.agents == 2:
-        others = "the other" if game.of_agents == 2 else f"all other {game.of_agents - 1}"
-        title = f"return of an agent, by its run and the run of {others}"
-        cells = {
-            (name, other): estimate(game.pairs[:, row, column])
-            for row, name in enumerate(game.names)
-            for column, other in enumerate(game.names)
+def _payoff_cells(analysis: Analysis) -> Cells:
+    """Return payoffs by the runs of both of two agents, else by how many agents play as each."""
+    names = analysis.names
+    agents = analysis.mean.agents
+    if agents == 2:
+        levels = {
+            (name, other, "return"): estimate(analysis.pairs[:, row, column])
+            for row, name in enumerate(names)
+            for column, other in enumerate(names)
         }
-        return matrix_table(title, "an agent \\ others", game.names, cells)
+        others = f"all other {analysis.of_agents - 1}" if analysis.is_reduction else "the other"
+        title = f"return of an agent, by its run and the run of {others}"
+        return matrix_cells(Family(levels, ("an agent", "others")), "return", title)
     rows = []
-    for place, counts in enumerate(compositions(game.agents, len(game.names)).tolist()):
-        means = zip(game.payoffs[:, place].T, counts, strict=True)
-        texts = (str(estimate(of_run)) if count else "" for of_run, count in means)
-        rows.append((composition_text(counts, game.names), *texts))
+    for place, counts in enumerate(compositions(agents, len(names)).tolist()):
+        row: list[Any] = [composition_text(counts, names)]
+        for run, count in enumerate(counts):
+            payoffs = [game.payoffs[place, run] for game in analysis.games]
+            row.append(estimate(payoffs) if count else "")
+        rows.append(row)
     title = "return of an agent of each run, by how many agents play as each"
-    return Cells(title, ["agents", *game.names], rows)
+    return Cells(title, ["agents", *names], rows)
 
 
 def _ends(analysis: Analysis) -> Iterator[tuple[str, str, str]]:
-    """What no agent leaves alone, the Nash equilibria, and where the dynamics end."""
-    names = analysis.game.names
+    """Yield what no agent leaves alone, the Nash equilibria, and where the dynamics end."""
+    names = analysis.names
     for counts, certain in analysis.pure.items():
         resamples = "" if isnan(certain) else f"in {certain:.0%} of the resamples"
         yield "no agent gains by another run", composition_text(counts, names), resamples
     if not analysis.pure:
         yield "no agent gains by another run", "no composition", ""
-    of_pairs = "" if analysis.game.agents == 2 else " of pairs"
+    of_pairs = "" if analysis.mean.agents == 2 else " of pairs"
     for equilibrium in analysis.equilibria:
         both = [mixture_text(side, names) for side in (equilibrium.first, equilibrium.second)]
         played = both[0] if equilibrium.is_symmetric else " against ".join(both)
@@ -316,12 +327,12 @@ def _ends(analysis: Analysis) -> Iterator[tuple[str, str, str]]:
 
 
 def composition_text(counts: Sequence[int], names: Sequence[str]) -> str:
-    """A composition in words, e.g. "3 dqn, 1 ppo"."""
+    """Return a composition in words, e.g. "3 dqn, 1 ppo"."""
     return ", ".join(f"{count} {name}" for count, name in zip(counts, names, strict=True) if count)
 
 
 def mixture_text(mixture: Values, names: Sequence[str]) -> str:
-    """A mixture in words, e.g. "dqn 0.75, ppo 0.25"; one strategy by its name alone."""
+    """Return a mixture in words, e.g. "dqn 0.75, ppo 0.25"; one strategy by its name alone."""
     played = [(name, share) for name, share in zip(names, mixture, strict=True) if share >= _LEAST]
     return played[0][0] if len(played) == 1 else ", ".join(f"{name} {share:.2f}" for name, share in played)
 
@@ -332,91 +343,104 @@ _CORNERS: Final = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, 3**0.5 / 2]])
 _DYNAMICS_HIGH: Final = 22.0
 
 
-def draw_egta(analysis: Analysis, path: Path | str, *, width: style.Width = "page") -> Path:
-    """Draws what one agent gains that plays as another run than all others, with a star where it is not 0 by
-    Holm's method; each run's share by alpha-rank, with the most frequent end of replicator dynamics; and the
-    phase portrait of these dynamics where there are two or three runs."""
-    game, names = analysis.game, analysis.game.names
-    usual = np.diagonal(game.pairs, axis1=1, axis2=2)
-    gains = {
-        (names[played], names[others]): estimate(game.pairs[:, played, others] - usual[:, others])
+def gains_by_switching(analysis: Analysis) -> Family:
+    """Return what one agent gains that plays as another run than all others: by its run and theirs."""
+    names = analysis.names
+    pairs = analysis.pairs
+    found = {
+        (names[played], names[others], "return"): estimate(
+            pairs[:, played, others] - pairs[:, others, others]
+        )
         for played, others in permutations(range(len(names)), 2)
     }
-    texts = dict(zip(gains, starred(list(gains.values()), "+.3g"), strict=True))
-    texts |= {(name, name): f"{mean:.3g}" for name, mean in zip(names, usual.mean(0), strict=True)}
+    return judged(found, ("an agent", "others"))
+
+
+def draw_egta(analysis: Analysis, path: Path | str, *, width: style.Width = "page") -> Path:
+    """Draw what one agent gains that plays as another run than all others, with a star where it is not 0 by
+    Holm's method; each run's share by alpha-rank, with the most frequent end of replicator dynamics; and the
+    phase portrait of these dynamics where there are two or three runs."""
+    names = {name: name for name in analysis.names}
+    gains = gains_by_switching(analysis)
+    texts = {key[:2]: f"{gain.value:+.3g}" + " *" * gain.differs for key, gain in gains.items()}
+    at_home = np.diagonal(analysis.pairs, axis1=1, axis2=2).mean(0)
+    texts |= {(name, name): f"{mean:.3g}" for name, mean in zip(names, at_home, strict=True)}
+    draw_dynamics = {2: _draw_line, 3: _draw_simplex}.get(len(names))
     with style.drawing(path, width=width, colours=style.SHADES, is_new=True) as sheet:
         columns = sheet.fitting(2, 24)
         ratios: Any = {"width_ratios": (1.35, 1)} if columns == 2 else {}
-        draw_dynamics = {2: _draw_line, 3: _draw_simplex}.get(len(names))
-        heights = [matrix_height(names)] * (3 - columns) + [_DYNAMICS_HIGH] * bool(draw_dynamics)
+        heights = [matrix_height(len(names))] * (3 - columns) + [_DYNAMICS_HIGH] * bool(draw_dynamics)
         panels = sheet.panels(2 + bool(draw_dynamics), columns=columns, high=heights, **ratios)
         matrix, rank = panels[:2]
         if draw_dynamics:
             draw_dynamics(panels[2], analysis)
-        differences = {pair: gain.value for pair, gain in gains.items()}
-        draw_matrix(sheet, matrix, names, differences, texts, share=1.15 / columns)
+        values = {key[:2]: gain.value for key, gain in gains.items()}
+        draw_matrix(sheet, matrix, names, names, values, texts, share=1.15 / columns)
         matrix.set(xlabel="run of all others", ylabel="run of an agent")
         matrix.set_title("gain of an agent by another run")
-        places = np.arange(len(names))
-        share, low, high = np.array([(share.value, share.low, share.high) for share in analysis.shares]).T
-        rank.barh(places, share, color=style.REPLICA, height=0.6)
-        rank.hlines(places, low, high, color=style.PUBLISHED)
-        if len(analysis.ends.mixtures):
-            label = f"end of replicator dynamics, from {analysis.ends.shares[0]:.0%} of the starts"
-            rank.plot(analysis.ends.mixtures[0], places, "D", color=style.MARK, label=label, clip_on=False)
-        rank.set_yticks(places, [style.wrapped(name, 9) for name in names])
-        rank.set(xlim=(0, 1), ylim=(len(places) - 0.5, -0.5), xlabel="share of the agents in the long run")
-        rank.set_title("alpha-rank, infinite alpha")
-        kind = (
-            f"pairwise reduction of {game.of_agents} agents" if game.is_reduction else f"{game.agents} agents"
-        )
+        _draw_ranks(rank, analysis)
+        kind = f"{analysis.of_agents} agents"
+        if analysis.is_reduction:
+            kind = f"pairwise reduction of {kind}"
         sheet.title = f"Empirical game of {', '.join(names)}"
         sheet.caption = (
-            f"{kind}; {game.fresh}{_CHOICES}. {HOLM} for these {len(gains)}; diagonal: an agent's return; "
+            f"{kind}; {analysis.played}. {HOLM} for these {len(gains)}; diagonal: an agent's return; "
             f"intervals of shares: 95 % of {analysis.resamples} resamples of the replicas."
         )
     return Path(path)
 
 
+def _draw_ranks(axes: Axes, analysis: Analysis) -> None:
+    """Draw each run's share by alpha-rank, and the most frequent end of replicator dynamics."""
+    places = np.arange(len(analysis.names))
+    axes.barh(places, [share.value for share in analysis.shares], color=style.REPLICA, height=0.6)
+    low = [share.low for share in analysis.shares]
+    high = [share.high for share in analysis.shares]
+    axes.hlines(places, low, high, color=style.PUBLISHED)
+    if len(analysis.ends.mixtures):
+        label = f"end of replicator dynamics, from {analysis.ends.shares[0]:.0%} of the starts"
+        axes.plot(analysis.ends.mixtures[0], places, "D", color=style.MARK, label=label, clip_on=False)
+    axes.set_yticks(places, [style.wrapped(name, 9) for name in analysis.names])
+    axes.set(xlim=(0, 1), ylim=(len(places) - 0.5, -0.5), xlabel="share of the agents in the long run")
+    axes.set_title("alpha-rank, infinite alpha")
+
+
 def _draw_line(axes: Axes, analysis: Analysis) -> None:
-    """What the first of two runs gains over the second, by its share, with the points of rest."""
-    shares, (first, second) = np.linspace(0, 1, _POINTS), analysis.game.names
-    tables = [analysis.game.payoff_table([place]) for place in range(len(analysis.game.payoffs))]
-    curves = [[np.subtract(*table.against([share, 1 - share])) for share in shares] for table in tables]
-    means = [estimate(gains) for gains in np.transpose(curves)]
-    middle, low, high = np.array([(mean.value, mean.low, mean.high) for mean in means]).T
-    axes.fill_between(shares, low, high, color=style.REPLICA, alpha=0.35, lw=0)
-    axes.plot(shares, middle, color=style.MEAN)
+    """Draw what the first of two runs gains over the second, by its share, with the fixed points."""
+    first, second = analysis.names
+    shares = np.linspace(0, 1, _POINTS)
+    curves = [[np.subtract(*game.against([share, 1 - share])) for share in shares] for game in analysis.games]
+    middle, low, high = curve_interval(curves)
+    draw_line(axes, shares, (middle, low, high))
     axes.axhline(0, color=style.RAW, lw=1, zorder=1)
-    for at, is_stable in _rests(shares, middle):
+    for at, is_stable in _fixed_points(shares, middle):
         face = style.MARK if is_stable else "white"
         axes.plot(at, 0, "o", markersize=8, color=style.MARK, markerfacecolor=face, clip_on=False, zorder=4)
+    arrow = {"arrowstyle": "->", "color": style.MARK}
     for start in (0.12, 0.37, 0.62, 0.87):
         ahead = 0.03 if np.interp(start, shares, middle) > 0 else -0.03
-        axes.annotate(
-            "", (start + ahead, 0), (start - ahead, 0), arrowprops={"arrowstyle": "->", "color": style.MARK}
-        )
+        axes.annotate("", (start + ahead, 0), (start - ahead, 0), arrowprops=arrow)
     axes.set(
         xlim=(-0.02, 1.02), xlabel=f"share that plays as {first}", ylabel=f"return as {first} less {second}"
     )
     axes.set_title("replicator dynamics, filled: attracts")
 
 
-def _rests(shares: Values, gains: Values) -> list[tuple[float, bool]]:
-    """Where nothing changes, and whether shares nearby move there."""
-    rests = [(0.0, bool(gains[0] < 0)), (1.0, bool(gains[-1] > 0))]
+def _fixed_points(shares: Values, gains: Values) -> list[tuple[float, bool]]:
+    """Return where nothing changes, and whether shares nearby move there."""
+    points = [(0.0, bool(gains[0] < 0)), (1.0, bool(gains[-1] > 0))]
     for place in np.flatnonzero(gains[:-1] * gains[1:] < 0):
-        low, high = gains[place], gains[place + 1]
+        low, high = gains[place : place + 2]
         at = shares[place] + (shares[place + 1] - shares[place]) * low / (low - high)
-        rests.append((float(at), bool(low > 0)))
-    return rests
+        points.append((float(at), bool(low > 0)))
+    return points
 
 
 def _draw_simplex(axes: Axes, analysis: Analysis) -> None:
-    """The direction in which the shares of three runs move, where they end, and the corners by name."""
+    """Draw the direction in which the shares of three runs move, where they end, and the corners by name."""
     axes.plot(*np.vstack([_CORNERS, _CORNERS[:1]]).T, color=style.RAW, lw=1)
     mixtures = (compositions(_GRID - 3, 3) + 1) / _GRID
-    moves = np.array([replicator(analysis.table.normalised, mixture) for mixture in mixtures]) @ _CORNERS
+    moves = np.array([replicator(analysis.mean.normalised, mixture) for mixture in mixtures]) @ _CORNERS
     lengths = np.linalg.norm(moves, axis=1, keepdims=True)
     arrows = np.divide(moves, lengths, out=np.zeros_like(moves), where=lengths > 0)
     axes.quiver(
@@ -427,7 +451,7 @@ def _draw_simplex(axes: Axes, analysis: Analysis) -> None:
         axes.plot(*at, "o", color=style.MARK, markersize=9, zorder=4)
         offset = (9, -9) if at[1] > _CORNERS[:, 1].max() - 0.1 else (8, 8)  # not over the name of the top
         axes.annotate(f"{share:.0%}", at, offset, textcoords="offset points")
-    for corner, name in zip(_CORNERS, analysis.game.names, strict=True):
+    for corner, name in zip(_CORNERS, analysis.names, strict=True):
         at, side = ((0, 3), "bottom") if corner[1] > 0 else ((0, -3), "top")
         axes.annotate(name, corner, at, textcoords="offset points", ha="center", va=side)
     axes.set(xlim=(-0.08, 1.08), ylim=(-0.1, 1.06), aspect="equal")

@@ -1,54 +1,43 @@
-"""Plays labelled populations of stored agents in the same fresh worlds; `Results` has the outcome.
+"""Plays populations of stored and scripted agents in fresh worlds; what they did is a tidy table.
 
 All replicas play at once, as lanes: a step of all takes as long as a step of one, and each lane's random
-numbers depend on (seed, replica, agent) alone.
+numbers depend on (seed, replica, agent) alone. Replica r plays the worlds from r x episodes on.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, NamedTuple, Self, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 import pyarrow as pa
-import torch
-from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
-from cprl.commons.world import Shown
-from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.make_env import is_playable, make_env, spaces_of
-from cprl.envs.unwrap import clock_of
-from cprl.measuring.episodes import Episode
-from cprl.measuring.evaluate import Policy, evaluate
-from cprl.measuring.played import Measured, institution_measures, over_replicas, social_measures
-from cprl.measuring.statistics import Estimate, difference
-from cprl.measuring.windows import Values
+from cprl.measuring.evaluate import evaluate
+from cprl.measuring.table import BACKGROUND, FOCAL, ROLE, complete
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
 from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
 from cprl.runs.episodes import Label, labelled
-from cprl.system.defaults import SEED
-from cprl.system.process import one_thread
-from cprl.system.working import say_how_far
+from cprl.system.defaults import Fresh
 from cprl.training.agents import LoadedRun, Population, StoredAgent, in_a_row, load, stored_policies
-from cprl.values import Custom, Positive, Seed, Value, Where, made, refusal
-
-Played: TypeAlias = dict[int, list[Episode]]
-"""Episodes by the number of the replica."""
+from cprl.values import Custom, made, refusal
 
 Agent: TypeAlias = Callable[[int], StoredAgent]
 """Who plays at an index, by the number of the replica."""
 
 Who: TypeAlias = tuple[int, ...]
 
+SCRIPTED_REPLICAS: Final = tuple(range(8))
+"""The replicas of scripted agents, of independent groups of episodes, unless somebody says."""
+
 
 def agents_of(run: LoadedRun, numbers: Mapping[int, int] | None = None) -> list[Agent]:
-    """The agents of a run, each at its own index.
+    """Return the agents of a run, each at its own index.
 
     Args:
         numbers: the run's replica for each replica that plays, if they differ.
@@ -65,7 +54,7 @@ def scripted(policy: ScriptedPolicy) -> Agent:
 
 
 def frozen(run: LoadedRun, spec: Frozen) -> Agent:
-    """An agent of a run, of the replica that a specification names."""
+    """Return an agent of a run, of the replica that a specification names."""
     return lambda replica: run.agent(spec.agent, replica=spec.replica_for(replica))
 
 
@@ -85,7 +74,7 @@ class FreshGame:
 
 
 def commons_game(run: LoadedRun) -> Game:
-    """The game of a run that has a board; raises a ValueError for others."""
+    """Return the game of a run that has a board; raise a ValueError for others."""
     if not isinstance(run.game, Game):
         raise ValueError(f"{run.path} plays a game without a board of cprl; allowed: a run of a cprl.Game")
     return run.game
@@ -95,7 +84,7 @@ Place: TypeAlias = LoadedRun | FreshGame
 
 
 def place_of(where: Any) -> Place:
-    """A run as it is, a game as what makes fresh worlds of it."""
+    """Return a run as it is, a game as what makes fresh worlds of it."""
     if isinstance(where, LoadedRun):
         return where
     if not is_playable(where):
@@ -103,79 +92,31 @@ def place_of(where: Any) -> Place:
     return FreshGame(made(where))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Fresh(Value, stored=False):
-    """Fresh episodes of some replicas; replica r plays the worlds from r x episodes on."""
-
-    replicas: Annotated[tuple[int, ...], Where(bool, "at least one")]
-    """Their numbers, ascending."""
-    episodes: Positive
-    """Of each replica with each choice of who plays where, each in its own world."""
-    seed: Seed
-    """Of the worlds and of all random numbers."""
-    greedy: bool = False
-    """Whether stored agents take their best action; else they explore as in evaluation."""
-
-    def __str__(self) -> str:
-        counts = {"replica": len(self.replicas), "episode": self.episodes}
-        return ", ".join(f"{count} {name}{'s' * (count != 1)}" for name, count in counts.items()) + " each"
-
-    def play(self, where: Place, agents: Sequence[Agent], *, among: Collection[LoadedRun] = ()) -> Played:
-        """The episodes by replica, with the metrics of the user's own that all runs among which they are
-        compared have; by default those of where they play."""
-        compared: Sequence[Place] = [*among] or [where]
-        metrics = [metric for metric in compared[0].metrics if all(metric in run.metrics for run in compared)]
-        played: Played = {}
-        for group, env in self.worlds(where):
-            policies = self.policies(where, agents, group)
-            ended = evaluate(env, policies, explore=not self.greedy, metrics=metrics)
-            for place, replica in enumerate(group):
-                played[replica] = ended[place * self.episodes : (place + 1) * self.episodes]
-        return played
-
-    def worlds(self, where: Place) -> Iterator[tuple[list[int], EnvBase]]:
-        """The numbers of replicas, and an environment with their worlds in the same order, with as many
-        consecutive replicas as possible in one."""
-        for group in in_a_row(self.replicas):
-            first = group[0] * self.episodes
-            yield group, where.env(len(group) * self.episodes, seed=self.seed, first_world=first)
-
-    def policies(self, where: Place, agents: Sequence[Agent], replicas: Sequence[int]) -> AgentPolicies:
-        """The policies of the agents of these replicas."""
-        stored = [[agent(replica) for replica in replicas] for agent in agents]
-        return stored_policies(stored, where.playing, replicas=replicas, worlds=self.episodes, seed=self.seed)
-
-
-def fresh_of(
-    runs: Iterable[LoadedRun],
-    *,
-    episodes: int,
-    greedy: bool,
-    seed: int,
-    replicas: Sequence[int],
-    among: Iterable[LoadedRun] = (),
-) -> Fresh:
-    """Fresh episodes of the chosen replicas, or of all that every run has.
+def fresh_for(runs: Iterable[LoadedRun], fresh: Fresh, *, among: Iterable[LoadedRun] = ()) -> Fresh:
+    """Return fresh episodes with the numbers of the replicas that play: those that are asked for, else all
+    that every run has.
 
     Args:
+        runs: those whose replicas play; without any, agents are scripted.
         among: more runs of which no agent may have been trained in the worlds.
     """
-    runs, chosen = list(runs), set(replicas)
-    common = set.intersection(*(set(run.replicas) for run in runs))
+    runs = list(runs)
     for run in runs:
-        missing = sorted(chosen - set(run.replicas))
+        missing = sorted(set(fresh.replicas) - set(run.replicas))
         if missing:
             raise ValueError(f"{run.path} has no replicas {missing}; allowed: {run.replicas}")
+    common = set(SCRIPTED_REPLICAS)
+    if runs:
+        common = set.intersection(*(set(run.replicas) for run in runs))
     if not common:
         has = {str(run.path): run.replicas for run in runs}
         raise ValueError(f"the replicas of the runs are {has}; allowed: runs with a replica in common")
-    fresh = Fresh(replicas=tuple(sorted(chosen or common)), episodes=episodes, seed=seed, greedy=greedy)
     refuse_trained_in(fresh.seed, [*runs, *among])
-    return fresh
+    return replace(fresh, replicas=tuple(sorted(set(fresh.replicas) or common)))
 
 
 def refuse_trained_in(seed: int, runs: Iterable[LoadedRun]) -> None:
-    """Raises a ValueError for the seed of worlds in which agents of a run were trained."""
+    """Raise a ValueError for the seed of worlds in which agents of a run were trained."""
     for run in runs:
         if run.experiment.seed == seed:
             raise ValueError(
@@ -183,171 +124,133 @@ def refuse_trained_in(seed: int, runs: Iterable[LoadedRun]) -> None:
             )
 
 
-Whose: TypeAlias = Literal["focal", "background", "group"]
-
-_RETURNS: Final[Mapping[Whose, Callable[[Values, list[int]], float]]] = {
-    "focal": lambda returns, focal: returns[focal].mean(),
-    "background": lambda returns, focal: np.delete(returns, focal).mean(),
-    "group": lambda returns, _: returns.sum(),
-}
-"""Of the agents' returns, float64 [N], and the indices of the focal agents."""
+def worlds_of(fresh: Fresh, place: Place) -> Iterator[tuple[list[int], EnvBase]]:
+    """Yield the numbers of replicas, and an environment with their worlds in the same order, with as many
+    consecutive replicas as possible in one."""
+    for group in in_a_row(fresh.replicas):
+        first = group[0] * fresh.episodes
+        yield group, place.env(len(group) * fresh.episodes, seed=fresh.seed, first_world=first)
 
 
-class Part(NamedTuple):
-    """The episodes of a population."""
-
-    labels: Label
-    played: Played
-    focal: tuple[Who, ...] = ()
-    """The indices of the agents that are judged; several choices where the same episodes stand for each."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Results:
-    """The episodes of labelled populations in the same fresh worlds."""
-
-    parts: Sequence[Part] = field(repr=False)
-    fresh: Fresh
-
-    def where(self, **labels: str | int) -> Self:
-        """The populations with these labels."""
-        return replace(self, parts=[part for part in self.parts if labels.items() <= part.labels.items()])
-
-    def table(self) -> pa.Table:
-        """All episodes with the columns of `episodes.parquet` after the labels: a row for each population,
-        replica, episode and agent."""
-        return labelled(
-            (labels, replica, episodes)
-            for labels, played, _ in self.parts
-            for replica, episodes in played.items()
-        )
-
-    @property
-    def played(self) -> Played:
-        """The episodes of all populations together."""
-        together: Played = {}
-        for part in self.parts:
-            for replica, episodes in part.played.items():
-                together.setdefault(replica, []).extend(episodes)
-        return together
-
-    def returns(self, whose: Whose) -> dict[int, list[float]]:
-        """A return by replica, of each episode with each choice of focal agents: the mean of the focal
-        agents, that of the others, or the sum of all."""
-        values: dict[int, list[float]] = {}
-        for part in self.parts:
-            for focal in part.focal:
-                for replica, episodes in part.played.items():
-                    of_episodes = (float(_RETURNS[whose](one.return_, list(focal))) for one in episodes)
-                    values.setdefault(replica, []).extend(of_episodes)
-        return values
-
-    def mean_returns(self, whose: Whose) -> Values:
-        """The means of `returns`, [R]."""
-        returns = self.returns(whose)
-        return np.array([np.mean(returns[replica]) for replica in self.fresh.replicas])
-
-    def estimates(self, *whose: Whose) -> dict[str, Measured]:
-        """Over replicas by name: these returns as `focal/return` and so on, the social metrics, and those of
-        institutions as `institutions/fines` and so on."""
-        returns = {f"{name}/return": over_replicas(self.returns(name)) for name in whose}
-        return {**returns, **social_measures(self.played), **institution_measures(self.played)}
+def policies_of(
+    fresh: Fresh, place: Place, agents: Sequence[Agent], replicas: Sequence[int]
+) -> AgentPolicies:
+    """Return the policies of the agents of these replicas."""
+    stored = [[agent(replica) for replica in replicas] for agent in agents]
+    return stored_policies(stored, place.playing, replicas=replicas, worlds=fresh.episodes, seed=fresh.seed)
 
 
-def more(reached: Results, usual: Results, whose: Whose) -> Estimate:
-    """How much higher a return is in the first results, paired by replica, which played the same worlds."""
-    return difference(reached.mean_returns(whose), usual.mean_returns(whose), paired=True)
+def play(
+    fresh: Fresh,
+    place: Place,
+    agents: Sequence[Agent],
+    labels: Label | None = None,
+    *,
+    roles: Sequence[str] = (),
+    among: Collection[LoadedRun] = (),
+) -> pa.Table:
+    """Let a population play fresh episodes; return their table.
+
+    Args:
+        fresh: with the numbers of its replicas, see `fresh_for`.
+        labels: what is played, the first columns by name.
+        roles: what each agent is among the others, see `cprl.measuring.table.ROLE`, and `roles_of`.
+        among: all runs with which this is compared: metrics of the user's own are measured that all have; by
+            default those of where they play.
+    """
+    compared: Sequence[Place] = [*among] or [place]
+    metrics = [metric for metric in compared[0].metrics if all(metric in run.metrics for run in compared)]
+    parts = []
+    for group, env in worlds_of(fresh, place):
+        policies = policies_of(fresh, place, agents, group)
+        ended = evaluate(env, policies, explore=not fresh.greedy, metrics=metrics)
+        for place_in_group, replica in enumerate(group):
+            first = place_in_group * fresh.episodes
+            parts.append((labels or {}, replica, ended[first : first + fresh.episodes]))
+    table = labelled(parts)
+    place_of_world = table.column_names.index("replica") + 1
+    world = table["replica"].to_numpy() * fresh.episodes + table["episode"].to_numpy()
+    table = table.add_column(place_of_world, "world", pa.array(world, pa.int32()))
+    if roles:
+        table = table.add_column(place_of_world + 3, ROLE, pa.array(roles).take(table["agent"]))
+    return table
+
+
+def roles_of(agents: int, focal: Collection[int]) -> list[str]:
+    """Return the role of each agent where some are focal."""
+    return [FOCAL if agent in focal else BACKGROUND for agent in range(agents)]
+
+
+def together(parts: Iterable[pa.Table], **said: object) -> pa.Table:
+    """Return the tables of populations as one, with all metrics.
+
+    Args:
+        said: how they were played: texts that its schema's metadata keep, see `said`.
+    """
+    table = complete(pa.concat_tables(parts))
+    texts = {name: str(value) for name, value in said.items()}
+    return table.replace_schema_metadata({**(table.schema.metadata or {}), **texts})
+
+
+def said(table: pa.Table, name: str) -> str:
+    """Return what the metadata of a table say of how it was played, e.g. its "heading"; "" if nothing."""
+    metadata = table.schema.metadata or {}
+    return str(metadata.get(name.encode(), b"").decode())
 
 
 def shifted(counts: Sequence[int]) -> list[Who]:
-    """Which kind plays at each index, where so many agents are of the first kind, of the second and so on:
-    shifted by an index at a time, so that all kinds have each index equally often; one way for one kind."""
+    """Return which kind plays at each index, where so many agents are of the first kind, of the second and
+    so on: shifted by an index at a time, so that all kinds have each index equally often; one way for one
+    kind."""
     first = tuple(np.repeat(np.arange(len(counts)), counts).tolist())
     shifts = range(len(first) if len(set(first)) > 1 else 1)
     return [first[len(first) - shift :] + first[: len(first) - shift] for shift in shifts]
 
 
-def play_population(
-    where: Any,
-    agents: Sequence[AgentSpec],
-    *,
-    episodes: int = 20,
-    replicas: int = 8,
-    greedy: bool = False,
-    seed: int = SEED,
-) -> Played:
-    """Plays fresh episodes of a population that does not learn.
+def play_population(where: Any, agents: Sequence[AgentSpec], fresh: Fresh = Fresh()) -> pa.Table:
+    """Let a population that does not learn play fresh episodes; return their table.
 
     Args:
         where: a game, or a run, a value of `cprl.load`, whose game and transforms are used.
         agents: the specification of each agent, `Scripted` or `Frozen`. `Frozen(run, agent, replica=None)`
             plays in replica r what the run's replica r learned.
-        episodes: episodes of each replica, each in its own world.
-        replicas: the number R of replicas; where all agents are scripted, of independent groups of episodes.
-        greedy: whether stored agents take their best action; else they explore as in evaluation.
-        seed: the seed of the worlds and of all random numbers; with one seed all populations play in the
-            same worlds.
-
-    Returns:
-        Episodes by the index of the replica, 0 to R - 1.
+        fresh: which episodes; with one seed all populations play in the same worlds.
     """
     place = place_of(where)
-    fresh = Fresh(replicas=tuple(range(replicas)), episodes=episodes, seed=seed, greedy=greedy)
-    return fresh.play(place, agents_specified(place, agents, fresh))
+    fresh = fresh_of_specs(agents, fresh)
+    return together([play(fresh, place, agents_specified(place, agents, fresh))])
+
+
+def fresh_of_specs(specs: Sequence[AgentSpec], fresh: Fresh) -> Fresh:
+    """Return fresh episodes with the replicas that stored agents among these have, see `fresh_for`."""
+    frozen = [spec for spec in specs if isinstance(spec, Frozen)]
+    runs = {spec.run: load(spec.run) for spec in frozen}
+    of_each_replica = {spec.run: runs[spec.run] for spec in frozen if spec.replica is None}
+    return fresh_for(of_each_replica.values(), fresh, among=runs.values())
 
 
 def agents_specified(place: Place, specs: Sequence[AgentSpec], fresh: Fresh) -> list[Agent]:
-    """The agents of specifications, `Scripted` or `Frozen`, none of which was trained in the worlds."""
-    by_agent = specs_by_agent(specs, place.game.agents)
-    for agent, spec in enumerate(by_agent):
+    """Return the agents of specifications, `Scripted` or `Frozen`."""
+    for agent, spec in enumerate(specs_by_agent(specs, place.game.agents)):
         if not isinstance(spec, Scripted | Frozen):
             allowed = "Scripted(policy) or Frozen(run, agent, replica)"
             raise ValueError(f"agents[{agent}] is a {type(spec).__name__}; allowed: {allowed}")
-    refuse_trained_in(fresh.seed, map(load, {spec.run for spec in by_agent if isinstance(spec, Frozen)}))
-    population = Population(place.env(len(fresh.replicas)), specs)
-    return [of_replicas.__getitem__ for of_replicas in population.as_stored(fresh.replicas)]
+    stored: dict[int, list[StoredAgent]] = {}
+    for group in in_a_row(fresh.replicas):
+        population = Population(place.env(len(group)), specs, first_replica=group[0])
+        by_replica = zip(*population.as_stored(group), strict=True)
+        stored |= dict(zip(group, map(list, by_replica), strict=True))
+
+    def agent_at(agent: int, replica: int) -> StoredAgent:
+        return stored[replica][agent]
+
+    return [partial(agent_at, agent) for agent in range(place.game.agents)]
 
 
 def agent_named(who: str, agent: int, *, replica: int | None = None, name: str) -> AgentSpec:
-    """Who plays at an index: a scripted policy, or the agent of a run with that index."""
+    """Return who plays at an index: a scripted policy, or the agent of a run with that index."""
     if who in SCRIPTED_POLICIES:
         return Scripted(who)
     if not Path(who).is_dir():
         raise refusal(name, who, f"{', '.join(SCRIPTED_POLICIES)}, or a run's directory")
     return Frozen(who, agent, replica)
-
-
-class Turns:
-    """An episode that is played turn by turn, with the exploration of training and evaluation.
-
-    Unlike a collector it does not reset an environment that has ended, so that the last board can be seen.
-
-    Args:
-        env: one world, batch size [1], with its transforms; it is reset.
-        policy: writes the actions of all agents, e.g. `cprl.policies.assignment.AgentPolicies`.
-    """
-
-    def __init__(self, env: EnvBase, policy: Policy) -> None:
-        self.env, self.policy = env, policy
-        self._moment: TensorDictBase = env.reset()
-        self._turns = 0
-        self._clock = clock_of(env)
-        self.has_ended = False
-
-    def play(self) -> TensorDictBase:
-        """Plays the next turn; returns its entries, batch size [1], see `cprl.keys`."""
-        if self.has_ended:
-            raise ValueError("the episode has ended; allowed: turns up to its end")
-        with torch.no_grad(), one_thread(), set_exploration_type(ExplorationType.RANDOM):
-            batch: TensorDictBase = self.env.step(self.policy(self._moment))
-        self._moment = self.env.step_mdp(batch)
-        self._turns += 1
-        say_how_far(self._turns, self._clock, "turns")
-        self.has_ended = bool(batch["next", "done"].any())
-        return batch
-
-
-def board_now(env: CommonsEnv) -> Shown:
-    """The board of one world without what agents observe."""
-    board = env.worlds.show(env.output)
-    return board._replace(observation=board.observation[:0])

@@ -12,34 +12,38 @@ episodes and placements, estimated over replicas, because only replicas are inde
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeAlias, get_args
+from typing import Annotated, Any, Final, Literal, TypeAlias
 
 import numpy as np
 import pyarrow as pa
 
 from cprl.commons.game import Game
-from cprl.evaluation.evaluate import SEED, bars_of, heading, opened, refuse_other_games, refuse_unlike
+from cprl.evaluation.evaluate import opened, refuse_other_games, refuse_unlike
 from cprl.evaluation.lanes import (
     Agent,
-    Part,
-    Results,
     Who,
-    Whose,
     agents_of,
-    fresh_of,
+    fresh_for,
     frozen,
-    more,
+    play,
+    roles_of,
+    said,
     scripted,
+    together,
 )
+from cprl.evaluation.pages import OVER_REPLICAS, heading
 from cprl.experiment import presets
-from cprl.measuring.played import Measured, notes_on
-from cprl.measuring.registry import with_unit
-from cprl.measuring.statistics import HOLM, Estimate, estimate, starred
+from cprl.measuring.registry import COLLECTIVE_RETURN, EQUALITY, with_unit
+from cprl.measuring.statistics import HOLM, Family, differences, estimates, notes_on
+from cprl.measuring.table import BACKGROUND, FOCAL
 from cprl.population import Frozen, Scripted
+from cprl.system.defaults import Fresh
 from cprl.system.working import say_how_far, working
 from cprl.terminal import style
-from cprl.terminal.tables import Cells
+from cprl.terminal.panels import draw_dots
+from cprl.terminal.tables import Cell, Cells, Change
 from cprl.training.agents import LoadedRun, check_scripted, load
 from cprl.values import Value, Where, refusal
 
@@ -157,57 +161,33 @@ def _modes(game: Game) -> tuple[Focal, ...]:
     return ("minority",) if game.agents == 2 else ("majority", "minority")
 
 
-FocalAgents: TypeAlias = Literal["run", "random", "greedy"]
+RUN: Final = "run"
+FOCAL_AGENTS: Final = (RUN, "random", "greedy")
 """Who takes the focal places: the run's agents, or agents that follow a scripted policy."""
-FOCAL_AGENTS: Final[tuple[FocalAgents, ...]] = get_args(FocalAgents)
-
-
-class Score(Results):
-    """The episodes of one scenario."""
-
-    def measures(self, focal: FocalAgents = "run") -> dict[str, Measured]:
-        """focal/return and background/return, the mean return of a focal and of a background agent, then the
-        social metrics of all agents together, and those of institutions as `institutions/fines` and so on;
-        intervals by Student's t."""
-        return self.where(focal=focal).estimates("focal", "background")
-
-    def advantage(self, over: FocalAgents, *, whose: Whose = "focal") -> Estimate:
-        """What the run's agents get more than others would in their places; or what the background gets
-        more among them. Paired by replica, which plays the same worlds; the interval is by Student's t."""
-        return more(self.where(focal="run"), self.where(focal=over), whose)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Scores(Results):
-    """What a run reached, by "scenario", "focal", who takes the focal places, and "focal_agents", their
-    indices, e.g. "0 2 3"."""
-
-    run: LoadedRun
-
-    @property
-    def by_scenario(self) -> dict[str, Score]:
-        """The scores by the name of the scenario."""
-        names = dict.fromkeys(str(part.labels["scenario"]) for part in self.parts)
-        return {name: Score(parts=self.where(scenario=name).parts, fresh=self.fresh) for name in names}
+OF_FOCAL: Final = f"{FOCAL}/return"
+OF_BACKGROUND: Final = f"{BACKGROUND}/return"
+BY: Final = ("scenario", FOCAL)
 
 
 @working("playing scenarios")
 def run_scenarios(
     run: str | Path | LoadedRun,
+    fresh: Fresh = Fresh(episodes=5),
     *,
     scenarios: Sequence[str | Scenario] = (),
-    episodes: int = 5,
-    greedy: bool = False,
-    seed: int = SEED,
-    replicas: Sequence[int] = (),
-) -> Scores:
-    """Plays scenarios with the agents of a stored run in the focal places, and with random and with greedy
-    agents in these places, in the same worlds.
+) -> pa.Table:
+    """Let the agents of a stored run play scenarios in the focal places, and random and greedy agents in
+    these places, in the same worlds.
 
     Args:
+        fresh: which episodes, in each placement.
         scenarios: names of `scenarios_of` the run's game, or scenarios of your own on the same game; by
             default all that it has.
-        greedy: whether stored agents take their best action, see `cprl.evaluate_run`.
+
+    Returns:
+        A row for each population, replica, episode and agent, see `cprl.measuring.table`, by "scenario",
+        "focal", who takes the focal places: "run", "random" or "greedy", and "focal_agents", their indices,
+        e.g. "0 2 3".
     """
     loaded = opened(run)
     check_game(loaded.game)
@@ -218,26 +198,27 @@ def run_scenarios(
     stored = {path: load(path) for path in {spec.run: None for spec in specs if isinstance(spec, Frozen)}}
     for path, background_run in stored.items():
         refuse_other_games({str(loaded.path): loaded, f"the background {path}": background_run})
-    fresh = fresh_of(
-        [loaded], episodes=episodes, greedy=greedy, seed=seed, replicas=replicas, among=stored.values()
-    )
+    fresh = fresh_for([loaded], fresh, among=stored.values())
     _refuse_meeting_itself(loaded, chosen, stored, fresh.replicas)
-    focal_agents: dict[FocalAgents, Sequence[Agent]] = {
-        "run": agents_of(loaded),
-        "random": [scripted("random")] * len(everyone),
-        "greedy": [scripted("greedy")] * len(everyone),
-    }
-    parts: list[Part] = []
+    focal_agents = {RUN: agents_of(loaded)}
+    focal_agents |= {policy: [scripted(policy)] * len(everyone) for policy in FOCAL_AGENTS[1:]}
+    parts: list[pa.Table] = []
     for scenario in chosen:
         background = [_background(spec, stored) for spec in scenario.background]
-        for who, focal in focal_agents.items():
-            for places in scenario.placements:
-                agents = [focal[agent] if agent in places else background[agent] for agent in everyone]
-                indices = " ".join(map(str, places))
-                say_how_far(len(parts), None, "populations")
-                labels = {"scenario": scenario.name, "focal": who, "focal_agents": indices}
-                parts.append(Part(labels, fresh.play(loaded, agents), (places,)))
-    return Scores(run=loaded, parts=parts, fresh=fresh)
+        for (who, focal), places in product(focal_agents.items(), scenario.placements):
+            agents = [focal[agent] if agent in places else background[agent] for agent in everyone]
+            say_how_far(len(parts), None, "populations")
+            labels = {"scenario": scenario.name, FOCAL: who, "focal_agents": " ".join(map(str, places))}
+            parts.append(play(fresh, loaded, agents, labels, roles=roles_of(len(everyone), places)))
+    is_all = {scenario.name for scenario in chosen} >= {one.name for one in scenarios_of(loaded.game)}
+    return together(
+        parts,
+        heading=heading(f"Scenarios of {loaded.path.name}", fresh, [loaded], " in each placement"),
+        run=loaded.path.name,
+        fresh=fresh,
+        weights=loaded.weights_from,
+        scenarios_left_out=left_out_of(loaded.game) if is_all else "",
+    )
 
 
 def _chosen(run: LoadedRun, scenarios: Sequence[str | Scenario]) -> list[Scenario]:
@@ -290,64 +271,50 @@ def _refuse_meeting_itself(
                 )
 
 
-SOCIAL: Final = ("collective_return", "equality", "sustainability", "survival_steps", "peacefulness")
-"""The social metrics of the table in the terminal; the others are in `estimates`."""
+SOCIAL: Final = (COLLECTIVE_RETURN, EQUALITY, "sustainability", "survival_steps", "peacefulness")
+"""The social metrics on the page; others are in the table."""
 
 
-def scenario_heading(scores: Scores) -> str:
-    return heading(f"Scenarios of {scores.run.path.name}", scores.fresh, [scores.run], " in each placement")
+def advantages(table: pa.Table, numbers: Sequence[str] = (OF_FOCAL, OF_BACKGROUND)) -> Family:
+    """Return what the run's agents get more than others would in their places, "focal/return", and what the
+    background gets more among them, "background/return", by "scenario" and "focal", these others. Paired by
+    replica, which plays the same worlds."""
+    behind = differences(table, numbers, BY, {FOCAL: RUN})
+    return Family({key: -one for key, one in behind.items()}, BY, behind.name)
 
 
-def scenario_tables(scores: Scores) -> Iterator[Cells]:
-    """A table of returns, a row for each scenario, and one of social metrics of all agents together."""
-    columns = ["scenario", "focal: the run's agents", "random in their place", "greedy in their place"]
-    columns += ["run's - random's, paired", "run's - greedy's, paired", "background"]
-    by_scenario = scores.by_scenario
-    ahead = [score.advantage(who) for score in by_scenario.values() for who in ("random", "greedy")]
-    texts = iter(starred(ahead))
-    rows = []
-    for name, score in by_scenario.items():
-        focal = [str(score.measures(who)["focal/return"]) for who in FOCAL_AGENTS]
-        rows.append((name, *focal, next(texts), next(texts), str(score.measures()["background/return"])))
-    everything = {scenario.name for scenario in scenarios_of(scores.run.game)}
-    left_out = left_out_of(scores.run.game) if everything == set(by_scenario) else ""
-    note = f"{HOLM} for all {len(ahead)} differences" + f". Left out: {left_out}" * bool(left_out)
-    yield Cells("return per agent, apples", columns, rows, note)
+def scenario_cells(table: pa.Table) -> Iterator[Cells]:
+    """Yield the returns, a row for each scenario, and social metrics of all agents together."""
+    levels = estimates(table, [OF_FOCAL, OF_BACKGROUND, *SOCIAL], BY)
+    ahead = advantages(table, [OF_FOCAL])
+    names = list(dict.fromkeys(scenario for scenario, _ in levels.labels))
+    others = FOCAL_AGENTS[1:]
+    returns: list[list[Cell]] = [
+        [
+            name,
+            *(levels[name, who, OF_FOCAL] for who in FOCAL_AGENTS),
+            *(Change(ahead[name, who, OF_FOCAL]) for who in others),
+            levels[name, RUN, OF_BACKGROUND],
+        ]
+        for name in names
+    ]
+    columns = ["scenario", "focal: the run's agents", *(f"{who} in their place" for who in others)]
+    columns += [*(f"run's - {who}'s, paired" for who in others), "background"]
+    missing = said(table, "scenarios_left_out")
+    note = f"{HOLM} for all {len(ahead)} differences" + f". Left out: {missing}" * bool(missing)
+    yield Cells("return per agent, apples", columns, returns, note)
     title = "all agents together, with the run's agents in the focal places"
-    measured = {name: score.measures() for name, score in by_scenario.items()}
-    social = [(name, *(str(measures[metric]) for metric in SOCIAL)) for name, measures in measured.items()]
-    note = "\n".join(notes_on([measures[metric] for measures in measured.values() for metric in SOCIAL]))
-    yield Cells(title, ["scenario", *map(with_unit, SOCIAL)], social, note)
+    social = {name: [levels[name, RUN, metric] for metric in SOCIAL] for name in names}
+    note = "\n".join(notes_on(one for row in social.values() for one in row))
+    rows: list[list[Cell]] = [[name, *row] for name, row in social.items()]
+    yield Cells(title, ["scenario", *map(with_unit, SOCIAL)], rows, note)
 
 
-def estimates(scores: Scores) -> pa.Table:
-    """Every measure of every scenario as a row: "scenario", "focal" (who takes the focal places), "metric",
-    "value", "low" and "high" (null where undefined), and how many "replicas", "episodes" and "undefined"
-    episodes there were. Metrics "focal/advantage" and "background/advantage" of "random" and "greedy" are
-    what the run's agents, or the background among them, get more; see `Score.advantage`."""
-    rows: list[dict[str, Any]] = []
-    for scenario, score in scores.by_scenario.items():
-        for who in FOCAL_AGENTS:
-            measures = score.measures(who)
-            for whose in ("focal", "background") if who != "run" else ():
-                ahead = score.advantage(who, whose=whose)
-                measures[f"{whose}/advantage"] = replace(
-                    measures["focal/return"], estimate=ahead, undefined=0
-                )
-            for metric, measured in measures.items():
-                numbers = {name: getattr(measured.estimate, name, None) for name in ("value", "low", "high")}
-                replicas = getattr(measured.estimate, "replicas", 0)
-                counts = {"episodes": measured.episodes, "undefined": measured.undefined}
-                labels = {"scenario": scenario, "focal": who, "metric": metric}
-                rows.append({**labels, **numbers, "replicas": replicas, **counts})
-    return pa.table({name: pa.array([row[name] for row in rows], from_pandas=True) for name in rows[0]})
-
-
-_LOOKS: Final[dict[tuple[FocalAgents, Whose], tuple[str, str, str]]] = {
-    ("run", "focal"): ("o", style.MEAN, "focal agents: the run's"),
-    ("greedy", "focal"): ("s", style.MARK, "greedy in their place"),
-    ("random", "focal"): ("D", "#8a8a8a", "random in their place"),
-    ("run", "background"): ("|", "#000000", "background agents, beside the run's"),
+_LOOKS: Final = {
+    (RUN, OF_FOCAL): ("o", style.MEAN, "focal agents: the run's"),
+    ("greedy", OF_FOCAL): ("s", style.MARK, "greedy in their place"),
+    ("random", OF_FOCAL): ("D", "#8a8a8a", "random in their place"),
+    (RUN, OF_BACKGROUND): ("|", "#000000", "background agents, beside the run's"),
 }
 """Marker, colour and name of each number."""
 _ROW: Final = 4.4
@@ -356,26 +323,22 @@ _BAND: Final = 0.16
 """The distance between two numbers of a scenario, in rows."""
 
 
-def draw_scenarios(scores: Scores, path: Path | str, *, width: style.Width = "page") -> Path:
-    """Draws the mean return per agent, a row for each scenario: of the run's agents in the focal places, of
+def draw_scenarios(table: pa.Table, path: Path | str, *, width: style.Width = "page") -> Path:
+    """Draw the mean return per agent, a row for each scenario: of the run's agents in the focal places, of
     greedy and of random ones there, and of the background; intervals by Student's t."""
-    by_scenario = scores.by_scenario
-    rows = np.arange(len(by_scenario))
+    levels = estimates(table, [OF_FOCAL, OF_BACKGROUND], BY)
+    names = list(dict.fromkeys(scenario for scenario, _ in levels.labels))
+    rows = np.arange(len(names))
     with style.drawing(path, width=width) as sheet:
         (axes,) = sheet.panels(1, high=_ROW * len(rows) + 4)
-        for place, ((who, whose), (marker, colour, label)) in enumerate(_LOOKS.items()):
-            returns = [score.where(focal=who).mean_returns(whose) for score in by_scenario.values()]
-            means, reach = bars_of(map(estimate, returns))
+        for place, ((who, number), (marker, colour, label)) in enumerate(_LOOKS.items()):
+            means = [levels[name, who, number] for name in names]
             at = rows + _BAND * (place - (len(_LOOKS) - 1) / 2)
-            axes.errorbar(means, at, xerr=reach, fmt=marker, color=colour, markersize=6, label=label)
+            draw_dots(axes, at, means, across=True, color=colour, marker=marker, label=label)
         for row in rows[1:]:
             axes.axhline(row - 0.5, color="#dddddd", linewidth=0.8)
-        names = [style.wrapped(name.replace("_", " "), 0.3 * sheet.width_em) for name in by_scenario]
-        axes.set_yticks(rows, names)
+        axes.set_yticks(rows, [style.wrapped(name.replace("_", " "), 0.3 * sheet.width_em) for name in names])
         axes.set(ylim=(len(rows) - 0.5, -0.5), xlabel="return per agent, apples")
-        sheet.title = f"{scores.run.path.name}: returns by scenario"
-        sheet.caption = (
-            f"{scores.fresh} in each placement, the same worlds for all; mean over replicas, 95 % interval "
-            "by Student's t."
-        )
+        sheet.title = f"{said(table, 'run')}: returns by scenario"
+        sheet.caption = f"{said(table, 'fresh')} in each placement, the same worlds for all; {OVER_REPLICAS}."
     return Path(path)

@@ -1,20 +1,32 @@
 """territory_of: where the agents of a stored run go in fresh worlds and whom they tag, beside random play."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
+import pyarrow as pa
 from matplotlib.axes import Axes
 
 from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, agent_colour
 from cprl.commons.maps import Map
-from cprl.evaluation.evaluate import BESIDE_RANDOM, SEED, heading, opened
-from cprl.evaluation.lanes import Agent, Fresh, agents_of, commons_game, fresh_of, scripted
+from cprl.evaluation.evaluate import opened
+from cprl.evaluation.lanes import (
+    agents_of,
+    commons_game,
+    fresh_for,
+    policies_of,
+    said,
+    scripted,
+    together,
+    worlds_of,
+)
+from cprl.evaluation.pages import heading
 from cprl.measuring import movement
 from cprl.measuring.movement import Array, Trace, overlap, owners, trace, visits
-from cprl.measuring.statistics import Estimate, estimate
+from cprl.measuring.statistics import estimates
+from cprl.measuring.table import labelled, where
+from cprl.system.defaults import Fresh
 from cprl.system.working import working
 from cprl.terminal import style
 from cprl.terminal.tables import Cells
@@ -23,102 +35,98 @@ from cprl.values import checked, refusal
 
 Policy = Literal["trained", "random"]
 
-EXCLUSION: Final = "exclusion (0 to 1)"
-VISITORS: Final = "agents that share a cell"
-OVERLAP: Final = "overlap of two agents within an episode (0 to 1)"
-TAGS: Final = "tags per 1000 steps"
-DEFENCE: Final = "tags in one's own territory (0 to 1)"
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Stays:
-    """Where agents were and whom they tagged, by replica."""
-
-    visits: Array
-    """float64 [R, N, H, W], the share of its time of each agent in each cell, mean over episodes."""
-    taggings: Array
-    """int64 [R, N, N], how often the agent of the row was tagged by that of the column, in all episodes."""
-    tagged_where: Array
-    """int64 [R, N, H, W], how often each agent was tagged in each cell, in all episodes."""
-    by_replica: dict[str, Array]
-    """float64 [R] each: exclusion, agents that share a cell and tags in one's own territory, of the visits of
-    all episodes; overlap, mean over episodes; tags per 1000 steps. NaN where a measure is undefined."""
-
-    def measures(self) -> dict[str, Estimate]:
-        """The mean over the replicas in which each measure is defined, if there are any, and its interval."""
-        defined = {name: values[np.isfinite(values)] for name, values in self.by_replica.items()}
-        return {name: estimate(values) for name, values in defined.items() if len(values)}
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Territory:
-    """Where a run's agents go in fresh worlds, and where random ones go in the same worlds."""
-
-    run: LoadedRun
-    fresh: Fresh
-    """Of R replicas, as in the arrays of `Stays`."""
-    trained: Stays = field(repr=False)
-    random: Stays = field(repr=False)
-
-    def of(self, policy: Policy) -> Stays:
-        stays: Stays = getattr(self, checked("policy", policy, Policy))
-        return stays
+WORDS: Final[Mapping[str, str]] = {
+    "exclusion": "exclusion (0 to 1)",
+    "visitors": "agents that share a cell",
+    "overlap": "overlap of two agents within an episode (0 to 1)",
+    "tag_rate": "tags per 1000 steps",
+    "defence": "tags in one's own territory (0 to 1)",
+}
+"""What the numbers of a table of territory are called: exclusion, visitors and defence of the visits of all
+episodes of a replica, overlap the mean over episodes; NaN where undefined."""
+ARRAYS: Final = ("visits", "tags_by_agent", "tags_by_cell")
+"""Its arrays of each agent, as lists: float64 [H x W], the share of its time in each cell, mean over
+episodes; int64 [N], how often it was tagged by each, and [H x W], in each cell, in all episodes."""
 
 
 @working("evaluating")
-def territory_of(
-    run: str | Path | LoadedRun,
-    *,
-    episodes: int = 20,
-    greedy: bool = False,
-    seed: int = SEED,
-    replicas: Sequence[int] = (),
-) -> Territory:
-    """Plays fresh episodes with every replica of a stored run, and with random agents in the same worlds.
+def territory_of(run: str | Path | LoadedRun, fresh: Fresh = Fresh()) -> pa.Table:
+    """Let every replica of a stored run play fresh episodes, and random agents in the same worlds.
 
     The episodes are those of `cprl.evaluate_run` with the same arguments.
+
+    Returns:
+        A row for each policy, replica and agent, by "policy": "trained" or "random"; with the numbers of
+        `WORDS` and `ARRAYS`, see `maps_of`.
     """
     loaded = opened(run)
     commons_game(loaded)
-    fresh = fresh_of([loaded], episodes=episodes, greedy=greedy, seed=seed, replicas=replicas)
-    random = [scripted("random")] * loaded.game.agents
-    return Territory(
-        run=loaded,
-        fresh=fresh,
-        trained=_stays(loaded, agents_of(loaded), fresh),
-        random=_stays(loaded, random, fresh),
+    fresh = fresh_for([loaded], fresh)
+    policies = {"trained": agents_of(loaded), "random": [scripted("random")] * loaded.game.agents}
+    parts: list[pa.Table] = []
+    for policy, agents in policies.items():
+        for group, env in worlds_of(fresh, loaded):
+            played = trace(env, policies_of(fresh, loaded, agents, group), explore=not fresh.greedy)
+            for place, replica in enumerate(group):
+                first = place * fresh.episodes
+                rows = _of_replica(played.worlds(first, first + fresh.episodes))
+                labels = {"policy": policy, "replica": replica}
+                parts.append(labelled(pa.table(rows), **labels))
+    return together(
+        parts,
+        heading=heading(loaded.path.name, fresh, [loaded]),
+        weights=loaded.weights_from,
+        run=loaded.path.name,
+        episodes=fresh.episodes,
     )
 
 
-def _stays(run: LoadedRun, agents: Sequence[Agent], fresh: Fresh) -> Stays:
-    by_replica: list[dict[str, Any]] = []
-    for group, env in fresh.worlds(run):
-        played = trace(env, fresh.policies(run, agents, group), explore=not fresh.greedy)
-        firsts = range(0, len(group) * fresh.episodes, fresh.episodes)
-        by_replica += [_of_replica(played.worlds(first, first + fresh.episodes)) for first in firsts]
-    stacked = {name: np.stack([arrays[name] for arrays in by_replica]) for name in by_replica[0]}
-    arrays = {name: stacked.pop(name) for name in ("visits", "taggings", "tagged_where")}
-    return Stays(**arrays, by_replica=stacked)
-
-
 def _of_replica(played: Trace) -> dict[str, Any]:
-    """The arrays and measures of the worlds of one replica."""
+    """Return the columns of the worlds of one replica, an entry for each agent."""
     shares = visits(played).mean(0)  # every agent is in play as an episode begins
     taggings = movement.taggings(played)
     tags = taggings.sum((1, 2))
     driven_out = np.where(tags > 0, movement.defence(played, shares), 0.0)
     with np.errstate(invalid="ignore"):
         defence = (driven_out * tags).sum() / np.float64(tags.sum())
-    return {
-        "visits": shares,
-        "taggings": taggings.sum(0),
-        "tagged_where": movement.tagged_where(played).sum(0),
-        EXCLUSION: movement.exclusion(shares),
-        VISITORS: movement.visitors(shares),
-        OVERLAP: overlap(played).mean(),
-        TAGS: 1000 * tags.sum() / played.played.sum(),
-        DEFENCE: defence,
+    numbers = {
+        "exclusion": movement.exclusion(shares),
+        "visitors": movement.visitors(shares),
+        "overlap": overlap(played).mean(),
+        "tag_rate": 1000 * tags.sum() / played.played.sum(),
+        "defence": defence,
     }
+    arrays = (shares, taggings.sum(0), movement.tagged_where(played).sum(0))
+    agents = len(shares)
+    return {
+        "agent": list(range(agents)),
+        **{name: np.full(agents, value) for name, value in numbers.items()},
+        **{name: list(array.reshape(agents, -1)) for name, array in zip(ARRAYS, arrays, strict=True)},
+    }
+
+
+def maps_of(table: pa.Table, name: str, policy: Policy = "trained") -> Array:
+    """Return one of `ARRAYS` of all replicas, [R, N, H x W] or [R, N, N]."""
+    rows = where(table, policy=checked("policy", policy, Policy)).sort_by("replica")
+    arrays = np.array(rows[name].to_pylist())
+    return arrays.reshape(len(rows["replica"].unique()), -1, arrays.shape[-1])
+
+
+def number_of(table: pa.Table, name: str, policy: Policy = "trained") -> Array:
+    """Return one of the numbers of `WORDS` of all replicas, float64 [R]."""
+    rows = where(table, policy=checked("policy", policy, Policy), agent=0).sort_by("replica")
+    return np.array(rows[name].to_pylist(), np.float64)
+
+
+def territory_cells(table: pa.Table) -> Cells:
+    """Return a row for each number: mean over replicas and 95 % interval, of the run's agents and of random
+    ones; a dash where it is undefined in all."""
+    found = estimates(table, list(WORDS), "policy")
+    rows = []
+    for name, words in WORDS.items():
+        of_policies = [found[policy, name] for policy in ("trained", "random")]
+        rows.append([words, *(one if one.replicas else "-" for one in of_policies)])
+    return Cells(said(table, "heading"), ["", "run's agents", "random"], rows)
 
 
 COLUMNS: Final = 3
@@ -128,14 +136,15 @@ DARKEST: Final = 0.3
 
 
 def draw_visits(
-    territory: Territory,
+    table: pa.Table,
+    board: Map,
     path: str | Path,
     *,
     replica: int | None = None,
     policy: Policy = "trained",
     width: style.Width = "page",
 ) -> Path:
-    """Draws who spends most time in each cell, and where each agent of a replica spends its time.
+    """Draw who spends most time in each cell, and where each agent of a replica spends its time.
 
     Hue is the agent. Brightness is the share of its time by its square root, the same scale in all maps, from
     the least to the longest stay of any agent. A ring is where the agent starts, small squares are sites, and
@@ -144,15 +153,20 @@ def draw_visits(
     what, each where its owner spends most time.
 
     Args:
+        table: of `territory_of`.
+        board: the map of the run's game.
         replica: the index of the replica in the run; by default the first one that played.
     """
-    stays, replicas = territory.of(policy), territory.fresh.replicas
+    replicas = sorted(table["replica"].unique().to_pylist())
     number = replicas[0] if replica is None else replica
     if number not in replicas:
-        raise refusal("replica", number, f"one that played, of {list(replicas)}")
-    place = replicas.index(number)
-    board, shares = territory.run.game.map, stays.visits[place]
-    owner, longest, total = owners(shares), shares.max(0), shares.sum(0)
+        raise refusal("replica", number, f"one that played, of {replicas}")
+    rows = where(table, replica=number)
+    shares = maps_of(rows, "visits", policy).reshape(-1, board.height, board.width)
+    tagged = maps_of(rows, "tags_by_agent", policy)[0].sum(1)
+    owner = owners(shares)
+    longest = shares.max(0)
+    total = shares.sum(0)
     hues = np.stack([_rgb(agent_colour(agent)) for agent in range(len(shares))])
     alone = np.divide(longest, total, out=np.zeros_like(total), where=total > 0)
     light = DARKEST + (1 - DARKEST) * np.sqrt(longest / max(longest.max(), 1e-12)) * alone
@@ -162,7 +176,7 @@ def draw_visits(
         whole, *panels = sheet.panels(len(shares) + 1, columns=columns, high=high)
         _show(whole, board, hues[owner], np.where(owner >= 0, light, 0.0), "who spends most time where")
         for agent, panel in enumerate(panels):
-            title = f"agent {agent}, tagged {int(stays.taggings[place, agent].sum()):,} times"
+            title = f"agent {agent}, tagged {tagged[agent]:,} times"
             _show(panel, board, hues[agent], _light(shares[agent], shares.max()), title)
             row, col, _ = board.starts[agent]
             panel.plot(col, row, "o", markersize=5, fillstyle="none", color="white", markeredgewidth=0.8)
@@ -171,18 +185,19 @@ def draw_visits(
                 row, col = divmod(int(owned.argmax()), board.width)
                 look: Any = {"color": "white", "ha": "center", "va": "center_baseline"}
                 whole.text(col, row, str(agent), **look)
-        index, sharing = (float(stays.by_replica[name][place]) for name in (EXCLUSION, VISITORS))
-        sheet.title = f"Where {'random ' if policy == 'random' else ''}agents spend their time"
+        first = where(rows, policy=policy, agent=0)
+        exclusion, sharing = (first[name][0].as_py() for name in ("exclusion", "visitors"))
+        sheet.title = f"Where {'random ' * (policy == 'random')}agents spend their time"
         sheet.caption = (
-            f"{territory.run.path.name}, replica {number}, {territory.fresh.episodes} episodes; exclusion "
-            f"{index:.2f}, {sharing:.1f} agents share a cell. The brighter, the longer; a ring is where an "
-            "agent starts, squares are sites of apples, grey cells walls."
+            f"{said(table, 'run')}, replica {number}, {said(table, 'episodes')} episodes; exclusion "
+            f"{exclusion:.2f}, {sharing:.1f} agents share a cell. The brighter, the longer; a ring is where "
+            "an agent starts, squares are sites of apples, grey cells walls."
         )
     return Path(path)
 
 
 def _show(panel: Axes, board: Map, hues: Array, light: Array, title: str) -> None:
-    """Shows hues [H, W, 3] on the ground by their brightness [H, W], with the board's walls and sites."""
+    """Show hues [H, W, 3] on the ground by their brightness [H, W], with the board's walls and sites."""
     image = _rgb(PALETTE[GROUND]) * (1 - light[..., None]) + hues * light[..., None]
     for cell in board.walls:
         image[cell] = _rgb(PALETTE[WALL])
@@ -195,21 +210,9 @@ def _show(panel: Axes, board: Map, hues: Array, light: Array, title: str) -> Non
 
 
 def _light(shares: Array, longest: float) -> Array:
-    """The brightness of cells, 0..1, by the square root of the share of an agent's time."""
+    """Return the brightness of cells, 0..1, by the square root of the share of an agent's time."""
     return np.where(shares > 0, DARKEST + (1 - DARKEST) * np.sqrt(shares / max(longest, 1e-12)), 0.0)
 
 
 def _rgb(colour: tuple[int, int, int]) -> Array:
     return np.array(colour) / 255
-
-
-def territory_table(territory: Territory) -> Cells:
-    """A row for each measure of territory: mean over replicas and 95 % interval, of the run's agents and of
-    random ones; a dash where it is undefined in all."""
-    trained, random = territory.trained.measures(), territory.random.measures()
-    rows = [
-        (name, *(str(of_policy.get(name, "-")) for of_policy in (trained, random)))
-        for name in territory.trained.by_replica
-    ]
-    title = heading(territory.run.path.name, territory.fresh, [territory.run])
-    return Cells(title, BESIDE_RANDOM, rows)

@@ -1,6 +1,9 @@
 """Defaults that functions share with the command line, which answers without importing the functions."""
 
+from dataclasses import dataclass
 from typing import Final, Literal
+
+from cprl.values import Natural, Positive, Seed, Value
 
 SEED: Final = 30_011
 """The seed of fresh worlds; no training of ours uses it, nor the next ones."""
@@ -25,3 +28,23 @@ EGTA_RESAMPLES: Final = 200
 
 Diagonal = Literal["self", "cross_seed"]
 """Whom a run's agents meet in the cross-play with their own run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fresh(Value, stored=False):
+    """Which fresh worlds are played, and how."""
+
+    episodes: Positive = 20
+    """Episodes of each replica, in each choice of who plays where, each in its own world."""
+    seed: Seed = SEED
+    """Of the worlds and all chance; the same one gives the same numbers."""
+    replicas: tuple[Natural, ...] = ()
+    """Which replicas play, by number; by default all that every run has, and 0 to 7 of scripted agents. A
+    replica's episodes do not depend on the others."""
+    greedy: bool = False
+    """Whether stored agents take their best action; else those with action values explore with the run's
+    `epsilon_evaluation`, and those with a policy draw from it."""
+
+    def __str__(self) -> str:
+        counts = {"replica": len(self.replicas), "episode": self.episodes}
+        return ", ".join(f"{count} {name}{'s' * (count != 1)}" for name, count in counts.items()) + " each"
