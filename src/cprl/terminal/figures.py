@@ -66,7 +66,7 @@ def training_curve(
         for axes, name in zip(panels, numbers, strict=True):
             values = curves[name]
             means = np.stack([mean_of_worlds(*one, window) for one in zip(values, worlds, strict=True)])
-            at = np.arange(length) - (over - 1) / 2
+            at = np.arange(length, dtype=np.float64) - (over - 1) / 2
             is_there = ~np.isnan(means).any(0)
             course = at[is_there], means[:, is_there]
             _draw(axes, values, *course)
