@@ -20,13 +20,14 @@ import pyarrow.compute as pc
 
 from cprl.evaluation.evaluate import opened, refuse_other_games
 from cprl.evaluation.lanes import agents_of, fresh_for, play, roles_of, said, together
-from cprl.evaluation.pages import draw_matrices, heading, matrix_cells, rewards_of, says_nothing
+from cprl.evaluation.pages import draw_matrices, heading, matrix_cells
 from cprl.measuring.registry import COLLECTIVE_RETURN, FINES, INCOME, with_unit
 from cprl.measuring.statistics import HOLM, Family, differences, estimates
 from cprl.measuring.table import BACKGROUND, BOTH, FOCAL, ROLE, labelled, numbers_in, where
 from cprl.system.defaults import Diagonal, Fresh
 from cprl.system.working import say_how_far, working
 from cprl.terminal import style
+from cprl.terminal.summary import rewards_of, says_nothing
 from cprl.terminal.tables import Cells
 from cprl.training.agents import LoadedRun
 from cprl.values import checked, refusal
