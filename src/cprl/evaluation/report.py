@@ -93,7 +93,8 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
         before.append("  \n".join([*facts, f"**{meaning}**"]))
     before.append(f"{learned(run.specs)}, {run.experiment.trained_for}.")
     before.append(run.experiment.own_code)
-    after = ["## Fresh episodes, beside random play", "", *markdown(compared(played, "", names={"trained": "run's agents"}))]
+    page_of_numbers = compared(played, "", names={"trained": "run's agents"})
+    after = ["## Fresh episodes, beside random play", "", *markdown(page_of_numbers)]
     after += [
         "These episodes were played for this page, in other worlds than those above, so that means differ by "
         f"chance. The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`."
