@@ -10,20 +10,22 @@ Student's t over replicas. A difference is paired: replica r has the same seeds 
 under none.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-import numpy as np
+import pyarrow as pa
 import tyro
-from numpy.typing import NDArray
 
-from cprl.experiment import presets
-from cprl.measuring.statistics import Estimate, curve_interval, estimate, holm
-from cprl.measuring.windows import centres, running_mean
-from cprl.runs.curves import as_curves, curves_of
-from cprl.runs.episodes import read_table
+from cprl.measuring.statistics import Estimate, Family, curve_interval, differences, estimates
+from cprl.measuring.table import complete, labelled
+from cprl.measuring.windows import centres, last_of, running_mean
+from cprl.runs.curves import curves_of
+from cprl.runs.episodes import read_episodes, read_table
 from cprl.terminal import style
-from cprl.terminal.style import INTERVAL, MEAN, RANDOM_LINE
+from cprl.terminal.panels import draw_dots, draw_line
+from cprl.terminal.style import RANDOM_LINE
+from cprl.terminal.tables import Cells, markdown
 
 NONE: Final = "none"
 NAMES: Final = {
@@ -47,78 +49,48 @@ METRICS: Final = {
     "survival_steps": "survival, steps",
     "peacefulness": "peacefulness, steps",
 }
-WITHOUT_MONEY: Final = {"income": "collective_return", "income_equality": "equality"}
-"""By the metric of income: that of the harvest, of which it is a copy where no apple is paid and lost."""
 LAST, SMOOTHED = 30, 10
 """Episodes at the end that are compared; episodes of a running mean."""
-CLOCK: Final = presets.game("commons").rules.episode_steps
-"""The turns of an episode at most."""
-
-Values = NDArray[np.float64]
 
 
-def of_replicas(run: Path) -> dict[str, Values]:
-    """The mean of the last episodes of each replica, [R] by metric."""
-    curves = curves_of(run)
-    curves.setdefault("income_equality", curves["equality"])
-    return {name: np.nanmean(curves[name][:, -LAST:], 1) for name in METRICS}
+def ends(runs: Mapping[str, Path]) -> pa.Table:
+    """The last episodes of each replica, labelled by institution."""
+    tables = []
+    for name, run in runs.items():
+        rows = complete(last_of(read_episodes(run), LAST))
+        if "income_equality" not in rows.column_names:  # where no apple is paid
+            rows = rows.append_column("income_equality", rows["equality"])
+        tables.append(labelled(rows, institution=name))
+    columns = ["institution", "replica", "episode", "agent", "steps", "terminated", *METRICS]
+    return pa.concat_tables([table.select(columns) for table in tables])
 
 
-def text_of(estimated: Estimate, *, sign: str = "") -> str:
-    """An estimate with its interval."""
-    numbers = estimated.value, *estimated.interval
+def text_of(one: Estimate, *, sign: str = "") -> str:
+    """An estimate with its interval, bold where it differs from 0."""
+    numbers = one.value, *one.interval
     digits = 2 if max(map(abs, numbers)) < 5 else 0
     value, low, high = (f"{number:{sign}.{digits}f}" for number in numbers)
-    return f"{value} [{low}, {high}]"
+    text = f"{value} [{low}, {high}]"
+    return f"**{text}**" if one.differs else text
 
 
-def difference_texts(differences: dict[str, dict[str, Estimate]]) -> tuple[dict[str, list[str]], int]:
-    """Differences with their intervals, bold where they are not 0 by Holm's method, and how many that
-    compared: a metric of income that is the harvest's, since nothing is lost, counts once."""
-    compared = {
-        (name, metric): estimated
-        for name, of_metric in differences.items()
-        for metric, estimated in of_metric.items()
-        if not is_copy(metric, of_metric)
-    }
-    is_different = holm([estimated.p_value for estimated in compared.values()])
-    marks = dict(zip(compared, is_different, strict=True))
-    rows: dict[str, list[str]] = {}
-    for name, of_metric in differences.items():
-        rows[name] = []
-        for metric, estimated in of_metric.items():
-            counted = WITHOUT_MONEY[metric] if is_copy(metric, of_metric) else metric
-            text = text_of(estimated, sign="+")
-            rows[name].append(f"**{text}**" if marks[name, counted] else text)
-    return rows, len(compared)
-
-
-def is_copy(metric: str, differences: dict[str, Estimate]) -> bool:
-    """Whether a metric of income is in a row what that of the harvest is."""
-    if metric not in WITHOUT_MONEY:
-        return False
-    own, other = differences[metric], differences[WITHOUT_MONEY[metric]]
-    return np.allclose((own.value, own.low, own.high), (other.value, other.low, other.high), atol=1e-9)
-
-
-def table(head: str, rows: dict[str, list[str]]) -> str:
+def table(head: str, family: Family, *, sign: str = "") -> str:
     """A Markdown table with a row for each institution."""
-    columns = [head, *METRICS.values()]
-    lines = ["| " + " | ".join(columns) + " |", "|---|" + "---:|" * len(METRICS)]
-    lines += ["| " + " | ".join([NAMES[name], *cells]) + " |" for name, cells in rows.items()]
-    return "\n".join(lines)
+    rows = [
+        [NAMES[name], *(text_of(family[name, metric], sign=sign) for metric in METRICS)]
+        for name in NAMES
+        if (name, "equality") in family
+    ]
+    return "\n".join(markdown(Cells("", [head, *METRICS.values()], rows)))
 
 
-def forest(differences: dict[str, dict[str, Estimate]], path: Path) -> None:
+def forest(family: Family, path: Path) -> None:
     """Draws the paired differences of every metric, with their intervals."""
-    names = list(differences)
+    names = [name for name in NAMES if (name, "equality") in family]
     with style.drawing(path) as sheet:
         panels = sheet.panels(len(METRICS), columns=4, high=2.4 * len(names) + 6, sharey=True)
         for axes, metric in zip(panels, METRICS, strict=True):
-            for place, name in enumerate(names):
-                found = differences[name][metric]
-                axes.plot([found.low, found.high], [place, place], color=INTERVAL, linewidth=2.5)
-                axes.plot([found.value], [place], "o", color=MEAN, markersize=6)
+            draw_dots(axes, range(len(names)), [family[name, metric] for name in names], across=True)
             axes.axvline(0, **RANDOM_LINE)
             axes.set_title(METRICS[metric])
             axes.set_yticks(range(len(names)), [NAMES[name] for name in names])
@@ -128,20 +100,20 @@ def forest(differences: dict[str, dict[str, Estimate]], path: Path) -> None:
         sheet.caption = f"Paired by replica; means of the last {LAST} episodes, 95 % intervals."
 
 
-def courses(runs: dict[str, Path], path: Path) -> None:
+def courses(runs: Mapping[str, Path], path: Path) -> None:
     """Draws the harvest over the training under each institution, beside none and random play."""
     returns = {name: curves_of(run)["collective_return"] for name, run in runs.items()}
-    random = as_curves(read_table(runs[NONE] / "evaluation" / "random.parquet"))["collective_return"].mean()
+    by_chance = read_table(runs[NONE] / "evaluation" / "random.parquet")
+    random = estimates(by_chance, "collective_return")["collective_return"].value
     others = [name for name in runs if name != NONE]
     with style.drawing(path) as sheet:
         panels = sheet.panels(len(others), columns=4, high=15, sharex=True, sharey=True)
         for axes, name in zip(panels, others, strict=True):
-            for institution, colour in ((NONE, "#777777"), (name, MEAN)):
-                middle, low, high = curve_interval(running_mean(returns[institution], SMOOTHED))
+            for institution, colour in ((NONE, "#777777"), (name, style.MEAN)):
+                curve = curve_interval(running_mean(returns[institution], SMOOTHED))
                 at = centres(returns[institution], SMOOTHED)
                 label = "no institution" if institution == NONE else "with the institution"
-                axes.fill_between(at, low, high, color=colour, alpha=0.25, linewidth=0)
-                axes.plot(at, middle, color=colour, linewidth=2, label=label)
+                draw_line(axes, at, curve, color=colour, label=label)
             axes.axhline(random, **RANDOM_LINE, label="random play")
             axes.set_title(NAMES[name])
         for axes in panels[-4:]:
@@ -159,22 +131,15 @@ def main(*, runs: Path, figures: Path) -> None:
         figures: where the figures are written.
     """
     found = {name: runs / name for name in NAMES if (runs / name / "evaluation").is_dir()}
-    values = {name: of_replicas(run) for name, run in found.items()}
-    levels = {
-        name: [text_of(estimate(own[metric]).of(metric, CLOCK)) for metric in METRICS]
-        for name, own in values.items()
-    }
-    print(table("institution", levels), end="\n\n")
-    differences = {
-        name: {metric: estimate(own[metric] - values[NONE][metric]) for metric in METRICS}
-        for name, own in values.items()
-        if name != NONE
-    }
-    texts, compared = difference_texts(differences)
-    print(table("difference from none", texts), end="\n\n")
-    print(f"Bold: not 0 by Holm's method for {compared} comparisons, those that are copies counted once.")
+    rows = ends(found)
+    print(table("institution", estimates(rows, list(METRICS), by="institution")))
+    changes = differences(rows, list(METRICS), "institution", {"institution": NONE})
+    print(table("difference from none", changes, sign="+"))
+    print(
+        f"Bold: not 0 by Holm's method for {changes.tests} comparisons, those that are copies counted once."
+    )
     figures.mkdir(exist_ok=True)
-    forest(differences, figures / "differences.png")
+    forest(changes, figures / "differences.png")
     courses(found, figures / "courses.png")
 
 

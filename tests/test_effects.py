@@ -8,10 +8,11 @@ import pyarrow as pa
 import pytest
 
 from cprl.evaluation.report import report
+from cprl.measuring.statistics import contrasts
 from cprl.studies.figures import by_condition, heat_map
 from cprl.studies.results import write_summary
-from cprl.studies.tables.comparing import cells, compare, compared_cells, metrics_of
-from cprl.studies.tables.effects import contrast, effect_cells, effects_of, estimated
+from cprl.studies.tables.comparing import cells, compared_cells, metrics_of
+from cprl.studies.tables.effects import effect_cells, effects_of, weights_of
 from cprl.studies.tables.table import Design, StudyTable
 from cprl.system.defaults import STUDY_TABLE
 from cprl.terminal.style import Sheet
@@ -72,16 +73,17 @@ def written(table, folder):
 
 def test_a_main_effect_is_a_difference_of_means_over_cells_within_a_replica():
     table = table_of(BOTH, GRID, reference="fine=1, prob=1.0")
-    effects = estimated(table, compare(table, "collective_return", part="evaluation"))
-    fine = effects.estimates["fine 4 against 0"]
+    effects = effects_of(table, "collective_return", part="evaluation")
+    found = {name: one for (name, _), one in effects.items()}
+    fine = found["fine 4 against 0"]
     assert fine.value == 11, "10 where it is seldom, 12 where it is certain"
     assert (fine.low, fine.high) == pytest.approx((11 - 1.3, 11 + 1.3), abs=0.01)
-    assert effects.estimates["fine 1 against 0"].value == 0
-    assert effects.estimates["prob 1 against 0.25"].value == pytest.approx(2 / 3), "2 in one of three fines"
-    assert effects.estimates["fine 4 against 0 x prob 1 against 0.25"].value == 2
-    assert effects.family.tests == len(effects.estimates) == 3 + 2
-    assert effects.is_marked("fine 4 against 0")
-    assert not effects.is_marked("fine 1 against 0")
+    assert found["fine 1 against 0"].value == 0
+    assert found["prob 1 against 0.25"].value == pytest.approx(2 / 3), "2 in one of three fines"
+    assert found["fine 4 against 0 x prob 1 against 0.25"].value == 2
+    assert effects.tests == len(effects) == 3 + 2
+    assert fine.differs
+    assert not found["fine 1 against 0"].differs
 
 
 def test_an_interaction_is_the_same_whatever_the_other_factors_are():
@@ -91,7 +93,7 @@ def test_an_interaction_is_the_same_whatever_the_other_factors_are():
         return replica + 5 * a + 7 * (a and b == "x") + 100 * c
 
     table = table_of({"income": value}, conditions, reference="a=False, b=y, c=0.0")
-    found = estimated(table, compare(table, "income")).estimates
+    found = effects_of(table, "income")
     by_hand = {
         "a True against False": 5 + 7 / 2,
         "b x against y": 7 / 2,
@@ -100,22 +102,23 @@ def test_an_interaction_is_the_same_whatever_the_other_factors_are():
         "a True against False x c 1 against 0": 0,
         "b x against y x c 1 against 0": 0,
     }
-    assert {name: one.value for name, one in found.items()} == pytest.approx(by_hand)
+    assert {name: one.value for (name, _), one in found.items()} == pytest.approx(by_hand)
 
 
 def test_effects_are_of_whole_grids_of_paired_replicas_alone():
-    assert effects_of(table_of(BOTH, GRID))
-    assert not effects_of(table_of(BOTH, dict(list(GRID.items())[1:])))
-    assert not effects_of(table_of({"income": lambda fine, r: r}, grid_of(("fine", FINES))))
-    assert not effects_of(table_of(BOTH, GRID, is_grid=False))
+    assert weights_of(table_of(BOTH, GRID))
+    assert not weights_of(table_of(BOTH, dict(list(GRID.items())[1:])))
+    assert not weights_of(table_of({"income": lambda fine, r: r}, grid_of(("fine", FINES))))
+    assert not weights_of(table_of(BOTH, GRID, is_grid=False))
     paired = table_of(BOTH, GRID)
-    assert not effects_of(replace(paired, design=replace(paired.design, is_paired=False)))
+    assert not weights_of(replace(paired, design=replace(paired.design, is_paired=False)))
     assert effect_cells(table_of({"income": lambda r: r}, {"one": {}, "other": {}})) == []
 
 
 def test_any_contrast_of_conditions_has_an_interval_over_the_replicas_that_have_them():
     table = table_of({"income": lambda level, r: level * r}, grid_of(("level", (1, 2, 4))))
-    found = contrast(compare(table, "income"), {"level=1": 1.0, "level=2": 1.0, "level=4": -0.5})
+    weights = {"level=1": 1.0, "level=2": 1.0, "level=4": -0.5}
+    found = contrasts(table.windows(), "income", "condition", {"half": weights})["half", "income"]
     assert (found.value, found.replicas) == (1.5, REPLICAS), "the mean of r, 0 to 3"
 
 
@@ -158,8 +161,8 @@ def test_what_is_not_shown_has_the_size_that_would_have_been(tmp_path):
     assert "more: d +20.0 [+18.7, +21.3]" in page
     assert "no difference shown: b +0.50 [-0.80, +1.80] (differences below 1.30 apples would not sh" in page
     assert "not shown among so many, though it would be alone: c +1.40 [+0.10, +2.70]" in page
-    rows = cells([compare(table, "collective_return")], "differences").rows
-    assert [name for name, _, text in rows if "**" in text] == ["d"], "the page has one family"
+    rows = cells(table, ["collective_return"], "differences").rows
+    assert [name for name, _, change in rows if change.estimate.differs] == ["d"], "the page has one family"
     one = written(table_of({"collective_return": value}, conditions, replicas=1), tmp_path / "one")
     assert "cannot be told, as one replica has no interval: b -0.50; c +0.400; d +19.0" in one
 
@@ -177,7 +180,7 @@ def test_the_answer_tests_what_the_table_below_it_tests(tmp_path):
         page = written(table, tmp_path / folder)
         assert said in page
         _, differences = compared_cells(table, part="evaluation")
-        assert differences.rows[0][2].startswith("**") == (said == "more: b")
+        assert differences.rows[0][2].estimate.differs == (said == "more: b")
 
 
 def test_a_metric_that_is_another_by_construction_stands_and_counts_once():
@@ -232,7 +235,7 @@ def test_what_an_institution_took_and_found_stands_beside_and_is_not_tested(tmp_
     table = table_of({**BOTH, **taken}, GRID)
     levels, differences, measures = compared_cells(table)
     assert measures.head == ["condition", "replicas", "fines of all, apples"], "nothing was violated"
-    assert measures.rows[-1][2] == "40.0 [40.0, 40.0]"
+    assert str(measures.rows[-1][2]) == "40.0 [40.0, 40.0]"
     assert not [name for name in (*levels.head, *differences.head) if "fines" in name]
     assert len(compared_cells(table, ["income"])) == 2
     by_condition(table, tmp_path / "levels.svg")

@@ -5,7 +5,6 @@ from itertools import groupby
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from cprl.measuring.outcome import Course, outcome_of
@@ -132,10 +131,6 @@ def test_boards_that_die_while_agents_get_more_than_random_play_do_not_make_them
 
 def test_a_mean_counts_episodes_whatever_the_number_that_each_value_is_of():
     assert [Recent(10, each=worlds).window for worlds in (1, 3, 4, 10, 16, 256)] == [10, 4, 3, 1, 1, 1]
-    recent = Recent(10, share=0.1, each=16)
-    for value in range(40):
-        recent.add(value)
-    assert recent.window == 4, "a tenth of 640 episodes"
 
 
 def test_noise_around_random_play_is_neither_rise_nor_fall():
@@ -176,65 +171,8 @@ def test_agents_explore_while_an_epsilon_falls_or_is_high(epsilons, expected):
     assert seen == expected
 
 
-def test_the_recent_mean_is_of_a_share_of_the_values_so_far_but_of_some_at_least():
-    recent = Recent(3, share=0.5)
-    assert [recent.add(value) for value in range(10)] == [0, 0.5, 1, 2, 3, 4, 4.5, 5.5, 6, 7]
-    assert recent.window == 5
+def test_the_recent_mean_is_of_the_last_values_that_are_defined():
+    recent = Recent(3)
+    assert [recent.add(value) for value in (0.0, 1.0, 5.0, 3.0)] == [0, 0.5, 2, 3]
+    assert recent.add(float("nan")) == 4
     assert np.isnan(Recent(3).add(float("nan")))
-
-
-FALL = [*[100.0] * 20, *[400.0] * 20]
-
-
-def episodes_of(returns, lives, *, agents=2, worlds=None, replica=0):
-    """A table of episodes in which all agents got so much, and boards lasted so long."""
-    number = np.arange(len(returns))
-    columns = {"replica": np.full(len(number), replica), "episode": number, "collective_return": returns}
-    columns |= {"steps": np.broadcast_to(lives, len(number))}
-    columns |= {} if worlds is None else {"world": worlds}
-    one = {name: np.repeat(np.asarray(column), agents) for name, column in columns.items()}
-    return pa.table({**one, "agent": np.tile(np.arange(agents), len(number))})
-
-
-def word(returns, *, agents=4, worlds=None, lives=(1000, 400)):
-    """How a training of one replica went whose boards lasted so long at first, and at the end."""
-    steps = np.where(np.arange(len(returns)) < 40, *lives)
-    return outcome_of(episodes_of(returns, steps, agents=agents, worlds=worlds), random=100.0).word
-
-
-@pytest.mark.parametrize(
-    ("course", "more", "expected"),
-    [
-        # Random play gets 100; the peak is 400, a third of its lead over random play is 100.
-        ([100.0] * 40, {}, "no better"),
-        ([*FALL, *[400.0] * 40], {}, "harvesting"),
-        ([*FALL, *[290.0] * 40], {}, "decline"),
-        ([*FALL, *[310.0] * 40], {}, "harvesting"),
-        ([*FALL, *[90.0] * 40], {}, "tragedy"),
-        ([*FALL, *[90.0] * 40], {"agents": 1}, "decline"),
-        ([*FALL, *[90.0] * 40], {"lives": (1000, 701)}, "decline"),
-        ([*FALL, *[90.0] * 40], {"lives": (1000, 700)}, "tragedy"),
-        ([*FALL, *[96.0] * 40], {}, "decline"),
-        # From 80 a quarter of the way back to 400 is 160.
-        ([*FALL, *[80.0] * 40, *[170.0] * 40], {}, "recovery"),
-        ([*FALL, *[80.0] * 40, *[150.0] * 40], {}, "decline"),
-    ],
-)
-def test_how_a_training_went_is_told_by_its_peak_and_its_last_episodes(course, more, expected):
-    assert word(course, **more) == expected
-
-
-def test_a_training_in_many_worlds_went_as_each_of_its_worlds_did():
-    # Three worlds fall to nothing, in short episodes; in the time of twenty of them the fourth plays one.
-    worlds = np.array([*[0, 1, 2, 3] * 10, *[0, 1, 2] * 20])
-    returns = np.where(worlds == 3, 600.0, [*[100.0] * 20, *[400.0] * 20, *[0.0] * 60])
-    assert word(returns) == "tragedy"
-    assert word(returns, worlds=worlds) == "decline", "600 / 4 is above 95"
-
-
-def test_the_outcome_over_replicas_is_of_their_mean():
-    falls = [[*FALL, *[90.0] * 40], [*FALL, *[70.0] * 50]]
-    tables = [episodes_of(returns, 500, replica=replica) for replica, returns in enumerate(falls)]
-    went = outcome_of(pa.concat_tables(tables), random=100.0)
-    assert (went.begins, went.peak, went.around, went.last) == (100.0, 400.0, 25, 80.0)
-    assert went.lived == 1.0

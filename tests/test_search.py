@@ -246,7 +246,7 @@ def test_a_value_is_the_mean_over_replicas_of_the_episodes_asked_for(tmp_path, m
     played = [as_curves(read_table(run / "evaluation" / "trained.parquet")) for run in runs]
     harvests = [curves["collective_return"] for curves in played]  # [1, 3] each
     assert result.points[0].value == pytest.approx(sum(harvest.sum() for harvest in harvests) / 6)
-    last = replace(search, metric="return_1", over="training", last=2)
+    last = replace(search, metric="agent_1/return", over="training", last=2)
     trained = [curves_of(run)["return_1"][0, 2:] for run in runs]
     assert value_of(last, result.points[0], result.runs) == pytest.approx(np.mean(trained))
     net = sum((curves["return_0"] + curves["return_1"]).sum() for curves in played) / 6

@@ -13,7 +13,7 @@ import torch
 from recordings import GAME, SCENE, column, names, observing, static, strict_rerun
 from rerun.chunk import RrdReader
 from tensordict import TensorDict
-from test_now import SIXTEEN_WORLDS
+from test_how_it_goes import SIXTEEN_WORLDS
 from test_watch import connected, fake, received
 
 from cprl import CommonsEnv, Game, Rules, maps

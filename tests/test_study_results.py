@@ -25,12 +25,20 @@ from cprl.runs.recipe import runs_in, write_circumstances
 from cprl.studies import figures, results
 from cprl.studies.factors import Uniform
 from cprl.studies.status import Status
-from cprl.studies.tables.comparing import Cells, cells, compare, markdown, metrics_of
+from cprl.studies.tables.comparing import (
+    cells,
+    differences_of,
+    episodes_text,
+    levels_of,
+    pairing_text,
+    values_of,
+)
 from cprl.studies.tables.pooled import pooled_table
 from cprl.studies.tables.sources import circumstances_of, design_of, study_table
 from cprl.studies.tables.table import METADATA, Design, StudyTable
 from cprl.studies.trials import trials_of
 from cprl.terminal.style import WIDTH_IN
+from cprl.terminal.tables import Cells, markdown
 
 SEES = "game.rules.window_rows"
 GAMMA = "agents.*.algorithm.settings.gamma"
@@ -363,28 +371,28 @@ def test_a_paired_difference_is_far_narrower_than_one_of_two_samples():
 
 
 def test_conditions_are_compared_by_the_last_episodes_and_pairs_of_replicas(pairs):
-    compared = compare(pairs, "collective_return")
-    reference, other = compared.conditions
+    number = "collective_return"
+    values = values_of(pairs.windows(), number)
     # Episodes 10 to 39 have the mean 24.5.
-    assert reference.values == {0: 24.5, 1: 124.5, 2: 224.5}
-    assert other.values == {0: 27.5, 1: 128.5, 2: 232.5}
-    assert (compared.reference, reference.difference) == ("freeze_steps=5", None)
-    assert other.difference.value == 5
-    assert other.difference.low == pytest.approx(5 - 6.5724, abs=1e-3)
-    assert compared.episodes_text == "the last 30 episodes of training"
-    assert compared.pairing_text == "paired by replica"
-    assert compare(pairs, "collective_return", last=10).conditions[0].values[0] == 34.5
-    evaluated = compare(pairs, "collective_return", part="evaluation")
-    assert evaluated.conditions[1].values == {0: 3, 1: 104, 2: 208}
-    assert evaluated.episodes_text == "3 fresh episodes of the trained agents"
+    assert values["freeze_steps=5"] == {0: 24.5, 1: 124.5, 2: 224.5}
+    assert values["freeze_steps=25"] == {0: 27.5, 1: 128.5, 2: 232.5}
+    found = differences_of(pairs, [number])
+    assert list(found) == [("freeze_steps=25", number)], "the reference has no difference from itself"
+    assert found["freeze_steps=25", number].value == 5
+    assert found["freeze_steps=25", number].low == pytest.approx(5 - 6.5724, abs=1e-3)
+    assert episodes_text(pairs) == "the last 30 episodes of training"
+    assert pairing_text(pairs) == "paired by replica"
+    assert values_of(pairs.windows(last=10), number)["freeze_steps=5"][0] == 34.5
+    assert values_of(pairs.windows("evaluation"), number)["freeze_steps=25"] == {0: 3, 1: 104, 2: 208}
+    assert episodes_text(pairs, "evaluation") == "3 fresh episodes of the trained agents"
     for name, value in (("metric", "wealth"), ("part", "sleep"), ("last", 5)):
         with pytest.raises(ValueError, match=f"{name} is {value!r}"):
-            compare(pairs, **{"metric": "collective_return", name: value})
+            levels_of(pairs, **({"metrics": [value]} if name == "metric" else {name: value}))
 
 
 def test_a_table_that_was_compared_is_freed_with_its_last_name(tmp_path):
     table = table_of(tmp_path, {TIME_OUT: [5, 25]})
-    assert compare(table, "equality") is compare(table, "equality")
+    assert levels_of(table, ["equality"])
     alive = weakref.ref(table)
     del table
     gc.collect()
@@ -396,25 +404,26 @@ def test_replicas_without_a_value_are_counted_and_pairs_are_those_that_both_have
         return NAN if replica == 1 or number == 39 else 0.25
 
     table = table_of(tmp_path, {TIME_OUT: [5, 25]}, harvest, replicas=3, written={"equality": equality})
-    compared = compare(table, "equality")
-    longer = compared.conditions[1]
+    longer = levels_of(table, ["equality"])["freeze_steps=25", "equality"]
+    change = differences_of(table, ["equality"])["freeze_steps=25", "equality"]
     # Of the last 30 episodes replica 1 has no value in any, the others have none in the last one: 30 + 2.
-    assert (longer.replicas, len(longer.defined), longer.episodes, longer.undefined) == (3, 2, 90, 32)
-    assert (longer.estimate.value, longer.estimate.replicas, longer.difference.replicas) == (0.25, 2, 2)
-    text = "\n".join(markdown(cells([compared])))
+    assert (table.replicas["freeze_steps=25"], longer.episodes, longer.undefined) == (3, 90, 32)
+    assert (longer.value, longer.replicas, change.replicas) == (0.25, 2, 2)
+    text = "\n".join(markdown(cells(table, ["equality"])))
     assert "| freeze_steps=25 | 3 | 0.250 [0.250, 0.250], undefined in 32 of 90 episodes |" in text
-    assert "(of 2)" in "\n".join(markdown(cells([compared], "differences")))
+    assert "(of 2)" in "\n".join(markdown(cells(table, ["equality"], "differences")))
 
 
 def test_a_table_in_markdown_has_replicas_intervals_and_differences(pairs):
-    compared = [compare(pairs, metric) for metric in metrics_of(pairs, ["collective_return"])]
-    levels, differences = cells(compared), cells(compared, "differences")
+    levels, differences = (cells(pairs, ["collective_return"], kind) for kind in ("levels", "differences"))
     assert levels.head == ["condition", "replicas", "collective return, apples"]
     assert levels.heading == (
         "The last 30 episodes of training; means over replicas; 95% intervals over replicas by Student's t."
     )
     assert [row[:2] for row in levels.rows] == [["freeze_steps=5", "3"], ["freeze_steps=25", "3"]]
-    assert differences.rows == [["freeze_steps=25", "3", "+5.0 [-1.6, +11.6]"]]
+    assert [list(map(str, row)) for row in differences.rows] == [
+        ["freeze_steps=25", "3", "+5.0 [-1.6, +11.6]"]
+    ]
 
 
 def test_differences_are_bold_that_differ_among_all_of_their_table(tmp_path):
@@ -422,24 +431,30 @@ def test_differences_are_bold_that_differ_among_all_of_their_table(tmp_path):
     apples = lambda condition, replica, _: 100 * replica + more[condition.levels[TIME_OUT]][replica]  # noqa: E731
     table = table_of(tmp_path, {TIME_OUT: [5, 25, 100]}, apples, replicas=3)
     # 5 +- 1 and 41 +- 1 of 3 pairs: t is 8.66 and 71.0, p is 0.0131 and 0.0002; the equality is 0.5 in all.
-    alone = cells([compare(table, "collective_return")], "differences")
-    assert [row[2] for row in alone.rows] == ["**+5.00 [+2.52, +7.48]**", "**+41.0 [+38.5, +43.5]**"]
+    alone = cells(table, ["collective_return"], "differences")
+    assert [line.split("|")[3].strip() for line in markdown(alone)[2:4]] == [
+        "**+5.00 [+2.52, +7.48]**",
+        "**+41.0 [+38.5, +43.5]**",
+    ]
     assert "Holm's method for the 2 differences of this table" in alone.note
     metrics = "collective_return", "equality", "peace"
-    several = cells([compare(table, metric) for metric in metrics], "differences")
-    assert [row[2] for row in several.rows] == ["+5.00 [+2.52, +7.48]", "**+41.0 [+38.5, +43.5]**"]
-    assert several.rows[0][3] == "+0 [+0, +0]"
+    several = cells(table, metrics, "differences")
+    assert [line.split("|")[3].strip() for line in markdown(several)[2:4]] == [
+        "+5.00 [+2.52, +7.48]",
+        "**+41.0 [+38.5, +43.5]**",
+    ]
+    assert str(several.rows[0][3]) == "+0 [+0, +0]"
     assert "for the 6 differences of this table" in several.note
     assert markdown(several)[-2:] == [several.note, ""]
 
 
 def test_names_in_a_table_in_markdown_are_texts_and_take_one_line():
     names = {"a|b": r"a\|b", "pay_$1_$_": r"pay_\$1_\$_", "*a*": r"\*a\*", "<b>": r"\<b>", "a\nb": "a b"}
-    _, _, *lines, _ = markdown(Cells("", ["condition", "x"], [[name, "**1**"] for name in names]))
-    assert lines == [f"| {written} | **1** |" for written in names.values()]
+    _, _, *lines, _ = markdown(Cells("", ["condition", "x"], [[name, "1"] for name in names]))
+    assert lines == [f"| {written} | 1 |" for written in names.values()]
 
 
-# Windows and endings
+# Phases
 
 
 def test_windows_of_many_worlds_have_as_many_episodes_of_each(tmp_path):
@@ -454,11 +469,10 @@ def test_windows_of_many_worlds_have_as_many_episodes_of_each(tmp_path):
     changed = changed.set_column(place, "collective_return", apples)
     write_listed(run, "episodes.parquet", lambda file: pq.write_table(changed, file))
     table = study_table(study, runs)
-    (compared,) = compare(table, "collective_return", last=10).conditions
-    assert list(compared.values.values()) == [25.0], "the last five of each"
-    grid = table.values(compared.condition, "collective_return", "training")
-    assert grid["window_episodes"].tolist() == [[5, 5, 10, 10]]
-    assert grid["episode"].tolist() == [[0, 5, 10, 20]]
+    (values,) = values_of(table.windows(last=10), "collective_return").values()
+    assert list(values.values()) == [25.0], "the last five of each"
+    windows = [(row["episode"], row["window_episodes"]) for row in rows_of(table)]
+    assert windows == [(0, 5), (5, 5), (10, 10), (20, 10)]
 
 
 def test_the_most_frequent_phase_of_a_condition_is_counted_over_replicas(tmp_path):
@@ -765,19 +779,26 @@ def test_cprl_table_prints_any_runs_by_a_field_and_writes_them(table_command, ca
     words = ["--by", "game.rules.freeze-steps", "--metric", "collective_return", "--out"]
     for out in ("table.parquet", "table.md", "table.csv"):
         table_command(*words, out)
+    table_command(*words, "table.tex", "--out", "table.txt")
     printed = capsys.readouterr().out
     assert "+5.0 [-1.6, +11.6]" in printed
     assert "2 runs by game.rules.freeze_steps: 6 replicas of 2 of 2 conditions" in printed
     rows = StudyTable.read("table.parquet").rows
     assert set(rows["metric"].to_pylist()) == {"collective_return"}
     assert set(rows["part"].to_pylist()) == {"training", "evaluation", "random"}
-    first, second = pyarrow.csv.read_csv("table.csv").to_pylist()
-    assert (first["metric"], first["condition"], first["replicas"]) == (*words[3:4], "freeze_steps=5", 3)
-    assert (first["difference"], first["differs"]) == (None, False)
-    numbers = [second[name] for name in ("mean", "difference", "difference_low", "difference_high")]
-    assert numbers == pytest.approx([100 + 5 + 24.5, 5, -1.57, 11.57], abs=0.01)
+    means = [row for row in pyarrow.csv.read_csv("table.csv").to_pylist() if row["column"] != "replicas"]
+    assert [(row["row"], row["column"], row["replicas"]) for row in means] == [
+        ("freeze_steps=5", "collective return, apples", 3),
+        ("freeze_steps=25", "collective return, apples", 3),
+        ("freeze_steps=25", "collective return, apples", 3),
+    ]
+    assert [row["value"] for row in means] == pytest.approx([124.5, 100 + 5 + 24.5, 5])
+    assert (means[2]["low"], means[2]["high"]) == pytest.approx((-1.57, 11.57), abs=0.01)
+    assert "Differences from" not in means[1]["table"]
+    assert "+5.0 [$-$1.6, +11.6]" in Path("table.tex").read_text()
+    assert "+5.0 [-1.6, +11.6]" in Path("table.txt").read_text()
     assert "| freeze_steps=25 | 3 | +5.0 [-1.6, +11.6] |" in Path("table.md").read_text()
-    for out, message in (("table.md", "is not overwritten"), ("a.txt", r"a name that ends in \.parquet")):
+    for out, message in (("table.md", "is not overwritten"), ("a.pdf", r"a name that ends in \.parquet")):
         with pytest.raises(SystemExit, match=message):
             table_command(*words, out)
 
@@ -825,8 +846,8 @@ def test_the_last_episodes_are_those_of_each_replica():
     ]
     design = Design(name="small", conditions={"a": {}}, reference="a", is_paired=True)
     table = StudyTable(design=design, rows=pa.Table.from_pylist(rows), window=10)
-    compared = compare(table, "income", last=10)
-    assert compared.by_name["a"].values == {0: 3.0, 1: 5.0}
-    assert (compared.last, compared.by_name["a"].episodes) == ((3, 4), 7)
-    compared = compare(table, "income", last=14)
-    assert compared.by_name["a"].values == pytest.approx({0: (10 * 2.0 + 4 * 3.0) / 14, 1: 55 / 13})
+    assert values_of(table.windows(last=10), "income") == {"a": {0: 3.0, 1: 5.0}}
+    assert episodes_text(table, last=10) == "the last 3 to 4 episodes of training"
+    assert levels_of(table, ["income"], last=10)["a", "income"].episodes == 7
+    values = values_of(table.windows(last=14), "income")["a"]
+    assert values == pytest.approx({0: (10 * 2.0 + 4 * 3.0) / 14, 1: 55 / 13})

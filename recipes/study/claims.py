@@ -32,6 +32,7 @@ from cprl.measuring.statistics import difference, estimate
 from cprl.measuring.windows import running_mean
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.scripted import ScriptedActor
+from cprl.system.defaults import SEED
 
 Values = NDArray[np.float64]
 

@@ -55,7 +55,7 @@ def with_rule(factor: str, *, metric: str, is_there: bool) -> Contrast:
     cells = [levels for levels in design() if (levels["quota"] or levels["boundaries"]) == is_there]
     where = "where there is a quota or boundaries" if is_there else "where there is neither"
     return Contrast(
-        label=f"{factor} {where}, {'income' if metric == 'net' else 'survival, turns'}",
+        label=f"{factor} {where}, {'income' if metric == 'income' else 'survival, turns'}",
         study="together",
         metric=metric,
         more=[name(levels) for levels in cells if levels[factor]],

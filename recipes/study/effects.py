@@ -10,49 +10,38 @@ stand together. Monitoring and sanctions are in the game only where a quota or b
 the sixteen combinations: their effects here are not what they do there, see contrasts.py.
 """
 
-from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable
 from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
-import numpy as np
 import tyro
-from numpy.typing import NDArray
 from together import FACTORS, design, name
 
-from cprl.measuring.statistics import Estimate, estimate, holm
+from cprl.measuring.statistics import Estimate, Weights, contrasts, crossed, main_effect, mean_difference
 from cprl.studies import StudyTable
-from cprl.studies.tables.comparing import compare
 
 METRICS: Final = {"income": "income, apples", "survival_steps": "survival, turns"}
 
 
-def measured(table: StudyTable, metric: str, part: str = "training") -> NDArray[np.float64]:
-    """The mean of each replica, float [conditions, R], as in `design`."""
-    found = compare(table, metric, part=part).by_name
-    return np.array([found[name(levels)].defined for levels in design()])
-
-
-def effects(values: NDArray[np.float64]) -> dict[str, Estimate]:
-    """Each effect by its name: main effects, then groups of interactions of two factors.
-
-    Args:
-        values: float [conditions, R], in the order of `design`.
-    """
-    signs = {factor: np.array([1.0 if levels[factor] else -1.0 for levels in design()]) for factor in FACTORS}
-    groups: dict[tuple[float, ...], list[str]] = defaultdict(list)
+def effects() -> dict[str, Weights]:
+    """What each condition counts in each effect: main effects, then groups of interactions of two factors."""
+    levels = {name(one): one for one in design()}
+    signs = {
+        factor: main_effect({row: one[factor] for row, one in levels.items()}, True, False)
+        for factor in FACTORS
+    }
+    groups: dict[tuple[float, ...], list[str]] = {}
     for one, other in combinations(FACTORS, 2):
-        groups[tuple(signs[one] * signs[other])].append(f"{one} x {other}")
-    contrasts = signs | {" = ".join(names): np.array(column) for column, names in groups.items()}
-    half = len(values) / 2
-    return {label: estimate(column @ values / half) for label, column in contrasts.items()}
+        column = tuple(crossed(signs[one], signs[other]).values())
+        groups.setdefault(column, []).append(f"{one} x {other}")
+    signs |= {" = ".join(names): dict(zip(levels, column, strict=True)) for column, names in groups.items()}
+    return {label: mean_difference(column) for label, column in signs.items()}
 
 
-def marked(differences: Sequence[Estimate]) -> list[str]:
-    """Texts with signs, and with stars by Holm's method for all of them."""
-    stars = holm([difference.p_value for difference in differences])
-    return [f"{one:+}{'*' if star else ''}" for one, star in zip(differences, stars, strict=True)]
+def marked(differences: Iterable[Estimate]) -> list[str]:
+    """Texts with signs, and with stars where they differ by Holm's method."""
+    return [f"{one:+}{'*' * one.differs}" for one in differences]
 
 
 def main(
@@ -67,10 +56,12 @@ def main(
         study: the study's directory.
         part: the last 30 episodes of training, or fresh episodes of the agents at its end, frozen.
     """
-    table, columns = StudyTable.read(study / "table.parquet"), []
+    rows = StudyTable.read(study / "table.parquet").windows(part)
+    columns = []
     for metric in METRICS:
-        found = effects(measured(table, metric, part))
-        columns.append(dict(zip(found, marked(list(found.values())), strict=True)))
+        found = contrasts(rows, metric, "condition", effects())
+        labels = [label for label, _ in found]
+        columns.append(dict(zip(labels, marked(found.values()), strict=True)))
     print(f"| effect of | {' | '.join(METRICS.values())} |")
     print("|---|" + "---:|" * len(METRICS))
     for label in columns[0]:

@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 from possible import KNOWN
 
 from cprl.commons.colours import BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION
-from cprl.measuring.statistics import Estimate, difference, estimate
+from cprl.measuring.registry import METRICS
+from cprl.measuring.statistics import Estimate, difference, estimate, judged
 from cprl.runs.curves import as_curves, curves_of
 from cprl.runs.episodes import read_table
 from cprl.studies import StudyTable
-from cprl.studies.tables.comparing import compare
+from cprl.studies.tables.comparing import values_of as replicas_of
 from cprl.terminal import style
 from cprl.terminal.style import RANDOM_LINE
 
@@ -178,14 +179,17 @@ def values_of(
     study: str, condition: str, metric: str, part: Part = "training", last: int = LAST
 ) -> NDArray[np.float64]:
     """A metric of each replica; "income" is the income, and without money the harvest."""
-    table = table_of(study)
-    without_money = {"income": "collective_return", "income_equality": "equality"}
-    if metric in without_money:
-        found = None if metric not in table.metrics else compare(table, metric, part=part, last=last)
-        if found is not None and len(found.by_name[condition].defined):
-            return found.by_name[condition].defined
-        metric = without_money[metric]
-    return compare(table, metric, part=part, last=last).by_name[condition].defined
+    values = by_condition(study, metric, part, last).get(condition)
+    same_as = METRICS[metric].same_as
+    if not values and same_as is not None:
+        values = by_condition(study, same_as, part, last)[condition]
+    return np.array(list(values.values()))
+
+
+@cache
+def by_condition(study: str, metric: str, part: Part, last: int) -> dict[str, dict[int, float]]:
+    """A metric of each replica, by condition."""
+    return replicas_of(table_of(study).windows(part, last=last), metric)
 
 
 def nets(study: str, condition: str, part: Part = "training", last: int = LAST) -> NDArray[np.float64]:
@@ -349,7 +353,8 @@ def elsewhere_table(part: Part, last: Mapping[str, int]) -> list[str]:
 
 def changes(pairs: list[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> list[str]:
     """The difference of each, paired by replica, and the ratio; stars by Holm's method for all of these."""
-    texts = marked([difference(*pair, paired=True) for pair in pairs])
+    found = {(str(place),): difference(*pair, paired=True) for place, pair in enumerate(pairs)}
+    texts = marked(judged(found).values())
     ratios = [value.mean() / base.mean() for value, base in pairs]
     return [f"{text}, x {ratio:.1f}" for text, ratio in zip(texts, ratios, strict=True)]
 

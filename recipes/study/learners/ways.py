@@ -27,9 +27,9 @@ from cprl.algorithms import (
     RolloutSettings,
     TeamAlgorithm,
 )
+from cprl.measuring.statistics import estimates
 from cprl.population import AgentSpec, Learning, Team
 from cprl.studies import StudyTable
-from cprl.studies.tables.comparing import compare
 from cprl.system.output import say
 
 Board = Literal["two_complex", "commons"]
@@ -157,12 +157,14 @@ def winners(table: StudyTable) -> dict[str, str]:
     Candidates that were not trained are not chosen, which is said.
     """
     best: dict[str, tuple[float, str]] = {}
-    for own in compare(table, "collective_return", part="evaluation").conditions:
-        way, _, candidate = own.condition.partition(": ")
-        if own.estimate is None:
-            say(f"Not evaluated, and not chosen from: {own.condition}")
+    harvests = estimates(table.windows("evaluation"), "collective_return", by="condition")
+    for condition in table.design.conditions:
+        way, _, candidate = condition.partition(": ")
+        harvest = harvests.get((condition, "collective_return"))
+        if harvest is None:
+            say(f"Not evaluated, and not chosen from: {condition}")
         else:
-            best[way] = max(best.get(way, (float("-inf"), "")), (own.estimate.value, candidate))
+            best[way] = max(best.get(way, (float("-inf"), "")), (harvest.value, candidate))
     return {way: candidate for way, (_, candidate) in best.items()}
 
 

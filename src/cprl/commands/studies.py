@@ -373,12 +373,11 @@ def _say_result(result: "StudyResult", command: Sequence[str], last: int) -> Non
     """Prints the results of a study, and where they are; of trials that failed or are damaged why, where to
     look and what to do, and exits."""
     from cprl.studies.results import FIGURES
-    from cprl.studies.tables.comparing import cells, compare, metrics_of, of_finished
+    from cprl.studies.tables.comparing import cells, of_finished
     from cprl.terminal.tables import show
 
     if result.table is not None and result.table.metrics:
-        compared = [compare(result.table, metric, last=last) for metric in metrics_of(result.table)]
-        show([of_finished(cells(compared))])
+        show([of_finished(cells(result.table, last=last))])
         for figure in sorted((result.out / FIGURES).glob("*.png")):
             say(f"Figure: {figure}")
     say(result.out)

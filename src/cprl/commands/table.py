@@ -9,17 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import tyro
 
 from cprl.commands.flags import NO_DEFAULT
-from cprl.runs.files import refuse_to_write_over, write_atomically
+from cprl.runs.files import refuse_to_write_over
 from cprl.runs.recipe import runs_in
 from cprl.system.defaults import LAST, STUDY_TABLE, WINDOW
 from cprl.system.output import OUT, say
 
 if TYPE_CHECKING:
     from cprl.studies import StudyTable
-    from cprl.terminal.tables import Cells
 
 _TRAINING: Final = "training"
-_SUFFIXES: Final = (".parquet", ".csv", ".md")
+_SUFFIXES: Final = (".parquet", ".txt", ".md", ".tex", ".csv")
 Part = Literal["training", "evaluation", "random"]
 
 
@@ -47,7 +46,7 @@ def table(
     compare: Annotated[Compare, tyro.conf.arg(name="")] = Compare(),
     reference: str | None = None,
     window: int | None = None,
-    out: Path | None = None,
+    out: tyro.conf.UseAppendAction[tuple[Path, ...]] = (),
     csv: bool = False,
     summary: bool = False,
     figures: Literal["png", "pdf", "svg"] | None = None,
@@ -64,19 +63,19 @@ def table(
             the first, or the reference of the study.
         window: episodes of a row of the table, of which --last compares whole ones, 10 by default; 1 for
             episodes one by one; with --by.
-        out: a new file: .md or .csv with the means, differences and intervals that are printed, or .parquet
-            with every window of episodes and replica, of the metrics asked for.
+        out: a new file: .txt, .md, .tex or .csv with the means, differences and intervals that are printed,
+            or .parquet with every window of episodes and replica, of the metrics asked for; may be repeated.
         csv: print every window of episodes, replica and metric as CSV, and nothing else.
         summary: write summary.md and the figures of a study again, from its table alone.
         figures: draw the figures of a study into its figures/ as png, pdf or svg, of the metrics asked for.
     """
-    if out is not None:
-        if out.suffix not in _SUFFIXES:
-            raise ValueError(f"--out is {out}; allowed: a name that ends in {', '.join(_SUFFIXES)}")
-        refuse_to_write_over(out)
+    for path in out:
+        if path.suffix not in _SUFFIXES:
+            raise ValueError(f"--out is {path}; allowed: a name that ends in {', '.join(_SUFFIXES)}")
+        refuse_to_write_over(path)
     if csv:
         given = {"out": out, "summary": summary, "figures": figures, "reference": reference, **vars(compare)}
-        defaults = {"summary": False, **vars(Compare())}
+        defaults = {"out": (), "summary": False, **vars(Compare())}
         for name, value in given.items():
             if value != defaults.get(name):
                 raise ValueError(
@@ -102,9 +101,10 @@ def table(
         _exit_if_damaged(study_table)
         return
 
+    from cprl.measuring.table import where
     from cprl.studies.tables.comparing import compared_cells, of_finished
     from cprl.studies.tables.effects import effect_cells
-    from cprl.terminal.tables import show
+    from cprl.terminal.tables import show, write
 
     last = LAST if compare.last is None else compare.last
     compared = compared_cells(study_table, compare.metric, part=compare.part, last=last)
@@ -120,9 +120,14 @@ def table(
 
         for path in draw(study_table, runs[0], last=last, suffix=f".{figures}", metrics=compare.metric):
             say(f"Figure: {path}")
-    if out is not None:
-        _write(study_table, [*compared, *effects], compare, last, out)
-        say(f"Written: {out}")
+    for path in out:
+        if path.suffix == ".parquet":
+            rows = study_table.rows
+            chosen = compare.metric or study_table.metrics
+            replace(study_table, rows=where(rows, metric=tuple(chosen))).write(path)
+        else:
+            write([*compared, *effects], path, notes=str(study_table).split("\n"))
+        say(f"Written: {path}")
     _exit_if_damaged(study_table)
 
 
@@ -150,27 +155,3 @@ def _table_in(runs: Sequence[Path], reference: str | None, window: int | None) -
         names = ", ".join(list(table.design.conditions)[:10])
         raise ValueError(f"--reference is {reference}; allowed: the name of a condition: {names}")
     return replace(table, design=replace(table.design, reference=reference))
-
-
-def _write(table: "StudyTable", compared: "Sequence[Cells]", choice: Compare, last: int, out: Path) -> None:
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
-    from cprl.studies.tables.comparing import compare, compared_rows, metrics_of
-    from cprl.studies.tables.table import csv_of
-    from cprl.terminal.tables import markdown
-
-    if out.suffix == ".parquet":
-        chosen = table.rows.filter(pc.is_in(table.rows["metric"], pa.array(choice.metric or table.metrics)))
-        replace(table, rows=chosen).write(out)
-        return
-    if out.suffix == ".csv":
-        metrics = metrics_of(table, choice.metric, part=choice.part)
-        content = csv_of(
-            compared_rows([compare(table, metric, part=choice.part, last=last) for metric in metrics])
-        )
-    else:
-        lines = [line for cells in compared for line in (cells.heading, "", *markdown(cells))]
-        content = "\n".join([*lines, *str(table).split("\n"), ""])
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(out, lambda file: file.write(content.encode()))

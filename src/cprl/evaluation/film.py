@@ -108,7 +108,8 @@ def _recorded(fresh: FreshEpisode, target: Path, title: str) -> Episode:
             )
             if commons is not None and scene.has_institutions:
                 views.append(Offences(logger, commons, names=scene.agents))
-        observer, tracker = Observer(views, env), tracker_of(env)
+        observer = Observer(views, env)
+        tracker = tracker_of(env)
         for step, batch in enumerate(turns(env, fresh.policies), start=1):
             observer.on_step(batch)
             for event in (*_tags_in(batch), *events(batch)):

@@ -3,9 +3,7 @@
 import json
 import re
 from base64 import b64encode
-from collections.abc import Mapping
 from html import escape
-from math import isnan
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -17,28 +15,17 @@ from cprl.commons.readable import growth_of, meaning_of, rule_of, tag_of
 from cprl.evaluation.evaluate import evaluate_run
 from cprl.evaluation.fresh import fresh_episode
 from cprl.evaluation.show import Page, page, shown
-from cprl.measuring.registry import INCOME, title, unit
-from cprl.measuring.statistics import Estimate, form_for
 from cprl.measuring.windows import Values
 from cprl.population import learned
 from cprl.runs.curves import curves_of
-from cprl.studies.results import SUMMARY
-from cprl.studies.tables.comparing import (
-    Family,
-    Place,
-    compare,
-    differences_in,
-    family_of,
-    metrics_of,
-)
-from cprl.studies.tables.effects import effects_of, estimated
-from cprl.studies.tables.table import EVALUATION, StudyTable
+from cprl.studies.results import SUMMARY, answer_of
+from cprl.studies.tables.table import StudyTable
 from cprl.system.defaults import SEED, STUDY_TABLE, Fresh
 from cprl.system.output import legible
 from cprl.system.working import working
 from cprl.terminal.figures import training_curve
 from cprl.terminal.summary import compared
-from cprl.terminal.tables import cell, markdown
+from cprl.terminal.tables import markdown
 from cprl.training.agents import LoadedRun, load
 from cprl.training.course import course_of
 
@@ -93,8 +80,11 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
         before.append("  \n".join([*facts, f"**{meaning}**"]))
     before.append(f"{learned(run.specs)}, {run.experiment.trained_for}.")
     before.append(run.experiment.own_code)
-    page_of_numbers = compared(played, "", names={"trained": "run's agents"})
-    after = ["## Fresh episodes, beside random play", "", *markdown(page_of_numbers)]
+    after = [
+        "## Fresh episodes, beside random play",
+        "",
+        *markdown(compared(played, "", names={"trained": "run's agents"})),
+    ]
     after += [
         "These episodes were played for this page, in other worlds than those above, so that means differ by "
         f"chance. The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`."
@@ -167,7 +157,7 @@ def _of_study(folder: Path) -> str:
     table = StudyTable.read(folder / STUDY_TABLE)
     summary = (folder / SUMMARY).read_text(encoding="utf-8")
     title, _, rest = summary.partition("\n")
-    answer = _answer(table)
+    answer = answer_of(table)
     head, found, tail = rest.partition("\n## ")
     text = f"{head}\n\n**Answer.** {answer}\n{found}{tail}" if answer else rest
 
@@ -178,70 +168,6 @@ def _of_study(folder: Path) -> str:
 
     body = re.sub(r'<p><img src="([^"]*)" alt="([^"]*)"\s*/?></p>', picture, _html(text))
     return page(legible(title.lstrip("# ")), body)
-
-
-def _answer(table: StudyTable) -> str:
-    """Return what differs in the episodes of the evaluation: of a grid the effects of its factors, else
-    conditions from the reference; "" without any.
-
-    It is about income where money moves, and then about the harvest too; else about the first metric.
-    """
-    if not table.metrics or len(table.design.conditions) < 2:
-        return ""
-    metrics = metrics_of(table, part=EVALUATION)
-    comparisons = {metric: compare(table, metric, part=EVALUATION) for metric in metrics}
-    has_income = {INCOME, "collective_return"} <= set(metrics)
-    compared = (
-        {INCOME: _INCOME, "collective_return": _HARVEST} if has_income else {metrics[0]: title(metrics[0])}
-    )
-    unit_of = "apples" if has_income else unit(metrics[0])
-    first = comparisons[metrics[0]]
-    beside = f"beside {cell(first.reference)}, {first.pairing_text}"
-    family = family_of(differences_in(list(comparisons.values())))
-    tests = f"{family.tests} differences of their table below"
-    parts = []
-    for metric, words in compared.items():
-        differences = differences_in([comparisons[metric]])
-        if effects_of(table):
-            effects = estimated(table, comparisons[metric])
-            differences = {(metric, name): one for name, one in effects.estimates.items()}
-            family = effects.family
-            beside = "effects of each factor over all cells of the grid, paired by replica"
-            tests = f"{family.tests} effects on a metric"
-        parts += [f"- {words}:", *_said(differences, family, unit_of)]
-    what = f"In {first.episodes_text}, {beside}"
-    what += f"; by Holm's method for the {tests}:" if family.tests else ":"
-    return "\n".join([what, "", *parts])
-
-
-_INCOME: Final = "**Income** of all agents together (harvest - fines + transfers), apples"
-_HARVEST: Final = "**Harvest** (collective return), apples"
-_NONE: Final = "no difference shown"
-_ALONE: Final = "not shown among so many, though it would be alone"
-_UNTOLD: Final = "cannot be told, as one replica has no interval"
-
-
-def _said(differences: Mapping[Place, Estimate | None], family: Family, unit_of: str) -> list[str]:
-    """Lines on which differences are more and less than 0; of those not shown, how large one would have to
-    be."""
-    said: dict[str, list[str]] = {kind: [] for kind in ("more", "less", _NONE, _ALONE, _UNTOLD)}
-    for place, one in differences.items():
-        if one is None:
-            continue
-        text = f"{cell(place[1])} {one:+}"
-        half = (one.high - one.low) / 2
-        if place in family.marked:
-            kind = "more" if one.value > 0 else "less"
-        elif isnan(half):
-            kind = _UNTOLD
-        elif abs(one.value) > half:
-            kind = _ALONE
-        else:
-            kind = _NONE
-            size = f"{half:{form_for(one.value, one.low, one.high)}} {unit_of}".rstrip()
-            text += f" (differences below {size} would not show)" if half else ""
-        said[kind].append(text)
-    return [f"  - {kind}: {'; '.join(texts)}" for kind, texts in said.items() if texts]
 
 
 def _html(text: str) -> str:

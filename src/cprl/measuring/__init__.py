@@ -8,7 +8,6 @@ Modules, in the order in which one reads them:
     table         tidy tables of episodes: their rows, labels and numbers
     windows       means over windows of episodes, in which every world counts alike
     statistics    estimates over replicas and differences, with intervals by Student's t, and Holm's families
-    played        estimates of episodes by replica
     series        numbers while a training runs
     outcome       how a training goes, and how it went
     movement      where agents go, which cells they share or keep, and who tags whom

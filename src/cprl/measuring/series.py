@@ -177,32 +177,20 @@ def mean_of(values: Values) -> float:
 
 
 class Recent:
-    """The mean of the last values: of a share of those so far, but of `least` at least.
+    """The mean of the last values.
 
     Args:
-        least: how many episodes at least; with fewer, the mean is that of all.
-        share: of the values so far, 0..1; 0 for a window of always `least`.
+        episodes: how many episodes it is of; with fewer, of all.
         each: the number of episodes that each value is the mean of.
     """
 
-    def __init__(self, least: int, *, share: float = 0.0, each: int = 1) -> None:
-        self.least = ceil(least / each)
-        """Values at least."""
-        self.share = share
-        self.count = 0
-        """Values so far."""
-        self._last: deque[float] = deque()
-
-    @property
-    def window(self) -> int:
-        """How many values the mean is of, at most."""
-        return max(self.least, ceil(self.share * self.count))
+    def __init__(self, episodes: int, *, each: int = 1) -> None:
+        self.window = ceil(episodes / each)
+        """How many values it is of, at most."""
+        self._last: deque[float] = deque(maxlen=self.window)
 
     def add(self, value: float) -> float:
         """Adds a value; returns the mean of the last ones that are defined, NaN if none is."""
-        self.count += 1
         self._last.append(float(value))
-        while len(self._last) > self.window:
-            self._last.popleft()
         defined = [value for value in self._last if not isnan(value)]
         return fmean(defined) if defined else float("nan")

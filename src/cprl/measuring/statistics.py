@@ -68,6 +68,17 @@ class Estimate:
         return replace(self, value=0.0 - self.value, low=-self.high, high=-self.low, bounds=bounds_of_it)
 
     @property
+    def reach(self) -> float:
+        """How far its interval goes on each side: of a difference, the smallest that so many replicas with as
+        much spread would have told from 0 at 5 %, alone; NaN for a single replica."""
+        return (self.high - self.low) / 2
+
+    def is_within(self, margin: float) -> bool:
+        """Return whether the interval of a difference lies within a margin that was said beforehand on both
+        sides of 0, so that the two are equivalent."""
+        return -margin < self.low and self.high < margin
+
+    @property
     def is_cut(self) -> bool:
         return self.interval != (self.low, self.high) and not isnan(self.low)
 
@@ -256,12 +267,16 @@ class Family(Mapping[Key, Estimate]):
         estimates: by their keys, in the order of pages.
         by: the names of the labels.
         name: of differences, which they are, e.g. "differences from random".
+        tests: how many differences were tested together; one that two numbers have in common counts once.
     """
 
-    def __init__(self, estimates: Mapping[Key, Estimate], by: Sequence[str] = (), name: str = "") -> None:
+    def __init__(
+        self, estimates: Mapping[Key, Estimate], by: Sequence[str] = (), name: str = "", tests: int = 0
+    ) -> None:
         self._estimates = dict(estimates)
         self.by = tuple(by)
         self.name = name
+        self.tests = tests
 
     def __getitem__(self, key: Key | str) -> Estimate:
         return self._estimates[key if isinstance(key, tuple) else (key,)]
@@ -286,9 +301,24 @@ class Family(Mapping[Key, Estimate]):
         """The names of its numbers, each once, in order."""
         return list(dict.fromkeys(key[-1] for key in self))
 
+    def changed(self, change: Callable[[Key, Estimate], Estimate]) -> "Family":
+        """Return the same family of changed estimates, e.g. of other bounds."""
+        estimates = {key: change(key, one) for key, one in self.items()}
+        return Family(estimates, self.by, self.name, self.tests)
+
     def of(self, *labels: Any) -> dict[str, Estimate]:
         """Return the estimates with these labels by number."""
         return {key[-1]: one for key, one in self.items() if key[:-1] == labels}
+
+    def note(self, of: str) -> str:
+        """Return what bold means; `of` says where these differences stand, e.g. "of this table"."""
+        number = f"the {self.tests} differences" if self.tests != 1 else "the one difference"
+        told = sum(not isnan(one.p_value) for one in self.values())
+        once = ", of which those that two columns have in common count once" if told > self.tests else ""
+        return (
+            f"Bold: not 0 by Holm's method for {number} {of}{once} (two-sided t-tests, "
+            f"{1 - CONFIDENCE:.0%} for all together); intervals are of single comparisons."
+        )
 
     def table(self) -> pa.Table:
         """Return a row for each estimate: its labels, "number", and the fields of `Estimate`, null where
@@ -376,6 +406,63 @@ def differences(
     return judged(found, keys, family)
 
 
+Weights = Mapping[Any, float]
+"""What the rows of a contrast count in it, by their labels; together 0. Of one label, its value alone."""
+
+
+def contrasts(
+    table: pa.Table,
+    numbers: Sequence[str] | str,
+    by: Sequence[str] | str,
+    weights: Mapping[str, Weights],
+    *,
+    family: str = "",
+) -> Family:
+    """Return weighted sums of numbers within each replica, by the name of the contrast and the number, over
+    the replicas that have a value in each row that counts.
+
+    Args:
+        table, numbers, by: as in `estimates`.
+        weights: by the name of each contrast, see `mean_difference`.
+        family: what the contrasts of this call are, which Holm's method judges all together.
+    """
+    keys = (by,) if isinstance(by, str) else tuple(by)
+    found: dict[Key, Estimate] = {}
+    for number in [numbers] if isinstance(numbers, str) else numbers:
+        samples = _samples(table, number, keys)
+        for name, of_rows in weights.items():
+            parts = [
+                (weight, samples.get(labels if isinstance(labels, tuple) else (labels,), _NOTHING).values)
+                for labels, weight in of_rows.items()
+                if weight
+            ]
+            replicas = sorted(set.intersection(*(set(values) for _, values in parts)))
+            sums = [sum(weight * values[replica] for weight, values in parts) for replica in replicas]
+            if sums:
+                found[name, number] = estimate_if_finite(sums)
+    return judged(found, ["contrast"], family)
+
+
+def main_effect(levels: Mapping[Any, Any], level: Any, first: Any) -> Weights:
+    """Return the signs of rows in the effect of a factor: 1 at a level, -1 at the one it is compared with.
+
+    Args:
+        levels: the level of each row, by its labels.
+    """
+    return {row: float(at == level) - float(at == first) for row, at in levels.items()}
+
+
+def crossed(one: Weights, other: Weights) -> Weights:
+    """Return the signs of rows in the interaction of two effects: the products of theirs."""
+    return {row: sign * other[row] for row, sign in one.items()}
+
+
+def mean_difference(signs: Weights) -> Weights:
+    """Return the weights of the mean over rows of sign 1 minus that over as many rows of sign -1."""
+    rows = sum(sign > 0 for sign in signs.values())
+    return {row: sign / rows for row, sign in signs.items()}
+
+
 class _Sample(NamedTuple):
     """A number of some replicas."""
 
@@ -404,6 +491,9 @@ class _Sample(NamedTuple):
         return difference(*samples, paired=False) if all(samples) else None
 
 
+_NOTHING: Final = _Sample({}, 0, 0)
+
+
 def _samples(table: pa.Table, number: str, by: Sequence[str]) -> dict[Labels, _Sample]:
     """Return a number of the replicas of each choice of labels."""
     samples: dict[Labels, _Sample] = {}
@@ -412,7 +502,7 @@ def _samples(table: pa.Table, number: str, by: Sequence[str]) -> dict[Labels, _S
         *(rows[name] for name in (*by, "replica", "value", "episodes", "undefined")), strict=True
     ):
         *key, replica, value, episodes, undefined = labels
-        before = samples.get(tuple(key), _Sample({}, 0, 0))
+        before = samples.get(tuple(key), _NOTHING)
         values = before.values if value is None else {**before.values, replica: value}
         samples[tuple(key)] = _Sample(values, before.episodes + episodes, before.undefined + undefined)
     return samples
@@ -434,7 +524,7 @@ def judged(found: Mapping[Key, Estimate], by: Sequence[str] = (), name: str = ""
     differ = holm([found[key].p_value for key in tests])
     marked = {key for keys, is_apart in zip(tests.values(), differ, strict=True) if is_apart for key in keys}
     told = {key: replace(one, differs=key in marked) for key, one in found.items()}
-    return Family(told, by, name or f"these {len(tests)} differences")
+    return Family(told, by, name or f"these {len(tests)} differences", len(tests))
 
 
 _ROUNDING: Final = 1e-6

@@ -6,7 +6,7 @@ random play in the worlds of the evaluation.
 """
 
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import combinations
 from math import isclose, nan
@@ -15,42 +15,31 @@ from typing import Any, Final
 
 import matplotlib
 import numpy as np
+import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize, to_hex
 from matplotlib.ticker import NullLocator
 
 from cprl.measuring.outcome import DECLINE, HARVESTING, NO_BETTER, RECOVERY, TRAGEDY
-from cprl.measuring.registry import bounds
-from cprl.measuring.statistics import Estimate, curve_interval, form_for
-from cprl.measuring.windows import SMOOTHED_EPISODES, running_mean
+from cprl.measuring.registry import COLLECTIVE_RETURN, bounds, title
+from cprl.measuring.statistics import Estimate, Family, curve_interval, form_for
+from cprl.measuring.table import where
+from cprl.measuring.windows import SMOOTHED_EPISODES, Values, running_mean
 from cprl.studies.tables.comparing import (
     INTERVALS,
-    Compared,
-    Comparison,
     Kind,
-    Place,
-    compare,
-    differences_in,
-    family_of,
+    capitalised,
+    differences_of,
+    episodes_text,
+    levels_of,
     measures_of,
-    metric_title,
     metrics_of,
+    pairing_text,
+    values_of,
 )
-from cprl.studies.tables.table import RANDOM, TRAINING, Design, StudyTable
-from cprl.system.defaults import LAST
-from cprl.terminal.style import (
-    CHARACTER,
-    DASHES,
-    EMPTY,
-    MEAN,
-    RANDOM_LINE,
-    SHADES,
-    Sheet,
-    Width,
-    draw_cell,
-    drawing,
-    wrapped,
-)
+from cprl.studies.tables.table import LAST, RANDOM, TRAINING, Design, StudyTable
+from cprl.terminal.panels import draw_cells, draw_dots, draw_line, draw_matrix, width_of_cells
+from cprl.terminal.style import CHARACTER, DASHES, EMPTY, RANDOM_LINE, SHADES, Width, drawing, wrapped
 from cprl.values import refusal
 
 MOST_CONDITIONS: Final = 60
@@ -88,10 +77,10 @@ def figures_of(
         words, what = "_".join(map(_file_name, pair)), " and ".join(pair)
         for metric in metrics_of(table, metrics)[:_MAPPED]:
             draw = partial(heat_map, table, pair, metric=metric, last=last)
-            yield f"map_{words}_{_file_name(metric)}{suffix}", f"{metric_title(metric)} by {what}", draw
+            yield f"map_{words}_{_file_name(metric)}{suffix}", f"{title(metric)} by {what}", draw
         if len({next(iter(counts)) for counts in table.endings.values()}) > 1:
-            title = f"In which phase most replicas end, by {what}"
-            yield f"phases_{words}{suffix}", title, partial(phase_diagram, table, pair)
+            what = f"In which phase most replicas end, by {what}"
+            yield f"phases_{words}{suffix}", what, partial(phase_diagram, table, pair)
 
 
 DRAWN: Final = re.compile(r"(by_|map_|phases|levels|differences|courses).*\.(png|pdf|svg)")
@@ -133,25 +122,47 @@ def by_factor(
     if factor not in numeric:
         allowed = ", ".join(numeric) or "none, as no factor has levels that are numbers"
         raise refusal("factor", factor, allowed)
-    comparisons = [compare(table, metric, last=last) for metric in _chosen(table, metrics)]
-    lines, others = _lines(table, factor), [name for name in design.factors if name != factor]
+    chosen = _chosen(table, metrics)
+    levels = levels_of(table, chosen, last=last)
+    rows = table.windows(last=last)
+    lines = _lines(table, factor)
+    others = [name for name in design.factors if name != factor]
     only = [design.conditions[names[0]][others[0]] for names in lines.values()] if len(others) == 1 else []
     colours = colours_of(list(lines), only or range(len(lines)))
     level_of = {name: design.conditions[name][factor] for name in finished(table)}
     places, is_even = places_of(level_of.values())
+    place_of = {name: places[level] for name, level in level_of.items()}
     with drawing(path, width=width) as sheet:
-        columns = sheet.fitting(min(len(comparisons), 3), 16)
-        panels = sheet.panels(len(comparisons), columns=columns, high=19, sharex=True)
-        for axes, comparison in zip(panels, comparisons, strict=True):
-            _draw_levels(axes, table, comparison, lines, colours, {n: places[level_of[n]] for n in level_of})
+        columns = sheet.fitting(min(len(chosen), 3), 16)
+        panels = sheet.panels(len(chosen), columns=columns, high=19, sharex=True)
+        for axes, metric in zip(panels, chosen, strict=True):
+            of_metric = {name: levels[name, metric] for name in place_of if (name, metric) in levels}
+            values = values_of(rows, metric)
+            for label, names in lines.items():
+                shown = [name for name in names if name in of_metric]
+                at = [place_of[name] for name in shown]
+                is_joined = design.is_grid and len(set(at)) == len(at)
+                draw_dots(
+                    axes,
+                    at,
+                    [of_metric[name] for name in shown],
+                    replicas=[list(values[name].values()) for name in shown],
+                    color=colours[label],
+                    label=label or "mean and interval",
+                    linestyle="-" if is_joined else "none",
+                )
+            _draw_chance_of_lines(axes, table, metric, lines, colours, place_of)
+            bottom, top = axes.get_ylim()
+            if bounds(metric)[0] == 0 and bottom < top / 2:
+                axes.set_ylim(0, None)
             _scale(axes, places, _replicas_by_level(table, factor), is_even=is_even)
-            axes.set_title(title_of(comparison))
+            axes.set_title(_title_of(metric, of_metric.values()))
         for axes in panels[-columns:]:
             axes.tick_params(labelbottom=True)
             axes.set_xlabel(f"{short(factor)}, at equal distances" if is_even else short(factor))
         sheet.title = f"{design.name}: outcome by {short(factor)}"
         sheet.caption = (
-            f"{replicas_text(table.replicas)}. {levels_note(comparisons[0])} Faint: single replicas."
+            f"{replicas_text(table.replicas)}. {_levels_note(table, last)} Faint: single replicas."
             f"{_not_run(table)}"
         )
         if others and list(lines) == [""]:
@@ -159,39 +170,31 @@ def by_factor(
     return Path(path)
 
 
-def _draw_levels(
+def _draw_chance_of_lines(
     axes: Axes,
     table: StudyTable,
-    comparison: Comparison,
+    metric: str,
     lines: Mapping[str, Sequence[str]],
     colours: Mapping[str, str],
     places: Mapping[str, float],
 ) -> None:
-    """Draw a metric of conditions at their places, those of a line joined, and random play."""
-    chance = _chance(table, comparison.metric)
+    """Draw random play under the conditions of each line; one for all where it depends on the level alone."""
+    chance = _chance(table, metric)
     by_place: dict[float, list[float]] = {}
     for name in chance:
         by_place.setdefault(places[name], []).append(chance[name])
     is_same = all(map(is_one, by_place.values()))
+    if not chance or not (is_same or len(lines) > 1):
+        return
     for label, names in lines.items():
         at = [places[name] for name in names]
-        style = "-" if table.design.is_grid and len(set(at)) == len(at) else "none"
-        for place, name in zip(at, names, strict=True):
-            compared = comparison.by_name[name]
-            _draw_spread(axes, place, compared.defined, compared.estimate, colours[label])
-        estimates = [comparison.by_name[name].estimate for name in names]
-        means = [nan if estimate is None else estimate.value for estimate in estimates]
-        look: dict[str, Any] = {"marker": "o", "linestyle": style, "linewidth": 1.4, "zorder": 4}
-        axes.plot(at, means, color=colours[label], label=label or "mean and interval", **look)
-        if is_same or len(lines) > 1:
-            look = RANDOM_LINE if is_same else {**RANDOM_LINE, "color": colours[label]}
-            look = look if style == "-" else {**look, "linestyle": "none"}
-            axes.plot(at, [chance.get(name, nan) for name in names], marker="_", markersize=9, **look)
-    if chance and (is_same or len(lines) > 1):
-        axes.plot([], [], label=CHANCE, **RANDOM_LINE)
-    bottom, top = axes.get_ylim()
-    if bounds(comparison.metric)[0] == 0 and bottom < top / 2:
-        axes.set_ylim(0, None)
+        look = {**RANDOM_LINE, "marker": "_", "markersize": 9}
+        if not is_same:
+            look["color"] = colours[label]
+        if not table.design.is_grid or len(set(at)) < len(at):
+            look["linestyle"] = "none"
+        axes.plot(at, [chance.get(name, nan) for name in names], **look)
+    axes.plot([], [], label=CHANCE, **RANDOM_LINE)
 
 
 def places_of(levels: Iterable[float]) -> tuple[dict[float, float], bool]:
@@ -283,60 +286,76 @@ def by_condition(
     if not 0 < len(conditions) <= MOST_CONDITIONS:
         raise refusal("table", table, f"1 to {MOST_CONDITIONS} conditions, not {len(conditions)}")
     chosen = _chosen(table, metrics) if is_levels else metrics_of(table, metrics)
-    comparisons = [compare(table, metric, last=last) for metric in chosen]
-    first = comparisons[0]
+    family = (levels_of if is_levels else differences_of)(table, chosen, last=last)
+    levels = family if is_levels else levels_of(table, chosen, last=last)
+    rows = table.windows(last=last)
     with drawing(path, width=width) as sheet:
         names = {
             name: wrapped(word, min(_NAME, 0.3 * sheet.width_em)) for name, word in names_of(table).items()
         }
         lines = [names[name].count("\n") + 1 for name in conditions]
         row = _LINE * max(*lines, 1) + 0.8
-        columns = sheet.fitting(len(comparisons), 12.5)
+        columns = sheet.fitting(len(chosen), 12.5)
         high = row * len(conditions) + 7
         beside = CHARACTER * max(len(line) for name in conditions for line in names[name].splitlines())
-        panels = sheet.panels(len(comparisons), columns=columns, high=high, beside=beside, sharey=True)
-        for axes, comparison in zip(panels, comparisons, strict=True):
-            chance = _chance(table, comparison.metric) if is_levels else {}
-            for place, name in enumerate(conditions):
-                _draw_row(axes, place, comparison.by_name[name], kind)
-                if name in chance:
-                    look = {**RANDOM_LINE, "linestyle": (0, (2, 1))}
-                    axes.plot([chance[name]] * 2, [place - 0.42, place + 0.42], **look)
-            if not is_levels:
+        panels = sheet.panels(len(chosen), columns=columns, high=high, beside=beside, sharey=True)
+        for axes, metric in zip(panels, chosen, strict=True):
+            values = values_of(rows, metric) if is_levels else {}
+            _draw_rows(axes, conditions, metric, family, values)
+            if is_levels:
+                _draw_chance_of_rows(axes, conditions, _chance(table, metric))
+            else:
                 axes.axvline(0, **RANDOM_LINE)
                 if axes.dataLim.width < _NO_WIDTH:
                     axes.set_xlim(-1, 1)
-            axes.set_title(title_of(comparison))
+            axes.set_title(_title_of(metric, [one for key, one in levels.items() if key[1] == metric]))
             axes.set_yticks(range(len(conditions)), [names[name] for name in conditions])
             axes.locator_params(axis="x", nbins=3)
             axes.grid(axis="y", color="#e6e6e6", linewidth=0.6)
         panels[0].set_ylim(len(conditions) - 0.4, -0.6)
         by = short(design.factors[0]) if len(design.factors) == 1 else "condition"
-        sheet.title, note = f"{design.name}: outcome by {by}", levels_note(first)
-        note += " Faint: single replicas. Dashed: random play."
+        sheet.title = f"{design.name}: outcome by {by}"
+        note = f"{_levels_note(table, last)} Faint: single replicas. Dashed: random play."
         if not is_levels:
             sheet.title = f"{design.name}: difference from {' '.join(design.reference.splitlines())}"
-            pairing = f"{first.pairing_text[0].upper()}{first.pairing_text[1:]}"
-            note = f"{pairing}; means of {first.episodes_text}; {INTERVALS}."
+            pairing = capitalised(pairing_text(table))
+            note = f"{pairing}; means of {episodes_text(table, last=last)}; {INTERVALS}."
         sheet.caption = f"{replicas_text(table.replicas)}. {note}{_not_run(table)}"
     return Path(path)
 
 
-def _draw_row(axes: Axes, place: int, compared: Compared, kind: Kind) -> None:
-    mean = compared.estimate if kind == "levels" else compared.difference
-    if mean is None:
-        why = "undefined" if compared.estimate is None else "no pairs"
+def _draw_rows(
+    axes: Axes,
+    conditions: Sequence[str],
+    metric: str,
+    family: Family,
+    values: Mapping[str, Mapping[int, float]],
+) -> None:
+    """Draw a metric of conditions one below the other, and why some have no number."""
+    shown: dict[int, Estimate] = {}
+    for place, name in enumerate(conditions):
+        one = family.get((name, metric))
+        if one is not None and one.replicas:
+            shown[place] = one
+            continue
+        why = "no pairs" if one is None else "undefined"
         box = {"facecolor": "white", "edgecolor": "none", "pad": 1}
         middle: dict[str, Any] = {"ha": "center", "va": "center", "transform": axes.get_yaxis_transform()}
         axes.text(0.5, place, why, bbox=box, **middle)
-        return
-    _draw_spread(axes, place, compared.defined if kind == "levels" else [], mean, MEAN, across=True)
-    axes.plot([mean.value], [place], "o", color=MEAN, markersize=6, zorder=4)
+    replicas = [list(values.get(conditions[place], {}).values()) for place in shown]
+    draw_dots(axes, list(shown), list(shown.values()), replicas=replicas, across=True)
+
+
+def _draw_chance_of_rows(axes: Axes, conditions: Sequence[str], chance: Mapping[str, float]) -> None:
+    for place, name in enumerate(conditions):
+        if name in chance:
+            look = {**RANDOM_LINE, "linestyle": (0, (2, 1))}
+            axes.plot([chance[name]] * 2, [place - 0.42, place + 0.42], **look)
 
 
 # Courses
 
-_USUAL: Final = ("collective_return", "survival_steps")
+_USUAL: Final = (COLLECTIVE_RETURN, "survival_steps")
 """Metrics whose courses are drawn unless something else is asked for."""
 _PART: Final = 20
 """A running mean takes in at most one part in so many of a training, so that short ones keep their course."""
@@ -382,7 +401,7 @@ def courses(
         for axes, (metric, of_panel, lines) in zip(panels, views, strict=True):
             windows |= _draw_courses(axes, table, metric, lines, is_dashed=is_dashed)
             _draw_chance(axes, table, metric, {name: lines[name][0] for name in of_panel}, is_together)
-            axes.set_title(metric_title(metric) if is_together else names[of_panel[0]])
+            axes.set_title(title(metric) if is_together else names[of_panel[0]])
         for axes in panels[-columns:]:
             axes.tick_params(labelbottom=True)
             axes.set_xlabel("episode")
@@ -390,7 +409,7 @@ def courses(
             if all(axes.dataLim.y0 >= 0 for axes in group):
                 group[0].set_ylim(0, None)
         sheet.legend_title = short(factor) if factor is not None and is_together else ""
-        what = "course of the training" if is_together else metric_title(chosen[0])
+        what = "course of the training" if is_together else title(chosen[0])
         sheet.title = f"{design.name}: {what}"
         over = f"{min(windows)} to {max(windows)}" if len(windows) > 1 else f"{max(windows)}"
         smoothed = (
@@ -422,25 +441,42 @@ def _draw_courses(
     """Draw the courses of conditions, each of a colour and with a label, and return over how many episodes
     their running means are."""
     windows = set()
+    training = table.windows(TRAINING, last=None)
     for place, (name, (colour, label)) in enumerate(lines.items()):
-        grid = table.values(name, metric, TRAINING)
-        if grid is None:
+        rows = where(training, condition=name, metric=metric)
+        if not len(rows):
             continue
-        lengths = grid["window_episodes"]
-        length, episodes = int(lengths.max()), int(lengths.sum(1).min())
+        starts, lengths, values = _windows_of(rows)
+        length = int(lengths.max())
+        episodes = min(sum(of_replica) for of_replica in _lists(rows, "window_episodes"))
         is_whole = (lengths == length).all(0)  # those that all replicas have
         count = max(1, min(SMOOTHED_EPISODES, episodes // _PART) // length)
-        middles = (grid["episode"][0, is_whole] + (length - 1) / 2).astype(np.float64)
+        middles = (starts[0, is_whole] + (length - 1) / 2).astype(np.float64)
         at = running_mean(middles, count)
-        middle, low, high = curve_interval(running_mean(grid["value"][:, is_whole], count))
-        axes.fill_between(at, low, high, color=colour, alpha=0.2, linewidth=0)
+        curve = curve_interval(running_mean(values[:, is_whole], count))
         label = " ".join(label.splitlines())
         label = f"\N{ZERO WIDTH SPACE}{label}" if label.startswith("_") else label  # matplotlib would hide it
         dash = DASHES[place % len(DASHES)] if is_dashed and len(lines) > 2 else "-"
         dot = "." if len(at) < 3 else None
-        axes.plot(at, middle, color=colour, linewidth=2, linestyle=dash, marker=dot, label=label)
+        draw_line(axes, at, curve, color=colour, linestyle=dash, marker=dot, label=label)
         windows.add(min(count, int(is_whole.sum())) * length)
     return windows or {1}
+
+
+def _windows_of(rows: pa.Table) -> list[Values]:
+    """Return the first episode, the episodes and the value of the windows that all replicas of a condition
+    have, each [R, W]."""
+    columns = [_lists(rows, name) for name in ("episode", "window_episodes", "value")]
+    fewest = min(map(len, columns[0]))
+    return [np.array([of_replica[:fewest] for of_replica in column]) for column in columns]
+
+
+def _lists(rows: pa.Table, name: str) -> list[list[float]]:
+    """Return a column by replica."""
+    lists: list[list[float]] = (
+        rows.group_by("replica", use_threads=False).aggregate([(name, "list")])[f"{name}_list"].to_pylist()
+    )
+    return lists
 
 
 # Maps of two factors
@@ -490,7 +526,7 @@ def heat_map(
     factors: tuple[str, str],
     path: Path | str,
     *,
-    metric: str = "collective_return",
+    metric: str = COLLECTIVE_RETURN,
     last: int = LAST,
     width: Width = "page",
 ) -> Path:
@@ -502,36 +538,50 @@ def heat_map(
     Args:
         factors: two of its factors; any others are at the levels of the reference.
     """
-    comparison = compare(table, metric, last=last)
     grid, elsewhere = _grid_of(table, factors)
     rows, columns = _levels_of(grid)
-    tested = dict.fromkeys([*metrics_of(table), metric])
-    comparisons = [compare(table, other, last=last) for other in tested]
-    family = family_of(differences_in(comparisons))
-    levels, differences = _numbers(comparison, grid, family.marked)
-    means = [value for value, _ in levels.values()]
-    reach = max((abs(value) for value, _ in differences.values()), default=1.0) or 1.0
-    maps = [(levels, Normalize(min(means, default=0), max(means, default=1)), "viridis", "mean (n)")]
-    if differences:
-        maps.append((differences, Normalize(-reach, reach), "RdBu", "difference"))
+    tested = tuple(dict.fromkeys([*metrics_of(table), metric]))
+    levels = levels_of(table, [metric], last=last)
+    differences = differences_of(table, tested, last=last)
+    means: dict[Any, tuple[float, str]] = {}
+    changes: dict[Any, tuple[float, str]] = {}
+    stars = 0
+    for pair, name in grid.items():
+        level = levels.get((name, metric))
+        if level is not None and level.replicas:
+            means[pair] = level.value, f"{level.value:{form_for(level.value)}}\nn={level.replicas}"
+            if name == table.design.reference:
+                changes[pair] = 0.0, "reference"
+        change = differences.get((name, metric))
+        if change is not None:
+            stars += change.differs
+            changes[pair] = change.value, f"{change.value:+{form_for(change.value)}}{' *' * change.differs}"
+    values = [value for value, _ in means.values()]
+    scale = Normalize(min(values, default=0), max(values, default=1))
+    maps: list[tuple[str, Any, dict[str, Any]]] = [
+        ("mean (n)", means, {"scale": scale, "colours": "viridis"})
+    ]
+    if changes:
+        maps.append(("difference", changes, {}))
     with drawing(path, width=width, colours=SHADES) as sheet:
         side_by_side = sheet.fitting(len(maps), 5.5 * len(columns) + 12)
         panels = sheet.panels(len(maps), columns=side_by_side, high=_CELL * len(rows) + 8)
-        for axes, (numbers, scale, name, title) in zip(panels, maps, strict=True):
-            shades = matplotlib.colormaps[name]
-            drawn = {at: (shades(scale(value)), text) for at, (value, text) in numbers.items()}
-            _draw_grid(sheet, axes, grid, factors, drawn, side_by_side)
-            axes.set_title(title)
-            sheet.figure.colorbar(matplotlib.cm.ScalarMappable(scale, name), ax=axes)
-        sheet.title = f"{table.design.name}: {title_of(comparison)}"
-        what = f"Means of {comparison.episodes_text}, then over n replicas."
-        differ = f" Differences from {table.design.reference}, {comparison.pairing_text}"
-        metrics = f"{len(tested)} metric{'s' * (len(tested) > 1)}"
-        has_star = any((metric, name) in family.marked for name in grid.values())
-        star = f"; {'*' if has_star else 'none shown to be'} not 0 by Holm's method for the {family.tests} "
-        star += f"differences of {metrics} together."
-        differ += star if family.tests else "."
-        sheet.caption = f"{what}{differ if differences else ''}{elsewhere}{_not_run(table)}"
+        for axes, (what, numbers, look) in zip(panels, maps, strict=True):
+            drawn = {pair: value for pair, (value, _) in numbers.items()}
+            texts = {pair: numbers[pair][1] if pair in numbers else "no run" for pair in grid}
+            draw_matrix(sheet, axes, rows, columns, drawn, texts, share=1 / side_by_side, upward=True, **look)
+            axes.set(xlabel=short(factors[1]), ylabel=short(factors[0]))
+            axes.set_title(what)
+        sheet.title = f"{table.design.name}: {_title_of(metric, levels.values())}"
+        episodes = episodes_text(table, last=last)
+        sheet.caption = f"Means of {episodes}, then over n replicas."
+        if changes:
+            number = f"{len(tested)} metric{'s' * (len(tested) > 1)}"
+            star = f"; {'*' if stars else 'none shown to be'} not 0 by Holm's method for the "
+            star += f"{differences.tests} differences of {number} together."
+            told = f" Differences from {table.design.reference}, {pairing_text(table)}"
+            sheet.caption += told + (star if differences.tests else ".")
+        sheet.caption += f"{elsewhere}{_not_run(table)}"
     return Path(path)
 
 
@@ -540,14 +590,20 @@ def phase_diagram(
 ) -> Path:
     """Draw in which phase most replicas end over two factors."""
     grid, elsewhere = _grid_of(table, factors)
-    phases = {}
+    rows, columns = _levels_of(grid)
     with drawing(path, width=width) as sheet:
-        (axes,) = sheet.panels(1, high=_CELL * len(_levels_of(grid)[0]) + 6)
-        wide = (sheet.width_em - 10) / len(_levels_of(grid)[1])
-        for name, counts in table.endings.items():
-            label, number = next(iter(counts.items()))
-            phases[name] = ENDINGS[label], f"{wrapped(label, wide)}\n{number} of {sum(counts.values())}"
-        _draw_grid(sheet, axes, grid, factors, phases)
+        (axes,) = sheet.panels(1, high=_CELL * len(rows) + 6)
+        wide = width_of_cells(sheet, rows, columns)
+        cells = {}
+        for pair, name in grid.items():
+            counts = table.endings.get(name)
+            cells[pair] = EMPTY, "no run"
+            if counts:
+                word, number = next(iter(counts.items()))
+                text = f"{wrapped(word, wide)}\n{number} of {sum(counts.values())}"
+                cells[pair] = ENDINGS[word], text
+        draw_cells(sheet, axes, rows, columns, cells, upward=True)
+        axes.set(xlabel=short(factors[1]), ylabel=short(factors[0]))
         sheet.title = f"{table.design.name}: phases at the end"
         rules = "; ".join(table.ending_rules)
         sheet.caption = (
@@ -566,58 +622,16 @@ def _grid_of(table: StudyTable, factors: tuple[str, str]) -> tuple[Grid, str]:
     at = design.conditions[design.reference]
     rest = [f"{short(factor)} {at[factor]}" for factor in design.factors if factor not in factors]
     grid = by_pair[factors[0], factors[1]]
-    rows, columns = _levels_of(
-        {levels: name for levels, name in grid.items() if table.replicas[name]} or grid
-    )
+    finished_only = {levels: name for levels, name in grid.items() if table.replicas[name]}
+    rows, columns = _levels_of(finished_only or grid)
     grid = {pair: name for pair, name in grid.items() if pair[0] in rows and pair[1] in columns}
     return grid, f" Elsewhere: {', '.join(rest)}." if rest else ""
 
 
-def _levels_of(grid: Grid) -> tuple[Sequence[Any], Sequence[Any]]:
+def _levels_of(grid: Grid) -> tuple[dict[Any, str], dict[Any, str]]:
+    """Return the levels of both factors with their words, in order."""
     rows, columns = zip(*grid, strict=True)
-    return list(dict.fromkeys(rows)), list(dict.fromkeys(columns))
-
-
-Numbers = dict[str, tuple[float, str]]
-"""The number and the text of a cell, by condition."""
-
-
-def _numbers(comparison: Comparison, grid: Grid, marked: Collection[Place]) -> tuple[Numbers, Numbers]:
-    """Return the means and the differences of a map, with a star where they are marked."""
-    levels = {}
-    differences = {}
-    for name in grid.values():
-        compared = comparison.by_name[name]
-        if compared.estimate is not None:
-            value = compared.estimate.value
-            levels[name] = value, f"{value:{form_for(value)}}\nn={len(compared.defined)}"
-            if name == comparison.reference:
-                differences[name] = 0.0, "reference"
-        if compared.difference is not None:
-            value = compared.difference.value
-            star = " *" if (comparison.metric, name) in marked else ""
-            differences[name] = value, f"{value:+{form_for(value)}}{star}"
-    return levels, differences
-
-
-def _draw_grid(
-    sheet: Sheet,
-    axes: Axes,
-    grid: Grid,
-    factors: tuple[str, str],
-    drawn: Mapping[str, tuple[Any, str]],
-    side_by_side: int = 1,
-) -> None:
-    rows, columns = _levels_of(grid)
-    for (row, column), name in grid.items():
-        draw_cell(axes, columns.index(column), rows.index(row), *drawn.get(name, (EMPTY, "no run")))
-    wide = (sheet.width_em / side_by_side - 12) / len(columns)
-    axes.set_xticks(range(len(columns)), [wrapped(_word(level), wide) for level in columns])
-    axes.set_yticks(range(len(rows)), [wrapped(_word(level), 7) for level in rows])
-    axes.set(xlim=(-0.5, len(columns) - 0.5), ylim=(-0.5, len(rows) - 0.5))
-    axes.set(xlabel=short(factors[1]), ylabel=short(factors[0]))
-    axes.tick_params(length=0)
-    axes.spines[:].set_visible(False)
+    return {level: _word(level) for level in rows}, {level: _word(level) for level in columns}
 
 
 def _word(level: Any) -> str:
@@ -641,32 +655,14 @@ def _not_run(table: StudyTable) -> str:
 
 def _chance(table: StudyTable, metric: str) -> dict[str, float]:
     """Random play under each condition in which it was played and the metric is defined."""
-    compared = compare(table, metric, part=RANDOM).by_name.items()
-    return {name: level.estimate.value for name, level in compared if level.estimate is not None}
+    levels = levels_of(table, [metric], part=RANDOM)
+    return {name: level.value for (name, _), level in levels.items() if level.replicas}
 
 
 def is_one(values: Iterable[float]) -> bool:
     """Whether values are one number, but for the rounding of exported tables to float32."""
     values = list(values)
     return not values or isclose(min(values), max(values), rel_tol=1e-6)
-
-
-def _draw_spread(
-    axes: Axes,
-    place: float,
-    replicas: Iterable[float],
-    mean: Estimate | None,
-    colour: str,
-    *,
-    across: bool = False,
-) -> None:
-    """Draw each replica and the interval of their mean at a place: upright, or `across` as a row."""
-    values = list(replicas)
-    points, bounds = [place + 0.16 * across] * len(values), [] if mean is None else [mean.low, mean.high]
-    dots: dict[str, Any] = {"color": colour, "alpha": 0.25, "markersize": 5, "zorder": 2}
-    line: dict[str, Any] = {"color": colour, "linewidth": 2.3, "alpha": 0.7, "zorder": 3}
-    axes.plot(*((values, points) if across else (points, values)), ".", **dots)
-    axes.plot(*((bounds, [place] * len(bounds)) if across else ([place] * len(bounds), bounds)), **line)
 
 
 def short(factor: str) -> str:
@@ -716,14 +712,15 @@ def _counts(replicas: Mapping[str, int]) -> list[int]:
     return sorted({number for number in replicas.values() if number}) or [0]
 
 
-def levels_note(comparison: Comparison) -> str:
-    """What points and intervals are."""
-    return f"Means of {comparison.episodes_text}, then over replicas; {INTERVALS}."
+def _levels_note(table: StudyTable, last: int) -> str:
+    """Return what points and intervals are."""
+    return f"Means of {episodes_text(table, last=last)}, then over replicas; {INTERVALS}."
 
 
-def title_of(comparison: Comparison) -> str:
-    """A metric with its unit, and in how many episodes it is undefined, which are in no mean."""
-    undefined = sum(compared.undefined for compared in comparison.conditions)
-    episodes = sum(compared.episodes for compared in comparison.conditions)
-    name = metric_title(comparison.metric)
+def _title_of(metric: str, levels: Iterable[Estimate]) -> str:
+    """Return a metric with its unit, and in how many episodes it is undefined, which are in no mean."""
+    shown = list(levels)
+    undefined = sum(level.undefined for level in shown)
+    episodes = sum(level.episodes for level in shown)
+    name = title(metric)
     return f"{name}, undefined in {undefined:,} of {episodes:,} episodes" if undefined else name

@@ -4,17 +4,26 @@ The summary and the figures are made of the table: `summarise_again` makes them 
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from math import isnan
 from pathlib import Path
 from typing import Final
 
+from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, title, unit
+from cprl.measuring.statistics import Estimate, form_for
 from cprl.runs.files import refuse_links, write_atomically
 from cprl.studies.figures import DRAWN, figures_of
 from cprl.studies.study import STATUS, Study
-from cprl.studies.tables.comparing import LAST, compare, compared_cells, metrics_of
-from cprl.studies.tables.effects import effect_cells
+from cprl.studies.tables.comparing import (
+    compared_cells,
+    differences_of,
+    episodes_text,
+    metrics_of,
+    pairing_text,
+)
+from cprl.studies.tables.effects import effect_cells, effects_of, weights_of
 from cprl.studies.tables.sources import study_table
-from cprl.studies.tables.table import EVALUATION, RANDOM, TRAINING, WINDOW, StudyTable
+from cprl.studies.tables.table import EVALUATION, LAST, RANDOM, TRAINING, WINDOW, StudyTable
 from cprl.system.defaults import STUDY_TABLE
 from cprl.terminal.tables import Cells, cell, markdown
 
@@ -43,8 +52,7 @@ def write_results(
     out = Path(out)
     refuse_links(out)
     table = study_table(study, runs, window=window, status=out / STATUS)
-    for metric in metrics_of(table)[:1]:
-        compare(table, metric, last=last)  # refuses before anything is written
+    table.windows(last=last)  # refuses before anything is written
     table.write(out / STUDY_TABLE)
     draw(table, out, last=last)
     write_summary(table, out, last=last, again=again)
@@ -54,8 +62,7 @@ def write_results(
 def summarise_again(table: StudyTable, out: Path, *, last: int = LAST) -> Path:
     """Write `summary.md` of a table alone, with an earlier one's line that runs what is lacking, and draw the
     figures that are there, so that both are of the same episodes and the same reference."""
-    for metric in metrics_of(table)[:1]:
-        compare(table, metric, last=last)  # refuses before anything is written
+    table.windows(last=last)  # refuses before anything is written
     if (out / FIGURES).exists():
         draw(table, out, last=last)
     earlier = (out / SUMMARY).read_text("utf-8", "replace") if (out / SUMMARY).exists() else ""
@@ -154,3 +161,58 @@ def _lengths(table: StudyTable) -> list[str]:
     ]
     lines = markdown(Cells(what, ["condition", "episodes", "environment steps"], rows))
     return [what, "", *lines] if rows else []
+
+
+def answer_of(table: StudyTable) -> str:
+    """Return in Markdown what differs in the episodes of the evaluation: of a grid the effects of its
+    factors, else conditions from the reference; "" without any.
+
+    It is about income where money moves, and then about the harvest too; else about the first metric.
+    """
+    if not table.metrics or len(table.design.conditions) < 2:
+        return ""
+    metrics = metrics_of(table, part=EVALUATION)
+    asked = {INCOME: _INCOME, COLLECTIVE_RETURN: _HARVEST}
+    if not asked.keys() <= set(metrics):
+        asked = {metrics[0]: title(metrics[0])}
+    beside = f"beside {cell(table.design.reference)}, {pairing_text(table)}"
+    family = differences_of(table, metrics, part=EVALUATION)
+    tests = f"{family.tests} differences of their table below"
+    parts = []
+    for metric, words in asked.items():
+        if weights_of(table):
+            family = effects_of(table, metric, part=EVALUATION)
+            beside = "effects of each factor over all cells of the grid, paired by replica"
+            tests = f"{family.tests} effects on a metric"
+        found = {name: one for (name, number), one in family.items() if number == metric}
+        parts += [f"- {words}:", *_said(found, unit(metric))]
+    what = f"In {episodes_text(table, EVALUATION)}, {beside}"
+    what += f"; by Holm's method for the {tests}:" if family.tests else ":"
+    return "\n".join([what, "", *parts])
+
+
+_INCOME: Final = "**Income** of all agents together (harvest - fines + transfers), apples"
+_HARVEST: Final = "**Harvest** (collective return), apples"
+_NONE: Final = "no difference shown"
+_ALONE: Final = "not shown among so many, though it would be alone"
+_UNTOLD: Final = "cannot be told, as one replica has no interval"
+
+
+def _said(differences: Mapping[str, Estimate], unit_of: str) -> list[str]:
+    """Return lines on which differences are more and less than 0; of those not shown, how large one would
+    have to be."""
+    said: dict[str, list[str]] = {kind: [] for kind in ("more", "less", _NONE, _ALONE, _UNTOLD)}
+    for name, one in differences.items():
+        text = f"{cell(name)} {one:+}"
+        if one.differs:
+            kind = "more" if one.value > 0 else "less"
+        elif isnan(one.reach):
+            kind = _UNTOLD
+        elif abs(one.value) > one.reach:
+            kind = _ALONE
+        else:
+            kind = _NONE
+            size = f"{one.reach:{form_for(one.value, one.low, one.high)}} {unit_of}".rstrip()
+            text += f" (differences below {size} would not show)" if one.reach else ""
+        said[kind].append(text)
+    return [f"  - {kind}: {'; '.join(texts)}" for kind, texts in said.items() if texts]

@@ -8,7 +8,6 @@ yet, whose runs are resumed.
 import hashlib
 import json
 import math
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -17,21 +16,22 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
+import pyarrow.compute as pc
 
 from cprl.commons.game import Game
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import own_name
-from cprl.measuring.registry import INCOME_EQUALITY, SOCIAL
-from cprl.runs.curves import as_curves, curves_of
-from cprl.runs.episodes import read_rows
+from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME_EQUALITY, SOCIAL
+from cprl.measuring.table import by_replica, complete, metrics_in
+from cprl.measuring.windows import last_of
+from cprl.runs.episodes import read_episodes, read_rows
 from cprl.runs.files import RunLock, digest_of
 from cprl.studies.executors import Executor
 from cprl.studies.factors import Distribution, Factor, Integers, LogUniform, levels_of
 from cprl.studies.run import StudyResult, run_study
 from cprl.studies.study import RUNS, Replicas, Study, directory_of, level_text, named, short_names, unlike
-from cprl.studies.tables.comparing import LAST
 from cprl.studies.trials import Outcome, trials_of
-from cprl.system.defaults import BLOCK
+from cprl.system.defaults import BLOCK, LAST
 from cprl.system.output import say
 from cprl.values import DirectoryName, Positive, Range, Value, refusal
 
@@ -72,8 +72,7 @@ class Search(Value, stored=False):
         experiment: what every point is, but for its factors.
         factors: as those of a `Study`: distributions, lists of values, or tables of named levels.
         points: how many are tried, those that came twice included.
-        metric: by a name of docs/metrics.md, e.g. "collective_return"; "return_0" of an agent, or "income",
-            that of all agents, which is the harvest after fines and transfers.
+        metric: by a name of docs/metrics.md, e.g. "collective_return", "income", or "agent_0/return".
         direction: which values of it are better.
         over: the episodes that count: those of the evaluation, or the last ones of the training.
         last: how many of the training.
@@ -86,7 +85,7 @@ class Search(Value, stored=False):
     experiment: Experiment
     factors: Mapping[str, Factor]
     points: Annotated[int, Range(1, 100_000)] = field(kw_only=True)
-    metric: str = field(default="collective_return", kw_only=True)
+    metric: str = field(default=COLLECTIVE_RETURN, kw_only=True)
     direction: Direction = field(default="maximise", kw_only=True)
     over: Episodes = field(default="evaluation", kw_only=True)
     last: Positive = field(default=30, kw_only=True)
@@ -104,7 +103,7 @@ class Search(Value, stored=False):
             metrics = [
                 *SOCIAL,
                 *map(own_name, self.experiment.metrics),
-                *(f"return_{agent}" for agent in range(game.agents)),
+                *(f"agent_{agent}/return" for agent in range(game.agents)),
             ]
             if self.metric not in metrics:
                 raise refusal("metric", self.metric, ", ".join(metrics))
@@ -319,14 +318,15 @@ def value_of(search: Search, point: Point, runs: Path) -> float | None:
         if trial.state(runs) != "finished":
             return None
         if search.over == "evaluation":
-            curves = as_curves(read_rows(run / "evaluation" / "trained.parquet"))
+            rows = read_rows(run / "evaluation" / "trained.parquet")
         else:
-            curves = curves_of(run, last=search.last)
-        if search.metric not in curves:
-            raise refusal("metric", search.metric, f"what the game reports: {', '.join(sorted(curves))}")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # of replicas in which it is never defined
-            means += np.nanmean(curves[search.metric], 1).tolist()
+            rows = last_of(read_episodes(run), search.last)
+        try:
+            values = by_replica(rows, search.metric)["value"]
+        except KeyError as error:
+            reported = ", ".join(sorted(metrics_in(complete(rows).schema)))
+            raise refusal("metric", search.metric, f"what the game reports: {reported}") from error
+        means += pc.fill_null(values, math.nan).to_pylist()
     return float(np.mean(means))
 
 

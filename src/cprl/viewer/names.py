@@ -5,7 +5,7 @@ from typing import Final
 
 from cprl.commons.colours import BLUE, GREEN, GREY, ORANGE, VERMILION, Colour
 from cprl.commons.decoding import UNSEEN
-from cprl.measuring import now
+from cprl.measuring import outcome
 
 HEADER: Final = "header"
 """The entity of the text that people read first."""
@@ -33,13 +33,14 @@ DIED: Final = VERMILION
 SETTLED: Final = "settled"
 """The state of agents who explore no more, which is not drawn."""
 STATES: Final[Mapping[str, Colour]] = {
-    now.BEGINS: (80, 80, 80),
-    now.RISING: GREEN,
-    now.RECOVERING: BLUE,
-    now.STEADY: GREY,
-    now.FALLING: ORANGE,
-    now.BELOW: VERMILION,
-    now.EXPLORING: (60, 90, 130),
+    outcome.BEGINS: (80, 80, 80),
+    outcome.RISING: GREEN,
+    outcome.RECOVERING: BLUE,
+    outcome.STEADY: GREY,
+    outcome.FALLING: ORANGE,
+    outcome.BELOW: VERMILION,
+    outcome.DEAD: (140, 40, 0),
+    outcome.EXPLORING: (60, 90, 130),
     SETTLED: BACKGROUND,
 }
 """The colours of live labels, and of agents who explore."""

@@ -6,7 +6,7 @@ view in `cprl.viewer.layout`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 from typing import Any, Final, Self, TypeAlias
 
@@ -53,9 +53,7 @@ class Samples(View):
             now.stock_left[:boards],
         ]
         self._pairs = [(array, np.empty((self.ROOM, *array.shape), array.dtype)) for array in arrays]
-        self._read = (
-            np.asarray if all(isinstance(array, np.ndarray) for array in arrays) else env.worlds.driver.read
-        )
+        self._read = env.worlds.driver.read
         self.visits = np.zeros((game.agents, game.map.height, game.map.width), np.int64)
         """Looks at which each agent of the first world was on each cell, since the last picture."""
         self._playing = np.full((boards, self.clock // self.stride + 1, 2), np.nan)
@@ -312,8 +310,10 @@ def _has_board(curves: Curves) -> bool:
     return isinstance(curves, Scene)
 
 
+OVER: Final = 50
+"""Episodes of a replica whose tags are drawn."""
 PICTURES: Final[Mapping[str, Picture]] = {
-    "tags": Picture(draw=tags, is_there=lambda curves: curves.has_tags_between, every=10, over=50),
+    "tags": Picture(draw=tags, is_there=lambda curves: curves.has_tags_between, every=10, over=OVER),
     "visits": Picture(draw=visits, is_there=_has_board, is_sampled=True),
     "turn": Picture(draw=turns, is_there=_has_board, axes=axes_of_turns, is_sampled=True),
     "lorenz": Picture(draw=lorenz, is_there=lambda curves: curves.has_lorenz, axes=axes_of_lorenz),
@@ -329,7 +329,8 @@ class Pictures(View):
     """
 
     def __init__(self, logger: RerunLogger, samples: Samples | None, *, every: int) -> None:
-        self._logger, self._samples, self._every = logger, samples, every
+        self._logger, self._every = logger, every
+        self._nothing = Seen(curves=logger.curves, samples=samples)
         self._pictures = {
             name: picture for name, picture in PICTURES.items() if picture.is_there(logger.curves)
         }
@@ -338,16 +339,19 @@ class Pictures(View):
         self._drawn = dict.fromkeys(self._pictures, 0)
         """The episodes of a replica that had ended when each was drawn."""
         self._first: dict[str, Seen] = {}
-        nothing = Seen(curves=logger.curves, samples=samples)
-        begins = ceil(every / logger.curves.worlds) * logger.curves.worlds
-        for picture in self._pictures.values():
+        worlds = logger.curves.worlds
+        soon = rr.Points2D.columns(
+            positions=[TITLE],
+            labels=[f"lines from episode {ceil(every / worlds) * worlds} on"],
+            colors=[TEXT],
+            radii=[0.0],
+            show_labels=[True],
+        )
+        for name, picture in self._pictures.items():
             if picture.axes is not None:
-                axes = picture.axes(nothing)
-                for entity, part in axes.fixed().items():
+                for entity, part in picture.axes(self._nothing).fixed().items():
                     logger.log_static(entity, part)
-                soon = rr.Points2D.columns(positions=[TITLE], labels=[f"lines from episode {begins} on"])
-                style = rr.Points2D.columns(colors=[TEXT], radii=[0.0], show_labels=[True])
-                logger.log_columns(f"{axes.origin}/title", ([0], [0], [0]), [*soon, *style], live_only=True)
+                logger.log_columns(f"{name}/title", ([0], [0], [0]), soon, live_only=True)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         self._episodes.append(episode)
@@ -358,6 +362,8 @@ class Pictures(View):
             every = picture.every or self._every
             if self._ended // every > before // every:
                 self._draw(name, picture)
+        oldest = min([self._ended - OVER, *self._drawn.values()])
+        self._episodes = [one for one in self._episodes if one.episode >= oldest]
 
     def close(self) -> None:
         for name, picture in self._pictures.items():
@@ -372,22 +378,18 @@ class Pictures(View):
     def _draw(self, name: str, picture: Picture) -> None:
         since, ended = self._drawn[name], self._ended
         begins = ended - picture.over if picture.over else since
-        seen = Seen(
-            curves=self._logger.curves,
-            samples=self._samples,
-            episodes=[episode for episode in self._episodes if begins <= episode.episode < ended],
+        seen = replace(
+            self._nothing,
+            episodes=[one for one in self._episodes if begins <= one.episode < ended],
             words=f"episode {ended}" if ended == since + 1 else f"episodes {since + 1} to {ended}",
             first=self._first.get(name),
         )
         self._drawn[name] = ended
-        if drawn := picture.draw(seen):
+        drawn = picture.draw(seen)
+        if drawn:
             self._first.setdefault(name, seen)
         for entity, archetype in drawn.items():
             self._logger.log_row(entity, archetype)
-        oldest = min(
-            self._ended - one.over if one.over else self._drawn[of] for of, one in self._pictures.items()
-        )
-        self._episodes = [episode for episode in self._episodes if episode.episode >= oldest]
 
 
 Regions: TypeAlias = list[tuple[list[int], NDArray[np.bool_]]]
@@ -422,12 +424,12 @@ def borders(regions: Regions) -> Any:
 
 def _borders(cells: NDArray[np.bool_]) -> list[list[tuple[float, float]]]:
     """The sides of cells beyond which the region ends, (x, y), a little inside of it."""
-    around, (height, width) = np.pad(cells, 1), cells.shape
+    around = np.pad(cells, 1)
     strips = []
-    for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        beyond = around[1 + down : 1 + down + height, 1 + right : 1 + right + width]
-        for row, col in np.argwhere(cells & ~beyond).tolist():
-            x, y = (RIM_CELLS + at + 0.5 for at in (col, row))
-            x, y = x + (0.5 - _INSET_CELLS) * right, y + (0.5 - _INSET_CELLS) * down
-            strips.append([(x + side * abs(down), y + side * abs(right)) for side in (-0.5, 0.5)])
+    for row, col in np.argwhere(cells).tolist():
+        for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+            if not around[1 + row + down, 1 + col + right]:
+                x = RIM_CELLS + col + 0.5 + (0.5 - _INSET_CELLS) * right
+                y = RIM_CELLS + row + 0.5 + (0.5 - _INSET_CELLS) * down
+                strips.append([(x + side * down, y + side * right) for side in (-0.5, 0.5)])
     return strips

@@ -1,6 +1,7 @@
 """What a replay shows besides the board: what policies say of actions, who breaks a rule, what is paid."""
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from typing import Any, Final
 
 import numpy as np
@@ -13,6 +14,7 @@ from cprl import keys
 from cprl.commons.colours import agent_colour
 from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode
+from cprl.measuring.registry import FINES, TRANSFERS
 from cprl.policies.assignment import AgentPolicies, agent_indices
 from cprl.policies.lanes import LaneActor
 from cprl.viewer.board import centres_of
@@ -31,7 +33,7 @@ SIGNS: Final = {  # the viewer ends at a sign that its font lacks
     "beam": "B",
     "stay": "S",
 }
-_TAKEN: Final = (255, 255, 255)
+_WHITE: Final = (255, 255, 255)
 _BAR_SHARE: Final = 0.75
 """Of an agent's hue, in the bars of actions that it does not take."""
 _MOST_LABELLED: Final = 4
@@ -72,11 +74,10 @@ class Decisions:
         self._step += 1
         if self._step == 1:
             return  # the first board is shown in no frame
-        observation = batch[keys.OBSERVATION]
         values = np.full((len(self._names), len(self._actions)), np.nan)
         for agents, actor in self._actors:
             if isinstance(actor, LaneActor):
-                seen = [observation[:, list(agents)]]
+                seen = [batch[keys.OBSERVATION][:, list(agents)]]
                 if actor.state_cells:
                     seen.append(batch[keys.RECURRENT_STATE_BEFORE][:, list(agents), : actor.state_cells])
                 preferences = actor.preferences(*seen)
@@ -85,35 +86,34 @@ class Decisions:
         self._rows.append((values, batch[keys.ACTION][0].numpy(force=True).copy()))
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        if not self._rows:
+        count = len(self._rows)
+        if not count:
             return
-        values, taken = (np.stack(part) for part in zip(*self._rows, strict=True))
-        count = len(values)
         frames = np.arange(count)
         at = frames + 1, np.zeros(count, np.int64), frames
-        images = self._images(values, taken).reshape(count, -1)
-        self._logger.log_columns(ENTITY, at, rr.SegmentationImage.columns(buffer=images.view(np.uint8)))
-        texts = [text for row in values for text in self._texts(row)]
+        images = np.stack([self._image(values, taken) for values, taken in self._rows])
+        pixels = images.reshape(count, -1).view(np.uint8)
+        self._logger.log_columns(ENTITY, at, rr.SegmentationImage.columns(buffer=pixels))
+        texts = [text for values, _ in self._rows for text in self._texts(values)]
         labels = rr.Points2D.columns(labels=texts).partition([len(self._names)] * count)
         self._logger.log_columns(f"{ENTITY}/labels", at, labels)
 
-    def _images(
+    def _image(
         self, values: NDArray[np.float64], taken: NDArray[np.int64]
     ) -> NDArray[np.unsignedinteger[Any]]:
-        """Bars of T frames as classes: values [T, N, A] and actions [T, N] to [T, rows, columns]."""
-        count, agents, actions = values.shape
+        """Return the bars of a frame as classes, [rows, columns]: of values [N, A] and actions taken [N]."""
+        image = np.zeros(self._panels.shape, self._dtype)
         heights = self._heights(values)
-        level = np.arange(HIGH)[::-1, None]
-        classes = 1 + 2 * np.arange(agents * actions).reshape(agents, actions)
-        classes = classes + (np.arange(actions) == taken[..., None])
-        bars = np.where(level < heights[..., None, None], classes[..., None, None], 0)  # [T, N, A, HIGH, 1]
-        bars = np.pad(bars.repeat(BAR, -1), ((0, 0),) * 4 + ((APART, 0),))
-        panels = bars.transpose(0, 1, 3, 2, 4).reshape(count, agents, HIGH, -1)
-        panels = np.pad(panels, ((0, 0),) * 3 + ((0, APART),))
-        whole = np.zeros((count, *self._panels.shape), self._dtype)
-        for agent, (top, left) in enumerate(self._panels.corners):
-            whole[:, top : top + HIGH, left : left + panels.shape[-1]] = panels[:, agent]
-        return whole
+        for agent, action in np.ndindex(values.shape):
+            top, left = self._panels.corners[agent]
+            left += APART + action * (BAR + APART)
+            bar = image[top + HIGH - heights[agent, action] : top + HIGH, left : left + BAR]
+            bar[:] = self._class(agent, action) + (action == taken[agent])
+        return image
+
+    def _class(self, agent: int, action: int) -> int:
+        """Return the class of a bar; that of the action that is taken is the next one."""
+        return 1 + 2 * (agent * len(self._actions) + action)
 
     def _heights(self, values: NDArray[np.float64]) -> NDArray[np.int64]:
         """The heights of bars in pixels, at least 1; 0 where there are no values."""
@@ -122,8 +122,7 @@ class Decisions:
         share = np.clip((values - low[..., None]) / np.where(span > 0, span, 1.0), 0.0, 1.0)
         is_share = np.array([kind == "probabilities" for kind in self._kinds])
         share = np.where(is_share[:, None], values, share)
-        heights = 1 + (share * (HIGH - 2)).round()
-        pixels: NDArray[np.int64] = np.nan_to_num(heights).astype(np.int64)
+        pixels: NDArray[np.int64] = np.nan_to_num(1 + (share * (HIGH - 2)).round()).astype(np.int64)
         return pixels
 
     def _texts(self, values: NDArray[np.float64]) -> list[str]:
@@ -142,10 +141,10 @@ class Decisions:
         for agent, name in enumerate(self._names):
             hue = tuple(round(_BAR_SHARE * part) for part in agent_colour(agent))
             for action, what in enumerate(self._actions):
-                first = 1 + 2 * (agent * len(self._actions) + action)
+                first = self._class(agent, action)
                 classes.append(rr.AnnotationInfo(id=first, label=f"{name}: {what}", color=hue))
-                label = f"{name} takes: {what}"
-                classes.append(rr.AnnotationInfo(id=first + 1, label=label, color=_TAKEN))
+                taken = f"{name} takes: {what}"
+                classes.append(rr.AnnotationInfo(id=first + 1, label=taken, color=_WHITE))
         image = rr.SegmentationImage.from_fields(format=form, opacity=1.0)
         self._logger.log_static(ENTITY, rr.AnnotationContext(classes), image)
         self._logger.log_static(f"{ENTITY}/labels", self._panels.labels())
@@ -172,7 +171,6 @@ def _kind(actor: nn.Module) -> str:
 
 
 _VIOLATORS: Final = "world/violators"
-_WHITE: Final = (255, 255, 255)
 _DIAMOND: Final = 0.72 * np.array([(0, -1), (1, 0), (0, 1), (-1, 0), (0, -1)], np.float32)
 """The mark of an agent that breaks a rule, (x, y) in cells from the middle of its own."""
 _RADIUS_CELLS: Final = 0.06
@@ -184,9 +182,11 @@ class Offences:
 
     def __init__(self, logger: RerunLogger, env: CommonsEnv, *, names: Sequence[str]) -> None:
         self._logger, self._env, self._names = logger, env, tuple(names)
-        self._paid: list[NDArray[np.float64]] = []
-        self._marked: list[NDArray[np.bool_]] = []
-        self._centres: list[NDArray[np.float32]] = []
+        self._amounts: dict[str, list[NDArray[np.float64]]] = {PAID: [], GIVEN: []}
+        """[N] in each turn."""
+        self._strips: list[NDArray[np.float32]] = []
+        self._labels: list[list[str]] = []
+        """Marks, and what they say, of each frame."""
         mark = rr.LineStrips2D.from_fields(colors=[_WHITE], radii=[_RADIUS_CELLS], show_labels=False)
         logger.log_static(_VIOLATORS, mark)
         for agent, name in enumerate(names):
@@ -196,38 +196,39 @@ class Offences:
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Notes the payments of the turn, and where those are who broke a rule in it."""
-        agents, count = batch["next", keys.AGENTS], len(self._names)
-        fines, transfers, violated = (
-            np.zeros(count) if (entry := agents.get(name, None)) is None else entry[0].numpy(force=True)
-            for name in ("fines", "transfers", "violated")
-        )
-        self._paid.append(np.stack([-fines.astype(np.float64), transfers.astype(np.float64)]))
+        fines, transfers, violated = (_of_agents(batch, name) for name in (FINES, TRANSFERS, "violated"))
+        self._amounts[PAID].append(-fines)
+        self._amounts[GIVEN].append(transfers)
         if bool(batch["next", keys.DONE][0, 0]):
             return  # the board is already that of the next episode
-        board = self._env.worlds.show(self._env.output)
-        self._marked.append(violated.astype(np.bool_, copy=True))
-        self._centres.append(centres_of(board._asdict()))
+        violators = np.flatnonzero(violated)
+        centres = centres_of(self._env.worlds.show(self._env.output)._asdict())
+        self._strips.append(centres[violators][:, None] + _DIAMOND)
+        # The viewer shows them on request.
+        self._labels.append([fined(agent, fines[agent]) for agent in violators.tolist()])
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        turns, frames = len(self._paid), len(self._marked)
+        frames = len(self._strips)
         if not frames:
             return
-        steps = np.arange(1, turns + 1)
-        nothing = np.zeros(turns, np.int64)
-        paid = np.stack(self._paid)  # [T, paid or given, N]
-        for agent, name in enumerate(self._names):
-            for side, kind in enumerate((PAID, GIVEN)):
-                at = steps, nothing, np.minimum(steps - 1, frames - 1)
-                self._logger.log_columns(
-                    f"{name}/{kind}", at, rr.Scalars.columns(scalars=paid[:, side, agent].copy())
-                )
-        marked, centres = np.stack(self._marked), np.stack(self._centres)
-        strips = centres[marked][:, None] + _DIAMOND
-        # The viewer shows them on request.
-        labels = [fined(agent, -paid[frame, 0, agent]) for frame, agent in np.argwhere(marked).tolist()]
-        marks = rr.LineStrips2D.columns(strips=strips, labels=labels)
-        at = steps[:frames], nothing[:frames], np.arange(frames)
-        self._logger.log_columns(_VIOLATORS, at, marks.partition(marked.sum(1)))
+        steps = np.arange(1, len(self._amounts[PAID]) + 1)
+        at = steps, np.zeros_like(steps), np.minimum(steps, frames) - 1
+        for kind, turns in self._amounts.items():
+            for name, amounts in zip(self._names, np.transpose(turns), strict=True):
+                self._logger.log_columns(f"{name}/{kind}", at, rr.Scalars.columns(scalars=amounts.copy()))
+        marks = rr.LineStrips2D.columns(
+            strips=np.concatenate(self._strips), labels=list(chain(*self._labels))
+        )
+        in_frames = tuple(times[:frames] for times in at)
+        self._logger.log_columns(_VIOLATORS, in_frames, marks.partition(list(map(len, self._strips))))
+
+
+def _of_agents(batch: TensorDictBase, name: str) -> NDArray[np.float64]:
+    """Return an entry of the agents of the first world in a turn, [N]; zeros where the game lacks it."""
+    agents: Any = batch["next", keys.AGENTS]
+    entry = agents.get(name, None)
+    values = np.zeros(agents["reward"].shape[1]) if entry is None else entry[0].numpy(force=True)
+    return values.astype(np.float64)
 
 
 def fined(agent: int, fine: float) -> str:
@@ -238,17 +239,11 @@ def fined(agent: int, fine: float) -> str:
 def events(batch: TensorDictBase) -> list[str]:
     """The violations of a turn of the first world in words, and the fines of agents who were tagged; taxes
     and costs, which many pay in each turn, are no events."""
-    agents: Any = batch["next", keys.AGENTS]
-    fines, violated, tagged_by = (agents.get(name, None) for name in ("fines", "violated", "tagged_by"))
-    if fines is None and violated is None:
-        return []
-    count = len(agents["reward"][0])
-    paid = [0.0] * count if fines is None else fines[0].tolist()
-    broke = [False] * count if violated is None else violated[0].tolist()
-    tagged = [False] * count if tagged_by is None else tagged_by[0].any(-1).tolist()
-    violations = [fined(agent, paid[agent]) for agent in range(count) if broke[agent]]
-    return violations + [
-        f"agent {agent} fined {paid[agent]:.4g}"
-        for agent in range(count)
-        if tagged[agent] and not broke[agent] and paid[agent] > 0
+    tagged_by = batch.get(("next", *keys.TAGGED_BY), None)
+    fines, violated = _of_agents(batch, FINES), _of_agents(batch, "violated")
+    tagged = np.zeros(len(fines)) if tagged_by is None else tagged_by[0].numpy(force=True).any(-1)
+    fined_when_tagged = np.flatnonzero((violated == 0) & (fines > 0) & tagged)
+    return [
+        *(fined(agent, fines[agent]) for agent in np.flatnonzero(violated).tolist()),
+        *(f"agent {agent} fined {fines[agent]:.4g}" for agent in fined_when_tagged.tolist()),
     ]

@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import ceil, isfinite, isnan, nan
+from math import ceil, isnan, nan
 from statistics import fmean
 from threading import Event, Thread
 from typing import Final, NamedTuple
@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from cprl.measuring.episodes import Episode
-from cprl.measuring.now import BEGINS, EXPLORING, Now
+from cprl.measuring.outcome import BEGINS, EXPLORING, Course
 from cprl.measuring.series import mean_of
 from cprl.measuring.statistics import Estimate, estimate_if_finite
 from cprl.measuring.windows import LAST_EPISODES, Values, rounds_of
@@ -78,7 +78,7 @@ class Header:
         return f"of {'about ' * self.is_about}{self.episodes:,}"
 
     def begins(self, status: str, random_play: float | None = None) -> str:
-        beside = "" if random_play is None else f"random play {self._amount(random_play)}"
+        beside = "" if random_play is None else f"random play {self.amount(random_play)}"
         return self._text(f"Episode 1 {self._of}", status, beside)
 
     def line(
@@ -87,37 +87,35 @@ class Header:
         """After an episode, in which so many boards died early; None for a game without stock."""
         beside = "" if random_play is None else f", random play {_number(random_play)}"
         deaths = "" if died is None else self._died(died, self.boards)
-        return self._text(f"Episode {episode:,} {self._of}", label, f"{self._amount(mean)}{beside}", deaths)
+        return self._text(f"Episode {episode:,} {self._of}", label, f"{self.amount(mean)}{beside}", deaths)
 
     def finished(self, learning: float, trained: Played, random: Played) -> str:
         """After the evaluation of a run: what agents got at the end of its training, and in fresh worlds the
         trained policy, which explores less there, and random play."""
-        amounts = {"trained": trained.harvest.value, "random play": random.harvest.value}
-        if not isnan(learning):
-            amounts = {"while learning": learning, **amounts}
-        (first, amount), *others = amounts.items()
+        amounts = {
+            "while learning": learning,
+            "trained": trained.harvest.value,
+            "random play": random.harvest.value,
+        }
+        (first, amount), *others = [of_one for of_one in amounts.items() if not isnan(of_one[1])]
         beside = ", ".join(f"{name} {_number(value)}" for name, value in others)
-        beside = f"{first} {self._amount(amount)}, {beside}"
         died = "" if trained.died is None else self._died(trained.died, trained.episodes)
-        return self._text(self._finished, beside, died)
+        return self.ended(f"{first} {self.amount(amount)}, {beside}", died)
 
-    def ended(self, mean: float) -> str:
-        return self._text(self._finished, f"{self._amount(mean)} at the end")
-
-    @property
-    def _finished(self) -> str:
-        return "Finished" if self.is_about else f"Finished, {self.episodes:,} episodes"
+    def ended(self, *parts: str) -> str:
+        return self._text("Finished" if self.is_about else f"Finished, {self.episodes:,} episodes", *parts)
 
     def stopped(self, episode: int, mean: float) -> str:
         """At the end of a run that was stopped after so many episodes; it can be resumed."""
-        amount = "" if isnan(mean) else self._amount(mean)
-        return self._text(f"Stopped after {episode:,} {self._of} episodes", amount)
+        return self._text(f"Stopped after {episode:,} {self._of} episodes", self.amount(mean))
 
     def _text(self, *parts: str) -> str:
         line = f"#### {' · '.join(part for part in (*parts, self.rules) if part)}"
         return f"{line}\n\n{self.legend}" if self.legend else line
 
-    def _amount(self, value: float) -> str:
+    def amount(self, value: float) -> str:
+        if isnan(value):
+            return ""
         return f"{_number(value)} apples" if self.unit == "apples" else f"{self.unit} {_number(value)}"
 
     def _died(self, died: int, boards: int) -> str:
@@ -190,7 +188,8 @@ class Story(View):
             legend=self._curves.legend,
             is_about=is_about,
         )
-        self.now = Now(self._curves.worlds)
+        self.course = Course(self._curves.replicas, self._curves.worlds)
+        self._label = BEGINS
         self._bests = Bests(self._curves.worlds)
         self._random: Played | None = None
         self._ended = 0
@@ -207,43 +206,63 @@ class Story(View):
     def random_play(self, episodes: Sequence[Episode]) -> None:
         """Sets what the group is compared with, and logs it as an event."""
         self._random = played(episodes, replicas=self._curves.replicas)
-        self.now.random_play = self._random.harvest.value
+        self.course.random_play = self._random.harvest.value
         self._logger.log_text(f"random play {self._in_words(self._random)}")
         if not self._ended:
             self.begins(BEGINS)
 
     def begins(self, status: str) -> None:
         """Says live what is done before the first episode ends, e.g. "compiling, 12 s so far"."""
-        self._logger.show_live(HEADER, self.header.begins(status, self.now.random_play))
+        self._logger.show_live(HEADER, self.header.begins(status, self.course.random_play))
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+        of_world = episode.replica, episode.world
+        gained, died = _gained(episode), has_died(episode)
+        self.course.add(gained, replica=episode.replica, world=episode.world, has_died=died)
         each = rounds_of(LAST_EPISODES, self._curves.worlds)
-        last = self._last.setdefault((episode.replica, episode.world), deque(maxlen=each))
-        last.append(_gained(episode))
-        if (died := has_died(episode)) is not None:
+        self._last.setdefault(of_world, deque(maxlen=each)).append(gained)
+        if died is not None:
             together = episode.episode // self._curves.worlds
             self._died[together] = self._died.get(together, 0) + died
 
     def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
         before, self._ended = self._ended, episode + 1
         died = self._died.pop(episode // self._curves.worlds, None)
-        means = {name: mean_of(values) for name, values in numbers.items()}
-        events = self._label(episode, means)
-        apples = means.get(HARVEST)
-        best = None if apples is None else self._bests.add(apples)
-        if best is not None:
-            events.append(best)
-            self._filming.show()
+        events = self._look(episode, {name: mean_of(values) for name, values in numbers.items()})
         for event in events:
             self._logger.log_text(f"episode {episode:,}: {event}")
         apart = -(-self._episodes // MOST_HEADERS)
         if -(-self._ended // apart) > -(-before // apart) or self._ended == self._episodes:
             self._show_episode(died)
 
+    def _look(self, episode: int, means: Mapping[str, float]) -> list[str]:
+        """Logs the live label, and whether agents explore, where an episode changes them; returns what is
+        new in words."""
+        events = []
+        explored = self.course.explores
+        explores = self.course.explore(
+            {name: mean for name, mean in means.items() if name.endswith("/epsilon")}
+        )
+        if explores != explored:
+            self._logger.log_states(names.EXPLORING, {episode: EXPLORING if explores else SETTLED})
+            if explored:
+                events.append("exploration ends: no epsilon falls any more")
+        label = self.course.label
+        if label != self._label or episode < self._curves.worlds:
+            self._logger.log_states(names.NOW, {episode: label})
+        if label != self._label:
+            events.append(f"now {label}")
+            self._label = label
+        best = self._bests.add(means[HARVEST]) if HARVEST in means else None
+        if best is not None:
+            events.append(best)
+            self._filming.show()
+        return events
+
     def resumed(self) -> None:
         """Shows where a run is that goes on after the episodes so far."""
         if self._ended:
-            self._logger.log_states(names.NOW, {self._ended - 1: self.now.label})
+            self._logger.log_states(names.NOW, {self._ended - 1: self._label})
             self._show_episode(None)
             self._logger.flush()
 
@@ -251,30 +270,12 @@ class Story(View):
         """Says in the header where the run is after an episode."""
         text = self.header.line(
             episode=self._ended,
-            label=f"{self.now.label}, {EXPLORING}" if self.now.explores else self.now.label,
-            mean=self.now.mean,
-            random_play=self.now.random_play,
+            label=f"{self._label}, {EXPLORING}" if self.course.explores else self._label,
+            mean=self.course.mean,
+            random_play=self.course.random_play,
             died=died,
         )
         self._logger.log_document(HEADER, text)
-
-    def _label(self, episode: int, means: Mapping[str, float]) -> list[str]:
-        """Logs the live label where an episode's means change it, and whether agents explore; returns the
-        changes in words."""
-        value = means.get(HARVEST)
-        if value is None:
-            value = sum(means.get(f"{agent}/return", 0.0) for agent in self._curves.agents)
-        if not isfinite(value):
-            return []
-        before, explored, events = self.now.label, self.now.explores, []
-        label = self.now.add(value, {name: mean for name, mean in means.items() if name.endswith("/epsilon")})
-        if label != before or episode < self._curves.worlds:
-            self._logger.log_states(names.NOW, {episode: label})
-        if self.now.explores != explored:
-            self._logger.log_states(names.EXPLORING, {episode: EXPLORING if self.now.explores else SETTLED})
-            if explored:
-                events.append("exploration ends: no epsilon falls any more")
-        return [*events, f"now {label}"] if label != before else events
 
     @property
     def _learning(self) -> float:
@@ -296,9 +297,9 @@ class Story(View):
         if self._is_over:
             return
         if self._ended + self._curves.worlds <= self._episodes and not self.header.is_about:
-            self._logger.log_document(HEADER, self.header.stopped(self._ended, self.now.mean))
+            self._logger.log_document(HEADER, self.header.stopped(self._ended, self.course.mean))
         else:
-            self._end(self.header.ended(self._learning))
+            self._end(self.header.ended(f"{self.header.amount(self._learning)} at the end"))
 
     def _end(self, header: str) -> None:
         self._is_over = True

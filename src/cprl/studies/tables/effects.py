@@ -6,51 +6,34 @@ weighted sum of the conditions within a replica; its interval is by Student's t 
 method is for all effects on one metric together.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations, product
-from math import isnan, prod
-from typing import Any, Final, NamedTuple
+from math import prod
+from typing import Any, Final
 
-from cprl.measuring.statistics import Estimate, estimate
+from cprl.measuring.registry import title
+from cprl.measuring.statistics import Family, Weights, contrasts, crossed, main_effect, mean_difference
 from cprl.studies.study import level_text, short_names
 from cprl.studies.tables.comparing import (
     INTERVALS,
-    Comparison,
-    Family,
-    compare,
-    family_of,
-    metric_title,
+    capitalised,
+    change,
+    episodes_text,
     metrics_of,
 )
-from cprl.studies.tables.table import TRAINING, Design, StudyTable
-from cprl.system.defaults import LAST
+from cprl.studies.tables.table import LAST, TRAINING, Design, StudyTable
 from cprl.terminal.tables import Cells
 
 MOST_INTERACTIONS: Final = 24
 """More are left out: so many tests together would show nothing."""
 
-Weights = dict[str, float]
-"""What each condition counts in an effect, by its name; together 0."""
 Levels = tuple[Any, Any]
 """A level of a factor, and the one that it is compared with."""
 
 
-def contrast(comparison: Comparison, weights: Weights) -> Estimate | None:
-    """Return a weighted sum of conditions within a replica, over the replicas that have a value in each; None
-    where none has."""
-    by_condition = {name: comparison.by_name[name].values for name, weight in weights.items() if weight}
-    replicas = set.intersection(*(set(values) for values in by_condition.values()))
-    sums = [
-        sum(weights[name] * values[replica] for name, values in by_condition.items())
-        for replica in sorted(replicas)
-    ]
-    defined = [value for value in sums if not isnan(value)]
-    return estimate(defined) if defined else None
-
-
-def effects_of(table: StudyTable) -> dict[str, Weights]:
-    """Return the main effects of a grid and its interactions of two factors, by name; none where it has a
-    single factor, a cell without a replica, or replicas that are not paired.
+def weights_of(table: StudyTable) -> dict[str, Weights]:
+    """Return what each condition counts in the main effects of a grid and its interactions of two factors, by
+    their names; none where it has a single factor, a cell without a replica, or replicas that are not paired.
 
     Levels are compared with the lowest one where all are numbers, else with that of the reference.
     """
@@ -58,19 +41,19 @@ def effects_of(table: StudyTable) -> dict[str, Weights]:
     if not (design.is_grid and is_whole_grid(table)):
         return {}
     short = short_names(design.factors)
-    pairs = {factor: list(_compared_levels(design, factor)) for factor in design.factors}
-    effects = {
-        f"{short[factor]} {_against(levels)}": _weights(design, {factor: levels})
-        for factor in design.factors
-        for levels in pairs[factor]
-    }
+    effects = {factor: _main_effects(design, factor) for factor in design.factors}
+    weights = {}
+    for factor, by_levels in effects.items():
+        for against, signs in by_levels.items():
+            weights[f"{short[factor]} {against}"] = mean_difference(signs)
     if interactions_of(design) > MOST_INTERACTIONS:
-        return effects
+        return weights
     for one, other in combinations(design.factors, 2):
-        for first, second in product(pairs[one], pairs[other]):
-            name = f"{short[one]} {_against(first)} x {short[other]} {_against(second)}"
-            effects[name] = _weights(design, {one: first, other: second})
-    return effects
+        for first, second in product(effects[one], effects[other]):
+            name = f"{short[one]} {first} x {short[other]} {second}"
+            signs = crossed(effects[one][first], effects[other][second])
+            weights[name] = {cell: 2 * weight for cell, weight in mean_difference(signs).items()}
+    return weights
 
 
 def is_whole_grid(table: StudyTable) -> bool:
@@ -89,6 +72,15 @@ def interactions_of(design: Design) -> int:
     return sum(one * other for one, other in combinations(steps, 2))
 
 
+def _main_effects(design: Design, factor: str) -> dict[str, Weights]:
+    """Return the signs of the conditions in each effect of a factor, by the levels that it compares."""
+    at = {name: levels[factor] for name, levels in design.conditions.items()}
+    return {
+        f"{level_text(level)} against {level_text(first)}": main_effect(at, level, first)
+        for level, first in _compared_levels(design, factor)
+    }
+
+
 def _compared_levels(design: Design, factor: str) -> Iterator[Levels]:
     levels = list(dict.fromkeys(design.levels(factor)))
     if all(isinstance(level, bool | int | float) for level in levels):
@@ -100,67 +92,31 @@ def _compared_levels(design: Design, factor: str) -> Iterator[Levels]:
         yield level, first
 
 
-def _against(levels: Levels) -> str:
-    return f"{level_text(levels[0])} against {level_text(levels[1])}"
-
-
-def _weights(design: Design, levels: Mapping[str, Levels]) -> Weights:
-    """Return the weights of the effect of one factor, or of the interaction of two."""
-    signs: Weights = {}
-    for name, at in design.conditions.items():
-        sign = 1.0
-        for factor, (level, first) in levels.items():
-            sign *= (at[factor] == level) - float(at[factor] == first)
-        signs[name] = sign
-    cells = sum(sign > 0 for sign in signs.values()) / 2 ** (len(levels) - 1)
-    return {name: sign / cells for name, sign in signs.items()}
-
-
-class Effects(NamedTuple):
-    """The effects on a metric."""
-
-    comparison: Comparison
-    estimates: Mapping[str, Estimate | None]
-    """By the name of the effect."""
-    family: Family
-    """Of all of them."""
-
-    def is_marked(self, name: str) -> bool:
-        """Return whether an effect is not 0 by Holm's method."""
-        return (self.comparison.metric, name) in self.family.marked
-
-
-def estimated(table: StudyTable, comparison: Comparison) -> Effects:
-    """Return the effects of a grid on a metric."""
-    estimates = {name: contrast(comparison, weights) for name, weights in effects_of(table).items()}
-    family = family_of({(comparison.metric, name): one for name, one in estimates.items()})
-    return Effects(comparison, estimates, family)
+def effects_of(table: StudyTable, metric: str, *, part: str = TRAINING, last: int = LAST) -> Family:
+    """Return the effects of a grid on a metric, by effect and metric; none where there is no grid."""
+    rows = table.windows(part, last=last)
+    return contrasts(rows, metric, "condition", weights_of(table))
 
 
 def effect_cells(
     table: StudyTable, metrics: Sequence[str] = (), *, part: str = TRAINING, last: int = LAST
 ) -> list[Cells]:
     """Return a row for each effect of a grid, a column for each metric; nothing where there are none."""
-    names = list(effects_of(table))
+    names = list(weights_of(table))
     if not names:
         return []
     chosen = metrics_of(table, metrics, part=part)
-    each = [estimated(table, compare(table, metric, part=part, last=last)) for metric in chosen]
-    rows = [[name, *(_text(effects, name) for effects in each)] for name in names]
-    episodes = each[0].comparison.episodes_text
+    families = {metric: effects_of(table, metric, part=part, last=last) for metric in chosen}
+    rows = []
+    for name in names:
+        found = [family.get((name, metric)) for metric, family in families.items()]
+        rows.append([name, *map(change, found)])
     what = (
         "effects of the factors, differences between means over all cells, paired by replica; with x, how "
         "much larger the first difference is at the second factor's level"
     )
-    note = each[0].family.note("of a column")
+    note = families[chosen[0]].note("of a column")
     if (left_out := interactions_of(table.design)) > MOST_INTERACTIONS:
         note += f" The {left_out} interactions of two factors are left out."
-    heading = f"{episodes[0].upper()}{episodes[1:]}; {what}; {INTERVALS}."
-    return [Cells(heading, ["effect", *map(metric_title, chosen)], rows, note)]
-
-
-def _text(effects: Effects, name: str) -> str:
-    one = effects.estimates[name]
-    if one is None:
-        return "-"
-    return f"**{one:+}**" if effects.is_marked(name) else f"{one:+}"
+    heading = f"{capitalised(episodes_text(table, part, last))}; {what}; {INTERVALS}."
+    return [Cells(heading, ["effect", *map(title, chosen)], rows, note)]

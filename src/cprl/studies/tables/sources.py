@@ -5,21 +5,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
+import pyarrow.compute as pc
 
 from cprl.envs.unwrap import clock_in
 from cprl.experiment import Experiment
 from cprl.measuring.outcome import RULE, outcome_of
-from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, METRICS
-from cprl.measuring.table import Numbers, where
+from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, INCOME_EQUALITY, METRICS
+from cprl.measuring.table import WINDOWS, Numbers, complete, labelled, metrics_in, where, world_of
 from cprl.measuring.windows import Values, episodes_after, rounds_of
 from cprl.population import any_learns
 from cprl.runs.checkpoints import REPORT
-from cprl.runs.curves import as_curves, worlds_of
 from cprl.runs.episodes import read_episodes, read_rows
 from cprl.runs.files import read_json
 from cprl.runs.recipe import parts_of, read_recipe
@@ -50,11 +49,6 @@ REASONS: Final[dict[State, str]] = {
     "finished": "is finished",
     "refused": "has another recipe than its name says, or none that can be read: was it renamed?",
 }
-
-Windows = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Values]
-"""A metric of a replica in W windows, [W]: the first episode of each, and its episodes, of which the last
-window may have fewer; the episodes in which it is undefined, and the mean over the others, NaN where there
-are none."""
 
 
 class TooShortError(ValueError):
@@ -161,114 +155,120 @@ def table_of(
         lacking: other runs, which are listed.
     """
     checked("window", window, Positive)
-    measured: list[_Measured] = []
-    damaged: list[Lacking] = []
+    rows = []
+    damaged = []
+    made: dict[str, Circumstances] = {}
+    endings: dict[str, Counter[str]] = {}
+    lengths: dict[str, dict[str, list[int]]] = {}
     for source in sources:
         try:
-            measured.append(_measured(source, window))
+            tables = _tables_of(source)
+            ended = _endings(tables)
+            made_by = circumstances_of(source.run)
+            of_run = [_windows(table, source, part, window) for part, table in tables.items()]
         except (ValueError, OSError, KeyError) as error:
             begins = "is too short" if isinstance(error, TooShortError) else DAMAGED
-            reason = f"{begins}: {error}"
-            damaged.append(Lacking(source.name, source.condition, source.replicas, reason))
-    made = {run.source.name: run.circumstances for run in measured}
-    by_condition: dict[str, list[_Measured]] = {}
-    for run in measured:
-        by_condition.setdefault(run.source.condition, []).append(run)
+            damaged.append(Lacking(source.name, source.condition, source.replicas, f"{begins}: {error}"))
+            continue
+        rows += of_run
+        made[source.name] = made_by
+        endings.setdefault(source.condition, Counter()).update(sorted(ended))
+        counted_in = lengths.setdefault(source.condition, {"episodes": [], "steps": []})
+        counted_in["episodes"] += _counts(tables[TRAINING])
+        steps = _steps_of(source.run)
+        counted_in["steps"] += [] if steps is None else [steps]
+    learn = [source.agents_learn for source in sources if source.name in made]
     return StudyTable(
         design=design,
-        rows=_rows(design, measured, marks(made)),
+        rows=_rows(design, rows, marks(made)),
         window=window,
         lacking=(*lacking, *damaged),
         made=made,
-        endings={
-            name: dict(Counter(sorted(phase for run in runs for phase in run.phases)).most_common())
-            for name, runs in by_condition.items()
-        },
-        ending_rules=tuple(dict.fromkeys(run.rule for run in measured)),
-        agents_learn=any(run.source.agents_learn for run in measured) or not measured,
+        endings={name: dict(Counter(dict(sorted(of.items()))).most_common()) for name, of in endings.items()},
+        ending_rules=(RULE,) * bool(made),
+        agents_learn=any(learn) or not learn,
         lengths={
-            name: {
-                "episodes": _range(number for run in runs for number in run.episodes),
-                "steps": _range(steps),
-            }
-            for name, runs in by_condition.items()
-            if (steps := [run.steps for run in runs if run.steps is not None])
+            name: {unit: (min(each), max(each)) for unit, each in of.items()}
+            for name, of in lengths.items()
+            if of["steps"]
         },
     )
 
 
-def _range(numbers: Iterable[int]) -> tuple[int, int]:
-    ordered = sorted(numbers)
-    return ordered[0], ordered[-1]
-
-
-class _Measured(NamedTuple):
-    """What a table takes from a run."""
-
-    source: Source
-    windows: Sequence[Mapping[tuple[str, str], Windows]]
-    """Of each replica, by part and metric."""
-    phases: Sequence[str]
-    """In which each replica ends."""
-    rule: str
-    """How these were told."""
-    circumstances: Circumstances
-    episodes: Sequence[int]
-    """Those that each replica ended in training."""
-    steps: int | None
-    """Those that its report says a replica trained."""
-
-
-def _measured(source: Source, window: int) -> _Measured:
-    """Reads a finished run.
-
-    In training, windows are of so many episodes; evaluation and random play are one window each, but for
-    `window=1`.
-    """
-    windows: list[dict[tuple[str, str], Windows]] = [{} for _ in range(source.replicas)]
-    curves: dict[str, list[dict[str, Values]]] = {}
-    worlds: dict[str, list[Numbers]] = {}
-    tables: dict[str, pa.Table] = {}
+def _tables_of(source: Source) -> dict[str, pa.Table]:
+    """Read the episodes of each part of a run, sorted, a row for each agent of each."""
+    tables = {}
     for part, name in PARTS.items():
         folder = source.run / "evaluation"
         table = read_episodes(source.run) if name is None else read_rows(folder / f"{name}.parquet")
         _refuse_gaps(table, source, part)
-        # one by one: in as many steps, each replica ends a number of episodes of its own
-        replica = table["replica"].to_numpy()
-        of_replicas = [table.filter(replica == number) for number in range(source.replicas)]
-        curves[part] = list(map(as_curves, of_replicas))
-        tables[part] = table
-        worlds[part] = [worlds_of(rows)[0] for rows in of_replicas]
-        for of_replica, by_name, world in zip(windows, curves[part], worlds[part], strict=True):
-            for metric, values in by_name.items():
-                length = window if part == TRAINING or window == 1 else values.shape[1]
-                of_replica[part, metric] = _in_windows(values[0], length, world)
-    gained = COLLECTIVE_RETURN if COLLECTIVE_RETURN in curves[RANDOM][0] else INCOME
-    random = float(np.concatenate([by_name[gained][0] for by_name in curves[RANDOM]]).mean())
-    endings = _endings(tables[TRAINING], random, source.replicas)
-    episodes = [by_name["return_0"].shape[1] for by_name in curves[TRAINING]]
-    made = circumstances_of(source.run)
-    return _Measured(source, windows, endings, RULE, made, episodes, _steps_of(source.run))
+        order = [(column, "ascending") for column in ("replica", "episode", "agent")]
+        tables[part] = complete(table.sort_by(order))
+    return tables
 
 
-def _in_windows(values: Values, window: int, world: Numbers) -> Windows:
-    """Windows of consecutive episodes; of many worlds, of as many consecutive ones of each, so that no window
-    has more of the short episodes, which end sooner. The last window is whole, the first ones may lack worlds
-    that have ended fewer."""
+def _counts(table: pa.Table) -> list[int]:
+    """Return how many episodes each replica has ended."""
+    return pc.value_counts(where(table, agent=0)["replica"]).field("counts").to_pylist()
+
+
+def in_windows(table: pa.Table, window: int | None) -> pa.Table:
+    """Return the rows of windows of consecutive episodes, for each number and replica.
+
+    In many worlds a window has as many consecutive episodes of each, so that none has more of the short
+    episodes, which end sooner. The last window is whole, the first ones may lack worlds that have ended
+    fewer.
+
+    Args:
+        table: of episodes, sorted by replica, episode and agent.
+        window: of so many episodes; None for one window of all.
+    """
+    one = where(table, agent=0)
+    replica = one["replica"].to_numpy()
+    world = world_of(one)
+    order = []
+    firsts = []
+    begins = []
+    for start, size in zip(*np.unique(replica, return_index=True, return_counts=True)[1:], strict=True):
+        place = _windows_of(world[start : start + size], size if window is None else window)
+        in_order = np.argsort(place, kind="stable")
+        order.append(start + in_order)
+        firsts.append(np.flatnonzero(np.diff(place[in_order], prepend=-1)))
+        begins.append(firsts[-1] + start)
+    chosen = np.concatenate(order)
+    begin = np.concatenate(begins)
+    lengths = np.diff(np.append(begin, len(chosen)))
+    numbers = _numbers_of(table, one)
+    values = np.stack(list(numbers.values()))[:, chosen]
+    defined = ~np.isnan(values)
+    counts = np.add.reduceat(defined.astype(np.int64), begin, axis=1)
+    with np.errstate(invalid="ignore"):
+        means = np.add.reduceat(np.where(defined, values, 0.0), begin, axis=1) / counts
+    columns = {
+        "replica": np.tile(replica[begin], len(numbers)),
+        "metric": np.repeat(list(numbers), len(begin)),
+        "episode": np.tile(np.concatenate(firsts), len(numbers)),
+        WINDOWS: np.tile(lengths, len(numbers)),
+        "undefined": (lengths - counts).reshape(-1),
+        "value": means.reshape(-1),
+    }
+    return pa.table({name: pa.array(column, _SCHEMA.field(name).type) for name, column in columns.items()})
+
+
+def _windows_of(world: Numbers, window: int) -> Numbers:
+    """Return the number of the window of each episode of a replica, [E]."""
     lanes = len(np.unique(world))
     if lanes == 1 or window == 1:
-        firsts = np.arange(0, len(values), window)
-    else:
-        to_end = episodes_after(world) // rounds_of(window, lanes)
-        order = np.argsort(-to_end, kind="stable")
-        values = values[order]
-        firsts = np.flatnonzero(np.diff(to_end[order], prepend=-1))
-    lengths = np.diff(np.append(firsts, len(values)))
-    defined = ~np.isnan(values)
-    counts = np.add.reduceat(defined.astype(np.int64), firsts)
-    with np.errstate(invalid="ignore"):
-        means = np.add.reduceat(np.where(defined, values, 0.0), firsts) / counts
-    return firsts, lengths, lengths - counts, means
+        return np.arange(len(world)) // window
+    after = episodes_after(world) // rounds_of(window, lanes)
+    return np.asarray(after.max() - after)
+
+
+def _numbers_of(table: pa.Table, one: pa.Table) -> dict[str, Values]:
+    """Return the numbers of each episode, [E], with the return of each agent."""
+    numbers = {name: one[name].to_numpy() for name in metrics_in(table.schema)}
+    returns = table["return"].to_numpy().astype(np.float64).reshape(len(one), -1)
+    return numbers | {f"agent_{agent}/return": of_agent for agent, of_agent in enumerate(returns.T)}
 
 
 def _refuse_gaps(table: pa.Table, source: Source, part: str) -> None:
@@ -302,68 +302,65 @@ def _steps_of(run: Path) -> int | None:
     return steps if isinstance(steps, int) else None
 
 
-def _rows(design: Design, measured: Sequence[_Measured], marked: Mapping[str, str]) -> pa.Table:
-    sources = [run.source for run in measured]
-    numbers = [(source.condition, source.first + row) for source in sources for row in range(source.replicas)]
-    for (name, number), times in Counter(numbers).items():
-        if times > 1:
-            raise ValueError(f"replica {number} of the condition {name!r} is there twice")
-    names, parts, metrics = list(design.conditions), list(PARTS), _metrics(measured)
-    blocks = []
-    for place, run in enumerate(measured):
-        at = names.index(run.source.condition)
-        for replica, of_replica in enumerate(run.windows, run.source.first):
-            for (part, metric), windows in of_replica.items():
-                if metric in metrics:
-                    codes = at, replica, parts.index(part), metrics.index(metric)
-                    blocks.append(np.broadcast_arrays(*codes, *windows, place))
-    columns = [np.concatenate(arrays) for arrays in zip(*blocks, strict=True)] or [np.zeros(0, np.int64)] * 9
-    order = np.lexsort(columns[4::-1])  # the first five, the first one first
-    condition, replicas, part_code, metric_code, episode, length, undefined, value, place_of_run = (
-        column[order] for column in columns
-    )
+def _windows(table: pa.Table, source: Source, part: str, window: int) -> pa.Table:
+    """Return the windows of a part of a run, with what the study's table says of the run."""
+    is_whole = part != TRAINING and window > 1
+    rows = in_windows(table, None if is_whole else window)
+    labels = {"condition": source.condition, "checksum": source.checksum, "run": source.name, "part": part}
+    replica = pc.cast(pc.add(rows["replica"], source.first), pa.int32())
+    rows = rows.set_column(rows.column_names.index("replica"), "replica", replica)
+    return labelled(rows, **labels).cast(_SCHEMA)
 
-    def texts(words: Sequence[str], codes: NDArray[np.int64]) -> pa.Array:
-        return pa.array(words, pa.string()).take(pa.array(codes))
 
-    rows = {
-        "condition": texts(names, condition),
-        "checksum": texts([source.checksum for source in sources], place_of_run),
-    }
+_SCHEMA: Final = pa.schema(
+    [
+        *((name, pa.string()) for name in ("condition", "checksum", "run", "part")),
+        *(("replica", pa.int32()), ("metric", pa.string()), ("episode", pa.int32())),
+        *((WINDOWS, pa.int32()), ("undefined", pa.int32()), ("value", pa.float64())),
+    ]
+)
+"""Of the windows of a run."""
+
+
+def _rows(design: Design, parts: Sequence[pa.Table], marked: Mapping[str, str]) -> pa.Table:
+    """Return the rows of all runs, sorted, with the levels of their conditions."""
+    rows = pa.concat_tables([_SCHEMA.empty_table(), *parts]).combine_chunks()
+    metrics = _metrics(rows["metric"].unique().to_pylist())
+    rows = rows.filter(pc.is_in(rows["metric"], pa.array(metrics, pa.string())))
+    orders = {"condition": list(design.conditions), "part": list(PARTS), "metric": metrics}
+    keys = {name: pc.index_in(rows[name], pa.array(order, pa.string())) for name, order in orders.items()}
+    keys |= {name: rows[name] for name in ("replica", "episode")}
+    by = [(name, "ascending") for name in ("condition", "replica", "part", "metric", "episode")]
+    in_order = pc.sort_indices(pa.table(keys), sort_keys=by)
+    rows = rows.take(in_order)
+    condition = keys["condition"].take(in_order)
+    columns = {name: rows[name] for name in ("condition", "checksum")}
     for factor in design.factors:
-        column = f"factor {factor}" if factor in COLUMNS else factor
-        rows[column] = _levels(design.levels(factor)).take(pa.array(condition))
-    rows |= {
-        "run": texts([source.name for source in sources], place_of_run),
-        "marks": texts([marked[source.name] for source in sources], place_of_run),
-        "replica": pa.array(replicas, pa.int32()),
-        "part": texts(parts, part_code),
-        "metric": texts(metrics, metric_code),
-        "episode": pa.array(episode, pa.int32()),
-        "window_episodes": pa.array(length, pa.int32()),
-        "undefined": pa.array(undefined, pa.int32()),
-        "value": pa.array(value, pa.float64()),
-    }
-    return pa.table(rows)
+        name = f"factor {factor}" if factor in COLUMNS else factor
+        columns[name] = _levels(design.levels(factor)).take(condition)
+    columns["run"] = rows["run"]
+    run_marks = pa.array(list(marked.values()), pa.string())
+    columns["marks"] = run_marks.take(pc.index_in(rows["run"], pa.array(list(marked), pa.string())))
+    return pa.table(columns | {name: rows[name] for name in _SCHEMA.names[3:] if name != "run"})
 
 
-def _metrics(measured: Sequence[_Measured]) -> list[str]:
-    """Metrics in the order of tables: social ones, returns of single agents, those of institutions.
+def _metrics(names: Sequence[str]) -> list[str]:
+    """Return metrics in the order of tables: those of the registry, returns of single agents, and others.
 
-    The return of all agents together is among them where it is not the harvest.
+    The income is among them where it is not the harvest.
     """
-    metrics = {metric for run in measured for _, metric in run.windows[0]}
-    if "collective_return" in metrics and not any(name.startswith("institutions/") for name in metrics):
-        metrics.discard(INCOME)
-    order = [name for name in METRICS if not METRICS[name].is_of_institutions]
+    order = list(METRICS)
+    moves_money = INCOME_EQUALITY in names or any(name.startswith("institutions/") for name in names)
+    if COLLECTIVE_RETURN in names and not moves_money:
+        names = [name for name in names if name != INCOME]
 
     def place(name: str) -> tuple[int, int, str]:
-        if name in order:
+        if name in METRICS:
             return 0, order.index(name), ""
-        agent = name.removeprefix("return_")
-        return (1, int(agent), "") if agent.isdecimal() else (2, 0, name)
+        is_of_agent = name.startswith("agent_")
+        return (1, len(name), name) if is_of_agent else (2, 0, name)
 
-    return sorted(metrics, key=place)
+    return sorted(names, key=place)
 
 
 def _levels(levels: Sequence[Any]) -> pa.Array:
@@ -414,6 +411,11 @@ def marks(made: Mapping[str, Circumstances]) -> dict[str, str]:
     }
 
 
-def _endings(training: pa.Table, random: float, replicas: int) -> list[str]:
+def _endings(tables: Mapping[str, pa.Table]) -> list[str]:
     """Return how the training of each replica went, in a word."""
-    return [outcome_of(where(training, replica=one), random=random).word for one in range(replicas)]
+    training, random = tables[TRAINING], tables[RANDOM]
+    number = COLLECTIVE_RETURN if COLLECTIVE_RETURN in random.column_names else INCOME
+    by_chance = float(np.mean(where(random, agent=0)[number].to_numpy()))
+    replicas = sorted(training["replica"].unique().to_pylist())
+    outcomes = [outcome_of(where(training, replica=replica), random=by_chance) for replica in replicas]
+    return [outcome.word for outcome in outcomes]

@@ -1,4 +1,4 @@
-"""StudyTable: what came out of the runs of a study, as one tidy table.
+"""StudyTable: what came out of the runs of a study, as one tidy table of windows of episodes.
 
 Columns:
     condition        its name
@@ -8,7 +8,7 @@ Columns:
     marks            what of its versions, git commit and processor differs from most runs'; "" if nothing
     replica          its number in the study, int32
     part             "training", "evaluation" or "random", random play in the worlds of the evaluation
-    metric           its name, as in docs/metrics.md, without "social/"; "income" is the return of all agents
+    metric           its name, as in docs/metrics.md, without "social/"
     episode          the first episode of the window, int32; in W worlds a window has as many consecutive
                      episodes of each, and its first is that after all earlier windows
     window_episodes  episodes of the window, int32
@@ -27,18 +27,20 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
+from cprl.measuring.table import WINDOWS, where
 from cprl.runs.episodes import write_table
 from cprl.runs.files import STUDY_TABLE_FORMAT, refuse_newer
 from cprl.runs.recipe import versions
+from cprl.system.defaults import LAST as LAST
 from cprl.system.defaults import WINDOW as WINDOW
+from cprl.values import Positive, checked, refusal
 
 METADATA: Final = b"cprl"
 """The key of all that a table holds beside its rows, see the fields of `StudyTable`."""
@@ -54,10 +56,6 @@ COLUMNS: Final = (
 )
 """All but those of factors, which follow "checksum"."""
 
-Grid = Mapping[str, NDArray[Any]]
-"""The rows of a metric in one part, for R replicas and the W windows of the one that has most: "replica",
-[R]; "episode", "window_episodes", "undefined" and "value", [R, W]. A window that a replica does not have is
-of 0 episodes."""
 Circumstances = Mapping[str, str]
 """The version of each package, the checksum of each module of the user's own, the git commit and the type of
 processor, by name. Where a run was resumed under others, all of them in order, with " then " between them."""
@@ -145,9 +143,6 @@ class StudyTable:
     the reports of its runs do not say how many steps."""
     agents_learn: bool = True
     """Whether any agent of its runs learns."""
-    comparisons: dict[tuple[str, str, int], Any] = field(default_factory=dict, init=False, repr=False)
-    """What figures and texts share: each metric, part and number of last episodes that was compared, see
-    `cprl.studies.tables.comparing`."""
 
     @cached_property
     def mixed(self) -> list[str]:
@@ -177,6 +172,33 @@ class StudyTable:
         counts = Counter(pairs["condition"].to_pylist())
         return {condition: counts[condition] for condition in self.design.conditions}
 
+    def windows(self, part: str = TRAINING, *, last: int | None = LAST) -> pa.Table:
+        """Return the rows of a part, of which `cprl.measuring.statistics` makes estimates and differences.
+
+        Args:
+            part: "training", "evaluation" or "random".
+            last: of training the last episodes of each replica, in whole windows; in many worlds as many
+                of each, see `cprl.measuring.windows.last_of`. None for all.
+        """
+        checked("part", part, Literal[tuple(PARTS)])
+        rows = where(self.rows, part=part)
+        if last is None:
+            return rows
+        checked("last", last, Positive)
+        if part != TRAINING:
+            return rows
+        if last < self.window:
+            raise refusal("last", last, f"at least {self.window}, the episodes of a window of the table")
+        condition = rows["condition"].combine_chunks().dictionary_encode().indices.to_numpy()
+        replica, episode, length = (rows[name].to_numpy() for name in ("replica", "episode", WINDOWS))
+        of_replica = condition * (replica.max(initial=0) + 1) + replica
+        ends = np.zeros(of_replica.max(initial=0) + 1, np.int64)
+        np.maximum.at(ends, of_replica, episode + length)
+        longest = np.ones(len(self.design.conditions), np.int64)
+        np.maximum.at(longest, condition, length)
+        whole = np.where(longest > self.window, -(-last // longest) * longest, last)
+        return rows.filter(pa.array(episode >= ends[of_replica] - whole[condition]))
+
     def __str__(self) -> str:
         """What it holds, what it lacks and what is mixed, in sentences."""
         return "\n".join([self.summary, *self.design.notes, *self.mixed, *map(str, self.lacking)])
@@ -192,23 +214,6 @@ class StudyTable:
             f"{len(self.rows):,} rows{without}."
         )
 
-    def values(self, condition: str, metric: str, part: str) -> Grid | None:
-        """Return the rows of a condition in one part, None if there are none."""
-        return self._grids.get((condition, part, metric))
-
-    @cached_property
-    def _grids(self) -> dict[tuple[str, str, str], Grid]:
-        keys = ["condition", "part", "metric"]
-        columns = ["replica", "episode", "window_episodes", "undefined", "value"]
-        rows = self.rows.select(keys + columns).sort_by([("replica", "ascending"), ("episode", "ascending")])
-        groups = rows.group_by(keys, use_threads=False).aggregate([(name, "list") for name in columns])
-        lists = {name: groups[f"{name}_list"].combine_chunks() for name in columns}
-        names = zip(*(groups[name].to_pylist() for name in keys), strict=True)
-        return {
-            key: _grid({name: each[place].values.to_numpy() for name, each in lists.items()})
-            for place, key in enumerate(names)
-        }
-
     def write(self, path: Path | str) -> Path:
         """Writes a parquet file atomically, which `read` gives back; replaces an older one."""
         path = Path(path)
@@ -217,15 +222,17 @@ class StudyTable:
             "versions": versions(),
             "design": asdict(self.design),
             "lacking": [asdict(run) for run in self.lacking],
-            **{name: getattr(self, name) for name in (*_HELD, "agents_learn")},
+            **{name: getattr(self, name) for name in _HELD},
         }
         rows = self.rows.replace_schema_metadata({METADATA: json.dumps(held)})
         write_table(path, rows, over=True)
         return path
 
     def to_csv(self) -> str:
-        """The rows as CSV, with the names of the columns, e.g. for spreadsheets and R."""
-        return csv_of(self.rows)
+        """Return the rows as CSV, with the names of the columns, e.g. for spreadsheets and R."""
+        file = io.BytesIO()
+        pyarrow.csv.write_csv(self.rows, file)
+        return file.getvalue().decode()
 
     @classmethod
     def read(cls, path: Path | str) -> "StudyTable":
@@ -240,32 +247,13 @@ class StudyTable:
                 design=Design(**{**held["design"], "notes": tuple(held["design"]["notes"])}),
                 lacking=tuple(Lacking(**run) for run in held["lacking"]),
                 **{name: held[name] for name in _HELD},
-                agents_learn=held.get("agents_learn", True),  # of a table of before
             )
         except (pa.ArrowException, OSError, LookupError, TypeError, json.JSONDecodeError) as error:
             raise ValueError(f"{path} is not the table of a study: {error!r}") from error
 
 
-def csv_of(rows: pa.Table) -> str:
-    """Return rows as CSV, with the names of the columns."""
-    file = io.BytesIO()
-    pyarrow.csv.write_csv(rows, file)
-    return file.getvalue().decode()
-
-
-_HELD: Final = ("window", "made", "endings", "ending_rules", "lengths")
+_HELD: Final = ("window", "made", "endings", "ending_rules", "lengths", "agents_learn")
 """Fields that JSON can hold as they are."""
-
-
-def _grid(columns: Mapping[str, NDArray[Any]]) -> Grid:
-    """Columns that are sorted by replica and episode, with a row for each replica."""
-    replicas, row, counts = np.unique(columns["replica"], return_inverse=True, return_counts=True)
-    place = np.concatenate([np.arange(count) for count in counts])
-    grid: dict[str, NDArray[Any]] = {"replica": replicas}
-    for name in ("episode", "window_episodes", "undefined", "value"):
-        grid[name] = np.zeros((len(replicas), counts.max()), columns[name].dtype)
-        grid[name][row, place] = columns[name]
-    return grid
 
 
 def counted(made: Mapping[str, Circumstances]) -> dict[str, Counter[str]]:
