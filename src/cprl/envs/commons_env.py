@@ -30,7 +30,7 @@ _AHEAD_BYTES = 2**16
 """Below this size, memory is allocated for sixteen turns at once: an allocation takes as long as a world."""
 _AHEAD_TURNS = 16
 _BALLOT_ENTRIES = (keys.IN_FORCE, keys.BALLOTS_DUE)
-_PAID_ENTRIES = ("fines", "transfers", "violated", "counts")
+_PAID_ENTRIES = tuple(key[-1] for key in (keys.FINES, keys.TRANSFERS, keys.VIOLATED, keys.COUNTS))
 """Entries of agents in games with institutions."""
 _REPLACED = frozenset((*StepOutput._fields, *Payments._fields, keys.STATE, keys.AGENTS, "next", "_reset"))
 """The entries that the environment writes anew in each turn."""

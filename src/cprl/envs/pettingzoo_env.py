@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import parallel_to_aec
 
+from cprl import keys
 from cprl.commons.batch import Batch, Output, turn_of
 from cprl.commons.game import Game
 from cprl.commons.picture import world_image
@@ -167,9 +168,9 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
             "tagged": bool(output.tagged_by[0, agent].any()),
         }
         if payments is not None:
-            info["fines"] = float(payments.fines[0, agent])
-            info["transfers"] = float(payments.transfers[0, agent])
-            info["violated"] = bool(payments.violated[0, agent])
+            info[keys.FINES[-1]] = float(payments.fines[0, agent])
+            info[keys.TRANSFERS[-1]] = float(payments.transfers[0, agent])
+            info[keys.VIOLATED[-1]] = bool(payments.violated[0, agent])
         return info
 
     @property

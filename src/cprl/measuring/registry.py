@@ -25,7 +25,7 @@ from torchrl.envs import EnvBase
 
 from cprl import keys
 from cprl.commons.colours import APPLE, BLUE, GREEN, GREY, ORANGE, PALETTE, PURPLE, VERMILION, Colour
-from cprl.institutions import COUNTS, Institution, Levies
+from cprl.institutions import COUNTS, Institution, Levies, ledger
 from cprl.measuring.social import (
     Groups,
     equality,
@@ -43,9 +43,9 @@ COLLECTIVE_RETURN: Final = "collective_return"
 EQUALITY: Final = "equality"
 INCOME: Final = "income"
 INCOME_EQUALITY: Final = "income_equality"
-FINES: Final = "fines"
-TRANSFERS: Final = "transfers"
-VIOLATIONS: Final = "violations"
+FINES: Final = keys.FINES[-1]
+TRANSFERS: Final = keys.TRANSFERS[-1]
+VIOLATIONS: Final = COUNTS[ledger.VIOLATIONS]
 
 SHARE: Final = "0 to 1"
 """In place of a unit."""
@@ -353,9 +353,7 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
     ),
     _institutional(FINES, "fines of all", APPLES, lambda fines: fines.sum(-1)),
     _institutional(TRANSFERS, "transfers to all", APPLES, lambda transfers: transfers.sum(-1)),
-    _institutional(
-        VIOLATIONS, "violations", "turns", lambda violations: violations.sum(-1), colour=VERMILION
-    ),
+    _institutional(VIOLATIONS, VIOLATIONS, "turns", lambda violations: violations.sum(-1), colour=VERMILION),
     _institutional(
         "violations_per_step",
         "violations per turn in play",

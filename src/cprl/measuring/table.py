@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from cprl.measuring.registry import IN_FORCE, INCOME, METRICS, TOTALS, is_own, measured
+from cprl.measuring.registry import FINES, IN_FORCE, INCOME, METRICS, TOTALS, is_own, measured
 
 Numbers = NDArray[np.int64]
 
@@ -88,7 +88,7 @@ def numbers_in(table: pa.Table) -> list[str]:
     The income is among them where it is not the harvest.
     """
     columns = complete(table).column_names
-    if "harvest" in columns and "fines" not in columns:
+    if "harvest" in columns and FINES not in columns:
         columns = [name for name in columns if name != INCOME]
     known = [name for name in METRICS if name in columns]
     own = [name for name in metrics_in(table.schema) if is_own(name)]
