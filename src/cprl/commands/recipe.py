@@ -6,6 +6,7 @@ Its own arguments stand first; every number of the experiment can be changed by 
 
 import ast
 import inspect
+import re
 import shutil
 import signal
 import sys
