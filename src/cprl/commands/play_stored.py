@@ -244,7 +244,7 @@ def visits(
         raise ValueError("--random says who is drawn; allowed: with --figure FILE")
     _begin(fresh.seed, run, files=files)
 
-    from cprl.evaluation.territory import draw_visits, territory_cells, territory_of
+    from cprl.experimental.territory import draw_visits, territory_cells, territory_of
     from cprl.training.agents import load
 
     loaded = load(run)
@@ -347,7 +347,7 @@ def egta(
     _begin(fresh.seed, *_paths(named), files=files)
 
     from cprl.evaluation.cross_play import crossplay
-    from cprl.evaluation.empirical_game import (
+    from cprl.experimental.empirical_game import (
         analyse,
         draw_egta,
         egta_cells,
