@@ -40,18 +40,17 @@ from cprl.evaluation import (
     by_focal_agent,
     draw_gains,
     gains,
-    play_empirical_game,
     play_population,
     run_scenarios,
     scenarios_of,
     schelling,
-    territory_of,
 )
 from cprl.evaluation.cross_play import PAIR, RETURNS
 from cprl.evaluation.evaluate import refuse_unlike
 from cprl.evaluation.lanes import agents_of, play, said, together
+from cprl.experimental import play_empirical_game, territory_of
+from cprl.experimental.movement import trace
 from cprl.measuring.evaluate import evaluate, turns
-from cprl.measuring.movement import trace
 from cprl.measuring.registry import INCOME_EQUALITY, with_unit
 from cprl.measuring.statistics import estimates
 from cprl.measuring.table import numbers_in, where

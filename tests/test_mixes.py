@@ -13,10 +13,11 @@ from stored_runs import CORRIDORS, MEADOW, SEED, command, episodes_of, ran, retu
 import cprl
 from cprl import Fresh, Game, Rules, maps
 from cprl.envs.matrix import stag_hunt
-from cprl.evaluation import draw_egta, pairwise_game, play_empirical_game, play_population, schelling
-from cprl.evaluation.empirical_game import analyse_games, egta_cells, games_in, mean_of
+from cprl.evaluation import play_population, schelling
 from cprl.evaluation.lanes import said, shifted
 from cprl.evaluation.schelling import between_the_ends, candidates, dilemma, margins, payoffs_of
+from cprl.experimental import draw_egta, pairwise_game, play_empirical_game
+from cprl.experimental.empirical_game import analyse_games, egta_cells, games_in, mean_of
 from cprl.population import Frozen, Scripted
 from cprl.theory import PayoffTable, compositions
 
@@ -335,6 +336,6 @@ def test_the_command_tells_all_compositions_of_more_agents(three, tmp_path, monk
 
 
 def test_more_profiles_than_alpha_rank_takes_are_refused_before_play(three, monkeypatch):
-    monkeypatch.setattr("cprl.evaluation.empirical_game.MOST_PROFILES", 7)
+    monkeypatch.setattr("cprl.experimental.empirical_game.MOST_PROFILES", 7)
     with pytest.raises(ValueError, match="2 runs of 3 agents have 8 profiles"):
         play_empirical_game(three)

@@ -12,10 +12,9 @@ from stored_runs import CORRIDORS, SEED
 
 import cprl
 from cprl import CommonsEnv, Fresh, Game, Rules, keys, maps
-from cprl.evaluation import territory_of
 from cprl.evaluation.lanes import agents_of, fresh_for, policies_of, scripted, worlds_of
-from cprl.evaluation.territory import WORDS, draw_visits, maps_of, number_of
-from cprl.measuring import movement
+from cprl.experimental import movement
+from cprl.experimental.territory import WORDS, draw_visits, maps_of, number_of, territory_of
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.table import where
 

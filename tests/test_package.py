@@ -24,7 +24,7 @@ from cprl.envs.make_env import make_env
 from cprl.envs.matrix import stag_hunt
 
 PACKAGES = (
-    *("algorithms", "commons", "envs", "evaluation", "institutions", "keys"),
+    *("algorithms", "commons", "envs", "evaluation", "experimental", "institutions", "keys"),
     *("learners", "measuring", "networks", "objectives", "policies", "population"),
     *("studies", "theory", "training", "viewer"),
 )
@@ -211,6 +211,7 @@ def test_a_package_imports_only_from_packages_above_it(package):
 def test_every_package_is_in_the_list_and_an_import_from_below_is_noticed():
     for line in ("from cprl.training import train", "import cprl.viewer.x", "from cprl import population"):
         assert imports_from_below("commons", line)
+    assert imports_from_below("evaluation", "from cprl.experimental import territory_of")
     entries = {
         path.stem for path in SOURCE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
     }

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from cprl.evaluation.empirical_game import _draw_simplex
+from cprl.experimental.empirical_game import _draw_simplex
 from cprl.theory import (
     PayoffTable,
     PowerWorth,
@@ -164,10 +164,10 @@ def test_replicator_dynamics_follow_what_pays(open_spiel):
 
 def test_the_share_of_an_end_of_replicator_dynamics_is_not_written_over_the_name_of_its_corner():
     ends = SimpleNamespace(mixtures=np.eye(3), shares=[0.1, 0.2, 0.7])
-    game = SimpleNamespace(names=["greedy", "restraint", "chance"])
+    names = ["greedy", "restraint", "chance"]
     figure = Figure(figsize=(4, 4))
     axes = figure.add_subplot()
-    _draw_simplex(axes, SimpleNamespace(table=ROCK_PAPER_SCISSORS, ends=ends, game=game))
+    _draw_simplex(axes, SimpleNamespace(mean=ROCK_PAPER_SCISSORS, ends=ends, names=names))
     renderer = FigureCanvasAgg(figure).get_renderer()
     boxes = [text.get_window_extent(renderer) for text in axes.texts]
     assert len(boxes) == 6

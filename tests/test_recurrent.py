@@ -26,8 +26,8 @@ from cprl.envs import make_env, spaces_of
 from cprl.envs.matrix import stag_hunt
 from cprl.evaluation.film import film
 from cprl.evaluation.play import open_session
+from cprl.experimental.movement import trace
 from cprl.measuring.evaluate import evaluate
-from cprl.measuring.movement import trace
 from cprl.networks import GRU, LSTM, MLP, Conv
 from cprl.networks.stacked import lane_state, stack_lanes
 from cprl.policies.assignment import AgentPolicies

@@ -29,8 +29,8 @@ from verdicts import CONTRADICTED, NOT_CONTRADICTED, curve_prediction, predictio
 import cprl
 from cprl import Game, Rules, maps, presets
 from cprl.algorithms import DQN
+from cprl.experimental.movement import Trace
 from cprl.institutions import Tax
-from cprl.measuring.movement import Trace
 from cprl.measuring.statistics import estimate
 from cprl.population import Learning, Scripted
 from cprl.runs.curves import as_curves, curves_of

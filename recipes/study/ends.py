@@ -23,11 +23,10 @@ from cprl.evaluation import (
     payoffs_of,
     plan_responses,
     schelling,
-    territory_of,
 )
 from cprl.evaluation.cross_play import OF_FOCAL
 from cprl.evaluation.exploit import BEST, compared
-from cprl.evaluation.territory import WORDS, number_of
+from cprl.experimental.territory import WORDS, number_of, territory_of
 from cprl.measuring.statistics import estimate
 from cprl.measuring.table import by_replica, where
 from cprl.measuring.windows import Values, running_mean

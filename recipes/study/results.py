@@ -26,7 +26,7 @@ from cprl.commons.game import Game
 from cprl.envs.commons_env import CommonsEnv
 from cprl.evaluation.lanes import Agent, agents_of, policies_of, scripted, worlds_of
 from cprl.experiment import Experiment
-from cprl.measuring.movement import Trace, overlap, trace
+from cprl.experimental.movement import Trace, overlap, trace
 from cprl.measuring.statistics import estimate
 from cprl.measuring.windows import SMOOTHED_EPISODES, running_mean
 from cprl.population import Learning, Scripted, Team, exploration_steps

@@ -14,7 +14,7 @@ A package imports only from those above it:
     learners     replay and rollouts, updates of many agents at once
     algorithms   what agents learn by: DQN, PPO, QMIX and so on, frozen values
     population   how each agent is specified: Learning, Team, Scripted, Frozen
-    measuring    social metrics, episodes, phases, statistics
+    measuring    social metrics, episodes, outcomes, statistics
     runs         what is kept of a run: recipe, table of episodes, checkpoints, weights
     experiment   Experiment: what is trained and how, a value; presets: what was published, by name
     viewer       recordings for the Rerun viewer
@@ -22,6 +22,7 @@ A package imports only from those above it:
     training     the loop: act, store, update, measure, record; run, load
     studies      one experiment under many conditions: factors, trials, tables, figures
     evaluation   stored agents in fresh worlds: alone, among each other and people, against best responses
+    experimental  the waiting room, which may change: empirical games, territory
     commands     the command line
 """
 
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
         commons,
         envs,
         evaluation,
+        experimental,
         institutions,
         keys,
         learners,
@@ -88,6 +90,7 @@ __all__ = [
     "estimates",
     "evaluate_run",
     "evaluation",
+    "experimental",
     "gains",
     "institutions",
     "keys",

@@ -76,7 +76,7 @@ def scenarios() -> dict[str, object]:
 
 def territory() -> dict[str, object]:
     import cprl
-    from cprl.evaluation.territory import WORDS, maps_of, territory_of
+    from cprl.experimental.territory import WORDS, maps_of, territory_of
     from cprl.measuring.table import where
 
     names = {"visits": "visits", "taggings": "tags_by_agent", "tagged_where": "tags_by_cell"}

@@ -25,7 +25,7 @@ from perolat_base import BEAMS
 
 from cprl import Study, maps
 from cprl.commands.recipe import in_a_sentence
-from cprl.evaluation.territory import WORDS, maps_of, number_of, territory_of
+from cprl.experimental.territory import WORDS, maps_of, number_of, territory_of
 from cprl.measuring.statistics import Estimate, difference, estimate
 from cprl.runs.curves import as_curves
 from cprl.runs.episodes import read_table

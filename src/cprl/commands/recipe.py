@@ -6,6 +6,7 @@ Its own arguments stand first; every number of the experiment can be changed by 
 
 import ast
 import inspect
+import re
 import shutil
 import signal
 import sys
@@ -150,7 +151,8 @@ def in_a_sentence(program: str) -> Iterator[None]:
                 raise
         if isinstance(error, BrokenPipeError) and not notes:  # `--help | head`: its reader has seen enough
             sys.exit(0)
-        sys.exit(legible("\n".join([_shortened(f"{program}: {error}"), *notes])))
+        text = re.sub(r"^Fresh\.", "--", str(error))  # whose fields are flags
+        sys.exit(legible("\n".join([_shortened(f"{program}: {text}"), *notes])))
 
 
 @contextmanager

@@ -7,10 +7,7 @@ Modules, in the order in which one reads them:
     evaluate        evaluate_run: all replicas of a run, beside the random policy
     cross_play      crossplay: a focal agent of one run among background agents of another; gains
     schelling       what restrained and greedy agents get, by how many of the others are restrained
-    empirical_game  play_empirical_game: the game whose strategies are runs; pairwise_game: of a cross-play;
-                    analyse: which runs last in it, by alpha-rank, equilibria and replicator dynamics
     scenarios       run_scenarios: a run among named backgrounds that it never met
-    territory       territory_of: where the agents of a run go and whom they tag
     exploit         exploitability: trains best responses, a study; play_responses, response_gains: what they
                     gain over the agents whose place they take
     fresh           fresh episodes that are shown, by default a typical one
@@ -24,43 +21,34 @@ Modules, in the order in which one reads them:
 """
 
 from cprl.evaluation.cross_play import by_focal_agent, crossplay, draw_gains, gains
-from cprl.evaluation.empirical_game import Analysis, analyse, draw_egta, pairwise_game, play_empirical_game
 from cprl.evaluation.evaluate import evaluate_run
 from cprl.evaluation.exploit import Plan, exploitability, plan_responses, play_responses, response_gains
 from cprl.evaluation.lanes import play_population
 from cprl.evaluation.scenarios import Scenario, advantages, draw_scenarios, run_scenarios, scenarios_of
 from cprl.evaluation.schelling import dilemma, draw_schelling, margins, payoffs_of, schelling
-from cprl.evaluation.territory import draw_visits, territory_of
 from cprl.system.defaults import Fresh
 
 __all__ = [
-    "Analysis",
     "Fresh",
     "Plan",
     "Scenario",
     "advantages",
-    "analyse",
     "by_focal_agent",
     "crossplay",
     "dilemma",
-    "draw_egta",
     "draw_gains",
     "draw_scenarios",
     "draw_schelling",
-    "draw_visits",
     "evaluate_run",
     "exploitability",
     "gains",
     "margins",
-    "pairwise_game",
     "payoffs_of",
     "plan_responses",
-    "play_empirical_game",
     "play_population",
     "play_responses",
     "response_gains",
     "run_scenarios",
     "scenarios_of",
     "schelling",
-    "territory_of",
 ]

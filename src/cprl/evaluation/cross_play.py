@@ -16,17 +16,18 @@ from pathlib import Path
 from typing import Final
 
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from cprl.evaluation.evaluate import opened, refuse_other_games
 from cprl.evaluation.lanes import agents_of, fresh_for, play, roles_of, said, together
-from cprl.evaluation.pages import draw_matrices, heading, matrix_cells, rewards_of, says_nothing
+from cprl.evaluation.pages import draw_matrices, heading, matrix_cells
 from cprl.measuring.registry import COLLECTIVE_RETURN, FINES, INCOME, with_unit
 from cprl.measuring.statistics import HOLM, Family, differences, estimates
 from cprl.measuring.table import BACKGROUND, BOTH, FOCAL, ROLE, labelled, numbers_in, where
+from cprl.runs.episodes import Label
 from cprl.system.defaults import Diagonal, Fresh
-from cprl.system.working import say_how_far, working
+from cprl.system.working import working
 from cprl.terminal import style
+from cprl.terminal.summary import rewards_of, says_nothing
 from cprl.terminal.tables import Cells
 from cprl.training.agents import LoadedRun
 from cprl.values import checked, refusal
@@ -65,8 +66,8 @@ def crossplay(runs: Runs, fresh: Fresh = Fresh(), *, diagonal: Diagonal = "self"
     if diagonal == "cross_seed" and len(numbers) < 2:
         raise ValueError(f"the replicas are {list(numbers)}; allowed for cross_seed: at least 2")
     following = dict(zip(numbers, (*numbers[1:], numbers[0]), strict=True))
-    parts: list[pa.Table] = []
-    for focal, background in product(named, repeat=2):
+
+    def cell(focal: str, background: str) -> Iterator[pa.Table]:
         home = agents_of(named[background])
         populations = {SELF_PLAY: (home, [BOTH] * len(home))}
         if focal != background or diagonal != "self":
@@ -76,12 +77,12 @@ def crossplay(runs: Runs, fresh: Fresh = Fresh(), *, diagonal: Diagonal = "self"
                 for agent, visitor in enumerate(visitors)
             }
         for agent, (agents, roles) in populations.items():
-            say_how_far(len(parts), None, "populations")
-            labels = {FOCAL: focal, BACKGROUND: background, "focal_agent": agent}
-            parts.append(play(fresh, named[background], agents, labels, roles=roles, among=named.values()))
+            labels: Label = {FOCAL: focal, BACKGROUND: background, "focal_agent": agent}
+            yield play(fresh, named[background], agents, labels, roles=roles, among=named.values())
+
     each = " with focal agent at each index"
     return together(
-        parts,
+        (part for pair in product(named, repeat=2) for part in cell(*pair)),
         heading=heading("Cross-play", fresh, named.values(), each, f", diagonal: {diagonal}"),
         fresh=fresh,
         diagonal=diagonal,
@@ -130,7 +131,7 @@ def gains(table: pa.Table) -> Family:
 
 def by_focal_agent(table: pa.Table) -> pa.Table:
     """Return the table of a cross-play in which each agent of self-play is the focal one in turn."""
-    agents = pc.max(table["agent"]).as_py() + 1
+    agents = len(table["agent"].unique())
     at_home = where(table, focal_agent=SELF_PLAY).drop_columns(["focal_agent", ROLE])
     parts = [where(table, focal_agent=tuple(range(agents)))]
     for agent in range(agents):

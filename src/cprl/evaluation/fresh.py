@@ -23,6 +23,8 @@ from cprl.evaluation.lanes import refuse_trained_in
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode, tracker_of
 from cprl.measuring.evaluate import evaluate, turns
+from cprl.measuring.registry import COLLECTIVE_RETURN
+from cprl.measuring.table import where
 from cprl.policies.assignment import AgentPolicies
 from cprl.population import AgentSpec
 from cprl.runs.episodes import read_rows
@@ -69,16 +71,15 @@ def averages_of(run: LoadedRun) -> dict[int, tuple[float, float]]:
     """Return how many turns the trained agents of each replica last and how many apples they pick, on average
     over the run's own evaluation, by replica; {} of a run that has none, or in which nobody learned."""
     path = run.path / "evaluation" / "trained.parquet"
-    names = ("survival_steps", "collective_return")
+    names = ("survival_steps", COLLECTIVE_RETURN)
     if not run.networks or not path.is_file():
         return {}
     table = read_rows(path)
     if not {*names} <= {*table.column_names}:
         return {}
-    means = table.group_by("replica").aggregate([(name, "mean") for name in names]).sort_by("replica")
-    turns, apples = (means[f"{name}_mean"].to_pylist() for name in names)
-    by_replica = zip(means["replica"].to_pylist(), zip(turns, apples, strict=True), strict=True)
-    return {replica: average for replica, average in by_replica if replica in run.replicas}
+    means = where(table, replica=tuple(run.replicas)).group_by("replica")
+    rows = means.aggregate([(name, "mean") for name in names]).sort_by("replica").to_pylist()
+    return {row["replica"]: tuple(row[f"{name}_mean"] for name in names) for row in rows}
 
 
 def _median(averages: Mapping[int, tuple[float, float]]) -> tuple[float, float]:
@@ -207,7 +208,7 @@ def _distance(fresh: FreshEpisode) -> float:
     """Play an episode; return how far its turns and its apples are from their medians, in shares of these."""
     median = _median(averages_of(fresh.run))
     (played,) = evaluate(fresh.env, fresh.policies, explore=True)
-    reached = np.array([played.steps, played.metrics["collective_return"]])
+    reached = np.array([played.steps, played.metrics[COLLECTIVE_RETURN]])
     return float(np.sum(np.abs(reached - median) / np.maximum(1.0, median)))
 
 

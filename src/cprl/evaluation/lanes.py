@@ -24,6 +24,7 @@ from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
 from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
 from cprl.runs.episodes import Label, labelled
 from cprl.system.defaults import Fresh
+from cprl.system.working import say_how_far
 from cprl.training.agents import LoadedRun, Population, StoredAgent, in_a_row, load, stored_policies
 from cprl.values import Custom, made, refusal
 
@@ -185,9 +186,14 @@ def together(parts: Iterable[pa.Table], **said: object) -> pa.Table:
     """Return the tables of populations as one, with all metrics.
 
     Args:
+        parts: each played as it is asked for.
         said: how they were played: texts that its schema's metadata keep, see `said`.
     """
-    table = complete(pa.concat_tables(parts))
+    tables = []
+    for part in parts:
+        tables.append(part)
+        say_how_far(len(tables), None, "populations")
+    table = complete(pa.concat_tables(tables))
     texts = {name: str(value) for name, value in said.items()}
     return table.replace_schema_metadata({**(table.schema.metadata or {}), **texts})
 

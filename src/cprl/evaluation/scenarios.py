@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 
 from cprl.commons.game import Game
+from cprl.evaluation.cross_play import OF_BACKGROUND, OF_FOCAL
 from cprl.evaluation.evaluate import opened, refuse_other_games, refuse_unlike
 from cprl.evaluation.lanes import (
     Agent,
@@ -33,16 +34,17 @@ from cprl.evaluation.lanes import (
     scripted,
     together,
 )
-from cprl.evaluation.pages import OVER_REPLICAS, heading
+from cprl.evaluation.pages import heading
 from cprl.experiment import presets
 from cprl.measuring.registry import COLLECTIVE_RETURN, EQUALITY, with_unit
 from cprl.measuring.statistics import HOLM, Family, differences, estimates, notes_on
-from cprl.measuring.table import BACKGROUND, FOCAL
+from cprl.measuring.table import FOCAL
 from cprl.population import Frozen, Scripted
 from cprl.system.defaults import Fresh
-from cprl.system.working import say_how_far, working
+from cprl.system.working import working
 from cprl.terminal import style
 from cprl.terminal.panels import draw_dots
+from cprl.terminal.summary import OVER_REPLICAS
 from cprl.terminal.tables import Cell, Cells, Change
 from cprl.training.agents import LoadedRun, check_scripted, load
 from cprl.values import Value, Where, refusal
@@ -164,8 +166,6 @@ def _modes(game: Game) -> tuple[Focal, ...]:
 RUN: Final = "run"
 FOCAL_AGENTS: Final = (RUN, "random", "greedy")
 """Who takes the focal places: the run's agents, or agents that follow a scripted policy."""
-OF_FOCAL: Final = f"{FOCAL}/return"
-OF_BACKGROUND: Final = f"{BACKGROUND}/return"
 BY: Final = ("scenario", FOCAL)
 
 
@@ -200,19 +200,19 @@ def run_scenarios(
         refuse_other_games({str(loaded.path): loaded, f"the background {path}": background_run})
     fresh = fresh_for([loaded], fresh, among=stored.values())
     _refuse_meeting_itself(loaded, chosen, stored, fresh.replicas)
-    focal_agents = {RUN: agents_of(loaded)}
-    focal_agents |= {policy: [scripted(policy)] * len(everyone) for policy in FOCAL_AGENTS[1:]}
-    parts: list[pa.Table] = []
-    for scenario in chosen:
+    populations = {RUN: agents_of(loaded)}
+    populations |= {policy: [scripted(policy)] * len(everyone) for policy in FOCAL_AGENTS[1:]}
+
+    def parts(scenario: Scenario) -> Iterator[pa.Table]:
         background = [_background(spec, stored) for spec in scenario.background]
-        for (who, focal), places in product(focal_agents.items(), scenario.placements):
+        for (who, focal), places in product(populations.items(), scenario.placements):
             agents = [focal[agent] if agent in places else background[agent] for agent in everyone]
-            say_how_far(len(parts), None, "populations")
             labels = {"scenario": scenario.name, FOCAL: who, "focal_agents": " ".join(map(str, places))}
-            parts.append(play(fresh, loaded, agents, labels, roles=roles_of(len(everyone), places)))
+            yield play(fresh, loaded, agents, labels, roles=roles_of(len(everyone), places))
+
     is_all = {scenario.name for scenario in chosen} >= {one.name for one in scenarios_of(loaded.game)}
     return together(
-        parts,
+        (part for scenario in chosen for part in parts(scenario)),
         heading=heading(f"Scenarios of {loaded.path.name}", fresh, [loaded], " in each placement"),
         run=loaded.path.name,
         fresh=fresh,
@@ -333,7 +333,7 @@ def draw_scenarios(table: pa.Table, path: Path | str, *, width: style.Width = "p
         (axes,) = sheet.panels(1, high=_ROW * len(rows) + 4)
         for place, ((who, number), (marker, colour, label)) in enumerate(_LOOKS.items()):
             means = [levels[name, who, number] for name in names]
-            at = rows + _BAND * (place - (len(_LOOKS) - 1) / 2)
+            at = list(rows + _BAND * (place - (len(_LOOKS) - 1) / 2))
             draw_dots(axes, at, means, across=True, color=colour, marker=marker, label=label)
         for row in rows[1:]:
             axes.axhline(row - 0.5, color="#dddddd", linewidth=0.8)

@@ -48,11 +48,12 @@ from cprl.measuring.statistics import Estimate, Family, difference, estimate
 from cprl.measuring.table import by_replica, where
 from cprl.measuring.windows import Values
 from cprl.policies.scripted import SCRIPTED_POLICIES
+from cprl.runs.episodes import Label
 from cprl.system.defaults import Fresh
-from cprl.system.working import say_how_far, working
+from cprl.system.working import working
 from cprl.terminal import style
 from cprl.terminal.panels import draw_dots
-from cprl.terminal.tables import Cells, Change
+from cprl.terminal.tables import Cell, Cells, Change
 from cprl.values import refusal
 
 _NAMES: Final = ("prisoner's dilemma", "chicken", "stag hunt", "no dilemma")
@@ -204,16 +205,16 @@ def schelling(
     ]
     fresh = fresh_of_specs([*specs[0], *specs[1]], fresh)
     kinds = [agents_specified(place, kind, fresh) for kind in specs]
-    parts: list[pa.Table] = []
-    for count in range(agents + 1):
+
+    def parts(count: int) -> Iterator[pa.Table]:
         for kind_of_agent in shifted((count, agents - count)):
             who = tuple(agent for agent, kind in enumerate(kind_of_agent) if kind == 0)
             mix = [kinds[kind][agent] for agent, kind in enumerate(kind_of_agent)]
-            say_how_far(len(parts), agents * (agents - 1) + 2, "populations")
-            labels = {"restrained": " ".join(map(str, who)), _MIX: count}
-            parts.append(play(fresh, place, mix, labels, roles=roles_of(agents, who)))
+            labels: Label = {"restrained": " ".join(map(str, who)), _MIX: count}
+            yield play(fresh, place, mix, labels, roles=roles_of(agents, who))
+
     return together(
-        parts,
+        (part for count in range(agents + 1) for part in parts(count)),
         heading=heading("Schelling diagram", fresh, (), " for each choice of restrained agents"),
         fresh=fresh,
         restrained=restrained,
@@ -277,13 +278,13 @@ def schelling_cells(table: pa.Table) -> Iterator[Cells]:
         "fear, G(0) - R(0)",
         f"greed, G({last}) - R({last})",
     )
-    changes = map(Change, margins(payoffs.restrained, payoffs.greedy).values())
-    rows = list(map(list, zip(names, changes, strict=True)))
+    changes = margins(payoffs.restrained, payoffs.greedy).values()
+    rows: list[list[Cell]] = [[name, Change(one)] for name, one in zip(names, changes, strict=True)]
     yield Cells(f"{title_of(payoffs)}, by returns", ["", "difference, paired by replica"], rows)
     head = [
         f"restrained among the other {last}",
         *(f"return of {said(table, name)} ({name})" for name in _LOOKS),
     ]
     pairs = zip(payoffs.restrained.T, payoffs.greedy.T, strict=True)
-    levels = [[str(count), *map(estimate, pair)] for count, pair in enumerate(pairs)]
+    levels: list[list[Cell]] = [[str(count), *map(estimate, pair)] for count, pair in enumerate(pairs)]
     yield Cells("return by the number of restrained others", head, levels, texts=0)

@@ -10,7 +10,6 @@ Modules, in the order in which one reads them:
     statistics    estimates over replicas and differences, with intervals by Student's t, and Holm's families
     series        numbers while a training runs
     outcome       how a training goes, and how it went
-    movement      where agents go, which cells they share or keep, and who tags whom
 """
 
 from cprl.measuring import social

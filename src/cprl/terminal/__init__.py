@@ -6,4 +6,5 @@ Modules, in the order in which one reads them:
     tables    tables of texts, for the terminal and for Markdown
     figures   the training curve
     style     what all figures share: sizes, colours, legends
+    panels    what they draw into a panel: lines, dots with intervals, matrices
 """

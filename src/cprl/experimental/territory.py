@@ -22,8 +22,8 @@ from cprl.evaluation.lanes import (
     worlds_of,
 )
 from cprl.evaluation.pages import heading
-from cprl.measuring import movement
-from cprl.measuring.movement import Array, Trace, overlap, owners, trace, visits
+from cprl.experimental import movement
+from cprl.experimental.movement import Array, Trace, overlap, owners, trace, visits
 from cprl.measuring.statistics import estimates
 from cprl.measuring.table import labelled, where
 from cprl.system.defaults import Fresh
