@@ -106,10 +106,10 @@ def test_what_is_logged_together_is_sent_together(tmp_path):
         stream.period_s = 0.0
         logger.log_scalar("alone", 1.0)
         assert not stream.waiting
-        with logger.together():
-            logger.log_scalar("first", 1.0)
-            logger.log_document("header", "# Episode 1")
-            assert list(stream.waiting) == ["first", "header"]
+        logger.log_lines("first", [1.0])
+        logger.log_document("header", "# Episode 1")
+        assert list(stream.waiting) == ["first", "header"]
+        logger.send_due()
         assert not stream.waiting
 
 

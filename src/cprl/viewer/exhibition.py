@@ -103,7 +103,7 @@ class Exhibition(View):
         recorder = self._at_random = FrameRecorder(commons, self._scene, has_windows=False)
 
         def acted(moment: TensorDictBase) -> TensorDictBase:
-            recorder.add_board()
+            recorder.add()
             return policy(moment)
 
         return acted
@@ -181,7 +181,7 @@ class Exhibition(View):
         self._turn += 1
         if self._carried is None:
             self._turn, self._carried = 0, self._env.reset()
-            self._recorder.add_board()
+            self._recorder.add()
             return None
         moment = self._policy(self._carried)
         if self._policy.is_trained:

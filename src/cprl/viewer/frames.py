@@ -45,16 +45,13 @@ class FrameRecorder:
     def __len__(self) -> int:
         return len(self._frames)
 
-    def add(self, batch: TensorDictBase, *, step: int = 0, episode: int = 0) -> None:
-        """Copy a frame; `batch` is the latest step, and `step` counts those of the whole run."""
-        if self._has_tags:  # of several shooters the first
+    def add(self, batch: TensorDictBase | None = None, *, step: int = 0, episode: int = 0) -> None:
+        """Copy a frame; `batch` is the latest step, None before the first of an episode, and `step` counts
+        those of the whole run."""
+        if batch is not None and self._has_tags:  # of several shooters the first
             tagged_by = batch["next"][keys.TAGGED_BY][0].cpu().numpy()
             tagged = tagged_by.any(1)
             self._tagged_by[tagged] = tagged_by.argmax(1)[tagged]
-        self.add_board(step=step, episode=episode)
-
-    def add_board(self, *, step: int = 0, episode: int = 0) -> None:
-        """Copy a frame of the board as it is, e.g. when an episode begins."""
         board = self._env.worlds.show(self._env.output)
         frame = {"step": step, "episode": episode, "beams": board.board == BEAM, "tagged_by": self._tagged_by}
         for name in ("stock", "row", "col", "heading", "in_play", "harvested"):

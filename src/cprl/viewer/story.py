@@ -9,6 +9,7 @@ from threading import Event, Thread
 from typing import Final, NamedTuple
 
 import numpy as np
+import rerun as rr
 
 from cprl.measuring.episodes import Episode
 from cprl.measuring.outcome import BEGINS, EXPLORING, Course
@@ -60,16 +61,11 @@ def _gained(episode: Episode) -> float:
 class Header:
     """The headers of one run: a line of Markdown each."""
 
+    curves: Curves
     episodes: int
     """Of the run, or about as many where it trains so many steps."""
-    boards: int
-    """The worlds of all replicas."""
-    unit: str
-    """"apples" or "return"."""
     rules: str = ""
     """The institutions in force, in words."""
-    legend: str = ""
-    """What a point of a curve is, below each header."""
     is_about: bool = False
     """Whether it trains so many steps."""
 
@@ -86,7 +82,7 @@ class Header:
     ) -> str:
         """After an episode, in which so many boards died early; None for a game without stock."""
         beside = "" if random_play is None else f", random play {_number(random_play)}"
-        deaths = "" if died is None else self._died(died, self.boards)
+        deaths = "" if died is None else self._died(died, self.curves.replicas * self.curves.worlds)
         return self._text(f"Episode {episode:,} {self._of}", label, f"{self.amount(mean)}{beside}", deaths)
 
     def finished(self, learning: float, trained: Played, random: Played) -> str:
@@ -111,12 +107,16 @@ class Header:
 
     def _text(self, *parts: str) -> str:
         line = f"#### {' · '.join(part for part in (*parts, self.rules) if part)}"
-        return f"{line}\n\n{self.legend}" if self.legend else line
+        return f"{line}\n\n{self.curves.legend}"
 
     def amount(self, value: float) -> str:
         if isnan(value):
             return ""
-        return f"{_number(value)} apples" if self.unit == "apples" else f"{self.unit} {_number(value)}"
+        return (
+            f"{_number(value)} apples"
+            if self.curves.unit == "apples"
+            else f"{self.curves.unit} {_number(value)}"
+        )
 
     def _died(self, died: int, boards: int) -> str:
         if boards == 1:
@@ -180,14 +180,7 @@ class Story(View):
     ) -> None:
         self._logger, self._filming, self._curves = logger, filming, logger.curves
         self._episodes = episodes
-        self.header = Header(
-            episodes=episodes,
-            boards=self._curves.replicas * self._curves.worlds,
-            unit=self._curves.unit,
-            rules=rules,
-            legend=self._curves.legend,
-            is_about=is_about,
-        )
+        self.header = Header(curves=self._curves, episodes=episodes, rules=rules, is_about=is_about)
         self.course = Course(self._curves.replicas, self._curves.worlds)
         self._label = BEGINS
         self._bests = Bests(self._curves.worlds)
@@ -199,7 +192,7 @@ class Story(View):
         """What all agents got in the last episodes of each world of each replica."""
         self._is_over = False
         # A file of a resumed run must not say so: it is shown with those before it.
-        logger.log_states(names.NOW, {0: BEGINS}, live_only=True)
+        logger.log_row(names.NOW, rr.StateChange(state=BEGINS), live_only=True)
         logger.log_document(HEADER, self.header.begins("begins"))
         logger.flush()
 
@@ -244,12 +237,13 @@ class Story(View):
             {name: mean for name, mean in means.items() if name.endswith("/epsilon")}
         )
         if explores != explored:
-            self._logger.log_states(names.EXPLORING, {episode: EXPLORING if explores else SETTLED})
+            state = EXPLORING if explores else SETTLED
+            self._logger.log_row(names.EXPLORING, rr.StateChange(state=state))
             if explored:
                 events.append("exploration ends: no epsilon falls any more")
         label = self.course.label
         if label != self._label or episode < self._curves.worlds:
-            self._logger.log_states(names.NOW, {episode: label})
+            self._logger.log_row(names.NOW, rr.StateChange(state=label))
         if label != self._label:
             events.append(f"now {label}")
             self._label = label
@@ -262,7 +256,7 @@ class Story(View):
     def resumed(self) -> None:
         """Shows where a run is that goes on after the episodes so far."""
         if self._ended:
-            self._logger.log_states(names.NOW, {self._ended - 1: self._label})
+            self._logger.log_row(names.NOW, rr.StateChange(state=self._label))
             self._show_episode(None)
             self._logger.flush()
 
@@ -307,7 +301,7 @@ class Story(View):
 
     def _in_words(self, numbers: Played) -> str:
         died = "" if numbers.died is None else f"; {numbers.died:,} of {numbers.episodes:,} boards died early"
-        return f"{numbers.harvest} {self.header.unit}{died}"
+        return f"{numbers.harvest} {self._curves.unit}{died}"
 
 
 class Events(View):
