@@ -16,10 +16,10 @@ from cprl.commons.colours import BEAM
 from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode
-from cprl.viewer.board import Frames, boards, image_form, mosaic_size
+from cprl.viewer.board import Frames, boards, image_form
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import DIED, TEXT
-from cprl.viewer.scene import Scene, boards_of
+from cprl.viewer.scene import Scene, boards_of, windows_of
 from cprl.viewer.views import View, has_died
 
 FRAMES_BYTES: Final = 45_000_000
@@ -92,7 +92,7 @@ class Filming(View):
         """The number of the frame of this turn, if it has one."""
         if env is not None and (scene := logger.scene) is not None:
             self._recorder = FrameRecorder(env, scene)
-            rows, columns = mosaic_size(len(scene.agents), scene.window)
+            rows, columns = windows_of(len(scene.agents), scene.window).shape
             # The largest size of a frame, about; with a trained population on `commons` it is 500 bytes.
             size = 80 + 45 * len(scene.agents) + 0.35 * (rows * columns + scene.height * scene.width)
             self.every = max(1, ceil(episodes * env.game.rules.episode_steps * size / FRAMES_BYTES))
