@@ -66,7 +66,7 @@ class ViewerCallback:
         exhibited: what is exhibited live: the current policy and one world for it, see
             `cprl.viewer.exhibition`.
         file_name: the name of the recording instead of `run.rrd`; there must be no such file.
-        is_replay: whether a stored policy is replayed, see `cprl.viewer.layout.Scene`.
+        is_replay: whether a stored policy is replayed, see `cprl.viewer.scene.Scene`.
     """
 
     is_extendable = True

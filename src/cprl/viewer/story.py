@@ -13,7 +13,8 @@ import rerun as rr
 
 from cprl.measuring.episodes import Episode
 from cprl.measuring.outcome import BEGINS, EXPLORING, Course
-from cprl.measuring.series import mean_of
+from cprl.measuring.registry import COLLECTIVE_RETURN
+from cprl.measuring.series import logged, mean_of
 from cprl.measuring.statistics import Estimate, estimate_if_finite
 from cprl.measuring.windows import LAST_EPISODES, Values, rounds_of
 from cprl.system.times import CLOCK
@@ -24,7 +25,7 @@ from cprl.viewer.names import HEADER, SETTLED
 from cprl.viewer.scene import Curves
 from cprl.viewer.views import View, has_died
 
-HARVEST: Final = "social/collective_return"
+HARVEST: Final = logged(COLLECTIVE_RETURN)
 
 
 class Played(NamedTuple):
@@ -46,7 +47,7 @@ def played(episodes: Sequence[Episode], *, replicas: int = 1) -> Played:
     harvest = estimate_if_finite(np.reshape(values, (replicas, -1)).mean(1).tolist())
     died = [has_died(episode) for episode in episodes]
     return Played(
-        harvest=harvest.of("collective_return") if "collective_return" in episodes[0].metrics else harvest,
+        harvest=harvest.of(COLLECTIVE_RETURN) if COLLECTIVE_RETURN in episodes[0].metrics else harvest,
         died=None if None in died else sum(map(bool, died)),
         episodes=len(values),
     )
@@ -54,7 +55,7 @@ def played(episodes: Sequence[Episode], *, replicas: int = 1) -> Played:
 
 def _gained(episode: Episode) -> float:
     """Return what all agents got together: apples, or the return where the game reports no harvest."""
-    return float(episode.metrics.get("collective_return", episode.return_.sum()))
+    return float(episode.metrics.get(COLLECTIVE_RETURN, episode.return_.sum()))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -283,20 +284,18 @@ class Story(View):
         replicas = self._curves.replicas
         trained = played(played_by["trained"], replicas=replicas)
         random = played(played_by["random"], replicas=replicas)
-        self._end(self.header.finished(self._learning, trained, random))
+        self._is_over = True
+        self._logger.log_document(HEADER, self.header.finished(self._learning, trained, random))
         self._logger.log_text(f"finished: trained {self._in_words(trained)}")
 
     def close(self) -> None:
         """Logs the end of a run that is over or was stopped, if `finished` did not."""
         if self._is_over:
             return
-        if self._ended + self._curves.worlds <= self._episodes and not self.header.is_about:
-            self._logger.log_document(HEADER, self.header.stopped(self._ended, self.course.mean))
-        else:
-            self._end(self.header.ended(f"{self.header.amount(self._learning)} at the end"))
-
-    def _end(self, header: str) -> None:
         self._is_over = True
+        header = self.header.ended(f"{self.header.amount(self._learning)} at the end")
+        if self._ended + self._curves.worlds <= self._episodes and not self.header.is_about:
+            header = self.header.stopped(self._ended, self.course.mean)
         self._logger.log_document(HEADER, header)
 
     def _in_words(self, numbers: Played) -> str:
