@@ -322,13 +322,9 @@ def test_the_table_of_an_evaluation_says_what_is_left_out():
     played = labelled([({"policy": policy}, 0, episodes) for policy in ("trained", "random")])
     table = compared(played, "")
     assert table.note.startswith("left out: collective_return")
-    of_agents = ["agent 0: return", "agent 1: return"]
-    assert [name for name, *_ in table.rows] == [
-        "income of all agents together",
-        "survival, steps",
-        *of_agents,
-        "episodes",
-    ]
+    returns = ["agent 0: return", "agent 1: return"]
+    rows = ["income of all agents together", "survival, steps", *returns, "episodes"]
+    assert [name for name, *_ in table.rows] == rows
     assert "One replica: no interval." in table.note
 
 

@@ -112,7 +112,13 @@ def test_an_episode_is_what_we_work_out_by_hand():
     }
     # collective 3; equality 1 - 2 / (2 * 2 * 3); harvest at steps 1 and 3, and at 3; 5 agent-steps in play
     first_three = {"collective_return": 3.0, "efficiency": 1.0, "equality": 1 - 1 / 6}
-    others = {"sustainability": 2.5, "survival_steps": 3.0, "peace": 5 / 3, "peacefulness": 2.5}
+    others = {
+        "sustainability": 2.5,
+        "survival_steps": 3.0,
+        "peace": 5 / 3,
+        "peacefulness": 2.5,
+        "stock_left": 0.0,
+    }
     assert metrics == repr(first_three | others)
 
 
@@ -156,6 +162,7 @@ def test_what_a_collector_yields_is_measured_as_the_whole_episodes_would_be():
         assert np.array_equal(episode.in_play_steps, in_play.sum(0))
         assert np.array_equal(episode.tagged, following["agents", "tagged_by"].any(-1).sum(0))
         metrics = {name: value.item() for name, value in social.summary(harvest, in_play).items()}
+        metrics["stock_left"] = episode.stock_left
         assert episode.metrics == pytest.approx(metrics, nan_ok=True)
 
 
@@ -196,7 +203,7 @@ def test_a_yield_adds_its_share_to_the_metrics_and_what_does_not_fit_is_named():
     tracker = EpisodeTracker(1, 2, sustainable_yield=1.5, first_stock=2.5)
     (episode,) = tracker.add(turn(harvest=[[1, 1]], done=[[True]]))
     assert episode.metrics["yield_share"] == 0.5
-    assert list(episode.metrics) == [*measurable(OPTIONAL)[:-1], "yield_share"]
+    assert list(episode.metrics) == [*measurable(OPTIONAL)[:-1], "yield_share", "stock_left"]
     tracker = EpisodeTracker(2, 2)
     with pytest.raises(ValueError, match=r"the batch is \[1\]; allowed: \[2\] or \[2, T\]"):
         tracker.add(turn(worlds=1))

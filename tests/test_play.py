@@ -72,7 +72,7 @@ def test_the_metrics_are_those_of_an_episode(run):
         if not session.has_ended:
             session.act(action)
     (episode,) = ended
-    assert session.metrics() == pytest.approx(episode.social, nan_ok=True)
+    assert session.metrics() == pytest.approx(episode.metrics, nan_ok=True)
     with pytest.raises(ValueError, match="the episode has ended"):
         session.act("stay")
 

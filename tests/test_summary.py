@@ -12,9 +12,10 @@ from rich.console import Console
 from test_results import an_episode
 
 from cprl.measuring.registry import INCOME, METRICS, title, with_unit
+from cprl.measuring.statistics import Estimate
 from cprl.runs.episodes import labelled
 from cprl.terminal.summary import summarise
-from cprl.terminal.tables import Cells
+from cprl.terminal.tables import Cells, Change
 
 
 def episode(number, harvest, **metrics):
@@ -120,9 +121,11 @@ def test_every_table_fits_80_columns_and_loses_no_number(names):
         f"1,{place}00 [1,{place}11, 1,{place}22], undefined in {place} of 160" for place in range(len(names))
     ]
     rows = [[f"a_long_name_of_a_condition={place}, {names[0]}", *numbers] for place in range(3)]
-    rows.append(
-        ["marked", *(f"**+{place}.5 [+{place}.1, +{place}.9]** (of 3)" for place in range(len(names)))]
+    bounds = ((place + 0.5, place + 0.1, place + 0.9) for place in range(len(names)))
+    apart = (
+        Estimate(value=value, low=low, high=high, replicas=3, differs=True) for value, low, high in bounds
     )
+    rows.append(["marked", *(Change(one, "(of 3)") for one in apart)])
     output = io.StringIO()
     Console(file=output, width=80).print(Cells("a heading " * 20, head, rows, "Bold: a note " * 20))
     text = output.getvalue()
@@ -130,7 +133,7 @@ def test_every_table_fits_80_columns_and_loses_no_number(names):
     for place in range(len(names)):
         assert text.count(f"[1,{place}11, 1,{place}22]") == 3
         assert text.count(f"undefined in {place}") == 3
-        assert text.count(f"[+{place}.1, +{place}.9] * (of 3)") == 1
+        assert text.count(f"[+{place}.10, +{place}.90] * (of 3)") == 1
     assert text.count("condition=2") >= 1
 
 

@@ -2,8 +2,12 @@
 
 import csv
 
+import pyarrow.parquet as pq
 import pytest
+from stored_runs import command
 
+import cprl
+from cprl.measuring.registry import title
 from cprl.measuring.statistics import Estimate
 from cprl.terminal.tables import SUFFIXES, Cells, Change, cell, markdown, write
 
@@ -93,5 +97,30 @@ def test_nothing_is_written_over(suffix, tmp_path):
 def test_names_of_users_mean_nothing_in_markdown():
     names = {"a|b": r"a\|b", "pay_$1_$_": r"pay_\$1_\$_", "*a*": r"\*a\*", "<b>": r"\<b>", "a\nb": "a b"}
     assert [cell(name) for name in names] == list(names.values())
-    _, _, line, _ = markdown(Cells("", ["condition", "x"], [["*a*", Change(SAME)]]))
-    assert line.startswith(r"| \*a\* |")
+    _, _, line, _ = markdown(Cells("", ["condition", "x"], [["**a**", Change(SAME)]]))
+    assert line.startswith(r"| \*\*a\*\* |")
+
+
+def test_a_command_writes_what_it_prints_as_the_suffix_says(alike, tmp_path, monkeypatch, capsys):
+    files = {suffix: tmp_path / f"means{suffix}" for suffix in (*SUFFIXES, ".parquet")}
+    words = [word for path in files.values() for word in ("--out", path)]
+    printed = command(monkeypatch, capsys, "evaluate", alike, "--episodes", 1, *words)
+    assert all(f"Written: {path}" in printed for path in files.values())
+    rows = list(csv.DictReader(files[".csv"].read_text().splitlines()))
+    played = pq.read_table(files[".parquet"])
+    levels = cprl.estimates(played, "collective_return", by="policy")
+    by_column = {row["column"]: row for row in rows if row["row"] == title("collective_return")}
+    for column, policy in {"run's agents": "trained", "random": "random"}.items():
+        one = levels[policy, "collective_return"]
+        assert [float(by_column[column][name]) for name in ("value", "low")] == [one.value, one.low]
+        assert all(str(one) in files[suffix].read_text() for suffix in (".txt", ".md"))
+    assert files[".tex"].read_text().count(r"\toprule") == 1
+
+
+def test_a_command_prints_every_row_as_csv_and_then_nothing_else(alike, monkeypatch, capsys):
+    text = command(monkeypatch, capsys, "evaluate", alike, "--episodes", 1, "--csv")
+    rows = list(csv.DictReader(text.splitlines()))
+    assert {row["policy"] for row in rows} == {"trained", "random"}
+    assert len(rows) == 2 * 3 * 2, "policies, replicas and agents"
+    with pytest.raises(SystemExit, match="--csv prints every row and nothing else; allowed: without --out"):
+        command(monkeypatch, capsys, "evaluate", alike, "--csv", "--out", "a.md")

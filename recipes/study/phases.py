@@ -1,5 +1,4 @@
-"""Phases of a training of the study of 2019: change points of the social metrics, labels for the phases
-between them, and how figures draw them.
+"""Phases of a training of the study of 2019: change points of the social metrics, and how figures draw them.
 
 find_phases   the phases of curves
 phases_of     those of a run, of running means

@@ -14,7 +14,7 @@ A package imports only from those above it:
     learners     replay and rollouts, updates of many agents at once
     algorithms   what agents learn by: DQN, PPO, QMIX and so on, frozen values
     population   how each agent is specified: Learning, Team, Scripted, Frozen
-    measuring    social metrics, episodes, phases, statistics
+    measuring    social metrics, episodes, outcomes, statistics
     runs         what is kept of a run: recipe, table of episodes, checkpoints, weights
     experiment   Experiment: what is trained and how, a value; presets: what was published, by name
     viewer       recordings for the Rerun viewer

@@ -199,7 +199,7 @@ def finished_runs(study: Study, runs: Path, episodes: int | None) -> dict[str, P
     """The finished runs of a study by condition; with `episodes`, those of as many, not of its own."""
     if episodes is not None:
         study = replace(study, experiment=replace(study.experiment, episodes=episodes))
-    return {source.condition: source.run for source in sources_of(study, runs)[0]}
+    return {source.condition: source.run for source in sources_of(study, runs) if not source.reason}
 
 
 def row(claim: Claim, name: str, runs: Path, episodes: int | None = None) -> str:

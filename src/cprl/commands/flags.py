@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Union, get_arg
 import tyro
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
+from cprl.commons.published import Variant
 from cprl.system.output import say
 from cprl.values import Custom, fits, refusal
 
@@ -32,30 +33,67 @@ NO_DEFAULT: Final = tyro.conf.arg(help_behavior_hint="")
 """Of a flag whose default says nothing: its text says what happens without it."""
 
 
+Run = Annotated[
+    Path,
+    tyro.conf.arg(
+        metavar="RUN",
+        help="The run's directory, or its results; of one that has not ended the newest checkpoint plays.",
+    ),
+]
+Runs = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(
+        metavar="RUN [RUN ...]",
+        help="Directories of runs of the same game, or their results; NAME=PATH gives one another name.",
+        help_behavior_hint="",
+    ),
+]
+Board = Annotated[
+    str,
+    tyro.conf.arg(
+        metavar="BOARD",
+        help="commons, two_complex, single_complex or single_basic; or the directory of a run, whose game is "
+        "played; or a file with a drawing.",
+    ),
+]
+VariantFlag = Annotated[
+    Variant,
+    tyro.conf.arg(
+        help="Of the boards with a name: published, as_run or, of two_complex, as_run_10_april; see "
+        "docs/game.md."
+    ),
+]
 ROWS: Final = ".parquet"
+"""What the name of a file with every row ends in."""
 
 
 def _hint(default: str) -> str:
     return f"(default: {default})" if default else ""
 
 
-def without_empty_defaults(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function whose flags, with those of its dataclasses, show no default that is None or ()."""
-    for name, parameter in inspect.signature(function).parameters.items():
+def with_help(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function whose flags, with those of its dataclasses, have their texts in lines as wide as the
+    terminal, and show no default that is None or ()."""
+    parameters = inspect.signature(function).parameters
+    _describe(function, {name: parameter.default for name, parameter in parameters.items()})
+    for parameter in parameters.values():
         if is_dataclass(parameter.default):
             of_class = {field.name: field.default for field in fields(parameter.default)}
-            _mark_empty(type(parameter.default), of_class)
-        else:
-            _mark_empty(function, {name: parameter.default})
+            _describe(type(parameter.default), of_class)
     return function
 
 
-def _mark_empty(owner: Any, defaults: Mapping[str, Any]) -> None:
-    hints = get_type_hints(owner, include_extras=True)
-    empty = {name for name, default in defaults.items() if default is None or default == ()}
-    owner.__annotations__ = {
-        name: Annotated[hint, NO_DEFAULT] if name in empty else hint for name, hint in hints.items()
-    }
+def _describe(owner: Any, defaults: Mapping[str, Any]) -> None:
+    from docstring_parser import parse_from_object  # as tyro does
+
+    bases = [base for base in getattr(owner, "__mro__", (owner,)) if base is not object]
+    parts = [part for base in reversed(bases) for part in parse_from_object(base).params]
+    texts = {part.arg_name: part.description or "" for part in parts}
+    for name, hint in get_type_hints(owner, include_extras=True).items():
+        text = " ".join(texts.get(name, "").split()) or None
+        is_empty = name in defaults and (defaults[name] is None or defaults[name] == ())
+        flag = tyro.conf.arg(help=text, help_behavior_hint="" if is_empty else None)
+        owner.__annotations__[name] = Annotated[hint, flag]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +111,9 @@ class Tables:
         from cprl.runs.files import refuse_to_write_over
         from cprl.terminal.tables import SUFFIXES
 
+        others = [name for name, value in vars(self).items() if value and name not in ("csv", "figure_width")]
+        if self.csv and others:
+            raise ValueError(f"--csv prints every row and nothing else; allowed: without --{others[0]}")
         for path in self.out:
             if path.suffix not in (ROWS, *SUFFIXES):
                 raise refusal("--out", str(path), f"a name that ends in {', '.join((ROWS, *SUFFIXES))}")

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Final, Literal
 
 import tyro
 
-from cprl.commands.flags import without_empty_defaults
+from cprl.commands.flags import with_help
 from cprl.commands.recipe import (
     ALLOW,
     RunOptions,
@@ -96,7 +96,8 @@ def main() -> None:
             _function(words[0])(words[1:])
     elif words[0] != "run" or not _is_run_by_name(words[1:]):
         with in_a_sentence("cprl"), ended_by_sigterm():
-            function = without_empty_defaults(_function(words[0]))
+            function = _function(words[0])
+            function = with_help(function) if {"-h", "--help"} & {*words} else function
             about = wrapped(f"{(getdoc(function) or '').partition(_ARGS)[0].strip()}\n\n{ALLOW}")
             config = (tyro.conf.HelptextFromCommentsOff, tyro.conf.DisallowNone)
             others = trust_allowed(words[1:])

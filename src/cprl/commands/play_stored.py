@@ -1,4 +1,4 @@
-"""What plays stored agents, none of which learns, in fresh worlds: `cprl film`, `evaluate`, `egta` ..."""
+"""Commands that play stored agents, none of which learns, in fresh worlds: `cprl film`, `evaluate` ..."""
 
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from cprl.commands.flags import NO_DEFAULT, ROWS, FileFlags, Files, TableFlags, Tables
-from cprl.commons.published import Variant, check_board
+from cprl.commands.flags import ROWS, Board, FileFlags, Files, Run, Runs, TableFlags, Tables, VariantFlag
+from cprl.commons.published import check_board
 from cprl.system.defaults import (
     EGTA_RESAMPLES,
     FILM_SEED,
@@ -58,7 +58,7 @@ class FilmOptions:
 
 
 def film(
-    run: Path,
+    run: Run,
     /,
     *,
     replica: int | None = None,
@@ -67,19 +67,18 @@ def film(
     out: Path | None = None,
     options: Annotated[FilmOptions, tyro.conf.arg(name="")] = FilmOptions(),
 ) -> None:
-    """Lets the agents of a run play a fresh episode, recorded for the Rerun viewer or as a film.
+    """Play a fresh episode with the agents of a run, and record it for the Rerun viewer or as a film.
 
     Args:
-        run: the run's directory, or its results.
-        replica: whose agents; by default, without --episode, those of a typical replica, whose boards last
-            nearest to the median over replicas.
-        episode: which of the fresh episodes; the same number plays the same again. By default, without
+        replica: Whose agents play; by default, without --episode, those of a typical replica, whose boards
+            last nearest to the median over replicas.
+        episode: Which of the fresh episodes; the same number plays the same again. By default, without
             --replica, a typical one of the first five.
-        seed: of the worlds and all chance, by default 20011; not that of the training. With the seed of
+        seed: Of the worlds and all chance, by default 20011; not that of the training. With the seed of
             cprl evaluate, 30011 by default, the world of its episode E of replica R is
             --episode R x EPISODES + E; what agents draw by chance differs. The run's own evaluation plays by
             the seed of its experiment + 1.
-        out: what is written: a recording for the viewer (.rrd), or a film of the board, the stock and the
+        out: What is written: a recording for the viewer (.rrd), or a film of the board, the stock and the
             harvests (.gif, or .mp4, which wants the extra "film"); by default film-<replica>-<episode>.rrd in
             the run's directory.
     """
@@ -109,7 +108,14 @@ def film(
 
 
 def show(
-    runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [RUN ...]", help_behavior_hint="")],
+    runs: Annotated[
+        tuple[Path, ...],
+        tyro.conf.arg(
+            metavar="RUN [RUN ...]",
+            help="One to six directories of runs, or their results.",
+            help_behavior_hint="",
+        ),
+    ],
     /,
     *,
     out: Path | None = None,
@@ -118,16 +124,15 @@ def show(
     episode: int | None = None,
     seed: int | None = None,
 ) -> None:
-    """Lets the agents of runs play a fresh episode side by side, and writes it as one page for any browser.
+    """Play a fresh episode with the agents of each run, and write one page for any browser of all of them.
 
     Args:
-        runs: one to six directories of runs, or their results.
-        out: the page, an .html, which opens from the disk without a network; by default
+        out: The page, an .html, which opens from the disk without a network; by default
             show-<replica>-<episode>.html in the directory of the first run.
-        titles: one for each run; by default their institutions, or the names of their experiments.
-        replica: whose agents, as of cprl film; by default of each run those of a typical replica.
-        episode: which of the fresh episodes, as of cprl film.
-        seed: of the worlds and all chance, as of cprl film.
+        titles: One for each run; by default their institutions, or the names of their experiments.
+        replica: Whose agents play, as of cprl film; by default of each run those of a typical replica.
+        episode: Which of the fresh episodes, as of cprl film.
+        seed: Of the worlds and all chance, as of cprl film.
     """
     if not runs:
         raise ValueError("no run is named; allowed: one to six")
@@ -144,14 +149,14 @@ def show(
 
 
 def report(run: Path, /, *, out: Path | None = None, episodes: int = 20, seed: int = SEED) -> None:
-    """Writes a page for any browser about a run or a study: its results, an episode, how to run it again.
+    """Write a page for any browser about a run or a study: its results, an episode, how to run it again.
 
     Args:
-        run: the directory of a run or of a study, or their results.
-        out: the page, an .html, which opens from the disk without a network; by default report.html in that
+        run: The directory of a run or of a study, or their results.
+        out: The page, an .html, which opens from the disk without a network; by default report.html in that
             directory.
-        episodes: of a run alone, how many fresh ones each replica plays, as of cprl evaluate.
-        seed: likewise: of their worlds and all chance.
+        episodes: Of a run alone, how many fresh ones each replica plays, as of cprl evaluate.
+        seed: Of a run alone, of the worlds and all chance, as of cprl evaluate.
     """
     _begin(seed, *([] if (run / STUDY_TABLE).is_file() else [run]))
 
@@ -162,12 +167,12 @@ def report(run: Path, /, *, out: Path | None = None, episodes: int = 20, seed: i
 
 
 def sandbox(*, port: int = 0, out: Path | None = None, episodes: int = SANDBOX_EPISODES) -> None:
-    """Opens a page with sliders for people who do not program: rules, boards, scripted agents, trainings.
+    """Open a page with sliders for people who do not program: rules, boards, scripted agents, trainings.
 
     Args:
-        port: of the page, which is on 127.0.0.1 alone; 0 for any that is free.
-        out: where trainings are kept; by default they are gone when the sandbox is closed.
-        episodes: of a training.
+        port: Of the page, which is on 127.0.0.1 alone; 0 for any that is free.
+        out: Where trainings are kept; by default they are gone when the sandbox is closed.
+        episodes: Of a training.
     """
     _begin(0)
 
@@ -189,14 +194,13 @@ class Session:
     """Who plays among whom, see `cprl.evaluation.play.open_session`."""
 
     agent: int = 0
-    """Yours."""
+    """The index of the one that you play."""
     others: str | None = None
     """The directory of a run, whose agents play, or random, greedy, sustainable, territorial, aggressive or
     pacifist; by default the agents of the run that is the board, else greedy."""
     replica: int | None = None
-    """Of the run whose agents play; by default a typical one, as of cprl film."""
-    variant: Variant = "published"
-    """Of the boards with a name: published, as_run or, of two_complex, as_run_10_april; see docs/game.md."""
+    """Whose agents play, of a run; by default a typical one, as of cprl film."""
+    variant: VariantFlag = "published"
     steps: int | None = None
     """Turns of the episode at most; by default as many as the game has."""
     seed: int | None = None
@@ -205,13 +209,8 @@ class Session:
     """What you vote for in a game with votes or elections, by its number; by default chance votes."""
 
 
-def play(board: str, /, *, session: Annotated[Session, tyro.conf.arg(name="")] = Session()) -> None:
-    """Lets you play in the terminal among trained or scripted agents, and measures the episode.
-
-    Args:
-        board: commons, two_complex, single_complex or single_basic; or the directory of a run, whose game
-            is played; or a file with a drawing.
-    """
+def play(board: Board, /, *, session: Annotated[Session, tyro.conf.arg(name="")] = Session()) -> None:
+    """Play in the terminal among trained or scripted agents, and measure the episode."""
     check_board(board)
     _begin(PLAY_SEED if session.seed is None else session.seed)
 
@@ -220,12 +219,8 @@ def play(board: str, /, *, session: Annotated[Session, tyro.conf.arg(name="")] =
     play_in_terminal(open_session(board, **vars(session)))
 
 
-def evaluate(run: Path, /, *, fresh: FreshFlags = Fresh(), files: TableFlags = Tables()) -> None:
-    """Lets all replicas of a run play fresh worlds, and prints the social metrics beside the random policy's.
-
-    Args:
-        run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
-    """
+def evaluate(run: Run, /, *, fresh: FreshFlags = Fresh(), files: TableFlags = Tables()) -> None:
+    """Play fresh worlds with all replicas of a run, and print the social metrics beside random play's."""
     _begin(fresh.seed, run, files=files)
 
     from cprl.evaluation.evaluate import evaluate_run
@@ -236,15 +231,14 @@ def evaluate(run: Path, /, *, fresh: FreshFlags = Fresh(), files: TableFlags = T
 
 
 def visits(
-    run: Path, /, *, fresh: FreshFlags = Fresh(), files: FileFlags = Files(), random: bool = False
+    run: Run, /, *, fresh: FreshFlags = Fresh(), files: FileFlags = Files(), random: bool = False
 ) -> None:
-    """Lets all replicas of a run play fresh worlds, and prints how far agents keep to cells of their own.
+    """Play fresh worlds with all replicas of a run, and print how far agents keep to cells of their own.
 
     The figure has a map for each agent of where it spends its time, in the first of the replicas.
 
     Args:
-        run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
-        random: draw random agents in the same worlds instead.
+        random: Draw random agents in the same worlds instead.
     """
     if random and files.figure is None:
         raise ValueError("--random says who is drawn; allowed: with --figure FILE")
@@ -261,20 +255,19 @@ def visits(
 
 
 def crossplay(
-    runs: Annotated[tuple[str, ...], NO_DEFAULT],
+    runs: Runs,
     /,
     *,
     fresh: FreshFlags = Fresh(),
     diagonal: Diagonal = "self",
     files: FileFlags = Files(),
 ) -> None:
-    """Lets agents of each run play among agents of each other run, and prints how all fare.
+    """Play agents of each run among agents of each other run, and print how all fare.
 
     The figure shows what focal agents gain, and what it costs the background agents.
 
     Args:
-        runs: directories of runs of the same game, or their results; NAME=PATH gives one another name.
-        diagonal: whom a run's agents meet on the diagonal: "self", the agents that they were trained with,
+        diagonal: Whom a run's agents meet on the diagonal: "self", the agents that they were trained with,
             or "cross_seed", agents of the run's next replica.
     """
     named = runs_by_name(runs)
@@ -297,30 +290,25 @@ class Mixes:
     greedy: str = "greedy"
     """Who plays greedy, of the same."""
     episodes: int = 5
-    """Of each replica and choice of restrained agents; with N agents these are N (N - 1) + 2."""
+    """Episodes of each replica, in each choice of who plays where, each in its own world; with N agents there
+    are N (N - 1) + 2 choices."""
     replicas: tuple[int, ...] = ()
-    """Which replicas, by number; by default all that every run has, and 0 to 7 of scripted agents."""
+    """Which replicas play, by number; by default all that every run has, and 0 to 7 of scripted agents."""
     seed: int = SEED
     """Of the worlds and all chance; the same one gives the same numbers."""
 
 
 def schelling(
-    board: str,
+    board: Board,
     /,
     *,
-    variant: Variant = "published",
+    variant: VariantFlag = "published",
     mixes: Annotated[Mixes, tyro.conf.arg(name="")] = Mixes(),
     files: FileFlags = Files(),
 ) -> None:
-    """Lets restrained and greedy agents play in all mixes, and prints which social dilemma they are in.
+    """Play all mixes of restrained and greedy agents, and print which social dilemma they are in.
 
     The figure is the Schelling diagram.
-
-    Args:
-        board: commons, two_complex, single_complex or single_basic; or the directory of a run, whose game
-            is played; or a file with a drawing.
-        variant: of the boards with a name: published, as_run or, of two_complex, as_run_10_april; see
-            docs/game.md.
     """
     check_board(board)
     _begin(mixes.seed, files=files)
@@ -337,7 +325,7 @@ def schelling(
 
 
 def egta(
-    runs: Annotated[tuple[str, ...], NO_DEFAULT],
+    runs: Runs,
     /,
     *,
     fresh: FreshFlags = Fresh(episodes=5),
@@ -345,16 +333,15 @@ def egta(
     resamples: int = EGTA_RESAMPLES,
     files: FileFlags = Files(),
 ) -> None:
-    """Lets agents of runs play in all compositions, and prints which runs last: equilibria, alpha-rank,
-    replicator dynamics (extra "theory").
+    """Play all compositions of agents of runs, and print which runs last: equilibria, alpha-rank, replicator
+    dynamics (extra "theory").
 
     The figure shows the dynamics, and the shares by alpha-rank.
 
     Args:
-        runs: directories of runs of the same game, or their results; NAME=PATH gives one another name.
-        pairwise: play one agent of each run among agents of each other run, as `cprl crossplay` does. This is
+        pairwise: Play one agent of each run among agents of each other run, as `cprl crossplay` does. This is
             cheaper, but leaves out other mixes if there are more than two agents.
-        resamples: of the replicas, for intervals.
+        resamples: Of the replicas, for intervals.
     """
     named = runs_by_name(runs)
     _begin(fresh.seed, *_paths(named), files=files)
@@ -379,21 +366,20 @@ def egta(
 
 
 def scenarios(
-    run: Path,
+    run: Run,
     /,
     *,
     scenarios: tuple[str, ...] = (),
     fresh: FreshFlags = Fresh(episodes=5),
     files: FileFlags = Files(),
 ) -> None:
-    """Lets a run's agents play among agents that they never met, and prints how they fare beside random and
-    greedy agents in their places.
+    """Play a run's agents among agents that they never met, and print how they fare beside random and greedy
+    agents in their places.
 
     The figure shows the returns in each scenario.
 
     Args:
-        run: the run's directory, or its results; of one that has not ended the newest checkpoint plays.
-        scenarios: their names, e.g. minority_among_greedy; by default all of the run's game.
+        scenarios: Their names, e.g. minority_among_greedy; by default all of the run's game.
     """
     _begin(fresh.seed, run, files=files)
 
@@ -421,28 +407,35 @@ class Responses:
 
 
 def exploit(
-    run: Path,
+    run: Annotated[Path, tyro.conf.arg(metavar="RUN")],
     /,
     *,
     responses: Annotated[Responses, tyro.conf.arg(name="")] = Responses(),
     fresh: FreshFlags = Fresh(),
-    out: Path | None = None,
+    out: tyro.conf.UseAppendAction[tuple[Path, ...]] = (),
     jobs: int | None = None,
     dry_run: bool = False,
 ) -> None:
-    """Trains best responses to the agents of a run, and prints what they gain: how exploitable the run is.
+    """Train best responses to the agents of a run, and print what they gain: how exploitable the run is.
 
     So many fresh episodes choose a response, in worlds of the next seed, and as many measure what it gains.
     The replicas that are responded to are 0 and those that follow it. You can stop it; the same command
     continues, and plays again with what is trained.
 
     Args:
-        run: the directory of a run that has ended, or its results.
-        out: the directory of trainings and results; by default exploit/NAME.
-        jobs: processes that train at the same time, one for each place and algorithm.
-        dry_run: list all trainings and their states; run and write nothing.
+        run: The directory of a run that has ended, or its results.
+        out: The directory of trainings and results, by default exploit/NAME; or a new file with the tables
+            that are printed (.txt, .md, .tex or .csv). May be repeated.
+        jobs: Processes that train at the same time, one for each place and algorithm.
+        dry_run: List all trainings and their states; run and write nothing.
     """
-    _begin(fresh.seed, run)
+    from cprl.terminal.tables import SUFFIXES
+
+    files = Tables(out=tuple(path for path in out if path.suffix in SUFFIXES))
+    folders = [path for path in out if path.suffix not in SUFFIXES]
+    if len(folders) > 1:
+        raise ValueError(f"--out names the directories {', '.join(map(str, folders))}; allowed: one")
+    _begin(fresh.seed, run, files=files)
 
     from cprl.commands.studies import StudyOptions, carry_out, executor_of
     from cprl.evaluation.exploit import TABLE, exploitability_cells, measure, plan_responses
@@ -450,7 +443,7 @@ def exploit(
     from cprl.terminal.tables import show
 
     plan = plan_responses(run, fresh, **vars(responses))
-    folder = directory_of(plan.study, plan.out if out is None else out)
+    folder = directory_of(plan.study, folders[0] if folders else plan.out)
     options = StudyOptions(out=folder, jobs=jobs, dry_run=dry_run, figures=False)
     executor_of(options)
     if not dry_run:
@@ -458,8 +451,11 @@ def exploit(
     carry_out(plan.study, options, ["cprl", *sys.argv[1:]])
     if dry_run:
         return
-    show(exploitability_cells(measure(plan, folder)))
+    played = measure(plan, folder)
+    tables = list(exploitability_cells(played))
+    show(tables)
     say(f"Episodes: {folder / TABLE}")
+    files.write(played, tables)
 
 
 def _begin(seed: int | None, *runs: Path | str, files: Tables = Tables()) -> None:
@@ -491,11 +487,12 @@ def _show(
         _print_rows(table)
         return
     tables = list(cells)
-    show([said(table, "heading"), *tables])
+    heading = said(table, "heading")
+    show([heading, *tables])
     weights = said(table, "weights")
     if weights:
         say(f"Weights: {weights}")
-    files.write(table, tables)
+    files.write(table, tables, notes=[heading])
     if isinstance(files, Files) and files.figure is not None and draw is not None:
         say(f"Figure: {draw(files.figure, width=files.figure_width)}")
 

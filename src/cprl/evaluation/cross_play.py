@@ -19,7 +19,7 @@ import pyarrow as pa
 
 from cprl.evaluation.evaluate import opened, refuse_other_games
 from cprl.evaluation.lanes import agents_of, fresh_for, play, roles_of, said, together
-from cprl.evaluation.pages import draw_matrices, heading, matrix_cells, rewards_of, says_nothing
+from cprl.evaluation.pages import draw_matrices, heading, matrix_cells
 from cprl.measuring.registry import COLLECTIVE_RETURN, FINES, INCOME, with_unit
 from cprl.measuring.statistics import HOLM, Family, differences, estimates
 from cprl.measuring.table import BACKGROUND, BOTH, FOCAL, ROLE, labelled, numbers_in, where
@@ -27,6 +27,7 @@ from cprl.runs.episodes import Label
 from cprl.system.defaults import Diagonal, Fresh
 from cprl.system.working import working
 from cprl.terminal import style
+from cprl.terminal.summary import rewards_of, says_nothing
 from cprl.terminal.tables import Cells
 from cprl.training.agents import LoadedRun
 from cprl.values import checked, refusal

@@ -2,20 +2,14 @@
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Final
 
-import pyarrow as pa
-
-from cprl.measuring.registry import METRICS, OF_AGENTS
 from cprl.measuring.statistics import Family, notes_on
 from cprl.system.defaults import Fresh
 from cprl.terminal import style
 from cprl.terminal.panels import draw_matrix, matrix_height
+from cprl.terminal.summary import OVER_REPLICAS
 from cprl.terminal.tables import Cells, Change
 from cprl.training.agents import LoadedRun
-
-OVER_REPLICAS: Final = "mean over replicas [95 % interval by Student's t]"
-"""What a number on a page is."""
 
 
 def heading(what: str, fresh: Fresh, runs: Iterable[LoadedRun], each: str = "", end: str = "") -> str:
@@ -28,21 +22,6 @@ def heading(what: str, fresh: Fresh, runs: Iterable[LoadedRun], each: str = "", 
     epsilons = {agent.epsilon for agent in agents if agent.scripted is None and not agent.stochastic}
     exploring = ", greedy" if fresh.greedy else "".join(f", epsilon {one:g}" for one in sorted(epsilons))
     return f"{what}: {fresh}{each}, seed {fresh.seed}{exploring}{end}\n{OVER_REPLICAS}"
-
-
-def rewards_of(table: pa.Table) -> str:
-    """Return the unit of rewards: apples in a game that reports harvests; in another they have none."""
-    return "apples" if "harvest" in table.column_names else ""
-
-
-def says_nothing(number: str, family: Family) -> bool:
-    """Return whether a number is of institutions, and undefined or 0 in a whole family: what none of the game
-    does."""
-    metric = METRICS.get(number)
-    is_payment = number.rpartition("/")[2] in OF_AGENTS
-    is_of_institutions = is_payment if metric is None else metric.is_of_institutions
-    found = (one for key, one in family.items() if key[-1] == number)
-    return is_of_institutions and not any(one.replicas and one.value for one in found)
 
 
 def matrix_cells(family: Family, number: str, title: str, note: str = "") -> Cells:

@@ -34,7 +34,7 @@ from cprl.evaluation.lanes import (
     scripted,
     together,
 )
-from cprl.evaluation.pages import OVER_REPLICAS, heading
+from cprl.evaluation.pages import heading
 from cprl.experiment import presets
 from cprl.measuring.registry import COLLECTIVE_RETURN, EQUALITY, with_unit
 from cprl.measuring.statistics import HOLM, Family, differences, estimates, notes_on
@@ -44,6 +44,7 @@ from cprl.system.defaults import Fresh
 from cprl.system.working import working
 from cprl.terminal import style
 from cprl.terminal.panels import draw_dots
+from cprl.terminal.summary import OVER_REPLICAS
 from cprl.terminal.tables import Cell, Cells, Change
 from cprl.training.agents import LoadedRun, check_scripted, load
 from cprl.values import Value, Where, refusal

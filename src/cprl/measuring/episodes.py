@@ -112,18 +112,6 @@ class Episode:
         return f"Episode(world={self.world}, episode={self.episode}, {ended}, returns={returns})"
 
     @property
-    def social(self) -> dict[str, float]:
-        stock = {} if self.stock_left is None else {"stock_left": float(self.stock_left)}
-        metrics = {
-            name: value for name, value in self.metrics.items() if not name.startswith("institutions/")
-        }
-        return {**metrics, **stock}
-
-    @property
-    def of_institutions(self) -> dict[str, float]:
-        return {name: value for name, value in self.metrics.items() if name.startswith("institutions/")}
-
-    @property
     def outcome(self) -> str:
         """The outcome as text: apples if the game reports a harvest, else returns."""
         if self.harvest is None:

@@ -10,7 +10,7 @@ that worlds count alike. Those that ended last, of all worlds, would be the long
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import ceil, isfinite, nan
+from math import ceil, isfinite, isnan, nan
 from statistics import fmean
 from typing import Final
 
@@ -95,12 +95,13 @@ class Course:
         self.label = BEGINS
         self.mean = nan
         """m after the last episode."""
-        self.peak: float | None = None
-        """The highest m; None until there are enough episodes."""
+        self.peak = nan
+        """The highest m; NaN until there are enough episodes."""
         self.explores: bool | None = None
         """Whether the epsilon of a learner falls, or is above 0.5; None while that is not known, and for
         learners without one."""
         self._worlds = worlds
+        self._least = rounds_of(PEAK_EPISODES, worlds)
         self._waiting: list[deque[tuple[int, float, bool]]] = [deque() for _ in range(replicas)]
         """Episodes of each replica that the others have not ended."""
         self._recent: dict[tuple[int, int], _Recent] = {}
@@ -144,7 +145,7 @@ class Course:
     @property
     def _window(self) -> int:
         """How many episodes of each world m is a mean of."""
-        return max(ceil(PEAK_EPISODES / self._worlds), ceil(RECENT_SHARE * self._rounds))
+        return max(self._least, ceil(RECENT_SHARE * self._rounds))
 
     def _add_round(self) -> None:
         """Take W episodes of each replica, and judge."""
@@ -153,16 +154,13 @@ class Course:
             for _ in range(self._worlds):
                 world, value, has_died = ended.popleft()
                 if isfinite(value):
-                    recent = self._recent.setdefault((replica, world), _Recent())
-                    recent.add(value, has_died, most=self._window)
-        all_recent = self._recent.values()
-        if not all_recent:
-            return
-        self.mean = sum(recent.mean for recent in all_recent) / len(all_recent)
-        fewest = min(map(len, all_recent))
-        if len(all_recent) == len(self._waiting) * self._worlds and fewest >= ceil(
-            PEAK_EPISODES / self._worlds
-        ):
+                    of_world = self._recent.setdefault((replica, world), _Recent())
+                    of_world.add(value, has_died, most=self._window)
+        recent = self._recent.values()
+        if recent:
+            self.mean = fmean(of_world.mean for of_world in recent)
+        fewest = min(map(len, recent), default=0)
+        if len(recent) == len(self._waiting) * self._worlds and fewest >= self._least:
             self._course = self._followed(self._course)
             self.label = self._judged()
 
@@ -171,14 +169,14 @@ class Course:
         is_below = self.label in (BELOW, DEAD)
         if random is None or self.mean >= random - (0 if is_below else SHORT * abs(random)):
             return self._course
-        died = sum(recent.died for recent in self._recent.values()) / sum(map(len, self._recent.values()))
-        is_dead = died >= (STILL_DEAD if self.label == DEAD else 1)
-        return DEAD if is_dead else BELOW
+        recent = self._recent.values()
+        died = sum(of_world.died for of_world in recent) / sum(map(len, recent))
+        return DEAD if died >= (STILL_DEAD if self.label == DEAD else 1) else BELOW
 
     def _followed(self, course: str) -> str:
         """Return the course after a round. `_top` is p, and `_low` the lowest mean of a fall."""
         mean = self.mean
-        if self.peak is None:
+        if isnan(self.peak):
             self.peak = self._top = self._first = self._level = mean
         is_highest = mean >= self.peak
         if is_highest:
@@ -192,9 +190,8 @@ class Course:
             self._top = mean
             course = RECOVERING
         self._top = max(self._top, mean)
-        if is_lost(
-            mean, peak=self._top, random=self._first if self.random_play is None else self.random_play
-        ):
+        random = self._first if self.random_play is None else self.random_play
+        if is_lost(mean, peak=self._top, random=random):
             self._low = mean
             return FALLING
         if course == RECOVERING:

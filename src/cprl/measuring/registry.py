@@ -201,7 +201,7 @@ class Metric:
     is_summarised: bool = False
     """Whether it is in the summary of a run."""
     is_stored: bool = True
-    """Whether an episode has it, and tables have a column of it; else it follows from their totals."""
+    """Whether episodes have it, and tables a column; else it follows from their totals."""
     same_as: str | None = None
     """The metric that it equals where nobody pays anything, or is out of play."""
     is_time: bool = False
@@ -349,7 +349,6 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
         of=lambda stock_left: stock_left,
         colour=PALETTE[APPLE],
         is_summarised=True,
-        is_stored=False,
     ),
     _institutional(FINES, "fines of all", APPLES, lambda fines: fines.sum(-1)),
     _institutional(TRANSFERS, "transfers to all", APPLES, lambda transfers: transfers.sum(-1)),
@@ -586,7 +585,7 @@ def left_out(reported: Collection[str], *, more: Mapping[str, tuple[str, ...]] |
         reported: the entries of `OPTIONAL` that the game reports.
         more: further names and the entries that they need; other words say what else the game lacks.
     """
-    needs = {name: METRICS[name].entries for name in SOCIAL if METRICS[name].is_stored}
+    needs = {name: METRICS[name].entries for name in SOCIAL if name not in (INCOME, *TOTALS)}
     lacking: dict[str, list[str]] = {}
     for name, entries in {**needs, **NEEDS, **(more or {})}.items():
         missing = " and no ".join(entry for entry in entries if entry not in reported)

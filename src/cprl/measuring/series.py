@@ -101,8 +101,7 @@ def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence
         learning: the numbers of learning in it, by agent index: `agent_0/loss` and so on.
         agents: the agents' names, which replace `agent_0` and so on.
     """
-    metrics = episode.social | episode.of_institutions
-    numbers = {logged(name): value for name, value in metrics.items()}
+    numbers = {logged(name): value for name, value in episode.metrics.items()}
     for agent, value in zip(agents, episode.return_, strict=True):
         numbers[f"{agent}/return"] = float(value)
     for name in OF_AGENTS:

@@ -63,9 +63,10 @@ def mean_of_worlds(values: Values, worlds: Numbers, window: int) -> Values:
     Returns:
         [E], at the last of the episodes that it is a mean of; NaN before each world has ended so many.
     """
-    lanes = np.unique(worlds)
-    each = rounds_of(min(window, len(values)), len(lanes))
-    each = min(each, int(np.unique(worlds, return_counts=True)[1].min()))
+    lanes, counts = np.unique(worlds, return_counts=True)
+    each = min(rounds_of(min(window, len(values)), len(lanes)), int(counts.min()))
+    if len(lanes) == 1:
+        return np.concatenate([np.full(each - 1, np.nan), running_mean(values, each)])
     means = np.full((len(lanes), len(values)), np.nan)
     for lane, world in enumerate(lanes):
         ended = np.flatnonzero(worlds == world)

@@ -220,7 +220,7 @@ def stored_episodes(run: Path) -> Iterator[Episode]:
         return
     columns = {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
     columns["world"] = world_of(table)
-    metrics = [name for name in metrics_in(table.schema) if name != "stock_left"]
+    metrics = metrics_in(table.schema)
     in_force = [name for name in metrics if name.startswith(IN_FORCE)]
     agents = int(max(columns["agent"], default=0)) + 1
     for first in range(0, table.num_rows, agents):

@@ -17,7 +17,7 @@ import matplotlib
 import numpy as np
 import pyarrow as pa
 from matplotlib.axes import Axes
-from matplotlib.colors import Normalize, to_hex
+from matplotlib.colors import to_hex
 from matplotlib.ticker import NullLocator
 
 from cprl.measuring.outcome import DECLINE, HARVESTING, NO_BETTER, RECOVERY, TRAGEDY
@@ -39,7 +39,7 @@ from cprl.studies.tables.comparing import (
 )
 from cprl.studies.tables.table import LAST, RANDOM, TRAINING, Design, StudyTable
 from cprl.terminal.panels import draw_cells, draw_dots, draw_line, draw_matrix, width_of_cells
-from cprl.terminal.style import CHARACTER, DASHES, EMPTY, RANDOM_LINE, SHADES, Width, drawing, wrapped
+from cprl.terminal.style import CHARACTER, DASHES, EMPTY, MEAN, RANDOM_LINE, SHADES, Width, drawing, wrapped
 from cprl.values import refusal
 
 MOST_CONDITIONS: Final = 60
@@ -131,70 +131,56 @@ def by_factor(
     colours = colours_of(list(lines), only or range(len(lines)))
     level_of = {name: design.conditions[name][factor] for name in finished(table)}
     places, is_even = places_of(level_of.values())
-    place_of = {name: places[level] for name, level in level_of.items()}
+    at = {name: places[level] for name, level in level_of.items()}
     with drawing(path, width=width) as sheet:
         columns = sheet.fitting(min(len(chosen), 3), 16)
         panels = sheet.panels(len(chosen), columns=columns, high=19, sharex=True)
         for axes, metric in zip(panels, chosen, strict=True):
-            of_metric = {name: levels[name, metric] for name in place_of if (name, metric) in levels}
             values = values_of(rows, metric)
+            chance = _chance(table, metric)
+            is_same = _depends_on_place(chance, at)
             for label, names in lines.items():
-                shown = [name for name in names if name in of_metric]
-                at = [place_of[name] for name in shown]
-                is_joined = design.is_grid and len(set(at)) == len(at)
+                drawn = [name for name in names if (name, metric) in levels]
+                is_joined = design.is_grid and len({at[name] for name in names}) == len(names)
+                style = "-" if is_joined else "none"
                 draw_dots(
                     axes,
-                    at,
-                    [of_metric[name] for name in shown],
-                    replicas=[list(values[name].values()) for name in shown],
+                    [at[name] for name in drawn],
+                    [levels[name, metric] for name in drawn],
+                    replicas=[list(values[name].values()) for name in drawn],
                     color=colours[label],
                     label=label or "mean and interval",
-                    linestyle="-" if is_joined else "none",
+                    linestyle=style,
                 )
-            _draw_chance_of_lines(axes, table, metric, lines, colours, place_of)
+                if chance and (is_same or len(lines) > 1):
+                    look = {**RANDOM_LINE, "marker": "_", "markersize": 9}
+                    look |= {} if is_same else {"color": colours[label]}
+                    look |= {} if is_joined else {"linestyle": style}
+                    dashes = [chance.get(name, nan) for name in names]
+                    axes.plot([at[name] for name in names], dashes, **look)
+            if chance and (is_same or len(lines) > 1):
+                axes.plot([], [], label=CHANCE, **RANDOM_LINE)
             bottom, top = axes.get_ylim()
             if bounds(metric)[0] == 0 and bottom < top / 2:
                 axes.set_ylim(0, None)
             _scale(axes, places, _replicas_by_level(table, factor), is_even=is_even)
-            axes.set_title(_title_of(metric, of_metric.values()))
+            axes.set_title(_title_of(metric, levels))
         for axes in panels[-columns:]:
             axes.tick_params(labelbottom=True)
             axes.set_xlabel(f"{short(factor)}, at equal distances" if is_even else short(factor))
         sheet.title = f"{design.name}: outcome by {short(factor)}"
-        sheet.caption = (
-            f"{replicas_text(table.replicas)}. {_levels_note(table, last)} Faint: single replicas."
-            f"{_not_run(table)}"
-        )
+        sheet.caption = _caption(table, f"{_levels_note(table, last)} Faint: single replicas.")
         if others and list(lines) == [""]:
             sheet.caption += f" Conditions differ in {', '.join(map(short, others))} too."
     return Path(path)
 
 
-def _draw_chance_of_lines(
-    axes: Axes,
-    table: StudyTable,
-    metric: str,
-    lines: Mapping[str, Sequence[str]],
-    colours: Mapping[str, str],
-    places: Mapping[str, float],
-) -> None:
-    """Draw random play under the conditions of each line; one for all where it depends on the level alone."""
-    chance = _chance(table, metric)
+def _depends_on_place(chance: Mapping[str, float], at: Mapping[str, float]) -> bool:
+    """Return whether random play is the same under all conditions that stand at the same place."""
     by_place: dict[float, list[float]] = {}
-    for name in chance:
-        by_place.setdefault(places[name], []).append(chance[name])
-    is_same = all(map(is_one, by_place.values()))
-    if not chance or not (is_same or len(lines) > 1):
-        return
-    for label, names in lines.items():
-        at = [places[name] for name in names]
-        look = {**RANDOM_LINE, "marker": "_", "markersize": 9}
-        if not is_same:
-            look["color"] = colours[label]
-        if not table.design.is_grid or len(set(at)) < len(at):
-            look["linestyle"] = "none"
-        axes.plot(at, [chance.get(name, nan) for name in names], **look)
-    axes.plot([], [], label=CHANCE, **RANDOM_LINE)
+    for name, value in chance.items():
+        by_place.setdefault(at[name], []).append(value)
+    return all(map(is_one, by_place.values()))
 
 
 def places_of(levels: Iterable[float]) -> tuple[dict[float, float], bool]:
@@ -290,26 +276,28 @@ def by_condition(
     levels = family if is_levels else levels_of(table, chosen, last=last)
     rows = table.windows(last=last)
     with drawing(path, width=width) as sheet:
-        names = {
-            name: wrapped(word, min(_NAME, 0.3 * sheet.width_em)) for name, word in names_of(table).items()
-        }
-        lines = [names[name].count("\n") + 1 for name in conditions]
-        row = _LINE * max(*lines, 1) + 0.8
+        wide = min(_NAME, 0.3 * sheet.width_em)
+        words = names_of(table)
+        names = {name: wrapped(words[name], wide) for name in conditions}
+        lines = [name.splitlines() for name in names.values()]
+        high = (_LINE * max(map(len, lines)) + 0.8) * len(conditions) + 7
+        beside = CHARACTER * max(len(line) for name in lines for line in name)
         columns = sheet.fitting(len(chosen), 12.5)
-        high = row * len(conditions) + 7
-        beside = CHARACTER * max(len(line) for name in conditions for line in names[name].splitlines())
         panels = sheet.panels(len(chosen), columns=columns, high=high, beside=beside, sharey=True)
         for axes, metric in zip(panels, chosen, strict=True):
             values = values_of(rows, metric) if is_levels else {}
-            _draw_rows(axes, conditions, metric, family, values)
-            if is_levels:
-                _draw_chance_of_rows(axes, conditions, _chance(table, metric))
-            else:
+            chance = _chance(table, metric) if is_levels else {}
+            for place, name in enumerate(conditions):
+                _draw_row(axes, place, family.get((name, metric)), values.get(name, {}))
+                if name in chance:
+                    look = {**RANDOM_LINE, "linestyle": (0, (2, 1))}
+                    axes.plot([chance[name]] * 2, [place - 0.42, place + 0.42], **look)
+            if not is_levels:
                 axes.axvline(0, **RANDOM_LINE)
                 if axes.dataLim.width < _NO_WIDTH:
                     axes.set_xlim(-1, 1)
-            axes.set_title(_title_of(metric, [one for key, one in levels.items() if key[1] == metric]))
-            axes.set_yticks(range(len(conditions)), [names[name] for name in conditions])
+            axes.set_title(_title_of(metric, levels))
+            axes.set_yticks(range(len(conditions)), list(names.values()))
             axes.locator_params(axis="x", nbins=3)
             axes.grid(axis="y", color="#e6e6e6", linewidth=0.6)
         panels[0].set_ylim(len(conditions) - 0.4, -0.6)
@@ -320,37 +308,19 @@ def by_condition(
             sheet.title = f"{design.name}: difference from {' '.join(design.reference.splitlines())}"
             pairing = capitalised(pairing_text(table))
             note = f"{pairing}; means of {episodes_text(table, last=last)}; {INTERVALS}."
-        sheet.caption = f"{replicas_text(table.replicas)}. {note}{_not_run(table)}"
+        sheet.caption = _caption(table, note)
     return Path(path)
 
 
-def _draw_rows(
-    axes: Axes,
-    conditions: Sequence[str],
-    metric: str,
-    family: Family,
-    values: Mapping[str, Mapping[int, float]],
-) -> None:
-    """Draw a metric of conditions one below the other, and why some have no number."""
-    shown: dict[int, Estimate] = {}
-    for place, name in enumerate(conditions):
-        one = family.get((name, metric))
-        if one is not None and one.replicas:
-            shown[place] = one
-            continue
-        why = "no pairs" if one is None else "undefined"
-        box = {"facecolor": "white", "edgecolor": "none", "pad": 1}
-        middle: dict[str, Any] = {"ha": "center", "va": "center", "transform": axes.get_yaxis_transform()}
-        axes.text(0.5, place, why, bbox=box, **middle)
-    replicas = [list(values.get(conditions[place], {}).values()) for place in shown]
-    draw_dots(axes, list(shown), list(shown.values()), replicas=replicas, across=True)
-
-
-def _draw_chance_of_rows(axes: Axes, conditions: Sequence[str], chance: Mapping[str, float]) -> None:
-    for place, name in enumerate(conditions):
-        if name in chance:
-            look = {**RANDOM_LINE, "linestyle": (0, (2, 1))}
-            axes.plot([chance[name]] * 2, [place - 0.42, place + 0.42], **look)
+def _draw_row(axes: Axes, place: int, one: Estimate | None, values: Mapping[int, float]) -> None:
+    """Draw a number of a condition, or why it has none."""
+    if one is not None and one.replicas:
+        draw_dots(axes, [place], [one], replicas=[list(values.values())], across=True)
+        return
+    why = "no pairs" if one is None else "undefined"
+    box = {"facecolor": "white", "edgecolor": "none", "pad": 1}
+    middle: dict[str, Any] = {"ha": "center", "va": "center", "transform": axes.get_yaxis_transform()}
+    axes.text(0.5, place, why, bbox=box, **middle)
 
 
 # Courses
@@ -379,29 +349,32 @@ def courses(
     chosen = metrics_of(table, metrics or usual)[: len(metrics) or 2]
     if len(conditions) > MOST_CONDITIONS:
         raise ValueError(f"the table has {len(conditions)} conditions; allowed: up to {MOST_CONDITIONS}")
-    names, factor = names_of(table), design.factors[0] if len(design.factors) == 1 else None
+    names = names_of(table)
+    factor = design.factors[0] if len(design.factors) == 1 else None
     is_together = len(conditions) <= _MOST_TOGETHER
-    views: list[tuple[str, list[str], dict[str, tuple[str, str]]]]
+    views: list[tuple[str, dict[str, tuple[str, str]]]]
     if is_together:
         levels = [name if factor is None else design.conditions[name][factor] for name in conditions]
         colours = colours_of(conditions, levels)
         lines = {name: (colours[name], names[name]) for name in conditions}
-        views = [(metric, conditions, lines) for metric in chosen]
+        views = [(metric, lines) for metric in chosen]
     else:
-        reference, alone = design.reference, ("#08519c", "the condition of the panel")
+        reference = design.reference
         beside = {reference: ("#777777", f"reference: {names[reference]}")} if reference in conditions else {}
-        others = [name for name in conditions if name != reference]
-        views = [(chosen[0], [name], {**beside, name: alone}) for name in others]
+        alone = (MEAN, "the condition of the panel")
+        views = [(chosen[0], {**beside, name: alone}) for name in conditions if name != reference]
     windows: set[int] = set()
     is_dashed = factor is None or not is_numeric(design.levels(factor))
     with drawing(path, width=width) as sheet:
         columns = 1 if is_together else sheet.fitting(4, 14)
-        shared = {"sharex": True, "sharey": not is_together}
-        panels = sheet.panels(len(views), columns=columns, high=21 if is_together else 15, **shared)
-        for axes, (metric, of_panel, lines) in zip(panels, views, strict=True):
+        high = 21 if is_together else 15
+        panels = sheet.panels(len(views), columns=columns, high=high, sharex=True, sharey=not is_together)
+        for axes, (metric, lines) in zip(panels, views, strict=True):
             windows |= _draw_courses(axes, table, metric, lines, is_dashed=is_dashed)
-            _draw_chance(axes, table, metric, {name: lines[name][0] for name in of_panel}, is_together)
-            axes.set_title(title(metric) if is_together else names[of_panel[0]])
+            *_, last = lines
+            beside_lines = {name: lines[name][0] for name in (lines if is_together else [last])}
+            _draw_chance(axes, table, metric, beside_lines, is_together)
+            axes.set_title(title(metric) if is_together else names[last])
         for axes in panels[-columns:]:
             axes.tick_params(labelbottom=True)
             axes.set_xlabel("episode")
@@ -409,16 +382,13 @@ def courses(
             if all(axes.dataLim.y0 >= 0 for axes in group):
                 group[0].set_ylim(0, None)
         sheet.legend_title = short(factor) if factor is not None and is_together else ""
-        what = "course of the training" if is_together else title(chosen[0])
-        sheet.title = f"{design.name}: {what}"
-        over = f"{min(windows)} to {max(windows)}" if len(windows) > 1 else f"{max(windows)}"
+        sheet.title = f"{design.name}: {'course of the training' if is_together else title(chosen[0])}"
+        over = " to ".join(map(str, dict.fromkeys((min(windows), max(windows)))))
         smoothed = (
             f"Centred running means over {over} episodes" if max(windows) > 1 else "Nothing is smoothed"
         )
-        sheet.caption = (
-            f"{replicas_text(table.replicas)}. {smoothed}, then over replicas; bands: 95% intervals over "
-            f"replicas by Student's t.{_not_run(table)}"
-        )
+        note = f"{smoothed}, then over replicas; bands: 95% intervals over replicas by Student's t."
+        sheet.caption = _caption(table, note)
     return Path(path)
 
 
@@ -427,12 +397,14 @@ def _draw_chance(
 ) -> None:
     """Draw random play under some conditions, a line for all where it is the same."""
     chance = {name: value for name, value in _chance(table, metric).items() if name in colours}
-    is_same = is_one(chance.values())
-    for name, value in list(chance.items())[: 1 if is_same else None]:
-        look = {} if is_same else {"color": colours[name], "linewidth": 1.0}
-        axes.axhline(value, **{**RANDOM_LINE, **look})
-    if chance:
-        axes.plot([], [], **RANDOM_LINE, label=CHANCE if is_together else "random play under it")
+    if not chance:
+        return
+    if is_one(chance.values()):
+        axes.axhline(next(iter(chance.values())), **RANDOM_LINE)
+    else:
+        for name, value in chance.items():
+            axes.axhline(value, **{**RANDOM_LINE, "color": colours[name], "linewidth": 1.0})
+    axes.plot([], [], **RANDOM_LINE, label=CHANCE if is_together else "random play under it")
 
 
 def _draw_courses(
@@ -543,46 +515,44 @@ def heat_map(
     tested = tuple(dict.fromkeys([*metrics_of(table), metric]))
     levels = levels_of(table, [metric], last=last)
     differences = differences_of(table, tested, last=last)
-    means: dict[Any, tuple[float, str]] = {}
-    changes: dict[Any, tuple[float, str]] = {}
-    stars = 0
-    for pair, name in grid.items():
-        level = levels.get((name, metric))
-        if level is not None and level.replicas:
-            means[pair] = level.value, f"{level.value:{form_for(level.value)}}\nn={level.replicas}"
-            if name == table.design.reference:
-                changes[pair] = 0.0, "reference"
-        change = differences.get((name, metric))
-        if change is not None:
-            stars += change.differs
-            changes[pair] = change.value, f"{change.value:+{form_for(change.value)}}{' *' * change.differs}"
-    values = [value for value, _ in means.values()]
-    scale = Normalize(min(values, default=0), max(values, default=1))
-    maps: list[tuple[str, Any, dict[str, Any]]] = [
-        ("mean (n)", means, {"scale": scale, "colours": "viridis"})
-    ]
+    means = _at(grid, metric, levels)
+    changes = _at(grid, metric, differences)
+    absent = dict.fromkeys(grid, "no run")
+    maps: list[tuple[str, dict[Any, Estimate], dict[Any, str], dict[str, Any]]] = []
+    texts = {pair: f"{one.value:{form_for(one.value)}}\nn={one.replicas}" for pair, one in means.items()}
+    maps.append(("mean (n)", means, absent | texts, {"colours": "viridis", "is_about_0": False}))
     if changes:
-        maps.append(("difference", changes, {}))
+        texts = {pair: "reference" for pair, name in grid.items() if name == table.design.reference}
+        texts |= {
+            pair: f"{one.value:+{form_for(one.value)}}{' *' * one.differs}" for pair, one in changes.items()
+        }
+        maps.append(("difference", changes, absent | texts, {}))
     with drawing(path, width=width, colours=SHADES) as sheet:
         side_by_side = sheet.fitting(len(maps), 5.5 * len(columns) + 12)
         panels = sheet.panels(len(maps), columns=side_by_side, high=_CELL * len(rows) + 8)
-        for axes, (what, numbers, look) in zip(panels, maps, strict=True):
-            drawn = {pair: value for pair, (value, _) in numbers.items()}
-            texts = {pair: numbers[pair][1] if pair in numbers else "no run" for pair in grid}
-            draw_matrix(sheet, axes, rows, columns, drawn, texts, share=1 / side_by_side, upward=True, **look)
+        for axes, (what, numbers, texts, look) in zip(panels, maps, strict=True):
+            values = {pair: one.value for pair, one in numbers.items()}
+            share = 1 / side_by_side
+            draw_matrix(sheet, axes, rows, columns, values, texts, share=share, upward=True, **look)
             axes.set(xlabel=short(factors[1]), ylabel=short(factors[0]))
             axes.set_title(what)
-        sheet.title = f"{table.design.name}: {_title_of(metric, levels.values())}"
-        episodes = episodes_text(table, last=last)
-        sheet.caption = f"Means of {episodes}, then over n replicas."
+        sheet.title = f"{table.design.name}: {_title_of(metric, levels)}"
+        sheet.caption = f"Means of {episodes_text(table, last=last)}, then over n replicas."
         if changes:
-            number = f"{len(tested)} metric{'s' * (len(tested) > 1)}"
-            star = f"; {'*' if stars else 'none shown to be'} not 0 by Holm's method for the "
-            star += f"{differences.tests} differences of {number} together."
-            told = f" Differences from {table.design.reference}, {pairing_text(table)}"
-            sheet.caption += told + (star if differences.tests else ".")
+            star = "*" if any(one.differs for one in changes.values()) else "none shown to be"
+            metrics = f"{len(tested)} metric{'s' * (len(tested) > 1)}"
+            tests = f"{differences.tests} differences of {metrics} together"
+            judged = f"; {star} not 0 by Holm's method for the {tests}"
+            paired = f" Differences from {table.design.reference}, {pairing_text(table)}"
+            sheet.caption += f"{paired}{judged if differences.tests else ''}."
         sheet.caption += f"{elsewhere}{_not_run(table)}"
     return Path(path)
+
+
+def _at(grid: Grid, metric: str, family: Family) -> dict[Any, Estimate]:
+    """Return the estimates of a metric that are defined, by the levels of two factors."""
+    by_pair = {pair: family.get((name, metric)) for pair, name in grid.items()}
+    return {pair: one for pair, one in by_pair.items() if one is not None and one.replicas}
 
 
 def phase_diagram(
@@ -606,10 +576,7 @@ def phase_diagram(
         axes.set(xlabel=short(factors[1]), ylabel=short(factors[0]))
         sheet.title = f"{table.design.name}: phases at the end"
         rules = "; ".join(table.ending_rules)
-        sheet.caption = (
-            f"{replicas_text(table.replicas)}. In which phase most replicas end: {rules}.{elsewhere}"
-            f"{_not_run(table)}"
-        )
+        sheet.caption = _caption(table, f"In which phase most replicas end: {rules}.{elsewhere}")
     return Path(path)
 
 
@@ -712,15 +679,19 @@ def _counts(replicas: Mapping[str, int]) -> list[int]:
     return sorted({number for number in replicas.values() if number}) or [0]
 
 
+def _caption(table: StudyTable, note: str) -> str:
+    return f"{replicas_text(table.replicas)}. {note}{_not_run(table)}"
+
+
 def _levels_note(table: StudyTable, last: int) -> str:
     """Return what points and intervals are."""
     return f"Means of {episodes_text(table, last=last)}, then over replicas; {INTERVALS}."
 
 
-def _title_of(metric: str, levels: Iterable[Estimate]) -> str:
+def _title_of(metric: str, levels: Family) -> str:
     """Return a metric with its unit, and in how many episodes it is undefined, which are in no mean."""
-    shown = list(levels)
-    undefined = sum(level.undefined for level in shown)
-    episodes = sum(level.episodes for level in shown)
+    of_metric = [one for (_, number), one in levels.items() if number == metric]
+    undefined = sum(one.undefined for one in of_metric)
+    episodes = sum(one.episodes for one in of_metric)
     name = title(metric)
     return f"{name}, undefined in {undefined:,} of {episodes:,} episodes" if undefined else name

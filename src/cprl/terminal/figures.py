@@ -1,7 +1,6 @@
 """The training curve of a run, plotted from its table of episodes alone."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,30 +22,6 @@ HEIGHTS: Final = (24, 13, 12, 12)
 """Of panels, in em."""
 OF_INSTITUTIONS: Final = ("institutions/violations", "institutions/fines")
 """What has a panel in games with institutions."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Panel:
-    """A number of each episode, and its course."""
-
-    number: str
-    values: Values
-    """[R, E]."""
-    at: Values
-    """The episodes at the centres of running means, [M]."""
-    means: Values
-    """These means of each replica, [R, M]."""
-    random: float | None
-    """The mean of random play."""
-    evaluated: tuple[Values, Values] | None
-    """The episodes after which agents were evaluated, counted from 0, and their means."""
-
-    @property
-    def title(self) -> str:
-        return with_unit(self.number)
-
-    def amount(self, value: float) -> str:
-        return f"{value:,.4g} {'' if self.number == INCOME else unit(self.number)}".rstrip()
 
 
 def training_curve(
@@ -76,23 +51,36 @@ def training_curve(
         The path.
     """
     table = read_episodes(run)
+    curves = as_curves(table)
+    numbers = _numbers(curves)
     worlds = worlds_of(table)
     lanes = len(np.unique(worlds[0]))
     length = worlds.shape[1]
     window = min(SMOOTHED_EPISODES, max(1, length // PARTS))
     over = rounds_of(window, lanes) * lanes
-    panels = _panels(run, table, random, window, over)
-    levels = [panel.amount(panel.random) for panel in panels if panel.random is not None]
+    levels = {} if random is None else {name: _mean(random, name) for name in numbers}
+    dashed = ", ".join(_amount(name, level) for name, level in levels.items())
     path = path or run / "figures" / "training_curve.png"
     with style.drawing(path, width=width) as sheet:
-        drawn = sheet.panels(len(panels), high=HEIGHTS[: len(panels)], sharex=True)
-        for axes, panel in zip(drawn, panels, strict=True):
-            _draw(axes, panel, f"random play, {', '.join(levels)}")
-            axes.set_xlim(-0.5, max(length - 0.5, 1))
-        _mark_peak(drawn[0], panels[0], over)
+        panels = sheet.panels(len(numbers), high=HEIGHTS[: len(numbers)], sharex=True)
+        for axes, name in zip(panels, numbers, strict=True):
+            values = curves[name]
+            means = np.stack([mean_of_worlds(*one, window) for one in zip(values, worlds, strict=True)])
+            at = np.arange(length, dtype=np.float64) - (over - 1) / 2
+            is_there = ~np.isnan(means).any(0)
+            course = at[is_there], means[:, is_there]
+            _draw(axes, values, *course)
+            _draw_evaluations(axes, run, name)
+            if name in levels:
+                axes.axhline(levels[name], **style.RANDOM_LINE, label=f"random play, {dashed}")
+            if name == numbers[0]:
+                _mark_peak(axes, name, *course, over)
+            axes.set(xlim=(-0.5, max(length - 0.5, 1)), ylabel=with_unit(name))
+            if values.min() >= 0:
+                axes.set_ylim(0, None)
         ends = None if exploration_turns is None else episode_of_turn(table, exploration_turns)
-        mark_exploration(drawn, ends)
-        drawn[-1].set_xlabel("episode")
+        mark_exploration(panels, ends)
+        panels[-1].set_xlabel("episode")
         note = f"Running means are over {over} episodes, centred." if over > 1 else "Nothing is smoothed."
         if lanes > 1:
             note = f"{note.removesuffix('.')}, {over // lanes} of each of {lanes} worlds."
@@ -103,78 +91,60 @@ def training_curve(
     return path
 
 
-def _panels(run: Path, table: pa.Table, random: pa.Table | None, window: int, over: int) -> list[_Panel]:
-    """Return collective return and survival, or the income of a game without a harvest; violations and fines
-    of a game with institutions."""
-    curves = as_curves(table)
-    worlds = worlds_of(table)
-    evaluations = read_evaluations(run)
+def _numbers(curves: Mapping[str, Values]) -> list[str]:
+    """Return what has a panel: collective return and survival, or the income of a game without a harvest;
+    violations and fines of a game with institutions."""
     main = (COLLECTIVE_RETURN, "survival_steps") if COLLECTIVE_RETURN in curves else (INCOME,)
-    panels = []
-    for number in (*main, *(name for name in OF_INSTITUTIONS if name in curves)):
-        values = curves[number]
-        means = np.stack([mean_of_worlds(*one, window) for one in zip(values, worlds, strict=True)])
-        is_there = ~np.isnan(means).any(0)
-        level = None if random is None else float(np.mean(episodes(random, number)["value"].to_numpy()))
-        panels.append(
-            _Panel(
-                number=number,
-                values=values,
-                at=np.asarray(np.flatnonzero(is_there) - (over - 1) / 2, np.float64),
-                means=means[:, is_there],
-                random=level,
-                evaluated=None if evaluations is None else _evaluated(evaluations, number),
-            )
-        )
-    return panels
+    return [*main, *(name for name in OF_INSTITUTIONS if name in curves)]
 
 
-def _evaluated(evaluations: pa.Table, number: str) -> tuple[Values, Values] | None:
-    """Return the episodes after which agents were evaluated, counted from 0, and the means of a number; None
-    where it was not reported."""
-    table = complete(evaluations)
-    if number not in table.column_names:
-        return None
-    rows = episodes(table, number).group_by("trained_episodes").aggregate([("value", "mean")])
-    rows = rows.sort_by("trained_episodes")
-    return rows["trained_episodes"].to_numpy() - 1.0, rows["value_mean"].to_numpy()
+def _amount(name: str, value: float) -> str:
+    return f"{value:,.4g} {'' if name == INCOME else unit(name)}".rstrip()
 
 
-def _draw(axes: Axes, panel: _Panel, dashed: str) -> None:
-    replicas, length = panel.values.shape
-    several = replicas > 1
+def _mean(table: pa.Table, name: str) -> float:
+    return float(np.mean(episodes(table, name)["value"].to_numpy()))
+
+
+def _draw(axes: Axes, values: Values, at: Values, means: Values) -> None:
+    """Draw a number of each episode, [R, E], and its running means, [R, M]."""
+    replicas, length = values.shape
     dot = "." if length < 3 else None  # a line needs two points
-    raw = panel.values.mean(0)
+    several = replicas > 1
     label = "each episode, mean of the replicas" if several else "each episode"
-    axes.plot(raw, color=style.RAW, linewidth=0.7, marker=dot, label=label, zorder=1.5)
+    axes.plot(values.mean(0), color=style.RAW, linewidth=0.7, marker=dot, label=label, zorder=1.5)
     if several:
-        lines = axes.plot(panel.at, panel.means.T, color=style.REPLICA, linewidth=0.9, alpha=0.75, zorder=2)
+        lines = axes.plot(at, means.T, color=style.REPLICA, linewidth=0.9, alpha=0.75, zorder=2)
         lines[0].set_label("each replica, running mean")
     label = f"mean of the {replicas} replicas, running mean" if several else "running mean"
-    mean = panel.means.mean(0)
-    axes.plot(panel.at, mean, color=style.MEAN, linewidth=2.4, marker=dot, label=label, zorder=3)
-    if panel.evaluated is not None:
-        axes.plot(*panel.evaluated, **style.EVALUATED, label="greedy, evaluated while trained", zorder=3.5)
-    if panel.random is not None:
-        axes.axhline(panel.random, **style.RANDOM_LINE, label=dashed)
-    axes.set_ylabel(panel.title)
-    if panel.values.min() >= 0:
-        axes.set_ylim(0, None)
+    axes.plot(at, means.mean(0), color=style.MEAN, linewidth=2.4, marker=dot, label=label, zorder=3)
 
 
-def _mark_peak(axes: Axes, panel: _Panel, number: int) -> None:
+def _draw_evaluations(axes: Axes, run: Path, name: str) -> None:
+    """Draw the means of evaluations while agents were trained, at the episodes after which they played."""
+    evaluations = read_evaluations(run)
+    if evaluations is None or name not in complete(evaluations).column_names:
+        return
+    rows = episodes(evaluations, name).group_by("trained_episodes").aggregate([("value", "mean")])
+    rows = rows.sort_by("trained_episodes")
+    at = rows["trained_episodes"].to_numpy() - 1.0  # counted from 0
+    label = "greedy, evaluated while trained"
+    axes.plot(at, rows["value_mean"].to_numpy(), **style.EVALUATED, label=label, zorder=3.5)
+
+
+def _mark_peak(axes: Axes, name: str, at: Values, means: Values, number: int) -> None:
     """Mark the highest and the last running mean, of so many episodes, of the mean over replicas."""
-    mean = panel.means.mean(0)
+    mean = means.mean(0)
     top = int(mean.argmax())
     end = len(mean) - 1
     over = f"mean of {number} episodes" if number > 1 else "episode"
     marks = {"highest": (top, "o"), "last": (end, "s")}
     if top == end:
         marks = {"highest and last": (top, "o")}
-    for name, (place, marker) in marks.items():
-        when = f", episode {panel.at[place]:,.0f}" if place == top else ""
-        label = f"{name} {over}, {panel.amount(mean[place])}{when}"
-        axes.plot(panel.at[place], mean[place], marker, **style.POINT, label=label, zorder=4)
+    for which, (place, marker) in marks.items():
+        when = f", episode {at[place]:,.0f}" if place == top else ""
+        label = f"{which} {over}, {_amount(name, mean[place])}{when}"
+        axes.plot(at[place], mean[place], marker, **style.POINT, label=label, zorder=4)
 
 
 def mark_exploration(panels: Sequence[Axes], episode: float | None) -> None:

@@ -9,7 +9,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from numpy.typing import ArrayLike
 
-from cprl.measuring.statistics import Estimate, Values
+from cprl.measuring.statistics import Estimate
+from cprl.measuring.windows import Values
 from cprl.terminal.style import CHARACTER, EMPTY, MEAN, Sheet, draw_cell, wrapped
 
 _BAND: Final = 0.2
@@ -85,8 +86,8 @@ def draw_matrix(
     values: Mapping[Pair, float],
     texts: Mapping[Pair, str],
     *,
-    scale: Normalize | None = None,
     colours: str = "RdBu",
+    is_about_0: bool = True,
     share: float = 1.0,
     upward: bool = False,
 ) -> None:
@@ -97,12 +98,14 @@ def draw_matrix(
     Args:
         rows: what each row is called, by its key in `values` and `texts`.
         columns: what each column is called.
-        scale: of the colours; by default about 0, as of differences.
+        colours: the name of a colour map of matplotlib.
+        is_about_0: whether its middle is 0, as of differences.
         share: of the width of the sheet, which the panel has.
         upward: whether the first row is the lowest.
     """
-    reach = max(map(abs, values.values()), default=0.0) or 1.0
-    scale = Normalize(-reach, reach) if scale is None else scale
+    low, high = min(values.values(), default=0.0), max(values.values(), default=1.0)
+    reach = max(-low, high) or 1.0
+    scale = Normalize(-reach, reach) if is_about_0 else Normalize(low, high)
     shades = matplotlib.colormaps[colours]
     is_small = width_of_cells(sheet, rows, columns, share=share) < _CELL[0]
     cells = {}

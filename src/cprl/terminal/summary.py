@@ -1,7 +1,6 @@
 """The results of a run, printed in the terminal: first what they come to, then a table and files."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from math import isclose
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -11,8 +10,8 @@ from rich.console import Console
 from rich.text import Text
 
 from cprl.measuring.registry import (
+    APPLES,
     COLLECTIVE_RETURN,
-    IN_FORCE,
     INCOME,
     INCOME_EQUALITY,
     METRICS,
@@ -28,8 +27,10 @@ from cprl.system.shipped import cprl_here
 from cprl.terminal.tables import Cell, Cells, Change
 
 _FILES: Final = ("recipe.json", "episodes.parquet", "run.rrd", "checkpoints", "figures")
-INTERVALS: Final = "mean over replicas [95 % interval by Student's t]"
+OVER_REPLICAS: Final = "mean over replicas [95 % interval by Student's t]"
+"""What a number on a page is."""
 ZEROS: Final = "Numbers of institutions that are 0 or undefined everywhere are left out."
+IDLE: Final = "{}: nobody harvested anything, so equality and sustainability are undefined"
 
 
 def summarise(
@@ -51,9 +52,9 @@ def summarise(
     """
     console = console or safe_console()
     baseline = played["policy"][0].as_py()
-    told = [name for name in every_number(played) if _is_summarised(name)]
+    numbers = list(filter(_is_summarised, every_number(played)))
     console.print(Text(course or _verdict(played, baseline), style="bold"))
-    console.print(compared(played, f"{title}\n{INTERVALS}", numbers=told, reference=baseline))
+    console.print(compared(played, f"{title}\n{OVER_REPLICAS}", numbers=numbers, reference=baseline))
     files = [name for name in _FILES if (run / name).exists()]
     lines = [note, f"Saved in {run}: {', '.join(files)}", f"Training curve: {figure}" if figure else None]
     if any(run.glob("run*.rrd")):
@@ -64,12 +65,11 @@ def summarise(
 
 def every_number(table: pa.Table) -> list[str]:
     """Return the names of all numbers in the order of pages: of whole episodes, then of each agent."""
-    together = [name for name in numbers_in(table) if name != INCOME]
-    has_harvest = COLLECTIVE_RETURN in together
-    together.insert(int(has_harvest), INCOME)
-    agents = range(int(np.max(table["agent"].to_numpy())) + 1)
+    numbers = [name for name in numbers_in(table) if name != INCOME]
+    numbers.insert(numbers.count(COLLECTIVE_RETURN), INCOME)
     amounts = [name for name in ("return", *OF_AGENTS) if name in table.column_names]
-    return [*together, *(f"agent_{agent}/{name}" for name in amounts for agent in agents)]
+    agents = range(len(table["agent"].unique()))
+    return [*numbers, *(f"agent_{agent}/{name}" for name in amounts for agent in agents)]
 
 
 def _is_summarised(name: str) -> bool:
@@ -80,88 +80,86 @@ def _is_summarised(name: str) -> bool:
     return is_gain or metric.is_summarised or metric.is_of_institutions
 
 
+def rewards_of(table: pa.Table) -> str:
+    """Return the unit of rewards: apples in a game that reports harvests; in another they have none."""
+    return APPLES if "harvest" in table.column_names else ""
+
+
+def says_nothing(name: str, family: Family) -> bool:
+    """Return whether a number is of institutions, and undefined or 0 in a whole family."""
+    metric = METRICS.get(name)
+    is_amount = name.rpartition("/")[2] in OF_AGENTS
+    is_of_institutions = is_amount if metric is None else metric.is_of_institutions
+    estimates_of = (one for key, one in family.items() if key[-1] == name)
+    return is_of_institutions and not any(one.replicas and one.value for one in estimates_of)
+
+
 def compared(
     table: pa.Table,
     heading: str,
     *,
     numbers: Sequence[str] = (),
-    by: str = "policy",
     reference: str = "random",
     names: Mapping[str, str] | None = None,
 ) -> Cells:
     """Return a row for each number: a column for each policy, then one for what each has more than the
     reference, paired by replica.
 
-    Numbers of institutions that are 0 or undefined everywhere have no row, and incomes none where nobody is
-    paid anything but the harvest.
+    Numbers that `says_nothing` have no row, and incomes none where they are the harvests.
 
     Args:
-        table: Of episodes, labelled by policy, see `cprl.measuring.table`.
+        table: Of episodes, labelled by "policy", see `cprl.measuring.table`.
         numbers: Their names; by default `every_number`.
-        by: The label that the policies are called by.
-        names: What columns are called instead of their label.
+        names: What policies are called instead of their label.
     """
-    asked = list(numbers or every_number(table))
-    levels = estimates(table, asked, by)
-    more = differences(table, asked, by, {by: reference})
-    columns = [label for (label,) in levels.labels]
-    others = [label for label in columns if label != reference]
-    words = {label: (names or {}).get(label, label) for label in columns}
-    rewards = "apples" if "harvest" in table.column_names else ""
-    told = [name for name in asked if _says_something(name, levels, columns)]
+    numbers = numbers or every_number(table)
+    levels = estimates(table, numbers, "policy")
+    changes = differences(table, numbers, "policy", {"policy": reference})
+    policies = [policy for (policy,) in levels.labels]
+    others = [policy for policy in policies if policy != reference]
+    called = {policy: (names or {}).get(policy, policy) for policy in policies}
+    silent = {name for name in numbers if says_nothing(name, levels)}
+    repeated = {name for name in (INCOME, INCOME_EQUALITY) if _is_repeated(name, levels)}
     rows: list[list[Cell]] = []
-    for name in told:
-        values = [levels[label, name] for label in columns]
-        gaps = [_change(more.get((label, name))) for label in others]
-        rows.append([with_unit(name, rewards=rewards), *values, *gaps])
-    of_columns = [where(table, **{by: label}) for label in columns]
+    for name in levels.numbers:
+        if name not in silent | repeated:
+            values = [levels[policy, name] for policy in policies]
+            gaps = [_change(changes.get((policy, name))) for policy in others]
+            rows.append([with_unit(name, rewards=rewards_of(table)), *values, *gaps])
+    of_policies = [where(table, policy=policy) for policy in policies]
     blank = [""] * len(others)
-    rows.append(["episodes", *(str(len(where(one, agent=0))) for one in of_columns), *blank])
-    if rewards:
-        idle = [_without_harvest(one) for one in of_columns]
-        rows.append(["agents without a harvest, not in sustainability", *idle, *blank])
-    shown = [levels[label, name] for label in columns for name in told]
-    left_out = (table.schema.metadata or {}).get(LEFT_OUT, b"").decode()
-    zeros = ZEROS * any(_is_of_institutions(name) for name in {*asked} - {*told})
-    holm = f"{HOLM} for {more.name}." * any(one.differs for one in more.values())
-    notes = [left_out, zeros, *_idle(levels, words), *notes_on(shown), holm]
-    head = ["", *words.values(), *(f"{words[label]} - {words[reference]}, paired" for label in others)]
+    rows.append(["episodes", *(str(len(where(one, agent=0))) for one in of_policies), *blank])
+    if "harvest" in table.column_names:
+        idle = [one["harvest"].to_pylist() for one in of_policies]
+        counts = (f"{each.count(0)} of {len(each)}" for each in idle)
+        rows.append(["agents without a harvest, not in sustainability", *counts, *blank])
+    notes = [
+        (table.schema.metadata or {}).get(LEFT_OUT, b"").decode(),
+        ZEROS if silent else "",
+        *(IDLE.format(called[policy]) for policy in policies if _is_idle(levels, policy)),
+        *notes_on(levels.values()),
+        f"{HOLM} for {changes.name}." if any(one.differs for one in changes.values()) else "",
+    ]
+    head = ["", *called.values(), *(f"{called[policy]} - {called[reference]}, paired" for policy in others)]
     return Cells(heading, head, rows, "\n".join(filter(None, notes)))
+
+
+def _is_repeated(name: str, levels: Family) -> bool:
+    """Return whether a number is that which it is where nobody pays anything."""
+    same = METRICS[name].same_as
+    if not {name, same} <= set(levels.numbers):
+        return False
+    values, others = ([levels[*labels, one].value for labels in levels.labels] for one in (name, same))
+    return np.allclose(values, others, rtol=1e-6, atol=1e-3, equal_nan=True)
+
+
+def _is_idle(levels: Family, policy: str) -> bool:
+    harvest = levels.get((policy, COLLECTIVE_RETURN))
+    return harvest is not None and harvest.value == 0
 
 
 def _change(difference: Estimate | None) -> Cell:
     return "" if difference is None else Change(difference)
-
-
-def _says_something(name: str, levels: Family, columns: Sequence[str]) -> bool:
-    values = [levels[label, name] for label in columns]
-    if name in (INCOME, INCOME_EQUALITY):
-        same = METRICS[name].same_as
-        pairs = ((one, levels.get((label, same))) for label, one in zip(columns, values, strict=True))
-        return not all(other is not None and _are_close(one, other) for one, other in pairs)
-    return not _is_of_institutions(name) or any(one.value > 0 or one.value < 0 for one in values)
-
-
-def _is_of_institutions(name: str) -> bool:
-    is_amount = name.rpartition("/")[2] in OF_AGENTS
-    return (name.startswith("institutions/") or is_amount) and not name.startswith(IN_FORCE)
-
-
-def _are_close(one: Estimate, other: Estimate) -> bool:
-    return isclose(one.value, other.value, rel_tol=1e-6, abs_tol=1e-3) or one.replicas == other.replicas == 0
-
-
-def _without_harvest(rows: pa.Table) -> str:
-    harvests = rows["harvest"].to_numpy()
-    return f"{np.count_nonzero(harvests == 0)} of {len(harvests)}"
-
-
-def _idle(levels: Family, words: Mapping[str, str]) -> Iterator[str]:
-    """Say why metrics are undefined."""
-    for label, policy in words.items():
-        harvest = levels.get((label, COLLECTIVE_RETURN))
-        if harvest is not None and harvest.value == 0:
-            yield f"{policy}: nobody harvested anything, so equality and sustainability are undefined"
 
 
 def _verdict(played: pa.Table, baseline: str) -> str:
@@ -169,13 +167,13 @@ def _verdict(played: pa.Table, baseline: str) -> str:
     has_harvest = COLLECTIVE_RETURN in played.column_names
     name = COLLECTIVE_RETURN if has_harvest else INCOME
     levels = estimates(played, name, "policy")
-    more = differences(played, name, "policy", {"policy": baseline})
+    gaps = differences(played, name, "policy", {"policy": baseline})
     parts = []
     for (policy, _), level in levels.items():
-        gap = more.get((policy, name))
+        gap = gaps.get((policy, name))
         beside = "" if gap is None else f" ({gap:+} beside {_called(baseline)})"
         parts.append(f"{_called(policy)}: {level}{beside}")
-    unit = "apples" if has_harvest else "of return"
+    unit = APPLES if has_harvest else "of return"
     return f"{'; '.join([parts[-1], *parts[:-1]])} {unit} an episode, all agents together"
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 from textwrap import TextWrapper
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Union
+from typing import TYPE_CHECKING, Final, NamedTuple, Union
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.table import Table
@@ -26,8 +26,6 @@ from cprl.values import refusal
 if TYPE_CHECKING:
     from cprl.measuring.statistics import Estimate
 
-SUFFIXES: Final = (".txt", ".md", ".tex", ".csv")
-"""Of the files that `write` writes."""
 _FILE_WIDTH: Final = 250
 """Of tables in a file or pipe, in characters."""
 _LATEX: Final = str.maketrans(
@@ -75,7 +73,7 @@ class Cells(NamedTuple):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
         yield Text(self.heading, style="bold")
         room = options.max_width
-        texts = [[_starred(cell) for cell in row] for row in self.rows]
+        texts = [[_marked(cell, "{} *") for cell in row] for row in self.rows]
         rows = texts
         widths = [max(_longest(head), wide) for head, wide in zip(self.head, self._widths(rows), strict=True)]
         if _total(widths) > room:
@@ -125,10 +123,9 @@ def write(tables: Sequence[Cells], path: str | Path, *, notes: Sequence[str] = (
     if path.suffix not in SUFFIXES:
         raise refusal("path", str(path), f"a file whose name ends in {', '.join(SUFFIXES)}")
     refuse_to_write_over(path)
-    content = _CONTENTS[path.suffix](tables, notes).encode()
+    content = SUFFIXES[path.suffix](tables, notes).encode()
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda file: file.write(content))
-    return path
+    return write_atomically(path, lambda file: file.write(content))
 
 
 def markdown(table: Cells) -> list[str]:
@@ -144,50 +141,9 @@ def cell(name: str) -> str:
     return re.sub(r"[\\`*<$|]", r"\\\g<0>", " ".join(name.splitlines()))
 
 
-def latex(table: Cells) -> list[str]:
-    """Return the lines of a table for LaTeX with the package booktabs."""
-    names = max(table.texts, 1)
-    rows = [" & ".join(map(_in_latex, row)) + r" \\" for row in (table.head, *table.rows)]
-    lines = [
-        r"\begin{table}",
-        rf"\caption{{{_in_latex(table.heading)}}}",
-        rf"\begin{{tabular}}{{{'l' * names}{'r' * (len(table.head) - names)}}}",
-        r"\toprule",
-        rows[0],
-        r"\midrule",
-        *rows[1:],
-        r"\bottomrule",
-        r"\end{tabular}",
-    ]
-    lines += [rf"\par\smallskip\footnotesize {_in_latex(table.note)}"] * bool(table.note)
-    return [*lines, r"\end{table}", ""]
-
-
-def csv_rows(tables: Iterable[Cells]) -> Iterator[dict[str, Any]]:
-    """Yield a row for each cell: "table" (its heading), "row" (its names), "column"; of an estimate its
-    numbers, of another cell its "text"."""
-    for table in tables:
-        names = max(table.texts, 1)
-        for row in table.rows:
-            name = ", ".join(map(str, row[:names]))
-            for head, part in zip(table.head[names:], row[names:], strict=True):
-                place = {"table": " ".join(table.heading.split()), "row": name, "column": head}
-                yield {**place, **_numbers(part)}
-
-
-def _numbers(part: Cell) -> dict[str, Any]:
-    from cprl.measuring.statistics import numbers_of
-
-    if isinstance(part, str):
-        return {"text": part}
-    return dict(numbers_of(part.estimate if isinstance(part, Change) else part))
-
-
 def _as_text(tables: Sequence[Cells], notes: Sequence[str]) -> str:
     drawn = StringIO()
-    terminal = Console(file=drawn, width=_FILE_WIDTH)
-    for part in (*tables, *map(Text, notes)):
-        terminal.print(part)
+    Console(file=drawn, width=_FILE_WIDTH).print(*tables, *map(Text, notes), sep="\n")
     return drawn.getvalue()
 
 
@@ -197,47 +153,59 @@ def _as_markdown(tables: Sequence[Cells], notes: Sequence[str]) -> str:
 
 
 def _as_latex(tables: Sequence[Cells], notes: Sequence[str]) -> str:
-    lines = [line for table in tables for line in latex(table)]
-    return "\n".join([r"% \usepackage{booktabs}", *lines, *map(_in_latex, notes), ""])
+    lines = [r"% \usepackage{booktabs}"]
+    for table in tables:
+        head, *rows = (" & ".join(map(_in_latex, row)) + r" \\" for row in (table.head, *table.rows))
+        columns = "l" * max(table.texts, 1)
+        columns = columns.ljust(len(table.head), "r")
+        lines += [
+            r"\begin{table}",
+            rf"\caption{{{_in_latex(table.heading)}}}",
+            rf"\begin{{tabular}}{{{columns}}}",
+            *(r"\toprule", head, r"\midrule", *rows, r"\bottomrule"),
+            r"\end{tabular}",
+            rf"\par\smallskip\footnotesize {_in_latex(table.note)}",
+            r"\end{table}",
+        ]
+    return "\n".join([*lines, *map(_in_latex, notes), ""])
 
 
 def _as_csv(tables: Sequence[Cells], notes: Sequence[str]) -> str:
-    from cprl.measuring.statistics import NUMBERS
+    """Return a row for each cell: "table" (its heading), "row" (its names), "column"; of an estimate its
+    numbers, of another cell its "text"."""
+    from cprl.measuring.statistics import NUMBERS, numbers_of
 
     written = StringIO(newline="")
     writer = csv.DictWriter(written, ["table", "row", "column", *NUMBERS, "text"], lineterminator="\n")
     writer.writeheader()
-    writer.writerows(csv_rows(tables))
+    for table in tables:
+        names = max(table.texts, 1)
+        for row in table.rows:
+            place = {"table": " ".join(table.heading.split()), "row": ", ".join(map(str, row[:names]))}
+            for head, part in zip(table.head[names:], row[names:], strict=True):
+                one = part.estimate if isinstance(part, Change) else part
+                numbers = {"text": one} if isinstance(one, str) else numbers_of(one)
+                writer.writerow({**place, "column": head, **numbers})
     return written.getvalue()
 
 
-_CONTENTS: Final = dict(zip(SUFFIXES, (_as_text, _as_markdown, _as_latex, _as_csv), strict=True))
+SUFFIXES: Final = {".txt": _as_text, ".md": _as_markdown, ".tex": _as_latex, ".csv": _as_csv}
+"""How `write` writes a file, by the suffix of its name."""
 
 
 def _is_bold(part: Cell) -> bool:
-    if isinstance(part, str):
-        return part.startswith("**")
     return isinstance(part, Change) and part.estimate.differs
 
 
 def _marked(part: Cell, mark: str) -> str:
     """Return the text of a cell, with its number where a mark has {} if it is bold."""
-    if isinstance(part, str) and part.startswith("**"):  # until studies hand over numbers
-        bold, _, more = part.removeprefix("**").partition("**")
-        return mark.format(bold) + more
-    if isinstance(part, Change) and part.estimate.differs:
-        return " ".join(filter(None, (mark.format(f"{part.estimate:+}"), part.more)))
+    if isinstance(part, Change) and _is_bold(part):
+        return str(part).replace(f"{part.estimate:+}", mark.format(f"{part.estimate:+}"), 1)
     return str(part)
 
 
-def _starred(part: Cell) -> str:
-    return _marked(part, "{} *")
-
-
 def _in_markdown(part: Cell) -> str:
-    if isinstance(part, str) and not part.startswith("**"):
-        return cell(part)
-    return _marked(part, "**{}**")
+    return cell(part) if isinstance(part, str) else _marked(part, "**{}**")
 
 
 def _in_latex(part: Cell) -> str:

@@ -100,10 +100,10 @@ def _differs(agents: Sequence[AgentSpec], table: pa.Table) -> str:
 
 def _replicas(fresh: pa.Table) -> list[str]:
     """Return replicas one by one, where they are few; else in how many most boards die, where they differ."""
-    apples = by_replica(fresh, COLLECTIVE_RETURN)["value"].to_pylist()
-    steps = by_replica(fresh, LIFE)["value"].to_pylist()
-    died = fresh.group_by("replica", use_threads=False).aggregate([("terminated", "mean")])
-    shares = died["terminated_mean"].to_pylist()
+    apples = by_replica(fresh, COLLECTIVE_RETURN).sort_by("replica")["value"].to_pylist()
+    steps = by_replica(fresh, LIFE).sort_by("replica")["value"].to_pylist()
+    died = fresh.group_by("replica").aggregate([("terminated", "mean")])
+    shares = died.sort_by("replica")["terminated_mean"].to_pylist()
     replicas = len(apples)
     if 1 < replicas <= FEW_REPLICAS:
         got = f"{_listed(apples, form_for(*apples))} apples and {_listed(steps, form_for(*steps))} steps"

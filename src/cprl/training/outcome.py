@@ -186,8 +186,10 @@ class Evaluations:
 
 def _means(episodes: Sequence[Episode]) -> dict[str, float]:
     means = {"return": fmean(float(episode.return_.sum()) for episode in episodes)}
-    for name in episodes[0].social:
-        values = [episode.social[name] for episode in episodes]
+    for name in episodes[0].metrics:
+        if name.startswith("institutions/"):
+            continue
+        values = [episode.metrics[name] for episode in episodes]
         means[name] = float(np.nanmean(values)) if not np.isnan(values).all() else float("nan")
     return means
 

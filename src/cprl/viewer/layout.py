@@ -318,9 +318,9 @@ def _tabs(curves: Curves, *, live: bool) -> list[Any]:
         wall = _wall(curves) if curves.worlds > 1 else None
         places = boards_of(curves, len(agents))
         visits = _panels(places, "Where agents go in the first replica, by episodes", "visits")
-    alone = [name for name in curves.metrics if name in METRICS and METRICS[name].plot == ""]
-    of_law = [name for name in alone if name.startswith(INSTITUTIONS)]
-    others = [name for name in alone if name not in (*of_law, *OVERVIEW) and (several or name != EQUALITY)]
+    own = list(filter(is_own, curves.metrics))
+    of_law = [name for name in curves.metrics if name not in own and METRICS[name].is_of_institutions]
+    seen = (*own, *of_law, *OVERVIEW, *([] if several else [EQUALITY]))
     decided = [f"{IN_FORCE}{ballot}" for ballot in range(len(curves.in_force))]
     tabs = {
         "Worlds": [wall],
@@ -333,8 +333,7 @@ def _tabs(curves: Curves, *, live: bool) -> list[Any]:
         ],
         "Institutions": [
             *(_of_each(curves, name) for name in curves.of_agents),
-            *(_plot(words, entities, share=True) for words, entities in _shared(curves).items()),
-            *(_metric(curves, name) for name in of_law),
+            *_metrics(curves, of_law),
             _plot(f"In force: {', '.join(curves.in_force)}", decided),
         ],
         "Learning": [
@@ -343,8 +342,8 @@ def _tabs(curves: Curves, *, live: bool) -> list[Any]:
             _plot("Epsilon, 0 to 1", _of(agents, "epsilon"), share=True),
             _plot("Steps per second", [SPEED]),
         ],
-        "More metrics": [stock, *(_metric(curves, name) for name in others)],
-        "Your metrics": [_metric(curves, name) for name in filter(is_own, curves.metrics)],
+        "More metrics": [stock, *_metrics(curves, [name for name in curves.metrics if name not in seen])],
+        "Your metrics": _metrics(curves, own),
     }
     grids = [
         rrb.Grid(*views, grid_columns=len(views) if len(views) < 4 else ceil(len(views) / 2), name=name)
@@ -360,13 +359,17 @@ def _of_each(curves: Curves, total: str) -> Any:
     return _plot(_sentence(words), _of(curves.agents, total))
 
 
-def _shared(curves: Curves) -> dict[str, list[str]]:
-    """The entities of metrics that share a plot, by its title."""
+def _metrics(curves: Curves, names: Sequence[str]) -> list[Any]:
+    """The plots of metrics that the registry says: one of its own, one with others, or none."""
     plots: dict[str, list[str]] = {}
-    for name in curves.metrics:
-        if name in METRICS and (words := METRICS[name].plot):
-            plots.setdefault(words, []).append(logged(name))
-    return plots
+    for name in names:
+        plot = METRICS[name].plot if name in METRICS else ""
+        if plot is not None:
+            plots.setdefault(plot or name, []).append(logged(name))
+    return [
+        _metric(curves, plot) if plot in names else _plot(plot, entities, share=True)
+        for plot, entities in plots.items()
+    ]
 
 
 def _recipe() -> Any:

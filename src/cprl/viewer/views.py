@@ -76,10 +76,7 @@ class Plots(View):
         """Sets the lines of random play: the mean of each metric in these episodes, where it is defined."""
         curves = self._logger.curves
         names = [*curves.metrics, *([RETURN] if curves.unit == "return" else [])]
-        played = [
-            {**episode.social, **episode.of_institutions, RETURN: float(episode.return_.sum())}
-            for episode in episodes
-        ]
+        played = [{**episode.metrics, RETURN: float(episode.return_.sum())} for episode in episodes]
         for name in names:
             values = [numbers.get(name, nan) for numbers in played]
             defined = [value for value in values if not isnan(value)]

@@ -108,8 +108,8 @@ def _are_equal(rows: pa.Table, metric: str, other: str) -> bool:
     places = ["condition", "replica", "episode"]
     if not one.select(places).equals(two.select(places)):
         return False
-    close = {"rtol": _ROUNDING, "atol": _ROUNDING, "equal_nan": True}
-    return bool(np.allclose(one["value"].to_numpy(), two["value"].to_numpy(), **close))
+    values = (rows["value"].to_numpy() for rows in (one, two))
+    return bool(np.allclose(*values, rtol=_ROUNDING, atol=_ROUNDING, equal_nan=True))
 
 
 def episodes_text(

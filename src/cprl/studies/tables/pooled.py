@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from cprl.experiment import Experiment
-from cprl.population import any_learns
 from cprl.runs.recipe import read_recipe, runs_in
 from cprl.studies.factors import ALL, normalised, values_at
 from cprl.studies.study import UNNAMED, Condition, named, short_names, unlike
-from cprl.studies.tables.sources import REASONS, Source, clocks_of, plain_level, table_of
-from cprl.studies.tables.table import WINDOW, Design, Lacking, StudyTable, some
+from cprl.studies.tables.sources import Source, clocks_of, plain_level, reason_of, table_of
+from cprl.studies.tables.table import WINDOW, Design, StudyTable, some
 from cprl.studies.trials import state_of
 from cprl.values import differences, refusal, to_config
 
@@ -51,24 +50,19 @@ def pooled_table(
     if reference is not None and reference not in groups:
         raise refusal("reference", reference, f"the name of a condition: {', '.join(list(groups)[:10])}")
     firsts = _firsts(experiments.values())
-    sources, lacking = [], []
-    for name, members in groups.items():
-        for run, experiment in members.items():
-            replicas, state = experiment.replicas, state_of(run)
-            if state != "finished":
-                lacking.append(Lacking(str(run), name, replicas, REASONS[state]))
-                continue
-            source = Source(
-                run=run,
-                name=str(run),
-                condition=name,
-                checksum=Condition(experiment).checksum_in(run.parent),
-                first=firsts[experiment.seed],
-                replicas=replicas,
-                episodes=experiment.episodes,
-                agents_learn=any_learns(experiment.agents),
-            )
-            sources.append(source)
+    sources = [
+        Source(
+            run=run,
+            name=str(run),
+            condition=name,
+            checksum=Condition(experiment).checksum_in(run.parent),
+            first=firsts[experiment.seed],
+            experiment=experiment,
+            reason=reason_of(state_of(run)),
+        )
+        for name, members in groups.items()
+        for run, experiment in members.items()
+    ]
     seeds = {frozenset(experiment.seed for experiment in members.values()) for members in groups.values()}
     design = Design(
         name=f"{len(paths)} runs by {', '.join(fields)}",
@@ -78,7 +72,7 @@ def pooled_table(
         notes=tuple(_notes(groups, fields)),
         clocks=clocks_of({name: members.values() for name, members in groups.items()}),
     )
-    return table_of(design, sources, lacking, window=window)
+    return table_of(design, sources, window=window)
 
 
 def _groups(

@@ -15,8 +15,8 @@ from cprl.envs.unwrap import clock_in
 from cprl.experiment import Experiment
 from cprl.measuring.outcome import RULE, outcome_of
 from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, INCOME_EQUALITY, METRICS
-from cprl.measuring.table import WINDOWS, Numbers, complete, labelled, metrics_in, where, world_of
-from cprl.measuring.windows import Values, episodes_after, rounds_of
+from cprl.measuring.table import WINDOWS, Numbers, by_replica, complete, metrics_in, where, world_of
+from cprl.measuring.windows import episodes_after, rounds_of
 from cprl.population import any_learns
 from cprl.runs.checkpoints import REPORT
 from cprl.runs.episodes import read_episodes, read_rows
@@ -67,11 +67,9 @@ class Source:
     """See `cprl.studies.study.Condition`."""
     first: int
     """The number of its first replica in the table."""
-    replicas: int
-    episodes: int | None
-    """That each replica trains; None where it trains so many steps."""
-    agents_learn: bool = True
-    """Whether any of its agents does."""
+    experiment: Experiment
+    reason: str = ""
+    """Why it is no part of the table; "" of a finished run."""
 
 
 def study_table(
@@ -83,8 +81,7 @@ def study_table(
         window: episodes of a window of training; 1 for episodes one by one, of the evaluation too.
         status: where its trials say why they failed, see `cprl.studies.trials`.
     """
-    finished, lacking = sources_of(study, Path(runs), status)
-    return table_of(design_of(study), finished, lacking, window=window)
+    return table_of(design_of(study), sources_of(study, Path(runs), status), window=window)
 
 
 def design_of(study: Study) -> Design:
@@ -115,28 +112,29 @@ def clocks_of(experiments: Mapping[str, Iterable[Experiment]]) -> dict[str, int]
     return {name: max(filter(None, each)) for name, each in clocks.items() if None not in each}
 
 
-def sources_of(study: Study, runs: Path, status: Path | None = None) -> tuple[list[Source], list[Lacking]]:
-    """The finished runs of a study, and the others; `status` is where its trials say why they failed."""
-    finished, lacking = [], []
+def sources_of(study: Study, runs: Path, status: Path | None = None) -> list[Source]:
+    """Return the runs of a study; `status` is where its trials say why they failed."""
+    sources = []
     for trial in trials_of(study, runs):
-        state, condition, block = trial.state(runs), trial.condition, trial.block
-        if state != "finished":
-            failure = None if status is None else Status(status, trial.name).failure()
-            reason = REASONS[state] if failure is None else f"failed: {failure}"
-            lacking.append(Lacking(trial.name, condition.name, block.replicas, reason))
-            continue
+        failure = None if status is None else Status(status, trial.name).failure()
         source = Source(
             run=runs / trial.name,
             name=trial.name,
-            condition=condition.name,
+            condition=trial.condition.name,
             checksum=trial.checksum,
-            first=block.first,
-            replicas=block.replicas,
-            episodes=trial.experiment.episodes,
-            agents_learn=any_learns(trial.experiment.agents),
+            first=trial.block.first,
+            experiment=trial.experiment,
+            reason=reason_of(trial.state(runs), failure),
         )
-        finished.append(source)
-    return finished, lacking
+        sources.append(source)
+    return sources
+
+
+def reason_of(state: State, failure: str | None = None) -> str:
+    """Return why a run is no part of a table; "" of a finished one."""
+    if state == "finished":
+        return ""
+    return REASONS[state] if failure is None else f"failed: {failure}"
 
 
 def plain_level(value: Any) -> Any:
@@ -144,55 +142,63 @@ def plain_level(value: Any) -> Any:
     return value if isinstance(value, bool | int | float) else level_text(value)
 
 
-def table_of(
-    design: Design, sources: Sequence[Source], lacking: Sequence[Lacking], *, window: int = WINDOW
-) -> StudyTable:
-    """The table of finished runs.
+def table_of(design: Design, sources: Sequence[Source], *, window: int = WINDOW) -> StudyTable:
+    """Return the table of finished runs.
 
     Args:
         design: the conditions that are compared.
-        sources: the runs; what is damaged of them is listed as lacking.
-        lacking: other runs, which are listed.
+        sources: the runs; what is not finished, or damaged, is listed as lacking.
     """
     checked("window", window, Positive)
-    rows = []
-    damaged = []
+    rows = [_SCHEMA.empty_table()]
+    lacking = []
+    read: list[Source] = []
+    endings: dict[str, list[str]] = {}
+    steps: dict[str, list[int]] = {}
     made: dict[str, Circumstances] = {}
-    endings: dict[str, Counter[str]] = {}
-    lengths: dict[str, dict[str, list[int]]] = {}
     for source in sources:
+        reason = source.reason
         try:
-            tables = _tables_of(source)
-            ended = _endings(tables)
-            made_by = circumstances_of(source.run)
-            of_run = [_windows(table, source, part, window) for part, table in tables.items()]
+            if not reason:
+                tables = _tables_of(source)
+                words = _endings(tables)
+                made[source.name] = circumstances_of(source.run)
+        except TooShortError as error:
+            reason = f"is too short: {error}"
         except (ValueError, OSError, KeyError) as error:
-            begins = "is too short" if isinstance(error, TooShortError) else DAMAGED
-            damaged.append(Lacking(source.name, source.condition, source.replicas, f"{begins}: {error}"))
+            reason = f"{DAMAGED}: {error}"
+        if reason:
+            lacking.append(Lacking(source.name, source.condition, source.experiment.replicas, reason))
             continue
-        rows += of_run
-        made[source.name] = made_by
-        endings.setdefault(source.condition, Counter()).update(sorted(ended))
-        counted_in = lengths.setdefault(source.condition, {"episodes": [], "steps": []})
-        counted_in["episodes"] += _counts(tables[TRAINING])
-        steps = _steps_of(source.run)
-        counted_in["steps"] += [] if steps is None else [steps]
-    learn = [source.agents_learn for source in sources if source.name in made]
+        read.append(source)
+        rows += [_windows(table, source, part, window) for part, table in tables.items()]
+        endings.setdefault(source.condition, []).extend(words)
+        steps.setdefault(source.condition, []).extend(_steps_of(source.run))
+    study_rows = _rows(design, pa.concat_tables(rows), marks(made))
     return StudyTable(
         design=design,
-        rows=_rows(design, rows, marks(made)),
+        rows=study_rows,
         window=window,
-        lacking=(*lacking, *damaged),
+        lacking=tuple(lacking),
         made=made,
-        endings={name: dict(Counter(dict(sorted(of.items()))).most_common()) for name, of in endings.items()},
+        endings={name: dict(Counter(sorted(words)).most_common()) for name, words in endings.items()},
         ending_rules=(RULE,) * bool(made),
-        agents_learn=any(learn) or not learn,
-        lengths={
-            name: {unit: (min(each), max(each)) for unit, each in of.items()}
-            for name, of in lengths.items()
-            if of["steps"]
-        },
+        agents_learn=not read or any(any_learns(source.experiment.agents) for source in read),
+        lengths=_lengths(study_rows, steps),
     )
+
+
+def _lengths(rows: pa.Table, steps: Mapping[str, list[int]]) -> dict[str, dict[str, tuple[int, int]]]:
+    """Return the least and the most episodes and steps of replicas, of conditions whose steps are known."""
+    if not len(rows):
+        return {}
+    played = by_replica(where(rows, part=TRAINING), rows["metric"][0].as_py(), ["condition"])
+    lengths = {}
+    for name in (name for name, of_runs in steps.items() if of_runs):
+        episodes = where(played, condition=name)["episodes"]
+        least, most = pc.min_max(episodes).as_py().values()
+        lengths[name] = {"episodes": (least, most), "steps": (min(steps[name]), max(steps[name]))}
+    return lengths
 
 
 def _tables_of(source: Source) -> dict[str, pa.Table]:
@@ -207,55 +213,92 @@ def _tables_of(source: Source) -> dict[str, pa.Table]:
     return tables
 
 
-def _counts(table: pa.Table) -> list[int]:
-    """Return how many episodes each replica has ended."""
-    return pc.value_counts(where(table, agent=0)["replica"]).field("counts").to_pylist()
+def _refuse_gaps(table: pa.Table, source: Source, part: str) -> None:
+    """Refuse a table that has an episode twice, or lacks some."""
+    times = table.group_by(["replica", "episode", "agent"]).aggregate([([], "count_all")])
+    twice = times.filter(pc.greater(times["count_all"], 1)).slice(length=1)
+    for row in twice.to_pylist():
+        raise ValueError(
+            f"{source.name} has episode {row['episode']} of replica {row['replica']} in {part} twice"
+        )
+    episodes = table.group_by(["replica", "episode"]).aggregate([])
+    counts = Counter(sorted(episodes["replica"].to_pylist()))
+    replicas = list(range(source.experiment.replicas))
+    wanted = source.experiment.episodes if part == TRAINING else max(counts.values(), default=0)
+    if wanted is None and (missing := [replica for replica in replicas if replica not in counts]):
+        steps = [*_steps_of(source.run), "its"][0]
+        raise TooShortError(f"replica {missing[0]} ended no episode in {steps} steps; train longer")
+    # Where steps are counted, each replica ends a number of its own.
+    is_whole = set(counts.values()) == {wanted} or wanted is None
+    if list(counts) != replicas or not is_whole:
+        raise ValueError(
+            f"{source.name} has these episodes by replica in {part}: {dict(counts)}; allowed: {wanted} of "
+            f"each of {len(replicas)} replicas"
+        )
 
 
-def in_windows(table: pa.Table, window: int | None) -> pa.Table:
-    """Return the rows of windows of consecutive episodes, for each number and replica.
+def _steps_of(run: Path) -> list[int]:
+    """Return how many steps the report of a run says that it trained; nothing where it does not say."""
+    try:
+        steps = read_json(run / REPORT).get("steps")
+    except (OSError, ValueError):  # which ends no table
+        return []
+    return [steps] if isinstance(steps, int) else []
 
-    In many worlds a window has as many consecutive episodes of each, so that none has more of the short
-    episodes, which end sooner. The last window is whole, the first ones may lack worlds that have ended
+
+def _endings(tables: Mapping[str, pa.Table]) -> list[str]:
+    """Return how the training of each replica went, in a word."""
+    training = tables[TRAINING]
+    random = tables[RANDOM]
+    number = COLLECTIVE_RETURN if COLLECTIVE_RETURN in random.column_names else INCOME
+    by_chance = float(np.mean(where(random, agent=0)[number].to_numpy()))
+    replicas = sorted(training["replica"].unique().to_pylist())
+    outcomes = [outcome_of(where(training, replica=replica), random=by_chance) for replica in replicas]
+    return [outcome.word for outcome in outcomes]
+
+
+def _windows(table: pa.Table, source: Source, part: str, window: int) -> pa.Table:
+    """Return the windows of a part of a run, for each number and replica.
+
+    In training, windows are of so many consecutive episodes; in many worlds of as many of each, so that
+    none has more of the short episodes, which end sooner, and the first ones may lack worlds that have ended
     fewer.
-
-    Args:
-        table: of episodes, sorted by replica, episode and agent.
-        window: of so many episodes; None for one window of all.
+    Another part is one window, but where episodes stand one by one.
     """
     one = where(table, agent=0)
     replica = one["replica"].to_numpy()
-    world = world_of(one)
-    order = []
-    firsts = []
-    begins = []
-    for start, size in zip(*np.unique(replica, return_index=True, return_counts=True)[1:], strict=True):
-        place = _windows_of(world[start : start + size], size if window is None else window)
-        in_order = np.argsort(place, kind="stable")
-        order.append(start + in_order)
-        firsts.append(np.flatnonzero(np.diff(place[in_order], prepend=-1)))
-        begins.append(firsts[-1] + start)
-    chosen = np.concatenate(order)
-    begin = np.concatenate(begins)
-    lengths = np.diff(np.append(begin, len(chosen)))
-    numbers = _numbers_of(table, one)
-    values = np.stack(list(numbers.values()))[:, chosen]
+    size = window if part == TRAINING or window == 1 else len(one)
+    places = [_places(world_of(where(one, replica=number)), size) for number in np.unique(replica)]
+    place = np.concatenate(places)
+    group = replica * (place.max() + 1) + place
+    order = np.argsort(group, kind="stable")
+    begin = np.flatnonzero(np.diff(group[order], prepend=-1))
+    lengths = np.diff(np.append(begin, len(order)))
+    numbers = {name: one[name].to_numpy() for name in metrics_in(table.schema)}
+    returns = table["return"].to_numpy().astype(np.float64).reshape(len(one), -1)
+    numbers |= {f"agent_{agent}/return": of_agent for agent, of_agent in enumerate(returns.T)}
+    values = np.stack(list(numbers.values()))[:, order]
     defined = ~np.isnan(values)
     counts = np.add.reduceat(defined.astype(np.int64), begin, axis=1)
     with np.errstate(invalid="ignore"):
         means = np.add.reduceat(np.where(defined, values, 0.0), begin, axis=1) / counts
     columns = {
-        "replica": np.tile(replica[begin], len(numbers)),
+        **{name: [text] * means.size for name, text in _labels_of(source, part).items()},
+        "replica": np.tile(source.first + replica[begin], len(numbers)),
         "metric": np.repeat(list(numbers), len(begin)),
-        "episode": np.tile(np.concatenate(firsts), len(numbers)),
+        "episode": np.tile(begin - np.searchsorted(replica, replica[begin]), len(numbers)),
         WINDOWS: np.tile(lengths, len(numbers)),
         "undefined": (lengths - counts).reshape(-1),
         "value": means.reshape(-1),
     }
-    return pa.table({name: pa.array(column, _SCHEMA.field(name).type) for name, column in columns.items()})
+    return pa.table({field.name: pa.array(columns[field.name], field.type) for field in _SCHEMA})
 
 
-def _windows_of(world: Numbers, window: int) -> Numbers:
+def _labels_of(source: Source, part: str) -> dict[str, str]:
+    return {"condition": source.condition, "checksum": source.checksum, "run": source.name, "part": part}
+
+
+def _places(world: Numbers, window: int) -> Numbers:
     """Return the number of the window of each episode of a replica, [E]."""
     lanes = len(np.unique(world))
     if lanes == 1 or window == 1:
@@ -264,84 +307,38 @@ def _windows_of(world: Numbers, window: int) -> Numbers:
     return np.asarray(after.max() - after)
 
 
-def _numbers_of(table: pa.Table, one: pa.Table) -> dict[str, Values]:
-    """Return the numbers of each episode, [E], with the return of each agent."""
-    numbers = {name: one[name].to_numpy() for name in metrics_in(table.schema)}
-    returns = table["return"].to_numpy().astype(np.float64).reshape(len(one), -1)
-    return numbers | {f"agent_{agent}/return": of_agent for agent, of_agent in enumerate(returns.T)}
-
-
-def _refuse_gaps(table: pa.Table, source: Source, part: str) -> None:
-    rows = np.stack([table[name].to_numpy() for name in ("replica", "episode", "agent")], axis=1)
-    each, times = np.unique(rows, axis=0, return_counts=True)
-    if (times > 1).any():
-        replica, episode, _ = each[times > 1][0].tolist()
-        raise ValueError(f"{source.name} has episode {episode} of replica {replica} in {part} twice")
-    played = np.unique(rows[:, :2], axis=0)
-    replicas, counts = np.unique(played[:, 0], return_counts=True)
-    wanted = source.episodes if part == TRAINING else counts.max(initial=0)
-    if wanted is None:  # of so many steps, in which each replica ends a number of its own
-        wanted = counts
-        if lacking := sorted(set(range(source.replicas)) - set(replicas.tolist())):
-            steps = _steps_of(source.run) or "its"
-            raise TooShortError(f"replica {lacking[0]} ended no episode in {steps} steps; train longer")
-    is_whole = np.all(counts == wanted) and np.all(counts > 0)
-    if replicas.tolist() != list(range(source.replicas)) or not is_whole:
-        raise ValueError(
-            f"{source.name} has these episodes by replica in {part}: "
-            f"{dict(zip(replicas.tolist(), counts.tolist(), strict=True))}; allowed: {wanted} of each of "
-            f"{source.replicas} replicas"
-        )
-
-
-def _steps_of(run: Path) -> int | None:
-    try:
-        steps = read_json(run / REPORT).get("steps")
-    except (OSError, ValueError):  # which ends no table
-        return None
-    return steps if isinstance(steps, int) else None
-
-
-def _windows(table: pa.Table, source: Source, part: str, window: int) -> pa.Table:
-    """Return the windows of a part of a run, with what the study's table says of the run."""
-    is_whole = part != TRAINING and window > 1
-    rows = in_windows(table, None if is_whole else window)
-    labels = {"condition": source.condition, "checksum": source.checksum, "run": source.name, "part": part}
-    replica = pc.cast(pc.add(rows["replica"], source.first), pa.int32())
-    rows = rows.set_column(rows.column_names.index("replica"), "replica", replica)
-    return labelled(rows, **labels).cast(_SCHEMA)
-
-
 _SCHEMA: Final = pa.schema(
     [
-        *((name, pa.string()) for name in ("condition", "checksum", "run", "part")),
-        *(("replica", pa.int32()), ("metric", pa.string()), ("episode", pa.int32())),
-        *((WINDOWS, pa.int32()), ("undefined", pa.int32()), ("value", pa.float64())),
+        *((name, pa.string()) for name in ("condition", "checksum", "run", "part", "metric")),
+        *((name, pa.int32()) for name in ("replica", "episode", WINDOWS, "undefined")),
+        ("value", pa.float64()),
     ]
 )
 """Of the windows of a run."""
 
 
-def _rows(design: Design, parts: Sequence[pa.Table], marked: Mapping[str, str]) -> pa.Table:
-    """Return the rows of all runs, sorted, with the levels of their conditions."""
-    rows = pa.concat_tables([_SCHEMA.empty_table(), *parts]).combine_chunks()
-    metrics = _metrics(rows["metric"].unique().to_pylist())
-    rows = rows.filter(pc.is_in(rows["metric"], pa.array(metrics, pa.string())))
-    orders = {"condition": list(design.conditions), "part": list(PARTS), "metric": metrics}
-    keys = {name: pc.index_in(rows[name], pa.array(order, pa.string())) for name, order in orders.items()}
-    keys |= {name: rows[name] for name in ("replica", "episode")}
-    by = [(name, "ascending") for name in ("condition", "replica", "part", "metric", "episode")]
-    in_order = pc.sort_indices(pa.table(keys), sort_keys=by)
-    rows = rows.take(in_order)
-    condition = keys["condition"].take(in_order)
-    columns = {name: rows[name] for name in ("condition", "checksum")}
+def _rows(design: Design, rows: pa.Table, marked: Mapping[str, str]) -> pa.Table:
+    """Return the windows of all runs, sorted, with the levels of their conditions."""
+    orders = {
+        "condition": list(design.conditions),
+        "part": list(PARTS),
+        "metric": _metrics(rows["metric"].unique().to_pylist()),
+    }
+    rows = rows.combine_chunks()
+    for name, order in orders.items():
+        rows = rows.append_column(f"#{name}", pc.index_in(rows[name], pa.array(order, pa.string())))
+    rows = rows.filter(pc.is_valid(rows["#metric"]))
+    keys = ("#condition", "replica", "#part", "#metric", "episode")
+    rows = rows.sort_by([(name, "ascending") for name in keys])
+    columns = {name: rows[name] for name in COLUMNS if name != "marks"}
     for factor in design.factors:
-        name = f"factor {factor}" if factor in COLUMNS else factor
-        columns[name] = _levels(design.levels(factor)).take(condition)
-    columns["run"] = rows["run"]
-    run_marks = pa.array(list(marked.values()), pa.string())
-    columns["marks"] = run_marks.take(pc.index_in(rows["run"], pa.array(list(marked), pa.string())))
-    return pa.table(columns | {name: rows[name] for name in _SCHEMA.names[3:] if name != "run"})
+        column = f"factor {factor}" if factor in COLUMNS else factor
+        columns[column] = _levels(design.levels(factor)).take(rows["#condition"])
+    places = pc.index_in(rows["run"], pa.array(list(marked), pa.string()))
+    columns["marks"] = pa.array(list(marked.values()), pa.string()).take(places)
+    names = list(columns)
+    factors = names[len(COLUMNS) - 1 : -1]
+    return pa.table(columns).select([*COLUMNS[:2], *factors, *COLUMNS[2:]])
 
 
 def _metrics(names: Sequence[str]) -> list[str]:
@@ -349,18 +346,14 @@ def _metrics(names: Sequence[str]) -> list[str]:
 
     The income is among them where it is not the harvest.
     """
-    order = list(METRICS)
     moves_money = INCOME_EQUALITY in names or any(name.startswith("institutions/") for name in names)
     if COLLECTIVE_RETURN in names and not moves_money:
         names = [name for name in names if name != INCOME]
-
-    def place(name: str) -> tuple[int, int, str]:
-        if name in METRICS:
-            return 0, order.index(name), ""
-        is_of_agent = name.startswith("agent_")
-        return (1, len(name), name) if is_of_agent else (2, 0, name)
-
-    return sorted(names, key=place)
+    order = {name: place for place, name in enumerate(METRICS)}
+    return sorted(
+        names,
+        key=lambda name: (order.get(name, len(order)), not name.startswith("agent_"), len(name), name),
+    )
 
 
 def _levels(levels: Sequence[Any]) -> pa.Array:
@@ -409,13 +402,3 @@ def marks(made: Mapping[str, Circumstances]) -> dict[str, str]:
         )
         for run, circumstances in made.items()
     }
-
-
-def _endings(tables: Mapping[str, pa.Table]) -> list[str]:
-    """Return how the training of each replica went, in a word."""
-    training, random = tables[TRAINING], tables[RANDOM]
-    number = COLLECTIVE_RETURN if COLLECTIVE_RETURN in random.column_names else INCOME
-    by_chance = float(np.mean(where(random, agent=0)[number].to_numpy()))
-    replicas = sorted(training["replica"].unique().to_pylist())
-    outcomes = [outcome_of(where(training, replica=replica), random=by_chance) for replica in replicas]
-    return [outcome.word for outcome in outcomes]
