@@ -4,6 +4,7 @@ from dataclasses import replace
 from math import inf
 from shutil import copytree
 
+import pyarrow as pa
 import pytest
 from recordings import column, names
 from stored_runs import command
@@ -17,6 +18,8 @@ from cprl.runs.curves import curves_of
 from cprl.runs.episodes import read_episodes, read_evaluations
 from cprl.runs.recipe import read_recipe
 from cprl.studies import Search, StudyTable
+from cprl.studies.tables.comparing import cells
+from cprl.studies.tables.table import Design
 from cprl.values import OWN_METRICS
 from cprl.viewer.layout import layout, styles
 from cprl.viewer.scene import Curves
@@ -80,6 +83,17 @@ def test_its_title_and_unit_come_from_its_function_and_stand_in_the_recipe_alone
     assert title("gap") == with_unit("gap") == "most minus least, apples"
     assert unit("gap") == "apples"
     assert title("largest_share") == "largest_share"
+
+
+def test_the_table_of_a_study_says_what_it_is_called(tmp_path):
+    OWN_METRICS["gap"] = {"title": "most minus least", "unit": "apples"}
+    row = {"condition": "a", "replica": 0, "part": "training", "metric": "gap", "episode": 0}
+    rows = pa.Table.from_pylist([row | {"window_episodes": 10, "undefined": 0, "value": 3.0}])
+    design = Design(name="one", conditions={"a": {}}, reference="a", is_paired=True)
+    written = StudyTable(design=design, rows=rows, window=10).write(tmp_path / "table.parquet")
+    OWN_METRICS.clear()
+    assert cells(StudyTable.read(written), last=10).head[-1] == "most minus least, apples"
+    OWN_METRICS.clear()
 
 
 def test_one_from_0_to_1_has_these_bounds():
