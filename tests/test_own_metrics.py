@@ -13,7 +13,7 @@ from tiny_study import TINY
 import cprl
 from cprl import Custom, Study
 from cprl.measuring.registry import bounds, title, unit, with_unit
-from cprl.measuring.table import numbers_in
+from cprl.measuring.table import numbers_in, where
 from cprl.runs.curves import curves_of
 from cprl.runs.episodes import read_episodes, read_evaluations
 from cprl.runs.recipe import read_recipe
@@ -121,8 +121,10 @@ def test_it_is_compared_in_a_study_and_what_a_search_looks_for(tmp_path):
     study = Study(measured, {"game.rules.freeze_steps": [2, 5]}, replicas=1)
     result = cprl.run_study(study, tmp_path / "study")
     assert "largest_share" in (result.out / "summary.md").read_text()
+    table = StudyTable.read(result.out / "table.parquet")
     for part in ("training", "evaluation", "random"):
-        assert StudyTable.read(result.out / "table.parquet").values("freeze_steps=5", "largest_share", part)
+        rows = where(table.windows(part), condition="freeze_steps=5", metric="largest_share")
+        assert rows["value"].to_pylist()
     factors = {"game.rules.freeze_steps": [2, 5]}
     assert Search(measured, factors, points=2, metric="largest_share").metric == "largest_share"
     with pytest.raises(ValueError, match="metric"):
