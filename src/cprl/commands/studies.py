@@ -162,7 +162,7 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
         changes = _given(options)
         said = {unit: changes.pop(unit) for unit in UNITS if unit in changes}
         if said:
-            changes["experiment"] = replace(study.experiment, **without_length({}), **said)
+            changes["experiment"] = replace(study.experiment, **without_length({}) | said)
         study = replace(study, **changes)
         for unit, number in said.items():
             for condition in study.all_conditions:
