@@ -1,6 +1,6 @@
 """How the board of one world looks in Rerun, frame by frame."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any, Final, NamedTuple
 
@@ -62,33 +62,29 @@ class Strokes(NamedTuple):
 
 
 @cache
-def numbers_and_headings(agents: int) -> Strokes:
-    """The number and the triangle of each agent."""
-    lines = [(agent, _triangle(agent)) for agent in range(agents)]
-    lines += [(agent, digit) for agent in range(agents) for digit in _number(agent)]
-    return _strokes(lines)
-
-
-@cache
-def numbers(agents: int) -> Strokes:
-    middle = [
-        (agent, np.broadcast_to(digit * _scale(agent, room=0.7), (4, POINTS, 2)))
-        for agent in range(agents)
-        for digit in number_paths(agent)
-    ]
-    return _strokes(middle)
-
-
-@cache
-def marks(agents: int) -> Strokes:
-    return _strokes([(agent, line) for agent in range(agents) for line in _mark(agent_mark(agent))])
-
-
-def _strokes(lines: list[tuple[int, Floats]]) -> Strokes:
+def strokes(agents: int, lines_of: Callable[[int], list[Floats]]) -> Strokes:
+    """The lines of so many agents, by a function that draws one: [4, P, 2] each."""
+    lines = [(agent, line) for agent in range(agents) for line in lines_of(agent)]
     shape = np.zeros((4, len(lines), POINTS, 2), np.float32)
     for index, (_, line) in enumerate(lines):
-        shape[:, index, : line.shape[1]], shape[:, index, line.shape[1] :] = line, line[:, -1:]
+        shape[:, index] = line[:, -1:]
+        shape[:, index, : line.shape[1]] = line
     return Strokes(np.array([agent for agent, _ in lines], np.intp), shape)
+
+
+def number_and_heading(agent: int) -> list[Floats]:
+    """The triangle, and behind it the digits: a number is upright whatever the heading."""
+    front = _front(agent) - _DEEP - 2 * RADIUS_CELLS
+    back = 0.5 - (_RIM if agent_mark(agent) in ("ring", "stripe") else 0.02)
+    behind = _turned((0, (back - front) / 2))
+    scale = np.float32(_scale(agent, room=back + front))
+    return [_triangle(agent), *(behind + digit * scale for digit in number_paths(agent))]
+
+
+def number(agent: int) -> list[Floats]:
+    """The digits in the middle."""
+    scale = _scale(agent, room=0.7)
+    return [np.broadcast_to(digit * scale, (4, POINTS, 2)) for digit in number_paths(agent)]
 
 
 def _turned(*corners: tuple[float, float]) -> Floats:
@@ -109,27 +105,21 @@ def _triangle(agent: int) -> Floats:
     return _turned((-_HALF_WIDE, -base), (0, -tip), (_HALF_WIDE, -base), (-_HALF_WIDE, -base), inside)
 
 
-def _number(agent: int) -> list[Floats]:
-    """The digits behind the triangle: a number is upright whatever the heading."""
-    front = _front(agent) - _DEEP - 2 * RADIUS_CELLS
-    back = 0.5 - (_RIM if agent_mark(agent) in ("ring", "stripe") else 0.02)
-    behind = _turned((0, (back - front) / 2))
-    return [behind + digit * np.float32(_scale(agent, room=back + front)) for digit in number_paths(agent)]
-
-
 def _scale(agent: int, *, room: float) -> float:
     """The distance between points of a digit with which a number fits, in cells."""
     points = max(DIGIT_HIGH - 1, 4 * len(str(agent)) - 2)
     return min(_GRID, (room - 2 * RADIUS_CELLS) / points)
 
 
-def _mark(mark: str) -> list[Floats]:
+def mark(agent: int) -> list[Floats]:
+    """What tells agents of the same hue apart."""
     edge, corner = 0.5 - RADIUS_CELLS, 0.25
-    if mark == "ring":
+    kind = agent_mark(agent)
+    if kind == "ring":
         return [_turned((-edge, -edge), (edge, -edge), (edge, edge), (-edge, edge), (-edge, -edge))]
-    if mark == "stripe":
+    if kind == "stripe":
         return [_turned((-edge, edge), (edge, edge))]
-    if mark == "corners":
+    if kind == "corners":
         return [
             _turned((x * corner, y * edge), (x * edge, y * edge), (x * edge, y * corner))
             for x in (-1, 1)
@@ -200,10 +190,11 @@ def board_columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.in
     everywhere = np.arange(count)
     contents = {
         "board": (everywhere, _pictures(boards(scene, frames))),
-        "agents": (everywhere, _lines(numbers_and_headings(agents), frames)),
+        "agents": (everywhere, _lines(strokes(agents, number_and_heading), frames)),
     }
-    if len(marks(agents).owner):
-        contents["marks"] = everywhere, _lines(marks(agents), frames)
+    marks = strokes(agents, mark)
+    if len(marks.owner):
+        contents["marks"] = everywhere, _lines(marks, frames)
     changed = _changes(frames["beams"])
     frame, row, col = np.nonzero(frames["beams"][changed])
     dots = np.stack([col, row], -1).astype(np.float32) + RIM_CELLS + 0.5
@@ -253,8 +244,8 @@ def _with_rim(pictures: Bytes, kind: int) -> Bytes:
     return np.pad(pictures, ((0, 0), (RIM_CELLS,) * 2, (RIM_CELLS,) * 2), constant_values=kind)
 
 
-def _lines(strokes: Strokes, frames: Frames) -> Any:
-    lines, counts = strokes.placed(centres_of(frames), frames["heading"], frames["in_play"])
+def _lines(of_agents: Strokes, frames: Frames) -> Any:
+    lines, counts = of_agents.placed(centres_of(frames), frames["heading"], frames["in_play"])
     return rr.LineStrips2D.columns(strips=lines).partition(counts)
 
 
@@ -277,9 +268,9 @@ def _out(frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
         colors=rgb[np.nonzero(out)[1]],
         labels=["out" if tagger < 0 else f"by {tagger}" for tagger in by[out]],
     ).partition(out.sum(1))
-    strokes = numbers(out.shape[1])
-    lines, counts = strokes.placed(centres, frames["heading"][changed], alone)
-    owner = strokes.owner[np.nonzero(alone[:, strokes.owner])[1]]
+    numbers = strokes(out.shape[1], number)
+    lines, counts = numbers.placed(centres, frames["heading"][changed], alone)
+    owner = numbers.owner[np.nonzero(alone[:, numbers.owner])[1]]
     digits = rr.LineStrips2D.columns(strips=lines, colors=rgb[owner]).partition(counts)
     return {"out": (changed, squares), "out/numbers": (changed, digits)}
 

@@ -20,7 +20,7 @@ from cprl.policies.lanes import LaneActor
 from cprl.viewer.board import centres_of
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import BACKGROUND, GIVEN, PAID
-from cprl.viewer.scene import APART, BAR, HIGH, decision_panels
+from cprl.viewer.scene import APART, BAR, HIGH, Scene, decision_panels
 
 ENTITY: Final = "decisions"
 SIGNS: Final = {  # the viewer ends at a sign that its font lacks
@@ -50,21 +50,15 @@ class Decisions:
     """
 
     def __init__(
-        self,
-        logger: RerunLogger,
-        policies: AgentPolicies,
-        *,
-        actions: Sequence[str],
-        names: Sequence[str],
-        window: tuple[int, int],
+        self, logger: RerunLogger, scene: Scene, policies: AgentPolicies, *, actions: Sequence[str]
     ) -> None:
-        self._logger, self._names, self._actions = logger, tuple(names), tuple(actions)
+        self._logger, self._names, self._actions = logger, scene.agents, tuple(actions)
         self._actors = list(zip(map(agent_indices, policies.indices), policies.actors, strict=True))
-        self._panels = decision_panels(len(names), len(actions), window)
-        many = 2 * len(names) * len(actions) > np.iinfo(np.uint8).max
+        self._panels = decision_panels(len(scene.agents), len(actions), scene.window)
+        many = 2 * len(scene.agents) * len(actions) > np.iinfo(np.uint8).max
         self._dtype = np.uint16 if many else np.uint8
         kinds = {agent: _kind(actor) for agents, actor in self._actors for agent in agents}
-        self._kinds = [kinds[agent] for agent in range(len(names))]
+        self._kinds = [kinds[agent] for agent in range(len(scene.agents))]
         self._rows: list[tuple[NDArray[np.float64], NDArray[np.int64]]] = []
         self._step = 0
         self._log_fixed()
@@ -180,8 +174,8 @@ class Offences:
     """Logs a white diamond around each agent in the frame of the turn in which it broke a rule, and lines of
     fines and transfers per turn; a callback of `cprl.training`."""
 
-    def __init__(self, logger: RerunLogger, env: CommonsEnv, *, names: Sequence[str]) -> None:
-        self._logger, self._env, self._names = logger, env, tuple(names)
+    def __init__(self, logger: RerunLogger, env: CommonsEnv) -> None:
+        self._logger, self._env, self._names = logger, env, logger.curves.agents
         self._amounts: dict[str, list[NDArray[np.float64]]] = {PAID: [], GIVEN: []}
         """[N] in each turn."""
         self._strips: list[NDArray[np.float32]] = []
@@ -189,7 +183,7 @@ class Offences:
         """Marks, and what they say, of each frame."""
         mark = rr.LineStrips2D.from_fields(colors=[_WHITE], radii=[_RADIUS_CELLS], show_labels=False)
         logger.log_static(_VIOLATORS, mark)
-        for agent, name in enumerate(names):
+        for agent, name in enumerate(self._names):
             for kind, words in ((PAID, "pays"), (GIVEN, "gets")):
                 line = rr.SeriesLines(names=[f"{name} {words}"], colors=[agent_colour(agent)], widths=[1.5])
                 logger.log_static(f"{name}/{kind}", line)
