@@ -126,7 +126,7 @@ def test_questions_that_are_no_longer_asked_are_not_played(tmp_path, monkeypatch
         may_end.wait(20)
         return {"populations": [{}]}, []
 
-    monkeypatch.setattr("cprl.evaluation.sandbox.shown", play)
+    monkeypatch.setattr("cprl.evaluation.sandbox.data_of", play)
     served = Sandbox(tmp_path)
     with ThreadPoolExecutor(4) as pool:
         answers = []

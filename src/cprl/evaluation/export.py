@@ -98,17 +98,14 @@ def _exported(game: Any, played: Recorded) -> Exported:
     action = played.entry(*keys.ACTION)
     nobody = np.zeros(action.shape, np.int64)
     reward = played.entry("next", *keys.REWARD)[..., 0]
-    tagged_by = played.entry("next", *keys.TAGGED_BY)
     columns = {
         "action": np.array(game.actions)[action] if isinstance(game, Game) else action,
         "reward": reward,
-        "harvest": played.entry("next", *keys.HARVEST),
-        "in_play": played.entry(*keys.IN_PLAY),
-        "fired": played.entry("next", *keys.FIRED),
-        "tagged": None if tagged_by is None else tagged_by.any(-1),
+        "harvest": played.entry("next", *keys.HARVEST, lacking=reward),
+        "in_play": played.entry(*keys.IN_PLAY, lacking=nobody + 1),
+        "fired": played.entry("next", *keys.FIRED, lacking=nobody),
+        "tagged": played.entry("next", *keys.TAGGED_BY, lacking=nobody[..., None]).any(-1),
     }
-    lacking = {"harvest": reward, "in_play": nobody + 1, "fired": nobody, "tagged": nobody}
-    columns = {name: lacking[name] if values is None else values for name, values in columns.items()}
     boards = played.boards[1:]
     if boards:
         stock = np.array([board.stock.sum(dtype=np.int64) for board in boards])

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from math import ceil
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
@@ -216,29 +217,24 @@ def film_video(
 
     def draw(turns: Sequence[int]) -> Iterator[Bytes]:
         """Yield the pictures after these turns, and the end card."""
-        for turn in turns:
-            since = max((other for other in chosen if other < turn), default=-1) + 1
-            yield joined([panel.draw(turn, since=since) for panel in panels])
+        for before, turn in pairwise((-1, *turns)):
+            yield joined([panel.draw(turn, since=before + 1) for panel in panels])
         yield joined([panel.draw(length, since=length, card=True) for panel in panels])
 
     def joined(pictures: Sequence[Bytes]) -> Bytes:
         return np.concatenate([np.concatenate(pictures, 1), words], 0)
 
-    wide = sum(panel.picture.size[0] for panel in panels)
     games = [commons_game(population.run) for population in fresh]
+    wide = sum(panel.picture.size[0] for panel in panels)
     words = note(f"{growth_of(games[0])} {legend_of(games)}", wide)
-    high = panels[0].picture.size[1] + len(words)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".mp4":
-        write_mp4(path, draw(chosen), (wide, high), fps=style.fps)
+        write_mp4(path, draw(chosen), fps=style.fps)
     else:
-        check_memory(
-            f"every is {every}: {len(chosen):,} pictures",
-            3 * len(chosen) * wide * high,
-            "fewer or smaller pictures",
-        )
-        samples = chosen[:: ceil(len(chosen) / _SAMPLES)]
-        write_gif(path, draw(chosen), list(draw(samples)), fps=style.fps)
+        samples = list(draw(chosen[:: ceil(len(chosen) / _SAMPLES)]))
+        pictures = f"every is {every}: {len(chosen):,} pictures"
+        check_memory(pictures, len(chosen) * samples[0].size, "fewer or smaller pictures")
+        write_gif(path, draw(chosen), samples, fps=style.fps)
     return path, tuple(panel.played.episode for panel in panels)
 
 
@@ -263,10 +259,8 @@ def titles_of(fresh: Sequence[FreshEpisode]) -> Sequence[str]:
 def _rules_in(run: LoadedRun) -> list[str]:
     """Return the names of the classes of a run's institutions and transforms."""
     institutions = [type(kind).__name__ for kind in commons_game(run).institutions]
-    return [
-        *institutions,
-        *(re.split("[:.]", transform.target)[-1] for transform in run.experiment.transforms),
-    ]
+    transforms = [re.split("[:.]", transform.target)[-1] for transform in run.experiment.transforms]
+    return institutions + transforms
 
 
 class _Panel(NamedTuple):

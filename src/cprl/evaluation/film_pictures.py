@@ -1,6 +1,6 @@
 """The pictures of a film: one population's board, stock and harvests so far; and its files."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from functools import cache
 from importlib.util import find_spec
@@ -46,7 +46,7 @@ class EpisodePicture:
     Args:
         steps: the length of the turn axis, in turns: the longest that an episode can be.
         width: of the picture in pixels, 240 to 1920.
-        most_harvested: the top of the axis of harvests, in apples; None where it is not known before, so that
+        most_harvested: the top of the axis of harvests, in apples; 0 where it is not known before, so that
             the axis grows with the episode.
         height: of the picture in pixels, at least what it takes, so that different boards can stand side by
             side; by default what it takes.
@@ -58,7 +58,7 @@ class EpisodePicture:
         *,
         steps: int,
         width: int = DEFAULT_WIDTH,
-        most_harvested: int | None = None,
+        most_harvested: int = 0,
         height: int = 0,
     ) -> None:
         width -= width % 2  # which videos want
@@ -77,7 +77,7 @@ class EpisodePicture:
         shrink = min(1.0, room / wide, highest / high)
         self._board_size = max(1, int(wide * shrink)), max(1, int(high * shrink))
         self._half = (width - 3 * unit) // 2
-        digits = 4 if most_harvested is None else len(str(most_harvested))
+        digits = len(str(most_harvested or 1000))
         self._item = int(self._font.getlength(f"00 {'0' * digits}  "))
         self._in_a_row = max(1, self._half // self._item)
         rows = ceil(len(board.starts) / self._in_a_row)
@@ -186,7 +186,7 @@ class EpisodePicture:
     def _plot_harvests(self, draw: ImageDraw.ImageDraw, harvests: NDArray[np.int32]) -> None:
         """Draw each agent's harvest so far, [T, N], as a line in its colour, which a legend repeats."""
         left = 2 * self._unit + self._half
-        most = int(harvests.max(initial=0)) if self._most is None else self._most
+        most = self._most or int(harvests.max(initial=0))
         words = f"apples picked; below by each, 0 to {most:,}"
         self._axes(draw, left, f"{harvests[-1].sum():,}", words)
         for agent in range(harvests.shape[1]):
@@ -307,19 +307,20 @@ def write_gif(path: Path, pictures: Iterable[Bytes], samples: Sequence[Bytes], *
     )
 
 
-def write_mp4(path: Path, pictures: Iterable[Bytes], size: tuple[int, int], *, fps: float) -> None:
+def write_mp4(path: Path, pictures: Iterator[Bytes], *, fps: float) -> None:
+    """Write an MP4, whose last picture stays for a while."""
     from imageio_ffmpeg import write_frames
 
+    look: Any = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+    picture = next(pictures)
+    high, wide, _ = picture.shape
     with TemporaryDirectory() as folder:
         partial = Path(folder) / "film.mp4"
-        video: Any = write_frames(
-            partial, size, fps=fps, codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="error"
-        )
-        with closing(video):
+        with closing(write_frames(partial, (wide, high), fps=fps, **look)) as video:
             video.send(None)
-            last = None
-            for last in pictures:
-                video.send(np.ascontiguousarray(last))
+            video.send(np.ascontiguousarray(picture))
+            for picture in pictures:
+                video.send(np.ascontiguousarray(picture))
             for _ in range(round(HOLD_S * fps) - 1):
-                video.send(np.ascontiguousarray(last))
+                video.send(np.ascontiguousarray(picture))
         write_atomically(path, lambda file: file.write(partial.read_bytes()))

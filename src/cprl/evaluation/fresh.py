@@ -222,10 +222,10 @@ class Recorded(NamedTuple):
     without a board."""
     episode: Episode
 
-    def entry(self, *key: str) -> Any:
-        """Return an entry of all turns, [T, ...]; None where the game has none."""
+    def entry(self, *key: str, lacking: Any = None) -> Any:
+        """Return an entry of all turns, [T, ...]; another value where the game has none."""
         if self.batches[0].get(key, None) is None:
-            return None
+            return lacking
         return np.stack([batch[key][0].numpy(force=True) for batch in self.batches])
 
     @property
@@ -246,10 +246,7 @@ class Recorded(NamedTuple):
     def since_the_start(self, *key: str) -> Any:
         """Return an entry of agents at the start and after each turn, [T + 1, N]; zeros where the game has
         none."""
-        values = self.entry(*key)
-        agents = self.batches[0][keys.ACTION].shape[1]
-        if values is None:
-            return np.zeros((self.last + 1, agents))
+        values = self.entry(*key, lacking=np.zeros(self.entry(*keys.ACTION).shape))
         return np.concatenate([np.zeros_like(values[:1]), values])
 
 

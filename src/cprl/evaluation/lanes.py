@@ -18,11 +18,11 @@ from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.envs.make_env import is_playable, make_env, spaces_of
 from cprl.measuring.evaluate import evaluate
-from cprl.measuring.table import BACKGROUND, FOCAL, ROLE, complete
+from cprl.measuring.table import BACKGROUND, FOCAL, ROLE, Label, complete, labelled
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
 from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
-from cprl.runs.episodes import Label, labelled
+from cprl.runs.episodes import table_of
 from cprl.system.defaults import Fresh
 from cprl.system.working import say_how_far
 from cprl.training.agents import LoadedRun, Population, StoredAgent, in_a_row, load, stored_policies
@@ -165,10 +165,8 @@ def play(
     for group, env in worlds_of(fresh, place):
         policies = policies_of(fresh, place, agents, group)
         ended = evaluate(env, policies, explore=not fresh.greedy, metrics=metrics)
-        for place_in_group, replica in enumerate(group):
-            first = place_in_group * fresh.episodes
-            parts.append((labels or {}, replica, ended[first : first + fresh.episodes]))
-    table = labelled(parts)
+        parts.append(table_of(ended, group))
+    table = labelled(pa.concat_tables(parts), **(labels or {}))
     place_of_world = table.column_names.index("replica") + 1
     world = table["replica"].to_numpy() * fresh.episodes + table["episode"].to_numpy()
     table = table.add_column(place_of_world, "world", pa.array(world, pa.int32()))
@@ -241,16 +239,12 @@ def agents_specified(place: Place, specs: Sequence[AgentSpec], fresh: Fresh) -> 
         if not isinstance(spec, Scripted | Frozen):
             allowed = "Scripted(policy) or Frozen(run, agent, replica)"
             raise ValueError(f"agents[{agent}] is a {type(spec).__name__}; allowed: {allowed}")
-    stored: dict[int, list[StoredAgent]] = {}
+    stored: list[dict[int, StoredAgent]] = [{} for _ in range(place.game.agents)]
     for group in in_a_row(fresh.replicas):
         population = Population(place.env(len(group)), specs, first_replica=group[0])
-        by_replica = zip(*population.as_stored(group), strict=True)
-        stored |= dict(zip(group, map(list, by_replica), strict=True))
-
-    def agent_at(agent: int, replica: int) -> StoredAgent:
-        return stored[replica][agent]
-
-    return [partial(agent_at, agent) for agent in range(place.game.agents)]
+        for by_replica, agents in zip(stored, population.as_stored(group), strict=True):
+            by_replica |= zip(group, agents, strict=True)
+    return [by_replica.__getitem__ for by_replica in stored]
 
 
 def agent_named(who: str, agent: int, *, replica: int | None = None, name: str) -> AgentSpec:

@@ -14,7 +14,7 @@ from cprl.commons.game import Game
 from cprl.commons.readable import growth_of, meaning_of, rule_of, tag_of
 from cprl.evaluation.evaluate import evaluate_run
 from cprl.evaluation.fresh import fresh_episode
-from cprl.evaluation.show import Page, page, shown
+from cprl.evaluation.show import Page, data_of, page
 from cprl.measuring.windows import Values
 from cprl.population import learned
 from cprl.runs.curves import curves_of
@@ -71,7 +71,7 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
     game, name = run.game, legible(run.experiment.name.replace("_", " "))
     played = evaluate_run(run, Fresh(episodes=episodes, seed=seed))
     is_commons = isinstance(game, Game)
-    data = shown([fresh_episode(run)])[0] if is_commons else None
+    data = data_of([fresh_episode(run)])[0] if is_commons else None
     before = [growth_of(game)] if is_commons else []
     curves = _curves(run)
     has_course = {"collective_return", "survival_steps"} <= set(curves)

@@ -25,7 +25,7 @@ from urllib.parse import parse_qsl, urlsplit
 from cprl.commons.game import Game
 from cprl.commons.published import game as published_game
 from cprl.evaluation.fresh import fresh_episodes, unstored
-from cprl.evaluation.show import page, shown
+from cprl.evaluation.show import data_of, page
 from cprl.population import Scripted
 from cprl.system.defaults import SANDBOX_EPISODES as EPISODES
 from cprl.training.agents import LoadedRun, load
@@ -39,17 +39,16 @@ _RECIPE: Final = '''\
 from dataclasses import replace
 
 import cprl
-from cprl import maps, presets
+from cprl import institutions, maps, presets
 from cprl.algorithms import DQN
-from cprl.institutions import {imports}
 from cprl.population import Learning
 
 
 def game() -> cprl.Game:
     base = presets.game("{board}")
     rules = replace(base.rules, regrow_prob={regrow_prob}, window_rows={sight}, window_columns={columns})
-    institutions = ({institutions})
-    return replace(base, map=maps.with_agents(base.map, {agents}), rules=rules, institutions=institutions)
+    laws = ({laws})
+    return replace(base, map=maps.with_agents(base.map, {agents}), rules=rules, institutions=laws)
 
 
 def experiment() -> cprl.Experiment:
@@ -103,32 +102,33 @@ class Sliders(Value, stored=False):
     def recipe(self, episodes: int = EPISODES) -> str:
         """Return the recipe of the game, with agents that learn."""
         base = published_game(self.board)
-        institutions = {
-            "Quota": f"Quota(share={self.quota!r}, window_steps=50)" if self.quota else "",
-            "Tax": f'Tax(rate={self.tax!r}, redistribution="equal")' if self.tax else "",
-            "GraduatedSanctions": 'GraduatedSanctions(on="tags")' if self.sanctions else "",
+        laws = {
+            f"institutions.Quota(share={self.quota!r}, window_steps=50)": self.quota,
+            f'institutions.Tax(rate={self.tax!r}, redistribution="equal")': self.tax,
+            'institutions.GraduatedSanctions(on="tags")': self.sanctions,
         }
-        used = [name for name, text in institutions.items() if text]
         probs = tuple(round(min(1.0, prob * self.regrowth), 6) for prob in base.rules.regrow_prob)
-        text = _RECIPE.format(
-            imports=", ".join(sorted(used)),
+        return _RECIPE.format(
             board=self.board,
             regrow_prob=probs,
             sight=self.sight,
             columns=2 * self.sight + 1,
-            institutions="".join(f"{institutions[name]}, " for name in used).rstrip(),
+            laws="".join(f"{law}, " for law, strength in laws.items() if strength).rstrip(),
             agents=self.agents,
             episodes=episodes,
         )
-        return text if used else text.replace("from cprl.institutions import \n", "")
 
     @property
     def rules(self) -> str:
         """The rules in a line, as a title says them."""
-        parts = [f"quota {self.quota:g}"] * bool(self.quota) + [f"tax {self.tax:g}"] * bool(self.tax)
-        parts += ["sanctions"] * bool(self.sanctions)
+        laws = {
+            f"quota {self.quota:g}": self.quota,
+            f"tax {self.tax:g}": self.tax,
+            "sanctions": self.sanctions,
+        }
+        names = " and ".join(name for name, strength in laws.items() if strength)
         growth = f", growth {self.regrowth:g}" if self.regrowth != 1 else ""
-        return f"{self.agents} agents, {' and '.join(parts) or 'no rule'}{growth}, sight {self.sight}"
+        return f"{self.agents} agents, {names or 'no rule'}{growth}, sight {self.sight}"
 
     def game(self) -> Game:
         """Return the game of the recipe."""
@@ -196,7 +196,7 @@ class Sandbox:
             runs: dict[str, LoadedRun] = {f"{greedy} greedy, {restrained} restrained": unstored(game, agents)}
             if trained and self._trained is not None:
                 runs[f"Trained with {self._learned_under[self._trained]}"] = load(self._trained)
-            data, _ = shown(fresh_episodes(list(runs.values()), replica=0, episode=0), list(runs))
+            data, _ = data_of(fresh_episodes(list(runs.values()), replica=0, episode=0), list(runs))
         data["populations"][0]["which"] = ""  # scripted agents have no replicas to choose from
         return data
 
@@ -258,13 +258,11 @@ class _Handler(BaseHTTPRequestHandler):
         trained = query.pop("trained", "") == "yes"
         try:
             text, kind = self._content(address.path, Sliders.of(query), trained=trained)
+            self._send(text, kind, HTTPStatus.OK)
         except ValueError as error:
             self._send(str(error), "text/plain", HTTPStatus.BAD_REQUEST)
-            return
         except SupersededError as error:
             self._send(str(error), "text/plain", HTTPStatus.CONFLICT)
-            return
-        self._send(text, kind, HTTPStatus.OK)
 
     def _content(self, path: str, sliders: Sliders, *, trained: bool) -> tuple[str, str]:
         if path == "/":
@@ -294,8 +292,8 @@ def sandbox_page() -> str:
     """Return the page, without an episode yet."""
     boards = "".join(f"<option>{board}</option>" for board in get_args(Board))
     sliders = "".join(
-        _slider(name, *shown)
-        for name, shown in {
+        _slider(name, words, step)
+        for name, (words, step) in {
             "agents": ("agents", 1),
             "greedy": ("of them greedy; the others restrained", 1),
             "regrowth": ("apples grow, times as fast", 0.25),

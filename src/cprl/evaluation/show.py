@@ -97,7 +97,7 @@ def show(
     path = Page(by_default if out is None else out)
     path.refuse()
     say_which(fresh)
-    data, episodes = shown(fresh, titles)
+    data, episodes = data_of(fresh, titles)
     path.write(page(_heading(fresh, data), begins(commons_game(fresh[0].run)), data))
     return path, tuple(episodes)
 
@@ -148,16 +148,16 @@ def page(
 
     Args:
         before, after: HTML above and below the episode.
-        data: of `shown`; None to show no episode.
+        data: of `data_of`; None to show no episode.
         live: JavaScript that runs after the page's own.
     """
     template = files("cprl.evaluation").joinpath("show.html").read_text(encoding="utf-8")
     encoded = json.dumps(data or {"populations": []}, separators=(",", ":")).replace("<", "\\u003c")
     parts = {"title": escape(title), "before": before, "after": after, "data": encoded, "live": live}
-    return re.sub(r"\$(title|before|after|data|live)\b", lambda found: parts[found[1]], template)
+    return re.sub(r"\$(title|before|after|data|live)\b", lambda name: parts[name[1]], template)
 
 
-def shown(
+def data_of(
     fresh: Sequence[FreshEpisode], titles: Sequence[str] = ()
 ) -> tuple[dict[str, Any], Sequence[Episode]]:
     """Play the episodes of these populations; return the data of `show.html` about them, and the episodes."""

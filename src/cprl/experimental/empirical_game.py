@@ -18,7 +18,7 @@ certain as the share of these games that have it. With few replicas such interva
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import permutations
+from itertools import permutations, product
 from math import isnan, nan
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -114,21 +114,22 @@ def games_in(table: pa.Table) -> tuple[list[str], list[PayoffTable]]:
     replicas = sorted(table["replica"].unique().to_pylist())
     if FOCAL in table.column_names:
         names = table[FOCAL].unique().to_pylist()
-        found = _values(by_replica(table, OF_FOCAL, PAIR), ("replica", *PAIR), "value")
-        return names, [
-            PayoffTable.of_pairs([[found[replica, one, other] for other in names] for one in names])
-            for replica in replicas
-        ]
+        pairs = list(product(names, repeat=2))
+        means = _values(by_replica(table, OF_FOCAL, PAIR), ("replica", *PAIR), "value")
+        matrices = [np.array([means[replica, *pair] for pair in pairs]) for replica in replicas]
+        size = len(names), len(names)
+        return names, [PayoffTable.of_pairs(matrix.reshape(size)) for matrix in matrices]
     names = table[ROLE].unique().to_pylist()
     agents = _agents_in(table)
     keys = ("replica", COMPOSITION, ROLE)
-    means = table.group_by(keys, use_threads=False).aggregate([("return", "mean")])
-    found = _values(means, keys, "return_mean")
+    grouped = table.group_by(keys, use_threads=False).aggregate([("return", "mean")])
+    means = _values(grouped, keys, "return_mean")
     every = [composition_text(counts, names) for counts in compositions(agents, len(names)).tolist()]
     games = []
     for replica in replicas:
-        payoffs = [[found.get((replica, played, name), nan) for name in names] for played in every]
-        games.append(PayoffTable(agents=agents, payoffs=np.array(payoffs)))
+        cells = product([replica], every, names)
+        payoffs = np.array([means.get(cell, nan) for cell in cells])
+        games.append(PayoffTable(agents=agents, payoffs=payoffs.reshape(len(every), -1)))
     return names, games
 
 
@@ -202,8 +203,8 @@ def analyse(table: pa.Table, *, resamples: int = EGTA_RESAMPLES, seed: int = 0) 
         ModuleNotFoundError: if OpenSpiel or nashpy is not installed.
     """
     names, games = games_in(table)
-    found = analyse_games(names, games, resamples=resamples, seed=seed)
-    return replace(found, of_agents=_agents_in(table), played=said(table, "fresh") + _EACH)
+    analysis = analyse_games(names, games, resamples=resamples, seed=seed)
+    return replace(analysis, of_agents=_agents_in(table), played=said(table, "fresh") + _EACH)
 
 
 def analyse_games(
@@ -347,13 +348,13 @@ def gains_by_switching(analysis: Analysis) -> Family:
     """Return what one agent gains that plays as another run than all others: by its run and theirs."""
     names = analysis.names
     pairs = analysis.pairs
-    found = {
+    gains = {
         (names[played], names[others], "return"): estimate(
             pairs[:, played, others] - pairs[:, others, others]
         )
         for played, others in permutations(range(len(names)), 2)
     }
-    return judged(found, ("an agent", "others"))
+    return judged(gains, ("an agent", "others"))
 
 
 def draw_egta(analysis: Analysis, path: Path | str, *, width: style.Width = "page") -> Path:

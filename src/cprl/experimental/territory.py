@@ -121,10 +121,10 @@ def number_of(table: pa.Table, name: str, policy: Policy = "trained") -> Array:
 def territory_cells(table: pa.Table) -> Cells:
     """Return a row for each number: mean over replicas and 95 % interval, of the run's agents and of random
     ones; a dash where it is undefined in all."""
-    found = estimates(table, list(WORDS), "policy")
+    means = estimates(table, list(WORDS), "policy")
     rows = []
     for name, words in WORDS.items():
-        of_policies = [found[policy, name] for policy in ("trained", "random")]
+        of_policies = [means[policy, name] for policy in ("trained", "random")]
         rows.append([words, *(one if one.replicas else "-" for one in of_policies)])
     return Cells(said(table, "heading"), ["", "run's agents", "random"], rows)
 
