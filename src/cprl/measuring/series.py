@@ -95,7 +95,7 @@ def logged(metric: str) -> str:
 
 
 def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence[str]) -> dict[str, float]:
-    """The numbers of an episode, by the names of docs/metrics.md; NaN where undefined.
+    """Return the numbers of an episode, by the names of docs/metrics.md; NaN where undefined.
 
     Args:
         learning: the numbers of learning in it, by agent index: `agent_0/loss` and so on.
@@ -127,7 +127,7 @@ class Series:
         """By the number of W episodes, and by replica."""
 
     def add(self, episode: Episode, numbers: Mapping[str, float]) -> dict[str, Values] | None:
-        """Adds the numbers of an episode of a replica.
+        """Add the numbers of an episode of a replica.
 
         Returns:
             The numbers, [R] by name, NaN where a replica has none, if all replicas have ended the episode and
@@ -158,11 +158,11 @@ class Series:
         return mean_of(np.array([numbers.get(name, np.nan) for numbers in episodes]))
 
     def state_dict(self) -> dict[str, Any]:
-        """The incomplete episodes."""
+        """Return the incomplete episodes."""
         return {"waiting": {episode: dict(numbers) for episode, numbers in self._waiting.items()}}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues with the incomplete episodes of a state."""
+        """Continue with the incomplete episodes of a state."""
         self._waiting = {
             int(together): {int(replica): list(numbers) for replica, numbers in of_replicas.items()}
             for together, of_replicas in state["waiting"].items()
@@ -170,7 +170,7 @@ class Series:
 
 
 def mean_of(values: Values) -> float:
-    """The mean of the defined values; NaN if none is defined."""
+    """Return the mean of the defined values; NaN if none is defined."""
     defined = values[~np.isnan(values)]
     return float(defined.mean()) if len(defined) else float("nan")
 
@@ -189,7 +189,7 @@ class Recent:
         self._last: deque[float] = deque(maxlen=self.window)
 
     def add(self, value: float) -> float:
-        """Adds a value; returns the mean of the last ones that are defined, NaN if none is."""
+        """Add a value; return the mean of the last ones that are defined, NaN if none is."""
         self._last.append(float(value))
         defined = [value for value in self._last if not isnan(value)]
         return fmean(defined) if defined else float("nan")

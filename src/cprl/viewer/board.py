@@ -44,7 +44,7 @@ class Strokes(NamedTuple):
     def placed(
         self, centres: Floats, heading: NDArray[np.integer], drawn: NDArray[np.bool_]
     ) -> tuple[Floats, NDArray[np.intp]]:
-        """The lines of all frames.
+        """Return the lines of all frames.
 
         Args:
             centres: float32 [T, N, 2], the middle of each agent's cell, (x, y).
@@ -63,7 +63,7 @@ class Strokes(NamedTuple):
 
 @cache
 def strokes(agents: int, lines_of: Callable[[int], list[Floats]]) -> Strokes:
-    """The lines of so many agents, by a function that draws one: [4, P, 2] each."""
+    """Return the lines of so many agents, by a function that draws one: [4, P, 2] each."""
     lines = [(agent, line) for agent in range(agents) for line in lines_of(agent)]
     shape = np.zeros((4, len(lines), POINTS, 2), np.float32)
     for index, (_, line) in enumerate(lines):
@@ -73,7 +73,7 @@ def strokes(agents: int, lines_of: Callable[[int], list[Floats]]) -> Strokes:
 
 
 def number_and_heading(agent: int) -> list[Floats]:
-    """The triangle, and behind it the digits: a number is upright whatever the heading."""
+    """Return the triangle, and behind it the digits: a number is upright whatever the heading."""
     front = _front(agent) - _DEEP - 2 * RADIUS_CELLS
     back = 0.5 - (_RIM if agent_mark(agent) in ("ring", "stripe") else 0.02)
     behind = _turned((0, (back - front) / 2))
@@ -82,19 +82,19 @@ def number_and_heading(agent: int) -> list[Floats]:
 
 
 def number(agent: int) -> list[Floats]:
-    """The digits in the middle."""
+    """Return the digits in the middle."""
     scale = _scale(agent, room=0.7)
     return [np.broadcast_to(digit * scale, (4, POINTS, 2)) for digit in number_paths(agent)]
 
 
 def _turned(*corners: tuple[float, float]) -> Floats:
-    """A line of an agent that is headed up, for each heading: [4, corners, 2]."""
+    """Return a line of an agent that is headed up, for each heading: [4, corners, 2]."""
     turned: Floats = np.einsum("pk,hkd->hpd", np.array(corners), _TURNS).astype(np.float32)
     return turned
 
 
 def _front(agent: int) -> float:
-    """How far the tip of the triangle is from the middle, in cells."""
+    """Return how far the tip of the triangle is from the middle, in cells."""
     return _EDGE - (_RIM if agent_mark(agent) == "ring" else 0)
 
 
@@ -106,13 +106,13 @@ def _triangle(agent: int) -> Floats:
 
 
 def _scale(agent: int, *, room: float) -> float:
-    """The distance between points of a digit with which a number fits, in cells."""
+    """Return the distance between points of a digit with which a number fits, in cells."""
     points = max(DIGIT_HIGH - 1, 4 * len(str(agent)) - 2)
     return min(_GRID, (room - 2 * RADIUS_CELLS) / points)
 
 
 def mark(agent: int) -> list[Floats]:
-    """What tells agents of the same hue apart."""
+    """Return what tells agents of the same hue apart."""
     edge, corner = 0.5 - RADIUS_CELLS, 0.25
     kind = agent_mark(agent)
     if kind == "ring":
@@ -139,7 +139,7 @@ SHOT_CELLS: Final = 0.1
 
 
 def image_form(size: tuple[int, int]) -> Any:
-    """The format of an image of classes with so many rows and columns."""
+    """Return the format of an image of classes with so many rows and columns."""
     return rr.components.ImageFormat(width=size[1], height=size[0], channel_datatype=rr.ChannelDatatype.U8)
 
 
@@ -148,7 +148,8 @@ def board_form(scene: Scene) -> Any:
 
 
 def board_styles() -> dict[str, list[Any]]:
-    """How the parts of a board look, by the names of `board_columns`; the form of the image is left out."""
+    """Return how the parts of a board look, by the names of `board_columns`; the form of the image is left
+    out."""
     image, lines = rr.SegmentationImage.from_fields, rr.LineStrips2D.from_fields
     return {
         "board": [image(opacity=1.0, draw_order=-10.0)],
@@ -168,7 +169,8 @@ def board_styles() -> dict[str, list[Any]]:
 
 
 def columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
-    """The contents of T frames, by entity: the frames that have a row there, and the columns of these rows.
+    """Return the contents of T frames, by entity: the frames that have a row there, and the columns of these
+    rows.
 
     Beams and the marks of agents out of play have rows only for the first frame and where they change.
     """
@@ -204,7 +206,7 @@ def board_columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.in
 
 
 def _stock(scene: Scene, frames: Frames) -> tuple[NDArray[np.intp], Any]:
-    """A bar below the board, as wide as it with all apples, filled as far as they are there."""
+    """Return a bar below the board, as wide as it with all apples, filled as far as they are there."""
     apples = (frames["stock"] > 0).sum(1)
     changed = _changes(apples)
     apples, sites = apples[changed], max(1, len(scene.sites))
@@ -250,7 +252,8 @@ def _lines(of_agents: Strokes, frames: Frames) -> Any:
 
 
 def _out(frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
-    """A hollow square in the colour of each agent out of play, with its number where nobody else's stands.
+    """Return a hollow square in the colour of each agent out of play, with its number where nobody else's
+    stands.
 
     The squares have labels that name who tagged the agent; the viewer shows them on request.
     """
@@ -276,18 +279,18 @@ def _out(frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
 
 
 def centres_of(frames: Frames) -> NDArray[np.float32]:
-    """The positions of agents on the image, (x, y): [(T), N, 2]."""
+    """Return the positions of agents on the image, (x, y): [(T), N, 2]."""
     return np.stack([frames["col"], frames["row"]], -1).astype(np.float32) + RIM_CELLS + 0.5
 
 
 def _changes(rows: NDArray[Any]) -> NDArray[np.intp]:
-    """The indices of the first row, and of all rows that differ from the previous one."""
+    """Return the indices of the first row, and of all rows that differ from the previous one."""
     flat = rows.reshape(len(rows), -1)
     return np.flatnonzero(np.concatenate([[True], (flat[1:] != flat[:-1]).any(1)]))
 
 
 def mosaic(windows: Bytes) -> Bytes:
-    """The windows of all agents in one image, with UNSEEN between them.
+    """Return the windows of all agents in one image, with UNSEEN between them.
 
     Args:
         windows: uint8 [T, N, X, Y], classes of `classes_seen`.

@@ -64,7 +64,7 @@ class Decisions:
         self._log_fixed()
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Notes what the agents' policies say of what they saw before this turn, and what they did."""
+        """Note what the agents' policies say of what they saw before this turn, and what they did."""
         self._step += 1
         if self._step == 1:
             return  # the first board is shown in no frame
@@ -110,7 +110,7 @@ class Decisions:
         return 1 + 2 * (agent * len(self._actions) + action)
 
     def _heights(self, values: NDArray[np.float64]) -> NDArray[np.int64]:
-        """The heights of bars in pixels, at least 1; 0 where there are no values."""
+        """Return the heights of bars in pixels, at least 1; 0 where there are no values."""
         low, best = _range(np.nan_to_num(values))
         span = (best - low)[..., None]
         share = np.clip((values - low[..., None]) / np.where(span > 0, span, 1.0), 0.0, 1.0)
@@ -127,7 +127,7 @@ class Decisions:
         ]
 
     def _log_fixed(self) -> None:
-        """Logs the form of the image, the classes of its bars, and the names of actions."""
+        """Log the form of the image, the classes of its bars, and the names of actions."""
         rows, columns = self._panels.shape
         kind = rr.ChannelDatatype.U16 if self._dtype is np.uint16 else rr.ChannelDatatype.U8
         form = rr.components.ImageFormat(width=columns, height=rows, channel_datatype=kind)
@@ -151,7 +151,7 @@ class Decisions:
 
 
 def _range(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where bars of action values [..., A] begin and end."""
+    """Return where bars of action values [..., A] begin and end."""
     best = values.max(-1)
     return np.maximum(2 * np.median(values, -1) - best, values.min(-1)), best
 
@@ -189,7 +189,7 @@ class Offences:
                 logger.log_static(f"{name}/{kind}", line)
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Notes the payments of the turn, and where those are who broke a rule in it."""
+        """Note the payments of the turn, and where those are who broke a rule in it."""
         fines, transfers, violated = (_of_agents(batch, name) for name in (FINES, TRANSFERS, "violated"))
         self._amounts[PAID].append(-fines)
         self._amounts[GIVEN].append(transfers)
@@ -227,13 +227,13 @@ def _of_agents(batch: TensorDictBase, name: str) -> NDArray[np.float64]:
 
 
 def fined(agent: int, fine: float) -> str:
-    """A violation in words, e.g. "agent 2 breaks a rule, fined 1.5"."""
+    """Return a violation in words, e.g. "agent 2 breaks a rule, fined 1.5"."""
     return f"agent {agent} breaks a rule" + (f", fined {fine:.4g}" if fine > 0 else "")
 
 
 def events(batch: TensorDictBase) -> list[str]:
-    """The violations of a turn of the first world in words, and the fines of agents who were tagged; taxes
-    and costs, which many pay in each turn, are no events."""
+    """Return the violations of a turn of the first world in words, and the fines of agents who were tagged;
+    taxes and costs, which many pay in each turn, are no events."""
     tagged_by = batch.get(("next", *keys.TAGGED_BY), None)
     fines, violated = _of_agents(batch, FINES), _of_agents(batch, "violated")
     tagged = np.zeros(len(fines)) if tagged_by is None else tagged_by[0].numpy(force=True).any(-1)
