@@ -41,7 +41,7 @@ Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
 
 
 def recording_id(run: Path, file_name: str) -> str | None:
-    """Return the id of a recording, the same when a run is resumed or extended; None where there is no run."""
+    """Return the id of a recording, the same when a run is resumed or extended; None without a run."""
     if not (run / RECIPE_FILE).exists():
         return None
     recipe = read_json(run / RECIPE_FILE)
