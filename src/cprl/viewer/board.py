@@ -43,7 +43,7 @@ class Strokes(NamedTuple):
 
     def placed(
         self, centres: Floats, heading: NDArray[np.integer], drawn: NDArray[np.bool_]
-    ) -> tuple[Floats, NDArray[np.intp]]:
+    ) -> tuple[Floats, NDArray[np.intp], NDArray[np.intp]]:
         """Return the lines of all frames.
 
         Args:
@@ -52,13 +52,14 @@ class Strokes(NamedTuple):
             drawn: bool [T, N], the agents whose lines are drawn.
 
         Returns:
-            The lines one after the other, float32 [lines, P, 2], and how many each frame has, [T].
+            The lines one after the other, float32 [lines, P, 2], the agent of each, and how many each frame
+            has, [T].
         """
         drawn = drawn[:, self.owner]
         frame, line = np.nonzero(drawn)
         agent = self.owner[line]
         lines = self.shape[heading[frame, agent], line] + centres[frame, agent][:, None]
-        return lines, drawn.sum(1)
+        return lines, agent, drawn.sum(1)
 
 
 @cache
@@ -230,8 +231,10 @@ def boards(scene: Scene, frames: Frames) -> Bytes:
     Returns:
         uint8 [T, H + 2, W + 2].
     """
-    count = len(frames["step"])
-    drawn = np.full((count, scene.height, scene.width), GROUND, np.uint8)
+    size = len(frames["in_play"]), scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS
+    whole = np.full(size, WALL, np.uint8)
+    drawn = whole[:, RIM_CELLS:-RIM_CELLS, RIM_CELLS:-RIM_CELLS]
+    drawn[:] = GROUND
     if scene.walls:
         drawn[:, *np.array(scene.walls).T] = WALL
     if scene.sites:
@@ -239,15 +242,11 @@ def boards(scene: Scene, frames: Frames) -> Bytes:
     for agent in range(len(scene.agents)):
         at = np.flatnonzero(frames["in_play"][:, agent])
         drawn[at, frames["row"][at, agent], frames["col"][at, agent]] = FIRST_AGENT + agent
-    return _with_rim(drawn, WALL)
-
-
-def _with_rim(pictures: Bytes, kind: int) -> Bytes:
-    return np.pad(pictures, ((0, 0), (RIM_CELLS,) * 2, (RIM_CELLS,) * 2), constant_values=kind)
+    return whole
 
 
 def _lines(of_agents: Strokes, frames: Frames) -> Any:
-    lines, counts = of_agents.placed(centres_of(frames), frames["heading"], frames["in_play"])
+    lines, _, counts = of_agents.placed(centres_of(frames), frames["heading"], frames["in_play"])
     return rr.LineStrips2D.columns(strips=lines).partition(counts)
 
 
@@ -272,9 +271,8 @@ def _out(frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
         labels=["out" if tagger < 0 else f"by {tagger}" for tagger in by[out]],
     ).partition(out.sum(1))
     numbers = strokes(out.shape[1], number)
-    lines, counts = numbers.placed(centres, frames["heading"][changed], alone)
-    owner = numbers.owner[np.nonzero(alone[:, numbers.owner])[1]]
-    digits = rr.LineStrips2D.columns(strips=lines, colors=rgb[owner]).partition(counts)
+    lines, agent, counts = numbers.placed(centres, frames["heading"][changed], alone)
+    digits = rr.LineStrips2D.columns(strips=lines, colors=rgb[agent]).partition(counts)
     return {"out": (changed, squares), "out/numbers": (changed, digits)}
 
 

@@ -203,7 +203,7 @@ class Wall(View):
         now, read = self._env.worlds.now, self._env.worlds.driver.read
         shown = len(self._died)
         state = {name: read(getattr(now, name)[:shown]) for name in ("stock", "in_play", "row", "col")}
-        image = self._panels.joined(boards(self._scene, {"step": state["stock"], **state}), UNSEEN)
+        image = self._panels.joined(boards(self._scene, state), UNSEEN)
         turns = read(now.step[:shown])[:, 0].tolist()
         word = "turn " if shown <= _LABELLED else ""  # more labels would stand on each other
         labels = [f"{board}: {word}{turn}" for board, turn in enumerate(turns)]
