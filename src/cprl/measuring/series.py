@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from math import ceil, isnan
 from statistics import fmean
 from typing import Any, Final
@@ -138,8 +139,8 @@ class Series:
         """
         if episode.replica >= self.replicas:
             raise ValueError(
-                f"an episode of replica {episode.replica}; allowed: of replicas 0 to {self.replicas - 1}, as "
-                "replicas says"
+                f"an episode of replica {episode.replica}; allowed: of replicas 0 to {self.replicas - 1}, "
+                "those of the environment"
             )
         together = episode.episode // self.worlds
         of_replicas = self._waiting.setdefault(together, {})
@@ -159,14 +160,11 @@ class Series:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the incomplete episodes."""
-        return {"waiting": {episode: dict(numbers) for episode, numbers in self._waiting.items()}}
+        return {"waiting": deepcopy(self._waiting)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue with the incomplete episodes of a state."""
-        self._waiting = {
-            int(together): {int(replica): list(numbers) for replica, numbers in of_replicas.items()}
-            for together, of_replicas in state["waiting"].items()
-        }
+        self._waiting = deepcopy(state["waiting"])
 
 
 def mean_of(values: Values) -> float:
