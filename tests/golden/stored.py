@@ -29,7 +29,6 @@ def twice() -> cprl.Fresh:
 
 
 def evaluated() -> dict[str, object]:
-
     found = {}
     for name, path in runs().items():
         for greedy in (False, True):

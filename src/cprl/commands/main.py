@@ -15,6 +15,7 @@ from typing import Annotated, Any, Final, Literal
 
 import tyro
 
+from cprl.commands import play_stored
 from cprl.commands.flags import with_help
 from cprl.commands.recipe import (
     ALLOW,
@@ -42,24 +43,15 @@ GROUPS: Final[Mapping[str, Mapping[str, str]]] = {
     },
     "Look": {
         "watch": "main:watch",
-        "film": "play_stored:film",
-        "show": "play_stored:show",
-        "report": "play_stored:report",
-        "play": "play_stored:play",
-        "sandbox": "play_stored:sandbox",
+        **{name: f"play_stored:{name}" for name in play_stored.LOOK},
     },
     "Measure": {
-        "evaluate": "play_stored:evaluate",
-        "visits": "play_stored:visits",
-        "scenarios": "play_stored:scenarios",
-        "schelling": "play_stored:schelling",
-        "exploit": "play_stored:exploit",
+        **{name: f"play_stored:{name}" for name in play_stored.MEASURE},
         "export": "main:export",
     },
     "Compare": {
         "table": "table:table",
-        "crossplay": "play_stored:crossplay",
-        "egta": "play_stored:egta",
+        **{name: f"play_stored:{name}" for name in play_stored.COMPARE},
     },
 }
 """The functions of the commands, each in a module of this package, in the order in which `cprl --help` lists

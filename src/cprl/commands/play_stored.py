@@ -7,7 +7,7 @@ from functools import partial
 from importlib import import_module
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import tyro
 
@@ -34,6 +34,11 @@ if TYPE_CHECKING:
 
     from cprl.terminal.tables import Cells
 
+
+LOOK: Final = ("film", "show", "report", "play", "sandbox")
+MEASURE: Final = ("evaluate", "visits", "scenarios", "schelling", "exploit")
+COMPARE: Final = ("crossplay", "egta")
+"""The commands of this module by their groups in `cprl --help`, in order."""
 
 FreshFlags = Annotated[Fresh, tyro.conf.arg(name="")]
 

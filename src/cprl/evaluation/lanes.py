@@ -241,16 +241,12 @@ def agents_specified(place: Place, specs: Sequence[AgentSpec], fresh: Fresh) -> 
         if not isinstance(spec, Scripted | Frozen):
             allowed = "Scripted(policy) or Frozen(run, agent, replica)"
             raise ValueError(f"agents[{agent}] is a {type(spec).__name__}; allowed: {allowed}")
-    stored: dict[int, list[StoredAgent]] = {}
+    stored: list[dict[int, StoredAgent]] = [{} for _ in range(place.game.agents)]
     for group in in_a_row(fresh.replicas):
         population = Population(place.env(len(group)), specs, first_replica=group[0])
-        by_replica = zip(*population.as_stored(group), strict=True)
-        stored |= dict(zip(group, map(list, by_replica), strict=True))
-
-    def agent_at(agent: int, replica: int) -> StoredAgent:
-        return stored[replica][agent]
-
-    return [partial(agent_at, agent) for agent in range(place.game.agents)]
+        for by_replica, agents in zip(stored, population.as_stored(group), strict=True):
+            by_replica |= zip(group, agents, strict=True)
+    return [by_replica.__getitem__ for by_replica in stored]
 
 
 def agent_named(who: str, agent: int, *, replica: int | None = None, name: str) -> AgentSpec:

@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase
 
 from cprl import keys
 from cprl.commons import maps
-from cprl.commons.colours import APPLE, BEAM, CLEANING, PALETTE, WALL, WASTE, WATER, Colour, agent_colour
+from cprl.commons.colours import APPLE, BEAM, CLEANING, WALL, WASTE, WATER, picture_colour
 from cprl.commons.game import Game
 from cprl.commons.maps import SIGN_OF_HEADING
 from cprl.commons.published import Variant, check_board
@@ -62,6 +62,7 @@ _ARROWS: Final = {"A": "w", "B": "s", "C": "e", "D": "q"}
 """The key for each arrow, by the last letter that a terminal sends: up, down, right, left."""
 _ENDING: Final = "\x1b\x04"
 """Esc, and the end of a text."""
+_SIGNS: Final = {APPLE: "A", WATER: maps.WATER, WASTE: maps.WASTE, BEAM: "*", CLEANING: "*"}
 _PROMPT: Final = "keys> "
 _BY_LINE: Final = f"Enter plays a line of them and alone stays, {HELP} prints them, {QUIT} ends"
 _BY_KEY: Final = f"arrows step and turn, Enter stays, {HELP} prints them, Esc ends"
@@ -281,29 +282,20 @@ def keys_of(pressed: str) -> str:
 def board_text(session: Session) -> Text:
     """Return the board by rows: `A` an apple, `#` a wall, `~` and `H` a river's water and waste, `*` a beam,
     and each agent's number with its heading."""
-    board = session.game.map
     now = session.moments[-1]
     wide = len(str(session.game.agents - 1)) + 1
-    cells: dict[tuple[int, int], tuple[str, Colour]] = {
-        **dict.fromkeys(board.river, (maps.WATER, PALETTE[WATER])),
-        **{cell: ("A", PALETTE[APPLE]) for cell, apple in zip(board.sites, now.stock, strict=True) if apple},
-        **{
-            (int(row), int(col)): (sign, PALETTE[kind])
-            for kind, sign in ((WASTE, maps.WASTE), (BEAM, "*"), (CLEANING, "*"))
-            for row, col in np.argwhere(now.board == kind)
-        },
-        **dict.fromkeys(board.walls, ("#" * wide, PALETTE[WALL])),
+    signs = {**_SIGNS, WALL: "#" * wide}
+    agents = {
+        (int(now.row[agent]), int(now.col[agent])): f"{agent}{SIGN_OF_HEADING[int(now.heading[agent])]}"
+        for agent in np.flatnonzero(now.in_play)
     }
-    for agent, (row, col, heading) in enumerate(zip(now.row, now.col, now.heading, strict=True)):
-        if now.in_play[agent]:
-            cells[int(row), int(col)] = f"{agent}{SIGN_OF_HEADING[int(heading)]}", agent_colour(agent)
     text = Text()
-    for row in range(board.height):
-        for col in range(board.width):
-            sign, (red, green, blue) = cells.get((row, col), (".", PALETTE[WALL]))
-            is_last = col == board.width - 1
-            text.append(sign if is_last else sign.ljust(wide), f"rgb({red},{green},{blue})")
-        text.append("\n" if row < board.height - 1 else "")
+    for cell, kind in np.ndenumerate(now.board):
+        sign = agents.get(cell, signs.get(int(kind), "."))
+        red, green, blue = picture_colour(int(kind) or WALL)
+        is_last = cell[1] == now.board.shape[1] - 1
+        text.append(f"{sign}\n" if is_last else sign.ljust(wide), f"rgb({red},{green},{blue})")
+    text.right_crop()
     return text
 
 

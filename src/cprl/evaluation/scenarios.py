@@ -199,12 +199,15 @@ def run_scenarios(
     for path, background_run in stored.items():
         refuse_other_games({str(loaded.path): loaded, f"the background {path}": background_run})
     fresh = fresh_for([loaded], fresh, among=stored.values())
-    _refuse_meeting_itself(loaded, chosen, stored, fresh.replicas)
+    backgrounds = {
+        scenario.name: [_background(spec, stored, loaded, fresh.replicas) for spec in scenario.background]
+        for scenario in chosen
+    }
     populations = {RUN: agents_of(loaded)}
     populations |= {policy: [scripted(policy)] * len(everyone) for policy in FOCAL_AGENTS[1:]}
 
     def parts(scenario: Scenario) -> Iterator[pa.Table]:
-        background = [_background(spec, stored) for spec in scenario.background]
+        background = backgrounds[scenario.name]
         for (who, focal), places in product(populations.items(), scenario.placements):
             agents = [focal[agent] if agent in places else background[agent] for agent in everyone]
             labels = {"scenario": scenario.name, FOCAL: who, "focal_agents": " ".join(map(str, places))}
@@ -236,39 +239,32 @@ def _chosen(run: LoadedRun, scenarios: Sequence[str | Scenario]) -> list[Scenari
     return list(chosen.values())
 
 
-def _background(spec: Scripted | Frozen, stored: Mapping[str, LoadedRun]) -> Agent:
+def _background(
+    spec: Scripted | Frozen, stored: Mapping[str, LoadedRun], run: LoadedRun, replicas: Sequence[int]
+) -> Agent:
+    """Return who plays in a background beside these replicas of a run; refuse one that would meet itself."""
     if isinstance(spec, Scripted):
         return scripted(spec.policy)
-    run = stored[spec.run]
+    other = stored[spec.run]
     if spec.replica is not None:
-        return frozen(run, spec)
-    return lambda replica: run.agent(spec.agent, replica=_following(run, replica))
+        return frozen(other, spec)
+    beside = {replica: _following(other, replica) for replica in replicas}
+    is_alike = other.experiment.seed == run.experiment.seed
+    if is_alike and any(replica == number for replica, number in beside.items()):
+        raise ValueError(
+            f"the background {other.path} keeps the single replica {other.replicas[0]} of the same seed as "
+            f"{run.path}; allowed: a run of at least 2 replicas, one of another seed, or a Frozen with the "
+            "number of its replica"
+        )
+    return agents_of(other, beside)[spec.agent]
 
 
 def _following(run: LoadedRun, replica: int) -> int:
-    """The number of the replica of a background that plays beside this one: of those that it keeps the next,
-    the first after the last."""
+    """Return the number of the replica of a background that plays beside this one: of those that it keeps the
+    next, the first after the last."""
     numbers = run.replicas  # some may be missing
     before = numbers.index(replica) if replica in numbers else replica
     return numbers[(before + 1) % len(numbers)]
-
-
-def _refuse_meeting_itself(
-    run: LoadedRun, scenarios: Sequence[Scenario], stored: Mapping[str, LoadedRun], replicas: Sequence[int]
-) -> None:
-    """Raises a ValueError for a background that has no other replica than one that it would play beside."""
-    for scenario in scenarios:
-        of_any = {
-            spec.run for spec in scenario.background if isinstance(spec, Frozen) and spec.replica is None
-        }
-        for background in map(stored.__getitem__, of_any):
-            is_alike = background.experiment.seed == run.experiment.seed
-            if is_alike and len(background.replicas) == 1 and background.replicas[0] in replicas:
-                raise ValueError(
-                    f"the scenario {scenario.name} has the background {background.path}, which keeps the "
-                    f"single replica {background.replicas[0]} of the same seed; allowed: a run of at least 2 "
-                    "replicas, one of another seed, or a Frozen with the number of its replica"
-                )
 
 
 SOCIAL: Final = (COLLECTIVE_RETURN, EQUALITY, "sustainability", "survival_steps", "peacefulness")
