@@ -16,6 +16,7 @@ from math import nan
 from pathlib import Path
 from statistics import fmean
 
+import pyarrow as pa
 import torch
 import tyro
 from tensordict.nn import TensorDictSequential
@@ -34,12 +35,12 @@ from cprl.learners.transitions import transitions_of
 from cprl.measuring.episodes import Episode, EpisodeTracker
 from cprl.measuring.evaluate import evaluate, mean_return
 from cprl.measuring.series import Observer
-from cprl.measuring.table import where
+from cprl.measuring.table import labelled, where
 from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
 from cprl.population import Learning, exploration_steps
-from cprl.runs.episodes import EpisodeTable, labelled
+from cprl.runs.episodes import EpisodeTable, table_of
 from cprl.runs.recipe import start_run
 from cprl.runs.weights import load_weights, save_weights
 from cprl.system.output import printed, say
@@ -171,7 +172,7 @@ def main(
         network.load_state_dict(load_weights(best.path)["agent_0"])
         played[f"greedy, best (episode {best.best_episode})"] = evaluate(fresh, policy)
     ends = exploration_steps(experiment.agents)
-    table = labelled(({"policy": name}, 0, episodes) for name, episodes in played.items())
+    table = pa.concat_tables(labelled(table_of(episodes), policy=name) for name, episodes in played.items())
     random = where(table, policy="random")
     figure = training_curve(run, title=title, random=random, exploration_turns=ends)
     note = None if best.path else "No best weights: greedy play harvested nothing whenever it was tried"

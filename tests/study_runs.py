@@ -74,7 +74,7 @@ def write_run(run, experiment, apples, *, random=4.0, equality=None, is_finished
     trained = [an_episode(number, replica, float(apples(replica, -1))) for replica, number in places]
     by_chance = [an_episode(number, replica, float(random)) for replica, number in places]
     played = {"trained": trained, "random": by_chance}
-    write_evaluation(run, played, of_replica=experiment.evaluation_episodes)
+    write_evaluation(run, played, replicas=experiment.replicas)
     if is_finished:
         (run / "report.json").write_text("{}")
     return run

@@ -42,11 +42,11 @@ from cprl.measuring.registry import (
 )
 from cprl.measuring.series import Observer
 from cprl.measuring.statistics import estimates
-from cprl.measuring.table import where
+from cprl.measuring.table import labelled, where
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
 from cprl.runs.curves import curves_of
-from cprl.runs.episodes import COLUMNS, LEFT_OUT, EpisodeTable, as_table, labelled, read_episodes
+from cprl.runs.episodes import COLUMNS, LEFT_OUT, EpisodeTable, read_episodes, table_of
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import compared, summarise
@@ -85,6 +85,12 @@ STORED = measurable(OPTIONAL)[:-1]
 
 def told(episodes):
     return [repr({**vars(episode), "world": None, "episode": None}) for episode in episodes]
+
+
+def by_policy(**played):
+    """The table of episodes of one replica by policy."""
+    tables = (labelled(table_of(episodes), policy=policy) for policy, episodes in played.items())
+    return pa.concat_tables(tables)
 
 
 def test_what_a_game_of_torchrl_reports_is_read_from_its_specs():
@@ -192,13 +198,13 @@ def test_its_table_has_the_columns_that_there_are_and_says_what_is_left_out(tmp_
     assert sorted(curves) == ["income", "return_0", "return_1", "survival_steps"]
     assert curves["income"].tolist() == [[12.5, 12.5], [14.5, 14.5]]
     assert curves["return_1"].tolist() == [[8.5, 8.5], [9.5, 9.5]]
-    joined = labelled([({"policy": "a"}, 0, episodes[:2]), ({"policy": "b"}, 0, episodes[2:])])
+    joined = by_policy(a=episodes[:2], b=episodes[2:])
     assert joined.column_names == ["policy", *columns]
 
 
 def test_the_table_of_a_commons_has_all_columns():
     (episode,) = evaluate(CommonsEnv(GAME, 1), at_random())
-    table = as_table([episode], 0)
+    table = table_of([episode])
     names = [
         (name, kind) for name, kind in COLUMNS.items() if name not in ("wanted_return", "world")
     ]  # of trainings
@@ -210,7 +216,7 @@ def test_a_game_that_must_not_be_stepped_when_it_has_ended_is_evaluated():
     episodes = evaluate(MatrixGame(3), tit_for_tat)
     ends = [(episode.world, episode.episode, episode.steps) for episode in episodes]
     assert ends == [(0, 0, 5), (1, 0, 6), (2, 0, 7)]
-    measures = estimates(as_table(episodes, 0))
+    measures = estimates(table_of(episodes))
     assert measures.numbers == ["income", "survival_steps"]
     assert measures["survival_steps"].value == 6.0
 
@@ -307,7 +313,7 @@ def test_the_terminal_shows_it_too(tmp_path, monkeypatch):
     ):
         episodes = play(MatrixGame(2), tit_for_tat, 12, callbacks=[table, bar])
     assert "return 12.5" in output.getvalue()
-    played = labelled([({"policy": policy}, 0, episodes) for policy in ("random", "trained")])
+    played = by_policy(random=episodes, trained=episodes)
     figure = training_curve(tmp_path, title="matrix", random=where(played, policy="random"))
     assert figure.stat().st_size > 10_000
     summarise(tmp_path, title="matrix", played=played, console=console)
@@ -319,7 +325,7 @@ def test_the_terminal_shows_it_too(tmp_path, monkeypatch):
 
 def test_the_table_of_an_evaluation_says_what_is_left_out():
     episodes = evaluate(MatrixGame(2), tit_for_tat)
-    played = labelled([({"policy": policy}, 0, episodes) for policy in ("trained", "random")])
+    played = by_policy(trained=episodes, random=episodes)
     table = compared(played, "")
     assert table.note.startswith("left out: collective_return")
     returns = ["agent 0: return", "agent 1: return"]

@@ -171,6 +171,7 @@ def blocks():
 def test_python_in_the_docs_runs(code, modules, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "docs").symlink_to(ROOT / "docs")
     for name, text in modules.items():
         (tmp_path / f"{name}.py").write_text(text)
         monkeypatch.delitem(sys.modules, name, raising=False)

@@ -283,7 +283,7 @@ def test_its_world_is_played_by_no_training_and_no_evaluation():
 
 def test_an_exhibition_that_fails_warns_once_and_ends(kept, monkeypatch):
     kept.step()
-    monkeypatch.setattr(kept.world, "step_and_maybe_reset", lambda moment: 1 / 0)
+    monkeypatch.setattr(kept.world, "step", lambda moment: 1 / 0)
     with pytest.warns(RuntimeWarning, match="the exhibition failed, the run") as caught:
         kept.step(8)
     assert len(caught) == 1

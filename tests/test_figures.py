@@ -26,7 +26,7 @@ from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.measuring.windows import centres
 from cprl.population import Learning, Scripted, Team, exploration_steps
 from cprl.runs.curves import episode_of_turn
-from cprl.runs.episodes import as_table
+from cprl.runs.episodes import table_of
 from cprl.terminal import style
 from cprl.terminal.figures import training_curve
 
@@ -103,7 +103,7 @@ def see_that_it_can_be_read(figure, width_in=3.3):
 
 def test_a_short_training_shows_its_peak_its_end_random_play_and_where_exploration_ends(tmp_path, drawn):
     run = a_run(tmp_path / "run", the_tragedy(4, 200))
-    random = as_table([an_episode(0, collective_return=282.0, survival_steps=1000.0)], 0)
+    random = table_of([an_episode(0, collective_return=282.0, survival_steps=1000.0)])
     training_curve(run, title="commons", random=random, exploration_turns=50_000)
     (figure,) = drawn
     above, below = curves_panels(figure)
@@ -247,7 +247,7 @@ def test_names_in_figures_are_no_formulas(name, tmp_path):
 @pytest.mark.parametrize("width", ["page", "column"])
 def test_a_training_curve_can_be_read_at_every_width(width, tmp_path, drawn):
     run = a_run(tmp_path / "run", the_tragedy(4, 1200))
-    random = as_table([an_episode(0, collective_return=282.0, survival_steps=1000.0)], 0)
+    random = table_of([an_episode(0, collective_return=282.0, survival_steps=1000.0)])
     training_curve(run, title="commons", random=random, exploration_turns=50_000, width=width)
     see_that_it_can_be_read(drawn[0], style.WIDTH_IN[width])
 

@@ -36,7 +36,7 @@ from cprl.measuring.table import numbers_in
 from cprl.policies.lanes import random_agents
 from cprl.runs.curves import as_curves
 from cprl.runs.episodes import OF_INSTITUTIONS as COLUMNS
-from cprl.runs.episodes import EpisodeTable, as_table, labelled, read_episodes, stored_episodes
+from cprl.runs.episodes import EpisodeTable, read_episodes, stored_episodes, table_of
 from cprl.training import train
 
 NAN = float("nan")
@@ -212,7 +212,7 @@ def test_an_episode_has_what_was_paid_broken_counted_and_decided():
 
 def test_a_table_has_the_counts_of_the_institutions_that_the_game_has_and_no_others():
     (episode,) = played(*an_episode(), institutions=[Quota(share=0.5, window_steps=10), Monitoring(prob=0.5)])
-    table = as_table([episode], 0)
+    table = table_of([episode])
     assert set(COUNTS) & set(table.column_names) == {"excess_bites", "violations", "detections"}
     of_counts = {name for name, metric in METRICS.items() if "counts" in metric.entries}
     curves = as_curves(table)
@@ -225,7 +225,7 @@ def test_with_groups_inequality_within_and_between_them_is_measured():
     (episode,) = played(*an_episode(), institutions=[Levies(groups=((0,), (1,)))])
     assert episode.metrics["institutions/income_equality_within"] == 1.0
     assert episode.metrics["institutions/income_equality_between"] == pytest.approx(1 - 2 / 30)
-    curves = as_curves(as_table([episode], 0))
+    curves = as_curves(table_of([episode]))
     assert {"institutions/equality_between", "institutions/income_equality_within"} <= set(curves)
     assert curves["institutions/income_equality_between"].item() == pytest.approx(1 - 2 / 30)
 
@@ -242,9 +242,9 @@ def test_a_viewer_that_goes_on_with_a_run_has_the_measures_of_groups(tmp_path):
 def test_a_game_without_institutions_is_as_it_was():
     (episode,) = played(turn(done=[[True]]))
     assert (episode.fines, episode.counts, episode.in_force, of_law(episode)) == (None, None, None, {})
-    assert not set(as_table([episode], 0).column_names) & set(COLUMNS)
+    assert not set(table_of([episode]).column_names) & set(COLUMNS)
     assert not [name for name in numbers_of(episode, {}, ["a", "b"]) if "institutions" in name]
-    assert not any("institutions" in name for name in numbers_in(as_table([episode], 0)))
+    assert not any("institutions" in name for name in numbers_in(table_of([episode])))
     assert not {"fines", "counts"} & set(EpisodeTracker(1, 2).state_dict())
 
 
@@ -298,7 +298,7 @@ def test_a_game_that_pays_without_counting_has_the_metrics_of_payments():
     (episode,) = played(batch)
     assert (episode.violations, episode.counts) == (None, None)
     assert list(of_law(episode)) == ["income_equality", "institutions/fines", "institutions/transfers"]
-    assert [name for name in as_table([episode], 0).column_names if name in COLUMNS] == ["fines", "transfers"]
+    assert [name for name in table_of([episode]).column_names if name in COLUMNS] == ["fines", "transfers"]
 
 
 def test_the_table_has_a_column_for_each_number_and_keeps_it(tmp_path):
@@ -315,17 +315,17 @@ def test_the_table_has_a_column_for_each_number_and_keeps_it(tmp_path):
     assert kept.select(list(numbers)).to_pydict() == numbers
     found = {name: [value, value] for name, value in episode.metrics.items()}
     np.testing.assert_equal(kept.select(list(found)).to_pydict(), found)
-    without = as_table(played(turn(done=[[True]])), 0)
+    without = table_of(played(turn(done=[[True]])))
     assert set(kept.column_names) - set(expected) - set(found) <= set(without.column_names)
 
 
 def test_curves_and_logged_numbers_are_those_of_the_episode():
     (episode,) = played(*an_episode())
-    curves = as_curves(as_table([episode], 0))
+    curves = as_curves(table_of([episode]))
     for name, value in episode.metrics.items():
         np.testing.assert_allclose(curves[name], [[value]], err_msg=name)
     assert curves["institutions/in_force_0"].tolist() == [[0.25]]
-    assert not any("inst" in name for name in as_curves(as_table(played(turn(done=[[True]])), 0)))
+    assert not any("inst" in name for name in as_curves(table_of(played(turn(done=[[True]])))))
     numbers = numbers_of(episode, {}, ["ann", "bob"])
     assert numbers["institutions/detection_rate"] == 0.5
     assert numbers["institutions/in_force_0"] == 0.25
@@ -335,7 +335,7 @@ def test_curves_and_logged_numbers_are_those_of_the_episode():
 def test_undefined_numbers_are_counted_apart():
     first, second = (played(*an_episode())[0] for _ in range(2))
     first.metrics["institutions/detection_rate"] = NAN
-    rows = labelled([({}, 0, [first, second])])
+    rows = table_of([first, second])
     found = estimates(rows, "institutions/detection_rate")["institutions/detection_rate"]
     assert str(found) == "0.50, undefined in 1 of 2 episodes"
 

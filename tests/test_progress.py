@@ -83,7 +83,7 @@ def test_the_return_is_the_mean_of_the_last_episodes_of_all_worlds():
     with ProgressBar(GAME, episodes=9, replicas=2, worlds=2, console=Console(file=io.StringIO())) as bar:
         for harvest in (100.0, 7.0, 1.0, 2.0, 4.0):
             bar.on_episode(SimpleNamespace(return_=np.array([harvest]), harvest=None, steps=5), {})
-        assert bar._latest["return"] == "3.5"  # (7 + 1 + 2 + 4) / 4
+        assert bar._return == "3.5"  # (7 + 1 + 2 + 4) / 4
 
 
 def test_the_bar_never_counts_more_episodes_than_there_are():

@@ -28,7 +28,7 @@ from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.viewer.board import boards, mosaic
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import EMPTY_SITE
-from cprl.viewer.scene import Scene, window_corners
+from cprl.viewer.scene import Scene, windows_of
 
 __all__ = ["strict_rerun"]
 
@@ -74,7 +74,7 @@ def test_frames_show_the_board_the_agents_and_what_each_sees(tmp_path):
     assert (np.abs(digit - (2.5, 1.5)) < 0.5).all(), "the number is inside the cell"
     assert digit[:, 0].max() < tip[0] - 0.2, "and behind the triangle"
     _, windows = column(path, "windows", "SegmentationImage:buffer")
-    (_, _), (top, left) = window_corners(2, (3, 5))
+    _, (top, left) = windows_of(2, (3, 5)).corners
     first = np.array(windows[0][0], np.uint8).reshape(3 + top, 5 + left)
     assert np.array_equal(np.array(COLOURS)[first[:3, :5]].transpose(2, 0, 1), shown[0].windows[0])
     assert np.array_equal(np.array(COLOURS)[first[top:, left:]].transpose(2, 0, 1), shown[0].windows[1])
@@ -106,10 +106,10 @@ def test_what_is_logged_together_is_sent_together(tmp_path):
         stream.period_s = 0.0
         logger.log_scalar("alone", 1.0)
         assert not stream.waiting
-        with logger.together():
-            logger.log_scalar("first", 1.0)
-            logger.log_document("header", "# Episode 1")
-            assert list(stream.waiting) == ["first", "header"]
+        logger.log_lines("first", [1.0])
+        logger.log_document("header", "# Episode 1")
+        assert list(stream.waiting) == ["first", "header"]
+        logger.send_due()
         assert not stream.waiting
 
 
@@ -366,6 +366,6 @@ def test_a_torchrl_example_that_knows_nothing_of_cprl_is_recorded(tmp_path):
 def test_mosaics_put_low_windows_below_each_other_and_high_ones_side_by_side():
     low = np.array([[[[SELF, BEAM, WALL]], [[GROUND, APPLE, OTHER]]]], np.uint8)
     assert mosaic(low).tolist() == [[[SELF, BEAM, WALL], [UNSEEN] * 3, [GROUND, APPLE, OTHER]]]
-    assert window_corners(4, (7, 15)) == [(0, 0), (0, 16), (8, 0), (8, 16)]
+    assert windows_of(4, (7, 15)).corners.tolist() == [[0, 0], [0, 16], [8, 0], [8, 16]]
     high = np.array([[[[SELF], [BEAM], [WALL]], [[GROUND], [APPLE], [OTHER]]]], np.uint8)
     assert mosaic(high).tolist() == [[[SELF, UNSEEN, GROUND], [BEAM, UNSEEN, APPLE], [WALL, UNSEEN, OTHER]]]

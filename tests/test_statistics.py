@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from cprl.measuring.statistics import curve_interval, difference, estimate, holm, starred
+from cprl.measuring.statistics import curve_interval, difference, estimate, holm, judged
 
 
 def test_intervals_are_by_student():
@@ -83,10 +83,20 @@ def test_of_several_differences_those_differ_that_holm_names(p_values, differs):
     assert holm(p_values).tolist() == differs
 
 
-def test_differences_that_are_compared_together_are_starred_together():
+def test_differences_that_are_compared_together_are_judged_together():
     # Alone the second would differ too: its p-value is 0.046.
-    pairs = ([3.0, 3.1, 3.2], [1.0, 1.5, 2.2], [-1.0, 1.0, 0.5])
-    differences = [estimate(values) for values in pairs]
-    assert [round(found.p_value, 3) for found in differences] == [0.0, 0.046, 0.808]
-    assert [text[-1] for text in starred(differences)] == ["*", "]", "]"]
-    assert starred(differences, "+.1f") == ["+3.1 *", "+1.6", "+0.2"]
+    pairs = {"a": [3.0, 3.1, 3.2], "b": [1.0, 1.5, 2.2], "c": [-1.0, 1.0, 0.5]}
+    family = judged({(name, "equality"): estimate(values) for name, values in pairs.items()}, ["condition"])
+    assert [round(one.p_value, 3) for one in family.values()] == [0.0, 0.046, 0.808]
+    assert [one.differs for one in family.values()] == [True, False, False]
+    assert (family.tests, family.name) == (3, "these 3 differences")
+
+
+def test_a_difference_within_a_margin_said_beforehand_is_none_and_its_reach_would_have_been_told():
+    one = estimate([-0.5, 0.0, 0.5])
+    # t of two degrees of freedom is 4.303, the standard error 0.5 / sqrt(3).
+    assert one.reach == pytest.approx(4.303 * 0.5 / 3**0.5, abs=1e-3)
+    assert one.is_within(1.3)
+    assert not one.is_within(1.2)
+    at_its_reach = estimate([value + one.reach for value in (-0.5, 0.0, 0.5)])
+    assert at_its_reach.p_value == pytest.approx(0.05)

@@ -379,12 +379,13 @@ def test_the_file_closes_while_the_live_view_goes_on(tmp_path):
 def test_the_header_says_where_a_run_is_and_which_institutions_are_in_force():
     institutions = (Quota(share=0.25, window_steps=50, fine=2.0), Vote(on=Tax(), choices=(0.0, 0.5)))
     rules = rules_of(replace(GAME, institutions=institutions))
-    header = Header(episodes=4800, boards=8, unit="apples", rules=rules)
-    assert header.begins("compiling") == f"#### Episode 1 of 4,800 · compiling · {rules}"
-    alone = Header(episodes=200, boards=1, unit="return")
+    eight = Curves(agents=("a", "b"), replicas=8)
+    header = Header(curves=eight, episodes=4800, rules=rules)
+    assert header.begins("compiling") == f"#### Episode 1 of 4,800 · compiling · {rules}\n\n{eight.legend}"
+    alone = Header(curves=Curves(agents=("a", "b"), metrics=()), episodes=200)
     for died in (None, 0):
         line = alone.line(episode=1, label="steady", mean=4.25, random_play=None, died=died)
-        assert line == "#### Episode 1 of 200 · steady · return 4.25"
+        assert line.splitlines()[0] == "#### Episode 1 of 200 · steady · return 4.25"
 
 
 def test_the_header_names_rules_of_ones_own(tmp_path):

@@ -835,14 +835,13 @@ def test_what_trained_agents_get_beyond_the_planner_is_in_the_committed_table():
     assert board == ("single_complex", "as_run")
     assert KNOWN[board].best_known > PLANNED[board].best_known + 5 * PLANNED[board].error
     path = Path(__file__).parents[1] / "docs" / "results" / "learners" / "two_complex" / "table.parquet"
-    rows = pq.read_table(
-        path, filters=[("part", "=", "evaluation"), ("metric", "in", ["return_0", "return_1"])]
-    )
+    numbers = ["agent_0/return", "agent_1/return"]
+    rows = pq.read_table(path, filters=[("part", "=", "evaluation"), ("metric", "in", numbers)])
     by_agent = {(row["condition"], row["replica"], row["metric"]): row["value"] for row in rows.to_pylist()}
     best = max(by_agent, key=by_agent.__getitem__)
-    assert best == ("MAPPO", 0, "return_1")
+    assert best == ("MAPPO", 0, "agent_1/return")
     assert by_agent[best] == pytest.approx(KNOWN[board].best_known, abs=0.05)
-    assert by_agent["MAPPO", 0, "return_0"] == pytest.approx(1.0)
+    assert by_agent["MAPPO", 0, "agent_0/return"] == pytest.approx(1.0)
 
 
 def test_no_population_of_a_published_board_gets_more_than_the_best_known():

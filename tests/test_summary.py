@@ -7,13 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from rich.console import Console
 from test_results import an_episode
 
 from cprl.measuring.registry import INCOME, METRICS, title, with_unit
 from cprl.measuring.statistics import Estimate
-from cprl.runs.episodes import labelled
+from cprl.measuring.table import labelled
+from cprl.runs.episodes import table_of
 from cprl.terminal.summary import summarise
 from cprl.terminal.tables import Cells, Change
 
@@ -24,11 +26,11 @@ def episode(number, harvest, **metrics):
     return replace(an_episode(number, **known), harvest=apples, return_=apples)
 
 
-def table_of(**played):
+def played_by(**played):
     """The episodes of policies as a table; of one replica, or by replica."""
     by_replica = {name: of if isinstance(of, dict) else {0: of} for name, of in played.items()}
-    return labelled(
-        ({"policy": name}, replica, episodes)
+    return pa.concat_tables(
+        labelled(table_of(episodes, [replica]), policy=name)
         for name, of in by_replica.items()
         for replica, episodes in of.items()
     )
@@ -37,7 +39,7 @@ def table_of(**played):
 def told_of(tmp_path, **played):
     """The cells of each row by its name, and all that was printed."""
     output = io.StringIO()
-    table = table_of(**played)
+    table = played_by(**played)
     summarise(tmp_path, title="a run", played=table, console=Console(file=output, width=200))
     text = output.getvalue()
     cells = [[cell.strip() for cell in re.split("[│┃]", line)[1:-1]] for line in text.splitlines()]
@@ -50,7 +52,7 @@ def test_the_line_that_watches_again_can_be_copied(tmp_path):
     (run / "run.rrd").touch()
     output = io.StringIO()
     console = Console(file=output, width=200, markup=False)
-    summarise(run, title="a run", played=table_of(random=[episode(0, [3, 1])]), console=console)
+    summarise(run, title="a run", played=played_by(random=[episode(0, [3, 1])]), console=console)
     (line,) = (line for line in output.getvalue().splitlines() if line.startswith("Watch again: "))
     assert shlex.split(line)[-2:] == ["watch", str(run)], "all recordings of a run that was resumed"
 

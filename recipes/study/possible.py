@@ -58,7 +58,7 @@ KNOWN: Final[dict[tuple[presets.Board, presets.Variant], Possible]] = {
 comparisons in docs/results that play one of these games unchanged, this is the only one.
 
 `two_complex` has the sites and the regrowth of `single_complex`, a second agent, and a beam. In replica 0 of
-MAPPO one agent takes 1.0 apple of an episode and the other 364.4 (50 fresh worlds, "return_1" in
+MAPPO one agent takes 1.0 apple of an episode and the other 364.4 (50 fresh worlds, "agent_1/return" in
 docs/results/learners/two_complex/table.parquet). It begins in another place than the agent of
 `single_complex`. The error is that of a mean of 50 episodes which scatter as the 20 of its cross-play did,
 with a standard deviation of 17.1 apples (that table left docs/results in commit 24558319)."""

@@ -16,6 +16,8 @@ recovery, and compares three moments of each replica:
 A replica shows a tragedy if the fall is at least `FALL`, and combat if it also rises by at least `RISE` and
 its peace stays below 1: the agents earn more again, but not because they have stopped tagging.
 
+A tragedy here is a fall of the study's three metrics; in `cprl.measuring.outcome` it ends below random play.
+
 How many replicas do depends on the window and on the fall that counts, and no definition is the right one. So
 whatever is said of a share of replicas is said by each of `DEFINITIONS`.
 """

@@ -22,8 +22,7 @@ from cprl.evaluation.lanes import agents_of, fresh_for, play, roles_of, said, to
 from cprl.evaluation.pages import draw_matrices, heading, matrix_cells
 from cprl.measuring.registry import COLLECTIVE_RETURN, FINES, INCOME, with_unit
 from cprl.measuring.statistics import HOLM, Family, differences, estimates
-from cprl.measuring.table import BACKGROUND, BOTH, FOCAL, ROLE, labelled, numbers_in, where
-from cprl.runs.episodes import Label
+from cprl.measuring.table import BACKGROUND, BOTH, FOCAL, ROLE, Label, labelled, numbers_in, where
 from cprl.system.defaults import Diagonal, Fresh
 from cprl.system.working import working
 from cprl.terminal import style

@@ -18,11 +18,11 @@ from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.envs.make_env import is_playable, make_env, spaces_of
 from cprl.measuring.evaluate import evaluate
-from cprl.measuring.table import BACKGROUND, FOCAL, ROLE, complete
+from cprl.measuring.table import BACKGROUND, FOCAL, ROLE, Label, complete, labelled
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
 from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
-from cprl.runs.episodes import Label, labelled
+from cprl.runs.episodes import table_of
 from cprl.system.defaults import Fresh
 from cprl.system.working import say_how_far
 from cprl.training.agents import LoadedRun, Population, StoredAgent, in_a_row, load, stored_policies
@@ -165,10 +165,8 @@ def play(
     for group, env in worlds_of(fresh, place):
         policies = policies_of(fresh, place, agents, group)
         ended = evaluate(env, policies, explore=not fresh.greedy, metrics=metrics)
-        for place_in_group, replica in enumerate(group):
-            first = place_in_group * fresh.episodes
-            parts.append((labels or {}, replica, ended[first : first + fresh.episodes]))
-    table = labelled(parts)
+        parts.append(table_of(ended, group))
+    table = labelled(pa.concat_tables(parts), **(labels or {}))
     place_of_world = table.column_names.index("replica") + 1
     world = table["replica"].to_numpy() * fresh.episodes + table["episode"].to_numpy()
     table = table.add_column(place_of_world, "world", pa.array(world, pa.int32()))

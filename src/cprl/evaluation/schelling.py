@@ -45,10 +45,9 @@ from cprl.evaluation.lanes import (
 from cprl.evaluation.pages import heading
 from cprl.measuring.registry import INCOME
 from cprl.measuring.statistics import Estimate, Family, difference, estimate
-from cprl.measuring.table import by_replica, where
+from cprl.measuring.table import Label, by_replica, where
 from cprl.measuring.windows import Values
 from cprl.policies.scripted import SCRIPTED_POLICIES
-from cprl.runs.episodes import Label
 from cprl.system.defaults import Fresh
 from cprl.system.working import working
 from cprl.terminal import style

@@ -6,10 +6,12 @@ samples have the degrees of freedom of B. L. Welch, "The generalization of 'Stud
 different population variances are involved" (1947).
 """
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import chain, compress
 from math import inf, isclose, isfinite, isnan, nan
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, Self
 
 import numpy as np
 import pyarrow as pa
@@ -27,13 +29,13 @@ class Estimate:
     """A number with its interval."""
 
     value: float
-    low: float
-    high: float
+    low: float = nan
+    high: float = nan
     """The bounds of the interval; NaN for a single replica."""
     replicas: int
     """Of all samples together; of paired differences, the pairs; 0 of a number that is undefined in all
     episodes, whose value is NaN."""
-    p_value: float = float("nan")
+    p_value: float = nan
     """How often a value at least as far from 0 would come by chance if it were 0, by the same t, two-sided;
     NaN for a single replica."""
     bounds: tuple[float, float] = (-inf, inf)
@@ -94,9 +96,9 @@ class Estimate:
         form += form_for(*numbers) if form in ("", "+") else ""
         value, low, high = (f"{number:{form}}" for number in numbers)
         text = f"{value} [{low}, {high}]" if np.isfinite([self.low, self.high]).all() else value
-        return (
-            f"{text}, undefined in {self.undefined} of {self.episodes} episodes" if self.undefined else text
-        )
+        if self.undefined:
+            text += f", undefined in {self.undefined} of {self.episodes} episodes"
+        return text
 
 
 CUT: Final = "Bounds of a metric cut an interval where Student's t passes them."
@@ -167,21 +169,7 @@ def holm(p_values: ArrayLike) -> NDArray[np.bool_]:
 
 
 HOLM: Final = "* not 0 by Holm's method"
-"""What a star of `starred` means; "for ..." says which comparisons."""
-
-
-def starred(differences: Sequence[Estimate], form: str = "") -> list[str]:
-    """Return the texts of all differences that are compared in one place, with a star where `holm` says that
-    one is not 0.
-
-    Args:
-        form: of the value alone, e.g. "+.3g"; by default the value has its interval.
-    """
-    are_apart = holm([difference.p_value for difference in differences])
-    return [
-        (f"{difference.value:{form}}" if form else str(difference)) + " *" * bool(is_apart)
-        for difference, is_apart in zip(differences, are_apart, strict=True)
-    ]
+"""What a star after a difference means; "for ..." says which comparisons."""
 
 
 def curve_interval(curves: ArrayLike) -> tuple[Values, Values, Values]:
@@ -208,22 +196,24 @@ def curve_interval(curves: ArrayLike) -> tuple[Values, Values, Values]:
 
 
 def _estimate(value: float, *samples: Values) -> Estimate:
-    """A mean or a difference of means with its interval by t, of the degrees of freedom of Welch."""
-    from scipy import stats
+    """Return a mean, or the difference of two, with its interval by t, of the degrees of freedom of Welch.
 
-    low = high = p_value = float("nan")
-    if all(len(sample) > 1 for sample in samples):
-        parts = [float(sample.var(ddof=1)) / len(sample) for sample in samples]
-        low, high, p_value = value, value, float(value == 0)
-        if error := sum(parts) ** 0.5:
-            freedoms = [len(sample) - 1 for sample in samples]
-            of_parts = zip(parts, freedoms, strict=True)
-            freedom = sum(parts) ** 2 / sum(part**2 / of_part for part, of_part in of_parts)
-            reach = float(stats.t.ppf((1 + CONFIDENCE) / 2, freedom)) * error
-            low, high = value - reach, value + reach
-            p_value = 2 * float(stats.t.sf(abs(value) / error, freedom))
-    replicas = sum(map(len, samples))
-    return Estimate(value=value, low=low, high=high, replicas=replicas, p_value=p_value)
+    `scipy.stats.ttest_1samp` and `ttest_ind` give the same, much slower, and warn of samples without spread.
+    """
+    from scipy.special import stdtr, stdtrit
+
+    one = Estimate(value=value, replicas=sum(map(len, samples)))
+    if any(len(sample) < 2 for sample in samples):
+        return one
+    parts = np.array([sample.var(ddof=1) / len(sample) for sample in samples])
+    error = float(parts.sum() ** 0.5)
+    if not error:
+        return replace(one, low=value, high=value, p_value=float(value == 0))
+    freedoms = np.array([len(sample) - 1 for sample in samples])
+    freedom = parts.sum() ** 2 / (parts**2 / freedoms).sum()
+    reach = float(stdtrit(freedom, (1 + CONFIDENCE) / 2)) * error
+    p_value = 2 * float(stdtr(freedom, -abs(value) / error))
+    return replace(one, low=value - reach, high=value + reach, p_value=p_value)
 
 
 def _sample(values: ArrayLike) -> Values:
@@ -231,11 +221,6 @@ def _sample(values: ArrayLike) -> Values:
     if sample.ndim != 1 or not len(sample) or not np.isfinite(sample).all():
         raise ValueError(f"values is {sample.tolist()}; allowed: [R], a finite number for each replica")
     return sample
-
-
-def signed(difference: Estimate | None) -> str:
-    """Return a difference as a cell of a table; "" where there is none."""
-    return "" if difference is None else f"{difference:+}"
 
 
 def notes_on(estimates: Iterable[Estimate]) -> list[str]:
@@ -246,12 +231,13 @@ def notes_on(estimates: Iterable[Estimate]) -> list[str]:
 
 
 def estimate_if_finite(means: Sequence[float]) -> Estimate:
-    """Return the estimate of means that may not be finite; then it is their mean, without an interval."""
-    if all(map(isfinite, means)):
+    """Return the estimate of means that may not be finite; then it is their mean, without an interval, and
+    NaN of none."""
+    if means and all(map(isfinite, means)):
         return estimate(means)
     with np.errstate(invalid="ignore"):
-        value = float(np.mean(means))
-    return Estimate(value=value, low=nan, high=nan, replicas=len(means))
+        value = float(np.mean(means)) if means else nan
+    return Estimate(value=value, replicas=len(means))
 
 
 Labels = tuple[Any, ...]
@@ -313,8 +299,8 @@ class Family(Mapping[Key, Estimate]):
     def note(self, of: str) -> str:
         """Return what bold means; `of` says where these differences stand, e.g. "of this table"."""
         number = f"the {self.tests} differences" if self.tests != 1 else "the one difference"
-        told = sum(not isnan(one.p_value) for one in self.values())
-        once = ", of which those that two columns have in common count once" if told > self.tests else ""
+        stands = sum(not isnan(one.p_value) for one in self.values())
+        once = ", of which those that two columns have in common count once" if stands > self.tests else ""
         return (
             f"Bold: not 0 by Holm's method for {number} {of}{once} (two-sided t-tests, "
             f"{1 - CONFIDENCE:.0%} for all together); intervals are of single comparisons."
@@ -351,18 +337,18 @@ def estimates(table: pa.Table, numbers: Sequence[str] | str = (), by: Sequence[s
         by: the labels that are kept apart.
     """
     table = complete(table)
-    keys = (by,) if isinstance(by, str) else tuple(by)
-    names = [numbers] if isinstance(numbers, str) else list(numbers) or numbers_in(table)
+    keys = _listed(by)
+    names = _listed(numbers) or tuple(numbers_in(table))
     clock = clock_of(table)
     samples = {name: _samples(table, name, keys) for name in names}
-    labels = dict.fromkeys(each for of_number in samples.values() for each in of_number)
-    found = {
-        (*each, name): samples[name][each].estimate(name, clock)
+    labels = dict.fromkeys(chain.from_iterable(samples.values()))
+    means = {
+        (*each, name): samples[name][each].estimate.of(name, clock)
         for each in labels
         for name in names
         if each in samples[name]
     }
-    return Family(found, keys)
+    return Family(means, keys)
 
 
 Reference = Mapping[str, Any] | Callable[[dict[str, Any]], Mapping[str, Any]]
@@ -389,10 +375,10 @@ def differences(
         family: what the differences of this call are, which Holm's method judges all together.
     """
     table = complete(table)
-    keys = (by,) if isinstance(by, str) else tuple(by)
+    keys = _listed(by)
     clock = clock_of(table)
-    found: dict[Key, Estimate] = {}
-    for name in [numbers] if isinstance(numbers, str) else numbers:
+    changes: dict[Key, Estimate] = {}
+    for name in _listed(numbers):
         samples = _samples(table, name, keys)
         for labels, sample in samples.items():
             row = dict(zip(keys, labels, strict=True))
@@ -400,10 +386,16 @@ def differences(
             home = tuple(other[key] for key in keys)
             if home == labels or home not in samples:
                 continue
-            one = sample.minus(samples[home], paired=paired)
-            if one is not None:
-                found[(*labels, name)] = one.between(name, clock)
-    return judged(found, keys, family)
+            values, usual = sample.values, samples[home].values
+            if paired:
+                change = _weighted_sum([(1.0, values), (-1.0, usual)])
+            elif values and usual:
+                change = difference(list(values.values()), list(usual.values()), paired=False)
+            else:
+                continue
+            if change.replicas:
+                changes[(*labels, name)] = change.between(name, clock)
+    return judged(changes, keys, family)
 
 
 Weights = Mapping[Any, float]
@@ -426,21 +418,24 @@ def contrasts(
         weights: by the name of each contrast, see `mean_difference`.
         family: what the contrasts of this call are, which Holm's method judges all together.
     """
-    keys = (by,) if isinstance(by, str) else tuple(by)
-    found: dict[Key, Estimate] = {}
-    for number in [numbers] if isinstance(numbers, str) else numbers:
+    keys = _listed(by)
+    sums: dict[Key, Estimate] = {}
+    for number in _listed(numbers):
         samples = _samples(table, number, keys)
         for name, of_rows in weights.items():
-            parts = [
-                (weight, samples.get(labels if isinstance(labels, tuple) else (labels,), _NOTHING).values)
-                for labels, weight in of_rows.items()
-                if weight
-            ]
-            replicas = sorted(set.intersection(*(set(values) for _, values in parts)))
-            sums = [sum(weight * values[replica] for weight, values in parts) for replica in replicas]
-            if sums:
-                found[name, number] = estimate_if_finite(sums)
-    return judged(found, ["contrast"], family)
+            rows = {labels if isinstance(labels, tuple) else (labels,): of_rows[labels] for labels in of_rows}
+            parts = [(weight, samples[labels].values) for labels, weight in rows.items() if weight]
+            one = _weighted_sum(parts)
+            if one.replicas:
+                sums[name, number] = one
+    return judged(sums, ["contrast"], family)
+
+
+def _weighted_sum(parts: Sequence[tuple[float, Mapping[int, float]]]) -> Estimate:
+    """Return the estimate of a weighted sum of values by replica, over the replicas that have all of them."""
+    replicas = set.intersection(*(set(values) for _, values in parts))
+    sums = [sum(weight * values[replica] for weight, values in parts) for replica in sorted(replicas)]
+    return estimate_if_finite(sums)
 
 
 def main_effect(levels: Mapping[Any, Any], level: Any, first: Any) -> Weights:
@@ -463,68 +458,54 @@ def mean_difference(signs: Weights) -> Weights:
     return {row: sign / rows for row, sign in signs.items()}
 
 
-class _Sample(NamedTuple):
+@dataclass
+class _Sample:
     """A number of some replicas."""
 
-    values: dict[int, float]
+    values: dict[int, float] = field(default_factory=dict)
     """The mean of each replica in which it is defined."""
-    episodes: int
-    undefined: int
+    episodes: int = 0
+    undefined: int = 0
 
-    def estimate(self, name: str, clock: float) -> Estimate:
-        if not self.values:
-            return Estimate(
-                value=nan, low=nan, high=nan, replicas=0, episodes=self.episodes, undefined=self.undefined
-            )
-        one = estimate_if_finite(list(self.values.values())).of(name, clock)
-        return replace(one, episodes=self.episodes, undefined=self.undefined)
-
-    def minus(self, other: Self, *, paired: bool) -> Estimate | None:
-        if paired:
-            pairs = [
-                value - other.values[replica]
-                for replica, value in self.values.items()
-                if replica in other.values
-            ]
-            return estimate_if_finite(pairs) if pairs else None
-        samples = [list(self.values.values()), list(other.values.values())]
-        return difference(*samples, paired=False) if all(samples) else None
-
-
-_NOTHING: Final = _Sample({}, 0, 0)
+    @property
+    def estimate(self) -> Estimate:
+        means = list(self.values.values())
+        return replace(estimate_if_finite(means), episodes=self.episodes, undefined=self.undefined)
 
 
 def _samples(table: pa.Table, number: str, by: Sequence[str]) -> dict[Labels, _Sample]:
     """Return a number of the replicas of each choice of labels."""
-    samples: dict[Labels, _Sample] = {}
-    rows = by_replica(table, number, by).to_pydict()
-    for labels in zip(
-        *(rows[name] for name in (*by, "replica", "value", "episodes", "undefined")), strict=True
-    ):
-        *key, replica, value, episodes, undefined = labels
-        before = samples.get(tuple(key), _NOTHING)
-        values = before.values if value is None else {**before.values, replica: value}
-        samples[tuple(key)] = _Sample(values, before.episodes + episodes, before.undefined + undefined)
+    samples: dict[Labels, _Sample] = defaultdict(_Sample)
+    for row in by_replica(table, number, by).to_pylist():
+        sample = samples[tuple(row[name] for name in by)]
+        sample.episodes += row["episodes"]
+        sample.undefined += row["undefined"]
+        if row["value"] is not None:
+            sample.values[row["replica"]] = row["value"]
     return samples
 
 
-def judged(found: Mapping[Key, Estimate], by: Sequence[str] = (), name: str = "") -> Family:
+def _listed(names: Sequence[str] | str) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else tuple(names)
+
+
+def judged(differences: Mapping[Key, Estimate], by: Sequence[str] = (), name: str = "") -> Family:
     """Return differences as a family, each with whether it is not 0 by Holm's method for all of them.
 
     One that equals that of the metric which its own is `same_as` is the same test, and counts once.
     """
     tests: dict[Key, list[Key]] = {}
-    for key, one in found.items():
+    for key, one in differences.items():
         if isnan(one.p_value):
             continue
         metric = METRICS.get(key[-1])
         same = (*key[:-1], metric.same_as if metric else None)
-        is_same = same in tests and _is_same(one, found[same])
+        is_same = same in tests and _is_same(one, differences[same])
         tests.setdefault(same if is_same else key, []).append(key)
-    differ = holm([found[key].p_value for key in tests])
-    marked = {key for keys, is_apart in zip(tests.values(), differ, strict=True) if is_apart for key in keys}
-    told = {key: replace(one, differs=key in marked) for key, one in found.items()}
-    return Family(told, by, name or f"these {len(tests)} differences", len(tests))
+    differ = holm([differences[key].p_value for key in tests])
+    marked = set(chain.from_iterable(compress(tests.values(), differ)))
+    family = {key: replace(one, differs=key in marked) for key, one in differences.items()}
+    return Family(family, by, name or f"these {len(tests)} differences", len(tests))
 
 
 _ROUNDING: Final = 1e-6

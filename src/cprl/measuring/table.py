@@ -61,10 +61,15 @@ def where(table: pa.Table, **labels: object) -> pa.Table:
     return table
 
 
+Label = Mapping[str, str | int]
+"""What was played: the values of the first columns of a table, by name."""
+
+
 def labelled(table: pa.Table, **labels: object) -> pa.Table:
     """Return a table with these columns first, each of one value."""
     for place, (name, value) in enumerate(labels.items()):
-        table = table.add_column(place, name, pa.array([value] * len(table)))
+        kind = pa.int32() if isinstance(value, int) else None
+        table = table.add_column(place, name, pa.array([value] * len(table), kind))
     return table
 
 

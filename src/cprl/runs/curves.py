@@ -2,14 +2,13 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute
 from numpy.typing import NDArray
 
-from cprl.measuring.table import Numbers, complete, metrics_in, world_of
+from cprl.measuring.table import Numbers, complete, metrics_in, where, world_of
 from cprl.measuring.windows import Values, last_of
 from cprl.runs.episodes import read_episodes
 
@@ -31,51 +30,39 @@ def as_curves(table: pa.Table, *, last: int | None = None) -> dict[str, Values]:
     """Like `curves_of`, from a table of `read_episodes`."""
     if not table.num_rows:
         return {}
-    table = complete(table if last is None else last_of(table, last))
-    agent = table["agent"].to_numpy()
-    replica, place, shape = _places(table)
-    read = place < shape[1]
-    cells = replica[read], place[read], agent[read]
-
-    def values(name: str) -> Values:
-        """A column as [R, E, N]."""
-        column = np.full((*shape, int(agent.max()) + 1), np.nan)
-        column[cells] = table[name].to_numpy()[read]
-        return column
-
-    curves = {name: values(name)[..., 0].copy() for name in metrics_in(table.schema)}
-    returns = values("return")
-    curves |= {f"return_{number}": returns[..., number].copy() for number in np.unique(agent)}
+    table = complete(table if last is None else last_of(table, last)).sort_by(_ORDER)
+    first = where(table, agent=0)
+    at = _places(first)
+    curves = {name: np.asarray(first[name].to_numpy()[at], np.float64) for name in metrics_in(table.schema)}
+    for agent in table["agent"].unique().to_pylist():
+        returns = where(table, agent=agent)["return"].to_numpy()
+        curves[f"return_{agent}"] = np.asarray(returns[at], np.float64)
     return curves
 
 
 def worlds_of(table: pa.Table) -> Numbers:
     """Return the world of each episode of the curves of a table, int64 [R, E]; of a table that has none, the
     replica."""
-    replica, place, shape = _places(table)
-    read = place < shape[1]
-    worlds = np.zeros(shape, np.int64)
-    worlds[replica[read], place[read]] = world_of(table)[read]
-    return worlds
+    first = where(table.sort_by(_ORDER), agent=0)
+    return world_of(first)[_places(first)]
 
 
-def _places(table: pa.Table) -> tuple[Numbers, Numbers, tuple[int, int]]:
-    """Return the row and the place of each row's episode in its replica, and how many of both: R, and as many
-    episodes as all replicas have."""
-    replicas, replica = np.unique(table["replica"].to_numpy(), return_inverse=True)
-    episode = table["episode"].to_numpy().astype(np.int64)
-    size = int(episode.max()) + 1
-    keys, row = np.unique(replica * size + episode, return_inverse=True)
-    firsts = np.searchsorted(keys // size, np.arange(len(replicas)))
-    counts = np.diff(np.append(firsts, len(keys)))
-    return replica, row - firsts[replica], (len(replicas), int(counts.min()))
+_ORDER: Final = [("replica", "ascending"), ("episode", "ascending"), ("agent", "ascending")]
+
+
+def _places(first: pa.Table) -> Numbers:
+    """Return the rows of one agent in which each episode of each replica stands, int64 [R, E]: as many as all
+    replicas have."""
+    _, starts, counts = np.unique(first["replica"].to_numpy(), return_index=True, return_counts=True)
+    return np.asarray(starts[:, None] + np.arange(counts.min()))
 
 
 def episode_of_turn(table: pa.Table, turn: float) -> float | None:
     """The episode with which the replicas of a training reach a turn, their mean; None if one does not."""
-    first = table.filter(pa.compute.equal(table["agent"], 0))
-    replica, steps = first["replica"].to_numpy(), first["steps"].to_numpy()
-    world = first["world"].to_numpy() if "world" in first.column_names else replica
+    first = where(table, agent=0)
+    replica = first["replica"].to_numpy()
+    steps = first["steps"].to_numpy()
+    world = world_of(first)
     ended = np.zeros(len(steps), np.int64)
     for number in np.unique(world):
         ended[world == number] = steps[world == number].cumsum()

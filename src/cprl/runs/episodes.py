@@ -136,7 +136,7 @@ class EpisodeTable:
         if not episodes:
             return
         file = self._file or self._open()  # without a checkpoint of the last attempt it starts over
-        batch = rows_of(episodes, None, self._schema or schema_of(episodes[0]))
+        batch = rows_of(episodes, self._schema or schema_of(episodes[0]))
         end, left = file.tell(), memoryview(_message(batch, is_first=self._schema is None))
         try:
             while left:
@@ -254,7 +254,7 @@ def _refuse_other_columns(path: str | os.PathLike[str], table: pa.Table) -> None
     for name in (*_NUMBERED, "return", "steps", "terminated"):
         if name not in names:
             raise ValueError(f"{is_not}it has no column {name}")
-    for name, kind in {**COLUMNS, **OF_INSTITUTIONS}.items():
+    for name, kind in _KINDS.items():
         if name not in names:
             continue
         if names.count(name) > 1:
@@ -292,11 +292,6 @@ def read_evaluations(run: Path) -> pa.Table | None:
     return read_rows(run / EVALUATIONS) if (run / EVALUATIONS).exists() else None
 
 
-def as_table(episodes: Sequence[Episode], replica: int) -> pa.Table:
-    """At least one episode of a replica as a table with the columns of a run's table."""
-    return pa.Table.from_batches([rows_of(episodes, replica, schema_of(episodes[0]))])
-
-
 def _reopen(path: Path, journal: Path) -> None:
     """Write the journal of a finished table again, a batch for each episode."""
     table = read_rows(path).combine_chunks()
@@ -324,13 +319,14 @@ OF_INSTITUTIONS: Final = {name: one.column for name, one in _OF_TOTALS.items() i
 `cprl.measuring.registry.counts_for` has them."""
 
 
+_KINDS: Final = {**COLUMNS, **OF_INSTITUTIONS}
+
 LEFT_OUT: Final = b"left_out"
 """The key of the schema's metadata whose value says which columns are left out, and why, if any are."""
 
 
 def _schema(names: Iterable[str]) -> pa.Schema:
-    kinds = {**COLUMNS, **OF_INSTITUTIONS}
-    return pa.schema({name: kinds.get(name, pa.float64()) for name in names})
+    return pa.schema({name: _KINDS.get(name, pa.float64()) for name in names})
 
 
 def schema_of(episode: Episode) -> pa.Schema:
@@ -339,10 +335,9 @@ def schema_of(episode: Episode) -> pa.Schema:
     return schema.with_metadata({LEFT_OUT: missing}) if missing else schema
 
 
-def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema) -> pa.RecordBatch:
-    """A row for each episode and agent, with the schema of the table's first episode; None as the replica for
-    each episode's own."""
-    parts = [_columns(episode, replica) for episode in episodes]
+def rows_of(episodes: Sequence[Episode], schema: pa.Schema) -> pa.RecordBatch:
+    """Return a row for each episode and agent, with the schema of the table's first episode."""
+    parts = list(map(_columns, episodes))
     for columns in parts:
         if columns.keys() != set(schema.names):
             more, lacks = columns.keys() - set(schema.names), set(schema.names) - columns.keys()
@@ -361,42 +356,25 @@ def rows_of(episodes: Sequence[Episode], replica: int | None, schema: pa.Schema)
     return pa.record_batch(arrays, schema=schema)
 
 
-def _columns(episode: Episode, replica: int | None = None) -> dict[str, Any]:
+def _columns(episode: Episode) -> dict[str, Any]:
     """Return the columns of an episode in order, [N] each."""
     agents = np.arange(len(episode.return_))
-    entries: dict[str, Any] = dict(episode.counts or {})
-    entries |= {name: value for name, value in vars(episode).items() if value is not None}
-    entries |= {"agent": agents, "return": episode.return_}
-    if replica is not None:
-        entries["replica"] = replica
+    entries = {**(episode.counts or {}), **vars(episode), "agent": agents, "return": episode.return_}
     if episode.wanted_return is None:  # no training, of whose worlds it is one
         del entries["world"]
-    values = {name: entries[name] for name in (*COLUMNS, *OF_INSTITUTIONS) if name in entries}
-    values = {**episode.metrics, **values}
-    order = dict.fromkeys([name for name in (*COLUMNS, *OF_INSTITUTIONS) if name in values])
-    return {name: np.broadcast_to(values[name], agents.shape) for name in {**order, **values}}
+    columns = {name: entries[name] for name in _KINDS if entries.get(name) is not None}
+    columns = {**columns, **episode.metrics, **columns}
+    return {name: np.broadcast_to(values, agents.shape) for name, values in columns.items()}
 
 
-Label = Mapping[str, str | int]
-"""The values of the first columns, by name."""
-
-
-def labelled(parts: Iterable[tuple[Label, int, Sequence[Episode]]]) -> pa.Table:
-    """A table like `episodes.parquet`, with label columns first.
-
-    Args:
-        parts: labels, all with the same names; the index of a replica; and its episodes, numbered from 0.
-    """
-    tables = []
-    for label, replica, episodes in parts:
-        table = as_table(
-            [replace(episode, episode=number) for number, episode in enumerate(episodes)], replica
-        )
-        for place, (name, value) in enumerate(label.items()):
-            kind = pa.string() if isinstance(value, str) else pa.int32()
-            table = table.add_column(place, pa.field(name, kind), pa.array([value] * len(table), kind))
-        tables.append(table)
-    return pa.concat_tables(tables)
+def table_of(episodes: Sequence[Episode], replicas: Sequence[int] = (0,)) -> pa.Table:
+    """Return episodes outside of a training as a table, as many of each replica in turn, numbered from 0."""
+    each = len(episodes) // len(replicas)
+    numbered = [
+        replace(episode, replica=replicas[place // each], episode=place % each)
+        for place, episode in enumerate(episodes)
+    ]
+    return pa.Table.from_batches([rows_of(numbered, schema_of(episodes[0]))])
 
 
 def write_table(path: Path, table: pa.Table, *, over: bool = False) -> None:

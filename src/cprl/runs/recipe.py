@@ -394,11 +394,10 @@ def git_state(package: Path = _PACKAGE) -> dict[str, str | bool] | None:
         return {"commit": str(built["commit"]), "dirty": bool(built["dirty"])}
     if _git(package, "ls-files", "--error-unmatch", "__init__.py") is None:
         return None
-    commit = _git(package, "rev-parse", "HEAD")
-    changes = _git(package, "status", "--porcelain", "--untracked-files=no")
-    if commit is None or changes is None:
+    state = _git(package, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+    if state is None:
         return None
-    return {"commit": commit, "dirty": changes != ""}
+    return {"commit": state.removesuffix("-dirty"), "dirty": state.endswith("-dirty")}
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

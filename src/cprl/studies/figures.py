@@ -16,6 +16,7 @@ from typing import Any, Final
 import matplotlib
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.ticker import NullLocator
@@ -23,7 +24,7 @@ from matplotlib.ticker import NullLocator
 from cprl.measuring.outcome import DECLINE, HARVESTING, NO_BETTER, RECOVERY, TRAGEDY
 from cprl.measuring.registry import COLLECTIVE_RETURN, bounds, title
 from cprl.measuring.statistics import Estimate, Family, curve_interval, form_for
-from cprl.measuring.table import where
+from cprl.measuring.table import WINDOWS, by_replica, where
 from cprl.measuring.windows import SMOOTHED_EPISODES, Values, running_mean
 from cprl.studies.tables.comparing import (
     INTERVALS,
@@ -418,14 +419,13 @@ def _draw_courses(
         rows = where(training, condition=name, metric=metric)
         if not len(rows):
             continue
-        starts, lengths, values = _windows_of(rows)
+        lengths = _windows_of(rows, WINDOWS)
         length = int(lengths.max())
-        episodes = min(sum(of_replica) for of_replica in _lists(rows, "window_episodes"))
+        episodes = pc.min(by_replica(rows, metric)["episodes"]).as_py()
         is_whole = (lengths == length).all(0)  # those that all replicas have
         count = max(1, min(SMOOTHED_EPISODES, episodes // _PART) // length)
-        middles = (starts[0, is_whole] + (length - 1) / 2).astype(np.float64)
-        at = running_mean(middles, count)
-        curve = curve_interval(running_mean(values[:, is_whole], count))
+        at = running_mean(_windows_of(rows, "episode")[0, is_whole] + (length - 1) / 2, count)
+        curve = curve_interval(running_mean(_windows_of(rows, "value")[:, is_whole], count))
         label = " ".join(label.splitlines())
         label = f"\N{ZERO WIDTH SPACE}{label}" if label.startswith("_") else label  # matplotlib would hide it
         dash = DASHES[place % len(DASHES)] if is_dashed and len(lines) > 2 else "-"
@@ -435,20 +435,12 @@ def _draw_courses(
     return windows or {1}
 
 
-def _windows_of(rows: pa.Table) -> list[Values]:
-    """Return the first episode, the episodes and the value of the windows that all replicas of a condition
-    have, each [R, W]."""
-    columns = [_lists(rows, name) for name in ("episode", "window_episodes", "value")]
-    fewest = min(map(len, columns[0]))
-    return [np.array([of_replica[:fewest] for of_replica in column]) for column in columns]
-
-
-def _lists(rows: pa.Table, name: str) -> list[list[float]]:
-    """Return a column by replica."""
-    lists: list[list[float]] = (
-        rows.group_by("replica", use_threads=False).aggregate([(name, "list")])[f"{name}_list"].to_pylist()
-    )
-    return lists
+def _windows_of(rows: pa.Table, number: str) -> Values:
+    """Return a column of the windows that all replicas of a condition have, [R, W]."""
+    replicas = [
+        where(rows, replica=replica)[number].to_numpy() for replica in rows["replica"].unique().to_pylist()
+    ]
+    return np.array([of_replica[: min(map(len, replicas))] for of_replica in replicas])
 
 
 # Maps of two factors

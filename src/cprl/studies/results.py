@@ -172,20 +172,20 @@ def answer_of(table: StudyTable) -> str:
     if not table.metrics or len(table.design.conditions) < 2:
         return ""
     metrics = metrics_of(table, part=EVALUATION)
-    asked = {INCOME: _INCOME, COLLECTIVE_RETURN: _HARVEST}
-    if not asked.keys() <= set(metrics):
-        asked = {metrics[0]: title(metrics[0])}
+    subjects = {INCOME: _INCOME, COLLECTIVE_RETURN: _HARVEST}
+    if not subjects.keys() <= set(metrics):
+        subjects = {metrics[0]: title(metrics[0])}
     beside = f"beside {cell(table.design.reference)}, {pairing_text(table)}"
     family = differences_of(table, metrics, part=EVALUATION)
     tests = f"{family.tests} differences of their table below"
     parts = []
-    for metric, words in asked.items():
+    for metric, words in subjects.items():
         if weights_of(table):
             family = effects_of(table, metric, part=EVALUATION)
             beside = "effects of each factor over all cells of the grid, paired by replica"
             tests = f"{family.tests} effects on a metric"
-        found = {name: one for (name, number), one in family.items() if number == metric}
-        parts += [f"- {words}:", *_said(found, unit(metric))]
+        changes = {name: one for (name, number), one in family.items() if number == metric}
+        parts += [f"- {words}:", *_lines(changes, unit(metric))]
     what = f"In {episodes_text(table, EVALUATION)}, {beside}"
     what += f"; by Holm's method for the {tests}:" if family.tests else ":"
     return "\n".join([what, "", *parts])
@@ -198,10 +198,10 @@ _ALONE: Final = "not shown among so many, though it would be alone"
 _UNTOLD: Final = "cannot be told, as one replica has no interval"
 
 
-def _said(differences: Mapping[str, Estimate], unit_of: str) -> list[str]:
+def _lines(differences: Mapping[str, Estimate], unit_of: str) -> list[str]:
     """Return lines on which differences are more and less than 0; of those not shown, how large one would
     have to be."""
-    said: dict[str, list[str]] = {kind: [] for kind in ("more", "less", _NONE, _ALONE, _UNTOLD)}
+    by_kind: dict[str, list[str]] = {kind: [] for kind in ("more", "less", _NONE, _ALONE, _UNTOLD)}
     for name, one in differences.items():
         text = f"{cell(name)} {one:+}"
         if one.differs:
@@ -214,5 +214,5 @@ def _said(differences: Mapping[str, Estimate], unit_of: str) -> list[str]:
             kind = _NONE
             size = f"{one.reach:{form_for(one.value, one.low, one.high)}} {unit_of}".rstrip()
             text += f" (differences below {size} would not show)" if one.reach else ""
-        said[kind].append(text)
-    return [f"  - {kind}: {'; '.join(texts)}" for kind, texts in said.items() if texts]
+        by_kind[kind].append(text)
+    return [f"  - {kind}: {'; '.join(texts)}" for kind, texts in by_kind.items() if texts]

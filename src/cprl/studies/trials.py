@@ -385,19 +385,13 @@ def begin_from_shorter(
     callbacks = [callback.resolve() for callback in experiment.callbacks]
     if any(not isinstance(callback, type) or depends_on_episodes(callback) for callback in callbacks):
         return None
-    wanted = without_length({**recipe["experiment"], **FREE})
     beginnings = []
     for other in (finished or FinishedRuns(run.parent)).like(recipe["experiment"]):
-        with suppress(ValueError, KeyError, TypeError):  # of a recipe that cannot be read
-            stored = read_recipe(other)
-            before = recipe_config(stored)
-            if (
-                not differences(without_length({**before, **FREE}), wanted, "experiment", Experiment)
-                and Length.of(before).is_shorter_than(experiment.length)
-                and not changed_code(stored)
-                and any(map(is_ending, checkpoints_in(other / FOLDER)))
-            ):
-                beginnings.append((Length.of(before).number, other))
+        stored = read_recipe(other)
+        length = Length.of(recipe_config(stored))
+        is_kept = any(map(is_ending, checkpoints_in(other / FOLDER))) and not changed_code(stored)
+        if is_kept and length.is_shorter_than(experiment.length):
+            beginnings.append((length.number, other))
     if not beginnings:
         return None
     _, shorter = max(beginnings)

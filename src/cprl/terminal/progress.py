@@ -13,6 +13,7 @@ from rich.text import Text
 from tensordict import TensorDictBase
 
 from cprl.measuring.episodes import Episode
+from cprl.runs.length import Length
 from cprl.system.output import NotebookLine
 from cprl.system.output import console as safe_console
 from cprl.system.times import CLOCK, Speed
@@ -31,7 +32,7 @@ TIMED_STEPS: Final = 20
 
 
 def in_words(seconds: float) -> str:
-    """A duration: "47 s", "12 min", "3 h 05 min"."""
+    """Return a duration as "47 s", "12 min" or "3 h 05 min"."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -49,8 +50,7 @@ class ProgressBar:
     Args:
         game: a game or its environment. The length of an episode is `episode_steps` of its `rules`, if it has
             them; else that of the last episode.
-        episodes: of each replica, about.
-        steps: of each replica; None for a training of so many episodes. The bar counts what is given.
+        episodes: of each replica; or `steps`. The bar counts what is given.
         worlds: of each replica.
     """
 
@@ -58,7 +58,7 @@ class ProgressBar:
         self,
         game: object = None,
         *,
-        episodes: int,
+        episodes: int | None = None,
         steps: int | None = None,
         title: str = "training",
         replicas: int = 1,
@@ -67,8 +67,9 @@ class ProgressBar:
     ) -> None:
         self.console = console or safe_console()
         rules = getattr(getattr(game, "game", game), "rules", None)
-        self._title, self._clock = title, getattr(rules, "episode_steps", None)
-        self._last_steps = 0
+        self._title = title
+        self._length = Length.of({"episodes": episodes, "steps": steps})
+        self._episode_steps = self._clock = getattr(rules, "episode_steps", None)
         self._progress = Progress(
             TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, ratio=1)),
             BarColumn(None, table_column=Column(ratio=1)),
@@ -80,39 +81,39 @@ class ProgressBar:
         )
         elsewhere_s = _NOTEBOOK_PERIOD_S if self.console.is_jupyter else _LINE_PERIOD_S
         self._period_s = _BAR_PERIOD_S if self.console.is_terminal else elsewhere_s
-        self._all_steps = steps
-        self._task = self._progress.add_task(title, total=steps or episodes, values="")
-        self._latest = {"return": "-", "epsilon": ""}
+        self._task = self._progress.add_task(title, total=self._length.number, values="")
+        self._return = "-"
+        self._epsilon = ""
         self._turns = self._steps = self._steps_running = self._episodes = 0
         self._speed = Speed()
         self._course = Speed()
         """How fast steps, and episodes or steps of each replica, are done."""
-        self._left_of, self._replicas = steps or episodes, replicas
+        self._replicas = replicas
         self._worlds = replicas * worlds
         self._returns: deque[float] = deque(maxlen=self._worlds)
         self._notebook_line = NotebookLine()
         self._silence = silent()
-        self._compiled_before_s = CLOCK.total_s
-        self._is_over, self._lines = Event(), Thread(target=self._say_compiling, daemon=True)
+        self._is_over = Event()
+        self._lines = Thread(target=self._say_compiling, daemon=True)
 
     @classmethod
     def of(cls, experiment: Any) -> Self:
         """Return the bar of an `Experiment`."""
         return cls(
             experiment.game,
-            episodes=experiment.length.episodes,
+            episodes=experiment.episodes,
             steps=experiment.steps,
             replicas=experiment.replicas,
             worlds=experiment.worlds,
         )
 
     def on_start(self, training: Any) -> None:
-        """Continues where the training does."""
+        """Continue where the training does."""
         self._steps = training.steps * self._replicas
         self._episodes = training.episodes_played
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Counts the turns of a batch and updates the bar if it is due."""
+        """Count the turns of a batch and update the bar if it is due."""
         if not self._turns:  # do not count the time before the first step
             self._speed, self._course = Speed(self._steps), Speed(self._done())
         self._turns += 1
@@ -124,26 +125,23 @@ class ProgressBar:
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         self._episodes += 1
         self._steps_running = max(0, self._steps_running - episode.steps)
-        self._last_steps = episode.steps
+        self._episode_steps = self._clock or episode.steps
         self._returns.append(float(episode.return_.sum()))
         mean = sum(self._returns) / len(self._returns)
-        self._latest["return"] = f"{mean:{'.0f' if episode.harvest is not None else '.4g'}}"
-        epsilons = [value for name, value in learning.items() if name.endswith("/epsilon")]
-        if any(epsilons):
-            self._latest["epsilon"] = f"{max(epsilons):.2f}"
+        self._return = f"{mean:{'.0f' if episode.harvest is not None else '.4g'}}"
+        epsilon = max((value for name, value in learning.items() if name.endswith("/epsilon")), default=0)
+        if epsilon:
+            self._epsilon = f"  epsilon {epsilon:.2f}"
 
     def _show(self) -> None:
-        values = f"return {self._latest['return']}"
-        if self._latest["epsilon"]:
-            values += f"  epsilon {self._latest['epsilon']}"
-        values += f"  {self._speed.lap(self._steps):,.0f} steps/s"
         done = self._done()
+        values = f"return {self._return}{self._epsilon}  {self._speed.lap(self._steps):,.0f} steps/s"
         values += self._time_left(done)
         self._progress.update(self._task, completed=done, values=values)
         if not self.console.is_terminal:
-            at = f"episode {self._episodes // self._replicas}/{self._left_of}"
-            if self._all_steps is not None:
-                at = f"step {done:,.0f}/{self._left_of:,}"
+            at = f"episode {self._episodes // self._replicas}/{self._length.number}"
+            if self._length.is_of_steps:
+                at = f"step {done:,.0f}/{self._length.number:,}"
             self._print(f"{self._title}: {at}  {values}", done)
 
     def _print(self, words: str, done: float) -> None:
@@ -151,26 +149,26 @@ class ProgressBar:
         if not self.console.is_jupyter:
             self.console.print(words, soft_wrap=True)
             return
-        full = int(_NOTEBOOK_CELLS * done / max(1, self._left_of))
+        full = int(_NOTEBOOK_CELLS * done / max(1, self._length.number))
         self._notebook_line.show(f"{'█' * full}{'░' * (_NOTEBOOK_CELLS - full)} {words}")
 
     def _done(self) -> float:
-        """Episodes of each replica so far, or steps; at most as many as there are to be."""
-        if self._all_steps is not None:
-            return min(self._left_of, self._steps / self._replicas)
-        episode_steps = self._clock or self._last_steps
-        running = min(self._worlds, self._steps_running / episode_steps) if episode_steps else 0
-        return min(self._left_of, (self._episodes + running) / self._replicas)
+        """Return the episodes of each replica so far, or steps; at most as many as there are to be."""
+        running = 0.0
+        if self._episode_steps:
+            running = min(self._worlds, self._steps_running / self._episode_steps)
+        done = self._steps if self._length.is_of_steps else self._episodes + running
+        return min(self._length.number, done / self._replicas)
 
     def _time_left(self, done: float) -> str:
-        """The time left after so many episodes, in words; empty before enough steps were timed."""
+        """Return the time left, in words; nothing before enough steps were timed."""
         per_s = self._course.mean(done)
         if self._turns < TIMED_STEPS or per_s is None:
             return ""
-        return f"  {in_words((self._left_of - done) / per_s)} left"
+        return f"  {in_words((self._length.number - done) / per_s)} left"
 
     def _say_compiling(self) -> None:
-        """Prints lines while code is compiled; in a terminal the bar shows it."""
+        """Print lines while code is compiled; in a terminal the bar shows it."""
         said_s = 0.0
         while not self._is_over.wait(0.2):
             spent_s = CLOCK.total_s - self._compiled_before_s

@@ -150,7 +150,7 @@ def _is_repeated(name: str, levels: Family) -> bool:
     if not {name, same} <= set(levels.numbers):
         return False
     values, others = ([levels[*labels, one].value for labels in levels.labels] for one in (name, same))
-    return np.allclose(values, others, rtol=1e-6, atol=1e-3, equal_nan=True)
+    return np.allclose(values, others, rtol=1e-6, atol=1e-6, equal_nan=True)
 
 
 def _is_idle(levels: Family, policy: str) -> bool:

@@ -21,8 +21,9 @@ from cprl.envs.unwrap import commons_of
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import Policy, evaluate
+from cprl.measuring.table import labelled
 from cprl.policies.present import PresentPolicy
-from cprl.runs.episodes import EVALUATIONS, labelled
+from cprl.runs.episodes import EVALUATIONS, table_of
 from cprl.runs.files import write_listed
 from cprl.training.agents import Population, in_a_row, stored_policies
 
@@ -151,7 +152,8 @@ class Evaluations:
         for replica, episodes in played.items():
             trained_episodes, learning = due[replica]
             learning |= {f"evaluation/{name}": mean for name, mean in _means(episodes).items()}
-            self._tables.append(labelled([({"trained_episodes": trained_episodes}, replica, episodes)]))
+            table = table_of(episodes, [replica])
+            self._tables.append(labelled(table, trained_episodes=trained_episodes))
         table = pa.concat_tables(self._tables)
         write_listed(self._run, EVALUATIONS, lambda file: pq.write_table(table, file, compression="zstd"))
 
@@ -231,15 +233,8 @@ def evaluate_population(
     return {"random": random, "trained": evaluate(fresh, policy, explore=True, metrics=experiment.metrics)}
 
 
-def by_replica(episodes: Sequence[Episode], of_replica: int) -> dict[int, Sequence[Episode]]:
-    """Return the episodes of an evaluation by replica, so many of each."""
-    starts = enumerate(range(0, len(episodes), of_replica))
-    return {replica: episodes[start : start + of_replica] for replica, start in starts}
-
-
-def write_evaluation(run: Path, played: Mapping[str, Sequence[Episode]], *, of_replica: int) -> None:
-    """Write `evaluation/<policy>.parquet` of a run, so many episodes of each replica; again where one is
-    there."""
+def write_evaluation(run: Path, played: Mapping[str, Sequence[Episode]], *, replicas: int) -> None:
+    """Write `evaluation/<policy>.parquet` of a run of so many replicas; again where one is there."""
     for name, episodes in played.items():
-        table = labelled(({}, *of_one) for of_one in by_replica(episodes, of_replica).items())
+        table = table_of(episodes, range(replicas))
         write_listed(run, f"evaluation/{name}.parquet", partial(pq.write_table, table))

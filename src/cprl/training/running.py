@@ -16,7 +16,7 @@ from cprl.commons.threads import MOST_THREADS
 from cprl.envs.state import transforms_state
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode, own_name, try_own_metrics
-from cprl.measuring.table import where
+from cprl.measuring.table import labelled, where
 from cprl.population import exploration_steps, partners_in
 from cprl.runs.checkpoints import (
     FOLDER,
@@ -28,7 +28,7 @@ from cprl.runs.checkpoints import (
     is_ending,
     refuse_to_extend,
 )
-from cprl.runs.episodes import EpisodeTable, labelled
+from cprl.runs.episodes import EpisodeTable, table_of
 from cprl.runs.files import LOCK_FILE, RunLockedError, refuse_missing, write_json
 from cprl.runs.length import Length
 from cprl.runs.loggers import LoggerCallback, check_logger, make_logger
@@ -63,7 +63,6 @@ from cprl.training.course import NEEDED, course_of
 from cprl.training.finite import summary
 from cprl.training.outcome import (
     Evaluations,
-    by_replica,
     evaluate_population,
     exhibited,
     make_agents,
@@ -250,7 +249,7 @@ def _evaluate(work: _Work, random: list[Episode] | None) -> dict[str, list[Episo
     if work.viewer is not None:
         work.viewer.flush()
     played = evaluate_population(work.experiment, work.env, work.population, random=random)
-    write_evaluation(work.directory, played, of_replica=work.experiment.evaluation_episodes)
+    write_evaluation(work.directory, played, replicas=work.experiment.replicas)
     if work.viewer is not None:
         work.viewer.finished(played)
     return played
@@ -264,11 +263,9 @@ def _table(work: _Work, played: Mapping[str, list[Episode]]) -> pa.Table:
     chances = {learner.settings.epsilon_evaluation for learner in learners if not learner.actor.stochastic}
     trained = "trained" + "".join(f", epsilon {chance:g}" for chance in sorted(chances))
     columns = {"random": played["random"], trained if learners else "agents": played["trained"]}
-    each = work.experiment.evaluation_episodes
-    return labelled(
-        ({"policy": name}, *of_replica)
-        for name, episodes in columns.items()
-        for of_replica in by_replica(episodes, each).items()
+    replicas = range(work.experiment.replicas)
+    return pa.concat_tables(
+        labelled(table_of(episodes, replicas), policy=name) for name, episodes in columns.items()
     )
 
 

@@ -13,7 +13,7 @@ from cprl.commons.decoding import UNSEEN
 from cprl.commons.picture import DIGIT_HIGH, INK_COLOUR, MARK_COLOUR, POINTS, number_paths
 from cprl.commons.world import Bytes
 from cprl.viewer.names import EMPTY_SITE, TEXT
-from cprl.viewer.scene import Scene, window_corners
+from cprl.viewer.scene import Scene, windows_of
 
 Floats = NDArray[np.float32]
 Frames = Mapping[str, NDArray[Any]]
@@ -295,22 +295,15 @@ def _changes(rows: NDArray[Any]) -> NDArray[np.intp]:
     return np.flatnonzero(np.concatenate([[True], (flat[1:] != flat[:-1]).any(1)]))
 
 
-def mosaic_size(agents: int, window: tuple[int, int]) -> tuple[int, int]:
-    corners = window_corners(agents, window)
-    return max(row for row, _ in corners) + window[0], max(col for _, col in corners) + window[1]
-
-
 def mosaic(windows: Bytes) -> Bytes:
-    """The windows of all agents in a mosaic at `window_corners`, with UNSEEN between them.
+    """The windows of all agents in one image, with UNSEEN between them.
 
     Args:
         windows: uint8 [T, N, X, Y], classes of `classes_seen`.
 
     Returns:
-        uint8 [T, rows, columns], with the size of `mosaic_size`.
+        uint8 [T, rows, columns], as `windows_of` places them.
     """
-    frames, agents, rows, columns = windows.shape
-    joined = np.full((frames, *mosaic_size(agents, (rows, columns))), UNSEEN, np.uint8)
-    for agent, (top, left) in enumerate(window_corners(agents, (rows, columns))):
-        joined[:, top : top + rows, left : left + columns] = windows[:, agent]
-    return joined
+    _, agents, rows, columns = windows.shape
+    joined = windows_of(agents, (rows, columns)).joined(np.moveaxis(windows, 0, -1), UNSEEN)
+    return np.ascontiguousarray(np.moveaxis(joined, -1, 0))

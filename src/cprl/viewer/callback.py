@@ -66,7 +66,7 @@ class ViewerCallback:
         exhibited: what is exhibited live: the current policy and one world for it, see
             `cprl.viewer.exhibition`.
         file_name: the name of the recording instead of `run.rrd`; there must be no such file.
-        is_replay: whether a stored policy is replayed, see `cprl.viewer.layout.Scene`.
+        is_replay: whether a stored policy is replayed, see `cprl.viewer.scene.Scene`.
     """
 
     is_extendable = True
@@ -177,7 +177,7 @@ class ViewerCallback:
                 again.on_episode(episode, {})
         for recording in self._earlier:
             self.logger.do(methodcaller("log_file_from_path", recording), live_only=True)
-        self._set_time(self._episode)
+        self._set_time(max(0, self._episode - 1))
         for view in self._views:
             view.resumed()
         self.logger.log_text(f"resumed from step {training.steps:,}")
@@ -208,9 +208,9 @@ class ViewerCallback:
         """Draws the numbers of an episode that all replicas have ended."""
         self._episode = episode + 1
         self._set_time(episode)
-        with self.logger.together():
-            for view in self._views:
-                view.on_numbers(episode, numbers)
+        for view in self._views:
+            view.on_numbers(episode, numbers)
+        self.logger.send_due()
 
     def seen_at_random(self, env: EnvBase, policy: Policy) -> Policy:
         """Return the policy of random play; viewers see its first world until the training begins."""

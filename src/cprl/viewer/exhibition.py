@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from threading import Event
 from typing import Any, Final, NamedTuple
@@ -15,10 +15,9 @@ from torchrl.envs import EnvBase, TransformedEnv
 from cprl import keys
 from cprl.commons.game import Game
 from cprl.envs.state import load_transforms_state, transforms_state
-from cprl.envs.stepping import begin_states
 from cprl.envs.unwrap import commons_of
 from cprl.measuring.episodes import Episode
-from cprl.measuring.evaluate import Policy
+from cprl.measuring.evaluate import Policy, turns
 from cprl.policies.present import PresentPolicy
 from cprl.viewer.board import RIM_CELLS, Frames, board_columns, board_form, board_styles
 from cprl.viewer.frames import FrameRecorder
@@ -78,9 +77,10 @@ class Exhibition(View):
         self._wait = wait or self._slept
         self._at_random: FrameRecorder | None = None
         self._recorder = FrameRecorder(commons, scene, has_windows=False)
-        self._carried: TensorDictBase | None = None
+        self._moves = self._played()
         self._due, self._count = clock(), BATCH_STEPS
-        self._turn = 0
+        self._rests = False
+        """Whether an episode of the trained policy has just ended."""
         self.steps = 0
         """Steps played so far."""
         self.is_over = False
@@ -103,7 +103,7 @@ class Exhibition(View):
         recorder = self._at_random = FrameRecorder(commons, self._scene, has_windows=False)
 
         def acted(moment: TensorDictBase) -> TensorDictBase:
-            recorder.add_board()
+            recorder.add()
             return policy(moment)
 
         return acted
@@ -114,9 +114,9 @@ class Exhibition(View):
         frames = None if self._at_random is None else self._at_random.take()
         if frames is not None:
             first = {name: array[: episodes[0].steps] for name, array in frames.items()}
-            self._send(first, "random play, before the training", wait=self._rests)
+            self._send(first, "random play, before the training", wait=self._until_it_begins)
 
-    def _rests(self, seconds: float) -> bool:
+    def _until_it_begins(self, seconds: float) -> bool:
         return self._wait(seconds) or self.steps > 0
 
     def play_on(self, stop: Event) -> None:
@@ -127,7 +127,7 @@ class Exhibition(View):
         self._policy.is_trained = True
         while not (self.is_over or stop.is_set()):
             self._play(0)
-            stop.wait(BATCH_S if self._carried is not None else REST_S)
+            stop.wait(REST_S if self._rests else BATCH_S)
 
     def close(self) -> None:
         """Leaves out frames that have not been sent."""
@@ -143,11 +143,15 @@ class Exhibition(View):
         """Plays some steps, and has them sent; fewer the next time if they took long."""
         if self._stream.is_behind:
             return
-        began, end = self._clock(), None
+        began = self._clock()
+        end = None
         try:
             with self._policy.apart():
+                if isinstance(self._env, TransformedEnv):
+                    load_transforms_state(self._env, transforms_state(self._trained))
                 for _ in range(self._count):
-                    if end := self._step():
+                    end = self._step()
+                    if end is not None and self._policy.is_trained:
                         break
         except Exception as error:
             self.is_over = True
@@ -162,45 +166,32 @@ class Exhibition(View):
         self._due = max(self._due, began + (0.0 if is_first else min(spent / MOST_SHARE, LONGEST_S)))
         affordable = int(MOST_SHARE * BATCH_S / max(spent / self._count, 1e-9))
         self._count = max(1, min(BATCH_STEPS, affordable))
+        self._rests = end is not None and self._policy.is_trained
         frames = self._recorder.take()
         if frames is not None:
             caption = caption_of(self._policy, episode)
             self._send(frames, caption)
-            if end is not None:
+            if self._rests:
                 self._stream.do(partial(_send_caption, caption=f"{caption}: {end}"))
 
     def _step(self) -> str | None:
-        """One step of the world, of which the recorder then has a frame; the first only begins an episode.
-
-        The last board of the trained policy's episodes stays until the next step.
-
-        Returns:
-            In words how such an episode has ended; None while it goes on.
-        """
+        """Play a step, of which the recorder then has a frame; return in words how an episode has ended."""
         self.steps += 1
-        self._turn += 1
-        if self._carried is None:
-            self._turn, self._carried = 0, self._env.reset()
-            self._recorder.add_board()
-            return None
-        moment = self._policy(self._carried)
-        if self._policy.is_trained:
-            batch = self._env.step(moment)
-            self._carried = self._env.step_mdp(batch)
-        else:
-            batch, self._carried = self._env.step_and_maybe_reset(moment)
-        begin_states(self._carried, self._carried, batch)
-        self._recorder.add(batch)
-        if isinstance(self._env, TransformedEnv) and self.steps % BATCH_STEPS == 0:
-            load_transforms_state(self._env, transforms_state(self._trained))
-        if not batch["next"][keys.DONE][0, 0]:
-            return None
-        end = f"{'no apple is left' if batch['next', 'terminated'][0, 0] else 'the end'}, turn {self._turn:,}"
-        self._turn = 0
-        if not self._policy.is_trained:
-            return None
-        self._carried = None
-        return end
+        return next(self._moves)
+
+    def _played(self) -> Iterator[str | None]:
+        """Play episode after episode; the first step of each only begins it, the last leaves its board."""
+        while True:
+            batches = turns(self._env, self._policy)
+            self._recorder.add()
+            yield None
+            for turn, batch in enumerate(batches, start=1):
+                self._recorder.add(batch)
+                if batch["next"][keys.DONE][0, 0]:
+                    end = "no apple is left" if batch["next", "terminated"][0, 0] else "the end"
+                    yield f"{end}, turn {turn:,}"
+                else:
+                    yield None
 
     def _send(self, frames: Frames, caption: str, *, wait: Callable[[float], bool] | None = None) -> None:
         send = partial(_send_frames, scene=self._scene, frames=frames, caption=caption)

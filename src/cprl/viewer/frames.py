@@ -16,10 +16,10 @@ from cprl.commons.colours import BEAM
 from cprl.commons.decoding import UNSEEN, classes_seen
 from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode
-from cprl.viewer.board import Frames, boards, image_form, mosaic_size
+from cprl.viewer.board import Frames, boards, image_form
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import DIED, TEXT
-from cprl.viewer.scene import Scene, boards_of
+from cprl.viewer.scene import Scene, boards_of, windows_of
 from cprl.viewer.views import View, has_died
 
 FRAMES_BYTES: Final = 45_000_000
@@ -45,16 +45,13 @@ class FrameRecorder:
     def __len__(self) -> int:
         return len(self._frames)
 
-    def add(self, batch: TensorDictBase, *, step: int = 0, episode: int = 0) -> None:
-        """Copy a frame; `batch` is the latest step, and `step` counts those of the whole run."""
-        if self._has_tags:  # of several shooters the first
+    def add(self, batch: TensorDictBase | None = None, *, step: int = 0, episode: int = 0) -> None:
+        """Copy a frame; `batch` is the latest step, None before the first of an episode, and `step` counts
+        those of the whole run."""
+        if batch is not None and self._has_tags:  # of several shooters the first
             tagged_by = batch["next"][keys.TAGGED_BY][0].cpu().numpy()
             tagged = tagged_by.any(1)
             self._tagged_by[tagged] = tagged_by.argmax(1)[tagged]
-        self.add_board(step=step, episode=episode)
-
-    def add_board(self, *, step: int = 0, episode: int = 0) -> None:
-        """Copy a frame of the board as it is, e.g. when an episode begins."""
         board = self._env.worlds.show(self._env.output)
         frame = {"step": step, "episode": episode, "beams": board.board == BEAM, "tagged_by": self._tagged_by}
         for name in ("stock", "row", "col", "heading", "in_play", "harvested"):
@@ -95,7 +92,7 @@ class Filming(View):
         """The number of the frame of this turn, if it has one."""
         if env is not None and (scene := logger.scene) is not None:
             self._recorder = FrameRecorder(env, scene)
-            rows, columns = mosaic_size(len(scene.agents), scene.window)
+            rows, columns = windows_of(len(scene.agents), scene.window).shape
             # The largest size of a frame, about; with a trained population on `commons` it is 500 bytes.
             size = 80 + 45 * len(scene.agents) + 0.35 * (rows * columns + scene.height * scene.width)
             self.every = max(1, ceil(episodes * env.game.rules.episode_steps * size / FRAMES_BYTES))

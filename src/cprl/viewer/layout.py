@@ -48,7 +48,7 @@ from cprl.measuring.registry import (
     title,
 )
 from cprl.measuring.series import INSTITUTIONS, SPEED, logged
-from cprl.viewer.board import OUT_STROKE_CELLS, board_form, board_styles, image_form, mosaic_size
+from cprl.viewer.board import OUT_STROKE_CELLS, board_form, board_styles, image_form
 from cprl.viewer.names import (
     BACKGROUND,
     EMPTY_SITE,
@@ -73,7 +73,7 @@ from cprl.viewer.scene import (
     Scene,
     boards_of,
     decision_panels,
-    window_corners,
+    windows_of,
 )
 
 OVERVIEW: Final = (COLLECTIVE_RETURN, "stock_left")
@@ -149,10 +149,11 @@ def fixed(curves: Curves) -> dict[str, list[Any]]:
         parts[f"world/{name}"] = styles_of_part
     parts["world/board"].append(rr.SegmentationImage.from_fields(format=board_form(curves)))
     agents, (rows, columns) = len(curves.agents), curves.window
-    corners = np.array(window_corners(agents, curves.window), np.float32)[:, ::-1]
+    windows = windows_of(agents, curves.window)
+    corners = windows.corners[:, ::-1]
     parts["windows"] = [
         classes(curves, class_colour),
-        rr.SegmentationImage.from_fields(format=image_form(mosaic_size(agents, curves.window)), opacity=1.0),
+        rr.SegmentationImage.from_fields(format=image_form(windows.shape), opacity=1.0),
     ]
     parts["windows/frames"] = [
         rr.Boxes2D(

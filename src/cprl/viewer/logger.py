@@ -168,7 +168,6 @@ class RerunLogger(Logger):
         """Frames recorded so far, including those in earlier files of the recording."""
         self.step = self.episode = 0
         """The time of what is logged; see `at`."""
-        self._is_together = False
         self._clips_end: dict[str, int] = {}
         super().__init__(exp_name, str(log_dir))
 
@@ -236,26 +235,18 @@ class RerunLogger(Logger):
         finally:
             self._streams = streams
 
-    @contextmanager
-    def together(self) -> Iterator[None]:
-        """Send all that is logged within the block at the same time, so that it agrees when it is seen."""
-        self._is_together = True
-        try:
-            yield
-        finally:
-            self._is_together = False
-            self._send_due()
-
-    def _send_due(self) -> None:
+    def send_due(self) -> None:
+        """Sends buffered numbers and texts to whom they are due; all that is logged between two calls is sent
+        together, so that it agrees when it is seen."""
         for stream in self._streams:
-            if stream.is_due and not self._is_together:
+            if stream.is_due:
                 send_waiting(stream)
 
     def log_static(self, entity: str, *what: Any) -> None:
         """Logs archetypes that hold at all times."""
         self.do(lambda recording: recording.log(entity, *what, static=True))
 
-    def log_row(self, name: str, what: Any, *, step: int | None = None) -> None:
+    def log_row(self, name: str, what: Any, *, step: int | None = None, live_only: bool = False) -> None:
         """Logs an archetype at the time set by `at`, or at another step."""
         at = self.step if step is None else step, self.episode, self.frames
 
@@ -265,7 +256,7 @@ class RerunLogger(Logger):
             recording.log(name, what)
             recording.reset_time()
 
-        self.do(log)
+        self.do(log, live_only=live_only)
 
     def log_columns(
         self, name: str, at: tuple[Numbers, Numbers, Numbers], what: Any, *, live_only: bool = False
@@ -285,9 +276,11 @@ class RerunLogger(Logger):
         for index, number in enumerate(numbers.tolist()):
             entity = name if numbers.size == 1 else f"{name}/{index}"
             self._wait(entity, self.step if step is None else int(step), [float(number)])
+        self.send_due()
 
     def log_lines(self, name: str, values: Sequence[float]) -> None:
-        """Logs the numbers of several lines of one plot, equally many each time; NaN leaves a gap."""
+        """Logs the numbers of several lines of one plot, equally many each time; NaN leaves a gap. They are
+        sent when they are due, see `send_due`."""
         self._wait(name, self.step, [float(value) for value in values])
 
     def log_document(self, name: str, text: str) -> None:
@@ -303,13 +296,6 @@ class RerunLogger(Logger):
     def _wait(self, name: str, step: int, values: list[float] | str) -> None:
         for stream in self._streams:
             stream.waiting.setdefault(name, []).append((step, self.episode, self.frames, values))
-        self._send_due()
-
-    def log_states(self, name: str, states: Mapping[int, str], *, live_only: bool = False) -> None:
-        """Logs states by the episode from which they hold; their step is the one set by `at`."""
-        at = [self.step] * len(states), list(states), [self.frames] * len(states)
-        what = rr.StateChange.columns(state=list(states.values()))
-        self.log_columns(name, at, what, live_only=live_only)
 
     def log_frames(self, frames: Frames) -> None:
         """Logs frames of `FrameRecorder.take`; see `cprl.viewer.board.columns`."""
@@ -321,8 +307,7 @@ class RerunLogger(Logger):
             self.log_columns(entity, (frames["step"][rows], frames["episode"][rows], numbers[rows]), what)
 
     def log_text(self, text: str) -> None:
-        at = [self.step], [self.episode], [self.frames]
-        self.log_columns("log", at, rr.TextLog.columns(text=[text], level=["INFO"]))
+        self.log_row("log", rr.TextLog(text, level="INFO"))
 
     def log_hparams(self, cfg: Any) -> None:
         """Logs a mapping, as a table, or a Markdown text, as the recipe of the run."""
@@ -339,18 +324,10 @@ class RerunLogger(Logger):
         clip = clip[0] if clip.ndim == 5 else clip
         if clip.ndim != 4:
             raise ValueError(f"the video is {list(video.shape)}; allowed: [T, C, H, W] or [1, T, C, H, W]")
-        count, channels, height, width = clip.shape
         first = max(self.step if step is None else int(step), self._clips_end.get(name, 0))
-        self._clips_end[name] = first + count
-        form = rr.components.ImageFormat(
-            width=width,
-            height=height,
-            color_model="L" if channels == 1 else "RGB",
-            channel_datatype=rr.ChannelDatatype.U8,
-        )
-        buffer = clip.permute(0, 2, 3, 1).to(torch.uint8).numpy().reshape(count, -1).copy()
-        at = range(first, first + count), [self.episode] * count, [self.frames] * count
-        self.log_columns(name, at, rr.Image.columns(buffer=buffer, format=[form] * count))
+        self._clips_end[name] = first + len(clip)
+        for number, image in enumerate(clip.permute(0, 2, 3, 1).to(torch.uint8).numpy(), start=first):
+            self.log_row(name, rr.Image(image), step=number)
 
     def log_histogram(
         self, name: str, data: Any, *, bins: int = 30, step: int | None = None, **kwargs: Any

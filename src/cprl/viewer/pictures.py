@@ -56,9 +56,9 @@ class Samples(View):
         self._read = env.worlds.driver.read
         self.visits = np.zeros((game.agents, game.map.height, game.map.width), np.int64)
         """Looks at which each agent of the first world was on each cell, since the last picture."""
-        self._playing = np.full((boards, self.clock // self.stride + 1, 2), np.nan)
-        """[boards, points, 2], turn and stock of the episodes that are being played."""
-        self.lines: list[list[tuple[float, float]]] = [[] for _ in range(boards)]
+        self._playing: list[dict[int, int]] = [{} for _ in range(boards)]
+        """The stock by the turn in each board's episode that is being played."""
+        self.lines: list[list[tuple[int, int]]] = [[] for _ in range(boards)]
         """The points of each board's last episode, (turn, stock)."""
         self.died = [False] * boards
         """Whether it died in it."""
@@ -79,22 +79,20 @@ class Samples(View):
         row, col, in_play = row[:, 0], col[:, 0], in_play[:, 0]
         agent = np.broadcast_to(np.arange(len(self.visits)), row.shape)
         np.add.at(self.visits, (agent[in_play], row[in_play], col[in_play]), 1)
-        # Where two have the same place the latest stays.
-        board = np.arange(len(self.lines))
-        point = turn[..., 0] // self.stride
-        self._playing[board, point, 0] = turn[..., 0]
-        self._playing[board, point, 1] = stock[..., 0]
+        for board, playing in enumerate(self._playing):
+            playing.update(zip(turn[:, board, 0].tolist(), stock[:, board, 0].tolist(), strict=True))
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         if episode.world >= len(self.lines):
             return
         self.add_up()
         playing = self._playing[episode.world]
-        points = playing[playing[:, 0] < episode.steps]
-        end = [] if episode.stock_left is None else [(float(episode.steps), float(episode.stock_left))]
-        self.lines[episode.world] = [*map(tuple, points.tolist()), *end]
+        points = [point for point in sorted(playing.items()) if point[0] < episode.steps]
+        end = [] if episode.stock_left is None else [(episode.steps, episode.stock_left)]
+        self.lines[episode.world] = points + end
         self.died[episode.world] = bool(has_died(episode))
-        playing[1:] = np.nan  # the first point is already that of the next episode, which begins alike
+        # Episodes begin alike: the first point is already that of the next one.
+        self._playing[episode.world] = {turn: stock for turn, stock in points if not turn}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -212,15 +212,16 @@ class Offences:
         if not frames:
             return
         steps = np.arange(1, len(self._amounts[PAID]) + 1)
-        at = steps, np.zeros_like(steps), np.minimum(steps, frames) - 1
+        nothing = np.zeros_like(steps)
+        at = steps, nothing, np.minimum(steps, frames) - 1
         for kind, turns in self._amounts.items():
             for name, amounts in zip(self._names, np.transpose(turns), strict=True):
                 self._logger.log_columns(f"{name}/{kind}", at, rr.Scalars.columns(scalars=amounts.copy()))
         marks = rr.LineStrips2D.columns(
             strips=np.concatenate(self._strips), labels=list(chain(*self._labels))
         )
-        in_frames = tuple(times[:frames] for times in at)
-        self._logger.log_columns(_VIOLATORS, in_frames, marks.partition(list(map(len, self._strips))))
+        at = steps[:frames], nothing[:frames], np.arange(frames)
+        self._logger.log_columns(_VIOLATORS, at, marks.partition(list(map(len, self._strips))))
 
 
 def _of_agents(batch: TensorDictBase, name: str) -> NDArray[np.float64]:

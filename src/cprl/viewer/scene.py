@@ -194,42 +194,39 @@ def missing_in(reported: Sequence[str], *, has_board: bool) -> list[str]:
     return [line for line in lines if line]
 
 
-_APART_PIXELS: Final = 1
 _WINDOWS_WIDE, _BOARDS_WIDE = 1.7, 3.0
 """The width of the viewer's area for windows, and of half a tab, divided by its height, about."""
 _LABEL_SHARE: Final = 0.3
 """The height of a line of text, of that of a board: texts have a size of their own on the screen."""
 
 
-def window_corners(
-    agents: int, window: tuple[int, int], *, wide: float = _WINDOWS_WIDE
-) -> list[tuple[int, int]]:
-    """Return the top-left corner (row, col) of each agent's window in a mosaic with cells as large as
-    possible."""
-    rows, cols = (length + _APART_PIXELS for length in window)
-
-    def cell_size(columns: int) -> float:
-        return min(wide / (columns * cols), 1 / (ceil(agents / columns) * rows))
-
-    columns = max(range(1, agents + 1), key=cell_size)
-    return [(agent // columns * rows, agent % columns * cols) for agent in range(agents)]
-
-
 class Panels:
-    """The places of equal boards in one image.
+    """The places of equal boards in one image, a pixel apart.
 
     Args:
+        wide: the width of the viewer's area, divided by its height.
         columns: how many stand side by side; by default so many that they are as large as possible.
+        has_labels: whether there is room for a text above each.
     """
 
-    def __init__(self, count: int, size: tuple[int, int], *, columns: int | None = None) -> None:
-        self._label = max(2, ceil(_LABEL_SHARE * size[0]))
-        padded = size[0] + self._label, size[1]
-        corners = np.array(window_corners(count, padded, wide=_BOARDS_WIDE))
-        if columns is not None:
-            corners = np.stack(np.divmod(np.arange(count), columns), 1) * (np.array(padded) + 1)
+    def __init__(
+        self,
+        count: int,
+        size: tuple[int, int],
+        *,
+        wide: float = _BOARDS_WIDE,
+        columns: int | None = None,
+        has_labels: bool = True,
+    ) -> None:
         self.size = size
-        self.corners = corners + np.array((self._label, 0))
+        self._label = max(2, ceil(_LABEL_SHARE * size[0])) if has_labels else 0
+        apart = np.array((size[0] + self._label + 1, size[1] + 1))
+
+        def cell_size(columns: int) -> float:
+            return min(wide / (columns * int(apart[1])), 1 / (ceil(count / columns) * int(apart[0])))
+
+        self.columns = columns or max(range(1, count + 1), key=cell_size)
+        self.corners = np.stack(np.divmod(np.arange(count), self.columns), 1) * apart + (self._label, 0)
         """int [count, 2], the top-left (row, col) of each board."""
         rows, width = (self.corners.max(0) + size).tolist()
         self.shape: tuple[int, int] = (rows, width)
@@ -260,6 +257,11 @@ def boards_of(scene: Scene, count: int) -> Panels:
     return Panels(count, (scene.height + 2, scene.width + 2))
 
 
+def windows_of(agents: int, window: tuple[int, int]) -> Panels:
+    """Return the places of the agents' windows (X, Y)."""
+    return Panels(agents, window, wide=_WINDOWS_WIDE, has_labels=False)
+
+
 HIGH: Final = 12
 """The height of a panel of bars, in pixels: the largest bar has one less."""
 BELOW: Final = 4
@@ -270,7 +272,7 @@ BAR, APART = 5, 1
 
 def decision_panels(agents: int, actions: int, window: tuple[int, int]) -> Panels:
     """Return the places of the agents' bars, arranged as their windows (X, Y) are."""
-    columns = sum(row == 0 for row, _ in window_corners(agents, window))
+    columns = windows_of(agents, window).columns
     return Panels(agents, (HIGH + BELOW, actions * (BAR + APART) + APART), columns=columns)
 
 

@@ -9,10 +9,12 @@ from threading import Event, Thread
 from typing import Final, NamedTuple
 
 import numpy as np
+import rerun as rr
 
 from cprl.measuring.episodes import Episode
 from cprl.measuring.outcome import BEGINS, EXPLORING, Course
-from cprl.measuring.series import mean_of
+from cprl.measuring.registry import COLLECTIVE_RETURN
+from cprl.measuring.series import logged, mean_of
 from cprl.measuring.statistics import Estimate, estimate_if_finite
 from cprl.measuring.windows import LAST_EPISODES, Values, rounds_of
 from cprl.system.times import CLOCK
@@ -23,7 +25,7 @@ from cprl.viewer.names import HEADER, SETTLED
 from cprl.viewer.scene import Curves
 from cprl.viewer.views import View, has_died
 
-HARVEST: Final = "social/collective_return"
+HARVEST: Final = logged(COLLECTIVE_RETURN)
 
 
 class Played(NamedTuple):
@@ -45,7 +47,7 @@ def played(episodes: Sequence[Episode], *, replicas: int = 1) -> Played:
     harvest = estimate_if_finite(np.reshape(values, (replicas, -1)).mean(1).tolist())
     died = [has_died(episode) for episode in episodes]
     return Played(
-        harvest=harvest.of("collective_return") if "collective_return" in episodes[0].metrics else harvest,
+        harvest=harvest.of(COLLECTIVE_RETURN) if COLLECTIVE_RETURN in episodes[0].metrics else harvest,
         died=None if None in died else sum(map(bool, died)),
         episodes=len(values),
     )
@@ -53,23 +55,18 @@ def played(episodes: Sequence[Episode], *, replicas: int = 1) -> Played:
 
 def _gained(episode: Episode) -> float:
     """Return what all agents got together: apples, or the return where the game reports no harvest."""
-    return float(episode.metrics.get("collective_return", episode.return_.sum()))
+    return float(episode.metrics.get(COLLECTIVE_RETURN, episode.return_.sum()))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Header:
     """The headers of one run: a line of Markdown each."""
 
+    curves: Curves
     episodes: int
     """Of the run, or about as many where it trains so many steps."""
-    boards: int
-    """The worlds of all replicas."""
-    unit: str
-    """"apples" or "return"."""
     rules: str = ""
     """The institutions in force, in words."""
-    legend: str = ""
-    """What a point of a curve is, below each header."""
     is_about: bool = False
     """Whether it trains so many steps."""
 
@@ -86,7 +83,7 @@ class Header:
     ) -> str:
         """After an episode, in which so many boards died early; None for a game without stock."""
         beside = "" if random_play is None else f", random play {_number(random_play)}"
-        deaths = "" if died is None else self._died(died, self.boards)
+        deaths = "" if died is None else self._died(died, self.curves.replicas * self.curves.worlds)
         return self._text(f"Episode {episode:,} {self._of}", label, f"{self.amount(mean)}{beside}", deaths)
 
     def finished(self, learning: float, trained: Played, random: Played) -> str:
@@ -111,12 +108,16 @@ class Header:
 
     def _text(self, *parts: str) -> str:
         line = f"#### {' · '.join(part for part in (*parts, self.rules) if part)}"
-        return f"{line}\n\n{self.legend}" if self.legend else line
+        return f"{line}\n\n{self.curves.legend}"
 
     def amount(self, value: float) -> str:
         if isnan(value):
             return ""
-        return f"{_number(value)} apples" if self.unit == "apples" else f"{self.unit} {_number(value)}"
+        return (
+            f"{_number(value)} apples"
+            if self.curves.unit == "apples"
+            else f"{self.curves.unit} {_number(value)}"
+        )
 
     def _died(self, died: int, boards: int) -> str:
         if boards == 1:
@@ -180,14 +181,7 @@ class Story(View):
     ) -> None:
         self._logger, self._filming, self._curves = logger, filming, logger.curves
         self._episodes = episodes
-        self.header = Header(
-            episodes=episodes,
-            boards=self._curves.replicas * self._curves.worlds,
-            unit=self._curves.unit,
-            rules=rules,
-            legend=self._curves.legend,
-            is_about=is_about,
-        )
+        self.header = Header(curves=self._curves, episodes=episodes, rules=rules, is_about=is_about)
         self.course = Course(self._curves.replicas, self._curves.worlds)
         self._label = BEGINS
         self._bests = Bests(self._curves.worlds)
@@ -199,7 +193,7 @@ class Story(View):
         """What all agents got in the last episodes of each world of each replica."""
         self._is_over = False
         # A file of a resumed run must not say so: it is shown with those before it.
-        logger.log_states(names.NOW, {0: BEGINS}, live_only=True)
+        logger.log_row(names.NOW, rr.StateChange(state=BEGINS), live_only=True)
         logger.log_document(HEADER, self.header.begins("begins"))
         logger.flush()
 
@@ -244,12 +238,13 @@ class Story(View):
             {name: mean for name, mean in means.items() if name.endswith("/epsilon")}
         )
         if explores != explored:
-            self._logger.log_states(names.EXPLORING, {episode: EXPLORING if explores else SETTLED})
+            state = EXPLORING if explores else SETTLED
+            self._logger.log_row(names.EXPLORING, rr.StateChange(state=state))
             if explored:
                 events.append("exploration ends: no epsilon falls any more")
         label = self.course.label
         if label != self._label or episode < self._curves.worlds:
-            self._logger.log_states(names.NOW, {episode: label})
+            self._logger.log_row(names.NOW, rr.StateChange(state=label))
         if label != self._label:
             events.append(f"now {label}")
             self._label = label
@@ -262,7 +257,7 @@ class Story(View):
     def resumed(self) -> None:
         """Shows where a run is that goes on after the episodes so far."""
         if self._ended:
-            self._logger.log_states(names.NOW, {self._ended - 1: self._label})
+            self._logger.log_row(names.NOW, rr.StateChange(state=self._label))
             self._show_episode(None)
             self._logger.flush()
 
@@ -289,25 +284,23 @@ class Story(View):
         replicas = self._curves.replicas
         trained = played(played_by["trained"], replicas=replicas)
         random = played(played_by["random"], replicas=replicas)
-        self._end(self.header.finished(self._learning, trained, random))
+        self._is_over = True
+        self._logger.log_document(HEADER, self.header.finished(self._learning, trained, random))
         self._logger.log_text(f"finished: trained {self._in_words(trained)}")
 
     def close(self) -> None:
         """Logs the end of a run that is over or was stopped, if `finished` did not."""
         if self._is_over:
             return
-        if self._ended + self._curves.worlds <= self._episodes and not self.header.is_about:
-            self._logger.log_document(HEADER, self.header.stopped(self._ended, self.course.mean))
-        else:
-            self._end(self.header.ended(f"{self.header.amount(self._learning)} at the end"))
-
-    def _end(self, header: str) -> None:
         self._is_over = True
+        header = self.header.ended(f"{self.header.amount(self._learning)} at the end")
+        if self._ended + self._curves.worlds <= self._episodes and not self.header.is_about:
+            header = self.header.stopped(self._ended, self.course.mean)
         self._logger.log_document(HEADER, header)
 
     def _in_words(self, numbers: Played) -> str:
         died = "" if numbers.died is None else f"; {numbers.died:,} of {numbers.episodes:,} boards died early"
-        return f"{numbers.harvest} {self.header.unit}{died}"
+        return f"{numbers.harvest} {self._curves.unit}{died}"
 
 
 class Events(View):

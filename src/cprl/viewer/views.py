@@ -103,7 +103,7 @@ class Plots(View):
                 lines.append(recent.add(mean))
             self._logger.log_lines(name, lines)
         for name, mean in self._random.items():
-            self._logger.log_scalar(f"{RANDOM_PLAY}/{name}", mean)
+            self._logger.log_lines(f"{RANDOM_PLAY}/{name}", [mean])
 
 
 class JointActions(View):

@@ -44,9 +44,9 @@ def levels_of(
         last: of training: episodes at its end; those of whole windows.
     """
     chosen = metrics_of(table, metrics, part=part)
-    found = estimates(table.windows(part, last=last), chosen, by="condition")
     clocks = table.design.clocks
-    return found.changed(lambda key, one: one.of(key[1], clocks.get(key[0], inf)))
+    means = estimates(table.windows(part, last=last), chosen, by="condition")
+    return means.changed(lambda key, one: one.of(key[1], clocks.get(key[0], inf)))
 
 
 def differences_of(
@@ -56,8 +56,8 @@ def differences_of(
     chosen = metrics_of(table, metrics, part=part)
     reference = {"condition": table.design.reference}
     rows = table.windows(part, last=last)
-    found = differences(rows, chosen, "condition", reference, paired=table.design.is_paired)
-    return found.changed(lambda _, one: replace(one, bounds=(-inf, inf)))  # as Student's t gives them
+    changes = differences(rows, chosen, "condition", reference, paired=table.design.is_paired)
+    return changes.changed(lambda _, one: replace(one, bounds=(-inf, inf)))  # as Student's t gives them
 
 
 def values_of(rows: pa.Table, metric: str) -> dict[str, dict[int, float]]:
@@ -87,8 +87,8 @@ def metrics_of(table: StudyTable, metrics: Sequence[str] = (), *, part: str = TR
 def measures_of(table: StudyTable, part: str = TRAINING) -> tuple[str, ...]:
     """Return those of `MEASURES` that a table has and that are not 0 in all windows of a part."""
     rows = table.windows(part, last=None)
-    found = set(rows.filter(pc.greater(rows["value"], 0))["metric"].unique().to_pylist())
-    return tuple(metric for metric in MEASURES if metric in found)
+    above_0 = rows.filter(pc.greater(rows["value"], 0))["metric"].unique().to_pylist()
+    return tuple(metric for metric in MEASURES if metric in above_0)
 
 
 def repeated_in(table: StudyTable, part: str) -> dict[str, str]:
@@ -108,8 +108,8 @@ def _are_equal(rows: pa.Table, metric: str, other: str) -> bool:
     places = ["condition", "replica", "episode"]
     if not one.select(places).equals(two.select(places)):
         return False
-    values = (rows["value"].to_numpy() for rows in (one, two))
-    return bool(np.allclose(*values, rtol=_ROUNDING, atol=_ROUNDING, equal_nan=True))
+    first, second = (of_metric["value"].to_numpy() for of_metric in (one, two))
+    return bool(np.allclose(first, second, rtol=_ROUNDING, atol=_ROUNDING, equal_nan=True))
 
 
 def episodes_text(
@@ -156,11 +156,11 @@ def cells(
     rows: list[list[Cell]] = []
     for name in table.design.conditions:
         replicas = played.count(name)
-        found = [family.get((name, metric)) for metric in chosen]
+        of_row = [family.get((name, metric)) for metric in chosen]
         if is_levels:
-            rows.append([name, str(replicas), *(one or "-" for one in found)])
+            rows.append([name, str(replicas), *(one or "-" for one in of_row)])
         elif name != reference:
-            rows.append([name, str(replicas), *(change(one, replicas) for one in found)])
+            rows.append([name, str(replicas), *(change(one, replicas) for one in of_row)])
     what = "means over replicas"
     note = CUT if any(one.is_cut for one in family.values()) else ""
     if not is_levels:

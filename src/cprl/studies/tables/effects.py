@@ -109,8 +109,8 @@ def effect_cells(
     families = {metric: effects_of(table, metric, part=part, last=last) for metric in chosen}
     rows = []
     for name in names:
-        found = [family.get((name, metric)) for metric, family in families.items()]
-        rows.append([name, *map(change, found)])
+        of_row = [family.get((name, metric)) for metric, family in families.items()]
+        rows.append([name, *map(change, of_row)])
     what = (
         "effects of the factors, differences between means over all cells, paired by replica; with x, how "
         "much larger the first difference is at the second factor's level"
