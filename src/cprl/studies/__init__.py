@@ -12,9 +12,20 @@ Modules, in the order in which one reads them:
     tables       what came out, as one tidy table; means and differences
     figures      drawn of a table
     results      write_results: table, summary and figures of a study
+    report       an HTML page about a run or a study
+    exploit      exploitability: trains best responses, a study; play_responses, response_gains, mean_gains:
+                 what they gain over the agents whose place they take
 """
 
 from cprl.studies.executors import InProcess, Processes, Ray
+from cprl.studies.exploit import (
+    Plan,
+    exploitability,
+    mean_gains,
+    plan_responses,
+    play_responses,
+    response_gains,
+)
 from cprl.studies.factors import Integers, LogUniform, Uniform
 from cprl.studies.run import StudyResult, run_study
 from cprl.studies.search import Search, SearchResult, run_search
@@ -26,6 +37,7 @@ __all__ = [
     "InProcess",
     "Integers",
     "LogUniform",
+    "Plan",
     "Processes",
     "Ray",
     "Search",
@@ -34,7 +46,12 @@ __all__ = [
     "StudyResult",
     "StudyTable",
     "Uniform",
+    "exploitability",
+    "mean_gains",
+    "plan_responses",
+    "play_responses",
     "read_study",
+    "response_gains",
     "run_search",
     "run_study",
     "study_table",
