@@ -315,8 +315,8 @@ def extend(run: Path, before: Length, length: Length) -> None:
     for name in (REPORT, *weights, "evaluation"):
         path = run / name
         if path.exists():
-            kept = path.with_stem(f"{path.stem}-{before.number}")
-            rename_listed(run, name, kept.relative_to(run).as_posix())
+            renamed = path.with_stem(f"{path.stem}-{before.number}")
+            rename_listed(run, name, renamed.relative_to(run).as_posix())
     checkpoints = checkpoints_in(run / FOLDER)
     last = max((steps_of(path) for path in checkpoints if is_ending(path)), default=None)
     for path in checkpoints:

@@ -44,7 +44,7 @@ _ROWS_PER_GROUP: Final = 2**16
 
 
 def batches_in(path: Path) -> Iterator[tuple[pa.RecordBatch, int]]:
-    """The whole batches of a journal, each with the byte at which it ends."""
+    """Yield the whole batches of a journal, each with the byte at which it ends."""
     refuse_special(path)
     source = pa.BufferReader(path.read_bytes())
     try:
@@ -56,7 +56,7 @@ def batches_in(path: Path) -> Iterator[tuple[pa.RecordBatch, int]]:
 
 
 def read_journal(path: Path) -> pa.Table:
-    """The rows of a journal; of one without a whole batch, none of all columns."""
+    """Return the rows of a journal; of one without a whole batch, none of all columns."""
     batches = [batch for batch, _ in batches_in(path)]
     if batches:
         return pa.Table.from_batches(batches)
@@ -64,14 +64,14 @@ def read_journal(path: Path) -> pa.Table:
 
 
 def _message(batch: pa.RecordBatch, *, is_first: bool) -> bytes:
-    """A batch as it stands in a stream, the first behind the schema."""
+    """Return a batch as it stands in a stream, the first behind the schema."""
     header = batch.schema.serialize().to_pybytes() if is_first else b""
     message: bytes = header + batch.serialize().to_pybytes()
     return message
 
 
 class EpisodeTable:
-    """Writes a table of episodes; a context manager, and a callback of `cprl.training`.
+    """The table of episodes that is being written; a context manager, and a callback of `cprl.training`.
 
     Episodes are safe once `add` has returned, even if the process is killed by SIGKILL; after a power failure
     those up to the last `state_dict` are, which syncs them to the disk. After an OSError (a full disk) all
@@ -122,7 +122,7 @@ class EpisodeTable:
         return self._file
 
     def state_dict(self) -> dict[str, int]:
-        """The number of rows, which are on the disk once it returns."""
+        """Return the number of rows, which are on the disk once it returns."""
         if self._file is not None:
             os.fsync(self._file.fileno())
         return {"rows": self._rows}
@@ -194,8 +194,8 @@ class EpisodeTable:
 
 
 def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
-    """The episodes of a finished, running or killed run, in the order in which they ended; those of what is
-    no run are a FileNotFoundError."""
+    """Return the episodes of a finished, running or killed run, in the order in which they ended; of what is no
+    run they are a FileNotFoundError."""
     path = Path(run_directory) / FILE_NAME
     recipe = path.with_name(RECIPE_FILE)  # with the format of the journal, which has none of its own
     if recipe.is_file():
@@ -270,7 +270,7 @@ def _refuse_other_columns(path: str | os.PathLike[str], table: pa.Table) -> None
 
 
 def read_table(path: str | os.PathLike[str]) -> pa.Table:
-    """A parquet file of a run, checked for damage; one that is missing is a FileNotFoundError."""
+    """Read a parquet file of a run, checked for damage; one that is missing is a FileNotFoundError."""
     path = Path(path)
     verify(path)
     try:
@@ -288,7 +288,7 @@ episodes that the agents had been trained; "episode" counts those of an evaluati
 
 
 def read_evaluations(run: Path) -> pa.Table | None:
-    """The table of `EVALUATIONS`; None for a run without `Experiment.evaluate_every`, or before the first."""
+    """Read the table of `EVALUATIONS`; None for a run without `evaluate_every`, or before the first."""
     return read_rows(run / EVALUATIONS) if (run / EVALUATIONS).exists() else None
 
 
@@ -330,7 +330,7 @@ def _schema(names: Iterable[str]) -> pa.Schema:
 
 
 def schema_of(episode: Episode) -> pa.Schema:
-    """The columns that an episode has; the schema's metadata names those that it lacks."""
+    """Return the columns that an episode has; the schema's metadata names those that it lacks."""
     schema, missing = _schema(_columns(episode)), left_out(episode.reported)
     return schema.with_metadata({LEFT_OUT: missing}) if missing else schema
 

@@ -160,8 +160,8 @@ def refuse_links(folder: Path) -> None:
 
 
 def written_by_another(recipe: object) -> str:
-    """The end of a message about a recipe that cannot be read: which cprl wrote it, where that was another
-    than this; else nothing."""
+    """Return the end of a message about a recipe that cannot be read: which cprl wrote it, where that was
+    another than this; else nothing."""
     versions = recipe.get("versions") if isinstance(recipe, Mapping) else None
     wrote = versions.get("cprl") if isinstance(versions, Mapping) else None
     here = version("cprl")
@@ -187,13 +187,13 @@ _NAMED_CHECKSUM: Final = re.compile(r"-([0-9a-f]{32})\.pt")
 
 
 def checksum(path: Path) -> str:
-    """BLAKE2b of a file's content, 16 bytes in hexadecimal."""
+    """Return BLAKE2b of a file's content, 16 bytes in hexadecimal."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
 
 def digest_of(text: str, *, size: int = 16) -> str:
-    """BLAKE2b of a text, so many bytes in hexadecimal."""
+    """Return BLAKE2b of a text, so many bytes in hexadecimal."""
     return hashlib.blake2b(text.encode(), digest_size=size).hexdigest()
 
 
@@ -316,7 +316,7 @@ class RunLockedError(ValueError):
 
 
 class RunLock:
-    """Holds the lock of a run's directory, or shares that of a study's; a context manager.
+    """The lock of a run's directory, or shares that of a study's; a context manager.
 
     The lock is a `flock` on `run.lock`, which the system releases when the process dies, however it dies. The
     file names host, process and start time. Where a file system is shared by several hosts a `flock` may not
@@ -398,7 +398,7 @@ class RunLock:
             raise OSError(error.errno, error.strerror, str(self.path)) from error
 
     def _is_in_place(self, file: int) -> bool:
-        """Whether the file is the one in the directory: its holder removes it at the end."""
+        """Return whether the file is the one in the directory: its holder removes it at the end."""
         try:
             return os.path.samestat(os.fstat(file), os.stat(self.path))
         except FileNotFoundError:
@@ -417,14 +417,14 @@ class RunLock:
 
 
 def holder_of(directory: Path) -> str:
-    """Who holds the lock of a directory, as messages name a process."""
+    """Return who holds the lock of a directory, as messages name a process."""
     with suppress(OSError), open(directory / LOCK_FILE, "rb") as file:
         return _named(_holder(file.fileno()))
     return _named({})
 
 
 def _holder(file: int) -> dict[str, Any]:
-    """Who wrote the lock file; empty if it cannot be read, e.g. because its process is just starting."""
+    """Return who wrote the lock file; empty if it cannot be read, e.g. as its process is just starting."""
     try:
         holder = json.loads(os.pread(file, 4096, 0))
     except (ValueError, RecursionError):
