@@ -158,12 +158,12 @@ class Experiment(Value, stored=False, called="experiment"):
 
     @classmethod
     def from_config(cls, table: Mapping[str, Any]) -> "Experiment":
-        """Return the experiment that `to_config` gave; of the modules named in it a game's alone is imported."""
+        """Return the experiment that `to_config` gave; of the modules that it names a game's is imported."""
         read = build(cls, table, "experiment")
         return read if not isinstance(read.game, Custom) else replace(read, game=game_of(read.game))
 
     def to_recipe(self, directory: str | Path | None = None) -> dict[str, Any]:
-        """Return what `recipe.json` says of it; `cprl.runs.recipe.start_run` adds when and by what it was run.
+        """Return what `recipe.json` says of it; `cprl.runs.recipe.start_run` adds when and by what.
 
         Args:
             directory: where the recipe is kept: runs of `Frozen` are then given relative to it.

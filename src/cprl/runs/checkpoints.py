@@ -68,8 +68,10 @@ class Checkpointer:
     ) -> None:
         if not every_s > 0:
             raise ValueError(f"every_s is {every_s}; allowed: a number above 0")
-        self.run, self.folder = run, run / FOLDER
-        self.every_s, self.keep_ending = every_s, keep_ending
+        self.run = run
+        self.folder = run / FOLDER
+        self.every_s = every_s
+        self.keep_ending = keep_ending
         self.resume_command = resume_command(run)
         self.has_begun = False
         """Whether a training has begun, or was resumed."""

@@ -89,9 +89,11 @@ class EpisodeTable:
     def __init__(self, path: str | os.PathLike[str], *, resumable: bool = False) -> None:
         self.path = Path(path)
         self.journal = self.path.with_suffix(".arrows")
-        self._resumable, self._is_closed = resumable, False
+        self._resumable = resumable
+        self._is_closed = False
         self._file: FileIO | None = None
-        self._rows, self._schema = 0, None
+        self._rows = 0
+        self._schema = None
         for table in () if resumable else (self.path, self.journal):
             if table.exists():
                 raise FileExistsError(f"{table} exists and is not overwritten; use another directory")
@@ -102,9 +104,13 @@ class EpisodeTable:
 
     def _open(self, rows: int = 0) -> FileIO:
         """Open the journal behind so many of its rows; what follows them is dropped."""
-        count, bytes_kept, schema = 0, 0, None
+        count = 0
+        bytes_kept = 0
+        schema = None
         for batch, end in batches_in(self.journal) if rows else ():
-            count, bytes_kept, schema = count + batch.num_rows, end, batch.schema
+            count += batch.num_rows
+            bytes_kept = end
+            schema = batch.schema
             if count >= rows:
                 break
         if count != rows:
@@ -116,7 +122,8 @@ class EpisodeTable:
         self._file = FileIO(self.journal, "x" if is_new else "r+")  # unbuffered: it survives the process
         self._file.truncate(bytes_kept)
         self._file.seek(bytes_kept)
-        self._rows, self._schema = count, schema
+        self._rows = count
+        self._schema = schema
         if is_new:
             sync_folder(self.journal.parent)
         return self._file
@@ -137,7 +144,8 @@ class EpisodeTable:
             return
         file = self._file or self._open()  # without a checkpoint of the last attempt it starts over
         batch = rows_of(episodes, self._schema or schema_of(episodes[0]))
-        end, left = file.tell(), memoryview(_message(batch, is_first=self._schema is None))
+        end = file.tell()
+        left = memoryview(_message(batch, is_first=self._schema is None))
         try:
             while left:
                 left = left[file.write(left) :]
@@ -148,7 +156,8 @@ class EpisodeTable:
                 what = f"could not add episodes; the {self._rows} earlier rows are in {self.journal}"
                 raise OSError(error.errno, f"{error.strerror or error}: {what}") from error
             raise
-        self._schema, self._rows = batch.schema, self._rows + batch.num_rows
+        self._schema = batch.schema
+        self._rows += batch.num_rows
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Do nothing: a table stores whole episodes."""
@@ -194,8 +203,8 @@ class EpisodeTable:
 
 
 def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
-    """Return the episodes of a finished, running or killed run, in the order in which they ended; of what is no
-    run they are a FileNotFoundError."""
+    """Return the episodes of a finished, running or killed run, in the order in which they ended; of what is
+    no run they are a FileNotFoundError."""
     path = Path(run_directory) / FILE_NAME
     recipe = path.with_name(RECIPE_FILE)  # with the format of the journal, which has none of its own
     if recipe.is_file():
@@ -331,7 +340,8 @@ def _schema(names: Iterable[str]) -> pa.Schema:
 
 def schema_of(episode: Episode) -> pa.Schema:
     """Return the columns that an episode has; the schema's metadata names those that it lacks."""
-    schema, missing = _schema(_columns(episode)), left_out(episode.reported)
+    schema = _schema(_columns(episode))
+    missing = left_out(episode.reported)
     return schema.with_metadata({LEFT_OUT: missing}) if missing else schema
 
 
@@ -340,7 +350,8 @@ def rows_of(episodes: Sequence[Episode], schema: pa.Schema) -> pa.RecordBatch:
     parts = list(map(_columns, episodes))
     for columns in parts:
         if columns.keys() != set(schema.names):
-            more, lacks = columns.keys() - set(schema.names), set(schema.names) - columns.keys()
+            more = columns.keys() - set(schema.names)
+            lacks = set(schema.names) - columns.keys()
             raise ValueError(
                 f"the episode has the extra columns {sorted(more)} and lacks {sorted(lacks)}; allowed: the "
                 "columns of the table's first episode"

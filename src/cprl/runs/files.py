@@ -242,7 +242,8 @@ def remove_listed(run: Path, name: str) -> None:
 def rename_listed(run: Path, name: str, new: str) -> None:
     """Rename a file or folder of a run; checksums stay with their files. What has the new name is replaced,
     but for a folder, whose files are."""
-    source, target = run / name, run / new
+    source = run / name
+    target = run / new
     if source.is_dir():
         target.mkdir(exist_ok=True)
         for path in sorted(source.iterdir()):
@@ -333,8 +334,10 @@ class RunLock:
     """
 
     def __init__(self, directory: Path, *, take_over: bool = False, study: str | None = None) -> None:
-        self.directory, self.path = directory, directory / LOCK_FILE
-        self._take_over, self._study = take_over, study
+        self.directory = directory
+        self.path = directory / LOCK_FILE
+        self._take_over = take_over
+        self._study = study
         self._file: int | None = None
         self.is_alone = True
         """Whether nobody else is known to have run the study when it was locked."""
@@ -369,7 +372,8 @@ class RunLock:
                 ) from None
             self.is_alone = False
         else:
-            holder, here = _holder(file), socket.gethostname()
+            holder = _holder(file)
+            here = socket.gethostname()
             # A process on another host may hold it, as far as the file says.
             self.is_alone = holder.get("host") in (None, here) or self._take_over
             if self.is_alone:

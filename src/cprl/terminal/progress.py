@@ -114,7 +114,8 @@ class ProgressBar:
     def on_step(self, batch: TensorDictBase) -> None:
         """Count the turns of a batch and update the bar if it is due."""
         if not self._turns:  # do not count the time before the first step
-            self._speed, self._course = Speed(self._steps), Speed(self._done())
+            self._speed = Speed(self._steps)
+            self._course = Speed(self._done())
         self._turns += 1
         self._steps += batch.numel()
         self._steps_running += batch.numel()
