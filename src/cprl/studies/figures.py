@@ -372,9 +372,8 @@ def courses(
         panels = sheet.panels(len(views), columns=columns, high=high, sharex=True, sharey=not is_together)
         for axes, (metric, lines) in zip(panels, views, strict=True):
             windows |= _draw_courses(axes, table, metric, lines, is_dashed=is_dashed)
+            _draw_chance(axes, _chance(table, metric), lines)
             *_, last = lines
-            beside_lines = {name: lines[name][0] for name in (lines if is_together else [last])}
-            _draw_chance(axes, table, metric, beside_lines, is_together)
             axes.set_title(title(metric) if is_together else names[last])
         for axes in panels[-columns:]:
             axes.tick_params(labelbottom=True)
@@ -393,19 +392,15 @@ def courses(
     return Path(path)
 
 
-def _draw_chance(
-    axes: Axes, table: StudyTable, metric: str, colours: Mapping[str, str], is_together: bool
-) -> None:
-    """Draw random play under some conditions, a line for all where it is the same."""
-    chance = {name: value for name, value in _chance(table, metric).items() if name in colours}
-    if not chance:
-        return
-    if is_one(chance.values()):
-        axes.axhline(next(iter(chance.values())), **RANDOM_LINE)
-    else:
-        for name, value in chance.items():
-            axes.axhline(value, **{**RANDOM_LINE, "color": colours[name], "linewidth": 1.0})
-    axes.plot([], [], **RANDOM_LINE, label=CHANCE if is_together else "random play under it")
+def _draw_chance(axes: Axes, chance: Mapping[str, float], lines: Mapping[str, tuple[str, str]]) -> None:
+    """Draw random play under the conditions of a panel, a line for all where it is the same."""
+    values = {name: chance[name] for name in lines if name in chance}
+    is_same = is_one(values.values())
+    for name, value in list(values.items())[: 1 if is_same else None]:
+        look = {} if is_same else {"color": lines[name][0], "linewidth": 1.0}
+        axes.axhline(value, **{**RANDOM_LINE, **look})
+    if values:
+        axes.plot([], [], **RANDOM_LINE, label=CHANCE)
 
 
 def _draw_courses(

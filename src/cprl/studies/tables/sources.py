@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Any, Final
 
@@ -368,11 +368,12 @@ def _levels(levels: Sequence[Any]) -> pa.Array:
 
 def circumstances_of(run: Path) -> Circumstances:
     """What the recipe of a run says of how it was made."""
-    recipe = read_recipe(run)
-    each = [_circumstances(part) for part in parts_of(recipe)]
-    names = dict.fromkeys(name for circumstances in each for name in circumstances)
-    values = {name: [circumstances.get(name, UNKNOWN) for circumstances in each] for name in names}
-    return {name: " then ".join(value for value, _ in groupby(in_order)) for name, in_order in values.items()}
+    each = [_circumstances(part) for part in parts_of(read_recipe(run))]
+    joined = {}
+    for name in dict.fromkeys(chain.from_iterable(each)):
+        in_order = groupby(made.get(name, UNKNOWN) for made in each)
+        joined[name] = " then ".join(value for value, _ in in_order)
+    return joined
 
 
 def _circumstances(recipe: Mapping[str, Any]) -> dict[str, str]:
@@ -394,11 +395,8 @@ def marks(made: Mapping[str, Circumstances]) -> dict[str, str]:
         made: the circumstances by run, in the order of the table.
     """
     usual = {name: counts.most_common(1)[0][0] for name, counts in counted(made).items()}
-    return {
-        run: ", ".join(
-            WORDS.get(name, name)
-            for name, value in usual.items()
-            if circumstances.get(name, UNKNOWN) != value
-        )
-        for run, circumstances in made.items()
-    }
+    marked = {}
+    for run, circumstances in made.items():
+        names = [name for name in usual if circumstances.get(name, UNKNOWN) != usual[name]]
+        marked[run] = ", ".join(WORDS.get(name, name) for name in names)
+    return marked
