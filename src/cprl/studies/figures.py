@@ -217,7 +217,8 @@ def _scale(
 
 
 def _lines(table: StudyTable, factor: str) -> dict[str, list[str]]:
-    """Conditions that are equal but for a factor, in the order of its levels, by what they have in common."""
+    """Return conditions that are equal but for a factor, in the order of its levels, by what they have in
+    common."""
     design, names = table.design, finished(table)
     others = [name for name in design.factors if name != factor]
     lines: dict[str, list[str]] = {}
@@ -232,14 +233,14 @@ def _lines(table: StudyTable, factor: str) -> dict[str, list[str]]:
 
 
 def is_numeric(levels: Sequence[Any]) -> bool:
-    """Whether levels stand on an axis of numbers: at least two, all numbers."""
+    """Return whether levels stand on an axis of numbers: at least two, all numbers."""
     return len(set(levels)) > 1 and all(
         isinstance(level, int | float) and not isinstance(level, bool) for level in levels
     )
 
 
 def is_logarithmic(levels: Sequence[float]) -> bool:
-    """Whether that axis is logarithmic."""
+    """Return whether that axis is logarithmic."""
     return min(levels) > 0 and max(levels) > _APART * min(levels)
 
 
@@ -568,7 +569,7 @@ def phase_diagram(
 
 
 def _grid_of(table: StudyTable, factors: tuple[str, str]) -> tuple[Grid, str]:
-    """The conditions of two factors, of levels that were run, and a sentence on the others."""
+    """Return the conditions of two factors, of levels that were run, and a sentence on the others."""
     design, by_pair = table.design, grids(table.design)
     if tuple(factors) not in by_pair:
         pairs = "; ".join(map(" and ".join, by_pair))
@@ -602,32 +603,31 @@ def finished(table: StudyTable) -> list[str]:
 
 
 def _not_run(table: StudyTable) -> str:
-    """A sentence on the conditions that a figure leaves out."""
+    """Return a sentence on the conditions that a figure leaves out."""
     count = len(table.design.conditions) - len(finished(table))
     return f" Not run: {count} of {len(table.design.conditions)} conditions." if count else ""
 
 
 def _chance(table: StudyTable, metric: str) -> dict[str, float]:
-    """Random play under each condition in which it was played and the metric is defined."""
+    """Return random play under each condition in which it was played and the metric is defined."""
     levels = levels_of(table, [metric], part=RANDOM)
     return {name: level.value for (name, _), level in levels.items() if level.replicas}
 
 
 def is_one(values: Iterable[float]) -> bool:
-    """Whether values are one number, but for the rounding of exported tables to float32."""
+    """Return whether values are one number, but for the rounding of exported tables to float32."""
     values = list(values)
     return not values or isclose(min(values), max(values), rel_tol=1e-6)
 
 
 def short(factor: str) -> str:
-    """A factor in a word, e.g. "freeze steps"."""
+    """Return a factor in a word, e.g. "freeze steps"."""
     return factor.rpartition(".")[2].replace("_", " ")
 
 
 def names_of(table: StudyTable) -> dict[str, str]:
-    """What figures call each condition: the level alone where there is one factor, else its name; with
-    the number of replicas where that is not the same for all.
-    """
+    """Return what figures call each condition: the level alone where there is one factor, else its name; with
+    the number of replicas where that is not the same for all."""
     design, names = table.design, list(table.design.conditions)
     words = names
     if len(design.factors) == 1:
@@ -640,7 +640,7 @@ def names_of(table: StudyTable) -> dict[str, str]:
 
 
 def colours_of(names: Sequence[str], levels: Sequence[Any]) -> dict[str, str]:
-    """A colour for each of several lines: from dark to light where their levels are numbers."""
+    """Return a colour for each of several lines: from dark to light where their levels are numbers."""
     if len(names) > 2 and is_numeric(levels):
         order = sorted(set(levels))
         shades = matplotlib.colormaps["viridis"]
@@ -655,7 +655,7 @@ def _chosen(table: StudyTable, metrics: Sequence[str]) -> tuple[str, ...]:
 
 
 def replicas_text(replicas: Mapping[str, int]) -> str:
-    """How many replicas conditions have, e.g. "8 replicas each", but for those that were not run."""
+    """Return how many replicas conditions have, e.g. "8 replicas each", but for those that were not run."""
     counts = _counts(replicas)
     if len(counts) == 1:
         return f"{counts[0]} replica{'s' * (counts[0] != 1)} each"

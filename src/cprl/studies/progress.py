@@ -52,17 +52,17 @@ class Row(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """What its experiment counts: "episodes" or "steps"."""
+        """Return what its experiment counts: "episodes" or "steps"."""
         return self.trial.experiment.length.unit
 
     @property
     def done(self) -> int:
-        """How far it is, in its unit."""
+        """Return how far it is, in its unit."""
         return self.whole * self.episodes // self.of
 
     @property
     def whole(self) -> int:
-        """How long it is, in its unit."""
+        """Return how long it is, in its unit."""
         return self.trial.experiment.length.number * self.trial.experiment.replicas
 
 
@@ -145,7 +145,7 @@ class Overview:
         return Row(trial, "running", episodes, of, per_s, note)
 
     def _listen(self, name: str) -> Mapping[str, Any]:
-        """What a trial says now; the first time it may be what a process said that is dead since."""
+        """Return what a trial says now; the first time it may be what a process said that is dead since."""
         words = self._status[name].read()
         if words != self._last.get(name, {}):
             if name in self._last or words.get("beat", 0) <= 1:
@@ -229,7 +229,8 @@ class Progress:
 
 
 def table_of(now: Snapshot, *, title: str, most: int | None = None) -> Any:
-    """The table of a study for a terminal, with at most so many rows; what the rest is stands below."""
+    """Return the table of a study for a terminal, with at most so many rows; what the rest is stands
+    below."""
     rows, rest = now.rows, ""
     if most is not None and len(rows) > most:
         states = Counter(row.state for row in rows[most - 1 :])

@@ -52,7 +52,7 @@ def run_study(
     last: int = LAST,
     again: str = "",
 ) -> StudyResult:
-    """Runs what a study lacks; may be stopped at any moment, and called again.
+    """Run what a study lacks; may be stopped at any moment, and called again.
 
     A trial that fails does not end the study. Two processes that run the same study share its trials.
     Another study in the same directory is refused until they end.
@@ -121,7 +121,7 @@ def trials_with(trials: Sequence[Trial], only: Sequence[str] | None) -> list[Tri
 
 @contextmanager
 def shared(study: Study, out: Path, *, progress: bool) -> Iterator[None]:
-    """Makes a study's directory, and locks it together with all who run the same study; another one is
+    """Make a study's directory, and lock it together with all who run the same study; another one is
     refused."""
     out.mkdir(parents=True, exist_ok=True)
     table = study.to_config(out)
@@ -138,7 +138,7 @@ def shared(study: Study, out: Path, *, progress: bool) -> Iterator[None]:
 
 
 def _run(tasks: Sequence[Task], executor: Executor, title: str, *, progress: bool) -> tuple[Outcome, ...]:
-    """Runs trials, shows how far they are, and returns those that failed.
+    """Run trials, show how far they are, and return those that failed.
 
     Those that another process runs come last: all others first, then it waits for these. Those that were made
     with other code of the user's own are moved aside and run anew."""
@@ -170,7 +170,7 @@ def _run(tasks: Sequence[Task], executor: Executor, title: str, *, progress: boo
 
 
 def _outcomes(tasks: Sequence[Task], executor: Executor) -> Generator[Outcome, None, None]:
-    """Runs all trials, those that other processes run as soon as these have ended or are silent."""
+    """Run all trials, those that other processes run as soon as these have ended or are silent."""
     silences = {task.name: is_silent(task.status, PATIENCE_S) for task in tasks}
     left = ready = list(tasks)
     while left:

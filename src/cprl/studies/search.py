@@ -147,7 +147,7 @@ class SearchResult(StudyResult):
 
     @property
     def ranked(self) -> list[Point]:
-        """The points with a value, each once, the best first."""
+        """Return the points with a value, each once, the best first."""
         by_name = {point.name: point for point in self.points if point.value is not None}
         sign = -1.0 if self.search.direction == "maximise" else 1.0
         return sorted(by_name.values(), key=lambda point: sign * (point.value or 0.0))
@@ -223,7 +223,8 @@ class _Proposals:
         return list(self._by_number.values())
 
     def next_batch(self) -> list[Point]:
-        """The points that are run next: first those that were stopped, with the rest of their batch."""
+        """Return the points that are run next: first those that were stopped, with the rest of their
+        batch."""
         batch, self._open = self._open, []
         first, at_once = len(self._study.trials), self._search.at_once
         end = math.ceil((first if batch else first + 1) / at_once) * at_once
@@ -247,7 +248,7 @@ class _Proposals:
                 self._by_number[point.number] = replace(point, value=value)
 
     def heading(self, batch: Sequence[Point]) -> str:
-        """What is run next, and the best value so far, in a line."""
+        """Return what is run next, and the best value so far, in a line."""
         search, is_high = self._search, self._search.direction == "maximise"
         values = [point.value for point in self.points if point.value is not None]
         best = f", best {search.metric} so far {(max if is_high else min)(values):.6g}" if values else ""
@@ -288,7 +289,8 @@ class _Proposals:
         }
 
     def _sampler(self, number: int) -> Any:
-        """A new sampler for each point, whose chance depends on the seed and the point's number alone."""
+        """Return a new sampler for each point, whose chance depends on the seed and the point's number
+        alone."""
         text = f"{self._search.experiment.seed} {number}"
         seed = int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest())
         samplers, sampler = self._optuna.samplers, self._search.sampler

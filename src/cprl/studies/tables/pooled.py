@@ -78,7 +78,8 @@ def pooled_table(
 def _groups(
     experiments: Experiments, fields: Sequence[str]
 ) -> tuple[dict[str, dict[str, Any]], dict[str, dict[Path, Experiment]]]:
-    """The levels and the runs of each condition by its name; in the order of numbers, else of the runs."""
+    """Return the levels and the runs of each condition by its name; in the order of numbers, else of the
+    runs."""
     by_values: dict[str, tuple[list[Any], dict[Path, Experiment]]] = {}
     for run, experiment in experiments.items():
         values = [_value_at(experiment, path, run) for path in fields]
@@ -127,7 +128,8 @@ def _firsts(experiments: Iterable[Experiment]) -> dict[int, int]:
 
 
 def _notes(groups: Mapping[str, Experiments], fields: Sequence[str]) -> Iterator[str]:
-    """What runs of one condition, and the conditions themselves, differ in beside the fields asked for."""
+    """Return what runs of one condition, and the conditions themselves, differ in beside the fields asked
+    for."""
     firsts = []
     for name, members in groups.items():
         first, *others = members.values()
@@ -142,7 +144,7 @@ def _notes(groups: Mapping[str, Experiments], fields: Sequence[str]) -> Iterator
 
 
 def _places(one: Experiment, other: Experiment) -> list[str]:
-    """The places in which two experiments differ, as paths, without what is no condition."""
+    """Return the places in which two experiments differ, as paths, without what is no condition."""
     before, now = one.to_config(), other.to_config()
     for name in _NOT_COMPARED:
         before[name] = now[name]
