@@ -62,7 +62,8 @@ def figures_of(
     """Yield what fits a study: the name of each figure's file, what it shows, and what draws it."""
     if not table.metrics:
         return
-    design, conditions = table.design, finished(table)
+    design = table.design
+    conditions = finished(table)
     for factor in design.factors:
         if is_numeric([design.conditions[name][factor] for name in conditions]):
             draw = partial(by_factor, table, factor, metrics=metrics, last=last)
@@ -75,7 +76,8 @@ def figures_of(
             differences = partial(by_condition, table, kind="differences", metrics=metrics, last=last)
             yield f"differences{suffix}", f"Differences from {design.reference}", differences
     for pair in grids(design):
-        words, what = "_".join(map(_file_name, pair)), " and ".join(pair)
+        words = "_".join(map(_file_name, pair))
+        what = " and ".join(pair)
         for metric in metrics_of(table, metrics)[:_MAPPED]:
             draw = partial(heat_map, table, pair, metric=metric, last=last)
             yield f"map_{words}_{_file_name(metric)}{suffix}", f"{title(metric)} by {what}", draw
@@ -219,7 +221,8 @@ def _scale(
 def _lines(table: StudyTable, factor: str) -> dict[str, list[str]]:
     """Return conditions that are equal but for a factor, in the order of its levels, by what they have in
     common."""
-    design, names = table.design, finished(table)
+    design = table.design
+    names = finished(table)
     others = [name for name in design.factors if name != factor]
     lines: dict[str, list[str]] = {}
     for name in names:  # lines are in the order of the conditions
@@ -267,7 +270,8 @@ def by_condition(
         kind: "levels", with random play as dashes; or "differences", with a dashed line at 0.
         metrics: by default those that are compared, and of levels what institutions took and found.
     """
-    design, is_levels = table.design, kind == "levels"
+    design = table.design
+    is_levels = kind == "levels"
     conditions = [name for name in finished(table) if is_levels or name != design.reference]
     if not is_levels and not table.replicas[design.reference]:
         raise ValueError(f"the reference {design.reference} has no finished run; allowed: one that has")
@@ -346,7 +350,8 @@ def courses(
     Args:
         metrics: by default the collective return and survival; else the first that the table has.
     """
-    design, conditions = table.design, finished(table)
+    design = table.design
+    conditions = finished(table)
     usual = [metric for metric in _USUAL if metric in table.metrics]
     chosen = metrics_of(table, metrics or usual)[: len(metrics) or 2]
     if len(conditions) > MOST_CONDITIONS:
@@ -570,7 +575,8 @@ def phase_diagram(
 
 def _grid_of(table: StudyTable, factors: tuple[str, str]) -> tuple[Grid, str]:
     """Return the conditions of two factors, of levels that were run, and a sentence on the others."""
-    design, by_pair = table.design, grids(table.design)
+    design = table.design
+    by_pair = grids(table.design)
     if tuple(factors) not in by_pair:
         pairs = "; ".join(map(" and ".join, by_pair))
         raise refusal("factors", factors, pairs or "none, as the conditions are no grid of two factors")
@@ -628,7 +634,8 @@ def short(factor: str) -> str:
 def names_of(table: StudyTable) -> dict[str, str]:
     """Return what figures call each condition: the level alone where there is one factor, else its name; with
     the number of replicas where that is not the same for all."""
-    design, names = table.design, list(table.design.conditions)
+    design = table.design
+    names = list(table.design.conditions)
     words = names
     if len(design.factors) == 1:
         levels = design.levels(design.factors[0])

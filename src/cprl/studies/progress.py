@@ -103,7 +103,8 @@ class Overview:
     """
 
     def __init__(self, trials: Sequence[Trial], runs: Path, status: Path) -> None:
-        self._trials, self._runs = trials, runs
+        self._trials = trials
+        self._runs = runs
         self._status = {trial.name: Status(status, trial.name) for trial in trials}
         self._last: dict[str, Mapping[str, Any]] = {}
         self._since: dict[str, float] = {}
@@ -171,7 +172,8 @@ class Progress:
         self._console = console(Output(lambda: stream))
         self._labels = {trial.name: trial.label for trial in trials}
         self._overview = Overview(trials, runs, status)
-        self._title, self._is_shown = title, is_shown
+        self._title = title
+        self._is_shown = is_shown
         self._ended = 0
         self._is_over = Event()
         self._live: Live | None = None
@@ -211,7 +213,8 @@ class Progress:
         self._silence.__exit__(None, None, None)
 
     def _watch(self) -> None:
-        said_s, period_s = time.monotonic(), _TABLE_PERIOD_S
+        said_s = time.monotonic()
+        period_s = _TABLE_PERIOD_S
         while not self._is_over.wait(period_s):
             began_s = time.monotonic()
             is_line = began_s - said_s >= _LINE_PERIOD_S
@@ -231,7 +234,8 @@ class Progress:
 def table_of(now: Snapshot, *, title: str, most: int | None = None) -> Any:
     """Return the table of a study for a terminal, with at most so many rows; what the rest is stands
     below."""
-    rows, rest = now.rows, ""
+    rows = now.rows
+    rest = ""
     if most is not None and len(rows) > most:
         states = Counter(row.state for row in rows[most - 1 :])
         rest = "and " + ", ".join(f"{states[state]} {state}" for state in ORDER if states[state])

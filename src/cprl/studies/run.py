@@ -142,7 +142,8 @@ def _run(tasks: Sequence[Task], executor: Executor, title: str, *, progress: boo
 
     Those that another process runs come last: all others first, then it waits for these. Those that were made
     with other code of the user's own are moved aside and run anew."""
-    runs, status = tasks[0].runs, tasks[0].status.folder
+    runs = tasks[0].runs
+    status = tasks[0].status.folder
     moved = move_aside([task.directory for task in tasks if is_of_other_code(task.directory)])
     if moved and progress:
         places = f"{moved[0]}{f' and {len(moved) - 1} more' if moved[1:] else ''}"
@@ -150,7 +151,8 @@ def _run(tasks: Sequence[Task], executor: Executor, title: str, *, progress: boo
         say(f"{anew}; what was there is kept: {places}")
     for task in tasks:
         task.status.tidy_up()
-    trials, failed = [task.trial for task in tasks], []
+    trials = [task.trial for task in tasks]
+    failed = []
     with (
         Progress(trials, runs, status, title=title, is_shown=progress) as table,
         closing(_outcomes(tasks, executor)) as outcomes,

@@ -41,8 +41,10 @@ class Status:
     """
 
     def __init__(self, folder: Path, name: str) -> None:
-        self.folder, self.name = folder, name
-        self.path, self.log = folder / f"{name}.json", folder / f"{name}.log"
+        self.folder = folder
+        self.name = name
+        self.path = folder / f"{name}.json"
+        self.log = folder / f"{name}.log"
         self.failed = folder / f"{name}.failed.txt"
 
     def read(self) -> dict[str, Any]:
@@ -100,7 +102,9 @@ class StatusFile:
             "steps": 0,
             "beat": 0,
         }
-        self._began, self._compiled_s, self._worlds = time.monotonic(), CLOCK.total_s, experiment.worlds
+        self._began = time.monotonic()
+        self._compiled_s = CLOCK.total_s
+        self._worlds = experiment.worlds
         self._length = experiment.length
         self._speed = Speed()
         """How fast episodes are played since this process began to train."""
@@ -128,7 +132,8 @@ class StatusFile:
 
     def write(self) -> None:
         self._table["beat"] += 1
-        running_s, compiling_s = time.monotonic() - self._began, CLOCK.total_s - self._compiled_s
+        running_s = time.monotonic() - self._began
+        compiling_s = CLOCK.total_s - self._compiled_s
         per_s = self._speed.mean(self._table["episodes"])
         times = {
             "running_s": round(running_s, 1),
@@ -164,11 +169,13 @@ def is_silent(status: Status, patience_s: float) -> Iterator[bool]:
 
     Other hosts' clocks may differ from this one's, so what counts is whether the status changes.
     """
-    last, since = status.read(), time.monotonic()
+    last = status.read()
+    since = time.monotonic()
     while True:
         table = status.read()
         if table != last:
-            last, since = table, time.monotonic()
+            last = table
+            since = time.monotonic()
         yield time.monotonic() - since >= patience_s
 
 

@@ -178,7 +178,8 @@ class Study(Value, stored=False):
             yield UNCHANGED, {CONDITION: Level(UNCHANGED, {})}
         else:
             short = short_names(self.factors)
-            seed, draws = self.experiment.seed, self.draws
+            seed = self.experiment.seed
+            draws = self.draws
             combinations = (
                 grid(self.factors)
                 if draws is None

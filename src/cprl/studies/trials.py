@@ -65,7 +65,8 @@ class Trial:
     @cached_property
     def experiment(self) -> Experiment:
         """Return what is run; stored agents play in its replicas, which a run numbers from 0 again."""
-        first, last = self.block.first, self.block.first + self.block.replicas
+        first = self.block.first
+        last = self.block.first + self.block.replicas
 
         def in_block(stored: Frozen) -> Frozen:
             if isinstance(stored.replica, tuple):
@@ -90,7 +91,8 @@ class Trial:
     @property
     def label(self) -> str:
         """Its condition, and which replicas of it, for people."""
-        first, last = self.block.first, self.block.first + self.block.replicas - 1
+        first = self.block.first
+        last = self.block.first + self.block.replicas - 1
         numbers = f"replica {first}" if first == last else f"replicas {first}-{last}"
         return f"{self.condition.name}, {numbers}"
 
@@ -248,7 +250,8 @@ class Task:
         """Return what stands after `cprl` on the command line that runs it."""
         allow = [word for target in self.targets for word in ("--allow", target)]
         keep = "--keep-checkpoint" if self.keep_checkpoint else "--no-keep-checkpoint"
-        experiment, directory = self.trial.experiment, os.path.abspath(self.directory)
+        experiment = self.trial.experiment
+        directory = os.path.abspath(self.directory)
         length = experiment.length.flag, str(experiment.length.number)
         return ["run", directory, "--resume", *length, "--watch", "off", keep, *allow]
 
@@ -284,7 +287,8 @@ class Task:
             return self.failed(f"{type(error).__name__}: {error}", traceback.format_exc())
 
     def _check(self) -> Outcome | None:
-        run, state = self.directory, state_of(self.directory)
+        run = self.directory
+        state = state_of(self.directory)
         if state != "missing":
             self.trial.refuse_another(run)
         if state == "finished":
@@ -297,7 +301,8 @@ class Task:
         return None
 
     def _prepare(self) -> Outcome | None:
-        run, experiment = self.directory, self.trial.experiment
+        run = self.directory
+        experiment = self.trial.experiment
         self.status.folder.mkdir(parents=True, exist_ok=True)
         self.status.tidy_up()
         take_apart(self.status.log)

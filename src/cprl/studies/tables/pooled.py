@@ -91,7 +91,8 @@ def _groups(
     for values, members in sorted(by_values.values(), key=lambda group: list(map(_rank, group[0]))):
         levels = {path: plain_level(value) for path, value in zip(fields, values, strict=True)}
         name = unlike(named({short[path]: level for path, level in levels.items()}), groups)
-        conditions[name], groups[name] = levels, members
+        conditions[name] = levels
+        groups[name] = members
     return conditions, groups
 
 
@@ -145,7 +146,8 @@ def _notes(groups: Mapping[str, Experiments], fields: Sequence[str]) -> Iterator
 
 def _places(one: Experiment, other: Experiment) -> list[str]:
     """Return the places in which two experiments differ, as paths, without what is no condition."""
-    before, now = one.to_config(), other.to_config()
+    before = one.to_config()
+    now = other.to_config()
     for name in _NOT_COMPARED:
         before[name] = now[name]
     lines = differences(before, now, "")
@@ -153,6 +155,7 @@ def _places(one: Experiment, other: Experiment) -> list[str]:
 
 
 def _is_within(place: str, path: str) -> bool:
-    parts, wanted = place.split("."), path.split(".")
+    parts = place.split(".")
+    wanted = path.split(".")
     matches = [part in (ALL, at) for part, at in zip(wanted, parts, strict=False)]
     return len(matches) == len(wanted) and all(matches)
