@@ -52,7 +52,9 @@ class Decisions:
     def __init__(
         self, logger: RerunLogger, scene: Scene, policies: AgentPolicies, *, actions: Sequence[str]
     ) -> None:
-        self._logger, self._names, self._actions = logger, scene.agents, tuple(actions)
+        self._logger = logger
+        self._names = scene.agents
+        self._actions = tuple(actions)
         self._actors = list(zip(map(agent_indices, policies.indices), policies.actors, strict=True))
         self._panels = decision_panels(len(scene.agents), len(actions), scene.window)
         many = 2 * len(scene.agents) * len(actions) > np.iinfo(np.uint8).max
@@ -175,7 +177,9 @@ class Offences:
     fines and transfers per turn; a callback of `cprl.training`."""
 
     def __init__(self, logger: RerunLogger, env: CommonsEnv) -> None:
-        self._logger, self._env, self._names = logger, env, logger.curves.agents
+        self._logger = logger
+        self._env = env
+        self._names = logger.curves.agents
         self._amounts: dict[str, list[NDArray[np.float64]]] = {PAID: [], GIVEN: []}
         """[N] in each turn."""
         self._strips: list[NDArray[np.float32]] = []
@@ -235,7 +239,8 @@ def events(batch: TensorDictBase) -> list[str]:
     """Return the violations of a turn of the first world in words, and the fines of agents who were tagged;
     taxes and costs, which many pay in each turn, are no events."""
     tagged_by = batch.get(("next", *keys.TAGGED_BY), None)
-    fines, violated = _of_agents(batch, FINES), _of_agents(batch, "violated")
+    fines = _of_agents(batch, FINES)
+    violated = _of_agents(batch, "violated")
     tagged = np.zeros(len(fines)) if tagged_by is None else tagged_by[0].numpy(force=True).any(-1)
     fined_when_tagged = np.flatnonzero((violated == 0) & (fines > 0) & tagged)
     return [
