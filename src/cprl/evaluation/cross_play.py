@@ -91,18 +91,14 @@ def crossplay(runs: Runs, fresh: Fresh = Fresh(), *, diagonal: Diagonal = "self"
 def named_runs(runs: Runs) -> dict[str, LoadedRun]:
     """Return runs of the same game of several agents by given names, by names of their directories, or by
     their paths if those coincide."""
-    names: list[str] = []
-    if isinstance(runs, Mapping):
-        names = list(runs)
-        runs = list(runs.values())
-    loaded = [opened(run) for run in runs]
+    loaded = [opened(run) for run in (runs.values() if isinstance(runs, Mapping) else runs)]
     if len(loaded) < 2:
         raise refusal("the number of runs", len(loaded), "at least two")
     paths = [run.path.resolve() for run in loaded]
-    for path in paths:
-        if paths.count(path) > 1:
-            raise ValueError(f"{path} is given twice; allowed: different runs")
-    names = names or [path.name for path in paths]
+    twice = [path for path in paths if paths.count(path) > 1]
+    if twice:
+        raise ValueError(f"{twice[0]} is given twice; allowed: different runs")
+    names = list(runs) if isinstance(runs, Mapping) else [path.name for path in paths]
     if len(set(names)) < len(names):
         names = list(map(str, paths))
     named = dict(zip(names, loaded, strict=True))

@@ -24,7 +24,8 @@ def refuse_other_games(runs: Mapping[str, LoadedRun]) -> None:
     """Raise a ValueError where a run, by its name, has another game than the first, or other transforms."""
     first, *others = runs
     for name in others:
-        run, other = runs[first].experiment, runs[name].experiment
+        run = runs[first].experiment
+        other = runs[name].experiment
         refuse_unlike(f"{first} and {name}", run.game, other.game)
         refuse_unlike(f"{first} and {name}", run.transforms, other.transforms, "transforms")
         learned = differing(runs[first].transforms_state, runs[name].transforms_state)

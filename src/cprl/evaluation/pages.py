@@ -28,11 +28,11 @@ def matrix_cells(family: Family, number: str, title: str, note: str = "") -> Cel
     """Return a row for each of the first labels, a column for each of the second, of a number of a family."""
     rows, columns = _sides(family)
     cells = {key[:-1]: one for key, one in family.items() if key[-1] == number}
-    shown = {pair: Change(one) if family.name else one for pair, one in cells.items()}
+    texts = {pair: Change(one) if family.name else one for pair, one in cells.items()}
     return Cells(
         title,
         [" \\ ".join(family.by), *columns],
-        [[row, *(shown.get((row, column), "") for column in columns)] for row in rows],
+        [[row, *(texts.get((row, column), "") for column in columns)] for row in rows],
         note or "\n".join(notes_on(cells.values())),
     )
 

@@ -103,14 +103,14 @@ _COMMITTED: Final[tuple[tuple[presets.Board, presets.Variant, bool, str], ...]] 
 
 
 def results_folder() -> Path:
-    """The folder with the results that come with a checkout of cprl, which is `docs/results`; an installed
-    wheel has none."""
+    """Return the folder with the results that come with a checkout of cprl, which is `docs/results`; an
+    installed wheel has none."""
     return Path(__file__).parents[3] / "docs" / "results"
 
 
 def stored_for(game: Game) -> Path | None:
-    """The folder of the committed population that was trained on a game, whether it is at hand or not; None
-    if there is none."""
+    """Return the folder of the committed population that was trained on a game, whether it is at hand or not;
+    None if there is none."""
     for board, variant, may_fire, name in _COMMITTED:
         published = presets.game(board, variant=variant)
         if game == replace(published, rules=replace(published.rules, may_fire=may_fire)):
@@ -119,7 +119,7 @@ def stored_for(game: Game) -> Path | None:
 
 
 def left_out_of(game: Game) -> str:
-    """Which scenarios of a game are not at hand and why; "" if all are."""
+    """Say which scenarios of a game are not at hand and why; "" if all are."""
     folder = stored_for(game)
     if folder is None or folder.is_dir():
         return ""
@@ -128,8 +128,9 @@ def left_out_of(game: Game) -> str:
 
 
 def scenarios_of(game: Game) -> tuple[Scenario, ...]:
-    """All named scenarios of a game: as a majority and as a minority among each of `SCRIPTED`, and among the
-    committed population that DQN trained on this very game, if there is one and its folder is at hand.
+    """Return all named scenarios of a game: as a majority and as a minority among each of `SCRIPTED`, and
+    among the committed population that DQN trained on this very game, if there is one and its folder is at
+    hand.
 
     In a game of two agents a majority and a minority are the same, so that it has the minorities alone.
     Without a beam "territorial" and "aggressive" have nothing to fire, and are left out.
@@ -225,7 +226,7 @@ def run_scenarios(
 
 
 def _chosen(run: LoadedRun, scenarios: Sequence[str | Scenario]) -> list[Scenario]:
-    """The scenarios by their names or as they are, checked against the run's game."""
+    """Return the scenarios by their names or as they are, checked against the run's game."""
     named = {scenario.name: scenario for scenario in scenarios_of(run.game)}
     chosen: dict[str, Scenario] = {}
     for given in scenarios or named:

@@ -129,9 +129,11 @@ def dilemma(margins: Family) -> str:
 
 def title_of(payoffs: Payoffs) -> str:
     """Return the name of the dilemma, and where between the ends it does not hold, or is not shown to."""
-    found = margins(payoffs.restrained, payoffs.greedy)
-    is_told = len(candidates(found)) == 1 and dilemma(found) != _NAMES[-1]
-    return dilemma(found) + (between_the_ends(payoffs.restrained, payoffs.greedy) if is_told else "")
+    of_ends = margins(payoffs.restrained, payoffs.greedy)
+    name = dilemma(of_ends)
+    if len(candidates(of_ends)) > 1 or name == _NAMES[-1]:
+        return name
+    return name + between_the_ends(payoffs.restrained, payoffs.greedy)
 
 
 def between_the_ends(restrained: Values, greedy: Values) -> str:

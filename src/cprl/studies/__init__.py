@@ -18,14 +18,6 @@ Modules, in the order in which one reads them:
 """
 
 from cprl.studies.executors import InProcess, Processes, Ray
-from cprl.studies.exploit import (
-    Plan,
-    exploitability,
-    mean_gains,
-    plan_responses,
-    play_responses,
-    response_gains,
-)
 from cprl.studies.factors import Integers, LogUniform, Uniform
 from cprl.studies.run import StudyResult, run_study
 from cprl.studies.search import Search, SearchResult, run_search
@@ -37,7 +29,6 @@ __all__ = [
     "InProcess",
     "Integers",
     "LogUniform",
-    "Plan",
     "Processes",
     "Ray",
     "Search",
@@ -46,12 +37,7 @@ __all__ = [
     "StudyResult",
     "StudyTable",
     "Uniform",
-    "exploitability",
-    "mean_gains",
-    "plan_responses",
-    "play_responses",
     "read_study",
-    "response_gains",
     "run_search",
     "run_study",
     "study_table",
