@@ -23,8 +23,7 @@ from cprl.measuring.statistics import estimate
 from cprl.measuring.table import by_replica, where
 from cprl.measuring.windows import Values, running_mean
 from cprl.runs.curves import curves_of
-from cprl.studies import exploitability, plan_responses
-from cprl.studies.exploit import BEST, compared
+from cprl.studies.exploit import BEST, compared, exploitability, plan_responses
 from cprl.training.agents import LoadedRun, load
 
 POINTS: Final = 2_000
