@@ -43,14 +43,8 @@ def replay(run):
             taken.append(batch["agents", "action"][0].tolist())
 
     with ViewerCallback(run, env, title="replay", episodes=1, is_replay=True) as viewer:
-        scene = viewer.logger.scene
-        shown = Decisions(
-            viewer.logger,
-            AgentPolicies(actors),
-            actions=GAME.actions,
-            names=scene.agents,
-            window=scene.window,
-        )
+        policies, logger = AgentPolicies(actors), viewer.logger
+        shown = Decisions(logger, logger.scene, policies, actions=GAME.actions)
         train(env, {}, others=actors, episodes=1, callbacks=[Remembers(), viewer, shown])
     return run / "run.rrd", taken, shown
 

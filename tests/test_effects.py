@@ -7,9 +7,9 @@ from itertools import product
 import pyarrow as pa
 import pytest
 
-from cprl.evaluation.report import report
 from cprl.measuring.statistics import contrasts
 from cprl.studies.figures import by_condition, heat_map
+from cprl.studies.report import report
 from cprl.studies.results import write_summary
 from cprl.studies.tables.comparing import cells, compared_cells, metrics_of
 from cprl.studies.tables.effects import effect_cells, effects_of, weights_of

@@ -12,7 +12,6 @@ import pytest
 import torch
 
 import cprl
-from cprl.evaluation.report import report
 from cprl.experiment import Experiment
 from cprl.runs.checkpoints import read_checkpoint
 from cprl.runs.curves import curves_of
@@ -28,6 +27,7 @@ from cprl.runs.files import (
 )
 from cprl.runs.recipe import read_recipe
 from cprl.studies import Study, read_study
+from cprl.studies.report import report
 from cprl.studies.tables.sources import circumstances_of
 from cprl.system.output import console, say
 

@@ -13,10 +13,10 @@ from cprl.envs.matrix import prisoners_dilemma
 from cprl.evaluation.film import Style, film, film_video
 from cprl.evaluation.fresh import averages_of, fresh_episode, fresh_episodes, fresh_seed, typical_replica
 from cprl.evaluation.play import open_session, play_in_terminal
-from cprl.evaluation.report import report
 from cprl.evaluation.show import show
 from cprl.runs.recipe import start_run
 from cprl.runs.weights import save_weights
+from cprl.studies.report import report
 from cprl.system.defaults import FILM_SEED, PLAY_SEED
 from cprl.training.agents import load
 from cprl.training.outcome import make_agents

@@ -182,7 +182,7 @@ def test_a_mark_is_a_diamond_around_the_agent(tmp_path):
     seen = Remembers(env.base_env)
 
     def marking(viewer):
-        return Offences(viewer.logger, env.base_env, names=viewer.logger.scene.agents)
+        return Offences(viewer.logger, env.base_env)
 
     recorded(tmp_path, env, episodes=1, is_replay=True, callbacks=[seen, marking])
     _, marks = column(tmp_path / "run.rrd", "world/violators", "LineStrips2D:strips", "frame")

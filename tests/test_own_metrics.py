@@ -4,6 +4,7 @@ from dataclasses import replace
 from math import inf
 from shutil import copytree
 
+import pyarrow as pa
 import pytest
 from recordings import column, names
 from stored_runs import command
@@ -12,11 +13,13 @@ from tiny_study import TINY
 import cprl
 from cprl import Custom, Study
 from cprl.measuring.registry import bounds, title, unit, with_unit
-from cprl.measuring.table import numbers_in
+from cprl.measuring.table import numbers_in, where
 from cprl.runs.curves import curves_of
 from cprl.runs.episodes import read_episodes, read_evaluations
 from cprl.runs.recipe import read_recipe
 from cprl.studies import Search, StudyTable
+from cprl.studies.tables.comparing import cells
+from cprl.studies.tables.table import Design
 from cprl.values import OWN_METRICS
 from cprl.viewer.layout import layout, styles
 from cprl.viewer.scene import Curves
@@ -82,6 +85,17 @@ def test_its_title_and_unit_come_from_its_function_and_stand_in_the_recipe_alone
     assert title("largest_share") == "largest_share"
 
 
+def test_the_table_of_a_study_says_what_it_is_called(tmp_path):
+    OWN_METRICS["gap"] = {"title": "most minus least", "unit": "apples"}
+    row = {"condition": "a", "replica": 0, "part": "training", "metric": "gap", "episode": 0}
+    rows = pa.Table.from_pylist([row | {"window_episodes": 10, "undefined": 0, "value": 3.0}])
+    design = Design(name="one", conditions={"a": {}}, reference="a", is_paired=True)
+    written = StudyTable(design=design, rows=rows, window=10).write(tmp_path / "table.parquet")
+    OWN_METRICS.clear()
+    assert cells(StudyTable.read(written), last=10).head[-1] == "most minus least, apples"
+    OWN_METRICS.clear()
+
+
 def test_one_from_0_to_1_has_these_bounds():
     assert bounds("gap") == (-inf, inf)
     OWN_METRICS["of_all"] = {"unit": "0 to 1"}
@@ -107,8 +121,10 @@ def test_it_is_compared_in_a_study_and_what_a_search_looks_for(tmp_path):
     study = Study(measured, {"game.rules.freeze_steps": [2, 5]}, replicas=1)
     result = cprl.run_study(study, tmp_path / "study")
     assert "largest_share" in (result.out / "summary.md").read_text()
+    table = StudyTable.read(result.out / "table.parquet")
     for part in ("training", "evaluation", "random"):
-        assert StudyTable.read(result.out / "table.parquet").values("freeze_steps=5", "largest_share", part)
+        rows = where(table.windows(part), condition="freeze_steps=5", metric="largest_share")
+        assert rows["value"].to_pylist()
     factors = {"game.rules.freeze_steps": [2, 5]}
     assert Search(measured, factors, points=2, metric="largest_share").metric == "largest_share"
     with pytest.raises(ValueError, match="metric"):

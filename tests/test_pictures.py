@@ -20,7 +20,7 @@ from cprl.commons.colours import (
     picture_colour,
 )
 from cprl.commons.picture import INK, agent_sprite, world_image
-from cprl.viewer.board import marks, numbers, numbers_and_headings
+from cprl.viewer.board import mark, number, number_and_heading, strokes
 
 SEEN = {
     "deuteranopia": (
@@ -111,9 +111,9 @@ def test_a_picture_draws_each_agent_in_its_own_cell_alone():
 
 
 def test_all_lines_of_agents_stay_in_their_cells():
-    for strokes in (numbers_and_headings(120), numbers(120), marks(120)):
-        assert np.abs(strokes.shape).max() <= 0.5
-    assert set(marks(12).owner) == set(range(4, 12))
+    for lines_of in (number_and_heading, number, mark):
+        assert np.abs(strokes(120, lines_of).shape).max() <= 0.5
+    assert set(strokes(12, mark).owner) == set(range(4, 12))
 
 
 def test_the_measure_finds_colours_that_look_the_same():

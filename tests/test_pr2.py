@@ -17,8 +17,8 @@ from cprl.envs import make_env
 from cprl.envs.matrix import MatrixGame, stag_hunt
 from cprl.learners.engine import FunctionalEngine
 from cprl.learners.transitions import joint_actions
-from cprl.networks.agent import chosen, marginal, soft_value
 from cprl.objectives import PR2Loss
+from cprl.objectives.pr2 import chosen, marginal, soft_value
 from cprl.population import Learning, Scripted
 from cprl.training import train
 from cprl.training.agents import Population

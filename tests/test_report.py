@@ -14,9 +14,9 @@ from viewers import browser, wait_until
 from cprl import Custom, presets
 from cprl.envs.matrix import prisoners_dilemma
 from cprl.evaluation import Fresh, evaluate_run
-from cprl.evaluation.report import report
 from cprl.evaluation.show import show
 from cprl.institutions import Quota
+from cprl.studies.report import report
 from cprl.terminal.summary import compared
 from cprl.training.agents import load
 from cprl.values import trust

@@ -69,7 +69,7 @@ def test_frames_show_the_board_the_agents_and_what_each_sees(tmp_path):
         assert others.sum() == len(agents), "who is out of play is not drawn as if it were in"
     _, lines = column(path, "world/agents", "LineStrips2D:strips")
     assert [len(drawn) for drawn in lines] == [4, 4, 2, 2, 2, 2], "a triangle and a digit an agent in play"
-    (_, tip, *_), _, digit, _ = (np.array(line) for line in lines[1])
+    (_, tip, *_), digit, *_ = (np.array(line) for line in lines[1])
     assert (tip - (2.5, 1.5)).tolist() == pytest.approx([0.44, 0], abs=1e-6), "heading 1 points right"
     assert (np.abs(digit - (2.5, 1.5)) < 0.5).all(), "the number is inside the cell"
     assert digit[:, 0].max() < tip[0] - 0.2, "and behind the triangle"

@@ -502,7 +502,7 @@ def test_an_episode_of_a_replica_that_an_observer_does_not_expect_is_refused_by_
     turns = list(itertools.islice(StepCollector(MatrixGame(2), tit_for_tat), 7))
     episodes = [episode for turn in turns for episode in tracker.add(turn)]
     (of_another, *_) = (episode for episode in episodes if episode.replica == 1)
-    with pytest.raises(ValueError, match=r"replica 1; allowed: of replicas 0 to 0, as replicas says"):
+    with pytest.raises(ValueError, match=r"replica 1; allowed: of replicas 0 to 0, those of the environment"):
         Observer([], MatrixGame(1)).on_episode(of_another, {})
 
 

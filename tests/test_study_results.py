@@ -761,7 +761,7 @@ def table_command(tmp_path, monkeypatch):
         ("--by name --summary", "--summary .* without --by"),
         ("--by name --figures pdf", "--figures .* without --by"),
         ("--csv --figures pdf", "without --figures"),
-        ("--csv --out a.csv", "without --out, --out FILE.csv"),
+        ("--csv --out a.csv", "without --out, as --out FILE.csv"),
         ("--csv --summary", "without --summary"),
         ("--csv --metric equality", "without --metric"),
         ("--csv --part random", "without --part"),

@@ -34,6 +34,7 @@ REFERENCE: Final = {
     "viewer": "recordings for the Rerun viewer",
     "evaluation": "stored agents in fresh worlds and among each other",
     "studies": "one experiment under many conditions",
+    "experimental": "the waiting room: works, is tested, may change",
     "values": "frozen values, whose annotations say what a field allows, as tables; code of your own",
 }
 """A page each, in reading order, and what it is about."""
@@ -43,7 +44,7 @@ _MODULES: Final = {
     "envs": ("make_env",),
     "experiment": ("presets",),
     "learners": ("settings",),
-    "measuring": ("social", "outcome", "statistics"),
+    "measuring": ("social", "registry", "table", "statistics", "outcome"),
     "objectives": ("preferences",),
     "policies": ("scripted", "assignment", "decisions"),
     "training": ("training",),

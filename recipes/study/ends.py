@@ -25,12 +25,12 @@ from cprl.evaluation import (
     schelling,
 )
 from cprl.evaluation.cross_play import OF_FOCAL
-from cprl.evaluation.exploit import BEST, compared
 from cprl.experimental.territory import WORDS, number_of, territory_of
 from cprl.measuring.statistics import estimate
 from cprl.measuring.table import by_replica, where
 from cprl.measuring.windows import Values, running_mean
 from cprl.runs.curves import curves_of
+from cprl.studies.exploit import BEST, compared
 from cprl.training.agents import LoadedRun, load
 
 POINTS: Final = 2_000

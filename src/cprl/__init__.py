@@ -20,8 +20,8 @@ A package imports only from those above it:
     viewer       recordings for the Rerun viewer
     terminal     progress, summary, figures
     training     the loop: act, store, update, measure, record; run, load
-    studies      one experiment under many conditions: factors, trials, tables, figures
-    evaluation   stored agents in fresh worlds: alone, among each other and people, against best responses
+    evaluation   stored agents in fresh worlds: alone, among each other and people
+    studies      one experiment under many conditions: factors, trials, tables, figures; best responses
     experimental  the waiting room, which may change: empirical games, territory
     commands     the command line
 """

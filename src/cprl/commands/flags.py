@@ -86,14 +86,14 @@ def with_help(function: Callable[..., Any]) -> Callable[..., Any]:
 def _describe(owner: Any, defaults: Mapping[str, Any]) -> None:
     from docstring_parser import parse_from_object  # as tyro does
 
-    bases = [base for base in getattr(owner, "__mro__", (owner,)) if base is not object]
-    parts = [part for base in reversed(bases) for part in parse_from_object(base).params]
-    texts = {part.arg_name: part.description or "" for part in parts}
-    for name, hint in get_type_hints(owner, include_extras=True).items():
-        text = " ".join(texts.get(name, "").split()) or None
-        is_empty = name in defaults and (defaults[name] is None or defaults[name] == ())
-        flag = tyro.conf.arg(help=text, help_behavior_hint="" if is_empty else None)
-        owner.__annotations__[name] = Annotated[hint, flag]
+    for base in getattr(owner, "__mro__", (owner, object))[:-1]:  # all but object
+        texts = {part.arg_name: part.description or "" for part in parse_from_object(base).params}
+        hints = get_type_hints(base, include_extras=True)
+        for name in inspect.get_annotations(base):
+            is_empty = name in defaults and (defaults[name] is None or defaults[name] == ())
+            text = " ".join(texts.get(name, "").split()) or None
+            flag = tyro.conf.arg(help=text, help_behavior_hint="" if is_empty else None)
+            base.__annotations__[name] = Annotated[hints[name], flag]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +113,8 @@ class Tables:
 
         others = [name for name, value in vars(self).items() if value and name not in ("csv", "figure_width")]
         if self.csv and others:
-            raise ValueError(f"--csv prints every row and nothing else; allowed: without --{others[0]}")
+            cure = others[0] + ", as --out FILE.csv writes means and intervals" * (others[0] == "out")
+            raise ValueError(f"--csv prints every row and nothing else; allowed: without --{cure}")
         for path in self.out:
             if path.suffix not in (ROWS, *SUFFIXES):
                 raise refusal("--out", str(path), f"a name that ends in {', '.join((ROWS, *SUFFIXES))}")

@@ -165,7 +165,7 @@ def report(run: Path, /, *, out: Path | None = None, episodes: int = 20, seed: i
     """
     _begin(seed, *([] if (run / STUDY_TABLE).is_file() else [run]))
 
-    from cprl.evaluation.report import report as report_on
+    from cprl.studies.report import report as report_on
 
     path = report_on(run, out, episodes=episodes, seed=seed)
     say(f"{path}: {path.stat().st_size / 1000:.0f} kB; open it in a browser")
@@ -443,7 +443,7 @@ def exploit(
     _begin(fresh.seed, run, files=files)
 
     from cprl.commands.studies import StudyOptions, carry_out, executor_of
-    from cprl.evaluation.exploit import TABLE, exploitability_cells, measure, plan_responses
+    from cprl.studies.exploit import TABLE, exploitability_cells, measure, plan_responses
     from cprl.studies.study import directory_of
     from cprl.terminal.tables import show
 

@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar
 
 import tyro
 
-from cprl.commands.recipe import ALLOW, Words, ended_by_sigterm, in_a_sentence, parse_with, trust_allowed
+from cprl.commands.flags import with_help
+from cprl.commands.recipe import (
+    ALLOW,
+    Words,
+    ended_by_sigterm,
+    in_a_sentence,
+    parse_with,
+    trust_allowed,
+    wrapped,
+)
 from cprl.runs.length import UNITS, without_length
 from cprl.runs.recipe import read_recipe, without_directories, without_options
 from cprl.system.defaults import LAST
@@ -39,8 +48,8 @@ _NOTE: Final = (
     "all conditions; --replicas is the number in each condition."
 )
 _ABOUT: Final = {
-    "cprl sweep": "Runs a recipe under several conditions.",
-    "cprl search": "Searches for good values of a recipe's experiment by Optuna, point by point.",
+    "cprl sweep": "Run a recipe under several conditions.",
+    "cprl search": "Search for good values of a recipe's experiment by Optuna, point by point.",
 }
 
 
@@ -133,7 +142,7 @@ RecipeOptions = TypeVar("RecipeOptions", SweepOptions, SearchOptions)
 
 
 def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
-    """Runs a study as the command line asks for it; a recipe of a study ends with it.
+    """Run a study as the command line asks for it; a recipe of a study ends with it.
 
     Args:
         argv: the command line, script first; by default this process's.
@@ -153,7 +162,7 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
         changes = _given(options)
         said = {unit: changes.pop(unit) for unit in UNITS if unit in changes}
         if said:
-            changes["experiment"] = replace(study.experiment, **without_length({}), **said)
+            changes["experiment"] = replace(study.experiment, **without_length({}) | said)
         study = replace(study, **changes)
         for unit, number in said.items():
             for condition in study.all_conditions:
@@ -172,7 +181,7 @@ def _given(options: TrialOptions) -> dict[str, Any]:
 
 
 def sweep(words: Sequence[str], /) -> None:
-    """Runs a recipe under several conditions: cprl sweep RECIPE --vary ...
+    """Run a recipe under several conditions: cprl sweep RECIPE --vary ...
 
     Args:
         words: what stands after `cprl sweep`: first a Python file with a function `experiment`, the name of
@@ -188,7 +197,7 @@ def sweep(words: Sequence[str], /) -> None:
 
 
 def search(words: Sequence[str], /) -> None:
-    """Searches for good values by Optuna: cprl search RECIPE --vary ... --points 30
+    """Search for good values by Optuna: cprl search RECIPE --vary ... --points 30
 
     Args:
         words: what stands after `cprl search`, see `sweep`.
@@ -241,8 +250,15 @@ def _print_help(options: RecipeOptions, program: str) -> None:
     ) -> None:
         """Never called."""
 
-    about = f"{_ABOUT[program]} {_NOTE} The flags of a recipe are listed by {program} RECIPE --help. {ALLOW}"
-    tyro.cli(read, args=["--help"], prog=program, description=about, config=_CONFIG)
+    listed = f"The flags of a recipe are listed by {program} RECIPE --help."
+    about = "\n\n".join([_ABOUT[program], _NOTE, listed, ALLOW])
+    tyro.cli(
+        with_help(read),
+        args=["--help"],
+        prog=program,
+        description=wrapped(about),
+        config=(*_CONFIG, tyro.conf.DisallowNone),
+    )
 
 
 def recipe_of(source: Path) -> "Callable[..., Experiment]":

@@ -1,4 +1,4 @@
-"""`cprl table`: compares any runs, or the runs of a study."""
+"""`cprl table`: compare any runs, or the runs of a study."""
 
 import sys
 from collections.abc import Sequence
@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import tyro
 
-from cprl.commands.flags import NO_DEFAULT
-from cprl.runs.files import refuse_to_write_over
+from cprl.commands.flags import ROWS, TableFlags, Tables
 from cprl.runs.recipe import runs_in
 from cprl.system.defaults import LAST, STUDY_TABLE, WINDOW
 from cprl.system.output import OUT, say
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
     from cprl.studies import StudyTable
 
 _TRAINING: Final = "training"
-_SUFFIXES: Final = (".parquet", ".txt", ".md", ".tex", ".csv")
 Part = Literal["training", "evaluation", "random"]
 
 
@@ -29,7 +27,7 @@ class Compare:
     metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """What is compared, e.g. collective_return; may be repeated."""
     part: Part = _TRAINING
-    """Of the runs: their training, their agents in fresh worlds, or random play in these."""
+    """Which part of the runs: their training, their agents in fresh worlds, or random play in these."""
     last: int | None = None
     """Episodes at the end of the training that are compared, by default 30."""
 
@@ -39,49 +37,40 @@ class Compare:
 
 
 def table(
-    runs: Annotated[tuple[Path, ...], NO_DEFAULT],
+    runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN [RUN ...]", help_behavior_hint="")],
     /,
     *,
     by: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     compare: Annotated[Compare, tyro.conf.arg(name="")] = Compare(),
     reference: str | None = None,
     window: int | None = None,
-    out: tyro.conf.UseAppendAction[tuple[Path, ...]] = (),
-    csv: bool = False,
+    files: TableFlags = Tables(),
     summary: bool = False,
     figures: Literal["png", "pdf", "svg"] | None = None,
 ) -> None:
-    """Compares any runs, grouped by fields of their experiments, with intervals over replicas.
+    """Compare any runs, grouped by fields of their experiments, and print intervals over replicas.
 
-    Ends with exit code 1 where a damaged run had to be left out; it is named.
+    A row is a window of episodes of a replica and a metric. Ends with exit code 1 where a damaged run had to
+    be left out; it is named.
 
     Args:
-        runs: directories of runs, or of directories that hold them, with --by; or the directory of a study.
-        by: the path of a field, e.g. game.rules.freeze-steps, agents.*.algorithm.settings.gamma or name; may
+        runs: Directories of runs, or of directories that hold them, with --by; or the directory of a study.
+        by: The path of a field, e.g. game.rules.freeze-steps, agents.*.algorithm.settings.gamma or name; may
             be repeated.
-        reference: the name of the condition that others are compared with, e.g. freeze_steps=25; by default
+        reference: The name of the condition that others are compared with, e.g. freeze_steps=25; by default
             the first, or the reference of the study.
-        window: episodes of a row of the table, of which --last compares whole ones, 10 by default; 1 for
+        window: Episodes of a row of the table, of which --last compares whole ones, 10 by default; 1 for
             episodes one by one; with --by.
-        out: a new file: .txt, .md, .tex or .csv with the means, differences and intervals that are printed,
-            or .parquet with every window of episodes and replica, of the metrics asked for; may be repeated.
-        csv: print every window of episodes, replica and metric as CSV, and nothing else.
-        summary: write summary.md and the figures of a study again, from its table alone.
-        figures: draw the figures of a study into its figures/ as png, pdf or svg, of the metrics asked for.
+        summary: Write summary.md and the figures of a study again, from its table alone.
+        figures: Draw the figures of a study into its figures/ as png, pdf or svg, of the metrics asked for.
     """
-    for path in out:
-        if path.suffix not in _SUFFIXES:
-            raise ValueError(f"--out is {path}; allowed: a name that ends in {', '.join(_SUFFIXES)}")
-        refuse_to_write_over(path)
-    if csv:
-        given = {"out": out, "summary": summary, "figures": figures, "reference": reference, **vars(compare)}
-        defaults = {"out": (), "summary": False, **vars(Compare())}
+    files.check()
+    if files.csv:
+        given = {"summary": summary, "figures": figures, "reference": reference, **vars(compare)}
+        defaults = {"summary": False, **vars(Compare())}
         for name, value in given.items():
             if value != defaults.get(name):
-                raise ValueError(
-                    f"--csv prints every row and nothing else; allowed: without --{name}"
-                    + ", --out FILE.csv writes means and intervals" * (name == "out")
-                )
+                raise ValueError(f"--csv prints every row and nothing else; allowed: without --{name}")
     if not runs:
         raise ValueError("cprl table needs at least one run: cprl table RUN... --by FIELD")
     for flag, value in (("--summary", summary), ("--figures", figures)):
@@ -96,7 +85,7 @@ def table(
         study_table = pooled_table(runs, by=by, window=window, reference=reference)
     else:
         study_table = _table_in(runs, reference, window)
-    if csv:
+    if files.csv:
         OUT.write(study_table.to_csv())
         _exit_if_damaged(study_table)
         return
@@ -120,8 +109,8 @@ def table(
 
         for path in draw(study_table, runs[0], last=last, suffix=f".{figures}", metrics=compare.metric):
             say(f"Figure: {path}")
-    for path in out:
-        if path.suffix == ".parquet":
+    for path in files.out:
+        if path.suffix == ROWS:
             rows = study_table.rows
             chosen = compare.metric or study_table.metrics
             replace(study_table, rows=where(rows, metric=tuple(chosen))).write(path)

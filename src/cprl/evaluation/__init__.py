@@ -8,13 +8,10 @@ Modules, in the order in which one reads them:
     cross_play      crossplay: a focal agent of one run among background agents of another; gains
     schelling       what restrained and greedy agents get, by how many of the others are restrained
     scenarios       run_scenarios: a run among named backgrounds that it never met
-    exploit         exploitability: trains best responses, a study; play_responses, response_gains: what they
-                    gain over the agents whose place they take
     fresh           fresh episodes that are shown, by default a typical one
     film            an episode, every step recorded, or as a GIF or an MP4
     film_pictures   the pictures of a film, and its files
     show            episodes side by side on an HTML page
-    report          an HTML page about a run or a study
     sandbox         an HTML page with sliders, whose agents play at once
     export          episodes for other programs: CSV, Minari
     play            a person among trained or scripted agents
@@ -22,7 +19,6 @@ Modules, in the order in which one reads them:
 
 from cprl.evaluation.cross_play import by_focal_agent, crossplay, draw_gains, gains
 from cprl.evaluation.evaluate import evaluate_run
-from cprl.evaluation.exploit import Plan, exploitability, plan_responses, play_responses, response_gains
 from cprl.evaluation.lanes import play_population
 from cprl.evaluation.scenarios import Scenario, advantages, draw_scenarios, run_scenarios, scenarios_of
 from cprl.evaluation.schelling import dilemma, draw_schelling, margins, payoffs_of, schelling
@@ -30,7 +26,6 @@ from cprl.system.defaults import Fresh
 
 __all__ = [
     "Fresh",
-    "Plan",
     "Scenario",
     "advantages",
     "by_focal_agent",
@@ -40,14 +35,10 @@ __all__ = [
     "draw_scenarios",
     "draw_schelling",
     "evaluate_run",
-    "exploitability",
     "gains",
     "margins",
     "payoffs_of",
-    "plan_responses",
     "play_population",
-    "play_responses",
-    "response_gains",
     "run_scenarios",
     "scenarios_of",
     "schelling",

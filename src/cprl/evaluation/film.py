@@ -102,13 +102,9 @@ def _recorded(fresh: FreshEpisode, target: Path, title: str) -> Episode:
         scene = logger.scene
         views: list[Any] = [viewer]
         if scene is not None:
-            actions = fresh.run.game.actions
-            window = scene.window
-            views.append(
-                Decisions(logger, fresh.policies, actions=actions, names=scene.agents, window=window)
-            )
+            views.append(Decisions(logger, scene, fresh.policies, actions=fresh.run.game.actions))
             if commons is not None and scene.has_institutions:
-                views.append(Offences(logger, commons, names=scene.agents))
+                views.append(Offences(logger, commons))
         observer = Observer(views, env)
         tracker = tracker_of(env)
         for step, batch in enumerate(turns(env, fresh.policies), start=1):

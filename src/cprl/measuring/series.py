@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from math import ceil, isnan
 from statistics import fmean
 from typing import Any, Final
@@ -95,7 +96,7 @@ def logged(metric: str) -> str:
 
 
 def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence[str]) -> dict[str, float]:
-    """The numbers of an episode, by the names of docs/metrics.md; NaN where undefined.
+    """Return the numbers of an episode, by the names of docs/metrics.md; NaN where undefined.
 
     Args:
         learning: the numbers of learning in it, by agent index: `agent_0/loss` and so on.
@@ -127,7 +128,7 @@ class Series:
         """By the number of W episodes, and by replica."""
 
     def add(self, episode: Episode, numbers: Mapping[str, float]) -> dict[str, Values] | None:
-        """Adds the numbers of an episode of a replica.
+        """Add the numbers of an episode of a replica.
 
         Returns:
             The numbers, [R] by name, NaN where a replica has none, if all replicas have ended the episode and
@@ -138,8 +139,8 @@ class Series:
         """
         if episode.replica >= self.replicas:
             raise ValueError(
-                f"an episode of replica {episode.replica}; allowed: of replicas 0 to {self.replicas - 1}, as "
-                "replicas says"
+                f"an episode of replica {episode.replica}; allowed: of replicas 0 to {self.replicas - 1}, "
+                "those of the environment"
             )
         together = episode.episode // self.worlds
         of_replicas = self._waiting.setdefault(together, {})
@@ -158,19 +159,16 @@ class Series:
         return mean_of(np.array([numbers.get(name, np.nan) for numbers in episodes]))
 
     def state_dict(self) -> dict[str, Any]:
-        """The incomplete episodes."""
-        return {"waiting": {episode: dict(numbers) for episode, numbers in self._waiting.items()}}
+        """Return the incomplete episodes."""
+        return {"waiting": deepcopy(self._waiting)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continues with the incomplete episodes of a state."""
-        self._waiting = {
-            int(together): {int(replica): list(numbers) for replica, numbers in of_replicas.items()}
-            for together, of_replicas in state["waiting"].items()
-        }
+        """Continue with the incomplete episodes of a state."""
+        self._waiting = deepcopy(state["waiting"])
 
 
 def mean_of(values: Values) -> float:
-    """The mean of the defined values; NaN if none is defined."""
+    """Return the mean of the defined values; NaN if none is defined."""
     defined = values[~np.isnan(values)]
     return float(defined.mean()) if len(defined) else float("nan")
 
@@ -189,7 +187,7 @@ class Recent:
         self._last: deque[float] = deque(maxlen=self.window)
 
     def add(self, value: float) -> float:
-        """Adds a value; returns the mean of the last ones that are defined, NaN if none is."""
+        """Add a value; return the mean of the last ones that are defined, NaN if none is."""
         self._last.append(float(value))
         defined = [value for value in self._last if not isnan(value)]
         return fmean(defined) if defined else float("nan")

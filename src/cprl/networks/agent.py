@@ -91,7 +91,7 @@ class JointNetwork(nn.Module):
     Args:
         network: a network with (N - 1) x A x A outputs.
         peers: the number of other agents, N - 1.
-        temperature: in units of reward, see `marginal`.
+        temperature: in units of reward, see `cprl.objectives.pr2.marginal`.
     """
 
     stacks_over: ClassVar = ("network",)
@@ -107,7 +107,9 @@ class JointNetwork(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         """[..., *shape] to the logits of the policy, [..., A]."""
-        return marginal(self.joint_values(observation), self.temperature) / self.temperature
+        # As `cprl.objectives.pr2.marginal` has it, to the last bit.
+        scaled = self.joint_values(observation) / self.temperature
+        return self.temperature * scaled.logsumexp(-1).sum(-2) / self.temperature
 
 
 class OtherOutputs(nn.Module):
@@ -120,31 +122,3 @@ class OtherOutputs(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         outputs: Tensor = getattr(self.of, self._method)(observation)
         return outputs
-
-
-def marginal(joint: Tensor, temperature: float) -> Tensor:
-    """The value of an agent's own action: T log sum exp(Q(s, a, others) / T) over the others' joint actions.
-
-    Computed exactly: with pairs, float [..., N - 1, A, A], the sum over joint actions is a product of sums
-    over each peer's; float [..., A]. The agent expects that a peer answers with rho(b | s, a), which is
-    proportional to exp(q(s, a, b) / T): Wen et al., "Probabilistic Recursive Reasoning for Multi-Agent
-    Reinforcement Learning" (2019).
-    """
-    return temperature * (joint / temperature).logsumexp(-1).sum(-2)
-
-
-def chosen(joint: Tensor, action: Tensor) -> Tensor:
-    """The value of one joint action.
-
-    Args:
-        action: int64 [..., N], the agent's own action first.
-    """
-    actions = joint.shape[-1]
-    action_of_agent, peers = action[..., :1], action[..., 1:]
-    pairs = joint.flatten(-2).gather(-1, (action_of_agent * actions + peers).unsqueeze(-1))
-    return pairs.sum((-2, -1))
-
-
-def soft_value(values: Tensor, temperature: float) -> Tensor:
-    """T log sum exp(values / T) over the last axis: [..., A] to [...]."""
-    return temperature * torch.logsumexp(values / temperature, -1)

@@ -9,7 +9,6 @@ from tensordict.nn import TensorDictModule, TensorDictParams
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
-from cprl.networks.agent import chosen, marginal, soft_value
 from cprl.objectives.td import TDLoss, distance
 
 
@@ -20,7 +19,7 @@ class PR2Loss(TDLoss):
     value of a joint action is their sum. With temperature T the peers' expected answer is
     rho(b | s, a) ~ exp(q_j(s, a, b) / T), the value of an own action Q(s, a) = T log sum exp(Q(s, a, others)
     / T) over the others' joint actions, and the policy pi(a | s) ~ exp(Q(s, a) / T); see
-    `cprl.networks.agent`. The loss is the squared difference between the value of the joint action taken and
+    `marginal`. The loss is the squared difference between the value of the joint action taken and
     r + gamma V(s'), where V is the soft value of the target network, T log sum exp(Q(s', a) / T).
 
     The model of the peers is optimistic: they are expected to do what the agent values, whatever they value.
@@ -112,3 +111,33 @@ class PR2Loss(TDLoss):
                 tensordict, next_value=following.unsqueeze(-1)
             )
         return estimated.squeeze(-1)
+
+
+def marginal(joint: Tensor, temperature: float) -> Tensor:
+    """Return the value of an agent's own action: T log sum exp(Q(s, a, others) / T) over the joint actions of
+    the others.
+
+    Computed exactly: with pairs, float [..., N - 1, A, A], the sum over joint actions is a product of sums
+    over each peer's; float [..., A]. The agent expects that a peer answers with rho(b | s, a), which is
+    proportional to exp(q(s, a, b) / T): Wen et al., "Probabilistic Recursive Reasoning for Multi-Agent
+    Reinforcement Learning" (2019).
+    """
+    return temperature * (joint / temperature).logsumexp(-1).sum(-2)
+
+
+def chosen(joint: Tensor, action: Tensor) -> Tensor:
+    """Return the value of one joint action.
+
+    Args:
+        action: int64 [..., N], the agent's own action first.
+    """
+    actions = joint.shape[-1]
+    action_of_agent = action[..., :1]
+    peers = action[..., 1:]
+    pairs = joint.flatten(-2).gather(-1, (action_of_agent * actions + peers).unsqueeze(-1))
+    return pairs.sum((-2, -1))
+
+
+def soft_value(values: Tensor, temperature: float) -> Tensor:
+    """Return T log sum exp(values / T) over the last axis: [..., A] to [...]."""
+    return temperature * torch.logsumexp(values / temperature, -1)

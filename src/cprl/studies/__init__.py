@@ -12,6 +12,9 @@ Modules, in the order in which one reads them:
     tables       what came out, as one tidy table; means and differences
     figures      drawn of a table
     results      write_results: table, summary and figures of a study
+    report       an HTML page about a run or a study
+    exploit      exploitability: trains best responses, a study; play_responses, response_gains, mean_gains:
+                 what they gain over the agents whose place they take
 """
 
 from cprl.studies.executors import InProcess, Processes, Ray

@@ -95,8 +95,10 @@ class Sheet:
         self.width_em = 72 * WIDTH_IN[width] / TEXT_PT[width]
         self._layout = ConstrainedLayoutEngine()
         self.figure = Figure(layout=self._layout, dpi=DPI[width])
-        self.title, self.caption, self.legend_title = "", "", ""
-        """The title has some five words; how the figure was made is said in the caption."""
+        self.title = ""
+        """Some five words; how the figure was made is said in the caption."""
+        self.caption = ""
+        self.legend_title = ""
         self._high = self._wide = 0.0
         self._row_high: dict[Axes, float] = {}
         """The height of each panel's row in em."""
@@ -123,21 +125,19 @@ class Sheet:
         """
         rows = -(-number // columns)
         heights = [float(high)] * rows if isinstance(high, int | float) else list(high)
-        self._high, self._wide = sum(heights), (self.width_em - beside) / columns
-        panels = list(
-            self.figure.subplots(
-                rows, columns, squeeze=False, gridspec_kw={"height_ratios": heights}, **grid
-            ).reshape(-1)
-        )
-        for axes in panels[number:]:
-            axes.set_visible(False)
-        for axes, row in zip(panels, [row for row in heights for _ in range(columns)], strict=True):
-            self._row_high[axes] = row
+        self._high = sum(heights)
+        self._wide = (self.width_em - beside) / columns
+        grid["gridspec_kw"] = {"height_ratios": heights}
+        panels = list(self.figure.subplots(rows, columns, squeeze=False, **grid).flat)
+        for place, axes in enumerate(panels):
+            self._row_high[axes] = heights[place // columns]
+            axes.set_visible(place < number)
         return panels[:number]
 
     def finish(self) -> None:
         """Put title, legend and caption around the panels, as high as they are."""
-        figure, em_in = self.figure, TEXT_PT[self.width] / 72
+        figure = self.figure
+        em_in = TEXT_PT[self.width] / 72
         figure.set_size_inches(WIDTH_IN[self.width], 10)
         for axes in figure.axes:
             axes.set_title(wrapped(axes.get_title("left"), self._wide - 1))
@@ -150,12 +150,13 @@ class Sheet:
         drawn = wrapped(self.caption, self.width_em - 1, 0.47) if self.width == "page" else ""
         caption = figure.text(0, 0, drawn, fontsize="small", color=_FAINT, va="bottom", ha="left")
         legend = self._legend(renderer)
-        em_pixels, parts = em_in * figure.dpi, (title, caption, *([legend] if legend else []))
-        over, under, keys = ([part.get_window_extent(renderer).height / em_pixels for part in parts] + [0])[
-            :3
-        ]
-        keys += 0.5 * bool(legend)
-        over, under = (over + 0.8) * bool(self.title), (under + 0.4) * bool(drawn)
+
+        def high(part: Any) -> float:
+            return float(part.get_window_extent(renderer).height) / (em_in * figure.dpi)
+
+        over = high(title) + 0.8 if self.title else 0.0
+        under = high(caption) + 0.4 if drawn else 0.0
+        keys = high(legend) + 0.5 if legend else 0.0
         total = over + self._high + keys + under + 0.6
         figure.set_size_inches(WIDTH_IN[self.width], total * em_in)
         left = 0.5 / self.width_em
@@ -171,7 +172,7 @@ class Sheet:
             line.set(linewidth=scale * line.get_linewidth(), markersize=scale * line.get_markersize())
 
     def _legend(self, renderer: Any) -> Any:
-        """A legend of everything that has a label, each label once, in as many columns as fit."""
+        """Return a legend of everything that has a label, each label once, in as many columns as fit."""
         entries: dict[str, Any] = {}
         for axes in self.figure.axes:
             for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -204,7 +205,7 @@ def drawing(
         colours: of a PNG.
         is_new: whether a picture that is there is refused.
     """
-    path = (check_picture if is_new else picture_path)(path)
+    path = check_picture(path, is_new=is_new)
     checked("width", width, Width)
     look: Any = {**_LOOK, "font.size": TEXT_PT[width]}
     with matplotlib.rc_context(look):
@@ -218,49 +219,43 @@ def drawing(
             write_atomically(path.with_suffix(".caption.txt"), lambda file: file.write(text))
 
 
-def picture_path(path: str | Path, name: str = "path") -> Path:
-    """The path of a picture to be, whose folder may be missing; a picture that is there is drawn anew."""
+def check_picture(path: str | Path, name: str = "path", *, is_new: bool = True) -> Path:
+    """Return the path of a picture to be, checked before hours of work; its folder may be missing."""
     path = Path(path)
     if path.suffix not in SUFFIXES:
         raise refusal(name, str(path), f"a file whose name ends in {', '.join(SUFFIXES)}")
-    return path
-
-
-def check_picture(path: str | Path, name: str = "path") -> Path:
-    """`picture_path` of a new picture, checked before hours of work."""
-    path = picture_path(path, name)
-    refuse_to_write_over(path)
+    if is_new:
+        refuse_to_write_over(path)
     return path
 
 
 def save(figure: Figure, path: Path, *, colours: int = COLOURS, title: str = "", caption: str = "") -> Path:
     """Write a picture atomically, a PNG of so few colours."""
     drawn = BytesIO()
-    if path.suffix == ".png":
-        figure.savefig(drawn, format="png")
-        drawn = _with_colours(drawn, colours, figure.dpi, {"Title": title, "Description": caption})
-    else:
+    about: dict[str, str | None] = {"Title": title, "Description": caption}
+    if path.suffix == ".pdf":
         about = {"Title": title, "Subject": caption, "CreationDate": None}
-        if path.suffix == ".svg":
-            about = {"Title": title, "Description": caption, "Date": None}
-        figure.savefig(drawn, format=path.suffix[1:], metadata=about)
-    write_atomically(path, lambda file: file.write(drawn.getvalue()))
-    return path
+    elif path.suffix == ".svg":
+        about["Date"] = None
+    figure.savefig(drawn, format=path.suffix[1:], metadata=about)
+    drawn = _with_colours(drawn, colours) if path.suffix == ".png" else drawn
+    return write_atomically(path, lambda file: file.write(drawn.getvalue()))
 
 
-def _with_colours(drawn: BytesIO, colours: int, dpi: float, about: dict[str, str]) -> BytesIO:
-    """A picture as a PNG of so few colours, each near those that it stands for."""
+def _with_colours(drawn: BytesIO, colours: int) -> BytesIO:
+    """Return a PNG with so few colours, each near those that it stands for."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
-    few, texts = BytesIO(), PngInfo()
-    for name, text in about.items():
-        texts.add_itxt(name, text)
+    few = BytesIO()
+    texts = PngInfo()
     with Image.open(drawn) as picture:
+        for name in ("Title", "Description"):
+            texts.add_itxt(name, picture.info[name])
         chosen = picture.convert("RGB").quantize(
             colours, method=Image.Quantize.MAXCOVERAGE, kmeans=2, dither=Image.Dither.NONE
         )
-        chosen.save(few, format="png", optimize=True, dpi=(dpi, dpi), pnginfo=texts)
+        chosen.save(few, format="png", optimize=True, dpi=picture.info["dpi"], pnginfo=texts)
     return few
 
 

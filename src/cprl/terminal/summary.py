@@ -130,9 +130,10 @@ def compared(
     blank = [""] * len(others)
     rows.append(["episodes", *(str(len(where(one, agent=0))) for one in of_policies), *blank])
     if "harvest" in table.column_names:
-        idle = [one["harvest"].to_pylist() for one in of_policies]
-        counts = (f"{each.count(0)} of {len(each)}" for each in idle)
-        rows.append(["agents without a harvest, not in sustainability", *counts, *blank])
+        harvests = [one["harvest"].to_pylist() for one in of_policies]
+        idle = [f"{each.count(0)} of {len(each)}" for each in harvests]
+        if any(0 in each for each in harvests):
+            rows.append(["agents without a harvest, not in sustainability", *idle, *blank])
     notes = [
         (table.schema.metadata or {}).get(LEFT_OUT, b"").decode(),
         ZEROS if silent else "",

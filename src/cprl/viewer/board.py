@@ -1,6 +1,6 @@
 """How the board of one world looks in Rerun, frame by frame."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any, Final, NamedTuple
 
@@ -43,8 +43,8 @@ class Strokes(NamedTuple):
 
     def placed(
         self, centres: Floats, heading: NDArray[np.integer], drawn: NDArray[np.bool_]
-    ) -> tuple[Floats, NDArray[np.intp]]:
-        """The lines of all frames.
+    ) -> tuple[Floats, NDArray[np.intp], NDArray[np.intp]]:
+        """Return the lines of all frames.
 
         Args:
             centres: float32 [T, N, 2], the middle of each agent's cell, (x, y).
@@ -52,53 +52,50 @@ class Strokes(NamedTuple):
             drawn: bool [T, N], the agents whose lines are drawn.
 
         Returns:
-            The lines one after the other, float32 [lines, P, 2], and how many each frame has, [T].
+            The lines one after the other, float32 [lines, P, 2], the agent of each, and how many each frame
+            has, [T].
         """
         drawn = drawn[:, self.owner]
         frame, line = np.nonzero(drawn)
         agent = self.owner[line]
         lines = self.shape[heading[frame, agent], line] + centres[frame, agent][:, None]
-        return lines, drawn.sum(1)
+        return lines, agent, drawn.sum(1)
 
 
 @cache
-def numbers_and_headings(agents: int) -> Strokes:
-    """The number and the triangle of each agent."""
-    lines = [(agent, _triangle(agent)) for agent in range(agents)]
-    lines += [(agent, digit) for agent in range(agents) for digit in _number(agent)]
-    return _strokes(lines)
-
-
-@cache
-def numbers(agents: int) -> Strokes:
-    middle = [
-        (agent, np.broadcast_to(digit * _scale(agent, room=0.7), (4, POINTS, 2)))
-        for agent in range(agents)
-        for digit in number_paths(agent)
-    ]
-    return _strokes(middle)
-
-
-@cache
-def marks(agents: int) -> Strokes:
-    return _strokes([(agent, line) for agent in range(agents) for line in _mark(agent_mark(agent))])
-
-
-def _strokes(lines: list[tuple[int, Floats]]) -> Strokes:
+def strokes(agents: int, lines_of: Callable[[int], list[Floats]]) -> Strokes:
+    """Return the lines of so many agents, by a function that draws one: [4, P, 2] each."""
+    lines = [(agent, line) for agent in range(agents) for line in lines_of(agent)]
     shape = np.zeros((4, len(lines), POINTS, 2), np.float32)
     for index, (_, line) in enumerate(lines):
-        shape[:, index, : line.shape[1]], shape[:, index, line.shape[1] :] = line, line[:, -1:]
+        shape[:, index] = line[:, -1:]
+        shape[:, index, : line.shape[1]] = line
     return Strokes(np.array([agent for agent, _ in lines], np.intp), shape)
 
 
+def number_and_heading(agent: int) -> list[Floats]:
+    """Return the triangle, and behind it the digits: a number is upright whatever the heading."""
+    front = _front(agent) - _DEEP - 2 * RADIUS_CELLS
+    back = 0.5 - (_RIM if agent_mark(agent) in ("ring", "stripe") else 0.02)
+    behind = _turned((0, (back - front) / 2))
+    scale = np.float32(_scale(agent, room=back + front))
+    return [_triangle(agent), *(behind + digit * scale for digit in number_paths(agent))]
+
+
+def number(agent: int) -> list[Floats]:
+    """Return the digits in the middle."""
+    scale = _scale(agent, room=0.7)
+    return [np.broadcast_to(digit * scale, (4, POINTS, 2)) for digit in number_paths(agent)]
+
+
 def _turned(*corners: tuple[float, float]) -> Floats:
-    """A line of an agent that is headed up, for each heading: [4, corners, 2]."""
+    """Return a line of an agent that is headed up, for each heading: [4, corners, 2]."""
     turned: Floats = np.einsum("pk,hkd->hpd", np.array(corners), _TURNS).astype(np.float32)
     return turned
 
 
 def _front(agent: int) -> float:
-    """How far the tip of the triangle is from the middle, in cells."""
+    """Return how far the tip of the triangle is from the middle, in cells."""
     return _EDGE - (_RIM if agent_mark(agent) == "ring" else 0)
 
 
@@ -109,27 +106,21 @@ def _triangle(agent: int) -> Floats:
     return _turned((-_HALF_WIDE, -base), (0, -tip), (_HALF_WIDE, -base), (-_HALF_WIDE, -base), inside)
 
 
-def _number(agent: int) -> list[Floats]:
-    """The digits behind the triangle: a number is upright whatever the heading."""
-    front = _front(agent) - _DEEP - 2 * RADIUS_CELLS
-    back = 0.5 - (_RIM if agent_mark(agent) in ("ring", "stripe") else 0.02)
-    behind = _turned((0, (back - front) / 2))
-    return [behind + digit * np.float32(_scale(agent, room=back + front)) for digit in number_paths(agent)]
-
-
 def _scale(agent: int, *, room: float) -> float:
-    """The distance between points of a digit with which a number fits, in cells."""
+    """Return the distance between points of a digit with which a number fits, in cells."""
     points = max(DIGIT_HIGH - 1, 4 * len(str(agent)) - 2)
     return min(_GRID, (room - 2 * RADIUS_CELLS) / points)
 
 
-def _mark(mark: str) -> list[Floats]:
+def mark(agent: int) -> list[Floats]:
+    """Return what tells agents of the same hue apart."""
     edge, corner = 0.5 - RADIUS_CELLS, 0.25
-    if mark == "ring":
+    kind = agent_mark(agent)
+    if kind == "ring":
         return [_turned((-edge, -edge), (edge, -edge), (edge, edge), (-edge, edge), (-edge, -edge))]
-    if mark == "stripe":
+    if kind == "stripe":
         return [_turned((-edge, edge), (edge, edge))]
-    if mark == "corners":
+    if kind == "corners":
         return [
             _turned((x * corner, y * edge), (x * edge, y * edge), (x * edge, y * corner))
             for x in (-1, 1)
@@ -149,7 +140,7 @@ SHOT_CELLS: Final = 0.1
 
 
 def image_form(size: tuple[int, int]) -> Any:
-    """The format of an image of classes with so many rows and columns."""
+    """Return the format of an image of classes with so many rows and columns."""
     return rr.components.ImageFormat(width=size[1], height=size[0], channel_datatype=rr.ChannelDatatype.U8)
 
 
@@ -158,7 +149,8 @@ def board_form(scene: Scene) -> Any:
 
 
 def board_styles() -> dict[str, list[Any]]:
-    """How the parts of a board look, by the names of `board_columns`; the form of the image is left out."""
+    """Return how the parts of a board look, by the names of `board_columns`; the form of the image is left
+    out."""
     image, lines = rr.SegmentationImage.from_fields, rr.LineStrips2D.from_fields
     return {
         "board": [image(opacity=1.0, draw_order=-10.0)],
@@ -178,7 +170,8 @@ def board_styles() -> dict[str, list[Any]]:
 
 
 def columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
-    """The contents of T frames, by entity: the frames that have a row there, and the columns of these rows.
+    """Return the contents of T frames, by entity: the frames that have a row there, and the columns of these
+    rows.
 
     Beams and the marks of agents out of play have rows only for the first frame and where they change.
     """
@@ -200,10 +193,11 @@ def board_columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.in
     everywhere = np.arange(count)
     contents = {
         "board": (everywhere, _pictures(boards(scene, frames))),
-        "agents": (everywhere, _lines(numbers_and_headings(agents), frames)),
+        "agents": (everywhere, _lines(strokes(agents, number_and_heading), frames)),
     }
-    if len(marks(agents).owner):
-        contents["marks"] = everywhere, _lines(marks(agents), frames)
+    marks = strokes(agents, mark)
+    if len(marks.owner):
+        contents["marks"] = everywhere, _lines(marks, frames)
     changed = _changes(frames["beams"])
     frame, row, col = np.nonzero(frames["beams"][changed])
     dots = np.stack([col, row], -1).astype(np.float32) + RIM_CELLS + 0.5
@@ -213,7 +207,7 @@ def board_columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.in
 
 
 def _stock(scene: Scene, frames: Frames) -> tuple[NDArray[np.intp], Any]:
-    """A bar below the board, as wide as it with all apples, filled as far as they are there."""
+    """Return a bar below the board, as wide as it with all apples, filled as far as they are there."""
     apples = (frames["stock"] > 0).sum(1)
     changed = _changes(apples)
     apples, sites = apples[changed], max(1, len(scene.sites))
@@ -237,8 +231,10 @@ def boards(scene: Scene, frames: Frames) -> Bytes:
     Returns:
         uint8 [T, H + 2, W + 2].
     """
-    count = len(frames["step"])
-    drawn = np.full((count, scene.height, scene.width), GROUND, np.uint8)
+    size = len(frames["in_play"]), scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS
+    whole = np.full(size, WALL, np.uint8)
+    drawn = whole[:, RIM_CELLS:-RIM_CELLS, RIM_CELLS:-RIM_CELLS]
+    drawn[:] = GROUND
     if scene.walls:
         drawn[:, *np.array(scene.walls).T] = WALL
     if scene.sites:
@@ -246,20 +242,17 @@ def boards(scene: Scene, frames: Frames) -> Bytes:
     for agent in range(len(scene.agents)):
         at = np.flatnonzero(frames["in_play"][:, agent])
         drawn[at, frames["row"][at, agent], frames["col"][at, agent]] = FIRST_AGENT + agent
-    return _with_rim(drawn, WALL)
+    return whole
 
 
-def _with_rim(pictures: Bytes, kind: int) -> Bytes:
-    return np.pad(pictures, ((0, 0), (RIM_CELLS,) * 2, (RIM_CELLS,) * 2), constant_values=kind)
-
-
-def _lines(strokes: Strokes, frames: Frames) -> Any:
-    lines, counts = strokes.placed(centres_of(frames), frames["heading"], frames["in_play"])
+def _lines(of_agents: Strokes, frames: Frames) -> Any:
+    lines, _, counts = of_agents.placed(centres_of(frames), frames["heading"], frames["in_play"])
     return rr.LineStrips2D.columns(strips=lines).partition(counts)
 
 
 def _out(frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
-    """A hollow square in the colour of each agent out of play, with its number where nobody else's stands.
+    """Return a hollow square in the colour of each agent out of play, with its number where nobody else's
+    stands.
 
     The squares have labels that name who tagged the agent; the viewer shows them on request.
     """
@@ -277,26 +270,25 @@ def _out(frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
         colors=rgb[np.nonzero(out)[1]],
         labels=["out" if tagger < 0 else f"by {tagger}" for tagger in by[out]],
     ).partition(out.sum(1))
-    strokes = numbers(out.shape[1])
-    lines, counts = strokes.placed(centres, frames["heading"][changed], alone)
-    owner = strokes.owner[np.nonzero(alone[:, strokes.owner])[1]]
-    digits = rr.LineStrips2D.columns(strips=lines, colors=rgb[owner]).partition(counts)
+    numbers = strokes(out.shape[1], number)
+    lines, agent, counts = numbers.placed(centres, frames["heading"][changed], alone)
+    digits = rr.LineStrips2D.columns(strips=lines, colors=rgb[agent]).partition(counts)
     return {"out": (changed, squares), "out/numbers": (changed, digits)}
 
 
 def centres_of(frames: Frames) -> NDArray[np.float32]:
-    """The positions of agents on the image, (x, y): [(T), N, 2]."""
+    """Return the positions of agents on the image, (x, y): [(T), N, 2]."""
     return np.stack([frames["col"], frames["row"]], -1).astype(np.float32) + RIM_CELLS + 0.5
 
 
 def _changes(rows: NDArray[Any]) -> NDArray[np.intp]:
-    """The indices of the first row, and of all rows that differ from the previous one."""
+    """Return the indices of the first row, and of all rows that differ from the previous one."""
     flat = rows.reshape(len(rows), -1)
     return np.flatnonzero(np.concatenate([[True], (flat[1:] != flat[:-1]).any(1)]))
 
 
 def mosaic(windows: Bytes) -> Bytes:
-    """The windows of all agents in one image, with UNSEEN between them.
+    """Return the windows of all agents in one image, with UNSEEN between them.
 
     Args:
         windows: uint8 [T, N, X, Y], classes of `classes_seen`.

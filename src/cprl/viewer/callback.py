@@ -165,7 +165,7 @@ class ViewerCallback:
             self.story.begins(status)
 
     def on_start(self, training: Any) -> None:
-        """Goes on where a `Training` that is resumed is: views get the episodes that the run's table has, and
+        """Go on where a `Training` that is resumed is: views get the episodes that the run's table has, and
         viewers the recording so far."""
         if not training.steps:
             return
@@ -183,7 +183,7 @@ class ViewerCallback:
         self.logger.log_text(f"resumed from step {training.steps:,}")
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Lets the views look at the worlds after the turn, if the first one's frames are recorded or one of
+        """Let the views look at the worlds after the turn, if the first one's frames are recorded or one of
         them needs to.
 
         Otherwise it only counts: whatever runs here displaces a training's data from the fast caches.
@@ -199,13 +199,13 @@ class ViewerCallback:
         self.logger.at(step=self._turn * self.logger.curves.worlds, episode=episode)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Adds an episode of a replica, and logs its events."""
+        """Add an episode of a replica, and log its events."""
         self._set_time(self._episode)
         for view in self._views:
             view.on_episode(episode, learning)
 
     def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
-        """Draws the numbers of an episode that all replicas have ended."""
+        """Draw the numbers of an episode that all replicas have ended."""
         self._episode = episode + 1
         self._set_time(episode)
         for view in self._views:
@@ -217,20 +217,20 @@ class ViewerCallback:
         return policy if self.exhibition is None else self.exhibition.seen(env, policy)
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
-        """Compares the training with these episodes of random play: in header, label, plots and an event."""
+        """Compare the training with these episodes of random play: in header, label, plots and an event."""
         for view in self._views:
             view.random_play(episodes)
 
     def finished(self, played: Mapping[str, Sequence[Episode]]) -> None:
-        """Shows that the run is finished, and closes the file; a live view stays open until the end."""
+        """Show that the run is finished, and close the file; a live view stays open until the end."""
         self.filming.close()
         for view in self._views:
             view.finished(played)
         self.logger.close_file()
 
     def linger(self) -> None:
-        """Says where the recording stays served, exhibits the trained policy, waits for Ctrl-C (SIGINT) or
-        SIGTERM, and closes the recording; a second signal in the meantime changes nothing."""
+        """Say where the recording stays served, exhibit the trained policy, wait for Ctrl-C (SIGINT) or
+        SIGTERM, and close the recording; a second signal in the meantime changes nothing."""
         if not self.logger.is_live:
             console().print("The recording is no longer served.")
             return
@@ -246,17 +246,17 @@ class ViewerCallback:
             self.logger.shutdown()
 
     def play_on(self, stop: Event) -> None:
-        """Exhibits the trained policy until the event is set; returns at once where nothing is exhibited."""
+        """Exhibit the trained policy until the event is set; return at once where nothing is exhibited."""
         if self.exhibition is not None:
             self.exhibition.play_on(stop)
 
     def flush(self) -> None:
-        """Sends all that waits, to the file and to viewers."""
+        """Send all that waits, to the file and to viewers."""
         self.filming.close()
         self.logger.flush()
 
     def state_dict(self) -> dict[str, Any]:
-        """What does not follow from the run's table; the recording is complete up to here."""
+        """Return what does not follow from the run's table; the recording is complete up to here."""
         self.flush()
         return {"frames": self.logger.frames}
 

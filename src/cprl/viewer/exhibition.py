@@ -90,7 +90,7 @@ class Exhibition(View):
         self._send(_before_the_first_step(commons.game), _beginning(commons.game))
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Plays the steps of a batch if they are due."""
+        """Play the steps of a batch if they are due."""
         now = self._clock()
         if now >= self._due and not self.is_over:
             self._due = now + BATCH_S
@@ -109,8 +109,8 @@ class Exhibition(View):
         return acted
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
-        """Has the episode of the first world sent, which shows what compares with the training while its code
-        is compiled; what is left of it when the exhibition begins is left out."""
+        """Have the episode of the first world sent, which shows what compares with the training while its
+        code is compiled; what is left of it when the exhibition begins is left out."""
         frames = None if self._at_random is None else self._at_random.take()
         if frames is not None:
             first = {name: array[: episodes[0].steps] for name, array in frames.items()}
@@ -120,7 +120,7 @@ class Exhibition(View):
         return self._wait(seconds) or self.steps > 0
 
     def play_on(self, stop: Event) -> None:
-        """Plays the trained policy until the event is set; returns at once where it has ended.
+        """Play the trained policy until the event is set; return at once where it has ended.
 
         It rests when an episode ends.
         """
@@ -130,17 +130,17 @@ class Exhibition(View):
             stop.wait(REST_S if self._rests else BATCH_S)
 
     def close(self) -> None:
-        """Leaves out frames that have not been sent."""
+        """Leave out frames that have not been sent."""
         self._closing.set()
 
     def _slept(self, seconds: float) -> bool:
-        """Whether `close` was called by the end of so many seconds; an event's own `wait` takes
+        """Return whether `close` was called by the end of so many seconds; an event's own `wait` takes
         longer to end, and keeps the training from going on meanwhile."""
         time.sleep(seconds)
         return self._closing.is_set()
 
     def _play(self, episode: int) -> None:
-        """Plays some steps, and has them sent; fewer the next time if they took long."""
+        """Play some steps, and have them sent; fewer the next time if they took long."""
         if self._stream.is_behind:
             return
         began = self._clock()
@@ -199,8 +199,8 @@ class Exhibition(View):
 
 
 def caption_of(policy: PresentPolicy, episode: int) -> str:
-    """What is shown: "current policy, episode 1,234, epsilon 0.31", without the last for agents that have no
-    epsilon, and without the episode after the training."""
+    """Return what is shown: "current policy, episode 1,234, epsilon 0.31", without the last for agents that
+    have no epsilon, and without the episode after the training."""
     policy.explore_as_now()
     chances = list(dict.fromkeys(f"{epsilon:.2f}" for epsilon in policy.epsilons))
     chance = f", epsilon {' to '.join(dict.fromkeys((chances[0], chances[-1])))}" if chances else ""
@@ -213,7 +213,7 @@ _THIN: Final = 0.01
 
 
 def _send_fixed(recording: Any, *, scene: Scene) -> None:
-    """Sends what never changes; formats of images are in each frame instead: a viewer that gets one after a
+    """Send what never changes; formats of images are in each frame instead: a viewer that gets one after a
     frame, for the first time or again, shows no board until the next frame."""
     for entity, parts in board_styles().items():
         recording.log(f"exhibition/{entity}", *parts, static=True)
@@ -226,7 +226,7 @@ def _send_fixed(recording: Any, *, scene: Scene) -> None:
 def _send_frames(
     recording: Any, *, scene: Scene, frames: Frames, caption: str, wait: Callable[[float], bool]
 ) -> None:
-    """Sends frames one by one, over the time of a batch, until `wait` says to leave out the rest."""
+    """Send frames one by one, over the time of a batch, until `wait` says to leave out the rest."""
     _send_caption(recording, caption=caption)
     rows = _rows(scene, frames)
     for sent, row in enumerate(rows, 1):
@@ -254,8 +254,8 @@ class _Row(NamedTuple):
 
 
 def _rows(scene: Scene, frames: Frames) -> list[list[tuple[str, list[Any]]]]:
-    """What each frame changes: entities and their columns of one row, cut out of those of all frames, which
-    takes a tenth of the time of columns for each."""
+    """Return what each frame changes: entities and their columns of one row, cut out of those of all frames,
+    which takes a tenth of the time of columns for each."""
     rows: list[list[tuple[str, list[Any]]]] = [[] for _ in frames["step"]]
     for entity, (numbers, columns) in board_columns(scene, frames).items():
         if entity == "board":
@@ -268,8 +268,8 @@ def _rows(scene: Scene, frames: Frames) -> list[list[tuple[str, list[Any]]]]:
 
 
 def _beginning(game: Game) -> str:
-    """What the frame before the first step is: each episode begins with the map as it is drawn, all apples on
-    it and each agent at its start, or otherwise by chance."""
+    """Return what the frame before the first step is: each episode begins with the map as it is drawn, all
+    apples on it and each agent at its start, or otherwise by chance."""
     rules = game.rules
     by_chance = rules.first_stock_share < 1 or rules.shuffle_starts or rules.random_headings
     if by_chance or game.map.spawns or game.map.river:
@@ -278,7 +278,7 @@ def _beginning(game: Game) -> str:
 
 
 def _before_the_first_step(game: Game) -> Frames:
-    """The frame before the first step, drawn from the map."""
+    """Return the frame before the first step, drawn from the map."""
     board = game.map
     row, col, heading = np.array(board.starts, np.int32).T
     frame = {

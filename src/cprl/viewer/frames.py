@@ -110,7 +110,7 @@ class Filming(View):
         self.is_on = self.is_shown(self._ended)
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Copies a frame if this episode's are recorded."""
+        """Copy a frame if this episode's are recorded."""
         self.frame = None
         if self._recorder is None or not self.is_on:
             return
@@ -132,7 +132,7 @@ class Filming(View):
             self.show(shows=False)
 
     def close(self) -> None:
-        """Logs the frames so far."""
+        """Log the frames so far."""
         self._sent = time.perf_counter()
         frames = None if self._recorder is None else self._recorder.take()
         if frames is not None:
@@ -188,7 +188,7 @@ class Wall(View):
                 self._log([self._row(self._logger.frames)], live_only=True)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Notes whether the board has died, and logs the rows of the episode."""
+        """Note whether the board has died, and log the rows of the episode."""
         if episode.world < len(self._died):
             self._died[episode.world] = bool(has_died(episode))
         if episode.world == 0:
@@ -203,7 +203,7 @@ class Wall(View):
         now, read = self._env.worlds.now, self._env.worlds.driver.read
         shown = len(self._died)
         state = {name: read(getattr(now, name)[:shown]) for name in ("stock", "in_play", "row", "col")}
-        image = self._panels.joined(boards(self._scene, {"step": state["stock"], **state}), UNSEEN)
+        image = self._panels.joined(boards(self._scene, state), UNSEEN)
         turns = read(now.step[:shown])[:, 0].tolist()
         word = "turn " if shown <= _LABELLED else ""  # more labels would stand on each other
         labels = [f"{board}: {word}{turn}" for board, turn in enumerate(turns)]

@@ -92,7 +92,7 @@ def classes(curves: Curves, colour_of: Callable[[int], Colour] = picture_colour)
 
 
 def styles(curves: Curves) -> dict[str, Any]:
-    """The names, colours and widths of each plot's lines, and the colours of states, by entity."""
+    """Return the names, colours and widths of each plot's lines, and the colours of states, by entity."""
     replicas = curves.replicas
     mean = f"mean of {curves.mean_over} episodes"
     lines = {
@@ -136,8 +136,8 @@ def styles(curves: Curves) -> dict[str, Any]:
 
 
 def fixed(curves: Curves) -> dict[str, list[Any]]:
-    """The static parts of a recording, by entity: names and colours of what it shows, and of a `Scene` also
-    sizes of images and the agents' frames."""
+    """Return the static parts of a recording, by entity: names and colours of what it shows, and of a `Scene`
+    also sizes of images and the agents' frames."""
     parts = {
         "/": [classes(curves)],
         **{entity: [style] for entity, style in styles(curves).items()},
@@ -186,7 +186,7 @@ def running(name: str, colour: Colour, replicas: int, *, is_alone: bool = False)
 
 
 def _drawn_plot(name: str, origin: str) -> Any:
-    """The view of a plot that is not over time, with room for its texts."""
+    """Return the view of a plot that is not over time, with room for its texts."""
     return flat(name, origin, x=(-24.0, PLOT_WIDE + 16.0), y=(TITLE[1], PLOT_HIGH + 34.0))
 
 
@@ -203,7 +203,8 @@ Rows share out any other height as they do this one."""
 
 
 def layout(curves: Curves, *, live: bool = False) -> Any:
-    """The layout of a recording; a replay has fewer views, and a game without a board none of the board.
+    """Return the layout of a recording; a replay has fewer views, and a game without a board none of the
+    board.
 
     The timeline of the time panel is the axis of every plot: episodes, and in a replay, which records all
     its steps, steps. Boards of a run are played back on `frame`, which counts recorded frames alone.
@@ -236,8 +237,8 @@ def layout(curves: Curves, *, live: bool = False) -> Any:
 
 
 def _replay(scene: Scene) -> Any:
-    """A large board, the agents' windows, what their policies say, and the harvest and stock of one episode,
-    turn by turn, and what institutions take and give."""
+    """Return a large board, the agents' windows, what their policies say, and the harvest and stock of one
+    episode, turn by turn, and what institutions take and give."""
     bars = decision_panels(len(scene.agents), scene.actions, scene.window)
     paid = [*_of(scene.agents, PAID), *_of(scene.agents, GIVEN)] if scene.has_institutions else []
     right = _present(
@@ -263,25 +264,26 @@ def _panels(panels: Panels, name: str, origin: str) -> Any:
 
 
 def _board(name: str, scene: Scene, *, origin: str = "world", below: float = 2.6) -> Any:
-    """The view of a board with room for what stands below it, in cells."""
+    """Return the view of a board with room for what stands below it, in cells."""
     return flat(name, origin, x=(-0.2, scene.width + 2.2), y=(-0.2, scene.height + 2.0 + below))
 
 
 def _events() -> Any:
-    """The events, whose texts say when; the viewer's own column is so narrow that it cuts the numbers."""
+    """Return the events, whose texts say when; the viewer's own column is so narrow that it cuts the
+    numbers."""
     hidden = [TimelineColumn("step", visible=False)]
     columns = rrb.TextLogColumns(timeline_columns=hidden, text_log_columns=["Body"])
     return rrb.TextLogView(name="Events", origin="/log", columns=columns)
 
 
 def _strips() -> Any:
-    """The live label, and below it whether agents explore, as bands over episodes."""
+    """Return the live label, and below it whether agents explore, as bands over episodes."""
     contents = [f"+ /{strip}" for strip in (NOW, EXPLORING)]
     return rrb.StateTimelineView(name="Strips", contents=contents, time_view=_whole(), titlebar=False)
 
 
 def _overview(curves: Curves, *, live: bool) -> Any:
-    """What a newcomer sees: the board large, and beside it what the group gets and leaves."""
+    """Return what a newcomer sees: the board large, and beside it what the group gets and leaves."""
     if curves.unit == "apples":
         gets = _metric(curves, COLLECTIVE_RETURN, is_explained=True)
     else:
@@ -305,7 +307,7 @@ def _overview(curves: Curves, *, live: bool) -> Any:
 
 
 def _tabs(curves: Curves, *, live: bool) -> list[Any]:
-    """The tabs; what the game has nothing of is left out."""
+    """Return the tabs; what the game has nothing of is left out."""
     agents, several = curves.agents, len(curves.agents) > 1
     recorded = None
     windows = None
@@ -355,13 +357,13 @@ def _tabs(curves: Curves, *, live: bool) -> list[Any]:
 
 
 def _of_each(curves: Curves, total: str) -> Any:
-    """The plot of what each agent pays, gets or breaks."""
+    """Return the plot of what each agent pays, gets or breaks."""
     words = METRICS[f"{INSTITUTIONS}{total}"].title.replace(" all,", " each,")
     return _plot(_sentence(words), _of(curves.agents, total))
 
 
 def _metrics(curves: Curves, names: Sequence[str]) -> list[Any]:
-    """The plots of metrics that the registry says: one of its own, one with others, or none."""
+    """Return the plots of metrics that the registry says: one of its own, one with others, or none."""
     plots: dict[str, list[str]] = {}
     for name in names:
         plot = METRICS[name].plot if name in METRICS else ""
@@ -421,7 +423,7 @@ def _sentence(words: str) -> str:
 
 
 def _plot(name: str, entities: Sequence[str], *, share: bool = False, has_legend: bool = True) -> Any:
-    """A plot over the whole run; None for no lines. The axis of a share is 0..1."""
+    """Return a plot over the whole run; None for no lines. The axis of a share is 0..1."""
     if not entities:
         return None
     return rrb.TimeSeriesView(
@@ -434,7 +436,7 @@ def _plot(name: str, entities: Sequence[str], *, share: bool = False, has_legend
 
 
 def _whole() -> Any:
-    """A time axis of the whole run; Rerun's default is a thousand steps around the cursor."""
+    """Return a time axis of the whole run; Rerun's default is a thousand steps around the cursor."""
     boundary = rrb.TimeRangeBoundary
     return rrb.TimeAxis(view_range=rr.TimeRange(start=boundary.infinite(), end=boundary.infinite()))
 

@@ -74,13 +74,13 @@ class Stream:
         return time.perf_counter() - self._sent > self.period_s
 
     def take(self) -> dict[str, list[Row]]:
-        """The buffered numbers; the buffer is empty afterwards."""
+        """Return the buffered numbers; the buffer is empty afterwards."""
         taken, self.waiting = self.waiting, {}
         self._sent = time.perf_counter()
         return taken
 
     def do(self, what: Callable[[Any], object]) -> None:
-        """Calls a function with the recording, unless the stream has failed or is closed."""
+        """Call a function with the recording, unless the stream has failed or is closed."""
         if self.is_open:
             self._try(partial(self._call, what))
 
@@ -135,7 +135,7 @@ class LiveStream(Stream):
         return self._queue.qsize() > 1
 
     def say(self, recording: Any, name: str, text: str) -> None:
-        """Sends a Markdown text without a time, which takes the place of the one before at all times; to be
+        """Send a Markdown text without a time, which takes the place of the one before at all times; to be
         called with `do`.
 
         A server sends it before the history, so who connects late never reads an old one as the present.
@@ -147,8 +147,8 @@ class LiveStream(Stream):
         recording.send_columns(name, [], rr.TextDocument.columns(text=[text]))
 
     def opened(self) -> None:
-        """A browser has opened the page, and reads the newest header first, then the history, then what is
-        sent from now on: the header says that history loads until it is sent again."""
+        """Note that a browser has opened the page. It reads the newest header first, then the history, then
+        what is sent from now on: the header says that history loads until it is sent again."""
         if time.perf_counter() < self._has_history_from:
             return
 
@@ -254,7 +254,7 @@ class Live:
 def open_file(
     recording_id: str, path: Path, blueprint: Any, *, period_s: float, application: str = RUN
 ) -> Stream | None:
-    """A stream to a new file; None, with a warning, if the disk is almost full.
+    """Return a stream to a new file; None, with a warning, if the disk is almost full.
 
     Otherwise Rerun may wait forever for the layout to be written.
     """
@@ -273,7 +273,7 @@ def open_file(
 
 
 def _serve(recording: Any, memory: str, blueprint: Any = None) -> str:
-    """Serves a recording on a free port of this machine alone; returns its address."""
+    """Serve a recording on a free port of this machine alone; return its address."""
     port = free_port()
     sink = rr.GrpcServerSink(LOCALHOST, port, server_memory_limit=memory)
     recording.set_sinks(sink, default_blueprint=blueprint)
@@ -322,7 +322,7 @@ def served(files: Sequence[Path]) -> Iterator[WebViewer]:
 
 
 def _newest_header(readers: Sequence[RrdReader]) -> tuple[RrdReader, str | None]:
-    """The recording that has the newest header, and the header; None if none has one."""
+    """Return the recording that has the newest header, and the header; None if none has one."""
     step, header, newest = -1, None, readers[0]
     for reader in readers:
         for chunk in reader.stream().filter(content=f"/{HEADER}"):
@@ -334,7 +334,7 @@ def _newest_header(readers: Sequence[RrdReader]) -> tuple[RrdReader, str | None]
 
 
 def _spawn(sources: list[str]) -> None:
-    """Starts Rerun's native viewer in its own process; warns if it cannot open."""
+    """Start Rerun's native viewer in its own process; warn if it cannot open."""
     if not has_display():
         _warn_of("viewer cannot open", "there is no display; open one of the addresses from elsewhere")
         return

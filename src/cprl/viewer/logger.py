@@ -41,7 +41,7 @@ Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
 
 
 def recording_id(run: Path, file_name: str) -> str | None:
-    """The recording id, the same when a run is resumed or extended; None where there is no run."""
+    """Return the id of a recording, the same when a run is resumed or extended; None without a run."""
     if not (run / RECIPE_FILE).exists():
         return None
     recipe = read_json(run / RECIPE_FILE)
@@ -50,7 +50,7 @@ def recording_id(run: Path, file_name: str) -> str | None:
 
 
 def as_table(recipe: Mapping[Any, Any]) -> str:
-    """The table; texts of several lines, such as drawn boards, stand below it as they are.
+    """Return a recipe as a table; texts of several lines, such as drawn boards, stand below it as they are.
 
     An entry of a list that equals the first is one row that says so.
     """
@@ -88,7 +88,7 @@ def _cell(text: str) -> str:
 
 
 def times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
-    """The timelines of each row."""
+    """Return the timelines of each row."""
     return [
         rr.TimeColumn(name, sequence=np.asarray(numbers, np.int64))
         for name, numbers in zip(TIMELINES, (steps, episodes, frames), strict=True)
@@ -96,7 +96,7 @@ def times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
 
 
 def send_waiting(stream: Stream) -> None:
-    """Sends the buffered numbers and texts of one stream, one chunk per entity.
+    """Send the buffered numbers and texts of one stream, one chunk per entity.
 
     Of texts viewers get the newest alone, by `LiveStream.say`. Files keep each with its time: of static texts
     in several files of one recording a viewer shows the one that it loads last.
@@ -221,7 +221,7 @@ class RerunLogger(Logger):
         return self.step // self.curves.worlds
 
     def do(self, what: Callable[[Any], object], *, live_only: bool = False) -> None:
-        """Calls a function with each recording, or with that to viewers alone, in the thread that sends."""
+        """Call a function with each recording, or with that to viewers alone, in the thread that sends."""
         for stream in self._streams:
             if stream.is_live or not live_only:
                 stream.do(what)
@@ -236,18 +236,18 @@ class RerunLogger(Logger):
             self._streams = streams
 
     def send_due(self) -> None:
-        """Sends buffered numbers and texts to whom they are due; all that is logged between two calls is sent
+        """Send buffered numbers and texts to whom they are due; all that is logged between two calls is sent
         together, so that it agrees when it is seen."""
         for stream in self._streams:
             if stream.is_due:
                 send_waiting(stream)
 
     def log_static(self, entity: str, *what: Any) -> None:
-        """Logs archetypes that hold at all times."""
+        """Log archetypes that hold at all times."""
         self.do(lambda recording: recording.log(entity, *what, static=True))
 
     def log_row(self, name: str, what: Any, *, step: int | None = None, live_only: bool = False) -> None:
-        """Logs an archetype at the time set by `at`, or at another step."""
+        """Log an archetype at the time set by `at`, or at another step."""
         at = self.step if step is None else step, self.episode, self.frames
 
         def log(recording: Any) -> None:
@@ -261,17 +261,17 @@ class RerunLogger(Logger):
     def log_columns(
         self, name: str, at: tuple[Numbers, Numbers, Numbers], what: Any, *, live_only: bool = False
     ) -> None:
-        """Logs rows at steps, episodes and frames of their own."""
+        """Log rows at steps, episodes and frames of their own."""
         columns = times(*at)
         self.do(lambda recording: recording.send_columns(name, columns, what), live_only=live_only)
 
     def at(self, *, step: int, episode: int) -> None:
-        """Sets the time of subsequent logs that have no step of their own."""
+        """Set the time of subsequent logs that have no step of their own."""
         self.step = step
         self.episode = episode
 
     def log_scalar(self, name: str, value: Any, step: int | None = None, **kwargs: Any) -> None:
-        """Logs a number, or a list, array or tensor of numbers as name/0, name/1 and so on."""
+        """Log a number, or a list, array or tensor of numbers as name/0, name/1 and so on."""
         numbers = _numbers_in(value)
         for index, number in enumerate(numbers.tolist()):
             entity = name if numbers.size == 1 else f"{name}/{index}"
@@ -279,12 +279,12 @@ class RerunLogger(Logger):
         self.send_due()
 
     def log_lines(self, name: str, values: Sequence[float]) -> None:
-        """Logs the numbers of several lines of one plot, equally many each time; NaN leaves a gap. They are
+        """Log the numbers of several lines of one plot, equally many each time; NaN leaves a gap. They are
         sent when they are due, see `send_due`."""
         self._wait(name, self.step, [float(value) for value in values])
 
     def log_document(self, name: str, text: str) -> None:
-        """Logs a Markdown text in place of the one before, live at all times; it is sent with the numbers."""
+        """Log a Markdown text in place of the one before, live at all times; it is sent with the numbers."""
         self._wait(name, self.step, text)
 
     def show_live(self, name: str, text: str) -> None:
@@ -298,7 +298,7 @@ class RerunLogger(Logger):
             stream.waiting.setdefault(name, []).append((step, self.episode, self.frames, values))
 
     def log_frames(self, frames: Frames) -> None:
-        """Logs frames of `FrameRecorder.take`; see `cprl.viewer.board.columns`."""
+        """Log frames of `FrameRecorder.take`; see `cprl.viewer.board.columns`."""
         if self.scene is None:
             raise ValueError("the logger has no scene; pass a Scene as curves to log frames")
         numbers = np.arange(self.frames, self.frames + len(frames["step"]))
@@ -310,12 +310,12 @@ class RerunLogger(Logger):
         self.log_row("log", rr.TextLog(text, level="INFO"))
 
     def log_hparams(self, cfg: Any) -> None:
-        """Logs a mapping, as a table, or a Markdown text, as the recipe of the run."""
+        """Log a mapping, as a table, or a Markdown text, as the recipe of the run."""
         text = cfg if isinstance(cfg, str) else as_table(dict(cfg))
         self.log_static("recipe", rr.TextDocument(legible(text), media_type=rr.MediaType.MARKDOWN))
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
-        """Logs uint8 [(1), T, C, H, W] as T images at consecutive steps from `step` on.
+        """Log uint8 [(1), T, C, H, W] as T images at consecutive steps from `step` on.
 
         Starts after the last image of an earlier clip with the same name, because TorchRL's recorders pass
         the number of the clip as its step.
@@ -332,24 +332,24 @@ class RerunLogger(Logger):
     def log_histogram(
         self, name: str, data: Any, *, bins: int = 30, step: int | None = None, **kwargs: Any
     ) -> None:
-        """Logs a histogram of values in equal bins, as bars."""
+        """Log a histogram of values in equal bins, as bars."""
         counts, edges = np.histogram(_numbers_in(data), bins=bins)
         self.log_row(name, rr.BarChart(counts, abscissa=(edges[:-1] + edges[1:]) / 2), step=step)
 
     def flush(self) -> None:
-        """Sends all buffered numbers to the file and to the viewer."""
+        """Send all buffered numbers to the file and to the viewer."""
         for stream in self._streams:
             send_waiting(stream)
 
     def close_file(self) -> None:
-        """Flushes and closes the file, which gets its footer; the live stream goes on."""
+        """Flush and close the file, which gets its footer; the live stream goes on."""
         self.flush()
         for stream in self._streams:
             if not stream.is_live:
                 stream.close()
 
     def shutdown(self) -> None:
-        """Flushes and closes the recording; the file gets its footer. A second call does nothing."""
+        """Flush and close the recording; the file gets its footer. A second call does nothing."""
         self.close_file()
         if self.live is not None:
             self.live.close()

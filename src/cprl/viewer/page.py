@@ -144,9 +144,9 @@ def viewer_binary() -> Path:
 
 
 def viewer() -> str:
-    """The command of Rerun's native viewer: the one next to this Python, if there is one, else that of the
-    shell, else that of the package, which is neither where packages are installed into a folder of their own.
-    """
+    """Return the command of Rerun's native viewer: the one next to this Python, if there is one, else that of
+    the shell, else that of the package, which is neither where packages are installed into a folder of their
+    own."""
     beside = Path(sys.executable).with_name("rerun")
     if beside.exists():
         return str(beside)

@@ -397,7 +397,7 @@ _INSET_CELLS, _BORDER_CELLS = 0.08, 0.04
 
 
 def regions_of(env: CommonsEnv) -> Regions:
-    """The regions of all `Boundaries` of a game; those that are open to all are none."""
+    """Return the regions of all `Boundaries` of a game; those that are open to all are none."""
     regions: Regions = []
     for institution in env.game.institutions:
         if isinstance(institution, Boundaries):
@@ -410,7 +410,7 @@ def regions_of(env: CommonsEnv) -> Regions:
 
 
 def borders(regions: Regions) -> Any:
-    """The borders of regions in the hue of their owner, or grey where several share one, as lines."""
+    """Return the borders of regions in the hue of their owner, or grey where several share one, as lines."""
     strips, colours = [], []
     for owners, cells in regions:
         sides = _borders(cells)
@@ -421,7 +421,7 @@ def borders(regions: Regions) -> Any:
 
 
 def _borders(cells: NDArray[np.bool_]) -> list[list[tuple[float, float]]]:
-    """The sides of cells beyond which the region ends, (x, y), a little inside of it."""
+    """Return the sides of cells beyond which the region ends, (x, y), a little inside of it."""
     around = np.pad(cells, 1)
     strips = []
     for row, col in np.argwhere(cells).tolist():

@@ -20,7 +20,7 @@ from cprl.policies.lanes import LaneActor
 from cprl.viewer.board import centres_of
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import BACKGROUND, GIVEN, PAID
-from cprl.viewer.scene import APART, BAR, HIGH, decision_panels
+from cprl.viewer.scene import APART, BAR, HIGH, Scene, decision_panels
 
 ENTITY: Final = "decisions"
 SIGNS: Final = {  # the viewer ends at a sign that its font lacks
@@ -50,27 +50,21 @@ class Decisions:
     """
 
     def __init__(
-        self,
-        logger: RerunLogger,
-        policies: AgentPolicies,
-        *,
-        actions: Sequence[str],
-        names: Sequence[str],
-        window: tuple[int, int],
+        self, logger: RerunLogger, scene: Scene, policies: AgentPolicies, *, actions: Sequence[str]
     ) -> None:
-        self._logger, self._names, self._actions = logger, tuple(names), tuple(actions)
+        self._logger, self._names, self._actions = logger, scene.agents, tuple(actions)
         self._actors = list(zip(map(agent_indices, policies.indices), policies.actors, strict=True))
-        self._panels = decision_panels(len(names), len(actions), window)
-        many = 2 * len(names) * len(actions) > np.iinfo(np.uint8).max
+        self._panels = decision_panels(len(scene.agents), len(actions), scene.window)
+        many = 2 * len(scene.agents) * len(actions) > np.iinfo(np.uint8).max
         self._dtype = np.uint16 if many else np.uint8
         kinds = {agent: _kind(actor) for agents, actor in self._actors for agent in agents}
-        self._kinds = [kinds[agent] for agent in range(len(names))]
+        self._kinds = [kinds[agent] for agent in range(len(scene.agents))]
         self._rows: list[tuple[NDArray[np.float64], NDArray[np.int64]]] = []
         self._step = 0
         self._log_fixed()
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Notes what the agents' policies say of what they saw before this turn, and what they did."""
+        """Note what the agents' policies say of what they saw before this turn, and what they did."""
         self._step += 1
         if self._step == 1:
             return  # the first board is shown in no frame
@@ -116,7 +110,7 @@ class Decisions:
         return 1 + 2 * (agent * len(self._actions) + action)
 
     def _heights(self, values: NDArray[np.float64]) -> NDArray[np.int64]:
-        """The heights of bars in pixels, at least 1; 0 where there are no values."""
+        """Return the heights of bars in pixels, at least 1; 0 where there are no values."""
         low, best = _range(np.nan_to_num(values))
         span = (best - low)[..., None]
         share = np.clip((values - low[..., None]) / np.where(span > 0, span, 1.0), 0.0, 1.0)
@@ -133,7 +127,7 @@ class Decisions:
         ]
 
     def _log_fixed(self) -> None:
-        """Logs the form of the image, the classes of its bars, and the names of actions."""
+        """Log the form of the image, the classes of its bars, and the names of actions."""
         rows, columns = self._panels.shape
         kind = rr.ChannelDatatype.U16 if self._dtype is np.uint16 else rr.ChannelDatatype.U8
         form = rr.components.ImageFormat(width=columns, height=rows, channel_datatype=kind)
@@ -157,7 +151,7 @@ class Decisions:
 
 
 def _range(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where bars of action values [..., A] begin and end."""
+    """Return where bars of action values [..., A] begin and end."""
     best = values.max(-1)
     return np.maximum(2 * np.median(values, -1) - best, values.min(-1)), best
 
@@ -180,8 +174,8 @@ class Offences:
     """Logs a white diamond around each agent in the frame of the turn in which it broke a rule, and lines of
     fines and transfers per turn; a callback of `cprl.training`."""
 
-    def __init__(self, logger: RerunLogger, env: CommonsEnv, *, names: Sequence[str]) -> None:
-        self._logger, self._env, self._names = logger, env, tuple(names)
+    def __init__(self, logger: RerunLogger, env: CommonsEnv) -> None:
+        self._logger, self._env, self._names = logger, env, logger.curves.agents
         self._amounts: dict[str, list[NDArray[np.float64]]] = {PAID: [], GIVEN: []}
         """[N] in each turn."""
         self._strips: list[NDArray[np.float32]] = []
@@ -189,13 +183,13 @@ class Offences:
         """Marks, and what they say, of each frame."""
         mark = rr.LineStrips2D.from_fields(colors=[_WHITE], radii=[_RADIUS_CELLS], show_labels=False)
         logger.log_static(_VIOLATORS, mark)
-        for agent, name in enumerate(names):
+        for agent, name in enumerate(self._names):
             for kind, words in ((PAID, "pays"), (GIVEN, "gets")):
                 line = rr.SeriesLines(names=[f"{name} {words}"], colors=[agent_colour(agent)], widths=[1.5])
                 logger.log_static(f"{name}/{kind}", line)
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Notes the payments of the turn, and where those are who broke a rule in it."""
+        """Note the payments of the turn, and where those are who broke a rule in it."""
         fines, transfers, violated = (_of_agents(batch, name) for name in (FINES, TRANSFERS, "violated"))
         self._amounts[PAID].append(-fines)
         self._amounts[GIVEN].append(transfers)
@@ -233,13 +227,13 @@ def _of_agents(batch: TensorDictBase, name: str) -> NDArray[np.float64]:
 
 
 def fined(agent: int, fine: float) -> str:
-    """A violation in words, e.g. "agent 2 breaks a rule, fined 1.5"."""
+    """Return a violation in words, e.g. "agent 2 breaks a rule, fined 1.5"."""
     return f"agent {agent} breaks a rule" + (f", fined {fine:.4g}" if fine > 0 else "")
 
 
 def events(batch: TensorDictBase) -> list[str]:
-    """The violations of a turn of the first world in words, and the fines of agents who were tagged; taxes
-    and costs, which many pay in each turn, are no events."""
+    """Return the violations of a turn of the first world in words, and the fines of agents who were tagged;
+    taxes and costs, which many pay in each turn, are no events."""
     tagged_by = batch.get(("next", *keys.TAGGED_BY), None)
     fines, violated = _of_agents(batch, FINES), _of_agents(batch, "violated")
     tagged = np.zeros(len(fines)) if tagged_by is None else tagged_by[0].numpy(force=True).any(-1)

@@ -143,7 +143,7 @@ class Bests:
         self._best = 0.0
 
     def add(self, apples: float) -> str | None:
-        """Adds the mean harvest of an episode, or of W; returns a new best in words if it is one."""
+        """Add the mean harvest of an episode, or of W; return a new best in words if it is one."""
         self._apples.append(apples)
         count = ceil(self.OVER / self._worlds)
         if len(self._apples) < count:
@@ -198,7 +198,7 @@ class Story(View):
         logger.flush()
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
-        """Sets what the group is compared with, and logs it as an event."""
+        """Set what the group is compared with, and log it as an event."""
         self._random = played(episodes, replicas=self._curves.replicas)
         self.course.random_play = self._random.harvest.value
         self._logger.log_text(f"random play {self._in_words(self._random)}")
@@ -206,7 +206,7 @@ class Story(View):
             self.begins(BEGINS)
 
     def begins(self, status: str) -> None:
-        """Says live what is done before the first episode ends, e.g. "compiling, 12 s so far"."""
+        """Say live what is done before the first episode ends, e.g. "compiling, 12 s so far"."""
         self._logger.show_live(HEADER, self.header.begins(status, self.course.random_play))
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
@@ -230,7 +230,7 @@ class Story(View):
             self._show_episode(died)
 
     def _look(self, episode: int, means: Mapping[str, float]) -> list[str]:
-        """Logs the live label, and whether agents explore, where an episode changes them; returns what is
+        """Log the live label, and whether agents explore, where an episode changes them; return what is
         new in words."""
         events = []
         explored = self.course.explores
@@ -255,14 +255,14 @@ class Story(View):
         return events
 
     def resumed(self) -> None:
-        """Shows where a run is that goes on after the episodes so far."""
+        """Show where a run is that goes on after the episodes so far."""
         if self._ended:
             self._logger.log_row(names.NOW, rr.StateChange(state=self._label))
             self._show_episode(None)
             self._logger.flush()
 
     def _show_episode(self, died: int | None) -> None:
-        """Says in the header where the run is after an episode."""
+        """Say in the header where the run is after an episode."""
         text = self.header.line(
             episode=self._ended,
             label=f"{self._label}, {EXPLORING}" if self.course.explores else self._label,
@@ -280,7 +280,7 @@ class Story(View):
         return fmean(value for last in self._last.values() for value in list(last)[-each:]) if each else nan
 
     def finished(self, played_by: Mapping[str, Sequence[Episode]]) -> None:
-        """Logs the evaluation of a run that is over."""
+        """Log the evaluation of a run that is over."""
         replicas = self._curves.replicas
         trained = played(played_by["trained"], replicas=replicas)
         random = played(played_by["random"], replicas=replicas)
@@ -289,7 +289,7 @@ class Story(View):
         self._logger.log_text(f"finished: trained {self._in_words(trained)}")
 
     def close(self) -> None:
-        """Logs the end of a run that is over or was stopped, if `finished` did not."""
+        """Log the end of a run that is over or was stopped, if `finished` did not."""
         if self._is_over:
             return
         self._is_over = True
@@ -333,7 +333,8 @@ _FEW: Final = 6
 
 
 def in_words(episode: Episode, curves: Curves) -> str:
-    """What was decided, broken and paid in an episode, e.g. "3 violations; fined 0, 1.5"; "" for nothing."""
+    """Return what was decided, broken and paid in an episode, e.g. "3 violations; fined 0, 1.5"; "" for
+    nothing."""
     parts = []
     if episode.in_force is not None:
         decided = zip(curves.in_force, episode.in_force, strict=False)

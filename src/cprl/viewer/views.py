@@ -48,7 +48,7 @@ class View:
         """Show the evaluation of a run that is over: the episodes of "trained" and "random"."""
 
     def resumed(self) -> None:
-        """The episodes so far have been added again, but not their steps."""
+        """Return the episodes so far have been added again, but not their steps."""
 
     def close(self) -> None:
         """Log what is left; a second call does nothing."""
@@ -73,7 +73,7 @@ class Plots(View):
         self._random: dict[str, float] = {}
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
-        """Sets the lines of random play: the mean of each metric in these episodes, where it is defined."""
+        """Set the lines of random play: the mean of each metric in these episodes, where it is defined."""
         curves = self._logger.curves
         names = [*curves.metrics, *([RETURN] if curves.unit == "return" else [])]
         played = [{**episode.metrics, RETURN: float(episode.return_.sum())} for episode in episodes]

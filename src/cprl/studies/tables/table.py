@@ -40,7 +40,7 @@ from cprl.runs.files import STUDY_TABLE_FORMAT, refuse_newer
 from cprl.runs.recipe import versions
 from cprl.system.defaults import LAST as LAST
 from cprl.system.defaults import WINDOW as WINDOW
-from cprl.values import Positive, checked, refusal
+from cprl.values import OWN_METRICS, Positive, checked, refusal
 
 METADATA: Final = b"cprl"
 """The key of all that a table holds beside its rows, see the fields of `StudyTable`."""
@@ -215,13 +215,14 @@ class StudyTable:
         )
 
     def write(self, path: Path | str) -> Path:
-        """Writes a parquet file atomically, which `read` gives back; replaces an older one."""
+        """Write a parquet file atomically, which `read` gives back; replace an older one."""
         path = Path(path)
         held = {
             "format": STUDY_TABLE_FORMAT,
             "versions": versions(),
             "design": asdict(self.design),
             "lacking": [asdict(run) for run in self.lacking],
+            "metrics": {name: OWN_METRICS[name] for name in self.metrics if name in OWN_METRICS},
             **{name: getattr(self, name) for name in _HELD},
         }
         rows = self.rows.replace_schema_metadata({METADATA: json.dumps(held)})
@@ -236,12 +237,16 @@ class StudyTable:
 
     @classmethod
     def read(cls, path: Path | str) -> "StudyTable":
-        """The table of a file that `write` wrote; raises a ValueError for any other."""
+        """Return the table of a file that `write` wrote; raise a ValueError for any other.
+
+        Titles and units of the user's own metrics are known from then on.
+        """
         path = Path(path)
         try:
             rows = pq.read_table(path)
             held = json.loads((rows.schema.metadata or {})[METADATA])
             refuse_newer(path, held, STUDY_TABLE_FORMAT)
+            OWN_METRICS.update(held.get("metrics", {}))
             return cls(
                 rows=rows,
                 design=Design(**{**held["design"], "notes": tuple(held["design"]["notes"])}),
@@ -257,12 +262,12 @@ _HELD: Final = ("window", "made", "endings", "ending_rules", "lengths", "agents_
 
 
 def counted(made: Mapping[str, Circumstances]) -> dict[str, Counter[str]]:
-    """How many runs have each value of each circumstance; of equally many the first run's comes first."""
+    """Count the runs that have each value of each circumstance; of equally many the first run's is first."""
     names = dict.fromkeys(name for circumstances in made.values() for name in circumstances)
     return {name: Counter(run.get(name, UNKNOWN) for run in made.values()) for name in names}
 
 
 def some(names: list[str], most: int) -> str:
-    """The first names, and how many more there are."""
+    """Return the first names, and how many more there are."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return f"{', '.join(names[:most])}{more}"
