@@ -17,8 +17,9 @@ from torchrl.envs import EnvBase
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.envs.make_env import is_playable, make_env, spaces_of
+from cprl.envs.unwrap import agent_names
 from cprl.measuring.evaluate import evaluate
-from cprl.measuring.table import BACKGROUND, FOCAL, ROLE, Label, complete, labelled
+from cprl.measuring.table import BACKGROUND, FOCAL, ROLE, Label, complete, labelled, naming
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
 from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
@@ -173,7 +174,7 @@ def play(
     table = table.add_column(place_of_world, "world", pa.array(world, pa.int32()))
     if roles:
         table = table.add_column(place_of_world + 3, ROLE, pa.array(roles).take(table["agent"]))
-    return table
+    return naming(table, agent_names(env))
 
 
 def roles_of(agents: int, focal: Collection[int]) -> list[str]:
