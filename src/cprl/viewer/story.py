@@ -179,7 +179,9 @@ class Story(View):
         is_about: bool = False,
         rules: str = "",
     ) -> None:
-        self._logger, self._filming, self._curves = logger, filming, logger.curves
+        self._logger = logger
+        self._filming = filming
+        self._curves = logger.curves
         self._episodes = episodes
         self.header = Header(curves=self._curves, episodes=episodes, rules=rules, is_about=is_about)
         self.course = Course(self._curves.replicas, self._curves.worlds)
@@ -211,7 +213,8 @@ class Story(View):
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         of_world = episode.replica, episode.world
-        gained, died = _gained(episode), has_died(episode)
+        gained = _gained(episode)
+        died = has_died(episode)
         self.course.add(gained, replica=episode.replica, world=episode.world, has_died=died)
         each = rounds_of(LAST_EPISODES, self._curves.worlds)
         self._last.setdefault(of_world, deque(maxlen=each)).append(gained)
@@ -220,7 +223,8 @@ class Story(View):
             self._died[together] = self._died.get(together, 0) + died
 
     def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
-        before, self._ended = self._ended, episode + 1
+        before = self._ended
+        self._ended = episode + 1
         died = self._died.pop(episode // self._curves.worlds, None)
         events = self._look(episode, {name: mean_of(values) for name, values in numbers.items()})
         for event in events:
@@ -312,13 +316,17 @@ class Events(View):
     """
 
     def __init__(self, logger: RerunLogger, filming: Filming, *, every: int) -> None:
-        self._logger, self._filming, self._every = logger, filming, every
-        self._has_seen_death, self._ended = False, 0
+        self._logger = logger
+        self._filming = filming
+        self._every = every
+        self._has_seen_death = False
+        self._ended = 0
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         if episode.world:
             return
-        number, self._ended = self._ended, self._ended + 1
+        number = self._ended
+        self._ended = self._ended + 1
         words = in_words(episode, self._logger.curves) if number % self._every == 0 else ""
         if words:
             self._logger.log_text(f"episode {episode.episode:,}: {words}")
@@ -359,7 +367,8 @@ class CompilingNotice(View):
     PERIOD_S = 1.0
 
     def __init__(self, show: Callable[[str], object]) -> None:
-        self._show, self._over = show, Event()
+        self._show = show
+        self._over = Event()
         self._before_s = CLOCK.total_s
         Thread(target=self._watch, daemon=True, name="cprl compiling").start()
 
