@@ -38,7 +38,7 @@ from cprl.studies.tables.comparing import (
     pairing_text,
     values_of,
 )
-from cprl.studies.tables.table import LAST, RANDOM, TRAINING, Design, StudyTable
+from cprl.studies.tables.table import RANDOM, TRAINING, Design, StudyTable
 from cprl.terminal.panels import draw_cells, draw_dots, draw_line, draw_matrix, width_of_cells
 from cprl.terminal.style import CHARACTER, DASHES, EMPTY, MEAN, RANDOM_LINE, SHADES, Width, drawing, wrapped
 from cprl.values import refusal
@@ -57,7 +57,7 @@ _MAPPED: Final = 2
 
 
 def figures_of(
-    table: StudyTable, last: int, *, suffix: str = ".png", metrics: Sequence[str] = ()
+    table: StudyTable, *, suffix: str = ".png", metrics: Sequence[str] = ()
 ) -> Iterator[tuple[str, str, Callable[[Path], Path]]]:
     """Yield what fits a study: the name of each figure's file, what it shows, and what draws it."""
     if not table.metrics:
@@ -66,20 +66,20 @@ def figures_of(
     conditions = finished(table)
     for factor in design.factors:
         if is_numeric([design.conditions[name][factor] for name in conditions]):
-            draw = partial(by_factor, table, factor, metrics=metrics, last=last)
+            draw = partial(by_factor, table, factor, metrics=metrics)
             yield f"by_{_file_name(factor)}{suffix}", f"Outcome by {factor}", draw
     if len(conditions) <= MOST_CONDITIONS:
-        levels = partial(by_condition, table, metrics=metrics, last=last)
+        levels = partial(by_condition, table, metrics=metrics)
         yield f"levels{suffix}", "Outcome by condition", levels
         yield f"courses{suffix}", "The course of the training", partial(courses, table, metrics=metrics)
         if len(conditions) > 1 and table.replicas[design.reference]:
-            differences = partial(by_condition, table, kind="differences", metrics=metrics, last=last)
+            differences = partial(by_condition, table, kind="differences", metrics=metrics)
             yield f"differences{suffix}", f"Differences from {design.reference}", differences
     for pair in grids(design):
         words = "_".join(map(_file_name, pair))
         what = " and ".join(pair)
         for metric in metrics_of(table, metrics)[:_MAPPED]:
-            draw = partial(heat_map, table, pair, metric=metric, last=last)
+            draw = partial(heat_map, table, pair, metric=metric)
             yield f"map_{words}_{_file_name(metric)}{suffix}", f"{title(metric)} by {what}", draw
         if len({next(iter(counts)) for counts in table.endings.values()}) > 1:
             what = f"In which phase most replicas end, by {what}"
@@ -109,7 +109,6 @@ def by_factor(
     path: Path | str,
     *,
     metrics: Sequence[str] = (),
-    last: int = LAST,
     width: Width = "page",
 ) -> Path:
     """Draw metrics against a factor whose levels are numbers.
@@ -126,8 +125,8 @@ def by_factor(
         allowed = ", ".join(numeric) or "none, as no factor has levels that are numbers"
         raise refusal("factor", factor, allowed)
     chosen = _chosen(table, metrics)
-    levels = levels_of(table, chosen, last=last)
-    rows = table.windows(last=last)
+    levels = levels_of(table, chosen)
+    rows = table.windows()
     lines = _lines(table, factor)
     others = [name for name in design.factors if name != factor]
     only = [design.conditions[names[0]][others[0]] for names in lines.values()] if len(others) == 1 else []
@@ -172,7 +171,7 @@ def by_factor(
             axes.tick_params(labelbottom=True)
             axes.set_xlabel(f"{short(factor)}, at equal distances" if is_even else short(factor))
         sheet.title = f"{design.name}: outcome by {short(factor)}"
-        sheet.caption = _caption(table, f"{_levels_note(table, last)} Faint: single replicas.")
+        sheet.caption = _caption(table, f"{_levels_note(table)} Faint: single replicas.")
         if others and list(lines) == [""]:
             sheet.caption += f" Conditions differ in {', '.join(map(short, others))} too."
     return Path(path)
@@ -260,7 +259,6 @@ def by_condition(
     *,
     kind: Kind = "levels",
     metrics: Sequence[str] = (),
-    last: int = LAST,
     width: Width = "page",
 ) -> Path:
     """Draw conditions one below the other: means over replicas, or differences from the reference.
@@ -278,9 +276,9 @@ def by_condition(
     if not 0 < len(conditions) <= MOST_CONDITIONS:
         raise refusal("table", table, f"1 to {MOST_CONDITIONS} conditions, not {len(conditions)}")
     chosen = _chosen(table, metrics) if is_levels else metrics_of(table, metrics)
-    family = (levels_of if is_levels else differences_of)(table, chosen, last=last)
-    levels = family if is_levels else levels_of(table, chosen, last=last)
-    rows = table.windows(last=last)
+    family = (levels_of if is_levels else differences_of)(table, chosen)
+    levels = family if is_levels else levels_of(table, chosen)
+    rows = table.windows()
     with drawing(path, width=width) as sheet:
         wide = min(_NAME, 0.3 * sheet.width_em)
         words = names_of(table)
@@ -309,11 +307,11 @@ def by_condition(
         panels[0].set_ylim(len(conditions) - 0.4, -0.6)
         by = short(design.factors[0]) if len(design.factors) == 1 else "condition"
         sheet.title = f"{design.name}: outcome by {by}"
-        note = f"{_levels_note(table, last)} Faint: single replicas. Dashed: random play."
+        note = f"{_levels_note(table)} Faint: single replicas. Dashed: random play."
         if not is_levels:
             sheet.title = f"{design.name}: difference from {' '.join(design.reference.splitlines())}"
             pairing = capitalised(pairing_text(table))
-            note = f"{pairing}; means of {episodes_text(table, last=last)}; {INTERVALS}."
+            note = f"{pairing}; means of {episodes_text(table)}; {INTERVALS}."
         sheet.caption = _caption(table, note)
     return Path(path)
 
@@ -415,7 +413,7 @@ def _draw_courses(
     """Draw the courses of conditions, each of a colour and with a label, and return over how many episodes
     their running means are."""
     windows = set()
-    training = table.windows(TRAINING, last=None)
+    training = where(table.rows, part=TRAINING)
     for place, (name, (colour, label)) in enumerate(lines.items()):
         rows = where(training, condition=name, metric=metric)
         if not len(rows):
@@ -492,7 +490,6 @@ def heat_map(
     path: Path | str,
     *,
     metric: str = COLLECTIVE_RETURN,
-    last: int = LAST,
     width: Width = "page",
 ) -> Path:
     """Draw a metric over two factors: its mean with the number of replicas, and its difference.
@@ -506,8 +503,8 @@ def heat_map(
     grid, elsewhere = _grid_of(table, factors)
     rows, columns = _levels_of(grid)
     tested = tuple(dict.fromkeys([*metrics_of(table), metric]))
-    levels = levels_of(table, [metric], last=last)
-    differences = differences_of(table, tested, last=last)
+    levels = levels_of(table, [metric])
+    differences = differences_of(table, tested)
     means = _at(grid, metric, levels)
     changes = _at(grid, metric, differences)
     absent = dict.fromkeys(grid, "no run")
@@ -530,7 +527,7 @@ def heat_map(
             axes.set(xlabel=short(factors[1]), ylabel=short(factors[0]))
             axes.set_title(what)
         sheet.title = f"{table.design.name}: {_title_of(metric, levels)}"
-        sheet.caption = f"Means of {episodes_text(table, last=last)}, then over n replicas."
+        sheet.caption = f"Means of {episodes_text(table)}, then over n replicas."
         if changes:
             star = "*" if any(one.differs for one in changes.values()) else "none shown to be"
             metrics = f"{len(tested)} metric{'s' * (len(tested) > 1)}"
@@ -677,9 +674,9 @@ def _caption(table: StudyTable, note: str) -> str:
     return f"{replicas_text(table.replicas)}. {note}{_not_run(table)}"
 
 
-def _levels_note(table: StudyTable, last: int) -> str:
+def _levels_note(table: StudyTable) -> str:
     """Return what points and intervals are."""
-    return f"Means of {episodes_text(table, last=last)}, then over replicas; {INTERVALS}."
+    return f"Means of {episodes_text(table)}, then over replicas; {INTERVALS}."
 
 
 def _title_of(metric: str, levels: Family) -> str:

@@ -143,6 +143,8 @@ class StudyTable:
     the reports of its runs do not say how many steps."""
     agents_learn: bool = True
     """Whether any agent of its runs learns."""
+    last: int = LAST
+    """Episodes at the end of the training that are compared, in whole windows; its file does not say it."""
 
     @cached_property
     def mixed(self) -> list[str]:
@@ -172,21 +174,19 @@ class StudyTable:
         counts = Counter(pairs["condition"].to_pylist())
         return {condition: counts[condition] for condition in self.design.conditions}
 
-    def windows(self, part: str = TRAINING, *, last: int | None = LAST) -> pa.Table:
+    def windows(self, part: str = TRAINING, *, last: int | None = None) -> pa.Table:
         """Return the rows of a part, of which `cprl.measuring.statistics` makes estimates and differences.
 
         Args:
             part: "training", "evaluation" or "random".
             last: of training the last episodes of each replica, in whole windows; in many worlds as many
-                of each, see `cprl.measuring.windows.last_of`. None for all.
+                of each, see `cprl.measuring.windows.last_of`. By default as many as the table compares.
         """
         checked("part", part, Literal[tuple(PARTS)])
         rows = where(self.rows, part=part)
-        if last is None:
-            return rows
-        checked("last", last, Positive)
         if part != TRAINING:
             return rows
+        last = checked("last", self.last if last is None else last, Positive)
         if last < self.window:
             raise refusal("last", last, f"at least {self.window}, the episodes of a window of the table")
         condition = rows["condition"].combine_chunks().dictionary_encode().indices.to_numpy()
@@ -236,7 +236,7 @@ class StudyTable:
         return file.getvalue().decode()
 
     @classmethod
-    def read(cls, path: Path | str) -> "StudyTable":
+    def read(cls, path: Path | str, *, last: int = LAST) -> "StudyTable":
         """Return the table of a file that `write` wrote; raise a ValueError for any other.
 
         Titles and units of the user's own metrics are known from then on.
@@ -252,6 +252,7 @@ class StudyTable:
                 design=Design(**{**held["design"], "notes": tuple(held["design"]["notes"])}),
                 lacking=tuple(Lacking(**run) for run in held["lacking"]),
                 **{name: held[name] for name in _HELD},
+                last=last,
             )
         except (pa.ArrowException, OSError, LookupError, TypeError, json.JSONDecodeError) as error:
             raise ValueError(f"{path} is not the table of a study: {error!r}") from error
