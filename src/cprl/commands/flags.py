@@ -174,7 +174,8 @@ class ValueFlags(ConstructorRegistry):
 
     def __init__(self, listed: Collection[str] | None = None, *, is_help: bool = False) -> None:
         super().__init__()
-        self._listed, self._is_help = listed if is_help else None, is_help
+        self._listed = listed if is_help else None
+        self._is_help = is_help
         self._places: dict[int, str] = {}
         self._is_inside = False
         self.struct_rule(self._changes)
@@ -204,7 +205,8 @@ class ValueFlags(ConstructorRegistry):
         return StructConstructorSpec(instantiate=changed, fields=tuple(flag for flag in flags if flag))
 
     def _flag(self, field: StructFieldSpec, above: str) -> StructFieldSpec | None:
-        value, place = field.default, f"{above}.{field.name}".lstrip(".")
+        value = field.default
+        place = f"{above}.{field.name}".lstrip(".")
         kind: Any
         if _is_code(value):
             return None
@@ -245,7 +247,8 @@ _WORDS: Final = (bool, int, float, str, NoneType)
 
 def _simple(hint: Any) -> Any:
     """A type without objects, tables and nested tuples; None if nothing is left."""
-    origin, arguments = get_origin(hint), get_args(hint)
+    origin = get_origin(hint)
+    arguments = get_args(hint)
     if origin is Annotated:
         return hint if _simple(arguments[0]) == arguments[0] else _simple(arguments[0])
     if origin in (Union, UnionType):
@@ -282,7 +285,8 @@ def in_shape(experiment: "Experiment", shape: Shape) -> "Experiment":
 
     if shape == Shape():
         return experiment
-    game, agents = experiment.game, experiment.agents
+    game = experiment.game
+    agents = experiment.agents
     if not isinstance(game, Game):
         raise ValueError("--game.map, --agents and --game.institutions are for games on a board of cprl")
     board = game.map if shape.map is None else maps.named(shape.map)
@@ -348,7 +352,8 @@ def shape_of(experiment: "Experiment") -> Shape:
 
 def numbered(words: Sequence[str], experiment: "Experiment") -> list[str]:
     """Return words whose flags of institutions have a number in place of a name."""
-    above, kinds = "--game.institutions.", _kinds(experiment)
+    above = "--game.institutions."
+    kinds = _kinds(experiment)
     changed = []
     for word in words:
         name, dot, field = word.removeprefix(above).partition(".")

@@ -141,7 +141,8 @@ def run(
     _refuse_unknown(recipe)
     from cprl.runs.recipe import read_recipe
 
-    directory, table = recipe if recipe.is_dir() else recipe.parent, read_recipe(recipe)
+    directory = recipe if recipe.is_dir() else recipe.parent
+    table = read_recipe(recipe)
 
     with working("starting"):
         from cprl.experiment import Experiment

@@ -175,7 +175,8 @@ def parse(
     make_experiment: "Callable[..., Experiment]", command: Sequence[str]
 ) -> "tuple[Experiment, RunOptions]":
     """Return the experiment that a command line, script first, asks for, and how it is to be run."""
-    words, program = trust_allowed(command[1:]), program_of(command[0])
+    words = trust_allowed(command[1:])
+    program = program_of(command[0])
     return parse_with(make_experiment, words, RunOptions(), program=program)
 
 
@@ -197,7 +198,8 @@ def parse_with(
         from cprl.experiment import Experiment
 
     _refuse_names(make_experiment, {*Experiment.__dataclass_fields__, *vars(options)})
-    is_help, is_short = bool(_HELP & {*words}), bool({"-h", "--help"} & {*words})
+    is_help = bool(_HELP & {*words})
+    is_short = bool({"-h", "--help"} & {*words})
     given = [word for word in words if word not in _HELP]
     recipe: Any = Annotated[Any, tyro.conf.arg(name="", constructor=make_experiment)]
 

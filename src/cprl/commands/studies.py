@@ -209,7 +209,8 @@ def search(words: Sequence[str], /) -> None:
     from cprl.studies.study import directory_of
 
     wanted = Search(experiment, factors_of(experiment, options.vary), **_given(options))
-    command, executor = ["cprl", "search", *words], executor_of(options)
+    command = ["cprl", "search", *words]
+    executor = executor_of(options)
     if options.dry_run:
         factors = ", ".join(f"{name}: {factor}" for name, factor in wanted.factors.items())
         out = directory_of(wanted.study_of([]), options.out)
@@ -265,7 +266,8 @@ def recipe_of(source: Path) -> "Callable[..., Experiment]":
     """What makes the experiment of a recipe: a Python file with a function `experiment`, which is imported
     and not run; a recipe.json; or the directory of a run."""
     if source.suffix != ".py" or source.is_dir():
-        directory, content = source if source.is_dir() else source.parent, read_recipe(source)
+        directory = source if source.is_dir() else source.parent
+        content = read_recipe(source)
 
         from cprl.experiment import Experiment
 
@@ -345,7 +347,10 @@ def _run(run: "Callable[..., T]", options: TrialOptions, executor: "Executor", c
     program, *words = named_command(command)
     # The line that runs what is lacking, whole and as a summary has it, which names no place.
     again = printed([without_directories(program), *without_options(words, ["--only"])])
-    out, runs, results, last = options.out, options.runs, options.figures, options.last
+    out = options.out
+    runs = options.runs
+    results = options.figures
+    last = options.last
     try:
         with ended_by_sigterm():
             return run(out, on=executor, runs=runs, results=results, last=last, again=again)

@@ -24,6 +24,7 @@ from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
 from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
 from cprl.runs.episodes import table_of
 from cprl.system.defaults import Fresh
+from cprl.system.output import legible
 from cprl.system.working import say_how_far
 from cprl.training.agents import LoadedRun, Population, StoredAgent, in_a_row, load, stored_policies
 from cprl.values import Custom, made, refusal
@@ -192,7 +193,7 @@ def together(parts: Iterable[pa.Table], **said: object) -> pa.Table:
         tables.append(part)
         say_how_far(len(tables), None, "populations")
     table = complete(pa.concat_tables(tables))
-    texts = {name: str(value) for name, value in said.items()}
+    texts = {name: legible(str(value)) for name, value in said.items()}
     return table.replace_schema_metadata({**(table.schema.metadata or {}), **texts})
 
 

@@ -158,12 +158,12 @@ class Experiment(Value, stored=False, called="experiment"):
 
     @classmethod
     def from_config(cls, table: Mapping[str, Any]) -> "Experiment":
-        """The experiment that `to_config` gave; of the modules that it names only a game's is imported."""
+        """Return the experiment that `to_config` gave; of the modules that it names a game's is imported."""
         read = build(cls, table, "experiment")
         return read if not isinstance(read.game, Custom) else replace(read, game=game_of(read.game))
 
     def to_recipe(self, directory: str | Path | None = None) -> dict[str, Any]:
-        """What `recipe.json` says of it; `cprl.runs.recipe.start_run` adds when and from what it was run.
+        """Return what `recipe.json` says of it; `cprl.runs.recipe.start_run` adds when and by what.
 
         Args:
             directory: where the recipe is kept: runs of `Frozen` are then given relative to it.
@@ -174,7 +174,7 @@ class Experiment(Value, stored=False, called="experiment"):
 
     @classmethod
     def from_recipe(cls, recipe: Mapping[str, Any], *, directory: str | Path | None = None) -> "Experiment":
-        """The experiment of a recipe, as `recipe.json` holds it.
+        """Return the experiment of a recipe, as `recipe.json` holds it.
 
         Args:
             directory: where the recipe is kept; runs of `Frozen` are then relative to where we stand.

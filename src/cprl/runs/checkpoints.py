@@ -68,8 +68,10 @@ class Checkpointer:
     ) -> None:
         if not every_s > 0:
             raise ValueError(f"every_s is {every_s}; allowed: a number above 0")
-        self.run, self.folder = run, run / FOLDER
-        self.every_s, self.keep_ending = every_s, keep_ending
+        self.run = run
+        self.folder = run / FOLDER
+        self.every_s = every_s
+        self.keep_ending = keep_ending
         self.resume_command = resume_command(run)
         self.has_begun = False
         """Whether a training has begun, or was resumed."""
@@ -315,8 +317,8 @@ def extend(run: Path, before: Length, length: Length) -> None:
     for name in (REPORT, *weights, "evaluation"):
         path = run / name
         if path.exists():
-            kept = path.with_stem(f"{path.stem}-{before.number}")
-            rename_listed(run, name, kept.relative_to(run).as_posix())
+            renamed = path.with_stem(f"{path.stem}-{before.number}")
+            rename_listed(run, name, renamed.relative_to(run).as_posix())
     checkpoints = checkpoints_in(run / FOLDER)
     last = max((steps_of(path) for path in checkpoints if is_ending(path)), default=None)
     for path in checkpoints:

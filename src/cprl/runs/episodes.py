@@ -44,7 +44,7 @@ _ROWS_PER_GROUP: Final = 2**16
 
 
 def batches_in(path: Path) -> Iterator[tuple[pa.RecordBatch, int]]:
-    """The whole batches of a journal, each with the byte at which it ends."""
+    """Yield the whole batches of a journal, each with the byte at which it ends."""
     refuse_special(path)
     source = pa.BufferReader(path.read_bytes())
     try:
@@ -56,7 +56,7 @@ def batches_in(path: Path) -> Iterator[tuple[pa.RecordBatch, int]]:
 
 
 def read_journal(path: Path) -> pa.Table:
-    """The rows of a journal; of one without a whole batch, none of all columns."""
+    """Return the rows of a journal; of one without a whole batch, none of all columns."""
     batches = [batch for batch, _ in batches_in(path)]
     if batches:
         return pa.Table.from_batches(batches)
@@ -64,14 +64,14 @@ def read_journal(path: Path) -> pa.Table:
 
 
 def _message(batch: pa.RecordBatch, *, is_first: bool) -> bytes:
-    """A batch as it stands in a stream, the first behind the schema."""
+    """Return a batch as it stands in a stream, the first behind the schema."""
     header = batch.schema.serialize().to_pybytes() if is_first else b""
     message: bytes = header + batch.serialize().to_pybytes()
     return message
 
 
 class EpisodeTable:
-    """Writes a table of episodes; a context manager, and a callback of `cprl.training`.
+    """The table of episodes that is being written; a context manager, and a callback of `cprl.training`.
 
     Episodes are safe once `add` has returned, even if the process is killed by SIGKILL; after a power failure
     those up to the last `state_dict` are, which syncs them to the disk. After an OSError (a full disk) all
@@ -89,9 +89,11 @@ class EpisodeTable:
     def __init__(self, path: str | os.PathLike[str], *, resumable: bool = False) -> None:
         self.path = Path(path)
         self.journal = self.path.with_suffix(".arrows")
-        self._resumable, self._is_closed = resumable, False
+        self._resumable = resumable
+        self._is_closed = False
         self._file: FileIO | None = None
-        self._rows, self._schema = 0, None
+        self._rows = 0
+        self._schema = None
         for table in () if resumable else (self.path, self.journal):
             if table.exists():
                 raise FileExistsError(f"{table} exists and is not overwritten; use another directory")
@@ -102,9 +104,13 @@ class EpisodeTable:
 
     def _open(self, rows: int = 0) -> FileIO:
         """Open the journal behind so many of its rows; what follows them is dropped."""
-        count, bytes_kept, schema = 0, 0, None
+        count = 0
+        bytes_kept = 0
+        schema = None
         for batch, end in batches_in(self.journal) if rows else ():
-            count, bytes_kept, schema = count + batch.num_rows, end, batch.schema
+            count += batch.num_rows
+            bytes_kept = end
+            schema = batch.schema
             if count >= rows:
                 break
         if count != rows:
@@ -116,13 +122,14 @@ class EpisodeTable:
         self._file = FileIO(self.journal, "x" if is_new else "r+")  # unbuffered: it survives the process
         self._file.truncate(bytes_kept)
         self._file.seek(bytes_kept)
-        self._rows, self._schema = count, schema
+        self._rows = count
+        self._schema = schema
         if is_new:
             sync_folder(self.journal.parent)
         return self._file
 
     def state_dict(self) -> dict[str, int]:
-        """The number of rows, which are on the disk once it returns."""
+        """Return the number of rows, which are on the disk once it returns."""
         if self._file is not None:
             os.fsync(self._file.fileno())
         return {"rows": self._rows}
@@ -137,7 +144,8 @@ class EpisodeTable:
             return
         file = self._file or self._open()  # without a checkpoint of the last attempt it starts over
         batch = rows_of(episodes, self._schema or schema_of(episodes[0]))
-        end, left = file.tell(), memoryview(_message(batch, is_first=self._schema is None))
+        end = file.tell()
+        left = memoryview(_message(batch, is_first=self._schema is None))
         try:
             while left:
                 left = left[file.write(left) :]
@@ -148,7 +156,8 @@ class EpisodeTable:
                 what = f"could not add episodes; the {self._rows} earlier rows are in {self.journal}"
                 raise OSError(error.errno, f"{error.strerror or error}: {what}") from error
             raise
-        self._schema, self._rows = batch.schema, self._rows + batch.num_rows
+        self._schema = batch.schema
+        self._rows += batch.num_rows
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Do nothing: a table stores whole episodes."""
@@ -194,8 +203,8 @@ class EpisodeTable:
 
 
 def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
-    """The episodes of a finished, running or killed run, in the order in which they ended; those of what is
-    no run are a FileNotFoundError."""
+    """Return the episodes of a finished, running or killed run, in the order in which they ended; of what is
+    no run they are a FileNotFoundError."""
     path = Path(run_directory) / FILE_NAME
     recipe = path.with_name(RECIPE_FILE)  # with the format of the journal, which has none of its own
     if recipe.is_file():
@@ -270,7 +279,7 @@ def _refuse_other_columns(path: str | os.PathLike[str], table: pa.Table) -> None
 
 
 def read_table(path: str | os.PathLike[str]) -> pa.Table:
-    """A parquet file of a run, checked for damage; one that is missing is a FileNotFoundError."""
+    """Read a parquet file of a run, checked for damage; one that is missing is a FileNotFoundError."""
     path = Path(path)
     verify(path)
     try:
@@ -288,7 +297,7 @@ episodes that the agents had been trained; "episode" counts those of an evaluati
 
 
 def read_evaluations(run: Path) -> pa.Table | None:
-    """The table of `EVALUATIONS`; None for a run without `Experiment.evaluate_every`, or before the first."""
+    """Read the table of `EVALUATIONS`; None for a run without `evaluate_every`, or before the first."""
     return read_rows(run / EVALUATIONS) if (run / EVALUATIONS).exists() else None
 
 
@@ -330,8 +339,9 @@ def _schema(names: Iterable[str]) -> pa.Schema:
 
 
 def schema_of(episode: Episode) -> pa.Schema:
-    """The columns that an episode has; the schema's metadata names those that it lacks."""
-    schema, missing = _schema(_columns(episode)), left_out(episode.reported)
+    """Return the columns that an episode has; the schema's metadata names those that it lacks."""
+    schema = _schema(_columns(episode))
+    missing = left_out(episode.reported)
     return schema.with_metadata({LEFT_OUT: missing}) if missing else schema
 
 
@@ -340,7 +350,8 @@ def rows_of(episodes: Sequence[Episode], schema: pa.Schema) -> pa.RecordBatch:
     parts = list(map(_columns, episodes))
     for columns in parts:
         if columns.keys() != set(schema.names):
-            more, lacks = columns.keys() - set(schema.names), set(schema.names) - columns.keys()
+            more = columns.keys() - set(schema.names)
+            lacks = set(schema.names) - columns.keys()
             raise ValueError(
                 f"the episode has the extra columns {sorted(more)} and lacks {sorted(lacks)}; allowed: the "
                 "columns of the table's first episode"

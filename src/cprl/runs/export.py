@@ -44,7 +44,8 @@ def export_results(run: Path, folder: Path, *, weights: bool = True) -> Path:
         The folder, which `cprl.load`, `read_episodes` and a report accept like the run itself. Metrics and
         returns are float32, and rows are sorted by replica, episode and agent.
     """
-    run, folder = Path(run), Path(folder)
+    run = Path(run)
+    folder = Path(folder)
     recipe = read_recipe(run)
     _refuse_another(folder, run, recipe)
     refuse_links(folder)

@@ -160,8 +160,8 @@ def refuse_links(folder: Path) -> None:
 
 
 def written_by_another(recipe: object) -> str:
-    """The end of a message about a recipe that cannot be read: which cprl wrote it, where that was another
-    than this; else nothing."""
+    """Return the end of a message about a recipe that cannot be read: which cprl wrote it, where that was
+    another than this; else nothing."""
     versions = recipe.get("versions") if isinstance(recipe, Mapping) else None
     wrote = versions.get("cprl") if isinstance(versions, Mapping) else None
     here = version("cprl")
@@ -187,13 +187,13 @@ _NAMED_CHECKSUM: Final = re.compile(r"-([0-9a-f]{32})\.pt")
 
 
 def checksum(path: Path) -> str:
-    """BLAKE2b of a file's content, 16 bytes in hexadecimal."""
+    """Return BLAKE2b of a file's content, 16 bytes in hexadecimal."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
 
 def digest_of(text: str, *, size: int = 16) -> str:
-    """BLAKE2b of a text, so many bytes in hexadecimal."""
+    """Return BLAKE2b of a text, so many bytes in hexadecimal."""
     return hashlib.blake2b(text.encode(), digest_size=size).hexdigest()
 
 
@@ -242,7 +242,8 @@ def remove_listed(run: Path, name: str) -> None:
 def rename_listed(run: Path, name: str, new: str) -> None:
     """Rename a file or folder of a run; checksums stay with their files. What has the new name is replaced,
     but for a folder, whose files are."""
-    source, target = run / name, run / new
+    source = run / name
+    target = run / new
     if source.is_dir():
         target.mkdir(exist_ok=True)
         for path in sorted(source.iterdir()):
@@ -316,7 +317,7 @@ class RunLockedError(ValueError):
 
 
 class RunLock:
-    """Holds the lock of a run's directory, or shares that of a study's; a context manager.
+    """The lock of a run's directory, or shares that of a study's; a context manager.
 
     The lock is a `flock` on `run.lock`, which the system releases when the process dies, however it dies. The
     file names host, process and start time. Where a file system is shared by several hosts a `flock` may not
@@ -333,8 +334,10 @@ class RunLock:
     """
 
     def __init__(self, directory: Path, *, take_over: bool = False, study: str | None = None) -> None:
-        self.directory, self.path = directory, directory / LOCK_FILE
-        self._take_over, self._study = take_over, study
+        self.directory = directory
+        self.path = directory / LOCK_FILE
+        self._take_over = take_over
+        self._study = study
         self._file: int | None = None
         self.is_alone = True
         """Whether nobody else is known to have run the study when it was locked."""
@@ -369,7 +372,8 @@ class RunLock:
                 ) from None
             self.is_alone = False
         else:
-            holder, here = _holder(file), socket.gethostname()
+            holder = _holder(file)
+            here = socket.gethostname()
             # A process on another host may hold it, as far as the file says.
             self.is_alone = holder.get("host") in (None, here) or self._take_over
             if self.is_alone:
@@ -398,7 +402,7 @@ class RunLock:
             raise OSError(error.errno, error.strerror, str(self.path)) from error
 
     def _is_in_place(self, file: int) -> bool:
-        """Whether the file is the one in the directory: its holder removes it at the end."""
+        """Return whether the file is the one in the directory: its holder removes it at the end."""
         try:
             return os.path.samestat(os.fstat(file), os.stat(self.path))
         except FileNotFoundError:
@@ -417,14 +421,14 @@ class RunLock:
 
 
 def holder_of(directory: Path) -> str:
-    """Who holds the lock of a directory, as messages name a process."""
+    """Return who holds the lock of a directory, as messages name a process."""
     with suppress(OSError), open(directory / LOCK_FILE, "rb") as file:
         return _named(_holder(file.fileno()))
     return _named({})
 
 
 def _holder(file: int) -> dict[str, Any]:
-    """Who wrote the lock file; empty if it cannot be read, e.g. because its process is just starting."""
+    """Return who wrote the lock file; empty if it cannot be read, e.g. as its process is just starting."""
     try:
         holder = json.loads(os.pread(file, 4096, 0))
     except (ValueError, RecursionError):

@@ -40,7 +40,7 @@ def write_results(
     last: int = LAST,
     again: str = "",
 ) -> StudyTable:
-    """Writes `table.parquet`, `summary.md` and `figures/`; again over what an earlier call wrote.
+    """Write `table.parquet`, `summary.md` and `figures/`; again over what an earlier call wrote.
 
     Args:
         last: episodes at the end of the training that are compared.
@@ -91,7 +91,7 @@ def draw(
 
 
 def write_summary(table: StudyTable, out: Path, *, last: int = LAST, again: str = "") -> Path:
-    """Writes `summary.md` of a table alone, with the figures that are there; see `write_results`."""
+    """Write `summary.md` of a table alone, with the figures that are there; see `write_results`."""
     design = table.design
     lines = [f"# {design.name}", ""]
     for word, text in (("Question", design.question), ("Expected before it was run", design.expectation)):

@@ -103,7 +103,8 @@ def draw_matrix(
         share: of the width of the sheet, which the panel has.
         upward: whether the first row is the lowest.
     """
-    low, high = min(values.values(), default=0.0), max(values.values(), default=1.0)
+    low = min(values.values(), default=0.0)
+    high = max(values.values(), default=1.0)
     reach = max(-low, high) or 1.0
     scale = Normalize(-reach, reach) if is_about_0 else Normalize(low, high)
     shades = matplotlib.colormaps[colours]

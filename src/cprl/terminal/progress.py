@@ -7,9 +7,8 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Column
-from rich.text import Text
 from tensordict import TensorDictBase
 
 from cprl.measuring.episodes import Episode
@@ -74,14 +73,14 @@ class ProgressBar:
             TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, ratio=1)),
             BarColumn(None, table_column=Column(ratio=1)),
             MofNCompleteColumn(table_column=Column(no_wrap=True)),
-            _Now(table_column=Column(no_wrap=True)),
+            TextColumn("{task.fields[words]}", markup=False, table_column=Column(no_wrap=True)),
             console=self.console,
             expand=True,
             disable=not self.console.is_terminal,
         )
         elsewhere_s = _NOTEBOOK_PERIOD_S if self.console.is_jupyter else _LINE_PERIOD_S
         self._period_s = _BAR_PERIOD_S if self.console.is_terminal else elsewhere_s
-        self._task = self._progress.add_task(title, total=self._length.number, values="")
+        self._task = self._progress.add_task(title, total=self._length.number, words="")
         self._return = "-"
         self._epsilon = ""
         self._turns = self._steps = self._steps_running = self._episodes = 0
@@ -115,7 +114,8 @@ class ProgressBar:
     def on_step(self, batch: TensorDictBase) -> None:
         """Count the turns of a batch and update the bar if it is due."""
         if not self._turns:  # do not count the time before the first step
-            self._speed, self._course = Speed(self._steps), Speed(self._done())
+            self._speed = Speed(self._steps)
+            self._course = Speed(self._done())
         self._turns += 1
         self._steps += batch.numel()
         self._steps_running += batch.numel()
@@ -135,19 +135,21 @@ class ProgressBar:
 
     def _show(self) -> None:
         done = self._done()
-        values = f"return {self._return}{self._epsilon}  {self._speed.lap(self._steps):,.0f} steps/s"
-        values += self._time_left(done)
-        self._progress.update(self._task, completed=done, values=values)
-        if not self.console.is_terminal:
-            at = f"episode {self._episodes // self._replicas}/{self._length.number}"
-            if self._length.is_of_steps:
-                at = f"step {done:,.0f}/{self._length.number:,}"
-            self._print(f"{self._title}: {at}  {values}", done)
+        words = f"return {self._return}{self._epsilon}  {self._speed.lap(self._steps):,.0f} steps/s"
+        at = f"episode {self._episodes // self._replicas}/{self._length.number}  "
+        if self._length.is_of_steps:
+            at = f"step {done:,.0f}/{self._length.number:,}  "
+        self._say(words + self._time_left(done), at)
 
-    def _print(self, words: str, done: float) -> None:
-        """Print a line; in a notebook over the one before, behind a bar."""
+    def _say(self, words: str, at: str = "") -> None:
+        """Say how far the training is: behind the bar; where there is none in a line, which in a notebook is
+        written over."""
+        done = self._done()
+        self._progress.update(self._task, completed=done, words=words)
+        words = f"{self._title}: {at}{words}"
         if not self.console.is_jupyter:
-            self.console.print(words, soft_wrap=True)
+            if not self.console.is_terminal:
+                self.console.print(words, soft_wrap=True)
             return
         full = int(_NOTEBOOK_CELLS * done / max(1, self._length.number))
         self._notebook_line.show(f"{'█' * full}{'░' * (_NOTEBOOK_CELLS - full)} {words}")
@@ -168,41 +170,29 @@ class ProgressBar:
         return f"  {in_words((self._length.number - done) / per_s)} left"
 
     def _say_compiling(self) -> None:
-        """Print lines while code is compiled; in a terminal the bar shows it."""
+        """Say how long code has been compiled, while it is."""
         said_s = 0.0
         while not self._is_over.wait(0.2):
             spent_s = CLOCK.total_s - self._compiled_before_s
             if CLOCK.is_running and spent_s - said_s >= COMPILING_PERIOD_S:
                 said_s = spent_s
-                self._print(f"{self._title}: compiling, {spent_s:.0f} s so far", self._done())
+                self._say(f"compiling, {spent_s:.0f} s so far")
 
     def __enter__(self) -> Self:
         self._compiled_before_s = CLOCK.total_s
         self._silence.__enter__()
         self._progress.start()
-        if not self.console.is_terminal:
-            self._lines.start()
+        self._lines.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._is_over.set()
-        if self._lines.is_alive():
-            self._lines.join()
+        self._lines.join()
         self._steps_running = 0
         self._progress.update(self._task, completed=self._done())
         self._progress.stop()
         if self.console.is_jupyter:
-            self._print(f"{self._title}: {self._episodes // self._replicas} episodes", self._done())
+            self._say(f"{self._episodes // self._replicas} episodes")
         self._silence.__exit__(None, None, None)
-
-
-class _Now(ProgressColumn):
-    """What a task says of itself, or that code is being compiled."""
-
-    def render(self, task: Task) -> Text:
-        """Called some ten times a second by rich's own thread."""
-        if CLOCK.is_running:
-            return Text(f"compiling, {CLOCK.total_s:.0f} s so far")
-        return Text(str(task.fields["values"]))

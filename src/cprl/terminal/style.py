@@ -260,12 +260,12 @@ def _with_colours(drawn: BytesIO, colours: int) -> BytesIO:
 
 
 def wrapped(text: str, wide: float, character: float = CHARACTER) -> str:
-    """A text in lines of so many em."""
+    """Return a text in lines of so many em."""
     return lines_of(text, max(4, int(wide / character)))
 
 
 def on_white(agent: int) -> dict[str, Any]:
-    """An agent's colour for a line on white, with a dark edge because some agents are as light as yellow.
+    """Return an agent's colour for a line on white, with a dark edge, as some agents are as light as yellow.
 
     Agents 4 and on have dashes too, because their colours repeat.
     """
@@ -276,7 +276,7 @@ def on_white(agent: int) -> dict[str, Any]:
 
 
 def draw_cell(axes: Axes, x: int, y: int, colour: Any, text: str) -> None:
-    """Draws the cell about (x, y), one unit wide and high, its text black on light cells and white on dark
+    """Draw the cell about (x, y), one unit wide and high, its text black on light cells and white on dark
     ones."""
     red, green, blue, _ = to_rgba(colour)
     ink = "black" if 0.299 * red + 0.587 * green + 0.114 * blue > 0.5 else "white"

@@ -149,7 +149,8 @@ def cells(
     Args:
         kind: "levels", means over replicas; or "differences" from the reference.
     """
-    chosen, reference = metrics_of(table, metrics, part=part), table.design.reference
+    chosen = metrics_of(table, metrics, part=part)
+    reference = table.design.reference
     is_levels = kind == "levels"
     family = (levels_of if is_levels else differences_of)(table, chosen, part=part, last=last)
     played = by_replica(table.windows(part, last=last), chosen[0], ["condition"])["condition"].to_pylist()

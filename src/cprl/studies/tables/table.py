@@ -89,11 +89,11 @@ class Design:
 
     @property
     def factors(self) -> tuple[str, ...]:
-        """The names of the factors; () where conditions have names alone."""
+        """Return the names of the factors; () where conditions have names alone."""
         return tuple(next(iter(self.conditions.values())))
 
     def levels(self, factor: str) -> list[Any]:
-        """The level of a factor in each condition."""
+        """Return the level of a factor in each condition."""
         return [levels[factor] for levels in self.conditions.values()]
 
 
@@ -112,7 +112,7 @@ class Lacking:
 
     @property
     def is_damaged(self) -> bool:
-        """Whether it ended and cannot be read, so that nothing runs it again."""
+        """Return whether it ended and cannot be read, so that nothing runs it again."""
         return self.reason.startswith(DAMAGED)
 
     def __str__(self) -> str:
@@ -146,7 +146,7 @@ class StudyTable:
 
     @cached_property
     def mixed(self) -> list[str]:
-        """How its runs were made in different circumstances, in sentences; [] if in the same."""
+        """Return how its runs were made in different circumstances, in sentences; [] if in the same."""
         sentences = []
         for name, counts in counted(self.made).items():
             if len(counts) == 1:
@@ -162,12 +162,12 @@ class StudyTable:
 
     @cached_property
     def metrics(self) -> tuple[str, ...]:
-        """The metrics in it, in order."""
+        """Return the metrics in it, in order."""
         return tuple(self.rows["metric"].unique().to_pylist()) if len(self.rows) else ()
 
     @cached_property
     def replicas(self) -> Mapping[str, int]:
-        """How many replicas of each condition are in it."""
+        """Return how many replicas of each condition are in it."""
         pairs = self.rows.select(["condition", "replica"]).group_by(["condition", "replica"]).aggregate([])
         counts = Counter(pairs["condition"].to_pylist())
         return {condition: counts[condition] for condition in self.design.conditions}
@@ -200,12 +200,12 @@ class StudyTable:
         return rows.filter(pa.array(episode >= ends[of_replica] - whole[condition]))
 
     def __str__(self) -> str:
-        """What it holds, what it lacks and what is mixed, in sentences."""
+        """Return what it holds, what it lacks and what is mixed, in sentences."""
         return "\n".join([self.summary, *self.design.notes, *self.mixed, *map(str, self.lacking)])
 
     @property
     def summary(self) -> str:
-        """What it holds, in a sentence."""
+        """Return what it holds, in a sentence."""
         lacking = len(self.lacking)
         without = f"; {lacking} run{'s are' if lacking != 1 else ' is'} not in it" if lacking else ""
         return (
