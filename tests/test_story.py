@@ -359,8 +359,8 @@ def test_a_recording_of_a_matrix_game_has_the_sum_of_returns_and_shares_of_joint
             observer.on_episode(fake(0, world, returned=returned, tagged=0), {})
     path = tmp_path / "run.rrd"
     assert column(path, "joint_actions", "Scalars:scalars")[1] == [[0.25, 0.25, 0, 0.5]]
-    assert column(path, "return_of_all", "Scalars:scalars")[1] == [[-5, -8, -6.5, -6.5]]
-    assert column(path, "random_play/return_of_all", "Scalars:scalars")[1] == [[-7]]
+    assert column(path, "income", "Scalars:scalars")[1] == [[-5, -8, -6.5, -6.5]]
+    assert column(path, "random_play/income", "Scalars:scalars")[1] == [[-7]]
 
 
 def test_the_file_closes_while_the_live_view_goes_on(tmp_path):

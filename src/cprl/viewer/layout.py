@@ -41,6 +41,7 @@ from cprl.measuring.registry import (
     COLLECTIVE_RETURN,
     EQUALITY,
     IN_FORCE,
+    INCOME,
     METRICS,
     SHARE,
     colour,
@@ -60,7 +61,6 @@ from cprl.viewer.names import (
     NOW,
     PAID,
     RANDOM_PLAY,
-    RETURN,
     SETTLED,
     STATES,
 )
@@ -102,8 +102,8 @@ def styles(curves: Curves) -> dict[str, Any]:
         "turn/stock": line("apples", PALETTE[APPLE]),
     }
     if curves.unit == "return":
-        lines[RETURN] = running(mean, ORANGE, replicas)
-        lines[f"{RANDOM_PLAY}/{RETURN}"] = line("random play", GREY)
+        lines[INCOME] = running(mean, ORANGE, replicas)
+        lines[f"{RANDOM_PLAY}/{INCOME}"] = line("random play", GREY)
     for metric in curves.metrics:
         is_alone = bool(metric in METRICS and METRICS[metric].plot)
         words = METRICS[metric].words if is_alone or metric.startswith(INSTITUTIONS) else mean
@@ -287,8 +287,8 @@ def _overview(curves: Curves, *, live: bool) -> Any:
     if curves.unit == "apples":
         gets = _metric(curves, COLLECTIVE_RETURN, is_explained=True)
     else:
-        entities = [RETURN, f"{RANDOM_PLAY}/{RETURN}", f"{EVALUATION}/return"]
-        gets = _plot(f"Sum of all returns; {curves.bold}", entities, has_legend=False)
+        entities = [INCOME, f"{RANDOM_PLAY}/{INCOME}", f"{EVALUATION}/return"]
+        gets = _plot(f"Income of all agents together; {curves.bold}", entities, has_legend=False)
     if not isinstance(curves, Scene):
         title = "Joint actions, share of turns; agent 0 first"
         joint = _plot(title, [JOINT] if curves.joint else [], share=True)

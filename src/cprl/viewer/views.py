@@ -15,11 +15,11 @@ from tensordict import TensorDictBase
 
 from cprl import keys
 from cprl.measuring.episodes import Episode
-from cprl.measuring.registry import OF_AGENTS
+from cprl.measuring.registry import INCOME, OF_AGENTS
 from cprl.measuring.series import OF_GROUP, STEPS, Recent, mean_of
 from cprl.measuring.windows import Values
 from cprl.viewer.logger import RerunLogger
-from cprl.viewer.names import JOINT, RANDOM_PLAY, RETURN
+from cprl.viewer.names import JOINT, RANDOM_PLAY
 
 
 class View:
@@ -75,8 +75,8 @@ class Plots(View):
     def random_play(self, episodes: Sequence[Episode]) -> None:
         """Set the lines of random play: the mean of each metric in these episodes, where it is defined."""
         curves = self._logger.curves
-        names = [*curves.metrics, *([RETURN] if curves.unit == "return" else [])]
-        played = [{**episode.metrics, RETURN: float(episode.return_.sum())} for episode in episodes]
+        names = [*curves.metrics, *([INCOME] if curves.unit == "return" else [])]
+        played = [{**episode.metrics, INCOME: float(episode.return_.sum())} for episode in episodes]
         for name in names:
             values = [numbers.get(name, nan) for numbers in played]
             defined = [value for value in values if not isnan(value)]
@@ -91,11 +91,11 @@ class Plots(View):
     def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
         curves = self._logger.curves
         if curves.unit == "return":
-            numbers = {**numbers, RETURN: np.sum([numbers[f"{name}/return"] for name in curves.agents], 0)}
+            numbers = {**numbers, INCOME: np.sum([numbers[f"{name}/return"] for name in curves.agents], 0)}
         for name, values in numbers.items():
             if name == STEPS:  # what its timeline says
                 continue
-            is_of_group = name.startswith((*OF_GROUP, RETURN))
+            is_of_group = name.startswith((*OF_GROUP, INCOME))
             mean = mean_of(values)
             lines = [*values, mean] if is_of_group and len(values) > 1 else [mean]
             if is_of_group or name.endswith(_WITH_MEAN):
