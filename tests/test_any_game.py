@@ -28,6 +28,7 @@ from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.envs import spaces_of
+from cprl.envs.unwrap import agent_names
 from cprl.measuring import EpisodeTracker
 from cprl.measuring.evaluate import evaluate
 from cprl.measuring.registry import (
@@ -42,7 +43,7 @@ from cprl.measuring.registry import (
 )
 from cprl.measuring.series import Observer
 from cprl.measuring.statistics import estimates
-from cprl.measuring.table import labelled, where
+from cprl.measuring.table import labelled, naming, where
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
 from cprl.runs.curves import curves_of
@@ -341,3 +342,16 @@ def test_actions_of_numbers_are_refused_by_the_name_of_their_entry():
     env.full_action_spec = spec
     with pytest.raises(ValueError, match=r'\("agents", "action"\)'):
         spaces_of(env)
+
+
+def test_a_page_calls_agents_what_their_game_calls_them():
+    env = MatrixGame(2, steps=3)
+    env.group_map = {"agents": ["ann", "bob"]}
+    played = table_of(evaluate(env, tit_for_tat), [0, 1])
+    tables = [labelled(played, policy=policy) for policy in ("trained", "random")]
+    page = compared(naming(pa.concat_tables(tables), agent_names(env)), "")
+    names = [row[0] for row in page.rows]
+    assert {"ann: return", "bob: return"} <= set(names)
+    assert not [name for name in names if "agent 0" in name]
+    unnamed = compared(pa.concat_tables(tables), "")
+    assert "agent 0: return" in [row[0] for row in unnamed.rows]

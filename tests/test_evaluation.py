@@ -451,7 +451,7 @@ WRITTEN = [
             "focal: return, apples",
             "income of all agents together, apples",
             "sustainability, steps",
-            "* not 0 by Holm's method for all 4 differences",
+            "* not 0 by Holm's method for the 4 differences of both tables",
         ],
         [
             ["bites", "2.50 [2.50, 2.50]", "2.50 [2.50, 2.50]"],
@@ -489,7 +489,7 @@ WRITTEN = [
         ["scenarios", "{sustainable}", "--episodes", 1, "--scenarios", "minority_among_greedy"],
         [
             "Scenarios of sustainable: 2 replicas, 1 episode each in each placement, seed 30011",
-            "* not 0 by Holm's method for all 2 differences",
+            "* not 0 by Holm's method for the 2 differences of this table",
         ],
         # What is not 0 differs for certain; all together get 3 or 2, as one of them plays greedy.
         [

@@ -92,7 +92,7 @@ def test_the_table_of_a_study_says_what_it_is_called(tmp_path):
     design = Design(name="one", conditions={"a": {}}, reference="a", is_paired=True)
     written = StudyTable(design=design, rows=rows, window=10).write(tmp_path / "table.parquet")
     OWN_METRICS.clear()
-    assert cells(StudyTable.read(written), last=10).head[-1] == "most minus least, apples"
+    assert cells(StudyTable.read(written, last=10)).head[-1] == "most minus least, apples"
     OWN_METRICS.clear()
 
 

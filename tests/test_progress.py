@@ -12,7 +12,7 @@ from tensordict import TensorDict
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.policies.lanes import LaneActor
-from cprl.system.times import CLOCK
+from cprl.system.times import CLOCK, Speed
 from cprl.terminal import progress
 from cprl.terminal.progress import ProgressBar
 from cprl.training import Training, train
@@ -140,6 +140,21 @@ def test_a_compilation_is_reported_while_it_lasts_and_slows_no_estimate(monkeypa
     assert re.search(r"training: compiling, \d s so far", told)
     rates = [int(rate.replace(",", "")) for rate in re.findall(r"([\d,]+) steps/s", told)]
     assert min(rates) > 30, "a second of compiling for the first step would make it one step per second"
+
+
+def test_speed_is_of_the_time_in_which_nothing_is_compiled(monkeypatch):
+    now, clock = SimpleNamespace(s=10.0), SimpleNamespace(total_s=0.0)
+    monkeypatch.setattr("cprl.system.times.time", SimpleNamespace(perf_counter=lambda: now.s))
+    monkeypatch.setattr("cprl.system.times.CLOCK", clock)
+    speed = Speed(100)
+    assert speed.mean(100) is None
+    assert np.isnan(speed.lap(100))
+    now.s, clock.total_s = 44.0, 30.0  # 4 s of work
+    assert speed.lap(108) == 2.0
+    now.s = 45.0
+    assert speed.waited_s == 1.0
+    assert speed.lap(109) == 1.0
+    assert speed.mean(109) == 9 / 5
 
 
 @pytest.mark.parametrize(

@@ -385,9 +385,13 @@ def test_conditions_are_compared_by_the_last_episodes_and_pairs_of_replicas(pair
     assert values_of(pairs.windows(last=10), number)["freeze_steps=5"][0] == 34.5
     assert values_of(pairs.windows("evaluation"), number)["freeze_steps=25"] == {0: 3, 1: 104, 2: 208}
     assert episodes_text(pairs, "evaluation") == "3 fresh episodes of the trained agents"
-    for name, value in (("metric", "wealth"), ("part", "sleep"), ("last", 5)):
-        with pytest.raises(ValueError, match=f"{name} is {value!r}"):
-            levels_of(pairs, **({"metrics": [value]} if name == "metric" else {name: value}))
+    for table, options, message in (
+        (pairs, {"metrics": ["wealth"]}, "metric is 'wealth'"),
+        (pairs, {"part": "sleep"}, "part is 'sleep'"),
+        (replace(pairs, last=5), {}, "last is 5"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            levels_of(table, **options)
 
 
 def test_a_table_that_was_compared_is_freed_with_its_last_name(tmp_path):
@@ -535,7 +539,7 @@ def test_a_study_of_24_conditions_most_of_which_were_not_run_has_figures_that_ca
     study = Study(EXPERIMENT, factors, name="combat", replicas=2)
     names = [condition.name for condition in study.all_conditions]
     table = study_table(study, write_study(study, tmp_path / "runs", harvest, but=names[5:]))
-    for _, _, draw in figures.figures_of(table, 30):
+    for _, _, draw in figures.figures_of(table):
         draw(tmp_path / "a.png", width=width)
     assert len(drawn) > 5
     for figure in drawn:
@@ -688,9 +692,7 @@ def test_the_results_of_a_study_are_a_table_a_summary_and_figures(grid_runs, tmp
         "differences.png", f"map_{pair}_collective_return.png", f"map_{pair}_equality.png",
     }  # fmt: skip
     unlike = {name: {phase: 3} for name, phase in zip(table.endings, ["tragedy", "decline"], strict=False)}
-    assert f"phases_{pair}.png" in [
-        name for name, *_ in figures.figures_of(replace(table, endings=unlike), 30)
-    ]
+    assert f"phases_{pair}.png" in [name for name, *_ in figures.figures_of(replace(table, endings=unlike))]
     assert StudyTable.read(tmp_path / "table.parquet").summary == table.summary
     text, (lacking,) = (tmp_path / "summary.md").read_text(), table.lacking
     for line in (
@@ -847,7 +849,8 @@ def test_the_last_episodes_are_those_of_each_replica():
     design = Design(name="small", conditions={"a": {}}, reference="a", is_paired=True)
     table = StudyTable(design=design, rows=pa.Table.from_pylist(rows), window=10)
     assert values_of(table.windows(last=10), "income") == {"a": {0: 3.0, 1: 5.0}}
-    assert episodes_text(table, last=10) == "the last 3 to 4 episodes of training"
-    assert levels_of(table, ["income"], last=10)["a", "income"].episodes == 7
+    ten = replace(table, last=10)
+    assert episodes_text(ten) == "the last 3 to 4 episodes of training"
+    assert levels_of(ten, ["income"])["a", "income"].episodes == 7
     values = values_of(table.windows(last=14), "income")["a"]
     assert values == pytest.approx({0: (10 * 2.0 + 4 * 3.0) / 14, 1: 55 / 13})

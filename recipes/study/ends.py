@@ -16,21 +16,14 @@ import tyro
 from phases import FEWEST_EPISODES, METRICS, UNNAMED, find_phases
 
 import cprl
-from cprl.evaluation import (
-    dilemma,
-    exploitability,
-    margins,
-    payoffs_of,
-    plan_responses,
-    schelling,
-)
+from cprl.evaluation import dilemma, margins, payoffs_of, schelling
 from cprl.evaluation.cross_play import OF_FOCAL
 from cprl.experimental.territory import WORDS, number_of, territory_of
 from cprl.measuring.statistics import estimate
 from cprl.measuring.table import by_replica, where
 from cprl.measuring.windows import Values, running_mean
 from cprl.runs.curves import curves_of
-from cprl.studies.exploit import BEST, compared
+from cprl.studies.exploit import BEST, compared, exploitability, plan_responses
 from cprl.training.agents import LoadedRun, load
 
 POINTS: Final = 2_000

@@ -218,7 +218,7 @@ def search(words: Sequence[str], /) -> None:
         return
     result = _run(partial(run_search, wanted), options, executor, command)
     _say_best(result)
-    _say_result(result, command, options.last)
+    _say_result(result, command)
 
 
 def _read(words: Sequence[str], options: RecipeOptions, program: str) -> "tuple[Experiment, RecipeOptions]":
@@ -338,7 +338,7 @@ def carry_out(study: "Study", options: StudyOptions, command: Sequence[str]) -> 
         return _list(study, options)
     run = partial(run_study, study, only=options.only or None, keep_checkpoints=options.keep_checkpoints)
     result = _run(run, options, executor, command)
-    _say_result(result, command, options.last)
+    _say_result(result, command)
     return result.out
 
 
@@ -390,7 +390,7 @@ def _say_best(result: "SearchResult") -> None:
         say(f"  {len(refused)} points were refused, e.g. {refused[0].name}: {refused[0].reason}")
 
 
-def _say_result(result: "StudyResult", command: Sequence[str], last: int) -> None:
+def _say_result(result: "StudyResult", command: Sequence[str]) -> None:
     """Prints the results of a study, and where they are; of trials that failed or are damaged why, where to
     look and what to do, and exits."""
     from cprl.studies.results import FIGURES
@@ -398,7 +398,7 @@ def _say_result(result: "StudyResult", command: Sequence[str], last: int) -> Non
     from cprl.terminal.tables import show
 
     if result.table is not None and result.table.metrics:
-        show([of_finished(cells(result.table, last=last))])
+        show([of_finished(cells(result.table))])
         for figure in sorted((result.out / FIGURES).glob("*.png")):
             say(f"Figure: {figure}")
     say(result.out)

@@ -95,19 +95,19 @@ def table(
     from cprl.studies.tables.effects import effect_cells
     from cprl.terminal.tables import show, write
 
-    last = LAST if compare.last is None else compare.last
-    compared = compared_cells(study_table, compare.metric, part=compare.part, last=last)
-    effects = effect_cells(study_table, compare.metric, part=compare.part, last=last)
+    study_table = replace(study_table, last=LAST if compare.last is None else compare.last)
+    compared = compared_cells(study_table, compare.metric, part=compare.part)
+    effects = effect_cells(study_table, compare.metric, part=compare.part)
     show([*map(of_finished, compared), *effects])
     say(str(study_table))
     if summary:
         from cprl.studies.results import summarise_again
 
-        say(f"Written: {summarise_again(study_table, runs[0], last=last)}")
+        say(f"Written: {summarise_again(study_table, runs[0])}")
     if figures is not None:
         from cprl.studies.results import draw
 
-        for path in draw(study_table, runs[0], last=last, suffix=f".{figures}", metrics=compare.metric):
+        for path in draw(study_table, runs[0], suffix=f".{figures}", metrics=compare.metric):
             say(f"Figure: {path}")
     for path in files.out:
         if path.suffix == ROWS:

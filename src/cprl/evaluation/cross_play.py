@@ -19,7 +19,7 @@ import pyarrow as pa
 
 from cprl.evaluation.evaluate import opened, refuse_other_games
 from cprl.evaluation.lanes import agents_of, fresh_for, play, roles_of, said, together
-from cprl.evaluation.pages import draw_matrices, heading, matrix_cells
+from cprl.evaluation.pages import draw_matrices, heading, matrix_cells, row_cells
 from cprl.measuring.registry import COLLECTIVE_RETURN, FINES, INCOME, with_unit
 from cprl.measuring.statistics import HOLM, Family, differences, estimates
 from cprl.measuring.table import BACKGROUND, BOTH, FOCAL, ROLE, Label, labelled, numbers_in, where
@@ -127,13 +127,12 @@ def gains(table: pa.Table) -> Family:
 def by_focal_agent(table: pa.Table) -> pa.Table:
     """Return the table of a cross-play in which each agent of self-play is the focal one in turn."""
     agents = len(table["agent"].unique())
-    at_home = where(table, focal_agent=SELF_PLAY).drop_columns(["focal_agent", ROLE])
-    parts = [where(table, focal_agent=tuple(range(agents)))]
+    parts = []
     for agent in range(agents):
-        roles = pa.array(roles_of(agents, [agent])).take(at_home["agent"])
-        part = labelled(at_home, focal_agent=agent).append_column(ROLE, roles)
-        parts.append(part.select(table.column_names).cast(table.schema))
-    return pa.concat_tables(parts)
+        part = where(table, focal_agent=(agent, SELF_PLAY)).drop_columns(["focal_agent", ROLE])
+        roles = pa.array(roles_of(agents, [agent])).take(part["agent"])
+        parts.append(labelled(part, focal_agent=agent).append_column(ROLE, roles))
+    return pa.concat_tables(parts).select(table.column_names)
 
 
 _BESIDE: Final = {
@@ -172,7 +171,7 @@ def crossplay_cells(table: pa.Table) -> Iterator[Cells]:
     for number, beside in _BESIDE.items():
         name = with_unit(number, rewards=rewards)
         title = f"{name}, difference of {beside}, paired by replica [95 % interval by Student's t]"
-        yield matrix_cells(gained, number, title, f"{HOLM} for all {len(gained)} differences")
+        yield matrix_cells(gained, number, title, gained.note("of both tables"))
     numbers = dict.fromkeys([*RETURNS, *numbers_in(table)])
     if FINES not in table.column_names:  # a reward is an apple then
         numbers.pop(COLLECTIVE_RETURN, None)
@@ -181,11 +180,4 @@ def crossplay_cells(table: pa.Table) -> Iterator[Cells]:
         if not says_nothing(number, levels):
             yield matrix_cells(levels, number, with_unit(number, rewards=rewards))
     by_agent = estimates(by_focal_agent(table), RETURNS, (*PAIR, "focal_agent"))
-    agents = range(len(table["agent"].unique()))
-    rows = [
-        [*pair, str(agent), *(by_agent[(*pair, agent, number)] for number in RETURNS)]
-        for pair in levels.labels
-        for agent in agents
-    ]
-    head = ["focal", "background", "focal agent", *(with_unit(name, rewards=rewards) for name in RETURNS)]
-    yield Cells("returns by the focal agent's index", head, rows, texts=3)
+    yield row_cells(by_agent, "returns by the focal agent's index", rewards=rewards)

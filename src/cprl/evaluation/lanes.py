@@ -17,13 +17,15 @@ from torchrl.envs import EnvBase
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.envs.make_env import is_playable, make_env, spaces_of
+from cprl.envs.unwrap import agent_names
 from cprl.measuring.evaluate import evaluate
-from cprl.measuring.table import BACKGROUND, FOCAL, ROLE, Label, complete, labelled
+from cprl.measuring.table import BACKGROUND, FOCAL, ROLE, Label, complete, labelled, naming
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
 from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
 from cprl.runs.episodes import table_of
 from cprl.system.defaults import Fresh
+from cprl.system.output import legible
 from cprl.system.working import say_how_far
 from cprl.training.agents import LoadedRun, Population, StoredAgent, in_a_row, load, stored_policies
 from cprl.values import Custom, made, refusal
@@ -172,7 +174,7 @@ def play(
     table = table.add_column(place_of_world, "world", pa.array(world, pa.int32()))
     if roles:
         table = table.add_column(place_of_world + 3, ROLE, pa.array(roles).take(table["agent"]))
-    return table
+    return naming(table, agent_names(env))
 
 
 def roles_of(agents: int, focal: Collection[int]) -> list[str]:
@@ -192,7 +194,7 @@ def together(parts: Iterable[pa.Table], **said: object) -> pa.Table:
         tables.append(part)
         say_how_far(len(tables), None, "populations")
     table = complete(pa.concat_tables(tables))
-    texts = {name: str(value) for name, value in said.items()}
+    texts = {name: legible(str(value)) for name, value in said.items()}
     return table.replace_schema_metadata({**(table.schema.metadata or {}), **texts})
 
 

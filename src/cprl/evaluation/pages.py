@@ -3,12 +3,13 @@
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from cprl.measuring.registry import with_unit
 from cprl.measuring.statistics import Family, notes_on
 from cprl.system.defaults import Fresh
 from cprl.terminal import style
 from cprl.terminal.panels import draw_matrix, matrix_height
 from cprl.terminal.summary import OVER_REPLICAS
-from cprl.terminal.tables import Cells, Change
+from cprl.terminal.tables import Cell, Cells, Change
 from cprl.training.agents import LoadedRun
 
 
@@ -22,6 +23,21 @@ def heading(what: str, fresh: Fresh, runs: Iterable[LoadedRun], each: str = "", 
     epsilons = {agent.epsilon for agent in agents if agent.scripted is None and not agent.stochastic}
     exploring = ", greedy" if fresh.greedy else "".join(f", epsilon {one:g}" for one in sorted(epsilons))
     return f"{what}: {fresh}{each}, seed {fresh.seed}{exploring}{end}\n{OVER_REPLICAS}"
+
+
+def row_cells(family: Family, title: str, *, rewards: str = "") -> Cells:
+    """Return a row for each choice of labels of a family, a column for each of its numbers.
+
+    Args:
+        rewards: their unit, see `with_unit`.
+    """
+    rows: list[list[Cell]] = [
+        [*map(str, labels), *(family[(*labels, number)] for number in family.numbers)]
+        for labels in family.labels
+    ]
+    labels_in_words = (name.replace("_", " ") for name in family.by)
+    head = [*labels_in_words, *(with_unit(number, rewards=rewards) for number in family.numbers)]
+    return Cells(title, head, rows, "\n".join(notes_on(family.values())), texts=len(family.by))
 
 
 def matrix_cells(family: Family, number: str, title: str, note: str = "") -> Cells:

@@ -34,11 +34,11 @@ from cprl.evaluation.lanes import (
     scripted,
     together,
 )
-from cprl.evaluation.pages import heading
+from cprl.evaluation.pages import heading, row_cells
 from cprl.experiment import presets
-from cprl.measuring.registry import COLLECTIVE_RETURN, EQUALITY, with_unit
-from cprl.measuring.statistics import HOLM, Family, differences, estimates, notes_on
-from cprl.measuring.table import FOCAL
+from cprl.measuring.registry import COLLECTIVE_RETURN, EQUALITY
+from cprl.measuring.statistics import Family, differences, estimates
+from cprl.measuring.table import FOCAL, where
 from cprl.population import Frozen, Scripted
 from cprl.system.defaults import Fresh
 from cprl.system.working import working
@@ -277,12 +277,12 @@ def advantages(table: pa.Table, numbers: Sequence[str] = (OF_FOCAL, OF_BACKGROUN
     background gets more among them, "background/return", by "scenario" and "focal", these others. Paired by
     replica, which plays the same worlds."""
     behind = differences(table, numbers, BY, {FOCAL: RUN})
-    return Family({key: -one for key, one in behind.items()}, BY, behind.name)
+    return behind.changed(lambda _, one: -one)
 
 
 def scenario_cells(table: pa.Table) -> Iterator[Cells]:
     """Yield the returns, a row for each scenario, and social metrics of all agents together."""
-    levels = estimates(table, [OF_FOCAL, OF_BACKGROUND, *SOCIAL], BY)
+    levels = estimates(table, [OF_FOCAL, OF_BACKGROUND], BY)
     ahead = advantages(table, [OF_FOCAL])
     names = list(dict.fromkeys(scenario for scenario, _ in levels.labels))
     others = FOCAL_AGENTS[1:]
@@ -298,13 +298,10 @@ def scenario_cells(table: pa.Table) -> Iterator[Cells]:
     columns = ["scenario", "focal: the run's agents", *(f"{who} in their place" for who in others)]
     columns += [*(f"run's - {who}'s, paired" for who in others), "background"]
     missing = said(table, "scenarios_left_out")
-    note = f"{HOLM} for all {len(ahead)} differences" + f". Left out: {missing}" * bool(missing)
+    note = ahead.note("of this table") + f"\nLeft out: {missing}" * bool(missing)
     yield Cells("return per agent, apples", columns, returns, note)
-    title = "all agents together, with the run's agents in the focal places"
-    social = {name: [levels[name, RUN, metric] for metric in SOCIAL] for name in names}
-    note = "\n".join(notes_on(one for row in social.values() for one in row))
-    rows: list[list[Cell]] = [[name, *row] for name, row in social.items()]
-    yield Cells(title, ["scenario", *map(with_unit, SOCIAL)], rows, note)
+    social = estimates(where(table, focal=RUN), SOCIAL, "scenario")
+    yield row_cells(social, "all agents together, with the run's agents in the focal places")
 
 
 _LOOKS: Final = {

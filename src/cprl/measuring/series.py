@@ -123,7 +123,8 @@ class Series:
     """
 
     def __init__(self, replicas: int, worlds: int = 1) -> None:
-        self.replicas, self.worlds = replicas, worlds
+        self.replicas = replicas
+        self.worlds = worlds
         self._waiting: dict[int, dict[int, list[dict[str, float]]]] = {}
         """By the number of W episodes, and by replica."""
 

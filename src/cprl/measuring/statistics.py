@@ -136,7 +136,8 @@ def difference(values: ArrayLike, reference: ArrayLike, *, paired: bool) -> Esti
     Raises:
         ValueError: If there are no replicas, a value is not finite, or pairs have unequal numbers of them.
     """
-    first, second = _sample(values), _sample(reference)
+    first = _sample(values)
+    second = _sample(reference)
     if not paired:
         return _estimate(float(first.mean() - second.mean()), first, second)
     if len(first) != len(second):
@@ -386,7 +387,8 @@ def differences(
             home = tuple(other[key] for key in keys)
             if home == labels or home not in samples:
                 continue
-            values, usual = sample.values, samples[home].values
+            values = sample.values
+            usual = samples[home].values
             if paired:
                 change = _weighted_sum([(1.0, values), (-1.0, usual)])
             elif values and usual:

@@ -31,6 +31,8 @@ WINDOWS: Final = "window_episodes"
 """The column that tables of windows have."""
 _INDICES: Final = ("replica", "world", "episode", "agent")
 _AGENT: Final = "agent_"
+_NAMES: Final = b"agents"
+"""Of a table's metadata: what the game calls the agents."""
 
 
 def complete(table: pa.Table, constants: Mapping[str, Any] | None = None) -> pa.Table:
@@ -51,6 +53,21 @@ def complete(table: pa.Table, constants: Mapping[str, Any] | None = None) -> pa.
         if name not in table.column_names:
             table = table.append_column(name, pa.array(np.repeat(values, agents)))
     return table
+
+
+def naming(table: pa.Table, agents: Sequence[str]) -> pa.Table:
+    """Return a table whose metadata say what its game calls the agents, see `agents_named`."""
+    metadata = {**(table.schema.metadata or {}), _NAMES: "\n".join(agents).encode()}
+    return table.replace_schema_metadata(metadata)
+
+
+def agents_named(table: pa.Table, number: str) -> str:
+    """Return a number by what the game calls its agent, e.g. "ann/return" for "agent_0/return"."""
+    who, _, what = number.rpartition("/")
+    names = (table.schema.metadata or {}).get(_NAMES, b"").decode().splitlines()
+    if not names or not who.startswith(_AGENT):
+        return number
+    return f"{names[int(who.removeprefix(_AGENT))]}/{what}"
 
 
 def where(table: pa.Table, **labels: object) -> pa.Table:

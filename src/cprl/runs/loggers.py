@@ -50,9 +50,11 @@ def make_logger(logger: str | Logger, run: str | Path) -> Logger:
     check_logger(logger)
     folder = Path(run) / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
-    name, options = logger, dict[str, Any]()
+    name = logger
+    options = dict[str, Any]()
     if logger == "wandb":
-        name, options = Path(run).resolve().name, {"wandb_kwargs": {"id": _wandb_id(folder)}}
+        name = Path(run).resolve().name
+        options = {"wandb_kwargs": {"id": _wandb_id(folder)}}
     made: Logger = get_logger(logger, str(folder), name, **options)
     return made
 

@@ -42,7 +42,7 @@ class Executor(Protocol):
     """
 
     def run(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
-        """Runs every trial; they begin in order."""
+        """Run every trial; they begin in order."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class InProcess:
 
 @contextmanager
 def signals() -> Iterator[list[int]]:
-    """The signals by which this process is asked to stop in the block, as they come; what is done about them
-    is up to the block."""
+    """Return the signals by which this process is asked to stop in the block, as they come; what is done
+    about them is up to the block."""
     numbers: list[int] = []
 
     def note(number: int) -> None:
@@ -81,11 +81,11 @@ class _SideBySide(ABC):
 
     @abstractmethod
     def places(self) -> int:
-        """How many trials may run at a time."""
+        """Return how many trials may run at a time."""
 
     @abstractmethod
     def exit_code(self, task: Task, stops: Sequence[int]) -> int:
-        """Runs the process of a trial; asks it to stop when this one is asked, the second time kills it."""
+        """Run the process of a trial; ask it to stop when this one is asked, kill it the second time."""
 
     def ready(self) -> AbstractContextManager[object]:
         """In which processes are started."""
@@ -120,7 +120,7 @@ class _SideBySide(ABC):
                     stops.append(signal.SIGTERM)
 
     def _carry_out(self, task: Task, stops: Sequence[int]) -> Outcome | None:
-        """Runs a trial, in a thread; None if this process was asked to stop."""
+        """Run a trial, in a thread; None if this process was asked to stop."""
         for _ in range(ATTEMPTS):
             outcome = None if stops else task.begin()
             if stops or outcome is not None:
@@ -284,7 +284,7 @@ def _wait(arguments: Sequence[str], log: str, variables: Mapping[str, str]) -> i
 
 
 def bytes_of(task: Task) -> int:
-    """What a trial is expected to take, a tenth more than any of its study has taken so far."""
+    """Return what a trial is expected to take, a tenth more than any of its study has taken so far."""
     folder = task.status.folder
     peaks = [Status(folder, path.stem).read().get("peak_bytes", 0) for path in folder.glob("*.json")]
     return max(_BYTES, round(1.1 * max(peaks, default=0)))

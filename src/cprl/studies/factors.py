@@ -92,7 +92,8 @@ def places(table: dict[str, Any], path: str) -> list[tuple[Any, Any]]:
 
 
 def _named(holder: Any, name: str, at: list[str]) -> list[tuple[Any, Any]]:
-    where, path = ".".join(at) or "the experiment", ".".join([*at, name])
+    where = ".".join(at) or "the experiment"
+    path = ".".join([*at, name])
     if isinstance(holder, list) and name == ALL:
         learns = [entry["kind"] in ("Learning", "Team") if at == ["agents"] else True for entry in holder]
         if any(learns):
@@ -205,7 +206,8 @@ def checked_factors(factors: Mapping[str, Any]) -> dict[str, Factor]:
                 for level, changes in factor.items()
             }
             continue
-        path, values = normalised(name), _plain(factor)
+        path = normalised(name)
+        values = _plain(factor)
         if isinstance(factor, Distribution):
             normal[path] = factor
         elif isinstance(values, tuple) and values:

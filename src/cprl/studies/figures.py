@@ -38,7 +38,7 @@ from cprl.studies.tables.comparing import (
     pairing_text,
     values_of,
 )
-from cprl.studies.tables.table import LAST, RANDOM, TRAINING, Design, StudyTable
+from cprl.studies.tables.table import RANDOM, TRAINING, Design, StudyTable
 from cprl.terminal.panels import draw_cells, draw_dots, draw_line, draw_matrix, width_of_cells
 from cprl.terminal.style import CHARACTER, DASHES, EMPTY, MEAN, RANDOM_LINE, SHADES, Width, drawing, wrapped
 from cprl.values import refusal
@@ -57,27 +57,29 @@ _MAPPED: Final = 2
 
 
 def figures_of(
-    table: StudyTable, last: int, *, suffix: str = ".png", metrics: Sequence[str] = ()
+    table: StudyTable, *, suffix: str = ".png", metrics: Sequence[str] = ()
 ) -> Iterator[tuple[str, str, Callable[[Path], Path]]]:
     """Yield what fits a study: the name of each figure's file, what it shows, and what draws it."""
     if not table.metrics:
         return
-    design, conditions = table.design, finished(table)
+    design = table.design
+    conditions = finished(table)
     for factor in design.factors:
         if is_numeric([design.conditions[name][factor] for name in conditions]):
-            draw = partial(by_factor, table, factor, metrics=metrics, last=last)
+            draw = partial(by_factor, table, factor, metrics=metrics)
             yield f"by_{_file_name(factor)}{suffix}", f"Outcome by {factor}", draw
     if len(conditions) <= MOST_CONDITIONS:
-        levels = partial(by_condition, table, metrics=metrics, last=last)
+        levels = partial(by_condition, table, metrics=metrics)
         yield f"levels{suffix}", "Outcome by condition", levels
         yield f"courses{suffix}", "The course of the training", partial(courses, table, metrics=metrics)
         if len(conditions) > 1 and table.replicas[design.reference]:
-            differences = partial(by_condition, table, kind="differences", metrics=metrics, last=last)
+            differences = partial(by_condition, table, kind="differences", metrics=metrics)
             yield f"differences{suffix}", f"Differences from {design.reference}", differences
     for pair in grids(design):
-        words, what = "_".join(map(_file_name, pair)), " and ".join(pair)
+        words = "_".join(map(_file_name, pair))
+        what = " and ".join(pair)
         for metric in metrics_of(table, metrics)[:_MAPPED]:
-            draw = partial(heat_map, table, pair, metric=metric, last=last)
+            draw = partial(heat_map, table, pair, metric=metric)
             yield f"map_{words}_{_file_name(metric)}{suffix}", f"{title(metric)} by {what}", draw
         if len({next(iter(counts)) for counts in table.endings.values()}) > 1:
             what = f"In which phase most replicas end, by {what}"
@@ -107,7 +109,6 @@ def by_factor(
     path: Path | str,
     *,
     metrics: Sequence[str] = (),
-    last: int = LAST,
     width: Width = "page",
 ) -> Path:
     """Draw metrics against a factor whose levels are numbers.
@@ -124,8 +125,8 @@ def by_factor(
         allowed = ", ".join(numeric) or "none, as no factor has levels that are numbers"
         raise refusal("factor", factor, allowed)
     chosen = _chosen(table, metrics)
-    levels = levels_of(table, chosen, last=last)
-    rows = table.windows(last=last)
+    levels = levels_of(table, chosen)
+    rows = table.windows()
     lines = _lines(table, factor)
     others = [name for name in design.factors if name != factor]
     only = [design.conditions[names[0]][others[0]] for names in lines.values()] if len(others) == 1 else []
@@ -170,7 +171,7 @@ def by_factor(
             axes.tick_params(labelbottom=True)
             axes.set_xlabel(f"{short(factor)}, at equal distances" if is_even else short(factor))
         sheet.title = f"{design.name}: outcome by {short(factor)}"
-        sheet.caption = _caption(table, f"{_levels_note(table, last)} Faint: single replicas.")
+        sheet.caption = _caption(table, f"{_levels_note(table)} Faint: single replicas.")
         if others and list(lines) == [""]:
             sheet.caption += f" Conditions differ in {', '.join(map(short, others))} too."
     return Path(path)
@@ -217,8 +218,10 @@ def _scale(
 
 
 def _lines(table: StudyTable, factor: str) -> dict[str, list[str]]:
-    """Conditions that are equal but for a factor, in the order of its levels, by what they have in common."""
-    design, names = table.design, finished(table)
+    """Return conditions that are equal but for a factor, in the order of its levels, by what they have in
+    common."""
+    design = table.design
+    names = finished(table)
     others = [name for name in design.factors if name != factor]
     lines: dict[str, list[str]] = {}
     for name in names:  # lines are in the order of the conditions
@@ -232,14 +235,14 @@ def _lines(table: StudyTable, factor: str) -> dict[str, list[str]]:
 
 
 def is_numeric(levels: Sequence[Any]) -> bool:
-    """Whether levels stand on an axis of numbers: at least two, all numbers."""
+    """Return whether levels stand on an axis of numbers: at least two, all numbers."""
     return len(set(levels)) > 1 and all(
         isinstance(level, int | float) and not isinstance(level, bool) for level in levels
     )
 
 
 def is_logarithmic(levels: Sequence[float]) -> bool:
-    """Whether that axis is logarithmic."""
+    """Return whether that axis is logarithmic."""
     return min(levels) > 0 and max(levels) > _APART * min(levels)
 
 
@@ -256,7 +259,6 @@ def by_condition(
     *,
     kind: Kind = "levels",
     metrics: Sequence[str] = (),
-    last: int = LAST,
     width: Width = "page",
 ) -> Path:
     """Draw conditions one below the other: means over replicas, or differences from the reference.
@@ -266,16 +268,17 @@ def by_condition(
         kind: "levels", with random play as dashes; or "differences", with a dashed line at 0.
         metrics: by default those that are compared, and of levels what institutions took and found.
     """
-    design, is_levels = table.design, kind == "levels"
+    design = table.design
+    is_levels = kind == "levels"
     conditions = [name for name in finished(table) if is_levels or name != design.reference]
     if not is_levels and not table.replicas[design.reference]:
         raise ValueError(f"the reference {design.reference} has no finished run; allowed: one that has")
     if not 0 < len(conditions) <= MOST_CONDITIONS:
         raise refusal("table", table, f"1 to {MOST_CONDITIONS} conditions, not {len(conditions)}")
     chosen = _chosen(table, metrics) if is_levels else metrics_of(table, metrics)
-    family = (levels_of if is_levels else differences_of)(table, chosen, last=last)
-    levels = family if is_levels else levels_of(table, chosen, last=last)
-    rows = table.windows(last=last)
+    family = (levels_of if is_levels else differences_of)(table, chosen)
+    levels = family if is_levels else levels_of(table, chosen)
+    rows = table.windows()
     with drawing(path, width=width) as sheet:
         wide = min(_NAME, 0.3 * sheet.width_em)
         words = names_of(table)
@@ -304,11 +307,11 @@ def by_condition(
         panels[0].set_ylim(len(conditions) - 0.4, -0.6)
         by = short(design.factors[0]) if len(design.factors) == 1 else "condition"
         sheet.title = f"{design.name}: outcome by {by}"
-        note = f"{_levels_note(table, last)} Faint: single replicas. Dashed: random play."
+        note = f"{_levels_note(table)} Faint: single replicas. Dashed: random play."
         if not is_levels:
             sheet.title = f"{design.name}: difference from {' '.join(design.reference.splitlines())}"
             pairing = capitalised(pairing_text(table))
-            note = f"{pairing}; means of {episodes_text(table, last=last)}; {INTERVALS}."
+            note = f"{pairing}; means of {episodes_text(table)}; {INTERVALS}."
         sheet.caption = _caption(table, note)
     return Path(path)
 
@@ -345,7 +348,8 @@ def courses(
     Args:
         metrics: by default the collective return and survival; else the first that the table has.
     """
-    design, conditions = table.design, finished(table)
+    design = table.design
+    conditions = finished(table)
     usual = [metric for metric in _USUAL if metric in table.metrics]
     chosen = metrics_of(table, metrics or usual)[: len(metrics) or 2]
     if len(conditions) > MOST_CONDITIONS:
@@ -372,9 +376,8 @@ def courses(
         panels = sheet.panels(len(views), columns=columns, high=high, sharex=True, sharey=not is_together)
         for axes, (metric, lines) in zip(panels, views, strict=True):
             windows |= _draw_courses(axes, table, metric, lines, is_dashed=is_dashed)
+            _draw_chance(axes, _chance(table, metric), lines)
             *_, last = lines
-            beside_lines = {name: lines[name][0] for name in (lines if is_together else [last])}
-            _draw_chance(axes, table, metric, beside_lines, is_together)
             axes.set_title(title(metric) if is_together else names[last])
         for axes in panels[-columns:]:
             axes.tick_params(labelbottom=True)
@@ -393,19 +396,15 @@ def courses(
     return Path(path)
 
 
-def _draw_chance(
-    axes: Axes, table: StudyTable, metric: str, colours: Mapping[str, str], is_together: bool
-) -> None:
-    """Draw random play under some conditions, a line for all where it is the same."""
-    chance = {name: value for name, value in _chance(table, metric).items() if name in colours}
-    if not chance:
-        return
-    if is_one(chance.values()):
-        axes.axhline(next(iter(chance.values())), **RANDOM_LINE)
-    else:
-        for name, value in chance.items():
-            axes.axhline(value, **{**RANDOM_LINE, "color": colours[name], "linewidth": 1.0})
-    axes.plot([], [], **RANDOM_LINE, label=CHANCE if is_together else "random play under it")
+def _draw_chance(axes: Axes, chance: Mapping[str, float], lines: Mapping[str, tuple[str, str]]) -> None:
+    """Draw random play under the conditions of a panel, a line for all where it is the same."""
+    values = {name: chance[name] for name in lines if name in chance}
+    is_same = is_one(values.values())
+    for name, value in list(values.items())[: 1 if is_same else None]:
+        look = {} if is_same else {"color": lines[name][0], "linewidth": 1.0}
+        axes.axhline(value, **{**RANDOM_LINE, **look})
+    if values:
+        axes.plot([], [], **RANDOM_LINE, label=CHANCE)
 
 
 def _draw_courses(
@@ -414,7 +413,7 @@ def _draw_courses(
     """Draw the courses of conditions, each of a colour and with a label, and return over how many episodes
     their running means are."""
     windows = set()
-    training = table.windows(TRAINING, last=None)
+    training = where(table.rows, part=TRAINING)
     for place, (name, (colour, label)) in enumerate(lines.items()):
         rows = where(training, condition=name, metric=metric)
         if not len(rows):
@@ -491,7 +490,6 @@ def heat_map(
     path: Path | str,
     *,
     metric: str = COLLECTIVE_RETURN,
-    last: int = LAST,
     width: Width = "page",
 ) -> Path:
     """Draw a metric over two factors: its mean with the number of replicas, and its difference.
@@ -505,8 +503,8 @@ def heat_map(
     grid, elsewhere = _grid_of(table, factors)
     rows, columns = _levels_of(grid)
     tested = tuple(dict.fromkeys([*metrics_of(table), metric]))
-    levels = levels_of(table, [metric], last=last)
-    differences = differences_of(table, tested, last=last)
+    levels = levels_of(table, [metric])
+    differences = differences_of(table, tested)
     means = _at(grid, metric, levels)
     changes = _at(grid, metric, differences)
     absent = dict.fromkeys(grid, "no run")
@@ -529,7 +527,7 @@ def heat_map(
             axes.set(xlabel=short(factors[1]), ylabel=short(factors[0]))
             axes.set_title(what)
         sheet.title = f"{table.design.name}: {_title_of(metric, levels)}"
-        sheet.caption = f"Means of {episodes_text(table, last=last)}, then over n replicas."
+        sheet.caption = f"Means of {episodes_text(table)}, then over n replicas."
         if changes:
             star = "*" if any(one.differs for one in changes.values()) else "none shown to be"
             metrics = f"{len(tested)} metric{'s' * (len(tested) > 1)}"
@@ -573,8 +571,9 @@ def phase_diagram(
 
 
 def _grid_of(table: StudyTable, factors: tuple[str, str]) -> tuple[Grid, str]:
-    """The conditions of two factors, of levels that were run, and a sentence on the others."""
-    design, by_pair = table.design, grids(table.design)
+    """Return the conditions of two factors, of levels that were run, and a sentence on the others."""
+    design = table.design
+    by_pair = grids(table.design)
     if tuple(factors) not in by_pair:
         pairs = "; ".join(map(" and ".join, by_pair))
         raise refusal("factors", factors, pairs or "none, as the conditions are no grid of two factors")
@@ -607,33 +606,33 @@ def finished(table: StudyTable) -> list[str]:
 
 
 def _not_run(table: StudyTable) -> str:
-    """A sentence on the conditions that a figure leaves out."""
+    """Return a sentence on the conditions that a figure leaves out."""
     count = len(table.design.conditions) - len(finished(table))
     return f" Not run: {count} of {len(table.design.conditions)} conditions." if count else ""
 
 
 def _chance(table: StudyTable, metric: str) -> dict[str, float]:
-    """Random play under each condition in which it was played and the metric is defined."""
+    """Return random play under each condition in which it was played and the metric is defined."""
     levels = levels_of(table, [metric], part=RANDOM)
     return {name: level.value for (name, _), level in levels.items() if level.replicas}
 
 
 def is_one(values: Iterable[float]) -> bool:
-    """Whether values are one number, but for the rounding of exported tables to float32."""
+    """Return whether values are one number, but for the rounding of exported tables to float32."""
     values = list(values)
     return not values or isclose(min(values), max(values), rel_tol=1e-6)
 
 
 def short(factor: str) -> str:
-    """A factor in a word, e.g. "freeze steps"."""
+    """Return a factor in a word, e.g. "freeze steps"."""
     return factor.rpartition(".")[2].replace("_", " ")
 
 
 def names_of(table: StudyTable) -> dict[str, str]:
-    """What figures call each condition: the level alone where there is one factor, else its name; with
-    the number of replicas where that is not the same for all.
-    """
-    design, names = table.design, list(table.design.conditions)
+    """Return what figures call each condition: the level alone where there is one factor, else its name; with
+    the number of replicas where that is not the same for all."""
+    design = table.design
+    names = list(table.design.conditions)
     words = names
     if len(design.factors) == 1:
         levels = design.levels(design.factors[0])
@@ -645,7 +644,7 @@ def names_of(table: StudyTable) -> dict[str, str]:
 
 
 def colours_of(names: Sequence[str], levels: Sequence[Any]) -> dict[str, str]:
-    """A colour for each of several lines: from dark to light where their levels are numbers."""
+    """Return a colour for each of several lines: from dark to light where their levels are numbers."""
     if len(names) > 2 and is_numeric(levels):
         order = sorted(set(levels))
         shades = matplotlib.colormaps["viridis"]
@@ -660,7 +659,7 @@ def _chosen(table: StudyTable, metrics: Sequence[str]) -> tuple[str, ...]:
 
 
 def replicas_text(replicas: Mapping[str, int]) -> str:
-    """How many replicas conditions have, e.g. "8 replicas each", but for those that were not run."""
+    """Return how many replicas conditions have, e.g. "8 replicas each", but for those that were not run."""
     counts = _counts(replicas)
     if len(counts) == 1:
         return f"{counts[0]} replica{'s' * (counts[0] != 1)} each"
@@ -675,9 +674,9 @@ def _caption(table: StudyTable, note: str) -> str:
     return f"{replicas_text(table.replicas)}. {note}{_not_run(table)}"
 
 
-def _levels_note(table: StudyTable, last: int) -> str:
+def _levels_note(table: StudyTable) -> str:
     """Return what points and intervals are."""
-    return f"Means of {episodes_text(table, last=last)}, then over replicas; {INTERVALS}."
+    return f"Means of {episodes_text(table)}, then over replicas; {INTERVALS}."
 
 
 def _title_of(metric: str, levels: Family) -> str:

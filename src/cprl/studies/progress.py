@@ -52,17 +52,17 @@ class Row(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """What its experiment counts: "episodes" or "steps"."""
+        """Return what its experiment counts: "episodes" or "steps"."""
         return self.trial.experiment.length.unit
 
     @property
     def done(self) -> int:
-        """How far it is, in its unit."""
+        """Return how far it is, in its unit."""
         return self.whole * self.episodes // self.of
 
     @property
     def whole(self) -> int:
-        """How long it is, in its unit."""
+        """Return how long it is, in its unit."""
         return self.trial.experiment.length.number * self.trial.experiment.replicas
 
 
@@ -103,7 +103,8 @@ class Overview:
     """
 
     def __init__(self, trials: Sequence[Trial], runs: Path, status: Path) -> None:
-        self._trials, self._runs = trials, runs
+        self._trials = trials
+        self._runs = runs
         self._status = {trial.name: Status(status, trial.name) for trial in trials}
         self._last: dict[str, Mapping[str, Any]] = {}
         self._since: dict[str, float] = {}
@@ -145,7 +146,7 @@ class Overview:
         return Row(trial, "running", episodes, of, per_s, note)
 
     def _listen(self, name: str) -> Mapping[str, Any]:
-        """What a trial says now; the first time it may be what a process said that is dead since."""
+        """Return what a trial says now; the first time it may be what a process said that is dead since."""
         words = self._status[name].read()
         if words != self._last.get(name, {}):
             if name in self._last or words.get("beat", 0) <= 1:
@@ -171,7 +172,8 @@ class Progress:
         self._console = console(Output(lambda: stream))
         self._labels = {trial.name: trial.label for trial in trials}
         self._overview = Overview(trials, runs, status)
-        self._title, self._is_shown = title, is_shown
+        self._title = title
+        self._is_shown = is_shown
         self._ended = 0
         self._is_over = Event()
         self._live: Live | None = None
@@ -211,7 +213,8 @@ class Progress:
         self._silence.__exit__(None, None, None)
 
     def _watch(self) -> None:
-        said_s, period_s = time.monotonic(), _TABLE_PERIOD_S
+        said_s = time.monotonic()
+        period_s = _TABLE_PERIOD_S
         while not self._is_over.wait(period_s):
             began_s = time.monotonic()
             is_line = began_s - said_s >= _LINE_PERIOD_S
@@ -229,8 +232,10 @@ class Progress:
 
 
 def table_of(now: Snapshot, *, title: str, most: int | None = None) -> Any:
-    """The table of a study for a terminal, with at most so many rows; what the rest is stands below."""
-    rows, rest = now.rows, ""
+    """Return the table of a study for a terminal, with at most so many rows; what the rest is stands
+    below."""
+    rows = now.rows
+    rest = ""
     if most is not None and len(rows) > most:
         states = Counter(row.state for row in rows[most - 1 :])
         rest = "and " + ", ".join(f"{states[state]} {state}" for state in ORDER if states[state])

@@ -5,6 +5,7 @@ The summary and the figures are made of the table: `summarise_again` makes them 
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from math import isnan
 from pathlib import Path
 from typing import Final
@@ -40,7 +41,7 @@ def write_results(
     last: int = LAST,
     again: str = "",
 ) -> StudyTable:
-    """Writes `table.parquet`, `summary.md` and `figures/`; again over what an earlier call wrote.
+    """Write `table.parquet`, `summary.md` and `figures/`; again over what an earlier call wrote.
 
     Args:
         last: episodes at the end of the training that are compared.
@@ -51,28 +52,26 @@ def write_results(
     """
     out = Path(out)
     refuse_links(out)
-    table = study_table(study, runs, window=window, status=out / STATUS)
-    table.windows(last=last)  # refuses before anything is written
+    table = replace(study_table(study, runs, window=window, status=out / STATUS), last=last)
+    table.windows()  # refuses before anything is written
     table.write(out / STUDY_TABLE)
-    draw(table, out, last=last)
-    write_summary(table, out, last=last, again=again)
+    draw(table, out)
+    write_summary(table, out, again=again)
     return table
 
 
-def summarise_again(table: StudyTable, out: Path, *, last: int = LAST) -> Path:
+def summarise_again(table: StudyTable, out: Path) -> Path:
     """Write `summary.md` of a table alone, with an earlier one's line that runs what is lacking, and draw the
     figures that are there, so that both are of the same episodes and the same reference."""
-    table.windows(last=last)  # refuses before anything is written
+    table.windows()  # refuses before anything is written
     if (out / FIGURES).exists():
-        draw(table, out, last=last)
+        draw(table, out)
     earlier = (out / SUMMARY).read_text("utf-8", "replace") if (out / SUMMARY).exists() else ""
     again = re.search("^This line runs what is lacking.*?: `(.*)`$", earlier, re.MULTILINE)
-    return write_summary(table, out, last=last, again=again[1] if again else "")
+    return write_summary(table, out, again=again[1] if again else "")
 
 
-def draw(
-    table: StudyTable, out: Path, *, last: int = LAST, suffix: str = ".png", metrics: Sequence[str] = ()
-) -> list[Path]:
+def draw(table: StudyTable, out: Path, *, suffix: str = ".png", metrics: Sequence[str] = ()) -> list[Path]:
     """Draw the figures that fit a study into `figures/`, and return them; those of an earlier call with the
     same suffix go.
 
@@ -82,7 +81,7 @@ def draw(
     """
     refuse_links(out)
     metrics_of(table, metrics)  # refuses before anything is drawn
-    figures = {name: draw_it for name, _, draw_it in figures_of(table, last, suffix=suffix, metrics=metrics)}
+    figures = {name: draw_it for name, _, draw_it in figures_of(table, suffix=suffix, metrics=metrics)}
     drawn = [draw_it(out / FIGURES / name) for name, draw_it in figures.items()]
     for path in (out / FIGURES).glob(f"*{suffix}"):
         if path.name not in figures and DRAWN.fullmatch(path.name):
@@ -90,8 +89,8 @@ def draw(
     return drawn
 
 
-def write_summary(table: StudyTable, out: Path, *, last: int = LAST, again: str = "") -> Path:
-    """Writes `summary.md` of a table alone, with the figures that are there; see `write_results`."""
+def write_summary(table: StudyTable, out: Path, *, again: str = "") -> Path:
+    """Write `summary.md` of a table alone, with the figures that are there; see `write_results`."""
     design = table.design
     lines = [f"# {design.name}", ""]
     for word, text in (("Question", design.question), ("Expected before it was run", design.expectation)):
@@ -103,8 +102,8 @@ def write_summary(table: StudyTable, out: Path, *, last: int = LAST, again: str 
         line = f"This line runs {what}: `{again}`" if again else f"Running the study again runs {what}."
         lines += ["## What is not in these results", "", *(f"- {run}" for run in table.lacking), "", line, ""]
     if table.metrics:
-        lines += [*_compared(table, TRAINING, last), *_compared(table, EVALUATION, last), *_phases(table)]
-        figures = [figure for figure in figures_of(table, last) if (out / FIGURES / figure[0]).exists()]
+        lines += [*_compared(table, TRAINING), *_compared(table, EVALUATION), *_phases(table)]
+        figures = [figure for figure in figures_of(table) if (out / FIGURES / figure[0]).exists()]
         lines += ["## Figures", ""] if figures else []
         for name, what, _ in figures:
             lines += [f"![{what}]({FIGURES}/{name})", ""]
@@ -114,8 +113,8 @@ def write_summary(table: StudyTable, out: Path, *, last: int = LAST, again: str 
     return out / SUMMARY
 
 
-def _compared(table: StudyTable, part: str, last: int) -> list[str]:
-    tables = compared_cells(table, part=part, last=last) + effect_cells(table, part=part, last=last)
+def _compared(table: StudyTable, part: str) -> list[str]:
+    tables = compared_cells(table, part=part) + effect_cells(table, part=part)
     if part == EVALUATION:
         tables += compared_cells(table, part=RANDOM)[:1]
     agents = "Trained agents" if table.agents_learn else "The agents"

@@ -52,7 +52,7 @@ def run_study(
     last: int = LAST,
     again: str = "",
 ) -> StudyResult:
-    """Runs what a study lacks; may be stopped at any moment, and called again.
+    """Run what a study lacks; may be stopped at any moment, and called again.
 
     A trial that fails does not end the study. Two processes that run the same study share its trials.
     Another study in the same directory is refused until they end.
@@ -121,7 +121,7 @@ def trials_with(trials: Sequence[Trial], only: Sequence[str] | None) -> list[Tri
 
 @contextmanager
 def shared(study: Study, out: Path, *, progress: bool) -> Iterator[None]:
-    """Makes a study's directory, and locks it together with all who run the same study; another one is
+    """Make a study's directory, and lock it together with all who run the same study; another one is
     refused."""
     out.mkdir(parents=True, exist_ok=True)
     table = study.to_config(out)
@@ -138,11 +138,12 @@ def shared(study: Study, out: Path, *, progress: bool) -> Iterator[None]:
 
 
 def _run(tasks: Sequence[Task], executor: Executor, title: str, *, progress: bool) -> tuple[Outcome, ...]:
-    """Runs trials, shows how far they are, and returns those that failed.
+    """Run trials, show how far they are, and return those that failed.
 
     Those that another process runs come last: all others first, then it waits for these. Those that were made
     with other code of the user's own are moved aside and run anew."""
-    runs, status = tasks[0].runs, tasks[0].status.folder
+    runs = tasks[0].runs
+    status = tasks[0].status.folder
     moved = move_aside([task.directory for task in tasks if is_of_other_code(task.directory)])
     if moved and progress:
         places = f"{moved[0]}{f' and {len(moved) - 1} more' if moved[1:] else ''}"
@@ -150,7 +151,8 @@ def _run(tasks: Sequence[Task], executor: Executor, title: str, *, progress: boo
         say(f"{anew}; what was there is kept: {places}")
     for task in tasks:
         task.status.tidy_up()
-    trials, failed = [task.trial for task in tasks], []
+    trials = [task.trial for task in tasks]
+    failed = []
     with (
         Progress(trials, runs, status, title=title, is_shown=progress) as table,
         closing(_outcomes(tasks, executor)) as outcomes,
@@ -170,7 +172,7 @@ def _run(tasks: Sequence[Task], executor: Executor, title: str, *, progress: boo
 
 
 def _outcomes(tasks: Sequence[Task], executor: Executor) -> Generator[Outcome, None, None]:
-    """Runs all trials, those that other processes run as soon as these have ended or are silent."""
+    """Run all trials, those that other processes run as soon as these have ended or are silent."""
     silences = {task.name: is_silent(task.status, PATIENCE_S) for task in tasks}
     left = ready = list(tasks)
     while left:

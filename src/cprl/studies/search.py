@@ -147,7 +147,7 @@ class SearchResult(StudyResult):
 
     @property
     def ranked(self) -> list[Point]:
-        """The points with a value, each once, the best first."""
+        """Return the points with a value, each once, the best first."""
         by_name = {point.name: point for point in self.points if point.value is not None}
         sign = -1.0 if self.search.direction == "maximise" else 1.0
         return sorted(by_name.values(), key=lambda point: sign * (point.value or 0.0))
@@ -198,8 +198,11 @@ def run_search(
 
 class _Proposals:
     def __init__(self, search: Search, out: Path, optuna: Any) -> None:
-        self._search, self._optuna, self._failed = search, optuna, optuna.trial.TrialState.FAIL
-        path, backends = str(out / FOLDER / JOURNAL), optuna.storages.journal
+        self._search = search
+        self._optuna = optuna
+        self._failed = optuna.trial.TrialState.FAIL
+        path = str(out / FOLDER / JOURNAL)
+        backends = optuna.storages.journal
         Path(f"{path}.lock").unlink(missing_ok=True)  # of a process that died: whoever lives holds our lock
         # The other kind of lock wants symbolic links.
         backend = backends.JournalFileBackend(path, lock_obj=backends.JournalFileOpenLock(path))
@@ -223,9 +226,12 @@ class _Proposals:
         return list(self._by_number.values())
 
     def next_batch(self) -> list[Point]:
-        """The points that are run next: first those that were stopped, with the rest of their batch."""
-        batch, self._open = self._open, []
-        first, at_once = len(self._study.trials), self._search.at_once
+        """Return the points that are run next: first those that were stopped, with the rest of their
+        batch."""
+        batch = self._open
+        self._open = []
+        first = len(self._study.trials)
+        at_once = self._search.at_once
         end = math.ceil((first if batch else first + 1) / at_once) * at_once
         for number in range(first, min(end, self._search.points)):
             self._study.sampler = self._sampler(number)
@@ -247,17 +253,20 @@ class _Proposals:
                 self._by_number[point.number] = replace(point, value=value)
 
     def heading(self, batch: Sequence[Point]) -> str:
-        """What is run next, and the best value so far, in a line."""
-        search, is_high = self._search, self._search.direction == "maximise"
+        """Return what is run next, and the best value so far, in a line."""
+        search = self._search
+        is_high = self._search.direction == "maximise"
         values = [point.value for point in self.points if point.value is not None]
         best = f", best {search.metric} so far {(max if is_high else min)(values):.6g}" if values else ""
-        first, final = batch[0].number + 1, batch[-1].number + 1
+        first = batch[0].number + 1
+        final = batch[-1].number + 1
         return f"{search.name}: points {first} to {final} of {search.points}{best}"
 
     def _add(self, number: int, params: Mapping[str, Any], value: float | None = None) -> Point:
         """Add the point of a trial; with the reason where the experiment refuses its levels together, since
         later ones may fit."""
-        factors, short = self._search.factors, short_names(self._search.factors)
+        factors = self._search.factors
+        short = short_names(self._search.factors)
         changes: dict[str, Any] = {}
         for name, factor in factors.items():
             is_drawn = isinstance(factor, Distribution)
@@ -288,10 +297,12 @@ class _Proposals:
         }
 
     def _sampler(self, number: int) -> Any:
-        """A new sampler for each point, whose chance depends on the seed and the point's number alone."""
+        """Return a new sampler for each point, whose chance depends on the seed and the point's number
+        alone."""
         text = f"{self._search.experiment.seed} {number}"
         seed = int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest())
-        samplers, sampler = self._optuna.samplers, self._search.sampler
+        samplers = self._optuna.samplers
+        sampler = self._search.sampler
         if callable(sampler):
             return sampler(seed)
         if sampler == "tpe":

@@ -41,12 +41,14 @@ class Status:
     """
 
     def __init__(self, folder: Path, name: str) -> None:
-        self.folder, self.name = folder, name
-        self.path, self.log = folder / f"{name}.json", folder / f"{name}.log"
+        self.folder = folder
+        self.name = name
+        self.path = folder / f"{name}.json"
+        self.log = folder / f"{name}.log"
         self.failed = folder / f"{name}.failed.txt"
 
     def read(self) -> dict[str, Any]:
-        """What the trial said last; empty if it has said nothing."""
+        """Return what the trial said last; empty if it has said nothing."""
         try:
             table = json.loads(self.path.read_bytes())
         except (OSError, ValueError):
@@ -59,14 +61,14 @@ class Status:
             self.failed.write_text(f"{reason}\n\n{trace}", encoding="utf-8", errors="replace")
 
     def failure(self) -> str | None:
-        """The error of the last attempt in a line; None if it did not fail."""
+        """Return the error of the last attempt in a line; None if it did not fail."""
         try:
             return self.failed.read_text(encoding="utf-8").partition("\n")[0]
         except (OSError, ValueError):
             return None
 
     def tidy_up(self) -> None:
-        """Forgets earlier failures."""
+        """Forget earlier failures."""
         with suppress(OSError):
             self.failed.unlink(missing_ok=True)
 
@@ -100,7 +102,9 @@ class StatusFile:
             "steps": 0,
             "beat": 0,
         }
-        self._began, self._compiled_s, self._worlds = time.monotonic(), CLOCK.total_s, experiment.worlds
+        self._began = time.monotonic()
+        self._compiled_s = CLOCK.total_s
+        self._worlds = experiment.worlds
         self._length = experiment.length
         self._speed = Speed()
         """How fast episodes are played since this process began to train."""
@@ -128,7 +132,8 @@ class StatusFile:
 
     def write(self) -> None:
         self._table["beat"] += 1
-        running_s, compiling_s = time.monotonic() - self._began, CLOCK.total_s - self._compiled_s
+        running_s = time.monotonic() - self._began
+        compiling_s = CLOCK.total_s - self._compiled_s
         per_s = self._speed.mean(self._table["episodes"])
         times = {
             "running_s": round(running_s, 1),
@@ -141,12 +146,12 @@ class StatusFile:
             write_json(self._status.path, {**self._table, **times})
 
     def on_start(self, training: Training) -> None:
-        """Continues counting where the training does."""
+        """Continue counting where the training does."""
         self._count(training.steps, training.episodes_played)
         self._speed = Speed(self._table["episodes"])
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Counts the steps of a replica: a turn of each of its worlds."""
+        """Count the steps of a replica: a turn of each of its worlds."""
         self._count(self._table["steps"] + self._worlds, self._table["episodes"])
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
@@ -160,20 +165,22 @@ class StatusFile:
 
 
 def is_silent(status: Status, patience_s: float) -> Iterator[bool]:
-    """Whether a trial has given no sign of life for so many seconds, each time it is asked.
+    """Return whether a trial has given no sign of life for so many seconds, each time it is asked.
 
     Other hosts' clocks may differ from this one's, so what counts is whether the status changes.
     """
-    last, since = status.read(), time.monotonic()
+    last = status.read()
+    since = time.monotonic()
     while True:
         table = status.read()
         if table != last:
-            last, since = table, time.monotonic()
+            last = table
+            since = time.monotonic()
         yield time.monotonic() - since >= patience_s
 
 
 def peak_bytes() -> int:
-    """The largest memory that this process has had, in bytes."""
+    """Return the largest memory that this process has had, in bytes."""
     if sys.platform == "win32":
         return int(psutil.Process().memory_info().peak_wset)
     import resource

@@ -66,8 +66,8 @@ class Condition:
         return self.checksum_in(".")
 
     def checksum_in(self, runs: Path | str) -> str:
-        """The checksum in the names of its runs in a directory: what runs of `Frozen` agents are called from
-        there, so that it is the same wherever the study is run from."""
+        """Return the checksum in the names of its runs in a directory: what runs of `Frozen` agents are
+        called from there, so that it is the same wherever the study is run from."""
         config = with_runs_moved(self.experiment.to_config(), ".", runs)
         table = {name: value for name, value in config.items() if name not in UNNAMED}
         content = {"format": CONDITION_FORMAT, "experiment": without_defaults(table, Experiment)}
@@ -178,7 +178,8 @@ class Study(Value, stored=False):
             yield UNCHANGED, {CONDITION: Level(UNCHANGED, {})}
         else:
             short = short_names(self.factors)
-            seed, draws = self.experiment.seed, self.draws
+            seed = self.experiment.seed
+            draws = self.draws
             combinations = (
                 grid(self.factors)
                 if draws is None
@@ -201,7 +202,7 @@ class Study(Value, stored=False):
 
     @property
     def reference_name(self) -> str:
-        """The name of the condition that others are compared with."""
+        """Return the name of the condition that others are compared with."""
         if self.reference is not None:
             return self.reference
         same = Condition(self.experiment).checksum
@@ -210,7 +211,7 @@ class Study(Value, stored=False):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The names of the factors; of named conditions "condition" alone."""
+        """Return the names of the factors; of named conditions "condition" alone."""
         return tuple(self.factors) if self.factors else (CONDITION,)
 
     def to_config(self, directory: str | Path | None = None) -> dict[str, Any]:

@@ -64,8 +64,9 @@ class Trial:
 
     @cached_property
     def experiment(self) -> Experiment:
-        """What is run; stored agents play in its replicas, which a run numbers from 0 again."""
-        first, last = self.block.first, self.block.first + self.block.replicas
+        """Return what is run; stored agents play in its replicas, which a run numbers from 0 again."""
+        first = self.block.first
+        last = self.block.first + self.block.replicas
 
         def in_block(stored: Frozen) -> Frozen:
             if isinstance(stored.replica, tuple):
@@ -84,18 +85,20 @@ class Trial:
 
     @property
     def name(self) -> str:
-        """The name of its directory: the condition's checksum, the seed and the number of replicas."""
+        """Return the name of its directory: the condition's checksum, the seed and the number of replicas."""
         return f"{self.checksum}-s{self.experiment.seed}-r{self.experiment.replicas}"
 
     @property
     def label(self) -> str:
         """Its condition, and which replicas of it, for people."""
-        first, last = self.block.first, self.block.first + self.block.replicas - 1
+        first = self.block.first
+        last = self.block.first + self.block.replicas - 1
         numbers = f"replica {first}" if first == last else f"replicas {first}-{last}"
         return f"{self.condition.name}, {numbers}"
 
     def state(self, runs: Path) -> State:
-        """What its directory holds; "refused" is a run of another trial, or of none that can be read."""
+        """Return what its directory holds; "refused" is a run of another trial, or of none that can be
+        read."""
         run = runs / self.name
         state = state_of(run)
         try:
@@ -106,7 +109,7 @@ class Trial:
         return state
 
     def refuse_another(self, run: Path) -> None:
-        """Refuses a run that is not this trial, e.g. one that was renamed or restored from a backup.
+        """Refuse a run that is not this trial, e.g. one that was renamed or restored from a backup.
 
         One that has not finished may have fewer episodes, or steps: a shorter run, copied to be continued.
         """
@@ -123,7 +126,7 @@ class Trial:
 
 
 def trials_of(study: Study, runs: Path | str = ".") -> list[Trial]:
-    """Every trial of a study: the first blocks of all conditions, then their second ones, and so on.
+    """Return every trial of a study: the first blocks of all conditions, then their second ones, and so on.
 
     Args:
         runs: the directory in which theirs are, on which their names depend where stored agents play.
@@ -133,7 +136,7 @@ def trials_of(study: Study, runs: Path | str = ".") -> list[Trial]:
 
 
 def state_of(run: Path) -> State:
-    """What the directory of a run holds; a finished run has a report."""
+    """Return what the directory of a run holds; a finished run has a report."""
     if (run / REPORT).exists():
         return "finished"
     return "unfinished" if (run / RECIPE_FILE).exists() else "missing"
@@ -234,20 +237,21 @@ class Task:
 
     @property
     def recipe(self) -> dict[str, Any]:
-        """What the trial's directory says that it is."""
+        """Return what the trial's directory says that it is."""
         return self.trial.experiment.to_recipe(self.directory)
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """The user's own code that it may import: of this experiment, and what this process trusts."""
+        """Return the user's own code that it may import: of this experiment, and what this process trusts."""
         return tuple(dict.fromkeys([*custom_targets(self.recipe["experiment"]), *trusted()]))
 
     @property
     def words(self) -> list[str]:
-        """What stands after `cprl` on the command line that runs it."""
+        """Return what stands after `cprl` on the command line that runs it."""
         allow = [word for target in self.targets for word in ("--allow", target)]
         keep = "--keep-checkpoint" if self.keep_checkpoint else "--no-keep-checkpoint"
-        experiment, directory = self.trial.experiment, os.path.abspath(self.directory)
+        experiment = self.trial.experiment
+        directory = os.path.abspath(self.directory)
         length = experiment.length.flag, str(experiment.length.number)
         return ["run", directory, "--resume", *length, "--watch", "off", keep, *allow]
 
@@ -257,7 +261,7 @@ class Task:
 
     @property
     def arguments(self) -> list[str]:
-        """What stands after Python on the command line of its process."""
+        """Return what stands after Python on the command line of its process."""
         return ["-m", "cprl", *self.words, "--trial", os.path.abspath(self.status.path)]
 
     @property
@@ -266,8 +270,8 @@ class Task:
         return {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
 
     def settled(self) -> Outcome | None:
-        """What there is to say of a trial that cannot be run now: a finished one, one in whose directory
-        another trial's run is, or a finished one that lost a file; None of one that can."""
+        """Return what there is to say of a trial that cannot be run now: a finished one, one in whose
+        directory another trial's run is, or a finished one that lost a file; None of one that can."""
         return self._tried(self._check)
 
     def begin(self) -> Outcome | None:
@@ -283,7 +287,8 @@ class Task:
             return self.failed(f"{type(error).__name__}: {error}", traceback.format_exc())
 
     def _check(self) -> Outcome | None:
-        run, state = self.directory, state_of(self.directory)
+        run = self.directory
+        state = state_of(self.directory)
         if state != "missing":
             self.trial.refuse_another(run)
         if state == "finished":
@@ -296,7 +301,8 @@ class Task:
         return None
 
     def _prepare(self) -> Outcome | None:
-        run, experiment = self.directory, self.trial.experiment
+        run = self.directory
+        experiment = self.trial.experiment
         self.status.folder.mkdir(parents=True, exist_ok=True)
         self.status.tidy_up()
         take_apart(self.status.log)
@@ -322,7 +328,7 @@ class Task:
         return None
 
     def ended(self, code: int) -> Outcome | None:
-        """The outcome where its process ended with an exit code; None where it died or was stopped."""
+        """Return the outcome where its process ended with an exit code; None where it died or was stopped."""
         if state_of(self.directory) == "finished":
             self.status.tidy_up()
             return Outcome(self.name, "finished", worked=True)
@@ -377,7 +383,7 @@ class Task:
 def begin_from_shorter(
     run: Path, experiment: Experiment, recipe: Mapping[str, Any], finished: FinishedRuns | None = None
 ) -> Path | None:
-    """Makes a run that is not there of the longest finished one beside it that has fewer episodes, keeps the
+    """Make a run that is not there of the longest finished one beside it that has fewer episodes, keeps the
     state of its training and is the same otherwise; it is then to be resumed with its own episodes.
 
     Returns the run that was copied, which stays as it is; None if there is none such, and where callbacks may

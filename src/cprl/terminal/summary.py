@@ -19,7 +19,7 @@ from cprl.measuring.registry import (
     with_unit,
 )
 from cprl.measuring.statistics import HOLM, Estimate, Family, differences, estimates, notes_on
-from cprl.measuring.table import numbers_in, where
+from cprl.measuring.table import agents_named, numbers_in, where
 from cprl.runs.episodes import LEFT_OUT
 from cprl.system.output import console as safe_console
 from cprl.system.output import printed
@@ -125,7 +125,8 @@ def compared(
         if name not in silent | repeated:
             values = [levels[policy, name] for policy in policies]
             gaps = [_change(changes.get((policy, name))) for policy in others]
-            rows.append([with_unit(name, rewards=rewards_of(table)), *values, *gaps])
+            words = with_unit(agents_named(table, name), rewards=rewards_of(table))
+            rows.append([words, *values, *gaps])
     of_policies = [where(table, policy=policy) for policy in policies]
     blank = [""] * len(others)
     rows.append(["episodes", *(str(len(where(one, agent=0))) for one in of_policies), *blank])

@@ -14,9 +14,10 @@ from torchrl.envs import EnvBase
 
 from cprl.commons.threads import MOST_THREADS
 from cprl.envs.state import transforms_state
+from cprl.envs.unwrap import agent_names
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode, own_name, try_own_metrics
-from cprl.measuring.table import labelled, where
+from cprl.measuring.table import labelled, naming, where
 from cprl.population import exploration_steps, partners_in
 from cprl.runs.checkpoints import (
     FOLDER,
@@ -264,9 +265,10 @@ def _table(work: _Work, played: Mapping[str, list[Episode]]) -> pa.Table:
     trained = "trained" + "".join(f", epsilon {chance:g}" for chance in sorted(chances))
     columns = {"random": played["random"], trained if learners else "agents": played["trained"]}
     replicas = range(work.experiment.replicas)
-    return pa.concat_tables(
+    table = pa.concat_tables(
         labelled(table_of(episodes, replicas), policy=name) for name, episodes in columns.items()
     )
+    return naming(table, agent_names(work.env))
 
 
 @working("drawing the training curve")

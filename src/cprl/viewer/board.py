@@ -114,7 +114,8 @@ def _scale(agent: int, *, room: float) -> float:
 
 def mark(agent: int) -> list[Floats]:
     """Return what tells agents of the same hue apart."""
-    edge, corner = 0.5 - RADIUS_CELLS, 0.25
+    edge = 0.5 - RADIUS_CELLS
+    corner = 0.25
     kind = agent_mark(agent)
     if kind == "ring":
         return [_turned((-edge, -edge), (edge, -edge), (edge, edge), (-edge, edge), (-edge, -edge))]
@@ -151,7 +152,8 @@ def board_form(scene: Scene) -> Any:
 def board_styles() -> dict[str, list[Any]]:
     """Return how the parts of a board look, by the names of `board_columns`; the form of the image is left
     out."""
-    image, lines = rr.SegmentationImage.from_fields, rr.LineStrips2D.from_fields
+    image = rr.SegmentationImage.from_fields
+    lines = rr.LineStrips2D.from_fields
     return {
         "board": [image(opacity=1.0, draw_order=-10.0)],
         "beams": [
@@ -210,8 +212,10 @@ def _stock(scene: Scene, frames: Frames) -> tuple[NDArray[np.intp], Any]:
     """Return a bar below the board, as wide as it with all apples, filled as far as they are there."""
     apples = (frames["stock"] > 0).sum(1)
     changed = _changes(apples)
-    apples, sites = apples[changed], max(1, len(scene.sites))
-    left, low = RIM_CELLS, scene.height + 2 * RIM_CELLS + 2 * BAR_CELLS
+    apples = apples[changed]
+    sites = max(1, len(scene.sites))
+    left = RIM_CELLS
+    low = scene.height + 2 * RIM_CELLS + 2 * BAR_CELLS
     bars = np.full((len(apples), 3, 2, 2), (left, low), np.float32)  # the last, a point, has the text
     bars[:, 0, 1, 0] += scene.width
     bars[:, 1, 1, 0] += scene.width * apples / sites
@@ -256,13 +260,19 @@ def _out(frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
 
     The squares have labels that name who tagged the agent; the viewer shows them on request.
     """
-    row, col, out, by = frames["row"], frames["col"], ~frames["in_play"], frames["tagged_by"]
+    row = frames["row"]
+    col = frames["col"]
+    out = ~frames["in_play"]
+    by = frames["tagged_by"]
     same = (row[:, :, None] == row[:, None]) & (col[:, :, None] == col[:, None])
     first = np.tri(row.shape[1], k=-1, dtype=np.bool_) | ~out[:, None]
     alone = out & ~(same & first).any(2)  # nobody in play is in the cell, nor anyone out with a lower index
     places = [np.where(out, row, 0), np.where(out, col, 0)]
     changed = _changes(np.concatenate([out, np.where(out, by, 0), alone, *places], 1))
-    out, by, alone, centres = out[changed], by[changed], alone[changed], centres_of(frames)[changed]
+    out = out[changed]
+    by = by[changed]
+    alone = alone[changed]
+    centres = centres_of(frames)[changed]
     rgb = np.array([agent_colour(agent) for agent in range(out.shape[1])], np.uint8)
     squares = rr.Boxes2D.columns(
         centers=centres[out],

@@ -87,8 +87,10 @@ class ViewerCallback:
         file_name: str | None = None,
         is_replay: bool = False,
     ) -> None:
-        self.env, self._run = env, run
-        reported, commons = reported_by(env), commons_of(env)
+        self.env = env
+        self._run = run
+        reported = reported_by(env)
+        commons = commons_of(env)
         curves = curves_of(env, agent_names(env), reported, episodes=episodes, worlds=worlds, own=metrics)
         scene = None if commons is None else scene_of(commons, curves, is_replay=is_replay)
         self._earlier = [] if file_name else recordings_of(run)
@@ -143,7 +145,8 @@ class ViewerCallback:
     def _views_of_a_training(
         self, commons: CommonsEnv | None, episodes: int, every: int, own_rules: str, *, is_about: bool
     ) -> Iterator[View]:
-        logger, scene = self.logger, self.logger.scene
+        logger = self.logger
+        scene = self.logger.scene
         samples = None
         if commons is not None and scene is not None:
             if scene.boards > 1:

@@ -66,19 +66,27 @@ class Exhibition(View):
         clock: Callable[[], float] = time.perf_counter,
         wait: Callable[[float], bool] | None = None,
     ) -> None:
-        commons, scene, live = commons_of(env), logger.scene, logger.live
+        commons = commons_of(env)
+        scene = logger.scene
+        live = logger.live
         assert commons is not None
         assert scene is not None
         assert live is not None
         assert live.exhibition is not None
-        self._policy, self._env, self._trained, self._scene = policy, env, trained, scene
-        self._logger, self._stream = logger, live.exhibition
-        self._clock, self._closing = clock, Event()
+        self._policy = policy
+        self._env = env
+        self._trained = trained
+        self._scene = scene
+        self._logger = logger
+        self._stream = live.exhibition
+        self._clock = clock
+        self._closing = Event()
         self._wait = wait or self._slept
         self._at_random: FrameRecorder | None = None
         self._recorder = FrameRecorder(commons, scene, has_windows=False)
         self._moves = self._played()
-        self._due, self._count = clock(), BATCH_STEPS
+        self._due = clock()
+        self._count = BATCH_STEPS
         self._rests = False
         """Whether an episode of the trained policy has just ended."""
         self.steps = 0
@@ -217,7 +225,8 @@ def _send_fixed(recording: Any, *, scene: Scene) -> None:
     frame, for the first time or again, shows no board until the next frame."""
     for entity, parts in board_styles().items():
         recording.log(f"exhibition/{entity}", *parts, static=True)
-    low, wide = scene.height + 2 * RIM_CELLS, scene.width + 2 * RIM_CELLS
+    low = scene.height + 2 * RIM_CELLS
+    wide = scene.width + 2 * RIM_CELLS
     place = wide / 2, low + _CAPTION_CELLS
     caption = rr.Points2D([place], show_labels=True, radii=_THIN, colors=[(255, 255, 255)])
     recording.log("exhibition/caption", caption, static=True)

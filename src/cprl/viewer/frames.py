@@ -37,7 +37,9 @@ class FrameRecorder:
     """
 
     def __init__(self, env: CommonsEnv, scene: Scene, *, has_windows: bool = True) -> None:
-        self._env, self._has_tags, self._has_windows = env, scene.has_tags, has_windows
+        self._env = env
+        self._has_tags = scene.has_tags
+        self._has_windows = has_windows
         self._frames: list[dict[str, NDArray[Any]]] = []
         self._tagged_by = np.full(env.game.agents, -1, np.int32)
         """Who tagged each agent last; -1 if unknown."""
@@ -62,7 +64,8 @@ class FrameRecorder:
 
     def take(self) -> Frames | None:
         """Return all frames as columns, [T, ...] each, for `RerunLogger.log_frames`, or None."""
-        taken, self._frames = self._frames, []
+        taken = self._frames
+        self._frames = []
         if not taken:
             return None
         frames = {name: np.stack([frame[name] for frame in taken]) for name in taken[0]}
@@ -81,9 +84,12 @@ class Filming(View):
     """
 
     def __init__(self, env: CommonsEnv | None, logger: RerunLogger, *, episodes: int) -> None:
-        self._logger, self._last, self._sent = logger, episodes - 1, time.perf_counter()
+        self._logger = logger
+        self._last = episodes - 1
+        self._sent = time.perf_counter()
         self._recorder: FrameRecorder | None = None
-        self._ended, self._shows = 0, False
+        self._ended = 0
+        self._shows = False
         self.was_on = False
         """Whether the last episode of the first world was recorded."""
         self.every = 0
@@ -166,7 +172,10 @@ class Wall(View):
     def __init__(
         self, env: CommonsEnv, logger: RerunLogger, filming: Filming, scene: Scene, *, recorded_steps: int
     ) -> None:
-        self._env, self._logger, self._filming, self._scene = env, logger, filming, scene
+        self._env = env
+        self._logger = logger
+        self._filming = filming
+        self._scene = scene
         self._panels = boards_of(scene, scene.boards)
         rows, columns = self._panels.shape
         row_bytes = 100 + 20 * scene.boards + 0.35 * rows * columns
@@ -200,12 +209,13 @@ class Wall(View):
             self._rows = []
 
     def _row(self, frame: int) -> _Row:
-        now, read = self._env.worlds.now, self._env.worlds.driver.read
-        shown = len(self._died)
-        state = {name: read(getattr(now, name)[:shown]) for name in ("stock", "in_play", "row", "col")}
+        now = self._env.worlds.now
+        read = self._env.worlds.driver.read
+        count = len(self._died)
+        state = {name: read(getattr(now, name)[:count]) for name in ("stock", "in_play", "row", "col")}
         image = self._panels.joined(boards(self._scene, state), UNSEEN)
-        turns = read(now.step[:shown])[:, 0].tolist()
-        word = "turn " if shown <= _LABELLED else ""  # more labels would stand on each other
+        turns = read(now.step[:count])[:, 0].tolist()
+        word = "turn " if count <= _LABELLED else ""  # more labels would stand on each other
         labels = [f"{board}: {word}{turn}" for board, turn in enumerate(turns)]
         colours = np.where(self._died[:, None], DIED, TEXT).astype(np.uint8)
         return self._logger.step, self._logger.episode, frame, image, labels, colours

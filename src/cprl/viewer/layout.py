@@ -308,7 +308,8 @@ def _overview(curves: Curves, *, live: bool) -> Any:
 
 def _tabs(curves: Curves, *, live: bool) -> list[Any]:
     """Return the tabs; what the game has nothing of is left out."""
-    agents, several = curves.agents, len(curves.agents) > 1
+    agents = curves.agents
+    several = len(curves.agents) > 1
     recorded = None
     windows = None
     visits = None
@@ -321,9 +322,9 @@ def _tabs(curves: Curves, *, live: bool) -> list[Any]:
         wall = _wall(curves) if curves.worlds > 1 else None
         places = boards_of(curves, len(agents))
         visits = _panels(places, "Where agents go in the first replica, by episodes", "visits")
-    own = list(filter(is_own, curves.metrics))
-    of_law = [name for name in curves.metrics if name not in own and METRICS[name].is_of_institutions]
-    seen = (*own, *of_law, *OVERVIEW, *([] if several else [EQUALITY]))
+    of_users = list(filter(is_own, curves.metrics))
+    of_law = [name for name in curves.metrics if name not in of_users and METRICS[name].is_of_institutions]
+    elsewhere = (*of_users, *of_law, *OVERVIEW, *([] if several else [EQUALITY]))
     decided = [f"{IN_FORCE}{ballot}" for ballot in range(len(curves.in_force))]
     tabs = {
         "Worlds": [wall],
@@ -345,8 +346,11 @@ def _tabs(curves: Curves, *, live: bool) -> list[Any]:
             _plot("Epsilon, 0 to 1", _of(agents, "epsilon"), share=True),
             _plot("Steps per second", [SPEED]),
         ],
-        "More metrics": [stock, *_metrics(curves, [name for name in curves.metrics if name not in seen])],
-        "Your metrics": _metrics(curves, own),
+        "More metrics": [
+            stock,
+            *_metrics(curves, [name for name in curves.metrics if name not in elsewhere]),
+        ],
+        "Your metrics": _metrics(curves, of_users),
     }
     grids = [
         rrb.Grid(*views, grid_columns=len(views) if len(views) < 4 else ceil(len(views) / 2), name=name)

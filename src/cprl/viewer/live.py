@@ -63,8 +63,11 @@ class Stream:
     """Whether it is sent to viewers."""
 
     def __init__(self, name: str, recording: Any, *, period_s: float) -> None:
-        self.name, self.recording, self.period_s = name, recording, period_s
-        self.is_open, self.has_failed = True, False
+        self.name = name
+        self.recording = recording
+        self.period_s = period_s
+        self.is_open = True
+        self.has_failed = False
         self.waiting: dict[str, list[Row]] = {}
         """Numbers and texts that have not been sent, by entity."""
         self._sent = time.perf_counter()
@@ -75,7 +78,8 @@ class Stream:
 
     def take(self) -> dict[str, list[Row]]:
         """Return the buffered numbers; the buffer is empty afterwards."""
-        taken, self.waiting = self.waiting, {}
+        taken = self.waiting
+        self.waiting = {}
         self._sent = time.perf_counter()
         return taken
 
@@ -94,7 +98,8 @@ class Stream:
         try:
             what()
         except Exception as error:
-            self.is_open, self.has_failed = False, True
+            self.is_open = False
+            self.has_failed = True
             if self.is_live:
                 _STALLED.append(self.recording)
             warnings.warn(
@@ -122,7 +127,8 @@ class LiveStream(Stream):
 
     def __init__(self, name: str, recording: Any, *, period_s: float, history_s: float = HISTORY_S) -> None:
         super().__init__(name, recording, period_s=period_s)
-        self._header, self._loading = "", 0
+        self._header = ""
+        self._loading = 0
         self._has_history_from = time.perf_counter() + history_s
         self._queue: Queue[Callable[[Any], object] | None] = Queue(QUEUED_CALLS)
         self._error: Exception | None = None
@@ -210,14 +216,14 @@ class Live:
     the history.
 
     Args:
-        how: "serve", or "spawn" to start Rerun's native viewer as well.
+        mode: "serve", or "spawn" to start Rerun's native viewer as well.
         exhibits: whether there is an exhibition, which has a server of its own, since a server that has used
             its memory drops the oldest rows of all.
     """
 
     def __init__(
         self,
-        how: str,
+        mode: str,
         recording_id: str,
         blueprint: Any,
         *,
@@ -225,7 +231,7 @@ class Live:
         application: str = RUN,
         exhibits: bool = False,
     ) -> None:
-        checked("live", how, Served)
+        checked("live", mode, Served)
         exit_in_time()
 
         def serve(name: str, memory: str, *, send_properties: bool) -> LiveStream:
@@ -239,7 +245,7 @@ class Live:
         self.exhibition: LiveStream | None = None
         if exhibits:
             self.exhibition = serve("exhibition", EXHIBITION_MEMORY, send_properties=False)
-        if how == "spawn":
+        if mode == "spawn":
             _spawn(sources)
         self._page = WebViewer(*sources, opened=self.stream.opened)
         self.addresses = self._page.addresses
@@ -288,7 +294,8 @@ def served(files: Sequence[Path]) -> Iterator[WebViewer]:
     while they load the history they would show old ones as the present.
     """
     exit_in_time()
-    recordings, readers = [], []
+    recordings = []
+    readers = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the recording of a run that was killed has no footer
         for path in files:
@@ -300,11 +307,15 @@ def served(files: Sequence[Path]) -> Iterator[WebViewer]:
         if not recordings:
             raise ValueError(f"no recording can be read of {', '.join(map(str, files))}")
         # Without one that is whole: a name of its own leaves viewers of "cprl" the layout in the file.
-        application, recording_id, header, layout = "cut", "cut", None, None
+        application = "cut"
+        recording_id = "cut"
+        header = None
+        layout = None
         if readers:
             reader, header = _newest_header(readers)
             store = reader.recordings()[0]
-            application, recording_id = store.application_id, store.recording_id
+            application = store.application_id
+            recording_id = store.recording_id
             layout = next((StoredLayout(reader.stream(store=stored)) for stored in reader.blueprints()), None)
     recording = _recording(application, recording_id, send_properties=False)
     source = _serve(recording, FILES_MEMORY, layout)
@@ -323,12 +334,15 @@ def served(files: Sequence[Path]) -> Iterator[WebViewer]:
 
 def _newest_header(readers: Sequence[RrdReader]) -> tuple[RrdReader, str | None]:
     """Return the recording that has the newest header, and the header; None if none has one."""
-    step, header, newest = -1, None, readers[0]
+    step = -1
+    header = None
+    newest = readers[0]
     for reader in readers:
         for chunk in reader.stream().filter(content=f"/{HEADER}"):
             batch = chunk.to_record_batch()
             if "step" in batch.schema.names and batch["step"][-1].as_py() >= step:
-                step, header = batch["step"][-1].as_py(), batch["TextDocument:text"][-1].as_py()[0]
+                step = batch["step"][-1].as_py()
+                header = batch["TextDocument:text"][-1].as_py()[0]
                 newest = reader
     return newest, header
 

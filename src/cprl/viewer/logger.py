@@ -54,7 +54,8 @@ def as_table(recipe: Mapping[Any, Any]) -> str:
 
     An entry of a list that equals the first is one row that says so.
     """
-    rows, texts = [], []
+    rows = []
+    texts = []
     for place, value in _places(recipe, ""):
         if isinstance(value, str) and "\n" in value:
             texts.append(f"`{place}`\n\n```\n{value}\n```")
@@ -162,7 +163,8 @@ class RerunLogger(Logger):
             )
         self.live: Live | None = None
         """What viewers are sent; None where the recording is written to a file alone."""
-        self._live, self._exhibits = live, exhibits
+        self._live = live
+        self._exhibits = exhibits
         self._streams: list[Stream] = []
         self.frames = 0
         """Frames recorded so far, including those in earlier files of the recording."""
@@ -229,7 +231,8 @@ class RerunLogger(Logger):
     @contextmanager
     def silent(self) -> Iterator[None]:
         """Log nothing within the block."""
-        streams, self._streams = self._streams, []
+        streams = self._streams
+        self._streams = []
         try:
             yield
         finally:

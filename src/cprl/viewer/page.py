@@ -96,7 +96,9 @@ class _Page(BaseHTTPRequestHandler):
     this machine: a foreign page that has bound its own name to 127.0.0.1 gets nothing."""
 
     def __init__(self, origin: str, page: str, opened: Callable[[], object], *arguments: Any) -> None:
-        self._origin, self._page, self._opened = origin, page, opened
+        self._origin = origin
+        self._page = page
+        self._opened = opened
         super().__init__(*arguments)
 
     def handle(self) -> None:

@@ -41,8 +41,11 @@ class Samples(View):
     """Looks at a board in an episode, at most."""
 
     def __init__(self, env: CommonsEnv, logger: RerunLogger) -> None:
-        game, now, boards = env.game, env.worlds.now, logger.curves.boards
-        self._logger, self._count = logger, 0
+        game = env.game
+        now = env.worlds.now
+        boards = logger.curves.boards
+        self._logger = logger
+        self._count = 0
         self.clock = game.rules.episode_steps
         self.stride = ceil(self.clock / self.POINTS)
         arrays: list[Any] = [
@@ -76,7 +79,9 @@ class Samples(View):
         """Add up what was copied."""
         row, col, in_play, turn, stock = (copies[: self._count] for _, copies in self._pairs)
         self._count = 0
-        row, col, in_play = row[:, 0], col[:, 0], in_play[:, 0]
+        row = row[:, 0]
+        col = col[:, 0]
+        in_play = in_play[:, 0]
         agent = np.broadcast_to(np.arange(len(self.visits)), row.shape)
         np.add.at(self.visits, (agent[in_play], row[in_play], col[in_play]), 1)
         for board, playing in enumerate(self._playing):
@@ -132,7 +137,8 @@ class Axes:
         grid = [self._placed([tick, tick], [0, self.y_end]) for tick in ticks[0]]
         grid += [self._placed([0, self.x_end], [tick, tick]) for tick in ticks[1]]
         axes = self._placed([0, 0, self.x_end], [self.y_end, 0, 0])
-        colours, radii = [*[faint] * len(grid), grey], [*[0.1] * len(grid), 0.3]
+        colours = [*[faint] * len(grid), grey]
+        radii = [*[0.1] * len(grid), 0.3]
         below = [(self._placed(tick, 0)[0], PLOT_HIGH + 1.0) for tick in ticks[0]]
         left = [(-10.0, self._placed(0, tick)[1] - 6.0) for tick in ticks[1]]
         texts = [*(f"{tick:g}" for of_axis in ticks for tick in of_axis), self.x]
@@ -185,7 +191,8 @@ def tags(seen: Seen) -> Archetypes:
 def visits(seen: Seen) -> Archetypes:
     """Draw a map for each agent of the first world: hue the agent, brightness the time it spent on the cell
     while in play."""
-    scene, samples = seen.curves, seen.samples
+    scene = seen.curves
+    samples = seen.samples
     assert isinstance(scene, Scene)
     assert samples is not None
     samples.add_up()
@@ -225,11 +232,13 @@ def turns(seen: Seen) -> Archetypes:
     """Draw the apples on the board over the turns of the last episode of each replica, or of each world that
     the wall shows: grey where the board lived until the time was up, in a colour of its own where it died."""
     assert seen.samples is not None
-    lines, died = seen.samples.lines, seen.samples.died
+    lines = seen.samples.lines
+    died = seen.samples.died
     boards = [board for board, line in enumerate(lines) if len(line) > 1]
     if not boards:
         return {}
-    whose, worlds = "each replica", seen.curves.worlds
+    whose = "each replica"
+    worlds = seen.curves.worlds
     if worlds > 1:
         each = "each world" if worlds == len(lines) else f"the first {len(lines)} worlds"
         whose = f"{each} of the first replica"
@@ -271,7 +280,8 @@ def lorenz(seen: Seen) -> Archetypes:
     if not curves:
         return {}
     first = seen.first or seen
-    curve, earliest = np.mean(curves, 0), np.mean(_lorenz_curves(first), 0)
+    curve = np.mean(curves, 0)
+    earliest = np.mean(_lorenz_curves(first), 0)
     share = np.linspace(0, 100, len(curve))
     title = (
         f"Gini {gini(curve):.2f}: {seen.words}, {len(curves)} with a harvest "
@@ -327,7 +337,8 @@ class Pictures(View):
     """
 
     def __init__(self, logger: RerunLogger, samples: Samples | None, *, every: int) -> None:
-        self._logger, self._every = logger, every
+        self._logger = logger
+        self._every = every
         self._nothing = Seen(curves=logger.curves, samples=samples)
         self._pictures = {
             name: picture for name, picture in PICTURES.items() if picture.is_there(logger.curves)
@@ -355,7 +366,8 @@ class Pictures(View):
         self._episodes.append(episode)
 
     def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
-        before, self._ended = self._ended, episode + 1
+        before = self._ended
+        self._ended = episode + 1
         for name, picture in self._pictures.items():
             every = picture.every or self._every
             if self._ended // every > before // every:
@@ -374,7 +386,8 @@ class Pictures(View):
                 self._drawn[name] = self._ended
 
     def _draw(self, name: str, picture: Picture) -> None:
-        since, ended = self._drawn[name], self._ended
+        since = self._drawn[name]
+        ended = self._ended
         begins = ended - picture.over if picture.over else since
         seen = replace(
             self._nothing,
@@ -411,7 +424,8 @@ def regions_of(env: CommonsEnv) -> Regions:
 
 def borders(regions: Regions) -> Any:
     """Return the borders of regions in the hue of their owner, or grey where several share one, as lines."""
-    strips, colours = [], []
+    strips = []
+    colours = []
     for owners, cells in regions:
         sides = _borders(cells)
         strips += sides

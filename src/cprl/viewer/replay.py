@@ -52,79 +52,52 @@ class Decisions:
     def __init__(
         self, logger: RerunLogger, scene: Scene, policies: AgentPolicies, *, actions: Sequence[str]
     ) -> None:
-        self._logger, self._names, self._actions = logger, scene.agents, tuple(actions)
+        self._logger = logger
+        self._names = scene.agents
+        self._actions = tuple(actions)
         self._actors = list(zip(map(agent_indices, policies.indices), policies.actors, strict=True))
         self._panels = decision_panels(len(scene.agents), len(actions), scene.window)
         many = 2 * len(scene.agents) * len(actions) > np.iinfo(np.uint8).max
         self._dtype = np.uint16 if many else np.uint8
-        kinds = {agent: _kind(actor) for agents, actor in self._actors for agent in agents}
-        self._kinds = [kinds[agent] for agent in range(len(scene.agents))]
-        self._rows: list[tuple[NDArray[np.float64], NDArray[np.int64]]] = []
+        self._images: list[NDArray[np.unsignedinteger[Any]]] = []
+        self._texts: list[str] = []
+        """Of each frame."""
         self._step = 0
         self._log_fixed()
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Note what the agents' policies say of what they saw before this turn, and what they did."""
+        """Draw what the agents' policies say of what they saw before this turn, and what they did."""
         self._step += 1
         if self._step == 1:
             return  # the first board is shown in no frame
-        values = np.full((len(self._names), len(self._actions)), np.nan)
+        actions = batch[keys.ACTION][0].tolist()
+        image = np.zeros(self._panels.shape, self._dtype)
+        words = list(self._names)
         for agents, actor in self._actors:
-            if isinstance(actor, LaneActor):
-                seen = [batch[keys.OBSERVATION][:, list(agents)]]
-                if actor.state_cells:
-                    seen.append(batch[keys.RECURRENT_STATE_BEFORE][:, list(agents), : actor.state_cells])
-                preferences = actor.preferences(*seen)
-                if preferences is not None:
-                    values[list(agents)] = preferences[0].double().numpy(force=True)
-        self._rows.append((values, batch[keys.ACTION][0].numpy(force=True).copy()))
+            for agent, (heights, text) in zip(agents, _bars(actor, batch, list(agents)), strict=True):
+                words[agent] += f": {text}"
+                top, left = self._panels.corners[agent]
+                for action, height in enumerate(heights):
+                    left_of_bar = left + APART + action * (BAR + APART)
+                    bar = image[top + HIGH - height : top + HIGH, left_of_bar : left_of_bar + BAR]
+                    bar[:] = self._class(agent, action) + (action == actions[agent])
+        self._images.append(image)
+        self._texts += words
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        count = len(self._rows)
+        count = len(self._images)
         if not count:
             return
         frames = np.arange(count)
         at = frames + 1, np.zeros(count, np.int64), frames
-        images = np.stack([self._image(values, taken) for values, taken in self._rows])
-        pixels = images.reshape(count, -1).view(np.uint8)
+        pixels = np.stack(self._images).reshape(count, -1).view(np.uint8)
         self._logger.log_columns(ENTITY, at, rr.SegmentationImage.columns(buffer=pixels))
-        texts = [text for values, _ in self._rows for text in self._texts(values)]
-        labels = rr.Points2D.columns(labels=texts).partition([len(self._names)] * count)
+        labels = rr.Points2D.columns(labels=self._texts).partition([len(self._names)] * count)
         self._logger.log_columns(f"{ENTITY}/labels", at, labels)
-
-    def _image(
-        self, values: NDArray[np.float64], taken: NDArray[np.int64]
-    ) -> NDArray[np.unsignedinteger[Any]]:
-        """Return the bars of a frame as classes, [rows, columns]: of values [N, A] and actions taken [N]."""
-        image = np.zeros(self._panels.shape, self._dtype)
-        heights = self._heights(values)
-        for agent, action in np.ndindex(values.shape):
-            top, left = self._panels.corners[agent]
-            left += APART + action * (BAR + APART)
-            bar = image[top + HIGH - heights[agent, action] : top + HIGH, left : left + BAR]
-            bar[:] = self._class(agent, action) + (action == taken[agent])
-        return image
 
     def _class(self, agent: int, action: int) -> int:
         """Return the class of a bar; that of the action that is taken is the next one."""
         return 1 + 2 * (agent * len(self._actions) + action)
-
-    def _heights(self, values: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return the heights of bars in pixels, at least 1; 0 where there are no values."""
-        low, best = _range(np.nan_to_num(values))
-        span = (best - low)[..., None]
-        share = np.clip((values - low[..., None]) / np.where(span > 0, span, 1.0), 0.0, 1.0)
-        is_share = np.array([kind == "probabilities" for kind in self._kinds])
-        share = np.where(is_share[:, None], values, share)
-        pixels: NDArray[np.int64] = np.nan_to_num(1 + (share * (HIGH - 2)).round()).astype(np.int64)
-        return pixels
-
-    def _texts(self, values: NDArray[np.float64]) -> list[str]:
-        low, best = _range(np.nan_to_num(values))
-        return [
-            f"{name}: Q {low[agent]:.2f} to {best[agent]:.2f}" if kind == "Q" else f"{name}: {kind}"
-            for agent, (name, kind) in enumerate(zip(self._names, self._kinds, strict=True))
-        ]
 
     def _log_fixed(self) -> None:
         """Log the form of the image, the classes of its bars, and the names of actions."""
@@ -150,18 +123,28 @@ class Decisions:
             self._logger.log_static(f"{ENTITY}/actions", labels)
 
 
-def _range(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return where bars of action values [..., A] begin and end."""
-    best = values.max(-1)
-    return np.maximum(2 * np.median(values, -1) - best, values.min(-1)), best
-
-
-def _kind(actor: nn.Module) -> str:
+def _bars(actor: nn.Module, batch: TensorDictBase, agents: list[int]) -> list[tuple[list[int], str]]:
+    """Return the heights of the bars of some agents in pixels, at least 1, and what they are; no heights
+    where there are no values."""
     if not isinstance(actor, LaneActor):
-        return "scripted, has no values"
-    if actor.values is None:
-        return "acts at random"
-    return "probabilities" if actor.stochastic else "Q"
+        return [([], "scripted, has no values")] * len(agents)
+    seen = [batch[keys.OBSERVATION][:, agents]]
+    if actor.state_cells:
+        seen.append(batch[keys.RECURRENT_STATE_BEFORE][:, agents, : actor.state_cells])
+    preferences = actor.preferences(*seen)
+    if preferences is None:
+        return [([], "acts at random")] * len(agents)
+    bars = []
+    for values in preferences[0].double().numpy(force=True):
+        share = values
+        words = "probabilities"
+        if not actor.stochastic:
+            best = values.max()
+            low = max(2 * np.median(values) - best, values.min())
+            share = ((values - low) / (best - low or 1.0)).clip(0.0, 1.0)
+            words = f"Q {low:.2f} to {best:.2f}"
+        bars.append(((1 + (share * (HIGH - 2)).round()).astype(int).tolist(), words))
+    return bars
 
 
 _VIOLATORS: Final = "world/violators"
@@ -175,7 +158,9 @@ class Offences:
     fines and transfers per turn; a callback of `cprl.training`."""
 
     def __init__(self, logger: RerunLogger, env: CommonsEnv) -> None:
-        self._logger, self._env, self._names = logger, env, logger.curves.agents
+        self._logger = logger
+        self._env = env
+        self._names = logger.curves.agents
         self._amounts: dict[str, list[NDArray[np.float64]]] = {PAID: [], GIVEN: []}
         """[N] in each turn."""
         self._strips: list[NDArray[np.float32]] = []
@@ -235,7 +220,8 @@ def events(batch: TensorDictBase) -> list[str]:
     """Return the violations of a turn of the first world in words, and the fines of agents who were tagged;
     taxes and costs, which many pay in each turn, are no events."""
     tagged_by = batch.get(("next", *keys.TAGGED_BY), None)
-    fines, violated = _of_agents(batch, FINES), _of_agents(batch, "violated")
+    fines = _of_agents(batch, FINES)
+    violated = _of_agents(batch, "violated")
     tagged = np.zeros(len(fines)) if tagged_by is None else tagged_by[0].numpy(force=True).any(-1)
     fined_when_tagged = np.flatnonzero((violated == 0) & (fines > 0) & tagged)
     return [

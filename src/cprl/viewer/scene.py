@@ -145,7 +145,8 @@ def joint_actions(game: MatrixGame) -> tuple[str, ...]:
     of two, where both are paid more if both choose action 0, else A and so on. None of a large game."""
     if game.actions**game.agents > MOST_JOINT:
         return ()
-    letters, payoffs = "ABCDEFGHIJKLMNOP"[: game.actions], np.array(game.payoffs)
+    letters = "ABCDEFGHIJKLMNOP"[: game.actions]
+    payoffs = np.array(game.payoffs)
     if payoffs.shape == (2, 2, 2) and (payoffs[..., 0] == payoffs[..., 1].T).all():
         (reward, sucker), (temptation, punishment) = payoffs[..., 0]
         if reward > max(punishment, sucker) and (temptation > reward or punishment > sucker):

@@ -75,58 +75,55 @@ class Header:
         return f"of {'about ' * self.is_about}{self.episodes:,}"
 
     def begins(self, status: str, random_play: float | None = None) -> str:
-        beside = "" if random_play is None else f"random play {self.amount(random_play)}"
-        return self._text(f"Episode 1 {self._of}", status, beside)
+        return self._text(f"Episode 1 {self._of}", status, self.amounts({"random play": random_play}))
 
     def line(
         self, *, episode: int, label: str, mean: float, random_play: float | None, died: int | None
     ) -> str:
-        """After an episode, in which so many boards died early; None for a game without stock."""
-        beside = "" if random_play is None else f", random play {_number(random_play)}"
-        deaths = "" if died is None else self._died(died, self.curves.replicas * self.curves.worlds)
-        return self._text(f"Episode {episode:,} {self._of}", label, f"{self.amount(mean)}{beside}", deaths)
+        """Return the header after an episode, in which so many boards died early; None for a game without
+        stock."""
+        amounts = self.amounts({"": mean, "random play": random_play})
+        deaths = _deaths(died, self.curves.replicas * self.curves.worlds)
+        return self._text(f"Episode {episode:,} {self._of}", label, amounts, deaths)
 
     def finished(self, learning: float, trained: Played, random: Played) -> str:
-        """After the evaluation of a run: what agents got at the end of its training, and in fresh worlds the
-        trained policy, which explores less there, and random play."""
+        """Return the header after the evaluation of a run: what agents got at the end of its training, and in
+        fresh worlds the trained policy, which explores less there, and random play."""
         amounts = {
             "while learning": learning,
             "trained": trained.harvest.value,
             "random play": random.harvest.value,
         }
-        (first, amount), *others = [of_one for of_one in amounts.items() if not isnan(of_one[1])]
-        beside = ", ".join(f"{name} {_number(value)}" for name, value in others)
-        died = "" if trained.died is None else self._died(trained.died, trained.episodes)
-        return self.ended(f"{first} {self.amount(amount)}, {beside}", died)
+        return self.ended(self.amounts(amounts), _deaths(trained.died, trained.episodes))
 
     def ended(self, *parts: str) -> str:
         return self._text("Finished" if self.is_about else f"Finished, {self.episodes:,} episodes", *parts)
 
     def stopped(self, episode: int, mean: float) -> str:
-        """At the end of a run that was stopped after so many episodes; it can be resumed."""
-        return self._text(f"Stopped after {episode:,} {self._of} episodes", self.amount(mean))
+        """Return the header of a run that was stopped after so many episodes; it can be resumed."""
+        return self._text(f"Stopped after {episode:,} {self._of} episodes", self.amounts({"": mean}))
 
     def _text(self, *parts: str) -> str:
         line = f"#### {' · '.join(part for part in (*parts, self.rules) if part)}"
         return f"{line}\n\n{self.curves.legend}"
 
-    def amount(self, value: float) -> str:
-        if isnan(value):
-            return ""
-        return (
-            f"{_number(value)} apples"
-            if self.curves.unit == "apples"
-            else f"{self.curves.unit} {_number(value)}"
-        )
-
-    def _died(self, died: int, boards: int) -> str:
-        if boards == 1:
-            return "the board died early" if died else ""
-        return f"{died:,} of {boards:,} boards died early"
+    def amounts(self, by_name: Mapping[str, float | None]) -> str:
+        """Return what agents got, e.g. "trained 100 apples, random play 282"; None and NaN are left out."""
+        form = "{} apples" if self.curves.unit == "apples" else f"{self.curves.unit} {{}}"
+        texts: list[str] = []
+        for name, value in by_name.items():
+            if value is not None and not isnan(value):
+                number = f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+                texts.append(f"{name} {number if texts else form.format(number)}".strip())
+        return ", ".join(texts)
 
 
-def _number(value: float) -> str:
-    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+def _deaths(died: int | None, boards: int) -> str:
+    if died is None:
+        return ""
+    if boards == 1:
+        return "the board died early" if died else ""
+    return f"{died:,} of {boards:,} boards died early"
 
 
 class Bests:
@@ -179,7 +176,9 @@ class Story(View):
         is_about: bool = False,
         rules: str = "",
     ) -> None:
-        self._logger, self._filming, self._curves = logger, filming, logger.curves
+        self._logger = logger
+        self._filming = filming
+        self._curves = logger.curves
         self._episodes = episodes
         self.header = Header(curves=self._curves, episodes=episodes, rules=rules, is_about=is_about)
         self.course = Course(self._curves.replicas, self._curves.worlds)
@@ -211,7 +210,8 @@ class Story(View):
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         of_world = episode.replica, episode.world
-        gained, died = _gained(episode), has_died(episode)
+        gained = _gained(episode)
+        died = has_died(episode)
         self.course.add(gained, replica=episode.replica, world=episode.world, has_died=died)
         each = rounds_of(LAST_EPISODES, self._curves.worlds)
         self._last.setdefault(of_world, deque(maxlen=each)).append(gained)
@@ -220,7 +220,8 @@ class Story(View):
             self._died[together] = self._died.get(together, 0) + died
 
     def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
-        before, self._ended = self._ended, episode + 1
+        before = self._ended
+        self._ended = episode + 1
         died = self._died.pop(episode // self._curves.worlds, None)
         events = self._look(episode, {name: mean_of(values) for name, values in numbers.items()})
         for event in events:
@@ -293,7 +294,7 @@ class Story(View):
         if self._is_over:
             return
         self._is_over = True
-        header = self.header.ended(f"{self.header.amount(self._learning)} at the end")
+        header = self.header.ended(f"{self.header.amounts({'': self._learning})} at the end")
         if self._ended + self._curves.worlds <= self._episodes and not self.header.is_about:
             header = self.header.stopped(self._ended, self.course.mean)
         self._logger.log_document(HEADER, header)
@@ -312,13 +313,17 @@ class Events(View):
     """
 
     def __init__(self, logger: RerunLogger, filming: Filming, *, every: int) -> None:
-        self._logger, self._filming, self._every = logger, filming, every
-        self._has_seen_death, self._ended = False, 0
+        self._logger = logger
+        self._filming = filming
+        self._every = every
+        self._has_seen_death = False
+        self._ended = 0
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         if episode.world:
             return
-        number, self._ended = self._ended, self._ended + 1
+        number = self._ended
+        self._ended = self._ended + 1
         words = in_words(episode, self._logger.curves) if number % self._every == 0 else ""
         if words:
             self._logger.log_text(f"episode {episode.episode:,}: {words}")
@@ -359,7 +364,8 @@ class CompilingNotice(View):
     PERIOD_S = 1.0
 
     def __init__(self, show: Callable[[str], object]) -> None:
-        self._show, self._over = show, Event()
+        self._show = show
+        self._over = Event()
         self._before_s = CLOCK.total_s
         Thread(target=self._watch, daemon=True, name="cprl compiling").start()
 

@@ -114,7 +114,8 @@ class JointActions(View):
 
     def __init__(self, logger: RerunLogger, *, actions: int) -> None:
         curves = logger.curves
-        self._logger, self._worlds = logger, np.arange(curves.replicas * curves.worlds)
+        self._logger = logger
+        self._worlds = np.arange(curves.replicas * curves.worlds)
         self._places = actions ** np.arange(len(curves.agents))[::-1]
         self._counts = np.zeros((len(self._worlds), len(curves.joint)))
         self._shares: dict[int, list[NDArray[np.float64]]] = {}

@@ -33,29 +33,24 @@ _ROUNDING: Final = 1e-6
 """What payments of float32 round off, of a value."""
 
 
-def levels_of(
-    table: StudyTable, metrics: Sequence[str] = (), *, part: str = TRAINING, last: int = LAST
-) -> Family:
+def levels_of(table: StudyTable, metrics: Sequence[str] = (), *, part: str = TRAINING) -> Family:
     """Return the means of metrics over replicas, by condition and metric.
 
     Args:
         metrics: see `metrics_of`.
         part: "training", "evaluation" or "random".
-        last: of training: episodes at its end; those of whole windows.
     """
     chosen = metrics_of(table, metrics, part=part)
     clocks = table.design.clocks
-    means = estimates(table.windows(part, last=last), chosen, by="condition")
+    means = estimates(table.windows(part), chosen, by="condition")
     return means.changed(lambda key, one: one.of(key[1], clocks.get(key[0], inf)))
 
 
-def differences_of(
-    table: StudyTable, metrics: Sequence[str] = (), *, part: str = TRAINING, last: int = LAST
-) -> Family:
+def differences_of(table: StudyTable, metrics: Sequence[str] = (), *, part: str = TRAINING) -> Family:
     """Return the differences of conditions from the reference, by condition and metric; see `levels_of`."""
     chosen = metrics_of(table, metrics, part=part)
     reference = {"condition": table.design.reference}
-    rows = table.windows(part, last=last)
+    rows = table.windows(part)
     changes = differences(rows, chosen, "condition", reference, paired=table.design.is_paired)
     return changes.changed(lambda _, one: replace(one, bounds=(-inf, inf)))  # as Student's t gives them
 
@@ -86,7 +81,7 @@ def metrics_of(table: StudyTable, metrics: Sequence[str] = (), *, part: str = TR
 
 def measures_of(table: StudyTable, part: str = TRAINING) -> tuple[str, ...]:
     """Return those of `MEASURES` that a table has and that are not 0 in all windows of a part."""
-    rows = table.windows(part, last=None)
+    rows = where(table.rows, part=part)
     above_0 = rows.filter(pc.greater(rows["value"], 0))["metric"].unique().to_pylist()
     return tuple(metric for metric in MEASURES if metric in above_0)
 
@@ -94,7 +89,7 @@ def measures_of(table: StudyTable, part: str = TRAINING) -> tuple[str, ...]:
 def repeated_in(table: StudyTable, part: str) -> dict[str, str]:
     """Return the metrics that are the same in every window of a part as the one which they are where nobody
     pays or gets anything, or is out of play, with that one."""
-    rows = table.windows(part, last=None)
+    rows = where(table.rows, part=part)
     same_as = {name: metric.same_as for name, metric in REGISTERED.items() if metric.same_as in table.metrics}
     return {
         metric: other
@@ -112,11 +107,9 @@ def _are_equal(rows: pa.Table, metric: str, other: str) -> bool:
     return bool(np.allclose(first, second, rtol=_ROUNDING, atol=_ROUNDING, equal_nan=True))
 
 
-def episodes_text(
-    table: StudyTable, part: str = TRAINING, last: int = LAST, *, metric: str | None = None
-) -> str:
+def episodes_text(table: StudyTable, part: str = TRAINING, *, metric: str | None = None) -> str:
     """Return which episodes of a metric are compared, e.g. "the last 30 episodes of training"."""
-    played = by_replica(table.windows(part, last=last), metric or table.metrics[0], ["condition"])
+    played = by_replica(table.windows(part), metric or table.metrics[0], ["condition"])
     low, high = pc.min_max(played["episodes"]).as_py().values()
     number = f"{high}" if low == high else f"{low} to {high}"
     if part == TRAINING:
@@ -142,17 +135,17 @@ def cells(
     kind: Kind = "levels",
     *,
     part: str = TRAINING,
-    last: int = LAST,
 ) -> Cells:
     """Return a row for each condition, a column for each metric.
 
     Args:
         kind: "levels", means over replicas; or "differences" from the reference.
     """
-    chosen, reference = metrics_of(table, metrics, part=part), table.design.reference
+    chosen = metrics_of(table, metrics, part=part)
+    reference = table.design.reference
     is_levels = kind == "levels"
-    family = (levels_of if is_levels else differences_of)(table, chosen, part=part, last=last)
-    played = by_replica(table.windows(part, last=last), chosen[0], ["condition"])["condition"].to_pylist()
+    family = (levels_of if is_levels else differences_of)(table, chosen, part=part)
+    played = by_replica(table.windows(part), chosen[0], ["condition"])["condition"].to_pylist()
     rows: list[list[Cell]] = []
     for name in table.design.conditions:
         replicas = played.count(name)
@@ -166,7 +159,7 @@ def cells(
     if not is_levels:
         what = f"differences from {reference}, {pairing_text(table)}"
         note = family.note("of this table")
-    episodes = capitalised(episodes_text(table, part, last, metric=chosen[0]))
+    episodes = capitalised(episodes_text(table, part, metric=chosen[0]))
     heading = f"{episodes}; {what}; {INTERVALS}."
     return Cells(heading, ["condition", "replicas", *map(title, chosen)], rows, note)
 
@@ -179,22 +172,20 @@ def change(difference: Estimate | None, replicas: int = 0) -> Cell:
     return Change(difference, f"(of {pairs})" if pairs < replicas else "")
 
 
-def compared_cells(
-    table: StudyTable, metrics: Sequence[str] = (), *, part: str = TRAINING, last: int = LAST
-) -> list[Cells]:
+def compared_cells(table: StudyTable, metrics: Sequence[str] = (), *, part: str = TRAINING) -> list[Cells]:
     """Return the levels of metrics, see `metrics_of`, and the differences where there are several conditions;
     nothing of a table without a finished run."""
     if not table.metrics:
         return []
-    levels = cells(table, metrics, part=part, last=last)
+    levels = cells(table, metrics, part=part)
     if not metrics:
         note = "\n".join(filter(None, (levels.note, repeated_note(table, part))))
         levels = levels._replace(note=note)
     tables = [levels]
     if len(table.design.conditions) > 1:
-        tables.append(cells(table, metrics, "differences", part=part, last=last))
+        tables.append(cells(table, metrics, "differences", part=part))
     measures = () if metrics else measures_of(table, part)
-    return [*tables, of_finished(cells(table, measures, part=part, last=last))] if measures else tables
+    return [*tables, of_finished(cells(table, measures, part=part))] if measures else tables
 
 
 def repeated_note(table: StudyTable, part: str) -> str:

@@ -21,7 +21,7 @@ from cprl.studies.tables.comparing import (
     episodes_text,
     metrics_of,
 )
-from cprl.studies.tables.table import LAST, TRAINING, Design, StudyTable
+from cprl.studies.tables.table import TRAINING, Design, StudyTable
 from cprl.terminal.tables import Cells
 
 MOST_INTERACTIONS: Final = 24
@@ -92,21 +92,19 @@ def _compared_levels(design: Design, factor: str) -> Iterator[Levels]:
         yield level, first
 
 
-def effects_of(table: StudyTable, metric: str, *, part: str = TRAINING, last: int = LAST) -> Family:
+def effects_of(table: StudyTable, metric: str, *, part: str = TRAINING) -> Family:
     """Return the effects of a grid on a metric, by effect and metric; none where there is no grid."""
-    rows = table.windows(part, last=last)
+    rows = table.windows(part)
     return contrasts(rows, metric, "condition", weights_of(table))
 
 
-def effect_cells(
-    table: StudyTable, metrics: Sequence[str] = (), *, part: str = TRAINING, last: int = LAST
-) -> list[Cells]:
+def effect_cells(table: StudyTable, metrics: Sequence[str] = (), *, part: str = TRAINING) -> list[Cells]:
     """Return a row for each effect of a grid, a column for each metric; nothing where there are none."""
     names = list(weights_of(table))
     if not names:
         return []
     chosen = metrics_of(table, metrics, part=part)
-    families = {metric: effects_of(table, metric, part=part, last=last) for metric in chosen}
+    families = {metric: effects_of(table, metric, part=part) for metric in chosen}
     rows = []
     for name in names:
         of_row = [family.get((name, metric)) for metric, family in families.items()]
@@ -118,5 +116,5 @@ def effect_cells(
     note = families[chosen[0]].note("of a column")
     if (left_out := interactions_of(table.design)) > MOST_INTERACTIONS:
         note += f" The {left_out} interactions of two factors are left out."
-    heading = f"{capitalised(episodes_text(table, part, last))}; {what}; {INTERVALS}."
+    heading = f"{capitalised(episodes_text(table, part))}; {what}; {INTERVALS}."
     return [Cells(heading, ["effect", *map(title, chosen)], rows, note)]

@@ -78,7 +78,8 @@ def pooled_table(
 def _groups(
     experiments: Experiments, fields: Sequence[str]
 ) -> tuple[dict[str, dict[str, Any]], dict[str, dict[Path, Experiment]]]:
-    """The levels and the runs of each condition by its name; in the order of numbers, else of the runs."""
+    """Return the levels and the runs of each condition by its name; in the order of numbers, else of the
+    runs."""
     by_values: dict[str, tuple[list[Any], dict[Path, Experiment]]] = {}
     for run, experiment in experiments.items():
         values = [_value_at(experiment, path, run) for path in fields]
@@ -90,7 +91,8 @@ def _groups(
     for values, members in sorted(by_values.values(), key=lambda group: list(map(_rank, group[0]))):
         levels = {path: plain_level(value) for path, value in zip(fields, values, strict=True)}
         name = unlike(named({short[path]: level for path, level in levels.items()}), groups)
-        conditions[name], groups[name] = levels, members
+        conditions[name] = levels
+        groups[name] = members
     return conditions, groups
 
 
@@ -127,7 +129,8 @@ def _firsts(experiments: Iterable[Experiment]) -> dict[int, int]:
 
 
 def _notes(groups: Mapping[str, Experiments], fields: Sequence[str]) -> Iterator[str]:
-    """What runs of one condition, and the conditions themselves, differ in beside the fields asked for."""
+    """Return what runs of one condition, and the conditions themselves, differ in beside the fields asked
+    for."""
     firsts = []
     for name, members in groups.items():
         first, *others = members.values()
@@ -142,8 +145,9 @@ def _notes(groups: Mapping[str, Experiments], fields: Sequence[str]) -> Iterator
 
 
 def _places(one: Experiment, other: Experiment) -> list[str]:
-    """The places in which two experiments differ, as paths, without what is no condition."""
-    before, now = one.to_config(), other.to_config()
+    """Return the places in which two experiments differ, as paths, without what is no condition."""
+    before = one.to_config()
+    now = other.to_config()
     for name in _NOT_COMPARED:
         before[name] = now[name]
     lines = differences(before, now, "")
@@ -151,6 +155,7 @@ def _places(one: Experiment, other: Experiment) -> list[str]:
 
 
 def _is_within(place: str, path: str) -> bool:
-    parts, wanted = place.split("."), path.split(".")
+    parts = place.split(".")
+    wanted = path.split(".")
     matches = [part in (ALL, at) for part, at in zip(wanted, parts, strict=False)]
     return len(matches) == len(wanted) and all(matches)

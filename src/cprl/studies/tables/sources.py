@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Any, Final
 
@@ -75,7 +75,7 @@ class Source:
 def study_table(
     study: Study, runs: Path | str, *, window: int = WINDOW, status: Path | None = None
 ) -> StudyTable:
-    """The table of the finished runs of a study.
+    """Return the table of the finished runs of a study.
 
     Args:
         window: episodes of a window of training; 1 for episodes one by one, of the evaluation too.
@@ -138,7 +138,7 @@ def reason_of(state: State, failure: str | None = None) -> str:
 
 
 def plain_level(value: Any) -> Any:
-    """A level as a table holds it: a number or truth value as it is, else a text."""
+    """Return a level as a table holds it: a number or truth value as it is, else a text."""
     return value if isinstance(value, bool | int | float) else level_text(value)
 
 
@@ -357,7 +357,7 @@ def _metrics(names: Sequence[str]) -> list[str]:
 
 
 def _levels(levels: Sequence[Any]) -> pa.Array:
-    """The levels of all conditions as a column: numbers, truth values, or else texts."""
+    """Return the levels of all conditions as a column: numbers, truth values, or else texts."""
     if all(isinstance(level, bool) for level in levels):
         return pa.array(levels, pa.bool_())
     if all(isinstance(level, int | float) and not isinstance(level, bool) for level in levels):
@@ -367,12 +367,13 @@ def _levels(levels: Sequence[Any]) -> pa.Array:
 
 
 def circumstances_of(run: Path) -> Circumstances:
-    """What the recipe of a run says of how it was made."""
-    recipe = read_recipe(run)
-    each = [_circumstances(part) for part in parts_of(recipe)]
-    names = dict.fromkeys(name for circumstances in each for name in circumstances)
-    values = {name: [circumstances.get(name, UNKNOWN) for circumstances in each] for name in names}
-    return {name: " then ".join(value for value, _ in groupby(in_order)) for name, in_order in values.items()}
+    """Return what the recipe of a run says of how it was made."""
+    each = [_circumstances(part) for part in parts_of(read_recipe(run))]
+    joined = {}
+    for name in dict.fromkeys(chain.from_iterable(each)):
+        in_order = groupby(made.get(name, UNKNOWN) for made in each)
+        joined[name] = " then ".join(value for value, _ in in_order)
+    return joined
 
 
 def _circumstances(recipe: Mapping[str, Any]) -> dict[str, str]:
@@ -388,17 +389,15 @@ def _circumstances(recipe: Mapping[str, Any]) -> dict[str, str]:
 
 
 def marks(made: Mapping[str, Circumstances]) -> dict[str, str]:
-    """What of each run's circumstances differs from those of most runs, e.g. "torch, git commit", or "".
+    """Return what of each run's circumstances differs from those of most runs, e.g. "torch, git commit", or
+    "".
 
     Args:
         made: the circumstances by run, in the order of the table.
     """
     usual = {name: counts.most_common(1)[0][0] for name, counts in counted(made).items()}
-    return {
-        run: ", ".join(
-            WORDS.get(name, name)
-            for name, value in usual.items()
-            if circumstances.get(name, UNKNOWN) != value
-        )
-        for run, circumstances in made.items()
-    }
+    marked = {}
+    for run, circumstances in made.items():
+        names = [name for name in usual if circumstances.get(name, UNKNOWN) != usual[name]]
+        marked[run] = ", ".join(WORDS.get(name, name) for name in names)
+    return marked

@@ -89,11 +89,11 @@ class Design:
 
     @property
     def factors(self) -> tuple[str, ...]:
-        """The names of the factors; () where conditions have names alone."""
+        """Return the names of the factors; () where conditions have names alone."""
         return tuple(next(iter(self.conditions.values())))
 
     def levels(self, factor: str) -> list[Any]:
-        """The level of a factor in each condition."""
+        """Return the level of a factor in each condition."""
         return [levels[factor] for levels in self.conditions.values()]
 
 
@@ -112,7 +112,7 @@ class Lacking:
 
     @property
     def is_damaged(self) -> bool:
-        """Whether it ended and cannot be read, so that nothing runs it again."""
+        """Return whether it ended and cannot be read, so that nothing runs it again."""
         return self.reason.startswith(DAMAGED)
 
     def __str__(self) -> str:
@@ -143,10 +143,12 @@ class StudyTable:
     the reports of its runs do not say how many steps."""
     agents_learn: bool = True
     """Whether any agent of its runs learns."""
+    last: int = LAST
+    """Episodes at the end of the training that are compared, in whole windows; its file does not say it."""
 
     @cached_property
     def mixed(self) -> list[str]:
-        """How its runs were made in different circumstances, in sentences; [] if in the same."""
+        """Return how its runs were made in different circumstances, in sentences; [] if in the same."""
         sentences = []
         for name, counts in counted(self.made).items():
             if len(counts) == 1:
@@ -162,31 +164,29 @@ class StudyTable:
 
     @cached_property
     def metrics(self) -> tuple[str, ...]:
-        """The metrics in it, in order."""
+        """Return the metrics in it, in order."""
         return tuple(self.rows["metric"].unique().to_pylist()) if len(self.rows) else ()
 
     @cached_property
     def replicas(self) -> Mapping[str, int]:
-        """How many replicas of each condition are in it."""
+        """Return how many replicas of each condition are in it."""
         pairs = self.rows.select(["condition", "replica"]).group_by(["condition", "replica"]).aggregate([])
         counts = Counter(pairs["condition"].to_pylist())
         return {condition: counts[condition] for condition in self.design.conditions}
 
-    def windows(self, part: str = TRAINING, *, last: int | None = LAST) -> pa.Table:
+    def windows(self, part: str = TRAINING, *, last: int | None = None) -> pa.Table:
         """Return the rows of a part, of which `cprl.measuring.statistics` makes estimates and differences.
 
         Args:
             part: "training", "evaluation" or "random".
             last: of training the last episodes of each replica, in whole windows; in many worlds as many
-                of each, see `cprl.measuring.windows.last_of`. None for all.
+                of each, see `cprl.measuring.windows.last_of`. By default as many as the table compares.
         """
         checked("part", part, Literal[tuple(PARTS)])
         rows = where(self.rows, part=part)
-        if last is None:
-            return rows
-        checked("last", last, Positive)
         if part != TRAINING:
             return rows
+        last = checked("last", self.last if last is None else last, Positive)
         if last < self.window:
             raise refusal("last", last, f"at least {self.window}, the episodes of a window of the table")
         condition = rows["condition"].combine_chunks().dictionary_encode().indices.to_numpy()
@@ -200,12 +200,12 @@ class StudyTable:
         return rows.filter(pa.array(episode >= ends[of_replica] - whole[condition]))
 
     def __str__(self) -> str:
-        """What it holds, what it lacks and what is mixed, in sentences."""
+        """Return what it holds, what it lacks and what is mixed, in sentences."""
         return "\n".join([self.summary, *self.design.notes, *self.mixed, *map(str, self.lacking)])
 
     @property
     def summary(self) -> str:
-        """What it holds, in a sentence."""
+        """Return what it holds, in a sentence."""
         lacking = len(self.lacking)
         without = f"; {lacking} run{'s are' if lacking != 1 else ' is'} not in it" if lacking else ""
         return (
@@ -236,7 +236,7 @@ class StudyTable:
         return file.getvalue().decode()
 
     @classmethod
-    def read(cls, path: Path | str) -> "StudyTable":
+    def read(cls, path: Path | str, *, last: int = LAST) -> "StudyTable":
         """Return the table of a file that `write` wrote; raise a ValueError for any other.
 
         Titles and units of the user's own metrics are known from then on.
@@ -252,6 +252,7 @@ class StudyTable:
                 design=Design(**{**held["design"], "notes": tuple(held["design"]["notes"])}),
                 lacking=tuple(Lacking(**run) for run in held["lacking"]),
                 **{name: held[name] for name in _HELD},
+                last=last,
             )
         except (pa.ArrowException, OSError, LookupError, TypeError, json.JSONDecodeError) as error:
             raise ValueError(f"{path} is not the table of a study: {error!r}") from error
