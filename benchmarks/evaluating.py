@@ -37,7 +37,9 @@ def main() -> None:
     parser.add_argument("after", type=Path)
     parser.add_argument("--run", default="docs/results/commons")
     parser.add_argument("--pairs", type=int, default=5)
-    parser.add_argument("--words", nargs="+", default=None, help="another command, by default evaluate RUN")
+    parser.add_argument(
+        "--words", nargs=argparse.REMAINDER, help="another command, last; by default evaluate RUN"
+    )
     options = parser.parse_args()
     words = options.words or ["evaluate", options.run]
     checkouts = {"before": options.before, "after": options.after}
