@@ -28,7 +28,7 @@ def main(
     """
     study, out = cprl.studies.read_study(comparison), out or comparison
     table, figure = out / "cross_play.parquet", out / "cross_play.png"
-    Files(out=table, figure=figure).check()
+    Files(out=(table,), figure=figure).check()
     out.mkdir(parents=True, exist_ok=True)
     trained = {own.condition.name: (runs or comparison / "runs") / own.name for own in trials_of(study)}
     played = cprl.crossplay(trained, cprl.Fresh(episodes=episodes))

@@ -222,7 +222,7 @@ def events(batch: TensorDictBase) -> list[str]:
     tagged_by = batch.get(("next", *keys.TAGGED_BY), None)
     fines = _of_agents(batch, FINES)
     violated = _of_agents(batch, "violated")
-    tagged = np.zeros(len(fines)) if tagged_by is None else tagged_by[0].numpy(force=True).any(-1)
+    tagged = np.zeros(len(fines), bool) if tagged_by is None else tagged_by[0].numpy(force=True).any(-1)
     fined_when_tagged = np.flatnonzero((violated == 0) & (fines > 0) & tagged)
     return [
         *(fined(agent, fines[agent]) for agent in np.flatnonzero(violated).tolist()),
