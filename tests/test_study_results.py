@@ -471,6 +471,8 @@ def test_windows_of_many_worlds_have_as_many_episodes_of_each(tmp_path):
     changed = rows.append_column("world", pa.array(np.where(quick, 0, 1)))
     place = changed.column_names.index("collective_return")
     changed = changed.set_column(place, "collective_return", apples)
+    halves = pa.array(np.where(quick, 10.0, 40.0) / 2)  # of two agents
+    changed = changed.set_column(changed.column_names.index("harvest"), "harvest", halves)
     write_listed(run, "episodes.parquet", lambda file: pq.write_table(changed, file))
     table = study_table(study, runs)
     (values,) = values_of(table.windows(last=10), "collective_return").values()

@@ -67,11 +67,12 @@ def test_a_csv_has_the_bounds_of_intervals_as_columns(tmp_path):
     assert [row["table"] for row in (first, rows[4])] == ["Means & differences, in $", "again"]
     assert (first["row"], first["column"]) == ("vote_1|<a>*", "equality")
     numbers = ("value", "low", "high", "replicas", "episodes", "undefined", "p_value", "differs", "text")
-    assert [first[name] for name in numbers] == ["0.5", "0.25", "0.75", "3", "30", "2", "", "False", ""]
+    assert [first[name] for name in numbers] == ["0.5", "0.25", "0.75", "3", "30", "2", "", "", ""]
     assert [second[name] for name in numbers[:3]] == ["-12.5", "-20.0", "-5.0"]
     assert (second["p_value"], second["differs"]) == ("0.01", "True")
     assert (third["row"], third["value"], third["text"]) == ("none", "", "-")
     assert fourth["differs"] == "False"
+    assert (second["episodes"], fourth["undefined"]) == ("", ""), "nobody counts those of a difference"
 
 
 def test_rows_have_as_many_names_as_the_table_says(tmp_path):

@@ -5,14 +5,14 @@
 Four DQN agents on `commons` learn from sixteen worlds, on the schedule of recipes/tragedy.py. The best of
 each kind was found by Optuna on the harvest after fines, in worlds of seeds that this study does not use:
 
-    cprl search recipes/study/best_rules.py --rule quota --seed 5000 --points 16 --metric net
+    cprl search recipes/study/best_rules.py --rule quota --seed 5000 --points 16 --metric income
         --vary "game.institutions.0.share=uniform(0.1,0.8)" --vary game.institutions.0.fine=None,1,2,4
         --vary game.institutions.0.window_steps=10,25,50,100,200
-    cprl search recipes/study/best_rules.py --rule sanctions --seed 5000 --points 16 --metric net
+    cprl search recipes/study/best_rules.py --rule sanctions --seed 5000 --points 16 --metric income
         --vary game.institutions.1.freeze_steps=1x5x25x100,5x25x100x100,25x100x400x400,100x100x100x100
         --vary game.institutions.1.fines=0x0x0x0,0x1x2x4,1x2x4x8,2x2x2x2
         --vary game.institutions.1.recovery_steps=10,50,200,1000
-    cprl search recipes/study/best_rules.py --rule tax --seed 5000 --points 12 --metric net
+    cprl search recipes/study/best_rules.py --rule tax --seed 5000 --points 12 --metric income
         --vary "game.institutions.0.rate=uniform(0,1)" --vary game.institutions.0.period_steps=1,10,100,1000
 """
 

@@ -118,6 +118,8 @@ class Tables:
         for path in self.out:
             if path.suffix not in (ROWS, *SUFFIXES):
                 raise refusal("--out", str(path), f"a name that ends in {', '.join((ROWS, *SUFFIXES))}")
+            if self.out.count(path) > 1:
+                raise refusal("--out", str(path), "each file once")
             refuse_to_write_over(path)
 
     def write(self, rows: "pa.Table", tables: "Sequence[Cells]" = (), *, notes: Sequence[str] = ()) -> None:

@@ -112,8 +112,8 @@ def table(
     for path in files.out:
         if path.suffix == ROWS:
             rows = study_table.rows
-            chosen = compare.metric or study_table.metrics
-            replace(study_table, rows=where(rows, metric=tuple(chosen))).write(path)
+            rows = where(rows, metric=tuple(compare.metric)) if compare.metric else rows
+            replace(study_table, rows=rows).write(path)
         else:
             write([*compared, *effects], path, notes=str(study_table).split("\n"))
         say(f"Written: {path}")

@@ -58,13 +58,16 @@ def trace(env: CommonsEnv, policy: Policy, *, explore: bool = True) -> Trace:
     tags: list[Array] = []
     row = read(now.row)
     col = read(now.col)
+    is_going = np.ones(len(row), np.bool_)  # a world with transforms plays on once it has ended
     for step, batch in enumerate(played):
         seen["row"].append(row)
         seen["col"].append(col)
         seen["in_play"].append(batch[keys.IN_PLAY].numpy(force=True).copy())
-        seen["fired"].append(batch["next"][keys.FIRED].numpy(force=True).copy())
-        seen["played"].append(~batch[keys.DONE][:, 0].numpy(force=True))
-        tags.append(np.insert(np.argwhere(batch["next"][keys.TAGGED_BY].numpy(force=True)), 0, step, axis=1))
+        seen["fired"].append(batch["next"][keys.FIRED].numpy(force=True) & is_going[:, None])
+        seen["played"].append(is_going)
+        hits = np.argwhere(batch["next"][keys.TAGGED_BY].numpy(force=True) & is_going[:, None, None])
+        tags.append(np.insert(hits, 0, step, axis=1))
+        is_going = is_going & ~batch["next"][keys.DONE][:, 0].numpy(force=True)
         row = read(now.row)
         col = read(now.col)
     arrays = {name: np.stack(values) for name, values in seen.items()}

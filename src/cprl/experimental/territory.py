@@ -126,7 +126,7 @@ def territory_cells(table: pa.Table) -> Cells:
     for name, words in WORDS.items():
         of_policies = [means[policy, name] for policy in ("trained", "random")]
         rows.append([words, *(one if one.replicas else "-" for one in of_policies)])
-    return Cells(said(table, "heading"), ["", "run's agents", "random"], rows)
+    return Cells("where agents go, and whom they tag", ["", "run's agents", "random"], rows)
 
 
 COLUMNS: Final = 3

@@ -140,6 +140,7 @@ _TAKEN: Final = {
     *(entry.name for entry in fields(Episode)),
     *METRICS,
     *TOTALS,
+    *("role", "composition", "restrained_agents", "window_episodes"),
     "replica",
     "agent",
     *("policy", "trained_episodes", "focal", "focal_agent", "focal_agents", "background", "scenario"),

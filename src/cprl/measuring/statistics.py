@@ -18,7 +18,7 @@ import pyarrow as pa
 from numpy.typing import ArrayLike, NDArray
 
 from cprl.measuring.registry import METRICS, bounds
-from cprl.measuring.table import by_replica, clock_of, complete, numbers_in
+from cprl.measuring.table import by_replica, clock_of, numbers_in
 from cprl.measuring.windows import Values
 
 CONFIDENCE: Final = 0.95
@@ -337,7 +337,6 @@ def estimates(table: pa.Table, numbers: Sequence[str] | str = (), by: Sequence[s
         numbers: their names; by default all `numbers_in` the table.
         by: the labels that are kept apart.
     """
-    table = complete(table)
     keys = _listed(by)
     names = _listed(numbers) or tuple(numbers_in(table))
     clock = clock_of(table)
@@ -375,7 +374,6 @@ def differences(
             replicas' differences, else Welch's.
         family: what the differences of this call are, which Holm's method judges all together.
     """
-    table = complete(table)
     keys = _listed(by)
     clock = clock_of(table)
     changes: dict[Key, Estimate] = {}

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from cprl.measuring.registry import FINES, IN_FORCE, INCOME, METRICS, TOTALS, is_own, measured
+from cprl.measuring.registry import COLLECTIVE_RETURN, FINES, IN_FORCE, INCOME, METRICS, TOTALS, is_own
 
 Numbers = NDArray[np.int64]
 
@@ -40,19 +40,40 @@ def complete(table: pa.Table, constants: Mapping[str, Any] | None = None) -> pa.
 
     Args:
         constants: of the game, see `cprl.measuring.registry.measured`.
+
+    Raises:
+        ValueError: if it lacks one and its rows are not whole episodes, each of all agents in order.
     """
-    if not len(table) or WINDOWS in table.column_names:
+    columns = {*table.column_names}
+    given = columns | {*(constants or {})}
+    lacking = [name for name, metric in METRICS.items() if name not in columns and given >= {*metric.needs}]
+    if not lacking or not len(table) or WINDOWS in columns:
         return table
-    agents = pc.max(table["agent"]).as_py() + 1
+    agents = _agents_of(table)
     totals = dict(constants or {})
-    for name, total in TOTALS.items():
-        if name in table.column_names:
-            values = table[name].to_numpy(zero_copy_only=False).astype(np.float64).reshape(-1, agents)
-            totals[name] = values if total.axes else values[:, 0]
-    for name, values in measured(totals).items():
-        if name not in table.column_names:
-            table = table.append_column(name, pa.array(np.repeat(values, agents)))
+    for name in columns & {*TOTALS}:
+        values = table[name].to_numpy(zero_copy_only=False).astype(np.float64).reshape(-1, agents)
+        totals[name] = values if TOTALS[name].axes else values[:, 0]
+    for name in lacking:
+        values = METRICS[name].of(*(totals[need] for need in METRICS[name].needs))
+        table = table.append_column(name, pa.array(np.repeat(np.asarray(values, np.float64), agents)))
     return table
+
+
+def _agents_of(table: pa.Table) -> int:
+    """Return how many agents the episodes have; refuse rows that are not those of all, in order."""
+    agent = table["agent"].to_numpy()
+    agents = int(agent.max()) + 1
+    is_whole = np.array_equal(agent, np.arange(len(agent)) % agents)
+    if is_whole and {"harvest", COLLECTIVE_RETURN} <= {*table.column_names}:
+        apples = table["harvest"].to_numpy().astype(np.float64).reshape(-1, agents).sum(-1)
+        is_whole = np.allclose(apples, table[COLLECTIVE_RETURN].to_numpy()[::agents], rtol=1e-5)
+    if not is_whole:
+        raise ValueError(
+            "the rows are not whole episodes, each of all agents in order; allowed: a table of one game that "
+            "is sorted by agent last, or `cprl.measuring.table.complete` of it before rows are chosen"
+        )
+    return agents
 
 
 def naming(table: pa.Table, agents: Sequence[str]) -> pa.Table:
@@ -109,9 +130,12 @@ def numbers_in(table: pa.Table) -> list[str]:
 
     The income is among them where it is not the harvest.
     """
-    columns = complete(table).column_names
-    if "harvest" in columns and FINES not in columns:
-        columns = [name for name in columns if name != INCOME]
+    whole = complete(table)
+    columns = whole.column_names
+    if {INCOME, COLLECTIVE_RETURN} <= {*columns} and FINES not in columns:
+        income = whole[INCOME].to_numpy()
+        if np.allclose(income, whole[COLLECTIVE_RETURN].to_numpy(), rtol=1e-6, atol=1e-6, equal_nan=True):
+            columns = [name for name in columns if name != INCOME]
     known = [name for name in METRICS if name in columns]
     own = [name for name in metrics_in(table.schema) if is_own(name)]
     is_social = {name: not name.startswith("institutions/") for name in known}
@@ -126,13 +150,15 @@ def episodes(table: pa.Table, number: str) -> pa.Table:
     if number in METRICS and number not in table.column_names:
         table = complete(table)
     who, _, what = number.rpartition("/")
-    if number in table.column_names and not (number in TOTALS and TOTALS[number].axes):
+    columns = table.column_names
+    agent = who.removeprefix(_AGENT)
+    if number in columns and not (number in TOTALS and TOTALS[number].axes):
         rows = where(table, agent=0)
         column = number
-    elif who.startswith(_AGENT):
-        rows = where(table, agent=int(who.removeprefix(_AGENT)))
+    elif what in columns and who != agent and agent in map(str, table["agent"].unique().to_pylist()):
+        rows = where(table, agent=int(agent))
         column = what
-    elif who in (FOCAL, BACKGROUND):
+    elif what in columns and who in (FOCAL, BACKGROUND) and ROLE in columns:
         rows = where(table, **{ROLE: (who, BOTH)})
         column = what
     else:
@@ -156,6 +182,9 @@ def by_replica(table: pa.Table, number: str, by: Sequence[str] = ()) -> pa.Table
     Args:
         by: the labels that are kept apart; episodes of all others count together.
     """
+    unknown = [name for name in by if name not in table.column_names]
+    if unknown:
+        raise KeyError(f"the table has no label {', '.join(unknown)}; it has {', '.join(labels_of(table))}")
     keys = [*by, "replica"]
     counts = ["episodes", "undefined"]
     if WINDOWS in table.column_names:
@@ -177,7 +206,8 @@ def by_replica(table: pa.Table, number: str, by: Sequence[str] = ()) -> pa.Table
 
 def clock_of(table: pa.Table) -> float:
     """Return the steps of an episode that the clock ended, infinity where none was."""
-    if not {"terminated", "steps"} <= set(table.column_names):
+    columns = {*table.column_names}
+    if WINDOWS in columns or not {"terminated", "steps"} <= columns:
         return inf
     steps = table.filter(pc.invert(table["terminated"]))["steps"]
     return float(pc.max(steps).as_py()) if len(steps) else inf

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from cprl.measuring.table import Numbers, world_of
+from cprl.measuring.table import Numbers, labels_of, world_of
 
 Values = NDArray[np.float64]
 
@@ -26,7 +26,12 @@ def last_of(table: pa.Table, number: int) -> pa.Table:
 
     The last that have ended, of all worlds, would be the longest ones where worlds began together. Where a
     world has ended fewer, only as many of each world are there.
+
+    Raises:
+        ValueError: if the table has labels, and so may be of several runs.
     """
+    if labels := labels_of(table):
+        raise ValueError(f"the table is labelled by {', '.join(labels)}; allowed: the episodes of one run")
     world = world_of(table)
     episode = table["episode"].to_numpy().astype(np.int64)
     size = int(episode.max(initial=0)) + 1

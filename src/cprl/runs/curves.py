@@ -30,7 +30,7 @@ def as_curves(table: pa.Table, *, last: int | None = None) -> dict[str, Values]:
     """Like `curves_of`, from a table of `read_episodes`."""
     if not table.num_rows:
         return {}
-    table = complete(table if last is None else last_of(table, last)).sort_by(_ORDER)
+    table = complete((table if last is None else last_of(table, last)).sort_by(_ORDER))
     first = where(table, agent=0)
     at = _places(first)
     curves = {name: np.asarray(first[name].to_numpy()[at], np.float64) for name in metrics_in(table.schema)}

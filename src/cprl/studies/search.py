@@ -336,7 +336,9 @@ def value_of(search: Search, point: Point, runs: Path) -> float | None:
             values = by_replica(rows, search.metric)["value"]
         except KeyError as error:
             reported = ", ".join(sorted(metrics_in(complete(rows).schema)))
-            raise refusal("metric", search.metric, f"what the game reports: {reported}") from error
+            raise refusal(
+                "metric", search.metric, f"what the game reports: {reported}, agent_0/return and so on"
+            ) from error
         means += pc.fill_null(values, math.nan).to_pylist()
     return float(np.mean(means))
 

@@ -143,7 +143,10 @@ def cell(name: str) -> str:
 
 def _as_text(tables: Sequence[Cells], notes: Sequence[str]) -> str:
     drawn = StringIO()
-    Console(file=drawn, width=_FILE_WIDTH).print(*tables, *map(Text, notes), sep="\n")
+    plain = Console(
+        file=drawn, width=_FILE_WIDTH, force_terminal=False, force_jupyter=False, color_system=None
+    )
+    plain.print(*tables, *map(Text, notes), sep="\n")
     return drawn.getvalue()
 
 
@@ -164,7 +167,7 @@ def _as_latex(tables: Sequence[Cells], notes: Sequence[str]) -> str:
             rf"\begin{{tabular}}{{{columns}}}",
             *(r"\toprule", head, r"\midrule", *rows, r"\bottomrule"),
             r"\end{tabular}",
-            rf"\par\smallskip\footnotesize {_in_latex(table.note)}",
+            *(rf"\par\smallskip\footnotesize {_in_latex(line)}" for line in table.note.splitlines()),
             r"\end{table}",
         ]
     return "\n".join([*lines, *map(_in_latex, notes), ""])
@@ -185,6 +188,8 @@ def _as_csv(tables: Sequence[Cells], notes: Sequence[str]) -> str:
             for head, part in zip(table.head[names:], row[names:], strict=True):
                 one = part.estimate if isinstance(part, Change) else part
                 numbers = {"text": one} if isinstance(one, str) else numbers_of(one)
+                for name in ("episodes", "undefined") if isinstance(part, Change) else ("p_value", "differs"):
+                    numbers.pop(name, None)  # nobody counted them, or tested whether a level is 0
                 writer.writerow({**place, "column": head, **numbers})
     return written.getvalue()
 

@@ -126,8 +126,8 @@ class Evaluations:
     """Lets agents play fresh episodes greedily after every so many episodes of their training; a callback.
 
     The replicas that have just ended such an episode play `evaluation_episodes` each, always the same ones,
-    as `cprl.evaluate_run(run, greedy=True, seed=experiment.seed + 1)` would let them. Nothing of the training
-    changes. The numbers of an evaluation are logged with those of the episode, and the table
+    as `cprl.evaluate_run(run, Fresh(greedy=True, seed=experiment.seed + 1))` would let them. Nothing of the
+    training changes. The numbers of an evaluation are logged with those of the episode, and the table
     `evaluation/training.parquet` has a row for each of its episodes and agents.
     """
 

@@ -175,7 +175,8 @@ def change(difference: Estimate | None, replicas: int = 0) -> Cell:
 def compared_cells(table: StudyTable, metrics: Sequence[str] = (), *, part: str = TRAINING) -> list[Cells]:
     """Return the levels of metrics, see `metrics_of`, and the differences where there are several conditions;
     nothing of a table without a finished run."""
-    if not table.metrics:
+    chosen = metrics_of(table, metrics, part=part)
+    if not chosen:
         return []
     levels = cells(table, metrics, part=part)
     if not metrics:
