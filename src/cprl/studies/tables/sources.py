@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 from cprl.envs.unwrap import clock_in
 from cprl.experiment import Experiment
 from cprl.measuring.outcome import RULE, outcome_of
-from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, INCOME_EQUALITY, METRICS
+from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, INCOME_EQUALITY, METRICS, TOTALS
 from cprl.measuring.table import WINDOWS, Numbers, by_replica, complete, metrics_in, where, world_of
 from cprl.measuring.windows import episodes_after, rounds_of
 from cprl.population import any_learns
@@ -274,7 +274,8 @@ def _windows(table: pa.Table, source: Source, part: str, window: int) -> pa.Tabl
     order = np.argsort(group, kind="stable")
     begin = np.flatnonzero(np.diff(group[order], prepend=-1))
     lengths = np.diff(np.append(begin, len(order)))
-    numbers = {name: one[name].to_numpy() for name in metrics_in(table.schema)}
+    metrics = [name for name in metrics_in(table.schema) if name not in TOTALS]
+    numbers = {name: one[name].to_numpy() for name in metrics}
     returns = table["return"].to_numpy().astype(np.float64).reshape(len(one), -1)
     numbers |= {f"agent_{agent}/return": of_agent for agent, of_agent in enumerate(returns.T)}
     values = np.stack(list(numbers.values()))[:, order]
