@@ -207,22 +207,21 @@ def _tables_of(source: Source) -> dict[str, pa.Table]:
     for part, name in PARTS.items():
         folder = source.run / "evaluation"
         table = read_episodes(source.run) if name is None else read_rows(folder / f"{name}.parquet")
+        table = table.sort_by([(column, "ascending") for column in ("replica", "episode", "agent")])
         _refuse_gaps(table, source, part)
-        order = [(column, "ascending") for column in ("replica", "episode", "agent")]
-        tables[part] = complete(table.sort_by(order))
+        tables[part] = complete(table)
     return tables
 
 
 def _refuse_gaps(table: pa.Table, source: Source, part: str) -> None:
-    """Refuse a table that has an episode twice, or lacks some."""
-    times = table.group_by(["replica", "episode", "agent"]).aggregate([([], "count_all")])
-    twice = times.filter(pc.greater(times["count_all"], 1)).slice(length=1)
-    for row in twice.to_pylist():
+    """Refuse a sorted table that has an episode twice, or lacks some."""
+    replica, episode, agent = (table[name].to_numpy() for name in ("replica", "episode", "agent"))
+    begins = (np.diff(replica, prepend=-1) != 0) | (np.diff(episode, prepend=-1) != 0)
+    for row in np.flatnonzero(~begins & (np.diff(agent, prepend=-1) == 0))[:1]:
         raise ValueError(
-            f"{source.name} has episode {row['episode']} of replica {row['replica']} in {part} twice"
+            f"{source.name} has episode {episode[row]} of replica {replica[row]} in {part} twice"
         )
-    episodes = table.group_by(["replica", "episode"]).aggregate([])
-    counts = Counter(sorted(episodes["replica"].to_pylist()))
+    counts = Counter(replica[begins].tolist())
     replicas = list(range(source.experiment.replicas))
     wanted = source.experiment.episodes if part == TRAINING else max(counts.values(), default=0)
     if wanted is None and (missing := [replica for replica in replicas if replica not in counts]):
@@ -268,7 +267,8 @@ def _windows(table: pa.Table, source: Source, part: str, window: int) -> pa.Tabl
     one = where(table, agent=0)
     replica = one["replica"].to_numpy()
     size = window if part == TRAINING or window == 1 else len(one)
-    places = [_places(world_of(where(one, replica=number)), size) for number in np.unique(replica)]
+    world = world_of(one)
+    places = [_places(world[replica == number], size) for number in np.unique(replica)]
     place = np.concatenate(places)
     group = replica * (place.max() + 1) + place
     order = np.argsort(group, kind="stable")
