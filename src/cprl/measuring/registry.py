@@ -539,7 +539,7 @@ def colour(name: str) -> Colour:
 def unit(name: str) -> str:
     """Return the unit after a value, e.g. "steps"; "" where a range stands for one. A single agent's return
     is in apples."""
-    if name.startswith("return_"):
+    if name.startswith("return_") or name.endswith("/return"):
         return APPLES
     metric = _metric(name)
     return "" if metric is None or metric.unit == SHARE else metric.unit
