@@ -369,7 +369,9 @@ def differences(
     Rows whose reference is themselves, or is not there, have no difference.
 
     Args:
-        table, numbers, by: as in `estimates`.
+        table: as in `estimates`.
+        numbers: likewise, their names.
+        by: likewise, the labels that are kept apart.
         paired: whether replica r of both had the same chance: then the interval is that of the mean of the
             replicas' differences, else Welch's.
         family: what the differences of this call are, which Holm's method judges all together.
@@ -414,7 +416,9 @@ def contrasts(
     the replicas that have a value in each row that counts.
 
     Args:
-        table, numbers, by: as in `estimates`.
+        table: as in `estimates`.
+        numbers: likewise, their names.
+        by: likewise, the labels that are kept apart.
         weights: by the name of each contrast, see `mean_difference`.
         family: what the contrasts of this call are, which Holm's method judges all together.
     """
