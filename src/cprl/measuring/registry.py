@@ -448,18 +448,19 @@ SOCIAL: Final = tuple(name for name in METRICS if not METRICS[name].is_of_instit
 """Those that say something of every game, as far as it reports their entries."""
 
 
-def measured(totals: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
+def measured(totals: Mapping[str, Any], names: Iterable[str] = METRICS) -> dict[str, NDArray[np.float64]]:
     """Return the metrics all of whose totals and constants are given, by name, each float64 [...].
 
     Args:
         totals: by the names of `TOTALS`, arrays [..., N] or [...]; and the constants "sustainable_yield",
             "first_stock" and "groups" of a game that has them.
+        names: of the metrics that are asked for.
     """
     given = {name for name, value in totals.items() if value is not None}
     return {
-        name: np.asarray(metric.of(*(totals[need] for need in metric.needs)), np.float64)
-        for name, metric in METRICS.items()
-        if given.issuperset(metric.needs)
+        name: np.asarray(METRICS[name].of(*(totals[need] for need in METRICS[name].needs)), np.float64)
+        for name in names
+        if given.issuperset(METRICS[name].needs)
     }
 
 

@@ -10,6 +10,7 @@ WHO/WHAT of some agents, the mean of theirs: "agent_2/fines", "focal/return", "b
 """
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from math import inf
 from typing import Any, Final
 
@@ -18,7 +19,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from cprl.measuring.registry import COLLECTIVE_RETURN, FINES, IN_FORCE, INCOME, METRICS, TOTALS, is_own
+from cprl.measuring.registry import (
+    COLLECTIVE_RETURN,
+    FINES,
+    IN_FORCE,
+    INCOME,
+    METRICS,
+    TOTALS,
+    is_own,
+    measured,
+)
 
 Numbers = NDArray[np.int64]
 
@@ -51,12 +61,12 @@ def complete(table: pa.Table, constants: Mapping[str, Any] | None = None) -> pa.
         return table
     agents = _agents_of(table)
     totals = dict(constants or {})
-    for name in columns & {*TOTALS}:
+    needs = chain.from_iterable(METRICS[name].needs for name in lacking)
+    for name in columns & {*TOTALS} & {*needs}:
         values = table[name].to_numpy(zero_copy_only=False).astype(np.float64).reshape(-1, agents)
         totals[name] = values if TOTALS[name].axes else values[:, 0]
-    for name in lacking:
-        values = METRICS[name].of(*(totals[need] for need in METRICS[name].needs))
-        table = table.append_column(name, pa.array(np.repeat(np.asarray(values, np.float64), agents)))
+    for name, values in measured(totals, lacking).items():
+        table = table.append_column(name, pa.array(np.repeat(values, agents)))
     return table
 
 
@@ -119,9 +129,8 @@ def labels_of(table: pa.Table) -> list[str]:
 def metrics_in(schema: pa.Schema) -> list[str]:
     """Return the stored metrics among the columns of a table, those of the user's own included."""
     floats = [field.name for field in schema if pa.types.is_floating(field.type)]
-    return [name for name in floats if name not in TOTALS] + [
-        name for name in ("stock_left",) if name in schema.names
-    ]
+    counted = [name for name in METRICS if name in TOTALS and name in schema.names]
+    return [*(name for name in floats if name not in TOTALS), *counted]
 
 
 def numbers_in(table: pa.Table) -> list[str]:

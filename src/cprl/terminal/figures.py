@@ -61,6 +61,8 @@ def training_curve(
     levels = {} if random is None else {name: _mean(random, name) for name in numbers}
     dashed = ", ".join(_amount(name, level) for name, level in levels.items())
     path = path or run / "figures" / "training_curve.png"
+    evaluations = read_evaluations(run)
+    evaluations = None if evaluations is None else complete(evaluations)
     with style.drawing(path, width=width) as sheet:
         panels = sheet.panels(len(numbers), high=HEIGHTS[: len(numbers)], sharex=True)
         for axes, name in zip(panels, numbers, strict=True):
@@ -70,7 +72,7 @@ def training_curve(
             is_there = ~np.isnan(means).any(0)
             course = at[is_there], means[:, is_there]
             _draw(axes, values, *course)
-            _draw_evaluations(axes, run, name)
+            _draw_evaluations(axes, evaluations, name)
             if name in levels:
                 axes.axhline(levels[name], **style.RANDOM_LINE, label=f"random play, {dashed}")
             if name == numbers[0]:
@@ -120,10 +122,9 @@ def _draw(axes: Axes, values: Values, at: Values, means: Values) -> None:
     axes.plot(at, means.mean(0), color=style.MEAN, linewidth=2.4, marker=dot, label=label, zorder=3)
 
 
-def _draw_evaluations(axes: Axes, run: Path, name: str) -> None:
+def _draw_evaluations(axes: Axes, evaluations: pa.Table | None, name: str) -> None:
     """Draw the means of evaluations while agents were trained, at the episodes after which they played."""
-    evaluations = read_evaluations(run)
-    if evaluations is None or name not in complete(evaluations).column_names:
+    if evaluations is None or name not in evaluations.column_names:
         return
     rows = episodes(evaluations, name).group_by("trained_episodes").aggregate([("value", "mean")])
     rows = rows.sort_by("trained_episodes")
