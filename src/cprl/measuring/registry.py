@@ -47,6 +47,8 @@ FINES: Final = keys.FINES[-1]
 TRANSFERS: Final = keys.TRANSFERS[-1]
 VIOLATIONS: Final = COUNTS[ledger.VIOLATIONS]
 
+INSTITUTIONS: Final = "institutions/"
+"""How the names of metrics begin that are of institutions alone."""
 SHARE: Final = "0 to 1"
 """In place of a unit."""
 RATIO: Final = "ratio"
@@ -188,7 +190,7 @@ class Metric:
     """A number of a whole episode, computed from its totals."""
 
     name: str
-    """With the prefix "institutions/" where it is of institutions alone."""
+    """With the prefix `INSTITUTIONS` where it is of institutions alone."""
     words: str
     unit: str
     of: Callable[..., Any]
@@ -230,7 +232,7 @@ class Metric:
 
 def _institutional(name: str, words: str, unit: str, of: Callable[..., Any], **look: Any) -> Metric:
     plot = look.pop("plot", None)
-    return Metric(name=f"institutions/{name}", words=words, unit=unit, of=of, plot=plot, **look)
+    return Metric(name=f"{INSTITUTIONS}{name}", words=words, unit=unit, of=of, plot=plot, **look)
 
 
 def _ratio(part: Any, whole: Any) -> Any:
@@ -442,7 +444,7 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
     ),
 )
 """In the order of pages and tables."""
-IN_FORCE: Final = "institutions/in_force_"
+IN_FORCE: Final = f"{INSTITUTIONS}in_force_"
 """How the numbers begin that say what each ballot decided for an episode."""
 SOCIAL: Final = tuple(name for name in METRICS if not METRICS[name].is_of_institutions)
 """Those that say something of every game, as far as it reports their entries."""

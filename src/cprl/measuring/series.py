@@ -13,12 +13,10 @@ from torchrl.envs import EnvBase
 
 from cprl.envs.unwrap import agent_names
 from cprl.measuring.episodes import Episode
-from cprl.measuring.registry import OF_AGENTS
+from cprl.measuring.registry import INSTITUTIONS, OF_AGENTS
 from cprl.measuring.windows import Values
 from cprl.system.times import Speed
 
-INSTITUTIONS: Final = "institutions/"
-"""How the names of metrics begin that are of institutions alone."""
 OF_GROUP: Final = ("social/", INSTITUTIONS)
 """How the names of numbers begin that are of all agents together."""
 STEPS: Final = "time/env_steps"

@@ -24,6 +24,7 @@ from cprl.measuring.registry import (
     FINES,
     IN_FORCE,
     INCOME,
+    INSTITUTIONS,
     METRICS,
     TOTALS,
     is_own,
@@ -147,7 +148,7 @@ def numbers_in(table: pa.Table) -> list[str]:
             columns = [name for name in columns if name != INCOME]
     known = [name for name in METRICS if name in columns]
     own = [name for name in metrics_in(table.schema) if is_own(name)]
-    is_social = {name: not name.startswith("institutions/") for name in known}
+    is_social = {name: not name.startswith(INSTITUTIONS) for name in known}
     social = [name for name in known if is_social[name]]
     of_institutions = [name for name in known if not is_social[name]]
     return [*social, *own, *of_institutions, *(name for name in columns if name.startswith(IN_FORCE))]

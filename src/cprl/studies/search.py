@@ -21,7 +21,7 @@ import pyarrow.compute as pc
 from cprl.commons.game import Game
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import own_name
-from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME_EQUALITY, SOCIAL
+from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME_EQUALITY, INSTITUTIONS, SOCIAL
 from cprl.measuring.table import by_replica, complete, metrics_in
 from cprl.measuring.windows import last_of
 from cprl.runs.episodes import read_episodes, read_rows
@@ -98,7 +98,7 @@ class Search(Value, stored=False):
     def __post_init__(self) -> None:
         super().__post_init__()
         game = self.experiment.game
-        is_of_law = self.metric.startswith("institutions/") or self.metric == INCOME_EQUALITY
+        is_of_law = self.metric.startswith(INSTITUTIONS) or self.metric == INCOME_EQUALITY
         if isinstance(game, Game) and not (game.institutions and is_of_law):
             metrics = [
                 *SOCIAL,

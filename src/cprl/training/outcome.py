@@ -21,6 +21,7 @@ from cprl.envs.unwrap import commons_of
 from cprl.experiment import Experiment
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import Policy, evaluate
+from cprl.measuring.registry import INSTITUTIONS
 from cprl.measuring.table import labelled
 from cprl.policies.present import PresentPolicy
 from cprl.runs.episodes import EVALUATIONS, table_of
@@ -189,7 +190,7 @@ class Evaluations:
 def _means(episodes: Sequence[Episode]) -> dict[str, float]:
     means = {"return": fmean(float(episode.return_.sum()) for episode in episodes)}
     for name in episodes[0].metrics:
-        if name.startswith("institutions/"):
+        if name.startswith(INSTITUTIONS):
             continue
         values = [episode.metrics[name] for episode in episodes]
         means[name] = float(np.nanmean(values)) if not np.isnan(values).all() else float("nan")

@@ -42,13 +42,14 @@ from cprl.measuring.registry import (
     EQUALITY,
     IN_FORCE,
     INCOME,
+    INSTITUTIONS,
     METRICS,
     SHARE,
     colour,
     is_own,
     title,
 )
-from cprl.measuring.series import INSTITUTIONS, SPEED, logged
+from cprl.measuring.series import SPEED, logged
 from cprl.viewer.board import OUT_STROKE_CELLS, board_form, board_styles, image_form
 from cprl.viewer.names import (
     BACKGROUND,

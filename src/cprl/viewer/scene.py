@@ -17,8 +17,15 @@ from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.matrix import MatrixGame
 from cprl.envs.unwrap import base_env
 from cprl.measuring.episodes import decisions_of, metrics_of
-from cprl.measuring.registry import COLLECTIVE_RETURN, EQUALITY, INCOME, OF_AGENTS, SOCIAL, left_out
-from cprl.measuring.series import INSTITUTIONS
+from cprl.measuring.registry import (
+    COLLECTIVE_RETURN,
+    EQUALITY,
+    INCOME,
+    INSTITUTIONS,
+    OF_AGENTS,
+    SOCIAL,
+    left_out,
+)
 from cprl.viewer.names import TEXT
 
 MOST_JOINT: Final = 16

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 from cprl.envs.unwrap import clock_in
 from cprl.experiment import Experiment
 from cprl.measuring.outcome import RULE, outcome_of
-from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, INCOME_EQUALITY, METRICS, TOTALS
+from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, INCOME_EQUALITY, INSTITUTIONS, METRICS, TOTALS
 from cprl.measuring.table import WINDOWS, Numbers, by_replica, complete, metrics_in, where, world_of
 from cprl.measuring.windows import episodes_after, rounds_of
 from cprl.population import any_learns
@@ -347,7 +347,7 @@ def _metrics(names: Sequence[str]) -> list[str]:
 
     The income is among them where it is not the harvest.
     """
-    moves_money = INCOME_EQUALITY in names or any(name.startswith("institutions/") for name in names)
+    moves_money = INCOME_EQUALITY in names or any(name.startswith(INSTITUTIONS) for name in names)
     if COLLECTIVE_RETURN in names and not moves_money:
         names = [name for name in names if name != INCOME]
     order = {name: place for place, name in enumerate(METRICS)}
