@@ -10,7 +10,7 @@ import cprl
 from cprl import presets
 from cprl.algorithms import DQN
 from cprl.population import Learning, Scripted
-from cprl.values import trusting
+from cprl.values import OWN_METRICS, trusting
 
 
 @pytest.fixture(autouse=True)
@@ -25,6 +25,13 @@ def trusted():
     """What a test allows to be imported is not allowed in the next one."""
     with trusting(()):
         yield
+
+
+@pytest.fixture(autouse=True)
+def names_of_metrics():
+    """What a test, or code of the docs that it runs, calls a metric of its own is forgotten after it."""
+    yield
+    OWN_METRICS.clear()
 
 
 @pytest.fixture
