@@ -10,12 +10,13 @@ import re
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import tyro
@@ -23,38 +24,44 @@ from numba import typeof
 from numba.cuda import compile_ptx, dispatcher
 
 from cprl import Game, presets
-from cprl.commons.batch import output_of
-from cprl.commons.cuda import kernels
+from cprl.commons.cuda import kernels, to_run, to_show
 from cprl.commons.game import output_forms
-from cprl.commons.world import Scratch, StepOutput, Worlds, empty_scratch, empty_worlds
+from cprl.commons.world import PLAY, Scratch, StepOutput, empty_scratch, empty_worlds
 from cprl.institutions import Tax
 from cprl.institutions.arrays import changed
 from cprl.institutions.law import new_law
 
+COMMONS: Final = presets.game("commons")
+GAMES: Final = {
+    "commons, published": COMMONS,
+    "commons, as run": presets.game("commons", variant="as_run"),
+    "cleanup, with a river": presets.game("ssd/cleanup-v1"),
+    "commons, with a tax": replace(COMMONS, institutions=(Tax(),)),
+}
+"""Games whose groups of rules differ, each with kernels of its own."""
+WORLDS: Final = 4
 
-def arguments(game: Game, worlds: int = 4) -> dict[str, tuple[Any, ...]]:
-    """Arguments of each kernel with the types and layouts that `CudaThreads` gives them."""
-    tables, sheet = game.tables, empty_scratch(game)
-    scratch = Scratch(*(np.zeros((worlds, *each.shape), each.dtype, order="F") for each in sheet))
-    told = StepOutput(**{name: np.zeros(*form) for name, form in output_forms(game, worlds).items()})
-    actions, marks = np.zeros((worlds, game.agents), np.int64), np.zeros(worlds, np.bool_)
-    boards = np.zeros((worlds, game.map.height, game.map.width), np.uint8)
-    on_gpu = Worlds(*map(np.asfortranarray, empty_worlds(game, worlds)))
-    loops = {"play_worlds": actions, "begin_worlds": marks, "refresh_worlds": marks, "show_worlds": boards}
-    ruled = replace(game, institutions=(Tax(),))
-    paid = output_of([np.zeros(*form) for form in output_forms(ruled, worlds).values()])
-    law = changed(
-        new_law(ruled, worlds), lambda array, of_worlds: np.asfortranarray(array) if of_worlds else array
-    )._replace(decisions=actions, payments=paid.payments)
-    return {
-        **{name: (on_gpu, tables, told, what, scratch) for name, what in loops.items()},
-        **{
-            f"governed {name}": (on_gpu, ruled.tables, paid.turn, law, what, scratch)
-            for name, what in loops.items()
-            if name != "show_worlds"
-        },
-        "find_unknown": (actions, len(game.actions), np.zeros(1, np.int64)),
-    }
+
+def column_major(array: np.ndarray, is_of_worlds: bool) -> np.ndarray:
+    """The layout that `CudaThreads.place` gives an array."""
+    return np.asfortranarray(array) if is_of_worlds else array
+
+
+def launches(game: Game) -> Iterator[tuple[str, Any, tuple[Any, ...]]]:
+    """Yield each loop's name, its kernel, and arguments with the types and layouts that `CudaThreads` gives
+    them."""
+    worlds = changed(empty_worlds(game, WORLDS), column_major)
+    law = changed(new_law(game, WORLDS), column_major) if game.institutions else None
+    output = StepOutput(*(np.zeros(*form) for form in output_forms(game, WORLDS).values()))
+    arrays = empty_scratch(game)
+    scratch = Scratch(*(np.zeros((WORLDS, *array.shape), array.dtype, order="F") for array in arrays))
+    actions = np.zeros((WORLDS, game.agents), np.int64)
+    which = np.ones(WORLDS, np.bool_)
+    run, run_arguments = to_run((worlds, game.tables, output, law, actions, actions, which))
+    yield "run", run, (*run_arguments, PLAY, scratch)
+    boards = np.zeros((WORLDS, game.map.height, game.map.width), np.uint8)
+    show, show_arguments = to_show((worlds, game.tables, boards))
+    yield "show", show, (*show_arguments, scratch)
 
 
 def ptxas() -> Path | None:
@@ -66,6 +73,18 @@ def ptxas() -> Path | None:
     return None
 
 
+def assembled(name: str, ptx: str, assembler: Path, capability: tuple[int, int]) -> str:
+    """Return what a kernel uses of a GPU, as the assembler says."""
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(folder) / "kernel.ptx"
+        source.write_text(ptx)
+        command = [assembler, "-c", "-v", f"-arch=sm_{capability[0]}{capability[1]}", source]
+        done = subprocess.run([*command, "-o", f"{source}.o"], capture_output=True, text=True)
+    if done.returncode:
+        sys.exit(f"{name}: {done.stderr}")
+    return ", ".join(re.findall(r"Used \d+ registers|\d+ bytes (?:stack frame|spill \w+)", done.stderr)[-4:])
+
+
 def main(*, capability: tuple[int, int] = (9, 0)) -> None:
     """Prints a line for each kernel.
 
@@ -75,21 +94,16 @@ def main(*, capability: tuple[int, int] = (9, 0)) -> None:
     gpu = SimpleNamespace(compute_capability=capability)
     dispatcher.get_current_device = lambda: gpu  # asks the driver otherwise, and there is none
     assembler = ptxas()
-    for name, given in arguments(presets.game("commons")).items():
-        ptx, _ = compile_ptx(kernels()[name].py_func, tuple(map(typeof, given)), cc=capability)
+    asked = np.zeros((WORLDS, COMMONS.agents), np.int64), len(COMMONS.actions), np.zeros(1, np.int64)
+    every = [("find_unknown", kernels(()).find_unknown, asked)]
+    for game_name, game in GAMES.items():
+        every += [(f"{game_name}: {loop}", *launch) for loop, *launch in launches(game)]
+    for name, kernel, arguments in every:
+        ptx, _ = compile_ptx(kernel.py_func, tuple(map(typeof, arguments)), cc=capability)
         line = f"{name}: {len(ptx):,} characters of PTX"
         if assembler:
-            with tempfile.TemporaryDirectory() as folder:
-                source = Path(folder) / "kernel.ptx"
-                source.write_text(ptx)
-                command = [assembler, "-c", "-v", f"-arch=sm_{capability[0]}{capability[1]}", source]
-                done = subprocess.run([*command, "-o", f"{source}.o"], capture_output=True, text=True)
-            if done.returncode:
-                sys.exit(f"{name}: {done.stderr}")
-            line += ", " + ", ".join(
-                re.findall(r"Used \d+ registers|\d+ bytes (?:stack frame|spill \w+)", done.stderr)[-4:]
-            )
-        print(line)
+            line += f", {assembled(name, ptx, assembler, capability)}"
+        print(line, flush=True)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,8 @@ from rerun.chunk import RrdReader
 sys.path.insert(0, str(Path(__file__).parents[1] / "docs"))
 from viewers import VIEWER, native_viewer
 
-from cprl.commons.colours import APPLE, PALETTE
+from cprl.commons.cells import APPLE
+from cprl.pictures.colours import PALETTE
 
 IMPORTS = "import cprl; cprl.recipe_main; import cprl.training.running"
 ADDRESS = re.compile(r"rerun\+http://127\.0\.0\.1:\d+/proxy")

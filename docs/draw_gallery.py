@@ -20,12 +20,12 @@ from typing import Any, Final
 import tyro
 
 from cprl import Experiment
-from cprl.commons.picture import world_image
-from cprl.commons.readable import legend_of
 from cprl.evaluation.film_pictures import write_gif
 from cprl.evaluation.fresh import fresh_episode, record
 from cprl.evaluation.lanes import commons_game
 from cprl.evaluation.show import about, begins, page, show
+from cprl.pictures.image import world_image
+from cprl.pictures.readable import legend_of
 from cprl.population import specs_by_agent
 
 TITLES: Final = {

@@ -3,13 +3,17 @@
 python docs/draw_sharing.py
 """
 
+import sys
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from cprl.terminal.style import MARK, MEAN, RAW, drawing
-from cprl.theory import herders
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "recipes" / "study" / "theory"))
+
+from sharing_games import herders
 
 PATH: Final = Path(__file__).parent / "theory" / "herders.png"
 HERDS: Final = (2, 5, 100)

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from cprl import Game, Rules, maps, presets
-from cprl.commons.batch import Batch, turn_of
-from cprl.commons.colours import agent_colour
-from cprl.commons.picture import world_image
+from cprl.commons.batch import Batch
 from cprl.institutions import COUNTS, Institution
+from cprl.pictures.colours import agent_colour
+from cprl.pictures.image import world_image
 from cprl.policies.scripted import ScriptedActor, ScriptedPolicy
 from cprl.terminal.style import MARK, MEAN, RAW
 
@@ -67,19 +67,19 @@ def play(
         decisions: those of the agents in an episode.
     """
     batch, found = Batch(game, 1, seed=SEED), []
-    whole = batch.begin(batch.new_output())
+    output = batch.begin(batch.new_output())
     choose = _scripted(game, policy) if isinstance(policy, str) else _named(game, policy)
     for episode in range(episodes):
         decided = None if decisions is None else np.array([decisions(episode)], np.int64)
         for turn in range(turns):
-            batch.play(choose(turn, turn_of(whole)), whole, decided)
-            paid, now = whole.payments, batch.now
-            one = turn_of(whole).harvest, paid.fines, paid.transfers, paid.counts, paid.in_force
+            batch.play(choose(turn, output), output, decided)
+            now = batch.now
+            one = output.harvest, output.fines, output.transfers, output.counts, output.in_force
             more = now.in_play, batch.law.sanctions.level, now.stock, now.row, now.col
             found.append([array[0].copy() for array in (*one, *more)])
-        shown = batch.show(whole)._replace(in_play=np.ones(game.agents, np.bool_))
+        shown = batch.show(output)._replace(in_play=np.ones(game.agents, np.bool_))
         if episode + 1 < episodes:
-            batch.begin(whole)
+            batch.begin(output)
     return Course(*map(np.array, zip(*found, strict=True)), world_image(game.map, shown, cell_pixels=CELL))
 
 

@@ -2,21 +2,21 @@
 
 import importlib.util
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from cprl import Game, Map, Observation, Rules, maps
-from cprl.commons.batch import Batch, turn_of
-from cprl.commons.colours import CLASS_NAMES, FIRST_AGENT, class_colour
+from cprl import Game, Map, Observation, Quirks2019, Rules, maps
+from cprl.commons.batch import Batch
+from cprl.commons.cells import CLASS_NAMES, FIRST_AGENT, class_colour
 from cprl.commons.maps import SIGN_OF_HEADING
+from cprl.commons.rules import Groups
 from cprl.commons.world import StepOutput, Worlds
 from cprl.institutions import COUNTS, Institution
-from cprl.institutions.arrays import DERIVED, STATE, STEPS, lasting
-from cprl.institutions.ledger import Payments
+from cprl.institutions.arrays import lasting
 
 RGB_SIGN = {
     (10, 10, 10): ".",
@@ -63,20 +63,19 @@ class Play:
             institutions=tuple(institutions),
         )
         self.batch = Batch(self.game, worlds, seed=seed)
-        self.whole = self.batch.begin(self.batch.new_output())
-        self.output: StepOutput = turn_of(self.whole)
+        self.output = self.batch.begin(self.batch.new_output())
 
     def turn(self, *names: str, decisions: Sequence[int] | None = None) -> "Play":
         """Plays one turn: one action per agent, or one for all agents."""
         names = names * self.game.agents if len(names) == 1 else names
         everywhere = (self.batch.size, 1)
         actions = np.tile([self.game.actions.index(name) for name in names], everywhere)
-        self.batch.play(actions, self.whole, None if decisions is None else np.tile(decisions, everywhere))
+        self.batch.play(actions, self.output, None if decisions is None else np.tile(decisions, everywhere))
         return self
 
     def put(self, **changes: Any) -> "Play":
         """Loads the state of all worlds with other entries."""
-        self.batch.load({**self.batch.state(), **changes}, self.whole)
+        self.batch.load({**self.batch.state(), **changes}, self.output)
         return self
 
     def shown(self, count: int) -> list[list[int]]:
@@ -86,20 +85,19 @@ class Play:
 
     def again(self) -> "Play":
         """Begins the next episode."""
-        self.batch.begin(self.whole)
+        self.batch.begin(self.output)
         return self
 
-    payments = property(lambda play: play.whole.payments, doc="What institutions output in the last turn.")
-    fines = property(lambda play: play.payments.fines[0].tolist())
-    transfers = property(lambda play: play.payments.transfers[0].tolist())
-    reward = property(lambda play: play.payments.reward[0].tolist())
-    violated = property(lambda play: play.payments.violated[0].tolist())
+    fines = property(lambda play: play.output.fines[0].tolist())
+    transfers = property(lambda play: play.output.transfers[0].tolist())
+    reward = property(lambda play: play.output.reward[0].tolist())
+    violated = property(lambda play: play.output.violated[0].tolist())
     in_play = property(lambda play: play.batch.now.in_play[0].tolist())
     harvest = property(lambda play: play.output.harvest[0].tolist())
 
     def counts(self, name: str) -> list[int]:
         """What was counted for each agent in this episode, by its name in `COUNTS`."""
-        return self.payments.counts[0, :, COUNTS.index(name)].tolist()
+        return self.output.counts[0, :, COUNTS.index(name)].tolist()
 
     @property
     def places(self) -> list[tuple[int, int]]:
@@ -136,6 +134,12 @@ class Play:
         return "\n".join("".join(signs[kind] for kind in row) for row in planes.argmax(0))
 
 
+def only_quirks(**on: bool) -> Quirks2019:
+    """The quirks of the program of 2019 that are named, without the others."""
+    off = {field.name: False for field in fields(Quirks2019)}
+    return Quirks2019(**{**off, **on})
+
+
 def drawn(text: str) -> str:
     """A drawing without the indentation it has in a test."""
     return "\n".join(line.strip() for line in text.strip().splitlines())
@@ -148,26 +152,30 @@ def random_actions(steps: int, worlds: int, game: Game, *, seed: int = 0) -> np.
 
 
 class Moment(NamedTuple):
-    """Copies of all arrays after a turn; `law`, of what lasts, and `payments` are those of institutions."""
+    """Copies of all arrays after a turn; `law`: of what institutions remember."""
 
     worlds: Worlds
     turn: StepOutput
     law: dict[str, np.ndarray] | None = None
-    payments: Payments | None = None
 
 
 def copied(record: Any) -> Any:
-    """A record of arrays with copies of them."""
-    return type(record)(*(array.copy() for array in record))
+    """A record of arrays with copies of them; groups of rules by the names of what they remember."""
+    entries = (remembered(entry) if isinstance(entry, Groups) else entry.copy() for entry in record)
+    return type(record)(*entries)
 
 
-def kept(batch: Batch, output: Any) -> Moment:
+def remembered(record: Any) -> dict[str, np.ndarray]:
+    """Copies of the arrays of a record, of institutions or groups of rules, that are part of the state."""
+    return {name: array.copy() for name, array, _ in lasting(record, derived=True)}
+
+
+def kept(batch: Batch, output: StepOutput) -> Moment:
     """The moment after the last turn."""
-    moment = Moment(copied(batch.now), copied(turn_of(output)))
+    moment = Moment(copied(batch.now), copied(output))
     if batch.law is None:
         return moment
-    law = {name: array.copy() for name, array, _ in lasting(batch.law, STATE, STEPS, DERIVED)}
-    return moment._replace(law=law, payments=copied(output.payments))
+    return moment._replace(law=remembered(batch.law))
 
 
 def play_on(batch: Batch, output: Any, actions: Any, decisions: Any = None) -> list[Moment]:
@@ -188,13 +196,20 @@ def played(game: Game, actions: Any, decisions: Any = None, **options) -> list[M
 
 def assert_same(record: Any, other: Any, *, rows: Any = slice(None), other_rows: Any = slice(None)) -> None:
     """All arrays of records, and of the records in them, are equal in the given worlds."""
-    if not isinstance(record, dict):
-        record, other = record._asdict(), other._asdict()
-    for name, one in record.items():
+    others = by_name(other)
+    for name, one in by_name(record).items():
         if isinstance(one, tuple | dict):
-            assert_same(one, other[name], rows=rows, other_rows=other_rows)
+            assert_same(one, others[name], rows=rows, other_rows=other_rows)
         elif one is not None:
-            assert np.array_equal(one[rows], other[name][other_rows]), name
+            assert np.array_equal(one[rows], others[name][other_rows]), name
+
+
+def by_name(record: Any) -> dict[str, Any]:
+    """The entries of a record; groups of rules by the names of what they remember."""
+    entries = record if isinstance(record, dict) else record._asdict()
+    return {
+        name: remembered(entry) if isinstance(entry, Groups) else entry for name, entry in entries.items()
+    }
 
 
 def module_at(path: Path) -> ModuleType:

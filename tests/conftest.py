@@ -1,5 +1,6 @@
 """What the tests share: small boards that are never square, and a quiet, seeded torch."""
 
+import os
 import signal
 from dataclasses import replace
 
@@ -9,8 +10,18 @@ import torch
 import cprl
 from cprl import presets
 from cprl.algorithms import DQN
+from cprl.commons.compiled import PLAIN, RULES_VARIABLE
 from cprl.population import Learning, Scripted
 from cprl.values import OWN_METRICS, trusting
+
+
+def pytest_addoption(parser):
+    parser.addoption("--plain", action="store_true", help="run the rules of the game as plain Python")
+
+
+def pytest_configure(config):
+    if config.getoption("--plain"):
+        os.environ[RULES_VARIABLE] = PLAIN
 
 
 @pytest.fixture(autouse=True)

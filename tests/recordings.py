@@ -10,10 +10,10 @@ from rerun.chunk import RrdReader
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.algorithms import DQN
-from cprl.commons.colours import COLOURS
-from cprl.commons.decoding import classes_seen
+from cprl.commons.cells import COLOURS
 from cprl.learners.settings import DQNSettings
 from cprl.measuring.series import Observer
+from cprl.pictures.decoding import classes_seen
 from cprl.policies.lanes import RandomActor
 from cprl.training import train
 from cprl.viewer.callback import ViewerCallback

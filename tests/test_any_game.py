@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from matrix_game import MatrixGame, tit_for_tat
+from recall_game import Recall
 from recordings import column
 from rerun.chunk import RrdReader
 from rich.console import Console
@@ -27,7 +28,7 @@ from torchrl.envs import (
 from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.envs import spaces_of
+from cprl.envs import make_env, spaces_of
 from cprl.envs.unwrap import agent_names
 from cprl.measuring import EpisodeTracker
 from cprl.measuring.evaluate import evaluate
@@ -124,6 +125,24 @@ def test_what_the_docs_say_is_left_out_is_what_needs_the_entry():
         entry: {name for name, entries in needs.items() if entry in entries} - {"tagged_by"}
         for entry in OPTIONAL
     }, "tagged_by is told as who tagged whom"
+
+
+class RecallByWorld(Recall):
+    """Takes the number of the first world, by which cues differ here as by the seed."""
+
+    def make(self, worlds, seed, device, first_world):
+        env = super().make(worlds, seed, device)
+        env.first_world = first_world
+        return env
+
+
+def test_a_game_gets_the_number_of_the_first_world_if_its_make_takes_it_else_another_seed():
+    plain = make_env(Recall(), worlds=2, seed=3, first_world=4)
+    assert plain.seed == 7
+    by_world = make_env(RecallByWorld(), worlds=2, seed=3, first_world=4)
+    assert (by_world.seed, by_world.first_world) == (3, 4)
+    with pytest.raises(ValueError, match=r"seed \+ first_world is 18446744073709551616"):
+        make_env(Recall(), seed=2**64 - 1, first_world=1)
 
 
 def test_a_game_that_reports_nothing_but_rewards_has_returns_and_steps():

@@ -18,7 +18,7 @@ CHOICES = (0.0, 0.5, 1.0)
 
 
 def in_force(play):
-    return play.payments.in_force[0].tolist()
+    return play.output.in_force[0].tolist()
 
 
 @pytest.mark.parametrize(

@@ -141,12 +141,3 @@ def test_only_what_is_observed_is_shown():
     patches = ClosedPatches(below=2, observed=False)
     shown = Boundaries.drawn("..1..\n.....")
     assert plane(Play(BOARD, institutions=[shown, patches], **rules), 0) == ".#.\n...\n..."
-
-
-def test_walls_hide_what_is_forbidden_where_they_block_sight():
-    board, regions = ">.#A\n...<", "...1\n...."
-    rules = {"window_rows": 4, "window_columns": 3}
-    play = Play(board, institutions=[Boundaries.drawn(regions)], **rules)
-    assert plane(play, 0) == ".#.\n...\n...\n..."
-    play = Play(board, institutions=[Boundaries.drawn(regions)], walls_block_sight=True, **rules)
-    assert plane(play, 0) == "...\n...\n...\n..."

@@ -17,7 +17,7 @@ from my_game import Dilemma
 from rich.table import Table
 
 import cprl
-from cprl import Experiment, presets
+from cprl import Experiment, Quirks2019, RandomEnd, presets
 from cprl.algorithms import DQN, PPO, QMIX, DQNSettings, RolloutSettings
 from cprl.commands import main as cli
 from cprl.commands.recipe import RunOptions, parse, recipe_main, refuse_mistyped_flags
@@ -287,6 +287,32 @@ def test_a_shape_that_does_not_fit_is_refused_and_a_team_of_all_agents_grows():
             read(line, make)
 
 
+def test_a_flag_of_a_group_of_rules_makes_the_group_or_changes_it():
+    given, _ = read("--game.rules.random-end.prob 0.15 --game.rules.random_end.from-step=9")
+    assert given.game.rules.random_end == RandomEnd(prob=0.15, from_step=9)
+    given, _ = read("--game.rules.quirks.no-paint-over")
+    assert given.game.rules == replace(presets.game("commons").rules, quirks=Quirks2019(paint_over=False))
+    given, _ = read("--variant as_run --game.rules.quirks.no-paint-over")
+    assert given.game.rules.quirks == Quirks2019(paint_over=False)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("--game.rules.random-end.from-step 9", r"--game\.rules\.random-end lacks prob"),
+        (
+            "--game.rules.random-end.prb 0.2",
+            r"--game\.rules\.random-end\.prb is unknown; allowed: prob, from-s",
+        ),
+        ("--game.rules.random-end.prob 2", r"RandomEnd\.prob is 2"),
+        ("--game.rules.river.may-clean", r"Map\.river has 0 cells and Rules\.river is River"),
+    ],
+)
+def test_a_group_of_rules_that_cannot_be_made_is_refused(line, message):
+    with pytest.raises(ValueError, match=message):
+        read(line)
+
+
 def test_institutions_are_given_by_their_names_or_a_file_with_flags_of_their_own(tmp_path):
     line = "--game.institutions quota graduated_sanctions --game.institutions.quota.share 0.25"
     given, _ = read(f"{line} --game.institutions.1.recovery-steps 7", alike)
@@ -537,6 +563,8 @@ def test_a_file_or_a_run_of_that_name_comes_first_but_not_the_folder_of_a_study(
         ("run study/base", "study/base runs nothing: other recipes import it; cprl recipe study/base"),
         ("run mine.py", r"mine\.py is a recipe of your own"),
         ("recipe comons", "there is no recipe 'comons'"),
+        ("recipe zebra", "there is no recipe 'zebra'; cprl recipe lists them$"),
+        ("recipe matrix_games", r"no recipe 'matrix_games' .did you mean 'study/theory/matrix_games'\?.$"),
     ],
 )
 def test_what_cannot_be_run_is_refused_in_a_sentence(line, message, elsewhere, monkeypatch):

@@ -402,14 +402,24 @@ def test_numba_refuses_allocations():
         numba.njit(**compiled.CPU_OPTIONS)(allocates)(np.ones(3))
 
 
-def test_numba_gives_the_machine_code_of_a_function_unless_it_is_told_not_to_compile(monkeypatch):
-    function = numba.njit(**compiled.CPU_OPTIONS)(summed)
-    code = compiled.machine_code(function, np.ones(3))
-    assert code is not function
-    assert code(np.arange(5.0)) == 10
+def summed_column(columns):
+    (values,) = columns
+    so_far = 0.0
+    for value in values:
+        so_far += value
+    return so_far
+
+
+def test_numba_gives_the_machine_code_of_a_function_unless_it_is_told_not_to_compile(tmp_path, monkeypatch):
+    monkeypatch.setenv("CPRL_CACHE", str(tmp_path))
+    monkeypatch.setenv(compiled.RULES_VARIABLE, compiled.COMPILED)
+    code = compiled.machine_code(summed_column, (np.ones(3),))
+    assert code((np.arange(5.0),)) == 10
+    assert list(tmp_path.glob("rules/summed_column-*/key.py"))
     monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
-    with pytest.raises(ValueError, match="NUMBA_DISABLE_JIT"):
-        compiled.machine_code(summed, np.ones(3))
+    plain = compiled.machine_code(summed_column, (np.ones(3),))
+    assert "compiled.py" in plain.__code__.co_filename
+    assert plain((np.arange(5.0),)) == 10
 
 
 def test_numba_keeps_compiled_functions_where_it_is_told(tmp_path):

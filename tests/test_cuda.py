@@ -15,6 +15,7 @@ from governed import EVERYTHING, random_decisions
 
 from cprl import CommonsEnv, keys, presets
 from cprl.algorithms import DQN
+from cprl.commons.compiled import PLAIN, RULES_VARIABLE
 from cprl.commons.literature import SOURCES
 from cprl.learners.settings import DQNSettings
 from cprl.measuring.evaluate import evaluate
@@ -51,6 +52,12 @@ def test_the_simulated_gpu_plays_the_same_game_as_the_cpu(simulated, check):
 @pytest.mark.integration
 def test_the_simulator_exits_without_an_error(simulated):
     assert simulated[1].returncode == 0, simulated[1].stderr
+
+
+def test_a_gpu_runs_no_rules_as_plain_python(monkeypatch):
+    monkeypatch.setenv(RULES_VARIABLE, PLAIN)
+    with pytest.raises(ValueError, match='device is "cuda" and CPRL_RULES is "python"'):
+        CommonsEnv(presets.game("commons"), device="cuda")
 
 
 @pytest.mark.gpu

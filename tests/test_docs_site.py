@@ -21,7 +21,7 @@ from website import navigation, pages, reference, replays
 from website.build import SITE
 
 from cprl.commands.main import COMMANDS
-from cprl.commons.colours import APPLE, FIRST_AGENT
+from cprl.commons.cells import APPLE, FIRST_AGENT
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
+from matrix_games import prisoners_dilemma
 from PIL import Image
 from stored_runs import (
     C51,
@@ -34,7 +35,6 @@ from stored_runs import (
 import cprl
 from cprl import CommonsEnv, Fresh, Game, Observation, maps, presets
 from cprl.envs.make_env import spaces_of
-from cprl.envs.matrix import prisoners_dilemma
 from cprl.evaluation import (
     Scenario,
     by_focal_agent,
@@ -652,6 +652,7 @@ TRAINED_IN = Fresh(seed=3)
     ],
 )
 def test_what_cannot_be_played_is_refused_by_name(play, answer, learned, corridors, odd):
+    cprl.trust("matrix_games:MatrixGame")
     with pytest.raises(ValueError, match=answer):
         play({**learned, **corridors, **odd})
 

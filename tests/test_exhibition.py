@@ -15,7 +15,7 @@ from rerun.chunk import RrdReader
 from torchrl.envs import Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cprl import Custom, Experiment, Game, Rules, maps
+from cprl import Custom, Experiment, Game, River, Rules, maps
 from cprl.algorithms import DQN, MAPPO, PPO, DQNSettings, RolloutSettings
 from cprl.envs.make_env import make_env
 from cprl.population import Learning, Scripted, Team
@@ -91,7 +91,7 @@ class Viewers(Stream):
         (".A>.A", {"shuffle_starts": True}, False),
         (".A>.A", {"random_headings": True}, False),
         (".A>.AP", {}, False),
-        (".A>.A~", {}, False),
+        (".A>.A~", {"river": River()}, False),
     ],
 )
 def test_the_map_that_is_sent_first_is_called_what_it_is(drawing, rules, is_drawn):

@@ -13,19 +13,20 @@ import numpy as np
 import pytest
 import torch
 from imageio_ffmpeg import get_ffmpeg_exe
+from matrix_games import stag_hunt
 from PIL import Image
 from stored_runs import CORRIDORS, command, stored
 
 from cprl import Custom, Game, Rules, load, maps
-from cprl.commons.colours import APPLE, GROUND, PALETTE, agent_colour
-from cprl.commons.picture import EMPTY_SITE_COLOUR
-from cprl.envs.matrix import stag_hunt
+from cprl.commons.cells import APPLE, GROUND
 from cprl.evaluation import film_pictures
 from cprl.evaluation.export import export_episodes
 from cprl.evaluation.film import Style, film, film_video, titles_of
 from cprl.evaluation.film_pictures import EpisodePicture
 from cprl.evaluation.fresh import fresh_episode
 from cprl.institutions import Monitoring, Quota
+from cprl.pictures.colours import PALETTE, agent_colour
+from cprl.pictures.image import EMPTY_SITE_COLOUR
 from cprl.values import trusting
 
 LEFT = [5, 3, 2, 0]
@@ -320,7 +321,8 @@ def test_flags_of_another_format_are_refused_by_name(flag, runs, tmp_path, monke
 
 
 def test_episodes_of_a_matrix_game_are_written_as_csv_with_actions_by_number(tmp_path):
-    export_episodes(stored(tmp_path / "run", stag_hunt(turns=3), "random"), tmp_path / "episodes.csv")
+    with trusting(["matrix_games:MatrixGame"]):
+        export_episodes(stored(tmp_path / "run", stag_hunt(turns=3), "random"), tmp_path / "episodes.csv")
     rows = list(csv.DictReader((tmp_path / "episodes.csv").read_text().splitlines()))
     assert [row["turn"] for row in rows[:6]] == ["1", "1", "2", "2", "3", "3"]
     assert {row["action"] for row in rows} <= {"0", "1"}

@@ -7,9 +7,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from matrix_games import prisoners_dilemma
 from stored_runs import CORRIDORS, DQN, MEADOW, an_experiment, command, stored
 
-from cprl.envs.matrix import prisoners_dilemma
 from cprl.evaluation.film import Style, film, film_video
 from cprl.evaluation.fresh import averages_of, fresh_episode, fresh_episodes, fresh_seed, typical_replica
 from cprl.evaluation.play import open_session, play_in_terminal
@@ -20,6 +20,7 @@ from cprl.studies.report import report
 from cprl.system.defaults import FILM_SEED, PLAY_SEED
 from cprl.training.agents import load
 from cprl.training.outcome import make_agents
+from cprl.values import trust
 
 TURNS, APPLES = [9.0, 2.0, 4.0, 14.0], [20.0, 3.0, 11.0, 30.0]
 """Of four replicas in their evaluation. Medians: 6.5 turns, to which 9 and 4 are equally near, and 15.5
@@ -134,9 +135,9 @@ def test_a_run_without_an_evaluation_of_learners_shows_its_first_episode(tmp_pat
         run = trained(tmp_path / "run")
         (run / "evaluation" / "trained.parquet").unlink()
     else:
-        run = stored(
-            tmp_path / "run", prisoners_dilemma(turns=2) if lacks == "board" else CORRIDORS, "random"
-        )
+        game = prisoners_dilemma(turns=2) if lacks == "board" else CORRIDORS
+        run = stored(tmp_path / "run", game, "random")
+        trust("matrix_games:MatrixGame")
     assert fresh_episode(run)[3:] == (0, 0, False)
     assert fresh_episode(run).words == "Replica 0, episode 0."
 
@@ -191,5 +192,6 @@ def test_a_seed_that_is_none_is_refused_by_the_name_of_its_flag(run, monkeypatch
 
 def test_a_game_without_a_board_cannot_be_shown_and_a_sentence_says_so(tmp_path):
     run = stored(tmp_path / "matrix", prisoners_dilemma(turns=2), "random")
+    trust("matrix_games:MatrixGame")
     with pytest.raises(ValueError, match="plays a game without a board"):
         show(run, tmp_path / "a.html")

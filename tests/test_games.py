@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from test_worlds import check_apples, check_no_beam_passes_a_wall, check_places, check_worlds_are_independent
 from test_worlds import games as plain_games
 
-from cprl import Observation, Rules, maps, presets
-from cprl.commons.batch import Batch, turn_of
+from cprl import Observation, RandomEnd, River, Rules, maps, presets
+from cprl.commons.batch import Batch
 from cprl.commons.literature import SOURCES
 from cprl.commons.near import growth
 from cprl.institutions import Punishment
@@ -37,9 +37,11 @@ def test_a_game_plays_the_trace_of_its_original(path):
     name, _, growth = path.stem.rpartition("_")
     game = presets.game(GAMES[name])
     probs = (0.0, 1.0) if growth == "growth" else (0.0,)
-    certain = {"regrow_prob": probs, "pollution_prob": 0.0}
-    if growth == "none" and game.map.river:
-        certain["regrow_prob"] = (2**-32,)  # an empty board that stays empty is refused
+    certain = {"regrow_prob": probs}
+    if game.rules.river is not None:
+        certain["river"] = replace(game.rules.river, pollution_prob=0.0)
+        if growth == "none":
+            certain["regrow_prob"] = (2**-32,)  # an empty board that stays empty is refused
     game = replace(game, rules=replace(game.rules, **certain))
     batch = Batch(game, 1)
     output = batch.begin(batch.new_output())
@@ -58,9 +60,8 @@ def test_a_game_plays_the_trace_of_its_original(path):
     for turn, actions in enumerate(trace["actions"]):
         before = batch.state()
         played = batch.play(actions[None].astype(np.int64), output)
-        harvest = turn_of(played).harvest[0].copy()
-        reward = harvest if turn_of(played) is played else played.payments.reward[0].copy()
-        tagged = turn_of(played).tagged_by[0].copy()
+        reward = played.reward[0].copy()
+        tagged = played.tagged_by[0].copy()
         state = batch.state()
         returned = state["in_play"][0] & ~before["in_play"][0]
         if game.rules.respawn_at_spawns:
@@ -95,19 +96,17 @@ def games(draw):
     switches = ("regrow_under_agents", "beam_tapers", "beam_from_beside", "beam_stops_at_agents")
     switches += ("plays_on_when_empty", "random_headings", "harvest_action", "shuffle_starts")
     changes = {name: draw(st.booleans()) for name in switches}
-    growth_time = draw(st.sampled_from(["regrow_after_bites", "regrow_before_bites", None]))
-    if growth_time:
-        changes[growth_time] = True
     rules = replace(
         rules,
         **changes,
+        growth=draw(st.sampled_from(["after_bites", "before_bites", "from_start"])),
         regrow_prob=draw(st.sampled_from([(0.1, 0.4), (0.0, 0.3, 0.9)])),
         regrow_by=draw(st.sampled_from(["count", "share", "share_with_own"])),
         first_stock_share=draw(st.sampled_from([1.0, 0.5])) if len(board.sites) > 1 else 1.0,
         cooldown_steps=draw(st.integers(0, 3)),
         respawn_at_spawns=bool(spawns) and draw(st.booleans()),
         clashes=draw(st.sampled_from(["all_back", "one_moves", "in_turn"])),
-        end_prob=draw(st.sampled_from([0.0, 0.1])),
+        random_end=draw(st.sampled_from([None, RandomEnd(prob=0.1)])),
     )
     return replace(game, map=replace(board, spawns=spawns), rules=rules)
 
@@ -162,7 +161,7 @@ def test_no_apple_grows_under_an_agent():
 
 
 def test_growth_counts_the_stock_after_the_bites():
-    one = Play(">A.A<", regrow_prob=(0.0, 1.0), regrow_after_bites=True).turn("forward", "stay")
+    one = Play(">A.A<", regrow_prob=(0.0, 1.0), growth="after_bites").turn("forward", "stay")
     assert one.output.regrown[0, 0] == 1  # the apple that is left makes the bitten one grow in the same turn
     assert Play(">A.A<", regrow_prob=(0.0, 1.0)).turn("forward", "stay").output.regrown[0, 0] == 0
 
@@ -268,8 +267,9 @@ def test_whoever_follows_another_agent_moves_always_or_if_it_comes_later(clashes
 
 
 def test_an_episode_ends_by_chance_and_is_truncated():
-    rules = {"end_prob": 0.25, "end_from_step": 5, "end_every_steps": 3, "plays_on_when_empty": True}
-    play = Play(maps.named("single_basic"), worlds=3000, **rules)
+    by_chance = RandomEnd(prob=0.25, from_step=5, every_steps=3)
+    board = maps.named("single_basic")
+    play = Play(board, worlds=3000, random_end=by_chance, plays_on_when_empty=True)
     lengths, is_over = np.zeros(3000), np.zeros(3000, np.bool_)
     while not is_over.all():
         lengths += ~is_over
@@ -296,16 +296,10 @@ def test_a_fine_costs_the_one_who_fines():
 @pytest.mark.parametrize(
     ("rules", "named"),
     [
-        ({"regrow_after_bites": True, "regrow_before_bites": True}, "regrow_after_bites"),
-        ({"clashes": "in_turn", "pairwise_clashes": True}, "clashes"),
-        ({"clashes": "one_moves", "agent_1_right_moves_agent_0": True}, "clashes"),
         ({"first_stock_share": 1.5}, "first_stock_share"),
         ({"first_stock_share": 0.1}, "first_stock_share"),  # no apple, and none can grow
         ({"respawn_at_spawns": True}, "respawn_at_spawns"),
-        ({"may_clean": True}, "may_clean"),  # no river
-        ({"pollution_prob": 0.5}, "pollution_prob"),
-        ({"pollution_limit": 0.5}, "pollution_limit"),
-        ({"pollution_free": 0.1}, "pollution_free"),
+        ({"river": River()}, "river"),  # the board has none
     ],
 )
 def test_rules_that_do_not_go_together_are_refused(rules, named):
@@ -319,7 +313,7 @@ def test_rules_that_do_not_go_together_are_refused(rules, named):
 def river(**rules):
     """Two agents before a river of four cells, two of which have waste; apples grow unless there is waste."""
     board = "v..A\n~H~.\nH..v"
-    rules = {"regrow_prob": (1.0,), "may_clean": True, "pollution_limit": 0.75, **rules}
+    rules = {"regrow_prob": (1.0,), "river": River(may_clean=True, pollution_limit=0.75), **rules}
     return Play(board, first_stock_share=0.0, beam_width_cells=1, **rules)
 
 
@@ -337,15 +331,16 @@ def test_cleaning_removes_the_first_waste_ahead_and_apples_grow_the_less_waste_t
 def test_apples_grow_by_the_share_of_clean_water():
     grown = {}
     for limit in (0.5, 1.0):
-        play = river(worlds=4000, regrow_prob=(0.8,), pollution_limit=limit).turn("stay")
+        waste = River(may_clean=True, pollution_limit=limit)
+        play = river(worlds=4000, regrow_prob=(0.8,), river=waste).turn("stay")
         grown[limit] = play.output.regrown.mean()
     assert grown[0.5] == 0
     assert grown[1.0] == pytest.approx(0.8 * 0.5, abs=0.03)
 
 
 def test_waste_comes_to_one_clean_cell_a_turn_up_to_the_limit():
-    rules = {"regrow_prob": (0.5,), "pollution_prob": 0.5, "pollution_limit": 0.75}
-    play = Play(">A..\n~~~~", worlds=4000, **rules).turn("stay")
+    polluted = River(pollution_prob=0.5, pollution_limit=0.75)
+    play = Play(">A..\n~~~~", worlds=4000, regrow_prob=(0.5,), river=polluted).turn("stay")
     waste = play.batch.state()["waste"]
     assert waste.sum(1).max() == 1
     assert waste.sum(1).mean() == pytest.approx(1 - 0.5**4, abs=0.02)
@@ -365,10 +360,12 @@ def test_agents_see_water_waste_and_the_cleaning_beam():
 
 
 def test_a_river_needs_a_map_with_one_and_shares_in_order():
-    with pytest.raises(ValueError, match=r"Rules\.may_clean"):
-        Play(">A", may_clean=True)
-    with pytest.raises(ValueError, match=r"Rules\.pollution_free"):
-        Rules(pollution_free=0.5, pollution_limit=0.5)
+    with pytest.raises(ValueError, match=r"Map\.river has 0 cells and Rules\.river is River"):
+        Play(">A", river=River(may_clean=True))
+    with pytest.raises(ValueError, match=r"Map\.river has 1 cell and Rules\.river is None"):
+        Play(">A~")
+    with pytest.raises(ValueError, match=r"River\.pollution_free"):
+        River(pollution_free=0.5, pollution_limit=0.5)
     with pytest.raises(ValueError, match=r"Map\.waste"):
         replace(maps.parse(">A~"), waste=(1,))
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from boards import assert_same, kept, play_on, random_actions
+from boards import assert_same, kept, only_quirks, play_on, random_actions
 from boards import played as played_without
 from governed import (
     EVERYTHING,
@@ -26,7 +26,7 @@ from cprl import Observation, presets
 from cprl import institutions as law
 from cprl.commons.batch import Batch
 from cprl.commons.world import PLAYING
-from cprl.institutions.arrays import STATE, STEPS, lasting
+from cprl.institutions.arrays import lasting
 
 # Random walls and boundaries may part all agents from all apples.
 pytestmark = [
@@ -36,13 +36,13 @@ pytestmark = [
 
 SEEDS = st.integers(0, 2**32 - 1)
 AS_RUN = {
-    "pairwise_clashes": True,
-    "regrow_before_bites": True,
-    "freeze_counts_tag_turn": True,
-    "ends_one_turn_late": True,
-    "picture_shows_old_stock": True,
+    "clashes": "pairwise",
+    "growth": "before_bites",
+    "quirks": only_quirks(freeze_counts_tag_turn=True, ends_one_turn_late=True, picture_shows_old_stock=True),
 }
 QUICK = settings(max_examples=60, deadline=None)
+PAYMENTS = ("reward", "fines", "transfers", "violated", "counts", "in_force", "ballots_due")
+"""What institutions write into the output of a turn."""
 
 
 def check_untouched(game, seed):
@@ -53,7 +53,8 @@ def check_untouched(game, seed):
         random_play(game, turns=30, seed=seed), played_without(plain, actions, seed=seed), strict=True
     ):
         assert_same(moment.worlds, worlds)
-        assert_same(moment.turn._replace(observation=moment.turn.observation[:, :, :cells]), turn)
+        payments = {name: getattr(turn, name) for name in PAYMENTS}
+        assert_same(moment.turn._replace(observation=moment.turn.observation[:, :, :cells], **payments), turn)
 
 
 @pytest.mark.integration
@@ -69,12 +70,12 @@ def test_payments_alone_leave_the_game_as_it_is_bit_for_bit(game, seed):
 def test_the_reward_is_the_harvest_less_fines_plus_transfers_and_an_ended_world_pays_nothing(game, seed):
     ended = np.zeros(2, bool)
     for moment in random_play(game, seed=seed):
-        turn, paid = moment.turn, moment.payments
-        expected = turn.harvest.astype(np.float64) - paid.fines + paid.transfers
-        np.testing.assert_allclose(paid.reward, expected, rtol=1e-5, atol=1e-6)
-        assert (paid.fines >= 0).all()
-        assert (paid.transfers >= 0).all()
-        for flow in (paid.fines, paid.transfers, paid.reward, paid.violated):
+        turn = moment.turn
+        expected = turn.harvest.astype(np.float64) - turn.fines + turn.transfers
+        np.testing.assert_allclose(turn.reward, expected, rtol=1e-5, atol=1e-6)
+        assert (turn.fines >= 0).all()
+        assert (turn.transfers >= 0).all()
+        for flow in (turn.fines, turn.transfers, turn.reward, turn.violated):
             assert not flow[ended].any()
         ended = moment.worlds.ended[:, 0] != PLAYING
 
@@ -83,7 +84,7 @@ def test_the_reward_is_the_harvest_less_fines_plus_transfers_and_an_ended_world_
 @QUICK
 @given(game=governed_games(), seed=SEEDS)
 def test_counts_add_up(game, seed):
-    moments = [moment.payments for moment in random_play(game, seed=seed)]
+    moments = [moment.turn for moment in random_play(game, seed=seed)]
     for before, moment in itertools.pairwise(moments):
         grown = moment.counts - before.counts
         assert (grown >= 0).all()
@@ -108,8 +109,8 @@ def sums(game, seed):
     """Of each turn: harvest, fines and transfers [T, B, N] of a whole episode, and the last counts."""
     moments = random_play(game, turns=game.rules.episode_steps, seed=seed)[1:]
     assert (moments[-1].worlds.ended != PLAYING).all()
-    flows = [(moment.turn.harvest, moment.payments.fines, moment.payments.transfers) for moment in moments]
-    counts = {name: moments[-1].payments.counts[..., n] for n, name in enumerate(law.COUNTS)}
+    flows = [(moment.turn.harvest, moment.turn.fines, moment.turn.transfers) for moment in moments]
+    counts = {name: moments[-1].turn.counts[..., n] for n, name in enumerate(law.COUNTS)}
     return *np.array(flows, np.float64).swapaxes(0, 1), counts
 
 
@@ -222,7 +223,7 @@ def test_inspection_costs_the_same_in_every_turn_until_the_end(game, seed, cost,
     game = replace(game, institutions=(law.Monitoring(cost=cost, monitor=monitor), never_broken))
     for before, moment in zip(*(random_play(game, seed=seed)[n:] for n in (0, 1)), strict=False):
         is_playing = before.worlds.ended[:, 0] == PLAYING
-        close(moment.payments.fines.sum(-1), cost * is_playing)
+        close(moment.turn.fines.sum(-1), cost * is_playing)
 
 
 @QUICK
@@ -254,7 +255,7 @@ def test_the_order_of_institutions_changes_no_move_and_no_payment(game, seed, or
     for one, two in zip(random_play(game, seed=seed), random_play(other, seed=seed), strict=True):
         assert_same(one.worlds, two.worlds)
         for name in ("fines", "transfers", "reward", "violated", "counts"):
-            mine, theirs = getattr(one.payments, name), getattr(two.payments, name)
+            mine, theirs = getattr(one.turn, name), getattr(two.turn, name)
             np.testing.assert_allclose(mine, theirs, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
@@ -309,12 +310,12 @@ def test_a_state_that_is_loaded_plays_on_bit_for_bit(game, seed, turns):
     play_on(batch, output, actions[:turns], decisions[:turns])
     other = Batch(game, 2, seed=5)
     shown = other.load(batch.state(), other.new_output())
-    assert {name for name, *_ in lasting(batch.law, STATE, STEPS)} <= set(batch.state())
-    assert np.array_equal(shown.turn.observation, output.turn.observation), "planes of institutions, too"
+    assert {name for name, *_ in lasting(batch.law)} <= set(batch.state())
+    assert np.array_equal(shown.observation, output.observation), "planes of institutions, too"
     for name in ("fines", "transfers", "reward", "violated"):
-        assert not getattr(shown.payments, name).any(), name
+        assert not getattr(shown, name).any(), name
     for name in ("counts", "in_force"):
-        assert np.array_equal(getattr(shown.payments, name), getattr(output.payments, name)), name
+        assert np.array_equal(getattr(shown, name), getattr(output, name)), name
     rest = actions[turns:], decisions[turns:]
     for one, two in zip(play_on(batch, output, *rest), play_on(other, shown, *rest), strict=True):
         assert_same(one, two)
@@ -342,10 +343,10 @@ def test_the_number_of_threads_changes_nothing(threads):
 
 def test_everything_at_once_happens_somewhere():
     moments = random_play(EVERYTHING, worlds=20, turns=24, seed=1)
-    counts = np.max([moment.payments.counts for moment in moments], (0, 1, 2))
+    counts = np.max([moment.turn.counts for moment in moments], (0, 1, 2))
     assert all(counts), dict(zip(law.COUNTS, counts.tolist(), strict=True))
-    assert any(moment.payments.transfers.any() for moment in moments)
-    assert len({tuple(row) for moment in moments for row in moment.payments.in_force.tolist()}) > 5
+    assert any(moment.turn.transfers.any() for moment in moments)
+    assert len({tuple(row) for moment in moments for row in moment.turn.in_force.tolist()}) > 5
 
 
 @pytest.mark.parametrize("variant", ["published", "as_run"])

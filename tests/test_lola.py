@@ -7,12 +7,12 @@ import pytest
 import torch
 from dqn_parts import make_learner, played
 from matrix_game import MatrixGame as SmallGame
+from matrix_games import prisoners_dilemma
 from test_population import Returns, population, trained, weights
 
 from cprl import Custom
 from cprl.algorithms import LOLA, LOLASettings
 from cprl.envs.make_env import make_env, spaces_of
-from cprl.envs.matrix import prisoners_dilemma
 from cprl.networks import Conv
 from cprl.objectives import loaded_dice, lola_gradients, look_ahead_losses, looked_ahead
 from cprl.population import Scripted, Team

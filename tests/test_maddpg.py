@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from dqn_parts import MEADOW, make_learner, played, transitions
+from matrix_games import MatrixGame
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from test_population import GAME, REPLAY
@@ -18,7 +19,6 @@ from cprl import CommonsEnv
 from cprl.algorithms import DQN, MADDPG, DQNSettings
 from cprl.algorithms.base import q_actor
 from cprl.envs import make_env
-from cprl.envs.matrix import MatrixGame
 from cprl.learners.ring import Horizon, Ring, TransitionForm
 from cprl.learners.transitions import LaneTurn
 from cprl.networks import MLP

@@ -8,18 +8,17 @@ import numpy as np
 import pytest
 from boards import module_at
 from matplotlib.image import imread
+from matrix_games import stag_hunt
 from stored_runs import CORRIDORS, MEADOW, SEED, command, episodes_of, ran, returns
 
 import cprl
 from cprl import Fresh, Game, Rules, maps
-from cprl.envs.matrix import stag_hunt
 from cprl.evaluation import play_population, schelling
 from cprl.evaluation.lanes import said, shifted
 from cprl.evaluation.schelling import between_the_ends, candidates, dilemma, margins, payoffs_of
-from cprl.experimental import draw_egta, pairwise_game, play_empirical_game
+from cprl.experimental import PayoffTable, compositions, draw_egta, pairwise_game, play_empirical_game
 from cprl.experimental.empirical_game import analyse_games, egta_cells, games_in, mean_of
 from cprl.population import Frozen, Scripted
-from cprl.theory import PayoffTable, compositions
 
 
 @pytest.mark.integration

@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from boards import Play, assert_same, copied
+from boards import Play, assert_same, copied, only_quirks
 
 from cprl import Rules, maps
 from cprl.commons.batch import Batch
@@ -80,7 +80,7 @@ def test_clashes_do_not_depend_on_agent_indices():
 
 def test_as_run_a_pair_goes_back_even_onto_a_third_agent():
     # 0 follows 1; 1 and 2 want one cell. Pair (0, 1): no clash. Pair (1, 2): both go back, 1 onto 0.
-    play = Play("A......\n.>>.<..", pairwise_clashes=True)
+    play = Play("A......\n.>>.<..", clashes="pairwise")
     assert play.turn("forward").places == [(1, 2), (1, 2), (1, 4)]
 
 
@@ -116,7 +116,8 @@ def test_agents_that_wait_for_one_cell_return_in_the_order_in_which_they_were_ta
 
 def test_a_time_out_of_three_misses_three_turns_and_as_run_two():
     for counts_tag_turn, missed in ((False, 3), (True, 2)):
-        play = Play("A....\n.>^..", freeze_steps=3, freeze_counts_tag_turn=counts_tag_turn)
+        quirks = only_quirks(freeze_counts_tag_turn=counts_tag_turn)
+        play = Play("A....\n.>^..", freeze_steps=3, quirks=quirks)
         play.turn("beam", "stay")
         for _ in range(missed):
             assert play.in_play == [True, False]
@@ -212,14 +213,14 @@ def test_every_site_is_full_at_the_start_of_an_episode_also_the_one_on_which_an_
 def test_as_run_the_agent_of_lower_index_on_a_cell_gets_the_apple():
     # Pair (1, 2) goes back, 1 onto the cell that 0 has entered: a site.
     board = maps.Map(height=2, width=7, sites=((1, 2), (0, 6)), starts=((1, 1, 1), (1, 2, 1), (1, 4, 3)))
-    play = Play(board, pairwise_clashes=True).turn("forward")
+    play = Play(board, clashes="pairwise").turn("forward")
     assert play.places[:2] == [(1, 2), (1, 2)]
     assert play.harvest == [1, 0, 0]
 
 
 def test_an_apple_can_be_harvested_the_turn_after_it_grew_and_as_run_in_the_same_turn():
-    for at_once, harvests in ((False, [1, 0, 1]), (True, [1, 1, 1])):
-        play = Play(">A.\n.A.", regrow_prob=(0.0, 1.0), regrow_before_bites=at_once)
+    for growth, harvests in (("from_start", [1, 0, 1]), ("before_bites", [1, 1, 1])):
+        play = Play(">A.\n.A.", regrow_prob=(0.0, 1.0), growth=growth)
         assert [play.turn(name).harvest[0] for name in ("forward", "stay", "stay")] == harvests
 
 
@@ -235,7 +236,7 @@ def test_regrowth_counts_the_stock_of_the_start_of_the_turn():
 
 def test_the_episode_ends_in_the_turn_that_takes_the_last_apple_and_as_run_one_later():
     for late in (False, True):
-        play = Play(">A.\n...", ends_one_turn_late=late).turn("forward")
+        play = Play(">A.\n...", quirks=only_quirks(ends_one_turn_late=late)).turn("forward")
         assert bool(play.output.terminated[0, 0]) is not late
         assert bool(play.turn("stay").output.terminated[0, 0])
 

@@ -111,7 +111,7 @@ def learner_of(kind, network, *, spaces=SPACES, **how):
     return make_learner(algorithm, spaces, **how)
 
 
-PLANES = replace(GAME, observation=Observation(scoreboard="planes", stock_gauge="planes"))
+PLANES = replace(GAME, observation=Observation(scoreboard=True, stock_gauge=True))
 
 
 @pytest.mark.parametrize(

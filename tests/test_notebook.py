@@ -11,8 +11,9 @@ from nbclient import NotebookClient
 import cprl
 from cprl import maps, presets
 from cprl.algorithms import DQN
-from cprl.commons.colours import APPLE, PALETTE, WASTE, agent_colour
+from cprl.commons.cells import APPLE, WASTE
 from cprl.institutions import Quota
+from cprl.pictures.colours import PALETTE, agent_colour
 from cprl.population import Learning, Scripted
 
 NOTEBOOK = Path(__file__).parents[1] / "examples" / "notebook.ipynb"

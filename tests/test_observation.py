@@ -1,16 +1,15 @@
-"""The forms of observations, and walls that block sight."""
+"""The forms of observations."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from boards import Play, drawn, random_actions
+from boards import Play, drawn, only_quirks, random_actions
 from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Observation, Rules, keys, maps, presets
-from cprl.commons.batch import Batch, turn_of
-from cprl.commons.colours import COLOURS, FIRST_AGENT, MAX_AGENTS_APART, class_colour
-from cprl.commons.tables import cells_between
+from cprl.commons.batch import Batch
+from cprl.commons.cells import COLOURS, FIRST_AGENT, MAX_AGENTS_APART, class_colour
 from cprl.institutions import Quota
 
 BOARD = """
@@ -37,16 +36,15 @@ def test_a_full_observation_shows_the_whole_board_with_the_observer_as_self(enco
     assert apart.window(1) == drawn("A..#.A\n.0...m\n.mmS.2")
 
 
-@pytest.mark.parametrize(("area", "sight"), [("window", False), ("window", True), ("full", False)])
+@pytest.mark.parametrize("area", ["window", "full"])
 @pytest.mark.parametrize("apart", [False, True])
-def test_one_hot_and_rgb_observations_show_the_same_cells(area, apart, sight):
+def test_one_hot_and_rgb_observations_show_the_same_cells(area, apart):
     colours, channels = (
         Play(
             BOARD,
             observation=Observation(area=area, encoding=encoding, agents_apart=apart),
             window_rows=3,
             window_columns=5,
-            walls_block_sight=sight,
             regrow_prob=(0.1, 0.5),
             freeze_steps=3,
         )
@@ -61,13 +59,11 @@ def test_one_hot_and_rgb_observations_show_the_same_cells(area, apart, sight):
 
 def test_channels_have_the_names_of_colours_or_classes():
     def names(**form):
-        rules = Rules(walls_block_sight=form.pop("sight", False))
-        return Game(map=maps.parse(BOARD), rules=rules, observation=Observation(**form)).channels
+        return Game(map=maps.parse(BOARD), rules=Rules(), observation=Observation(**form)).channels
 
     common = ("ground", "wall", "apple", "heading", "beam")
     assert names() == ("red", "green", "blue")
     assert names(encoding="one_hot") == (*common, "other", "self")
-    assert names(encoding="one_hot", sight=True) == (*common, "other", "self", "hidden")
     apart = names(encoding="one_hot", agents_apart=True)
     assert apart == (*common, "self", "agent_0", "agent_1", "agent_2")
 
@@ -84,20 +80,8 @@ def test_agents_apart_refuses_too_many_agents():
         Game(map=many, rules=Rules(), observation=Observation(agents_apart=True))
 
 
-def test_a_scoreboard_shows_the_observers_harvest_first_then_those_of_the_next_indices():
-    play = Play("A>A.A<.>A", observation=Observation(scoreboard=True, stock_gauge=True))
-    assert play.output.stock_gauge[0].tolist() == [[1.0]] * 3
-    play.turn("forward", "forward", "stay")
-    play.turn("backward", "stay", "stay")
-    play.turn("backward", "stay", "stay")
-    assert play.output.scoreboard[0].tolist() == [[2, 1, 0], [1, 0, 2], [0, 2, 1]]
-    assert play.output.stock_gauge[0].tolist() == [[0.25]] * 3
-    play.batch.begin(play.output)
-    assert not play.output.scoreboard.any()
-
-
 def test_planes_hold_the_scoreboard_and_the_stock_gauge_scaled():
-    planes = Observation(scoreboard="planes", stock_gauge="planes")
+    planes = Observation(scoreboard=True, stock_gauge=True)
     play = Play("A>A.A<.>A", observation=planes, window_rows=2, window_columns=3)
     assert play.game.channels == ("red", "green", "blue", "scoreboard", "stock_gauge")
     play.turn("forward", "forward", "stay")
@@ -109,15 +93,13 @@ def test_planes_hold_the_scoreboard_and_the_stock_gauge_scaled():
     ):
         assert seen[3].tolist() == [board, board], "by row: the observer, the next index, the one after"
         assert (seen[4] == 64).all(), "255 x 1 / 4, rounded"
-    assert not play.output.scoreboard.size
-    assert not play.output.stock_gauge.size
     play.again()
     assert not play.output.observation[0, :, 3].any()
     assert (play.output.observation[0, :, 4] == 255).all()
 
 
 def test_a_scoreboard_of_more_agents_than_cells_takes_several_planes():
-    full, form = Observation(area="full", scoreboard="planes"), Observation(scoreboard="planes")
+    full, form = Observation(area="full", scoreboard=True), Observation(scoreboard=True)
     assert Play(">A\n<v", observation=full).game.channels == ("red", "green", "blue", "scoreboard")
     play = Play(">A\n<v", observation=form, window_rows=1, window_columns=1)
     assert play.game.channels == ("red", "green", "blue", *["scoreboard"] * 3)
@@ -129,37 +111,32 @@ def test_a_scoreboard_of_more_agents_than_cells_takes_several_planes():
     ], "255 x 1 / (1 + 1 site), rounded"
 
 
-SCORES = (True, "planes")
-
-
 @pytest.mark.parametrize("institutions", [(), (Quota(share=0.25, window_steps=20),)], ids=["free", "quota"])
 @pytest.mark.parametrize("encoding", ["rgb", "one_hot"])
 @pytest.mark.parametrize("area", ["window", "full"])
-def test_planes_show_what_vectors_do_and_change_nothing_else(area, encoding, institutions):
-    game = replace(presets.game("commons"), institutions=institutions)
-    forms = (
-        {"area": area, "encoding": encoding, "scoreboard": scores, "stock_gauge": scores} for scores in SCORES
-    )
-    vectors, planes = (replace(game, observation=Observation(**form)) for form in forms)
+def test_planes_show_harvests_and_stock_and_change_nothing_else(area, encoding, institutions):
+    form = Observation(area=area, encoding=encoding)
+    without = replace(presets.game("commons"), institutions=institutions, observation=form)
+    planes = replace(without, observation=replace(form, scoreboard=True, stock_gauge=True))
     check_env_specs(CommonsEnv(planes, 2, seed=1))
-    assert planes.spaces.vectors == ()
     assert planes.spaces.observation_scale == 255, "networks divide by it"
-    assert not vectors.tables.further, "compiled without planes"
-    batches = [Batch(game, 2, seed=3) for game in (vectors, planes)]
+    batches = [Batch(game, 2, seed=3) for game in (without, planes)]
     outputs = [batch.begin(batch.new_output()) for batch in batches]
-    first, sites = len(planes.cell_channels), len(game.map.sites)
+    first, sites = len(planes.cell_channels), len(planes.map.sites)
+    harvest = np.zeros((2, 4))
     seen = 0
-    for turn in random_actions(60, 2, game):
-        shown, drawn = (turn_of(batch.play(turn, out)) for batch, out in zip(batches, outputs, strict=True))
+    for turn in random_actions(60, 2, planes):
+        shown, drawn = (batch.play(turn, out) for batch, out in zip(batches, outputs, strict=True))
         scores = drawn.observation[:, :, first].reshape(2, 4, -1)
-        harvest = shown.scoreboard.astype(np.float64)
-        expected = np.floor(255 * harvest / (harvest + sites) + 0.5)
+        harvest += shown.harvest
         for entry in range(4):
-            assert (scores[:, :, entry::4] == expected[:, :, entry, None]).all()
+            apples = np.roll(harvest, -entry, axis=1)
+            expected = np.floor(255 * apples / (apples + sites) + 0.5)
+            assert (scores[:, :, entry::4] == expected[..., None]).all()
         stock = np.floor(255 * shown.stock / sites + 0.5)
         assert (drawn.observation[:, :, first + 1] == stock[..., None, None]).all()
         rest = np.delete(drawn.observation, [first, first + 1], axis=2)
-        scale = planes.observation_highest // vectors.observation_highest
+        scale = planes.observation_highest // without.observation_highest
         assert np.array_equal(rest, shown.observation * scale)
         assert np.array_equal(drawn.harvest, shown.harvest)
         seen = max(seen, int(scores.max()))
@@ -175,8 +152,8 @@ def test_specs_match_the_form_of_the_observation(form):
     assert channels == len(env.game.channels)
     assert moment[keys.OBSERVATION].shape == (2, 4, channels, rows, columns)
     assert (rows, columns) == ((12, 24) if form.area == "full" else (7, 15))
-    assert (keys.SCOREBOARD in moment.keys(True)) == form.scoreboard
-    assert (keys.STOCK_GAUGE in moment.keys(True)) == form.stock_gauge
+    assert ("scoreboard" in env.game.channels) == form.scoreboard
+    assert ("stock_gauge" in env.game.channels) == form.stock_gauge
     assert moment[keys.OBSERVATION].max() <= env.observation_spec[keys.OBSERVATION].space.high.max()
 
 
@@ -190,62 +167,11 @@ def test_the_form_of_the_observation_does_not_change_the_game():
             assert np.array_equal(other.harvest, plain.harvest)
             assert np.array_equal(other.stock, plain.stock)
             if form == Observation(stock_gauge=True):
-                assert np.array_equal(other.observation, plain.observation)
-
-
-WALLED = """
-    ..A.A..
-    .#.....
-    A..#..A
-    .......
-    ...^...
-"""
-
-
-def test_walls_hide_the_cells_behind_them():
-    play = Play(WALLED, window_rows=5, window_columns=7, walls_block_sight=True, may_fire=False)
-    assert play.window(0) == drawn(
-        """
-        ?????..
-        .#.?...
-        A..#..A
-        ...m...
-        ...S...
-        """
-    )
-    open_sight = Play(WALLED, window_rows=5, window_columns=7, may_fire=False)
-    assert open_sight.window(0) == drawn("..A.A..\n.#.....\nA..#..A\n...m...\n...S...")
-
-
-def test_the_edge_of_the_board_hides_the_cells_behind_it():
-    play = Play("A>.", window_rows=4, window_columns=3, walls_block_sight=True, may_fire=False)
-    assert play.window(0) == drawn("???\n?#?\n#m#\n#S#")
-
-
-def test_the_cells_between_two_cells_are_those_whose_interior_the_line_crosses():
-    assert cells_between(0, 0) == []
-    assert cells_between(0, 1) == []
-    assert cells_between(3, 0) == [(1, 0), (2, 0)]
-    assert cells_between(-2, 2) == [(-1, 1)], "corners do not count"
-    assert cells_between(1, 2) == [(0, 1), (1, 1)]
-    assert cells_between(-1, -3) == [(0, -1), (-1, -2)]
-
-
-@pytest.mark.parametrize("rows", range(-4, 5))
-@pytest.mark.parametrize("cols", range(-4, 5))
-def test_sight_is_mutual(rows, cols):
-    back = {(rows + r, cols + c) for r, c in cells_between(-rows, -cols)}
-    assert back == set(cells_between(rows, cols))
-
-
-def test_walls_that_block_sight_need_windows():
-    rules, form = Rules(walls_block_sight=True), Observation(area="full")
-    with pytest.raises(ValueError, match=r"Observation\.area"):
-        Game(map=maps.parse(BOARD), rules=rules, observation=form)
+                assert np.array_equal(other.observation[:, :, :3], plain.observation)
 
 
 def test_under_paint_over_an_entry_says_whether_an_apple_is_ahead_of_an_agent():
-    play = Play(">A.\n.^A\nA.<", paint_over=True)
+    play = Play(">A.\n.^A\nA.<", quirks=only_quirks(paint_over=True))
     assert play.output.apple_ahead[0].tolist() == [[True], [True], [False]]
     play.turn("forward", "turn_left", "turn_right")
     assert play.output.apple_ahead[0].tolist() == [[False], [False], [True]]

@@ -81,8 +81,6 @@ def test_sites_far_apart_are_counted_without_walking_over_the_board():
     crowded = maps.random(200, 200, agents=1, density=0.5)
     with pytest.raises(ValueError, match=r"radius_cells is 1000 and the map has 20,000"):
         Game(map=crowded, rules=Rules(regrow_radius_cells=1000))
-    with pytest.raises(ValueError, match=r"walls_block_sight is True with windows of 1000 x"):
-        Game(map=GAME.map, rules=Rules(walls_block_sight=True, window_rows=1000))
 
 
 @pytest.mark.parametrize(

@@ -215,7 +215,7 @@ def test_planes_are_learned_from_through_stop_resume_and_evaluation(of_agent, tm
         "memory": [Learning(PPO(settings=rollouts, network=GRU(recurrent_cells=4)))] * 2,
         "team": [Team(QMIX(settings=REPLAY), (0, 1))],
     }
-    planes = Observation(scoreboard="planes", stock_gauge="planes")
+    planes = Observation(scoreboard=True, stock_gauge=True)
     experiment = replace(
         MEADOW,
         game=replace(MEADOW.game, observation=planes),

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from dqn_parts import dqn_learner
+from matrix_games import stag_hunt
 from oldest import PYPROJECT, oldest
 from packaging.requirements import Requirement
 from tiny_study import FREEZE, SETTINGS, TINY
@@ -21,12 +22,11 @@ from cprl import presets
 from cprl.commands import main as cli
 from cprl.envs import CommonsGymnasiumEnv, parallel_env
 from cprl.envs.make_env import make_env
-from cprl.envs.matrix import stag_hunt
 
 PACKAGES = (
     *("algorithms", "commons", "envs", "evaluation", "experimental", "institutions", "keys"),
     *("learners", "measuring", "networks", "objectives", "policies", "population"),
-    *("studies", "theory", "training", "viewer"),
+    *("studies", "training", "viewer"),
 )
 """What users import."""
 TAKES_SECONDS = ("torch", "numba", "pyarrow", "scipy", "matplotlib", "rerun")

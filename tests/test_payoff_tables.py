@@ -8,20 +8,18 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from sharing_games import PowerWorth, SharingGame, herders
 
-from cprl.experimental.empirical_game import _draw_simplex
-from cprl.theory import (
+from cprl.experimental import (
     PayoffTable,
-    PowerWorth,
-    SharingGame,
     alpha_rank,
     compositions,
     equilibria,
-    herders,
     replicator,
     replicator_ends,
 )
-from cprl.theory import solutions as needed
+from cprl.experimental import solutions as needed
+from cprl.experimental.empirical_game import _draw_simplex
 
 DILEMMA = PayoffTable.of_pairs([[3, 0], [5, 1]])
 STAG_HUNT = PayoffTable.of_pairs([[4, 0], [3, 1]])

@@ -7,19 +7,9 @@ import pytest
 
 from cprl import Game, Rules, maps
 from cprl.commons.batch import Batch
-from cprl.commons.colours import (
-    APPLE,
-    BEAM,
-    FIRST_AGENT,
-    GROUND,
-    SELF,
-    WALL,
-    agent_colour,
-    agent_mark,
-    class_colour,
-    picture_colour,
-)
-from cprl.commons.picture import INK, agent_sprite, world_image
+from cprl.commons.cells import APPLE, BEAM, FIRST_AGENT, GROUND, SELF, WALL, class_colour
+from cprl.pictures.colours import agent_colour, agent_mark, picture_colour
+from cprl.pictures.image import INK, agent_sprite, world_image
 from cprl.viewer.board import mark, number, number_and_heading, strokes
 
 SEEN = {

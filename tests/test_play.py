@@ -10,7 +10,7 @@ import pytest
 import torch
 from stored_runs import command, stored
 
-from cprl import CommonsEnv, Game, Rules, keys, maps, presets
+from cprl import CommonsEnv, Game, River, Rules, keys, maps, presets
 from cprl.evaluation.play import Session, board_text, help_of, keys_of, open_session, play_in_terminal
 from cprl.measuring.episodes import EpisodeTracker
 
@@ -194,7 +194,8 @@ def test_a_game_without_a_beam_has_no_key_for_it():
 def test_keys_harvest_and_clean_where_the_game_has_these_actions(tmp_path, capsys):
     assert not {"h harvest", "c clean the river"} & set(help_of(MEADOW).split(", "))
     assert "h harvest" in help_of(presets.game("janssen/foraging-v1"))
-    rules = Rules(regrow_prob=(1.0,), may_clean=True, beam_width_cells=1, window_rows=3, window_columns=3)
+    river = River(may_clean=True)
+    rules = Rules(regrow_prob=(1.0,), river=river, beam_width_cells=1, window_rows=3, window_columns=3)
     env = CommonsEnv(Game(map=maps.parse("A>.~HH"), rules=rules), seed=0)
     session = Session(env, lambda moment: moment.set(keys.ACTION, torch.zeros(1, 1, dtype=torch.long)))
     assert text_of(session) == ["A 0>. ~ H H"]

@@ -303,10 +303,7 @@ def test_a_tabular_agent_is_a_member_like_any_other(tmp_path, capsys):
     chosen = first_of(Frozen(run, 2, replica=1)).choose(seen[:2].unsqueeze(1))
     assert chosen[:, 0].tolist() == table["values"][:2].argmax(1).tolist()
 
-    told = replace(GAME, observation=Observation(scoreboard=True))
-    with pytest.raises(ValueError, match=r'observe observation, scoreboard; .*scoreboard="planes"'):
-        population(members, game=told)
-    population(members, game=replace(GAME, observation=Observation(scoreboard="planes")))
+    population(members, game=replace(GAME, observation=Observation(scoreboard=True)))
 
 
 @pytest.mark.parametrize("reward_kind", ["individual", "team"])

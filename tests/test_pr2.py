@@ -7,6 +7,7 @@ from typing import ClassVar
 import pytest
 import torch
 from dqn_parts import make_learner, transitions
+from matrix_games import MatrixGame, stag_hunt
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SoftUpdate, ValueEstimators
@@ -14,7 +15,6 @@ from torchrl.objectives import SoftUpdate, ValueEstimators
 from cprl import CommonsEnv, Game, Rules, keys, maps
 from cprl.algorithms import PR2, VDN, DQNSettings
 from cprl.envs import make_env
-from cprl.envs.matrix import MatrixGame, stag_hunt
 from cprl.learners.engine import FunctionalEngine
 from cprl.learners.transitions import joint_actions
 from cprl.objectives import PR2Loss

@@ -4,13 +4,13 @@ import re
 from dataclasses import replace
 
 import pytest
+from boards import only_quirks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from valid_values import valid
 
 from cprl import CommonsEnv, Game, Rules, maps, presets
 from cprl.commons.published import GAMES
-from cprl.commons.readable import growth_of, legend_of, meaning_of, rule_of, tag_of
 from cprl.institutions import (
     Boundaries,
     ClosedPatches,
@@ -26,6 +26,7 @@ from cprl.institutions import (
     Vote,
 )
 from cprl.institutions.law import KINDS
+from cprl.pictures.readable import growth_of, legend_of, meaning_of, rule_of, tag_of
 
 COMMONS = presets.game("commons")
 AS_RUN = presets.game("commons", variant="as_run")
@@ -144,7 +145,7 @@ def test_what_is_said_of_a_tag_is_what_tags_do(hits, freeze, counts_tag_turn, le
         Punishment(fine=fine, cost=0.0),
         hits_to_tag=hits,
         freeze_steps=freeze,
-        freeze_counts_tag_turn=counts_tag_turn,
+        quirks=only_quirks(freeze_counts_tag_turn=counts_tag_turn),
         regrow_prob=(0.0,),
     )
     sentence = tag_of(game)

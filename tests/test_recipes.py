@@ -112,26 +112,6 @@ def test_agents_of_a_study_of_learners_meet_in_a_cross_play(tmp_path, monkeypatc
         cross_play.main(tmp_path / "few", episodes=1)
 
 
-def test_the_study_of_experiment_3_has_the_two_programs_and_each_difference_alone():
-    conditions = {
-        own.name: own.experiment for own in recipe("experiment_3", RECIPES / "study").STUDY.all_conditions
-    }
-    assert list(conditions) == ["as run", "gamma 0.999", "the fault", "10 April: both"]
-    of = {
-        variant: recipe("two_complex").experiment(variant=variant)
-        for variant in ("as_run", "as_run_10_april")
-    }
-    later, earlier = of["as_run"], of["as_run_10_april"]
-    assert {(own.episodes, own.replicas, own.seed) for own in conditions.values()} == {(6000, 8, 0)}
-    parts = {name: (own.game, own.agents) for name, own in conditions.items()}
-    assert parts == {
-        "as run": (later.game, later.agents),
-        "gamma 0.999": (later.game, earlier.agents),
-        "the fault": (earlier.game, later.agents),
-        "10 April: both": (earlier.game, earlier.agents),
-    }
-
-
 def run_recipe(name, out, *, own=None, watch="file", **changes):
     """Runs the experiment of a recipe, in miniature."""
     changes = {"replicas": 2, "evaluation_episodes": 1, "engine": "eager", **changes}
@@ -163,7 +143,6 @@ def test_the_table_of_where_learners_end_follows_from_what_was_measured(monkeypa
     assert capsys.readouterr().out in page
 
 
-BOARD_OF = {"two_against_random": "two_complex"}
 LANES = {"single_basic": 1, "single_complex": 1, "two_complex": 2, "two_against_random": 2, "commons": 4}
 
 
@@ -174,7 +153,6 @@ LANES = {"single_basic": 1, "single_complex": 1, "two_complex": 2, "two_against_
         pytest.param(name, variant, marks=[pytest.mark.slow] * (variant != "published"))
         for name in LANES
         for variant in presets.VARIANTS
-        if (BOARD_OF.get(name, name), variant) in presets.GAMES
     ],
 )
 def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, capsys):

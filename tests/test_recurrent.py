@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from dqn_parts import make_learner
+from matrix_games import stag_hunt
 from recall_game import Recall
 from stock_collector import stock_collector
 from stored_runs import returns
@@ -23,7 +24,6 @@ import cprl
 from cprl import CommonsEnv, Custom, Experiment, algorithms
 from cprl.algorithms import DQN, PPO, DQNSettings, LOLASettings, RolloutSettings
 from cprl.envs import make_env, spaces_of
-from cprl.envs.matrix import stag_hunt
 from cprl.evaluation.film import film
 from cprl.evaluation.play import open_session
 from cprl.experimental.movement import trace

@@ -12,14 +12,11 @@ from torchrl.modules import QValueActor
 from torchrl.objectives import ClipPPOLoss, DQNLoss, HardUpdate, KLPENPPOLoss, SoftUpdate, ValueEstimators
 
 from cprl import CommonsEnv, Observation
-from cprl.algorithms import A2C, DQN, PPO, QMIX
+from cprl.algorithms import A2C, DQN, PPO
 from cprl.algorithms.base import policy
-from cprl.learners.base import LearningAgents
 from cprl.learners.engine import ListEngine
 from cprl.learners.reference import TorchRLRolloutLearner
 from cprl.learners.rollouts import RolloutLearner
-from cprl.learners.settings import TabularSettings
-from cprl.learners.tabular import TabularLearner
 
 FLOATS = replace(SPACES, observation_dtype="float32", observation_scale=1.0)
 
@@ -166,24 +163,10 @@ def test_a_loss_that_reads_what_batches_do_not_have_is_refused_by_the_name_of_th
         rollout_learner(make_loss)
 
 
-@pytest.mark.parametrize("observed", [{"scoreboard": True}, {"stock_gauge": True}])
-def test_what_no_network_sees_is_refused_but_tables_read_it(observed):
-    spaces = replace(GAME, observation=Observation(**observed)).spaces
-    (name,) = observed
-    for algorithm in (DQN(settings=REPLAY), PPO(settings=ROLLOUTS)):
-        with pytest.raises(ValueError, match=rf'agents observe \("agents", "{name}"\); allowed for networks'):
-            algorithm.make_network(spaces)
-        with pytest.raises(ValueError, match=rf'Observation\({name}="planes"\)'):
-            algorithm.make_network(spaces)
-        with pytest.raises(ValueError, match=rf'agents observe \("agents", "{name}"\); allowed for networks'):
-            make_learner(algorithm, spaces, agents=(0,), replicas=1)
-    with pytest.raises(ValueError, match="allowed for networks"):
-        make_learner(QMIX(settings=REPLAY), spaces, agents=(0, 1), replicas=1, reward_kind="team")
-    TabularLearner(LearningAgents(spaces, agents=(0,), replicas=1), TabularSettings())
-    with pytest.raises(
-        ValueError, match=rf"Observation\.{name} is 'plane'; allowed: True or False or 'planes'"
-    ):
-        Observation(**{name: "plane"})
+@pytest.mark.parametrize("name", ["scoreboard", "stock_gauge"])
+def test_a_switch_of_observations_is_true_or_false(name):
+    with pytest.raises(ValueError, match=rf"Observation\.{name} is 'planes'; allowed: True or False"):
+        Observation(**{name: "planes"})
 
 
 class OnlyTheCritics(ClipPPOLoss):

@@ -9,8 +9,8 @@ from torchrl.envs import TransformedEnv
 from torchrl.record import PixelRenderTransform, VideoRecorder
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.commons.picture import world_image
 from cprl.envs import parallel_env
+from cprl.pictures.image import world_image
 
 MEADOW = Game(
     map=maps.parse(

@@ -7,12 +7,12 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from matrix_games import prisoners_dilemma
 from stored_runs import CORRIDORS, command, stored
 from test_course import LENGTHS, RISE_AND_FALL, told_of
 from viewers import browser, wait_until
 
 from cprl import Custom, presets
-from cprl.envs.matrix import prisoners_dilemma
 from cprl.evaluation import Fresh, evaluate_run
 from cprl.evaluation.show import show
 from cprl.institutions import Quota
@@ -99,6 +99,7 @@ def test_pictures_of_other_places_are_no_part_of_a_report(tmp_path):
 
 def test_a_game_without_a_board_has_a_report_without_an_episode(tmp_path):
     run = stored(tmp_path / "matrix", prisoners_dilemma(turns=2), "random")
+    trust("matrix_games:MatrixGame")
     text = report(run, episodes=2).read_text(encoding="utf-8")
     assert '"populations":[]' in text
     assert any(cell.startswith("agent 0") for cell in cells_of(text))

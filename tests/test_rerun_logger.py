@@ -23,8 +23,9 @@ from torchrl.record import VideoRecorder
 from torchrl.trainers import LogScalar, LogValidationReward, Trainer
 
 from cprl import CommonsEnv, Observation
-from cprl.commons.colours import APPLE, BEAM, COLOURS, FIRST_AGENT, GROUND, OTHER, PALETTE, SELF, WALL
-from cprl.commons.decoding import UNSEEN, classes_seen
+from cprl.commons.cells import APPLE, BEAM, COLOURS, FIRST_AGENT, GROUND, OTHER, SELF, WALL
+from cprl.pictures.colours import PALETTE
+from cprl.pictures.decoding import UNSEEN, classes_seen
 from cprl.viewer.board import boards, mosaic
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import EMPTY_SITE

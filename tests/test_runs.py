@@ -23,7 +23,7 @@ from tiny_study import TINY
 from torchrl.record.loggers import CSVLogger
 
 import cprl
-from cprl import presets
+from cprl import Rules, presets
 from cprl.algorithms import DQN
 from cprl.commands import main as cli
 from cprl.evaluation.film import film
@@ -122,6 +122,12 @@ def test_a_run_in_a_directory_of_any_name_is_trained_resumed_by_its_line_exporte
     assert film(started, Path("film.rrd"), replica=0, episode=0)[0].exists()
 
 
+OTHER_RULES = Rules(
+    beam_length_cells=2, beam_width_cells=1, hits_to_tag=3, freeze_steps=4, signals=1, cooldown_steps=2
+)
+"""Eight rules differ from those of `EXPERIMENT`: these, and the two of its window."""
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -130,8 +136,9 @@ def test_a_run_in_a_directory_of_any_name_is_trained_resumed_by_its_line_exporte
         ({"name": "two_complex"}, r"experiment\.name was .commons., is .two_complex.$"),
         (
             {"game": presets.game("commons", variant="as_run")},
-            r"game\.rules\.hits_to_tag was 1, is 2; .* 4 more$",
+            r"game\.rules\.hits_to_tag was 1, is 2; .*game\.rules\.quirks was None, is \{.*\}$",
         ),
+        ({"game": replace(EXPERIMENT.game, rules=OTHER_RULES)}, r"hits_to_tag was 1, is 3; .* 3 more$"),
     ],
 )
 def test_another_recipe_is_refused_by_what_differs(change, message, tmp_path):
@@ -152,7 +159,7 @@ def test_fields_that_a_later_version_has_are_no_difference_while_they_have_their
             recipe["experiment"].pop(name, None)
         for agent in recipe["experiment"]["agents"][:2]:
             del agent["algorithm"]["settings"]["steps_per_update"]
-        del recipe["experiment"]["game"]["rules"]["walls_block_sight"]
+        del recipe["experiment"]["game"]["rules"]["shuffle_starts"]
 
     edited(run, without_later_fields)
     assert resume(run, default) == EXPERIMENT.length

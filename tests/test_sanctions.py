@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from boards import Play
+from boards import Play, only_quirks
 
-from cprl import Observation, presets
+from cprl import Observation, Quirks2019, presets
 from cprl.institutions import Boundaries, GraduatedSanctions, Mediation, Monitoring, Quota, Tax
 
 OUTSIDE = Boundaries.drawn("........\n...0....", step_fine=1.0)
@@ -164,7 +164,8 @@ def test_agents_see_their_level():
 def test_the_quirk_counts_the_turn_of_the_sanction():
     for on, decides in (("tags", "beam"), ("violations", "stay")):
         sanctions = GraduatedSanctions(freeze_steps=(3,), fines=(0,), on=on)
-        play = Play(BOARD, institutions=[OUTSIDE, sanctions], freeze_counts_tag_turn=True)
+        quirks = only_quirks(freeze_counts_tag_turn=True)
+        play = Play(BOARD, institutions=[OUTSIDE, sanctions], quirks=quirks)
         assert missed(play.turn(decides, "stay")) == 2
 
 
@@ -270,10 +271,11 @@ def test_agents_see_who_violated_a_rule_of_late_their_own_mark_first():
 def test_as_run_everything_follows_in_the_same_way():
     # Two hits tag, and the turn of the tag counts: 25 missed turns are 24. The level of the tag is 0.
     rules = presets.game("two_complex", variant="as_run").rules
-    assert (rules.hits_to_tag, rules.freeze_counts_tag_turn, rules.pairwise_clashes) == (2, True, True)
-    quirks = {"hits_to_tag": 2, "freeze_counts_tag_turn": True, "pairwise_clashes": True}
+    assert (rules.hits_to_tag, rules.clashes, rules.quirks) == (2, "pairwise", Quirks2019())
+    quirks = only_quirks(freeze_counts_tag_turn=True)
+    as_run = {"hits_to_tag": 2, "clashes": "pairwise", "growth": "before_bites", "quirks": quirks}
     sanctions = GraduatedSanctions(freeze_steps=(25, 2), fines=(1,), recovery_steps=None, on="tags")
-    play = Play(BOARD, institutions=[sanctions, Tax(rate=0.5)], **quirks, regrow_before_bites=True)
+    play = Play(BOARD, institutions=[sanctions, Tax(rate=0.5)], **as_run)
     assert play.turn("beam", "stay").fines == [0, 0]
     assert play.turn("beam", "stay").fines == [0, 1]
     assert missed(play) == 24

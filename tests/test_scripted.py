@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from boards import Play, drawn
+from boards import Play, drawn, only_quirks
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cprl import CommonsEnv, Game, Observation, Rules, maps, presets
+from cprl import CommonsEnv, Game, Observation, River, Rules, maps, presets
 from cprl.commons.rules import ACTIONS
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.assignment import AgentPolicies
@@ -84,14 +84,16 @@ CROSS = """
     ("policy", "spare", "left"), [("sustainable", 3, 3), ("sustainable", 1, 1), ("greedy", 3, 0)]
 )
 def test_sustainable_leaves_spare_apples_of_a_patch(policy, spare, left, paint_over):
-    scene = Scene(CROSS, policy, worlds=8, spare=spare, may_fire=False, paint_over=paint_over)
+    quirks = only_quirks(paint_over=paint_over)
+    scene = Scene(CROSS, policy, worlds=8, spare=spare, may_fire=False, quirks=quirks)
     scene.go(200)
     assert scene.env.output.stock[:, 0].tolist() == [left] * 8
 
 
 @pytest.mark.parametrize("paint_over", [False, True])
 def test_sustainable_does_not_walk_over_an_apple_that_it_spares_not_even_under_its_own_mark(paint_over):
-    scene = Scene(">.A..", "sustainable", worlds=8, may_fire=False, paint_over=paint_over)
+    quirks = only_quirks(paint_over=paint_over)
+    scene = Scene(">.A..", "sustainable", worlds=8, may_fire=False, quirks=quirks)
     scene.go(100)
     assert scene.bitten == 0
     assert scene.env.worlds.now.col[:, 0].max() == 1
@@ -155,12 +157,6 @@ def test_aggressive_harvests_if_it_sees_no_agent():
     assert scene.bitten == 1
 
 
-@pytest.mark.parametrize("policy", ["greedy", "territorial", "aggressive", "pacifist"])
-def test_cells_out_of_sight_are_neither_ground_nor_agents(policy):
-    scene = Scene("..#A\n.>#.\n...A", policy, walls_block_sight=True, window_columns=3)
-    assert scene.go(1)[0].startswith("turn_"), "the wall ahead hides the cells behind it"
-
-
 @pytest.mark.parametrize(("policy", "goes"), [("greedy", 1.0), ("pacifist", 0.0)])
 def test_pacifist_leaves_an_apple_that_another_agent_is_nearer_to(policy, goes):
     scene = Scene("^..A.<\n......", policy, worlds=64)
@@ -181,7 +177,7 @@ def test_two_agents_that_want_one_cell_wait_at_random_until_one_gets_it():
 
 
 def test_agents_that_wait_stay_also_where_they_may_clean():
-    scene = Scene("~~~~\n>A<.", "greedy", worlds=64, may_clean=True)
+    scene = Scene("~~~~\n>A<.", "greedy", worlds=64, river=River(may_clean=True))
     chosen = scene.policy(scene.env.reset())["agents", "action"][:, 0].tolist()
     assert {scene.game.actions[action] for action in chosen} == {"forward", "stay"}
 
@@ -226,7 +222,7 @@ FORMS = [
     Observation(encoding="one_hot"),
     Observation(agents_apart=True),
     Observation(encoding="one_hot", agents_apart=True, stock_gauge=True),
-    Observation(scoreboard="planes", stock_gauge="planes"),
+    Observation(scoreboard=True, stock_gauge=True),
 ]
 
 
@@ -234,7 +230,7 @@ FORMS = [
 @pytest.mark.parametrize("policy", SCRIPTED_POLICIES)
 def test_actions_do_not_depend_on_the_form_of_the_observation(policy, may_fire):
     walled = maps.parse("A.A.#.A\n.>A.#AA\nA..v.A.\n..#A.<.")
-    rules = Rules(walls_block_sight=True, may_fire=may_fire, window_rows=4, window_columns=7)
+    rules = Rules(may_fire=may_fire, window_rows=4, window_columns=7)
     courses = []
     for form in FORMS:
         game = Game(map=walled, rules=rules, observation=form)

@@ -13,12 +13,12 @@ from stored_runs import CORRIDORS, command, stored
 from viewers import browser, wait_until
 
 from cprl import Custom, keys, presets
-from cprl.commons.colours import BEAM
-from cprl.commons.readable import growth_of, legend_of, meaning_of
+from cprl.commons.cells import BEAM
 from cprl.evaluation.fresh import fresh_episode, record
 from cprl.evaluation.show import show
 from cprl.institutions import Boundaries, Monitoring, Punishment, Quota, Tax
 from cprl.measuring.registry import SOCIAL
+from cprl.pictures.readable import growth_of, legend_of, meaning_of
 from cprl.values import trust
 
 COMMONS = presets.game("commons")

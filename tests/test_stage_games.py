@@ -1,4 +1,7 @@
-"""Matrix games and games of people who share: payments, what is seen, the clock, experiments of them."""
+"""Matrix games and games of people who share: payments, what is seen, the clock, experiments of them.
+
+They are games of one's own, of recipes/study/theory: all that they show, any user's game can.
+"""
 
 import json
 from dataclasses import replace
@@ -10,9 +13,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from matrix_games import MatrixGame, chicken, matching_pennies, prisoners_dilemma, stag_hunt
 from report import write_report
 from restorable import assert_restorable
 from same_runs import assert_same_training
+from sharing_games import CallableWorth, PowerWorth, SharingGame, appropriation, herders
+from taking_games import TakingGame
 from tensordict import TensorDict, assert_close
 from torchrl.envs.utils import check_env_specs
 
@@ -30,13 +36,10 @@ from cprl.algorithms import (
 )
 from cprl.commands.recipe import parse
 from cprl.envs import make_env, spaces_of
-from cprl.envs.matrix import MatrixGame, chicken, matching_pennies, prisoners_dilemma, stag_hunt
-from cprl.envs.taking import TakingGame
 from cprl.experiment import changes
 from cprl.measuring.table import by_replica, where
 from cprl.population import Learning, Team
 from cprl.studies.trials import trials_of
-from cprl.theory import CallableWorth, PowerWorth, SharingGame, appropriation, herders
 
 DONES = ("done", "terminated", "truncated")
 IPD = prisoners_dilemma(turns=3)
@@ -245,7 +248,7 @@ def test_agents_with_other_numbers_see_and_get_the_same_to_the_bit():
 
 
 def test_a_worth_of_the_users_own_is_a_game_by_the_name_of_the_function_that_makes_it():
-    with pytest.raises(ValueError, match=r"^experiment\.game\.sharing\.worth is a CallableWorth, which a re"):
+    with pytest.raises(ValueError, match=r"^SharingGame\.worth is a CallableWorth, which a recipe"):
         replace(HERDERS, game=own_game())
     experiment = replace(HERDERS, game=Custom("test_stage_games:own_game"))
     cprl.trust("test_stage_games:own_game")
@@ -387,10 +390,10 @@ HERDERS = replace(
 DEARER = replace(HERDERS, game=replace(HERDERS.game, sharing=herders(2, cost=2.0)))
 
 
+MATRIX, TAKING = "matrix_games:MatrixGame", "taking_games:TakingGame"
 SHARING = {
-    "kind": "SharingGame",
     "agents": 2,
-    "worth": {"kind": "PowerWorth", "top": 10, "factor": 1, "power": 2},
+    "worth": {"top": 10, "factor": 1, "power": 2},
     "cost": 1,
     "most_each": None,
     "payment": 0,
@@ -398,26 +401,34 @@ SHARING = {
 
 
 @pytest.mark.parametrize(
-    ("experiment", "table", "other", "change"),
+    ("experiment", "target", "arguments", "other", "change"),
     [
         (
             DILEMMA,
-            {"kind": "MatrixGame", "payoffs": [[[-1, -1], [-3, 0]], [[0, -3], [-2, -2]]]},
+            MATRIX,
+            {"payoffs": [[[-1, -1], [-3, 0]], [[0, -3], [-2, -2]]]},
             replace(DILEMMA, game=prisoners_dilemma(turns=6)),
-            "experiment.game.turns was 5, is 6",
+            "experiment.game.arguments.turns was 5, is 6",
         ),
         (
             HERDERS,
-            {"kind": "TakingGame", "sharing": SHARING, "levels": 5, "most": 2},
+            TAKING,
+            {"sharing": SHARING, "levels": 5, "most": 2},
             DEARER,
-            "experiment.game.sharing.cost was 1.0, is 2.0",
+            "experiment.game.arguments.sharing.cost was 1.0, is 2.0",
         ),
     ],
     ids=["matrix", "taking"],
 )
-def test_its_recipe_holds_it_and_gives_it_back_without_importing_anything(experiment, table, other, change):
+def test_its_recipe_holds_it_by_the_name_of_its_class_and_gives_it_back(
+    experiment, target, arguments, other, change
+):
     recipe = json.loads(json.dumps(experiment.to_recipe()))
-    assert recipe["experiment"]["game"] == {**table, "turns": 5, "memory": None, "continue_prob": 1}
+    whole = {**arguments, "turns": 5, "memory": None, "continue_prob": 1}
+    assert recipe["experiment"]["game"] == {"kind": "Custom", "target": target, "arguments": whole}
+    with pytest.raises(ValueError, match=f"--allow {target}"):
+        Experiment.from_recipe(recipe)
+    cprl.trust(target)
     back = Experiment.from_recipe(recipe)
     assert back == experiment
     assert (back.game, hash(back.game)) == (experiment.game, hash(experiment.game))
@@ -428,9 +439,10 @@ def test_its_recipe_holds_it_and_gives_it_back_without_importing_anything(experi
 @pytest.mark.parametrize(
     ("experiment", "third", "least", "most", "differing"),
     [
-        (DILEMMA, replace(DILEMMA, game=chicken(turns=5)), -15, 0, "MatrixGame.payoffs"),  # turns of -3 to 0
+        # Five turns of -3 to 0.
+        (DILEMMA, replace(DILEMMA, game=chicken(turns=5)), -15, 0, "MatrixGame.arguments.payoffs"),
         # Two animals bring 10 alone, and -2 where the other has two too.
-        (HERDERS, DEARER, -10, 50, "TakingGame.sharing"),
+        (HERDERS, DEARER, -10, 50, "TakingGame.arguments.sharing"),
     ],
     ids=["matrix", "taking"],
 )
@@ -443,7 +455,7 @@ def test_a_population_trains_stops_resumes_loads_and_meets_another(
     stopped(23, stopping, tmp_path / "parts")
     parts = cprl.run(stopping, tmp_path / "parts", watch="off", resume=True)
     assert_same_training(parts, whole)
-    cprl.trust("one_road_parts:Stopping")
+    cprl.trust("one_road_parts:Stopping", MATRIX, TAKING)
     loaded = cprl.load(whole)
     assert loaded.game == experiment.game
     found = cprl.estimates(cprl.evaluate_run(loaded, cprl.Fresh(episodes=4)), "agent_0/return", by="policy")
@@ -497,6 +509,7 @@ def test_their_numbers_are_flags_of_a_command_line():
     ],
 )
 def test_learners_of_every_kind_play_it(agents, engine, tmp_path):
+    cprl.trust(TAKING)
     experiment = replace(HERDERS, agents=agents, episodes=3, engine=engine)
     run = cprl.load(cprl.run(experiment, tmp_path / "run", watch="off"))
     found = cprl.estimates(cprl.evaluate_run(run, cprl.Fresh(episodes=2)), "agent_1/return", by="policy")
@@ -506,6 +519,7 @@ def test_learners_of_every_kind_play_it(agents, engine, tmp_path):
 @pytest.mark.slow
 def test_independent_tables_end_at_the_equilibrium_and_one_agent_at_the_optimum(tmp_path):
     """One agent takes 36 of 72 tokens; two, where each knows only what it got, 24 each."""
+    cprl.trust(TAKING)
     for agents, total in ((1, 36), (2, 48)):
         sharing = appropriation(agents, tokens=60.0)
         learner = TabularSettings(gamma=0.0, epsilon_decay_steps=5000, epsilon_end=0.02, epsilon_evaluation=0)
@@ -526,6 +540,7 @@ def test_independent_tables_end_at_the_equilibrium_and_one_agent_at_the_optimum(
 @pytest.mark.slow
 def test_dqn_learns_to_defect_in_the_one_shot_dilemma(tmp_path):
     """Defection is dominant, so five of five pairs end there: -2 each (a theorem, not a published figure)."""
+    cprl.trust(MATRIX)
     settings = replace(
         SMALL, learning_rate=1e-2, buffer_size=1000, epsilon_decay_steps=500, epsilon_evaluation=0.0
     )

@@ -10,19 +10,22 @@ import numpy as np
 import pytest
 import rerun as rr
 import torch
+from matrix_games import MatrixGame, chicken, matching_pennies, prisoners_dilemma, stag_hunt
 from recordings import GAME, SCENE, column, names, observing, static, strict_rerun
 from rerun.chunk import RrdReader
 from tensordict import TensorDict
 from test_how_it_goes import SIXTEEN_WORLDS
 from test_watch import connected, fake, received
+from torchrl.envs import StepCounter
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, agent_colour
-from cprl.commons.readable import rules_of
+from cprl.commons.cells import APPLE, GROUND, WALL
 from cprl.envs import make_env
-from cprl.envs.matrix import MatrixGame, chicken, matching_pennies, prisoners_dilemma
+from cprl.envs.unwrap import joint_actions
 from cprl.institutions import Quota, Tax, Vote
 from cprl.measuring import social
+from cprl.pictures.colours import PALETTE, agent_colour
+from cprl.pictures.readable import rules_of
 from cprl.policies.lanes import random_agents
 from cprl.runs.episodes import EpisodeTable
 from cprl.training import train
@@ -32,7 +35,7 @@ from cprl.viewer.layout import layout
 from cprl.viewer.live import LiveStream, Stream
 from cprl.viewer.logger import RerunLogger, as_table, send_waiting
 from cprl.viewer.pictures import Pictures, Samples, gini, lorenz_curve, visits_drawn
-from cprl.viewer.scene import Curves, Panels, curves_of, joint_actions, scene_of
+from cprl.viewer.scene import Curves, Panels, curves_of, scene_of
 from cprl.viewer.story import CompilingNotice, Header, played
 from cprl.viewer.views import Plots
 
@@ -340,11 +343,25 @@ def test_a_layout_has_the_views_of_what_a_game_reports_and_the_live_one_the_pres
 
 
 def test_joint_actions_are_named_by_letters_c_and_d_in_social_dilemmas():
-    assert joint_actions(prisoners_dilemma()) == joint_actions(chicken()) == ("CC", "CD", "DC", "DD")
-    assert joint_actions(matching_pennies()) == ("AA", "AB", "BA", "BB")
-    three = joint_actions(MatrixGame(np.zeros((2, 2, 2, 3))))
+    for game in (prisoners_dilemma(), chicken()):
+        assert joint_actions(make_env(game)) == ("CC", "CD", "DC", "DD")
+    assert joint_actions(make_env(matching_pennies())) == ("AA", "AB", "BA", "BB")
+    three = joint_actions(make_env(MatrixGame(np.zeros((2, 2, 2, 3)))))
     assert three[:3] == ("AAA", "AAB", "ABA")
-    assert joint_actions(MatrixGame(np.zeros((5, 5, 2)))) == (), "too many for lines"
+    assert joint_actions(make_env(MatrixGame(np.zeros((5, 5, 2))))) == (), "too many for lines"
+
+
+def test_a_game_of_ones_own_names_its_joint_actions():
+    env = make_env(stag_hunt(), transforms=[StepCounter()])
+    env.base_env.joint_actions = ["both", "first", "second", "none"]
+    assert joint_actions(env) == ("both", "first", "second", "none")
+    assert curves_of(env, ("a", "b"), (), episodes=9).joint == joint_actions(env)
+    env.base_env.joint_actions = ["both", "none"]
+    with pytest.raises(ValueError, match="joint_actions of the environment has 2 names"):
+        joint_actions(env)
+    larger = make_env(MatrixGame(np.zeros((5, 5, 2))))
+    larger.joint_actions = [str(number) for number in range(25)]
+    assert curves_of(larger, ("a", "b"), (), episodes=9).joint == (), "too many for lines"
 
 
 def test_a_recording_of_a_matrix_game_has_the_sum_of_returns_and_shares_of_joint_actions(tmp_path):

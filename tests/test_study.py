@@ -25,6 +25,7 @@ from report import write_report
 from results import dip_depth, pooled, read_result, returns_by_chance, study_of
 from tragedies import DEFINITIONS, METRICS, combat
 from verdicts import CONTRADICTED, NOT_CONTRADICTED, curve_prediction, prediction, share
+from yield_bounds import yield_bounds
 
 import cprl
 from cprl import Game, Rules, maps, presets
@@ -36,7 +37,6 @@ from cprl.population import Learning, Scripted
 from cprl.runs.curves import as_curves, curves_of
 from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
-from cprl.theory import yield_bounds
 from cprl.values import Custom, trusting
 
 EPISODES = np.arange(4800)
@@ -66,7 +66,7 @@ CROSS = Game(
         >.A..
         """
     ),
-    rules=Rules(window_rows=3, window_columns=3, episode_steps=300, regrow_before_bites=True),
+    rules=Rules(window_rows=3, window_columns=3, episode_steps=300, growth="before_bites"),
 )
 """One agent and an isolated cross, which bears a tenth of an apple a turn."""
 

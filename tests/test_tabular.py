@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 from dqn_parts import q_table
+from matrix_games import prisoners_dilemma
 
 from cprl import CommonsEnv, Game, Observation, Rules, maps
 from cprl.envs import make_env, spaces_of
-from cprl.envs.matrix import prisoners_dilemma
 from cprl.learners.base import LearningAgents
 from cprl.learners.settings import TabularSettings
 from cprl.learners.tabular import TabularLearner
@@ -106,8 +106,7 @@ def true_states(env):
 
 
 def observed(agents):
-    seen, gauge = agents["observation"].numpy(), agents["stock_gauge"].numpy()
-    return [s.tobytes() + g.tobytes() for s, g in zip(seen[:, 0], gauge[:, 0], strict=True)]
+    return [seen.tobytes() for seen in agents["observation"].numpy()[:, 0]]
 
 
 def played(game, *, worlds, turns):

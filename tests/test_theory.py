@@ -8,12 +8,13 @@ import pytest
 from exact_yields import TOLERANCE, exact_yield
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sharing_games import CallableWorth, PowerWorth, SharingGame, appropriation, herders
 from test_yields import AS_RUN, CROSS, PUBLISHED
+from yield_bounds import yield_bounds
 
 from cprl import Map, Rules, maps, presets
 from cprl.commons.near import sites_around
 from cprl.commons.yields import sustainable_yield
-from cprl.theory import CallableWorth, PowerWorth, SharingGame, appropriation, herders, yield_bounds
 
 
 @pytest.mark.parametrize(
@@ -145,7 +146,7 @@ def test_a_cross_bears_a_tenth_of_an_apple_a_turn_and_keeps_three():
 def test_a_pair_is_worked_by_hand():
     # Two sites near each other, 1/2 with one apple near and nothing with none: one is kept for ever.
     pair = maps.parse("AA>")
-    rules = Rules(regrow_prob=(0.0, 0.5), regrow_before_bites=True)
+    rules = Rules(regrow_prob=(0.0, 0.5), growth="before_bites")
     assert exact_yield(pair, rules).per_step == pytest.approx(0.5)
     both = yield_bounds(pair, rules)
     assert (both.at_least, both.at_most, both.is_exact, both.stock.sum()) == (0.5, 0.5, True, 1)
@@ -158,7 +159,7 @@ def test_a_pair_is_worked_by_hand():
 
 
 def test_a_pair_bears_less_where_nothing_grows_under_agents():
-    rules = Rules(regrow_prob=(0.0, 0.5), regrow_before_bites=True, regrow_under_agents=False)
+    rules = Rules(regrow_prob=(0.0, 0.5), growth="before_bites", regrow_under_agents=False)
     bounds = yield_bounds(maps.parse("AA>"), rules)
     assert (bounds.at_least, bounds.at_most) == pytest.approx((1 / 3, 1 / 2))
 
@@ -168,7 +169,7 @@ def test_the_bounds_follow_what_growth_depends_on(regrow_by, per_step):
     # By count the middle site grows with 0.5 between two apples. By share the other two do beside one, 0.5
     # each; or with 0.2 each where the site itself, empty, counts as the half of those near.
     rules = Rules(
-        regrow_prob=(0.0, 0.2, 0.5), regrow_radius_cells=1, regrow_by=regrow_by, regrow_before_bites=True
+        regrow_prob=(0.0, 0.2, 0.5), regrow_radius_cells=1, regrow_by=regrow_by, growth="before_bites"
     )
     bounds = yield_bounds(maps.parse("AAA>"), rules)
     assert (bounds.at_least, bounds.at_most) == pytest.approx((per_step, per_step))
@@ -191,15 +192,15 @@ def boards(draw):
 @given(
     board=boards(),
     probs=st.lists(st.sampled_from([0.0, 0.05, 0.2, 0.5, 1.0]), min_size=1, max_size=5),
-    before=st.booleans(),
+    growth=st.sampled_from(["from_start", "before_bites"]),
 )
-def test_the_exact_yield_lies_between_the_bounds(board, probs, before):
-    rules = Rules(regrow_prob=tuple(probs), regrow_before_bites=before)
+def test_the_exact_yield_lies_between_the_bounds(board, probs, growth):
+    rules = Rules(regrow_prob=tuple(probs), growth=growth)
     exact = exact_yield(board, rules).per_step
     bounds = yield_bounds(board, rules)
     assert sustainable_yield(board, rules) - 1e-8 <= bounds.at_least <= exact + 1e-8
     assert exact <= bounds.at_most + 1e-8
-    if before:
+    if growth == "before_bites":
         assert bounds.is_exact or list(probs) != sorted(probs)
     assert exact_yield(board, rules, bites_per_step=1).per_step <= min(exact, 1) + 1e-8
     assert exact_yield(board, rules, sees_growth=True).per_step >= exact - 1e-8
@@ -208,7 +209,7 @@ def test_the_exact_yield_lies_between_the_bounds(board, probs, before):
 @settings(deadline=None, max_examples=25)
 @given(board=boards(), probs=st.lists(st.sampled_from([0.0, 0.05, 0.2, 0.5, 1.0]), min_size=1, max_size=5))
 def test_no_stock_grows_faster_than_the_bound(board, probs):
-    rules = Rules(regrow_prob=tuple(probs), regrow_before_bites=True)
+    rules = Rules(regrow_prob=tuple(probs), growth="before_bites")
     growths = [
         sum(
             probs[min(sum(stock[other] for other in others), len(probs) - 1)]
@@ -225,7 +226,7 @@ def test_no_stock_grows_faster_than_the_bound(board, probs):
 
 def test_what_is_kept_is_worth_its_own_growth_where_more_apples_near_mean_less():
     cross = maps.parse(".A.\nAAA\n.A>")
-    rules = Rules(regrow_prob=(0.05, 0.02), regrow_before_bites=True)
+    rules = Rules(regrow_prob=(0.05, 0.02), growth="before_bites")
     bounds, exact = yield_bounds(cross, rules), exact_yield(cross, rules).per_step
     assert bounds.at_least == pytest.approx(0.25)
     assert bounds.at_most == pytest.approx(exact) == pytest.approx(0.25)

@@ -10,7 +10,10 @@ import torch
 from boards import random_actions
 from governed import EVERYTHING as GOVERNED
 from governed import random_decisions
+from matrix_games import prisoners_dilemma
 from restorable import assert_restorable
+from sharing_games import herders
+from taking_games import TakingGame
 from tensordict import TensorDict, assert_close
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
@@ -27,12 +30,9 @@ from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Game, Observation, Rules, keys, maps, presets
 from cprl.envs import make_env
-from cprl.envs.matrix import prisoners_dilemma
 from cprl.envs.state import load_transforms_state, transforms_state
-from cprl.envs.taking import TakingGame
 from cprl.institutions import COUNTS
 from cprl.system.compat import LeanStepEnv
-from cprl.theory import herders
 
 SHORT = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -161,7 +161,7 @@ def test_a_mask_resets_only_the_marked_worlds(game):
 def test_the_lean_step_equals_torchrls_own_and_what_was_returned_never_changes_later(game):
     if isinstance(game, str):
         game = presets.game(game)
-        game = replace(game, rules=replace(game.rules, episode_steps=4, end_prob=0.0))
+        game = replace(game, rules=replace(game.rules, episode_steps=4, random_end=None))
     lean, stock = (make_env(game, worlds=4, seed=2) for _ in range(2))
     assert type(lean)._step_and_maybe_reset is LeanStepEnv._step_and_maybe_reset
     torch.manual_seed(0)

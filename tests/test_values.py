@@ -13,6 +13,8 @@ import pytest
 import torch
 from dqn_parts import make_learner
 from my_game import Callback, Dilemma
+from sharing_games import appropriation, herders
+from taking_games import TakingGame
 from valid_values import EVERY
 
 from cprl import Custom, Experiment, Game, Observation, Rules, institutions, maps, presets
@@ -29,8 +31,6 @@ from cprl.algorithms import (
     TabularSettings,
 )
 from cprl.commands.recipe import parse
-from cprl.envs.matrix import MatrixGame
-from cprl.envs.taking import TakingGame
 from cprl.experiment import changes
 from cprl.institutions import Tax
 from cprl.learners.base import LearningAgents
@@ -38,12 +38,10 @@ from cprl.learners.settings import Exploring
 from cprl.networks import GRU, LSTM, Conv
 from cprl.objectives.preferences import SocialValueOrientation
 from cprl.policies.decisions import Bandit
-from cprl.policies.rng import LaneRng
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.files import read_json
 from cprl.runs.recipe import read_recipe
 from cprl.system.memory import TooLargeError
-from cprl.theory import appropriation, herders
 from cprl.training.running import run
 from cprl.values import KINDS, custom_targets, described, differences, from_config, to_config, trust, trusting
 
@@ -282,41 +280,29 @@ def test_who_learns_cannot_be_agents_and_replicas_that_there_are_not():
             LearningAgents(SPACES, **{"agents": (0, 1), "replicas": 1, field: value})
 
 
-WIDE = (2**16,) * 64
-MANY = {**HOW, "replicas": 2**20}
+TOO_LARGE = DQNSettings(buffer_size=2**40 - 1)
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "how", "cure"),
-    [
-        (DQN(settings=DQNSettings(buffer_size=2**40 - 1)), HOW, "buffer_size"),
-        (DQN(settings=DQNSettings(batch_size=2**31 - 1)), HOW, "batch_size"),
-        (DQN(settings=DQNSettings(hidden_cells=WIDE)), HOW, "smaller layers"),
-        (DQN(settings=REPLAY, network=Conv(channels=WIDE)), HOW, "smaller layers"),
-        (DQN(settings=DQNSettings(hidden_cells=WIDE[:1])), {**HOW, "replicas": 200}, "400 learners"),
-        (DQN(settings=REPLAY), MANY, "fewer replicas"),
-        (PPO(settings=RolloutSettings(rollout_steps=2**28, minibatch_size=1)), HOW, "2 (learners|agents)"),
-    ],
-)
 @pytest.mark.parametrize("engine", ["eager", "torchrl"])
-def test_what_no_memory_has_is_refused_before_it_is_allocated(algorithm, how, engine, cure, monkeypatch):
-    for place in ("system.memory", "learners.ring"):
-        monkeypatch.setattr(f"cprl.{place}.free_bytes", lambda device="cpu": 2 * 2**30)
-    with pytest.raises(TooLargeError, match=cure):
-        make_learner(algorithm, SPACES, **{**how, "engine": engine})
-
-
-def test_tables_random_numbers_and_evaluations_that_no_memory_has_are_refused_too(tmp_path, monkeypatch):
+def test_a_replay_buffer_that_no_memory_has_is_refused_before_it_is_allocated(engine):
+    with pytest.raises(TooLargeError, match=r"^the replay buffers of .* are free: use a smaller "):
+        make_learner(DQN(settings=TOO_LARGE), SPACES, **{**HOW, "engine": engine})
     assert issubclass(TooLargeError, ValueError)
     assert issubclass(TooLargeError, MemoryError)
-    with pytest.raises(TooLargeError, match=r"^random numbers of 2 agents, 2,147,483,647 a"):
-        LaneRng([(0,), (1,)], 2**31 - 1)
-    monkeypatch.setattr("cprl.system.memory.free_bytes", lambda device="cpu": 2 * 2**30)
-    with pytest.raises(TooLargeError, match="1048576 replicas of 2 agents take 8"):
-        make_learner(Tabular(settings=TABLES), SPACES, **MANY)
+
+
+@pytest.mark.parametrize("engine", ["compiled", "torchrl"])
+def test_a_replay_buffer_that_no_memory_has_is_refused_before_anything_is_written(engine, tmp_path):
+    agents = [Learning(DQN(settings=TOO_LARGE))] * 2
+    with pytest.raises(TooLargeError, match="smaller buffer_size"):
+        run(replace(EXPERIMENT, agents=agents, engine=engine), tmp_path / "run", watch="off")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_evaluation_that_no_memory_has_is_refused_before_anything_is_written(tmp_path, monkeypatch):
     monkeypatch.setattr("cprl.system.memory.free_bytes", lambda device="cpu": 50 * 2**20)
-    with pytest.raises(TooLargeError, match=r"random numbers of 2 agents, .* fewer evaluation"):
-        run(replace(EXPERIMENT, evaluation_episodes=1000), tmp_path / "run", watch="off")
+    with pytest.raises(TooLargeError, match=r"^worlds is 1,048,576: .* use fewer worlds"):
+        run(replace(EXPERIMENT, evaluation_episodes=2**20), tmp_path / "run", watch="off")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -337,7 +323,6 @@ UNUSUAL = (
         decisions=Bandit(step_size=1e-6),
     ),
     Team(LOLA(settings=LOLASettings(), estimator="dice"), agents=(0, 2), reward="individual"),
-    MatrixGame((((((1.0,) * 4,) * 2,) * 2,) * 2,) * 2, turns=3, memory=2, continue_prob=0.9),
     Game(
         map=BOARD,
         rules=Rules(regrow_prob=(0.0, 5e-9), beam_length_cells=(1, 2, 3, 4), shuffle_starts=True),

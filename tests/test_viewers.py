@@ -18,8 +18,9 @@ from test_exhibition import ALONE, population_of
 from test_story import headers
 from viewers import browser, native_viewer, wait_until
 
-from cprl.commons.colours import APPLE, PALETTE, agent_colour
+from cprl.commons.cells import APPLE
 from cprl.measuring.registry import colour
+from cprl.pictures.colours import PALETTE, agent_colour
 from cprl.training.outcome import exhibited
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.live import served

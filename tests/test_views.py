@@ -1,10 +1,13 @@
 """Windows, drawn as signs: `S` self, `o` other agents, `m` heading marks, `b` beams."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from boards import Play, drawn
+from boards import Play, drawn, only_quirks
 
-from cprl.commons.colours import APPLE, GROUND, MARK, OTHER, WALL
+from cprl import Observation, maps
+from cprl.commons.cells import APPLE, GROUND, MARK, OTHER, WALL
 
 
 def windows(play, *agents):
@@ -57,7 +60,8 @@ FIRE_OVER_APPLES = drawn(
     [(False, ["bob", "bbb", "bob", "bbb", "AAb", "AS."]), (True, ["bbb", "bbb", "bbb", "bbb", "bbb", "AS."])],
 )
 def test_marks_and_beams_are_painted_over_apples_and_agents_as_run_alone(paint_over, seen):
-    play = Play(FIRE_OVER_APPLES, window_rows=6, window_columns=3, paint_over=paint_over, hits_to_tag=2)
+    quirks = only_quirks(paint_over=paint_over)
+    play = Play(FIRE_OVER_APPLES, window_rows=6, window_columns=3, quirks=quirks, hits_to_tag=2)
     play.turn("beam", "stay", "stay")
     assert play.in_play == [True, True, True]
     assert windows(play, 0) == [seen]
@@ -90,14 +94,15 @@ FACING_DOWN = "....\n.v..\n...A\n>..."
 
 def test_the_mark_shows_the_heading_and_as_run_it_is_behind_an_agent_that_faces_down():
     ahead = Play(FACING_DOWN, window_rows=4, window_columns=3)
-    behind = Play(FACING_DOWN, window_rows=4, window_columns=3, mark_behind_if_vertical=True)
+    quirks = only_quirks(mark_behind_if_vertical=True)
+    behind = Play(FACING_DOWN, window_rows=4, window_columns=3, quirks=quirks)
     assert windows(ahead, 0, 1) == [["###", ".mo", ".m.", ".S."], ["A.#", "..#", "mm#", ".S#"]]
     assert windows(behind, 0, 1) == [["###", ".mo", "...", ".S."], ["A.#", "..#", ".m#", ".S#"]]
 
 
 @pytest.mark.parametrize(("old_stock", "ahead"), [(False, "A"), (True, "m")])
 def test_as_run_the_picture_shows_the_apples_of_the_start_of_the_turn(old_stock, ahead):
-    rules = {"regrow_prob": (0.0, 1.0), "picture_shows_old_stock": old_stock}
+    rules = {"regrow_prob": (0.0, 1.0), "quirks": only_quirks(picture_shows_old_stock=old_stock)}
     play = Play("A.A\n^..", window_rows=2, window_columns=3, **rules).turn("forward")
     play.turn("backward")
     assert play.output.regrown[0, 0] == 1, "the apple bitten has grown again"
@@ -107,14 +112,15 @@ def test_as_run_the_picture_shows_the_apples_of_the_start_of_the_turn(old_stock,
 
 def test_as_run_the_cells_of_earlier_agents_stay_painted_as_self():
     board = "A....\n.>.<."
-    stays = Play(board, window_rows=3, window_columns=3, self_paint_stays=True)
+    stays = Play(board, window_rows=3, window_columns=3, quirks=only_quirks(self_paint_stays=True))
     goes = Play(board, window_rows=3, window_columns=3)
     assert windows(goes, 0, 1) == [[".o#", ".m#", ".S#"], ["#o.", "#m.", "#S."]]
     assert windows(stays, 0, 1) == [[".o#", ".m#", ".S#"], ["#S.", "#m.", "#S."]]
 
 
 def test_as_run_the_mark_of_a_later_agent_covers_an_earlier_agent():
-    covered = Play("A....\n..<<.", window_rows=3, window_columns=3, paint_over=True)
+    quirks = only_quirks(paint_over=True)
+    covered = Play("A....\n..<<.", window_rows=3, window_columns=3, quirks=quirks)
     seen = Play("A....\n..<<.", window_rows=3, window_columns=3)
     assert windows(covered, 1) == [["#m.", "#m.", "#S."]]
     assert windows(seen, 1) == [["#m.", "#o.", "#S."]]
@@ -125,3 +131,28 @@ def test_boards_show_the_classes_of_all_cells():
     shown = play.batch.boards(play.output)[0]
     expected = [[APPLE, GROUND, WALL], [GROUND, OTHER, MARK], [GROUND, GROUND, GROUND]]
     assert np.array_equal(shown, expected)
+
+
+WHOLE = Observation(area="full")
+
+
+def test_a_beam_is_drawn_from_where_it_was_fired_also_if_its_shooter_was_tagged_and_is_elsewhere():
+    board = replace(maps.parse(">...<A\n......\n......"), spawns=((2, 0), (2, 5)))
+    rules = {"freeze_steps": 0, "respawn_at_spawns": True, "beam_length_cells": 4, "beam_width_cells": 1}
+    play = Play(board, observation=WHOLE, **rules).turn("beam")
+    assert play.output.tagged_by[0].tolist() == [[False, True], [True, False]]
+    assert sorted(play.places) == [(2, 0), (2, 5)]
+    assert play.window(0).splitlines()[0] == "bbbbbA", "both beams, over the places that their shooters left"
+    assert sorted("".join(play.window(0).splitlines()[1:]).replace(".", "")) == ["S", "o"]
+    copy = Play(board, observation=WHOLE, **rules).put(**play.batch.state())
+    assert copy.window(0) == play.window(0), "the place of a shot is part of the state"
+
+
+def test_an_agent_that_is_tagged_and_misses_no_turn_is_in_play_and_drawn():
+    play = Play(">..<A", freeze_steps=0, observation=WHOLE).turn("beam", "stay")
+    assert play.output.tagged_by[0, 1, 0]
+    assert play.in_play == [True, True]
+    assert play.window(0) == "SbboA"
+    frozen = Play(">..<A", freeze_steps=1, observation=WHOLE).turn("beam", "stay")
+    assert frozen.in_play == [True, False]
+    assert frozen.window(0) == "SbbbA"

@@ -25,13 +25,13 @@ SHORT = (
 )
 TRAINED = f"run two_complex {SHORT} --replicas 2 --watch file --keep-checkpoint"
 OF_A_USER = """
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cprl
 from cprl import CommonsEnv, Game, Rules, maps, presets
 from cprl.algorithms import DQN
 from cprl.envs import make_env
-from cprl.envs.matrix import MatrixGame
+from cprl.envs.make_env import PlayableGame
 from cprl.population import Learning
 
 
@@ -42,10 +42,21 @@ def experiment(*, freeze_steps: int = 5) -> cprl.Experiment:
     return cprl.Experiment(name="mine", game=replace(game, rules=rules), agents=(agent,) * 2, episodes=2)
 
 
+@dataclass(frozen=True)
+class Chicken:
+    agents: int = 2
+
+    def to_config(self) -> dict[str, int]:
+        return {"agents": self.agents}
+
+    def make(self, worlds: int, seed: int, device: object) -> CommonsEnv:
+        raise NotImplementedError
+
+
 env = CommonsEnv(Game(map=maps.parse("A.>"), rules=Rules(freeze_steps=3)), worlds=2)
 worlds = make_env(experiment().game, worlds=2)
 study = cprl.Study(experiment(), {"game.rules.freeze_steps": [5, 25]}, replicas=2)
-chicken = MatrixGame([[[6, 6], [2, 7]], [[7, 2], [0, 0]]])
+chicken: PlayableGame = Chicken()
 names: list[str] = [field for field in experiment().to_config()]
 """
 """What a user might write; it holds no type but those of cprl."""
@@ -191,6 +202,22 @@ def test_a_printed_recipe_of_a_study_finds_what_it_imports(name, bare, tmp_path)
     (tmp_path / "mine.py").write_text(bare.cprl(f"recipe {name}"))
     assert "0 of" in bare.python("mine.py", "--dry-run", cwd=tmp_path)
     assert "0 of" in bare.cprl(f"run {name} --dry-run", cwd=tmp_path)
+
+
+PLAYED = """
+from matrix_games import chicken
+
+from cprl.envs import make_env
+
+print(make_env(chicken(turns=5), worlds=2).rollout(9)["next", "agents", "reward"].shape)
+"""
+
+
+@pytest.mark.parametrize(("name", "code"), [("study/theory/matrix_games", PLAYED)])
+def test_a_printed_game_of_ones_own_is_played_anywhere(name, code, bare, tmp_path):
+    (tmp_path / f"{Path(name).name}.py").write_text(bare.cprl(f"recipe {name}"))
+    (tmp_path / "mine.py").write_text(code)
+    assert "[2, 5, 2, 1]" in bare.python("mine.py", cwd=tmp_path)
 
 
 def test_the_types_of_the_wheel_serve_a_users_file(bare):

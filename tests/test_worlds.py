@@ -3,19 +3,19 @@
 import itertools
 import pickle
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from boards import assert_same, copied, kept, play_on, played, random_actions
+from boards import assert_same, copied, only_quirks, play_on, played, random_actions
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cprl import Game, Map, Rules, maps, presets
-from cprl.commons import compiled, loops
+from cprl import CommonsEnv, Game, Map, Rules, maps, presets
+from cprl.commons import apples, beam, compiled, loops
 from cprl.commons.batch import Batch
+from cprl.commons.headings import COL_STEP, ROW_STEP
 from cprl.commons.near import sites_around
-from cprl.commons.world import COL_STEP, ROW_STEP, empty_scratch
+from cprl.institutions import sanctions
 
 # Random walls and boundaries may part all agents from all apples.
 pytestmark = pytest.mark.filterwarnings("ignore:no agent can harvest:UserWarning")
@@ -163,15 +163,17 @@ def test_the_game_does_not_depend_on_agent_indices(game, seed, random):
 
 
 @SOME
-@given(games(), st.booleans(), SEEDS)
-def test_apples_are_conserved_and_counted(game, regrow_before_bites, seed):
-    check_apples(replace(game, rules=replace(game.rules, regrow_before_bites=regrow_before_bites)), seed)
+@given(games(), st.sampled_from(["from_start", "before_bites"]), SEEDS)
+def test_apples_are_conserved_and_counted(game, growth, seed):
+    check_apples(replace(game, rules=replace(game.rules, growth=growth)), seed)
 
 
 @SOME
 @given(games(freeze_steps=3), st.booleans(), SEEDS)
 def test_no_agent_out_of_play_acts(game, as_run, seed):
-    rules = replace(game.rules, pairwise_clashes=as_run, freeze_counts_tag_turn=as_run)
+    clashes = "pairwise" if as_run else "all_back"
+    quirks = only_quirks(freeze_counts_tag_turn=True) if as_run else None
+    rules = replace(game.rules, clashes=clashes, quirks=quirks)
     check_no_agent_out_of_play_acts(replace(game, rules=rules), seed)
 
 
@@ -185,11 +187,10 @@ CROWDED = "A>#A.\n.v.<A\n#A.^#"
 """Walls between agents that often meet."""
 
 
-@pytest.mark.parametrize("sight", [False, True], ids=["open", "walls block sight"])
 @pytest.mark.parametrize("board", ["single", "multiple", "none", "unequal", "crowded"])
-def test_the_invariants_hold_on_the_boards_with_walls(board, sight):
+def test_the_invariants_hold_on_the_boards_with_walls(board):
     drawn = maps.parse(CROWDED) if board == "crowded" else maps.rooms(board)
-    game = Game(map=drawn, rules=Rules(walls_block_sight=sight, regrow_prob=(0, 0.1, 0.3), freeze_steps=4))
+    game = Game(map=drawn, rules=Rules(regrow_prob=(0, 0.1, 0.3), freeze_steps=4))
     check_places(game, 1)
     check_agent_indices_do_not_matter(game, 2, list(np.random.default_rng(0).permutation(game.agents)))
     check_apples(game, 3)
@@ -249,30 +250,53 @@ def test_a_cache_folder_that_is_not_writable_brings_a_warning(tmp_path):
         assert not compiled._can_write(blocked / "folder")
 
 
-def test_a_changed_rule_changes_the_cache_folder(tmp_path, monkeypatch):
-    for source in Path(compiled.__file__).parent.glob("*.py"):
-        (tmp_path / source.name).write_bytes(source.read_bytes())
-    monkeypatch.setattr(compiled, "__file__", str(tmp_path / "compiled.py"))
-    before = compiled._fingerprint()
-    (tmp_path / "moves.py").write_text((tmp_path / "moves.py").read_text() + "\n")
-    assert compiled._fingerprint() != before
+def test_only_a_changed_rule_changes_the_key_of_what_calls_it(monkeypatch):
+    run, show, check = map(compiled.code_key, loops.ENTRIES)
+    beside = compiled.code_key(beam.beam_begin)
+
+    def keys():
+        return list(map(compiled.code_key, loops.ENTRIES))
+
+    def beam_begin(tables, side):
+        """Another docstring."""
+        # A comment.
+        return 0 if tables.beam_from_beside and side != 0 else 1
+
+    monkeypatch.setattr(beam.beam_begin, "__code__", beam_begin.__code__.replace(co_name="beam_begin"))
+    assert compiled.code_key(beam.beam_begin) == beside
+    assert keys() == [run, show, check]
+    monkeypatch.setattr(beam.beam_begin, "__code__", (lambda tables, side: 2).__code__)
+    assert keys()[0] != run
+    assert keys()[1] != show
+    assert keys()[2] == check
+    monkeypatch.undo()
+    assert keys() == [run, show, check]
+    monkeypatch.setattr(sanctions, "SANCTIONS", 7)
+    assert keys()[0] != run, "the same constant of another module is as before"
+    monkeypatch.undo()
+    monkeypatch.setattr(apples, "AFTER_BITES", 7)
+    assert keys()[0] != run
+    assert keys()[1] == show, "a board is drawn without a harvest"
 
 
+@pytest.mark.skipif(compiled.runs_plain(), reason="all rules are plain Python")
+@pytest.mark.parametrize("name", [*presets.BOARDS, "ssd/cleanup-v1"])
 @pytest.mark.parametrize("variant", presets.VARIANTS)
-def test_the_rules_play_the_same_game_without_compilation(variant):
-    # Numba's CUDA simulator runs them in this way.
-    game = presets.game("two_complex", variant=variant)
-    plain = compiled.compiled(loops.ENTRIES, lambda function: function)
-    actions = random_actions(25, 2, game, seed=1)
-    batch = Batch(game, 2, seed=1)
-    scratch = empty_scratch(game)
-    output = batch.new_output()
-    arrays = loops.Played(batch.now, game.tables, output, None, None, None)
-    plain["begin_worlds"](arrays, np.ones(2, np.bool_), scratch, 0, 2)
-    for turn, expected in zip([None, *actions], played(game, actions, seed=1), strict=True):
-        if turn is not None:
-            plain["play_worlds"](arrays, turn, scratch, 0, 2)
-        assert_same(kept(batch, output), expected)
+def test_the_rules_play_the_same_game_as_plain_python(name, variant, monkeypatch):
+    if name not in presets.BOARDS and variant != "published":
+        pytest.skip("has no variant")
+    game = presets.game(name, variant=variant)
+    actions = random_actions(12, 2, game, seed=1)
+    expected = played(game, actions, seed=1)
+    monkeypatch.setenv(compiled.RULES_VARIABLE, compiled.PLAIN)
+    for one, other in zip(played(game, actions, seed=1), expected, strict=True):
+        assert_same(one, other)
+
+
+def test_another_word_for_how_rules_run_is_refused(monkeypatch):
+    monkeypatch.setenv(compiled.RULES_VARIABLE, "fast")
+    with pytest.raises(ValueError, match=r'CPRL_RULES is .*fast.*"compiled" and "python"'):
+        CommonsEnv(presets.game("commons"))
 
 
 def test_a_pickled_batch_continues_like_the_original():

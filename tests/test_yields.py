@@ -1,5 +1,6 @@
 """The sustainable yield is a lower bound of what a map bears, which a harvest in a known way reaches."""
 
+from dataclasses import fields, replace
 from itertools import product
 
 import numpy as np
@@ -9,8 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cprl import Map, Rules, maps, presets
+from cprl.commons import yields
+from cprl.commons.batch import Batch
 from cprl.commons.near import sites_around
 from cprl.commons.yields import sustainable_yield
+from cprl.institutions import Quota
+from cprl.measuring.episodes import yield_of_game
 
 CROSS = maps.parse(
     """
@@ -39,11 +44,11 @@ FAR = maps.crosses(height=7, width=30, centres=((3, 3), (3, 12), (3, 21)), start
         (maps.parse("A...>...A"), PUBLISHED, 0),  # no apple is near another
         # Apples from nothing: three sites are harvested, each 1/2 without regrowth in the same turn.
         (maps.parse("AAA>"), Rules(regrow_prob=(1.0,)), 1.5),
-        (maps.parse("AAA>"), Rules(regrow_prob=(1.0,), regrow_before_bites=True), 3),
+        (maps.parse("AAA>"), Rules(regrow_prob=(1.0,), growth="before_bites"), 3),
         # Nothing grows under an agent, which has to leave the site for a turn.
         (
             maps.parse("AAA>"),
-            Rules(regrow_prob=(1.0,), regrow_before_bites=True, regrow_under_agents=False),
+            Rules(regrow_prob=(1.0,), growth="before_bites", regrow_under_agents=False),
             1.5,
         ),
         # A pair whose probability falls. One harvested, its neighbour full: always one near, 0.2 / 1.2. Both
@@ -68,7 +73,7 @@ RULES = st.builds(
         tuple
     ),
     regrow_radius_cells=st.sampled_from([1.0, 1.5, 2.0, 3.0]),
-    regrow_before_bites=st.booleans(),
+    growth=st.sampled_from(["from_start", "before_bites"]),
 )
 
 
@@ -78,7 +83,7 @@ def bound_of(harvested, near, rules):
     for k in np.flatnonzero(harvested):
         kept = sum(not harvested[other] for other in near[k])
         p = min(rules.regrow_prob[min(n, len(rules.regrow_prob) - 1)] for n in range(kept, most + 1))
-        total += p if rules.regrow_before_bites else p / (1 + p)
+        total += p if rules.growth == "before_bites" else p / (1 + p)
     return total
 
 
@@ -110,19 +115,19 @@ def harvested_per_turn(board, rules, harvested, *, worlds=300, turns=300, rng):
     for turn in range(turns):
         p = probs[np.minimum(full @ near.T, len(probs) - 1).astype(int)]
         grows = ~full & (rng.random(full.shape) < p)
-        bitten = harvested & (full | grows if rules.regrow_before_bites else full)
+        bitten = harvested & (full | grows if rules.growth == "before_bites" else full)
         full = (full | grows) & ~bitten
         taken += bitten.sum() * (turn >= turns // 3)
     return taken / (worlds * (turns - turns // 3))
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("before", [False, True])
-def test_a_harvest_of_the_best_set_bears_at_least_its_bound(seed, before):
+@pytest.mark.parametrize("growth", ["from_start", "before_bites"])
+def test_a_harvest_of_the_best_set_bears_at_least_its_bound(seed, growth):
     rng = np.random.default_rng(seed)
     cells = rng.permutation([(r, c) for r in range(4) for c in range(5)]).tolist()
     board = Map(height=4, width=5, sites=tuple(map(tuple, cells[1:9])), starts=((*cells[0], 0),))
-    rules = Rules(regrow_prob=(0.0, 0.02, 0.05, 0.3), regrow_before_bites=before)
+    rules = Rules(regrow_prob=(0.0, 0.02, 0.05, 0.3), growth=growth)
     chosen, best = best_set(board, rules)
     played = harvested_per_turn(board, rules, chosen, rng=rng)
     # About 60,000 world-turns: the standard error is below 0.01 x the mean + 0.002.
@@ -138,3 +143,19 @@ def test_two_agents_that_stay_on_two_sites_of_a_cross_harvest_its_yield(rules, e
     taken = sum(play.turn("stay").output.harvest.sum() for _ in range(900))
     # About 5,600 apples, each by chance: a standard deviation of 75, 1.3 %.
     assert taken / (64 * 900) == pytest.approx(expected, rel=0.05)
+
+
+def test_a_rule_for_which_no_yield_is_proven_is_refused_by_name_and_has_no_share_of_a_yield(monkeypatch):
+    assert {field.name for field in fields(Rules)} >= yields.PROVEN
+    few = replace(presets.game("commons"), rules=replace(PUBLISHED, first_stock_share=0.5))
+    with pytest.raises(ValueError, match=r"Rules\.first_stock_share is 0\.5, with which no yield"):
+        sustainable_yield(few.map, few.rules)
+    assert yield_of_game(few) == {}
+    grows_anywhere = replace(PUBLISHED, first_stock_share=0.5, regrow_prob=(0.01, 0.1))
+    assert sustainable_yield(few.map, grows_anywhere) > 0
+    monkeypatch.setattr(yields, "PROVEN", yields.PROVEN - {"hits_to_tag"})
+    game = presets.game("commons", variant="as_run")
+    with pytest.raises(ValueError, match=r"Rules\.hits_to_tag is 2, with which no yield of a board"):
+        Batch(replace(game, institutions=(Quota(),)), 1)
+    assert yield_of_game(game) == {}
+    assert yield_of_game(presets.game("commons"))["sustainable_yield"] > 0

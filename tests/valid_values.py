@@ -7,9 +7,7 @@ from typing import get_type_hints
 from tiny_study import GAME, LEARNING, TINY
 
 import cprl
-from cprl import algorithms, institutions, population, theory
-from cprl.envs.matrix import prisoners_dilemma
-from cprl.envs.taking import TakingGame
+from cprl import algorithms, institutions, population
 from cprl.objectives import preferences
 from cprl.values import KINDS
 
@@ -19,9 +17,7 @@ REQUIRED = {
     "Learning": lambda: LEARNING,
     "Team": lambda: population.Team(algorithms.VDN(settings=algorithms.DQNSettings()), agents=(0, 1)),
     "Frozen": lambda: population.Frozen("runs/none", agent=0),
-    "MatrixGame": prisoners_dilemma,
-    "TakingGame": lambda: TakingGame(theory.herders(2)),
-    "SharingGame": lambda: theory.herders(2),
+    "RandomEnd": lambda: cprl.RandomEnd(prob=0.15),
     "InequityAversion": lambda: preferences.InequityAversion(alpha=5, beta=0.05, smoothing=0.9),
     "SocialValueOrientation": lambda: preferences.SocialValueOrientation(angle=0.5, weight=1.0),
     "Exchange": lambda: preferences.Exchange(0.5),

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from cprl import Game, maps, presets
-from cprl.commons.batch import Batch, turn_of
+from cprl.commons.batch import Batch
 
 STORED = Path(__file__).parents[2] / "docs" / "results" / "games"
 ORIGINALS = {
@@ -36,20 +36,18 @@ def play(game: Game, *, episodes: int = 400, seed: int = 0) -> dict[str, Any]:
     sums, is_over = {name: np.zeros(episodes) for name in names}, np.zeros(episodes, np.bool_)
     while not is_over.all():
         output = batch.play(rng.integers(len(game.actions), size=(episodes, game.agents)), output)
-        turn = turn_of(output)
-        reward = turn.harvest if turn is output else output.payments.reward
-        waste = turn.waste.sum(1) / game.rules.episode_steps
+        waste = output.waste.sum(1) / game.rules.episode_steps
         rows = (
-            turn.harvest.sum(1),
-            turn.regrown[:, 0],
-            turn.tagged_by.any(2).sum(1),
+            output.harvest.sum(1),
+            output.regrown[:, 0],
+            output.tagged_by.any(2).sum(1),
             1,
-            reward.sum(1),
+            output.reward.sum(1),
             waste,
         )
         for name, row in zip(names, rows, strict=True):
             sums[name] += row * ~is_over
-        is_over |= turn.done[:, 0]
+        is_over |= output.done[:, 0]
     return sums
 
 

@@ -21,7 +21,6 @@ REFERENCE: Final = {
     "keys": "the TensorDict entries",
     "envs": "TorchRL, PettingZoo, Gymnasium",
     "institutions": "rules that people make",
-    "theory": "games with a known answer",
     "networks": "from observations to numbers",
     "objectives": "what agents want, and losses that TorchRL lacks",
     "policies": "agents that follow a rule",
@@ -53,7 +52,7 @@ _MODULES: Final = {
 }
 """Modules of a package that its page shows too, beside what the package exports."""
 
-INTERNAL: Final = {"system", "runs", "terminal", "commands", "__main__"}
+INTERNAL: Final = {"system", "pictures", "runs", "terminal", "commands", "__main__"}
 """Packages that no page shows: users reach what they hold by the names of `cprl` or by a command."""
 
 

@@ -8,7 +8,7 @@ and of seed 1000, so that the second is the first with another seed and all else
 the first alone. The first block of the condition that changes nothing is experiment 1 as run, whose results
 over 6,000 episodes are committed; a study of so many finds it finished in its directory of runs after
 
-    cp -r docs/results/single_basic studies/runs/2919eaddb858-s0-r8
+    cp -r docs/results/single_basic studies/runs/3b5ad6d79d31-s0-r8
 
 Each trial of 1,000 episodes takes a quarter of an hour of a core and 0.7 GB.
 """

@@ -21,21 +21,22 @@ from cprl.evaluation.cross_play import OF_FOCAL
 from cprl.experimental.territory import WORDS, number_of, territory_of
 from cprl.measuring.statistics import estimate
 from cprl.measuring.table import by_replica, where
-from cprl.measuring.windows import Values, running_mean
+from cprl.measuring.windows import running_mean
 from cprl.runs.curves import curves_of
 from cprl.studies.exploit import BEST, compared, exploitability, plan_responses
 from cprl.training.agents import LoadedRun, load
+from cprl.values.arrays import Float64
 
 POINTS: Final = 2_000
 """Of the courses in which phases are found: means of as many blocks of episodes."""
 
 
-def together(values: list[dict[str, Values]]) -> dict[str, str]:
+def together(values: list[dict[str, Float64]]) -> dict[str, str]:
     """Estimates over the replicas of all runs, from a number for each replica of each run."""
     return {name: str(estimate(np.concatenate([run[name] for run in values]))) for name in values[0]}
 
 
-def fresh(run: LoadedRun, episodes: int) -> dict[str, Values]:
+def fresh(run: LoadedRun, episodes: int) -> dict[str, Float64]:
     """Harvests and the like in fresh worlds, and where agents are, beside random play."""
     evaluated = cprl.evaluate_run(run, cprl.Fresh(episodes=episodes))
     territory = territory_of(run, cprl.Fresh(episodes=episodes))
@@ -50,7 +51,7 @@ def fresh(run: LoadedRun, episodes: int) -> dict[str, Values]:
     return numbers
 
 
-def gains(run: LoadedRun, episodes: int, training_episodes: int) -> dict[str, Values]:
+def gains(run: LoadedRun, episodes: int, training_episodes: int) -> dict[str, Float64]:
     """What best responses gain that learn as the agent did whose place they take, three for each replica."""
     fresh = cprl.Fresh(episodes=episodes)
     plan = plan_responses(run, fresh, algorithms=("own",), training_episodes=training_episodes)
@@ -75,14 +76,14 @@ def mixes(runs: list[LoadedRun], episodes: int, **policies: str) -> dict[str, st
     return {**{name: f"{margin:+}" for (name,), margin in found.items()}, "dilemma": dilemma(found)}
 
 
-def training(curves: dict[str, Values]) -> dict[str, Values]:
+def training(curves: dict[str, Float64]) -> dict[str, Float64]:
     """The lowest harvest of any twentieth of the training, and that of the last."""
     harvest = curves["collective_return"]
     means = running_mean(harvest, max(1, harvest.shape[-1] // 20))
     return {"harvest in its lowest twentieth": means.min(1), "harvest in the last twentieth": means[:, -1]}
 
 
-def course(curves: list[dict[str, Values]]) -> list[str]:
+def course(curves: list[dict[str, Float64]]) -> list[str]:
     """The phases of the mean over all replicas, in millions of steps, with the harvest at each end."""
     episodes = min(len(of_run["collective_return"][0]) for of_run in curves)
     if episodes < FEWEST_EPISODES:

@@ -1,6 +1,6 @@
 """What apples can bear on a board of a few sites, exactly, if a harvester visits so many cells a turn.
 
-`cprl.theory.yield_bounds` has bounds for any board.
+`yield_bounds` has bounds for any board.
 """
 
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ def exact_yield(
     """The largest long-run harvest of a few sites, by value iteration over all their stocks.
 
     Before each turn a set of sites is chosen by the stock, and every apple there is bitten, also one that
-    grows in this turn where the rules let it be (`regrow_before_bites`). An isolated cross under the
+    grows in this turn where the rules let it be (growth "before_bites"). An isolated cross under the
     published probabilities bears 0.1 apples a turn as run, 3 of its 5 being kept; with one bite a turn
     0.0975, or 0.09987 if the harvester chooses once it has seen what grew. Ways, clashes and beams are
     left out: the harvester is where it wants to be. The policy found is evaluated exactly, and proven to be
@@ -54,7 +54,7 @@ def exact_yield(
         board: the map, of up to 7 sites.
         rules: its rules.
         bites_per_step: sites that can be visited in a turn; by default all.
-        sees_growth: whether the sites are chosen after the turn's growth, under `regrow_before_bites`.
+        sees_growth: whether the sites are chosen after the turn's growth, where that is before the bites.
 
     Raises:
         ValueError: for more sites, and for a number of bites below 1.
@@ -114,10 +114,11 @@ def _moves(board: Map, rules: Rules, most: int, sees_growth: bool) -> _Moves:
     every, apples = np.arange(2**sites), _bits(sites).sum(1)
     stocks, grown = np.broadcast_arrays(every[:, None], every)
     growth, made = _growth(board, rules), []
+    is_before = rules.growth == "before_bites"
     for visited in (own for own in range(2**sites) if own.bit_count() <= most):
-        there = stocks | grown if rules.regrow_before_bites and not sees_growth else stocks
+        there = stocks | grown if is_before and not sees_growth else stocks
         left = there & ~visited
-        sets = growth[left[:, 0]] if rules.regrow_before_bites and sees_growth else growth
+        sets = growth[left[:, 0]] if is_before and sees_growth else growth
         after = left if there is not stocks else left | grown
         chances = np.zeros(growth.shape)
         np.add.at(chances, (stocks, after), sets)

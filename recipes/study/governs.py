@@ -21,9 +21,9 @@ from effects import marked
 from numpy.typing import NDArray
 from possible import KNOWN
 
-from cprl.commons.colours import BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION
 from cprl.measuring.registry import METRICS
 from cprl.measuring.statistics import Estimate, difference, estimate, judged
+from cprl.pictures.colours import BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION
 from cprl.runs.curves import as_curves, curves_of
 from cprl.runs.episodes import read_table
 from cprl.studies import StudyTable
@@ -54,7 +54,7 @@ AT_MOST: Final = {
     "2 agents": 2000,
 }
 """What nobody can exceed on average in an episode, in apples, where it is not that of the unchanged game: the
-smaller of an apple for each agent and turn, and of the bound of `cprl.theory.yield_bounds` with the first
+smaller of an apple for each agent and turn, and of the bound of `yield_bounds` with the first
 stock, as in possible.py."""
 
 GROUPS: Final = {

@@ -6,7 +6,7 @@ with the shortest way first, around apples that are to stay; the others wait bes
 Near the end of the episode less and less growth is worth keeping.
 
 It is a rule of thumb, not an optimum: nobody has shown that more cannot be got; what certainly cannot, see
-`cprl.theory.yield_bounds`.
+`yield_bounds`.
 """
 
 from collections.abc import Callable
@@ -22,9 +22,9 @@ from tensordict import TensorDictBase
 from cprl import keys
 from cprl.commons.compiled import kept_on_disk
 from cprl.commons.game import Game
+from cprl.commons.headings import COL_STEP, ROW_STEP
 from cprl.commons.moves import WALK_TURN
 from cprl.commons.near import neighbours
-from cprl.commons.world import COL_STEP, ROW_STEP
 from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.evaluate import evaluate
 from cprl.values import Range, Value

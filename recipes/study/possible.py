@@ -1,7 +1,7 @@
 """possible: how many apples an episode of a game could give, from below and from above.
 
 From below by the best policy that is known, a planner or trained agents, from above by proof: nobody gets
-more on average than what the board holds at first and the most that it can grow, `cprl.theory.yield_bounds`.
+more on average than what the board holds at first and the most that it can grow, `yield_bounds`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from planner import planned_harvest
 from results import LAST, Result, table, with_interval
+from yield_bounds import yield_bounds
 
 from cprl import presets
 from cprl.commons.game import Game
 from cprl.measuring.episodes import yield_of_game
 from cprl.measuring.statistics import estimate
 from cprl.system.output import say
-from cprl.theory.growth import yield_bounds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +108,7 @@ def shares_of(results: Sequence[Result]) -> list[str]:
         "group (`recipes/study/planner.py`), trained agents if any get more (`recipes/study/possible.py`), "
         "or the run itself if it does. No policy gets more on "
         "average than the bound: what the board holds at first, and the most that it can grow "
-        "(`cprl.theory.yield_bounds`). The yield share (docs/metrics.md) counts in what the board can "
+        "(`yield_bounds`). The yield share (docs/metrics.md) counts in what the board can "
         "bear for ever in the steps that were played, so that it is high, too, for agents who take all at "
         "once, and end the episode. Shares are of means, but for the yield share, a mean over episodes.",
         "",

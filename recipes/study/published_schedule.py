@@ -5,7 +5,7 @@
 Each condition, of 4,800 episodes, takes two to three hours of a core. The one that changes nothing is
 experiment 5 as run, whose results are committed; a study finds it finished in its directory of runs after
 
-    cp -r docs/results/commons studies/runs/dab4a686bb41-s0-r8
+    cp -r docs/results/commons studies/runs/dfd7ebd751a3-s0-r8
 """
 
 from base import PUBLISHED

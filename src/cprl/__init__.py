@@ -6,7 +6,7 @@ A package imports only from those above it:
     keys         the TensorDict entries, their shapes and types
     institutions  rules that people make: boundaries, quotas, taxes, sanctions, votes; numpy alone
     commons      the game: maps, rules, turns; numpy and numba alone
-    theory       games with a known answer: herders, appropriation, what apples can bear; numpy alone
+    pictures     games for people: boards as images and SVG, rules in words, the colours of all pictures
     envs         TorchRL, PettingZoo, Gymnasium; make_env, where environments are put together
     networks     from observations to numbers
     objectives   what agents want, and losses that TorchRL lacks: log-cosh, MADDPG, PR2, LOLA
@@ -47,7 +47,6 @@ if TYPE_CHECKING:
         policies,
         population,
         studies,
-        theory,
         training,
         viewer,
     )
@@ -57,7 +56,9 @@ if TYPE_CHECKING:
     from cprl.commons.game import Game
     from cprl.commons.maps import Map
     from cprl.commons.observation import Observation
-    from cprl.commons.rules import Rules
+    from cprl.commons.quirks import Quirks2019
+    from cprl.commons.river import River
+    from cprl.commons.rules import RandomEnd, Rules
     from cprl.envs import CommonsEnv
     from cprl.evaluation import crossplay, evaluate_run, gains
     from cprl.experiment import Experiment, presets
@@ -79,6 +80,9 @@ __all__ = [
     "Game",
     "Map",
     "Observation",
+    "Quirks2019",
+    "RandomEnd",
+    "River",
     "Rules",
     "Study",
     "__version__",
@@ -108,7 +112,6 @@ __all__ = [
     "run_study",
     "studies",
     "study_main",
-    "theory",
     "train",
     "training",
     "trust",
@@ -123,6 +126,9 @@ _MODULES: Final = {
     "Game": "cprl.commons.game",
     "Map": "cprl.commons.maps",
     "Observation": "cprl.commons.observation",
+    "Quirks2019": "cprl.commons.quirks",
+    "RandomEnd": "cprl.commons.rules",
+    "River": "cprl.commons.river",
     "Rules": "cprl.commons.rules",
     "Study": "cprl.studies",
     "crossplay": "cprl.evaluation",

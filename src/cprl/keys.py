@@ -41,17 +41,9 @@ HIT_BY: Final = (AGENTS, "hit_by")
 TAGGED_BY: Final = (AGENTS, "tagged_by")
 """bool [B, N, N]: whether the column's agent tagged out the row's agent this turn."""
 
-SCOREBOARD: Final = (AGENTS, "scoreboard")
-"""float32 [B, N, N]: apples harvested so far in this episode, a row per observing agent: its own first, then
-those of the following indices, cyclically. Only with `Observation(scoreboard=True)`."""
-
-STOCK_GAUGE: Final = (AGENTS, "stock_gauge")
-"""float32 [B, N, 1]: the fraction of sites with an apple, 0..1. Only with
-`Observation(stock_gauge=True)`."""
-
 APPLE_AHEAD: Final = (AGENTS, "apple_ahead")
-"""bool [B, N, 1]: whether the cell ahead of the agent holds an apple. Only with `Rules.paint_over`, where its
-own heading mark covers the cell; scripted policies read it, networks do not."""
+"""bool [B, N, 1]: whether the cell ahead of the agent holds an apple. Only with `Quirks2019.paint_over`, by
+which its own heading mark covers the cell; scripted policies read it, networks do not."""
 
 RECURRENT_STATE: Final = (AGENTS, "recurrent_state")
 """float32 [B, N, M]: the states of recurrent networks after this turn's observation, zeros beyond an agent's

@@ -8,19 +8,19 @@ import sys
 from itertools import pairwise
 from pathlib import Path
 
-from golden import checksum, columns
+from golden import RESULTS, WITH_THE_FAULT, checksum, columns
 
 import cprl
 from cprl.measuring.table import numbers_in, where
 
-RESULTS = Path(__file__).parents[2] / "docs" / "results"
 TEN_TARGETS = "commons_targets_10"
 
 
 def runs() -> dict[str, Path]:
-    """The stored runs that keep weights, by their path below docs/results."""
+    """The stored runs that keep weights and whose game can be played, by their path below docs/results."""
     found = sorted(path.parents[1] for path in RESULTS.rglob("checkpoints/*.pt"))
-    return {path.relative_to(RESULTS).as_posix(): path for path in found}
+    by_path = {path.relative_to(RESULTS).as_posix(): path for path in found}
+    return {path: run for path, run in by_path.items() if run / "recipe.json" not in WITH_THE_FAULT}
 
 
 def twice() -> cprl.Fresh:

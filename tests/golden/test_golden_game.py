@@ -24,13 +24,9 @@ from cprl.institutions import (
 
 WORLDS, TURNS, EPISODE_STEPS = 16, 150, 60
 GAMES = [
-    *(
-        (board, variant)
-        for board in ("single_basic", "single_complex")
-        for variant in ("published", "as_run")
-    ),
-    *(("two_complex", variant) for variant in ("published", "as_run", "as_run_10_april")),
-    *(("commons", variant) for variant in ("published", "as_run")),
+    (board, variant)
+    for board in ("single_basic", "single_complex", "two_complex", "commons")
+    for variant in ("published", "as_run")
 ]
 FORMS = {
     f"{area}, {encoding}{', apart' * apart}{', scores' * scores}": Observation(
@@ -71,7 +67,6 @@ INSTITUTIONS = {
     "an elected monitor": (QUOTA, Monitoring(prob=0.7, cost=0.2, monitor="elected")),
 }
 OTHER_RULES = {
-    "walls block sight": {"walls_block_sight": True},
     "starts are shuffled": {"shuffle_starts": True},
     "growth by the chessboard": {"regrow_norm": "chebyshev", "regrow_radius_cells": 1.0},
     "growth by streets": {"regrow_norm": "manhattan", "regrow_radius_cells": 3.0},

@@ -10,11 +10,12 @@ other. recipes/study/theory/where_learners_end.py plays all of them, measures wh
 
 from typing import Literal
 
+from sharing_games import SharingGame, appropriation, herders
+from taking_games import TakingGame
+
 import cprl
 from cprl.algorithms import PPO, Algorithm, RolloutSettings, Tabular, TabularSettings
-from cprl.envs.taking import TakingGame
 from cprl.population import Learning
-from cprl.theory import SharingGame, appropriation, herders
 
 Kind = Literal["herders", "appropriation"]
 Learner = Literal["tables", "PPO"]

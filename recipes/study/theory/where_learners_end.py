@@ -30,14 +30,14 @@ import pyarrow.parquet as pq
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from sharing import TURNS, experiment, sharing_of
+from sharing_games import SharingGame
+from taking_games import TakingGame
 from tensordict import TensorDictBase
 
 import cprl
 from cprl import keys
-from cprl.envs.taking import TakingGame
 from cprl.measuring.statistics import estimate
 from cprl.terminal.style import MARK, MEAN, RAW, drawing
-from cprl.theory import SharingGame
 
 GAMES: Final = (("herders", 2), ("herders", 5), ("appropriation", 8))
 WAYS: Final = {("tables", "team"): 150, ("PPO", "individual"): 150, ("tables", "individual"): 300}

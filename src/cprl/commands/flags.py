@@ -8,7 +8,7 @@ import inspect
 import json
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Union, get_args, get_origin, get_type_hints
@@ -18,7 +18,7 @@ from tyro.constructors import ConstructorRegistry, StructConstructorSpec, Struct
 
 from cprl.commons.published import Variant
 from cprl.system.output import say
-from cprl.values import Custom, fits, refusal
+from cprl.values import Custom, fits, hints_of, refusal
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -58,10 +58,7 @@ Board = Annotated[
 ]
 VariantFlag = Annotated[
     Variant,
-    tyro.conf.arg(
-        help="Of the boards with a name: published, as_run or, of two_complex, as_run_10_april; see "
-        "docs/game.md."
-    ),
+    tyro.conf.arg(help="Of the boards with a name: published or as_run; see docs/game.md."),
 ]
 ROWS: Final = ".parquet"
 """What the name of a file with every row ends in."""
@@ -337,6 +334,41 @@ def _institutions(words: Sequence[str]) -> "tuple[Institution, ...]":
 
 def _snake(name: str) -> str:
     return re.sub("(?<=[a-z])(?=[A-Z])", "_", name).lower()
+
+
+def with_groups(experiment: "Experiment", flags: Sequence[str]) -> "Experiment":
+    """Return an experiment with the groups of rules that it lacks and whose fields words of a command line
+    set, e.g. --game.rules.random-end.prob 0.15."""
+    from cprl.commons.game import Game
+
+    game = experiment.game
+    if not isinstance(game, Game):
+        return experiment
+    places = [flag.partition("=")[0].replace("-", "_").split(".") for flag in flags]
+    groups: dict[str, Any] = {}
+    for name, hint in hints_of(type(game.rules)).items():
+        kinds = [kind for kind in get_args(hint) if is_dataclass(kind)]
+        said = [place[3] for place in places if place[:3] == ["__game", "rules", name] and len(place) > 3]
+        if kinds and said and getattr(game.rules, name) is None:
+            groups[name] = _group(kinds[0], f"--game.rules.{name}", said)
+    return replace(experiment, game=replace(game, rules=replace(game.rules, **groups)))
+
+
+def _group(kind: Any, place: str, said: Collection[str]) -> Any:
+    """Make a group of rules of which words set some fields, all that it requires among them."""
+    known = [field.name for field in fields(kind)]
+    flag = place.replace("_", "-")
+    for name in said:
+        if name.removeprefix("no_") not in known:
+            raise ValueError(
+                f"{flag}.{name.replace('_', '-')} is unknown; allowed: "
+                f"{', '.join(field.replace('_', '-') for field in known)}"
+            )
+    required = [field.name for field in fields(kind) if field.default is MISSING]
+    lacking = [name for name in required if name not in said]
+    if lacking:
+        raise ValueError(f"{flag} lacks {', '.join(lacking)}, which {kind.__name__} requires")
+    return kind(**dict.fromkeys(required, 1))  # which the words replace
 
 
 def shape_of(experiment: "Experiment") -> Shape:

@@ -359,7 +359,7 @@ def egta(
         pairwise_game,
         play_empirical_game,
     )
-    from cprl.theory.solutions import check_extras
+    from cprl.experimental.solutions import check_extras
 
     check_extras()
     game = pairwise_game(crossplay(named, fresh)) if pairwise else play_empirical_game(named, fresh)

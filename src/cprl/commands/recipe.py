@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 import tyro
 
-from cprl.commands.flags import RefusedError, Shape, ValueFlags, in_shape, numbered, shape_of
+from cprl.commands.flags import RefusedError, Shape, ValueFlags, in_shape, numbered, shape_of, with_groups
 from cprl.runs.length import UNITS, without_length
 from cprl.system.output import RESUMES, legible, say
 from cprl.system.process import at_signals
@@ -56,7 +56,8 @@ _NOTE: Final = (
     "listed; they have the same arguments by their own number. What is not listed cannot be changed on the "
     "command line, but in a copy of the recipe: the kind of an agent (Learning, Team, Scripted, Frozen), of "
     "its algorithm (DQN, PPO and so on), of its network and of what it wants; transforms, callbacks, drawn "
-    "boards."
+    "boards. A group of rules that is None is made by a flag of its fields, e.g. "
+    "--game.rules.random-end.prob 0.15."
 )
 _HELP: Final = {"-h", "--help", "--help-all", "--help_all"}
 _CONFIG: Final = (tyro.conf.HelptextFromCommentsOff,)
@@ -211,7 +212,7 @@ def parse_with(
     )
     if not isinstance(made, Experiment):
         raise refusal("what the recipe makes", made, "an Experiment")
-    start = _of_length(in_shape(made, shape), given)
+    start = with_groups(_of_length(in_shape(made, shape), given), given)
     shaped = shape_of(start)
 
     def read(

@@ -9,26 +9,25 @@ In reading order:
     spaces       what agents of a game observe and may do, in numbers
     observation  what agents observe, and in which form
     game         Game: a map, its rules and its observations; the memory that worlds of it take
-    world        the arrays of B worlds: state, step output, scratch memory
-    colours      the classes of cells and their colours
+    cells        the classes of cells, and the colours in which agents observe them
+    headings     the four headings, and the step to the cell ahead
     near         which sites are near each other
     yields       what a map can bear: a proven lower bound
     tables       a game as lookup tables for the compiled rules
     chance       counter-based random numbers
-    moves        turning, walking and clashes, on one world
-    river        the river: waste, and how it is cleaned, on one world
+    world        the arrays of B worlds: state, step output, scratch memory
+    moves        walking, clashes, and how agents return to play, on one world
+    quirks       a group of rules: what only the program of 2019 does
     beam         beams, hits and tags, on one world
+    river        a group of rules: waste in a river, and how it is cleaned
+    actions      what an agent does with its action, on one world
     apples       harvest and regrowth, on one world
     views        the picture of the board and the agents' windows, on one world
     turn         the order of a turn and of an episode, on one world
     loops        the loops over worlds that a thread runs
-    compiled     compiles the rules for a target
+    compiled     compiles the rules for a target, or runs them as plain Python
     threads      CpuThreads: runs the loops on CPU threads
     cuda         CudaThreads: runs the loops on a GPU
     state        reads, checks and restores the state of B worlds
     batch        Batch: B worlds, played a turn at a time
-    decoding     observations back to classes of cells
-    svg          an image of the board of a map as SVG
-    readable     a game's rules in words, for readers
-    picture      an image of the board for people, in which agents have number, heading and second mark
 """

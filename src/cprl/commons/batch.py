@@ -1,25 +1,21 @@
 """Batch: B worlds of a game, played a turn at a time by a driver (CPU threads or a GPU)."""
 
-from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, Protocol, TypeAlias
+from collections.abc import Mapping
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from cprl.commons import state as states
-from cprl.commons.game import Game, check_worlds_fit, output_forms
-from cprl.commons.loops import Loop
+from cprl.commons.game import Game, output_forms
 from cprl.commons.tables import Tables
 from cprl.commons.threads import CpuThreads
-from cprl.commons.world import Actions, Bools, Bytes, GovernedOutput, Shown, StepOutput, Worlds, empty_worlds
+from cprl.commons.world import BEGIN, PLAY, REFRESH, Shown, StepOutput, Worlds, empty_worlds
 from cprl.institutions import Law
-from cprl.institutions.arrays import STATE, STEPS, lasting
+from cprl.institutions.arrays import lasting
 from cprl.institutions.law import new_law
-from cprl.institutions.ledger import Payments
 from cprl.values import Range, Seed, checked
-
-Output: TypeAlias = StepOutput | GovernedOutput
-"""`GovernedOutput` for a game with institutions."""
+from cprl.values.arrays import Bool, Int64, UInt8
 
 
 class Driver(Protocol):
@@ -32,24 +28,28 @@ class Driver(Protocol):
         """Copy a tuple of numpy arrays, `Worlds`, `Law` or `Tables`, to where the rules run."""
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """A new array with undefined entries."""
+        """Return a new array with undefined entries."""
 
     def read(self, array: NDArray[Any]) -> NDArray[Any]:
-        """A copy as a numpy array."""
+        """Return a copy as a numpy array."""
 
     def write(self, array: NDArray[Any], values: NDArray[Any]) -> None:
-        """Copies values of the same shape and dtype into an array."""
+        """Copy values of the same shape and dtype into an array."""
 
-    def first_unknown(self, actions: Actions, known: int) -> int:
-        """The index, in row-major order, of the first action outside 0 .. known - 1; -1 if there is none."""
+    def first_unknown(self, actions: Int64, known: int) -> int:
+        """Return the index, in row-major order, of the first action outside 0 .. known - 1; -1 if there is
+        none."""
 
-    def run(self, loop: Loop, game: tuple[Any, ...], argument: NDArray[Any]) -> None:
-        """Run a loop over all worlds. Nothing is checked: all arrays are contiguous and have the form that
-        the game gives them.
+    def run(self, task: int, game: tuple[Any, ...]) -> None:
+        """Do a task of `cprl.commons.loops.run_worlds`. Nothing is checked: all arrays are contiguous and
+        have the form that the game gives them.
 
         Args:
             game: what `Played` says, as a plain tuple, which takes a third of the time to make.
         """
+
+    def show(self, game: tuple[Worlds, Tables, UInt8]) -> None:
+        """Draw boards, see `cprl.commons.loops.show_worlds`."""
 
 
 class Batch:
@@ -79,8 +79,6 @@ class Batch:
                 f"first_world is {first_world} and worlds is {worlds}; "
                 "allowed: worlds with indices from 0 to 2**32 - 1"
             )
-        if driver is None:
-            check_worlds_fit(game, worlds)
         self.game = game
         self.size = worlds
         self.driver: Driver = driver or CpuThreads(game, worlds, threads=threads)
@@ -91,50 +89,54 @@ class Batch:
         self.now: Worlds = self.driver.place(host)
         """The current state of the worlds, in the driver's arrays."""
         self.law: Law | None = self.driver.place(new_law(game, worlds)) if game.institutions else None
-        """Likewise, without decisions or payments; None without institutions."""
-        self._no_decisions: Actions = self.driver.empty((worlds, game.agents), np.int64)
-        self.driver.write(self._no_decisions, np.zeros((worlds, game.agents), np.int64))
-        self._all_worlds: Bools = self.driver.empty((worlds,), np.bool_)
+        """Likewise; None without institutions."""
+        self._nothing: Int64 = self.driver.empty((worlds, game.agents), np.int64)
+        self.driver.write(self._nothing, np.zeros((worlds, game.agents), np.int64))
+        self._all_worlds: Bool = self.driver.empty((worlds,), np.bool_)
         self.driver.write(self._all_worlds, np.ones(worlds, np.bool_))
         self.set_seed(seed)
 
     def set_seed(self, seed: int) -> None:
-        """Restarts from a seed: the next episode of each world is the first episode of this seed."""
+        """Restart from a seed: the next episode of each world is the first episode of this seed."""
         self.driver.write(self.now.seed, np.full((self.size, 1), checked("seed", seed, Seed), np.uint64))
         self.driver.write(self.now.episode, np.full((self.size, 1), -1, np.int32))
 
-    def new_output(self) -> Output:
-        """New arrays for the output of a turn."""
-        shapes = output_forms(self.game, self.size)
-        return output_of([self.driver.empty(*form) for form in shapes.values()])
+    def new_output(self) -> StepOutput:
+        """Return new arrays for the output of a turn."""
+        forms = output_forms(self.game, self.size)
+        return StepOutput(*(self.driver.empty(*form) for form in forms.values()))
 
-    def _run(self, loop: Loop, argument: NDArray[Any], output: Any, decisions: Actions | None = None) -> None:
-        """Runs a loop of the game, with its institutions if it has any."""
-        if self.law is None:
-            game: tuple[Any, ...] = self.now, self.driver.tables, output, None, None, None
-        else:
-            decided = self._no_decisions if decisions is None else decisions
-            game = self.now, self.driver.tables, output.turn, self.law, decided, output.payments
-        self.driver.run(loop, game, argument)
+    def _run(
+        self,
+        task: int,
+        output: StepOutput,
+        *,
+        actions: Int64 | None = None,
+        decisions: Int64 | None = None,
+        which: Bool | None = None,
+    ) -> None:
+        """Do a task with the worlds, by default all of them and with the first action and decision."""
+        acted = self._nothing if actions is None else actions
+        decided = self._nothing if decisions is None else decisions
+        marked = self._all_worlds if which is None else which
+        self.driver.run(task, (self.now, self.driver.tables, output, self.law, acted, decided, marked))
 
-    def begin(self, output: Output, which: Bools | None = None) -> Output:
-        """Begins the next episode of some worlds and writes their rows of `output`.
+    def begin(self, output: StepOutput, which: Bool | None = None) -> StepOutput:
+        """Begin the next episode of some worlds and write their rows of `output`.
 
         Args:
             which: bool [B], the worlds that begin; None for all. Of a new batch, all worlds begin.
         """
-        if which is None:
-            which = self._all_worlds
-        else:
+        if which is not None:
             if which.shape != (self.size,) or which.dtype != np.bool_:
                 raise ValueError(f"which is {which.dtype} {list(which.shape)}; allowed: bool [{self.size}]")
             if not self.has_begun and not self.driver.read(which).all():
                 raise ValueError("which leaves worlds out; allowed at first: None, so that all worlds begin")
-        self._run("begin_worlds", which, output)
+        self._run(BEGIN, output, which=which)
         self.has_begun = True
         return output
 
-    def play(self, actions: Actions, output: Output, decisions: Actions | None = None) -> Output:
+    def play(self, actions: Int64, output: StepOutput, decisions: Int64 | None = None) -> StepOutput:
         """Play one turn of every world and write its output.
 
         Nothing is checked, which would take as long as a turn of one world: `check` says whether actions of
@@ -145,58 +147,57 @@ class Batch:
             decisions: int64 [B, N], contiguous, where agents decide something, see `Game.decisions`; read of
                 worlds in the first turn of an episode alone. None for the first option of all agents.
         """
-        self._run("play_worlds", actions, output, decisions)
+        self._run(PLAY, output, actions=actions, decisions=decisions)
         return output
 
-    def boards(self, output: Output) -> Bytes:
-        """The current boards: uint8 [B, H, W], classes of `cprl.commons.colours`."""
+    def boards(self, output: StepOutput) -> UInt8:
+        """Return the current boards: uint8 [B, H, W], classes of `cprl.commons.cells`."""
         boards = self.driver.empty((self.size, self.game.map.height, self.game.map.width), np.uint8)
-        game = self.now, self.driver.tables, turn_of(output), None, None, None
-        self.driver.run("show_worlds", game, boards)
+        self.driver.show((self.now, self.driver.tables, boards))
         return boards
 
-    def show(self, output: Output, *, world: int = 0) -> Shown:
-        """A copy of one world for display; `output` holds its latest observation."""
-        read, observation = self.driver.read, turn_of(output).observation[world]
+    def show(self, output: StepOutput, *, world: int = 0) -> Shown:
+        """Return a copy of one world for display; `output` holds its latest observation."""
+        read, observation = self.driver.read, output.observation[world]
         of_world = {name: read(getattr(self.now, name))[world] for name in Shown._fields[2:]}
         return Shown(read(observation), read(self.boards(output))[world], **of_world)
 
     def state(self) -> states.State:
-        """The state of all worlds: copies of arrays [B, ...] by the names of `Worlds`.
+        """Return the state of all worlds: copies of arrays [B, ...] by the names of `Worlds`.
 
         The state and the game together determine the future, including all random numbers.
         """
         return {name: self.driver.read(array) for name, array in self._state_arrays().items()}
 
     def _state_arrays(self) -> dict[str, NDArray[Any]]:
-        """The driver's arrays of a state by name."""
-        arrays = {name: getattr(self.now, name) for name in states.names(self.game)}
+        """Return the driver's arrays of a state by name."""
+        arrays = {name: array for name, array, _ in lasting(self.now)}
         if self.law is not None:
-            arrays |= {name: array for name, array, _ in lasting(self.law, STATE, STEPS)}
+            arrays |= {name: array for name, array, _ in lasting(self.law)}
         return arrays
 
-    def load(self, state: Mapping[str, NDArray[Any]], output: Output) -> Output:
-        """Sets the state of the worlds and writes it into `output`, with no harvest, shots, hits or growth,
+    def load(self, state: Mapping[str, NDArray[Any]], output: StepOutput) -> StepOutput:
+        """Set the state of the worlds and write it into `output`, with no harvest, shots, hits or growth,
         whatever happened in the turn before.
         """
         sound, arrays = states.checked(state, worlds=self.size, game=self.game), self._state_arrays()
         for name, values in sound.items():
             self.driver.write(arrays[name], values)
-        self._run("refresh_worlds", self._all_worlds, output)
+        self._run(REFRESH, output)
         self.has_begun = bool((sound["episode"] >= 0).all())
         return output
 
-    def check(self, actions: Actions) -> None:
+    def check(self, actions: Int64) -> None:
         """Raise a ValueError for actions, int64 [B, N], that cannot be played."""
         if not self.has_begun:
             raise ValueError("the worlds have not begun; allowed: reset() or load() before the first step")
         self._check_known("action", actions, len(self.game.actions), self.game.actions)
 
-    def check_decisions(self, decisions: Actions) -> None:
+    def check_decisions(self, decisions: Int64) -> None:
         """Raise a ValueError for decisions, int64 [B, N], that agents cannot take."""
         self._check_known("decision", decisions, max(1, self.game.decisions))
 
-    def _check_known(self, what: str, chosen: Actions, known: int, names: tuple[str, ...] = ()) -> None:
+    def _check_known(self, what: str, chosen: Int64, known: int, names: tuple[str, ...] = ()) -> None:
         at = self.driver.first_unknown(chosen, known)
         if at >= 0:
             world, agent = divmod(at, self.game.agents)
@@ -205,16 +206,3 @@ class Batch:
             raise ValueError(
                 f"{what} {came} of agent {agent} in world {world} is unknown; allowed: {allowed}"
             )
-
-
-def turn_of(output: Output) -> StepOutput:
-    """The part of an output that every game has."""
-    return output if isinstance(output, StepOutput) else output.turn
-
-
-def output_of(arrays: Iterable[Any]) -> Output:
-    """An output out of its arrays, in the order of `output_forms`."""
-    in_order = list(arrays)
-    turn = StepOutput(*in_order[: len(StepOutput._fields)])
-    rest = in_order[len(StepOutput._fields) :]
-    return GovernedOutput(turn, Payments(*rest)) if rest else turn

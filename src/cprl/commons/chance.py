@@ -5,12 +5,24 @@ The seed is the key; the counter identifies the number: purpose and site, step, 
 So a world plays the same game in any batch, on any number of threads and on any device.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Final
 
 import numpy as np
 
+from cprl.values import Where
+
 if TYPE_CHECKING:
     from cprl.commons.world import Worlds
+
+SMALLEST_PROBABILITY: Final = 2**-32
+"""Chance is compared in 32 bits: a smaller probability could never come true, or would be rounded up."""
+Probability = Annotated[
+    float,
+    Where(
+        lambda value: value == 0 or SMALLEST_PROBABILITY <= value <= 1,
+        "a number that is 0, or 2**-32 (2.3e-10) to 1",
+    ),
+]
 
 MULTIPLIER_0 = np.uint64(0xD2511F53)
 MULTIPLIER_1 = np.uint64(0xCD9E8D57)
@@ -59,7 +71,7 @@ def philox4x32(
 
 
 def draw(world: "Worlds", number: int) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
-    """Draws four random 32-bit words; `number` identifies the draw within this world, episode and step."""
+    """Draw four random 32-bit words; `number` identifies the draw within this world, episode and step."""
     return philox4x32(
         np.uint64(number),
         np.uint64(world.step[0]),

@@ -4,6 +4,7 @@ What relies on private parts of Numba is here, each in a function or constant of
 `kept_in`, `kept_on_disk`, `_is_kept` and `machine_code`. `tests/test_compat.py` has a test for each.
 """
 
+import dis
 import hashlib
 import os
 import pickle
@@ -15,16 +16,25 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import cache, partial
 from io import BytesIO
 from pathlib import Path
-from types import FunctionType
-from typing import Any, Final
+from threading import Lock
+from types import CodeType, FunctionType, ModuleType
+from typing import Any, Final, get_args, get_type_hints
 
 import numba
+import numpy as np
 from filelock import FileLock
 
-from cprl.commons import loops
 from cprl.system.libraries import relying_on
 from cprl.system.process import cache_folder, obey_parent
 from cprl.system.times import CLOCK
+from cprl.values import refusal
+
+RULES_VARIABLE: Final = "CPRL_RULES"
+"""The environment variable that says how rules run."""
+COMPILED, PLAIN = "compiled", "python"
+
+KEY_FILE: Final = "key.py"
+"""Stands for the file of what is kept in a folder."""
 
 Compiled = dict[str, Callable[..., Any]]
 
@@ -69,8 +79,6 @@ def kept_on_disk(function: FunctionType, *, in_child: Callable[[], Any] | None =
         made: Any = numba.njit(**options, cache=True)(function)
     except RuntimeError:  # no folder for it is writable
         return numba.njit(**options)(function)
-    if _SETTINGS.DISABLE_JIT:
-        return made
     with relying_on("numba", "Dispatcher.compile and its cache"):
         compile_for, stop_caching, folder = made.compile, made._cache.disable, Path(made.stats.cache_path)
         files = made._cache._cache_file
@@ -134,7 +142,8 @@ def _is_whole(path: Path) -> bool:
 
 
 def _is_kept(function: Any, types: Any) -> bool:
-    """Whether the machine code of a function for arguments of these types is on disk and can be read."""
+    """Return whether the machine code of a function for arguments of these types is on disk and can be
+    read."""
     with relying_on("numba", "the cache of a Dispatcher"):
         cache, codegen = function._cache, function.targetctx.codegen
         key_of, load = cache._index_key, cache._cache_file.load
@@ -183,7 +192,7 @@ def compile_for_parent() -> None:
 
 @contextmanager
 def _alone(path: Path, *, but_if: str) -> Iterator[None]:
-    """Holds a lock among processes, unless the folder of the lock has a file like `but_if`; without a lock
+    """Hold a lock among processes, unless the folder of the lock has a file like `but_if`; without a lock
     where it cannot be had, or not within minutes."""
     lock = FileLock(path, timeout=_WAIT_S)
     with ExitStack() as stack:
@@ -193,39 +202,49 @@ def _alone(path: Path, *, but_if: str) -> Iterator[None]:
         yield
 
 
-def machine_code(function: Any, *arguments: Any) -> Callable[..., Any]:
-    """The machine code of a compiled function for arguments of the types of these, to be called directly.
+def runs_plain() -> bool:
+    """Return whether rules run as the plain Python functions that they are: with CPRL_RULES=python in the
+    environment, or NUMBA_DISABLE_JIT=1. Print, breakpoints and coverage then work in them; they are some
+    hundred times slower."""
+    word = os.environ.get(RULES_VARIABLE, COMPILED)
+    if word not in (COMPILED, PLAIN):
+        raise refusal(RULES_VARIABLE, word, f'"{COMPILED}" and "{PLAIN}"')
+    return word == PLAIN or bool(_SETTINGS.DISABLE_JIT)
 
-    Numba's own call looks at the types of all arguments each time; this one looks at none, so the caller
-    must. `Dispatcher.compile` returns it, which Numba does not document.
+
+def machine_code(entry: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
+    """Return the machine code of an entry for arguments of the types of these, to be called directly.
+
+    The first argument is a tuple, and may be a plain one in later calls. Numba's own call looks at the types
+    of all arguments each time; this one looks at none, so the caller must. `Dispatcher.compile` returns it,
+    which Numba does not document.
     """
-    if _SETTINGS.DISABLE_JIT:
-        raise ValueError(
-            "NUMBA_DISABLE_JIT is set, and the rules of the game run as machine code alone; allowed: an "
-            "environment without it"
-        )
+    if runs_plain():
+        make = getattr(type(arguments[0]), "_make", tuple)
+        return lambda first, *others: entry(make(first), *others)
     with relying_on("numba", "Dispatcher.compile"):
-        compile_for = function.compile
-    code: Callable[..., Any] = compile_for(tuple(map(numba.typeof, arguments)))
+        compile_for = compiled_for_cpu(entry).compile
+    with CLOCK.running():
+        code: Callable[..., Any] = compile_for(tuple(map(numba.typeof, arguments)))
     return code
 
 
 def compiled(
-    functions: Iterable[Any], jit: Callable[[FunctionType], Callable[..., Any]], **constants: Any
+    functions: Iterable[Any], jit: Callable[[FunctionType], Callable[..., Any]], **others: Any
 ) -> Compiled:
     """Compile plain functions, and before each of them the functions of `cprl` that it calls.
 
     Args:
-        constants: values of names of their modules, which hold in what is compiled.
+        others: functions to take in place of those of these names.
     """
     done: dict[FunctionType, Callable[..., Any]] = {}
 
     def compile_one(function: FunctionType) -> Callable[..., Any]:
         if function not in done:
-            names = function.__globals__ | constants
+            names = function.__globals__ | others
             for name in function.__code__.co_names:
-                called = names.get(name)
-                if isinstance(called, FunctionType) and called.__module__.startswith("cprl."):
+                called: Any = names.get(name)
+                if _is_rule(called):
                     names[name] = compile_one(called)
             done[function] = jit(FunctionType(function.__code__, names, function.__name__))
         return done[function]
@@ -233,68 +252,134 @@ def compiled(
     return {function.__name__: compile_one(function) for function in functions}
 
 
-def _jit_for_cpu(function: FunctionType, *, on_disk: bool, further: bool) -> Callable[..., Any]:
-    """Compiles a function for CPU threads."""
-    options, name = dict(CPU_OPTIONS), function.__name__
-    if name not in (entry.__name__ for entry in loops.ENTRIES):
-        options |= {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    elif on_disk:
-        in_child = partial(_loop_for_cpu, name, further=further) if name in loops.LOOPS else None
-        return kept_on_disk(function, in_child=in_child, **options)
-    return numba.njit(**options)(function)
+def _is_rule(value: Any) -> bool:
+    """Return whether a name in a rule stands for a function that is compiled with it."""
+    return isinstance(value, FunctionType) and value.__module__.startswith("cprl.")
 
 
-def _loop_for_cpu(name: str, *, further: bool) -> Callable[..., Any]:
-    return rules_for_cpu(further=further)[name]
+def compiled_for_cpu(entry: Callable[..., Any], *, inline: bool = True) -> Any:
+    """Return a function compiled for CPU threads, with all rules that it calls, and kept on disk; the
+    function itself where rules run as plain Python.
+
+    Its folder is named after the code that it can reach, see `code_key`: what changes no rule compiles
+    nothing, also in another copy of this program.
+
+    Args:
+        inline: whether the rules become one piece of code, which runs faster and takes so long to compile
+        that
+            a process of its own does it.
+    """
+    return entry if runs_plain() else _compiled_for_cpu(entry, inline)
+
+
+_ONE_AT_A_TIME: Final = Lock()
+"""`kept_in` changes a setting of the whole process."""
 
 
 @cache
-def rules_for_cpu(*, further: bool = False) -> Compiled:
-    """The rules compiled for CPU threads, then cached on disk.
+def _compiled_for_cpu(entry: Any, inline: bool) -> Any:
+    options = dict(CPU_OPTIONS)
+    inner = options | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    if inline:
+        inner["forceinline"] = True
+    folder = cache_folder() / "rules" / f"{entry.__name__}-{code_key(entry, **inner)}"
 
-    Compiling takes 24 seconds of processor time for the study's game, 80 with institutions and 109 for
-    Cleanup, as measured on a busy machine.
+    def jit(function: FunctionType) -> Any:
+        if function.__code__ is not entry.__code__:
+            return numba.njit(**inner)(function)
+        if not _can_write(folder):
+            return numba.njit(**options)(function)
+        # Numba asks when the file of a function was changed, and where it is, which says nothing of the rules
+        # that it calls: so it stands in a file of its folder.
+        place = {"co_filename": str(folder / KEY_FILE), "co_firstlineno": 1}
+        function.__code__ = function.__code__.replace(**place)
+        in_child = partial(_compiled_for_cpu, entry, inline) if inline else None
+        return kept_on_disk(function, in_child=in_child, **options)
 
-    With `further` they hold what `FURTHER_RULES` need, which would slow games without them.
+    with _ONE_AT_A_TIME, kept_in(folder):
+        return compiled([entry], jit)[entry.__name__]
 
-    Numba's own cache checks only the file of the called function and would miss a change in a rule that this
-    function calls; so the cache folder is named after the text of all rules.
+
+def code_key(entry: Any, **options: Any) -> str:
+    """Return a hash of the code that a function can reach: its own, that of the functions of `cprl` that it
+    calls, the constants that they name, and the fields of their tuples; and of options of the compiler.
+
+    Docstrings, comments, annotations, the places of lines, and whatever no rule calls do not count.
     """
-    folder = cache_folder() / _fingerprint() / ("further" if further else "plain")
-    on_disk = _can_write(folder)
-    with kept_in(folder):
-        return compiled(
-            loops.ENTRIES, partial(_jit_for_cpu, on_disk=on_disk, further=further), FURTHER=further
-        )
+    parts: dict[Any, str] = {"options": repr(sorted(options.items()))}
+    _note_function(entry, parts)
+    return hashlib.sha256(repr(sorted(parts.values())).encode()).hexdigest()[:16]
 
 
-ENTRIES: Final[Mapping[tuple[bool, bool], Compiled]] = {
-    (further, governed): {} for further in (False, True) for governed in (False, True)
-}
-"""The machine code of loops, as far as it was asked for: by whether the game has `FURTHER_RULES`, and whether
-it has institutions."""
+def _note_function(function: FunctionType, parts: dict[Any, str]) -> None:
+    """Note the code of a function with what the names in it stand for, and the functions that it calls."""
+    if function in parts:
+        return
+    codes = list(_codes(function.__code__))
+    names = sorted({name for code in codes for name in code.co_names})
+    parts[function] = f"{_place(function)} {[_text_of(code) for code in codes]}"
+    for name in names:
+        value: Any = function.__globals__.get(name)
+        parts[function] += f", {name}: {_meaning(value)}"
+        if isinstance(value, ModuleType) and value.__name__.startswith("cprl."):
+            parts[function] += f" {[_meaning(getattr(value, inner, None)) for inner in names]}"
+        if _is_rule(value):
+            _note_function(value, parts)
+        elif _is_tuple(value):
+            _note_tuple(value, parts)
 
 
-def compiled_entry(loop: str, arguments: tuple[Any, ...]) -> Callable[..., None]:
-    """Put the machine code of a loop into `ENTRIES`, for direct calls with arguments like these.
+def _note_tuple(kind: Any, parts: dict[Any, str]) -> None:
+    """Note the fields of a named tuple, and of the tuples in it."""
+    if kind in parts:
+        return
+    parts[kind] = f"{_place(kind)} {kind._fields}"
+    for hint in get_type_hints(kind).values():
+        for inner in filter(_is_tuple, (hint, *get_args(hint))):
+            _note_tuple(inner, parts)
 
-    Numba's dispatcher inspects the types of about sixty arrays on every call, which takes seven of the eight
-    microseconds that one world needs. A direct call inspects nothing, so the caller must check the arguments.
-    The types are the same in every game: the fields of `Worlds`, `Tables`, `StepOutput` and `Scratch` have
-    fixed types.
-    """
-    further = arguments[0].tables.further
-    entries = ENTRIES[further, arguments[0].law is not None]
-    with CLOCK.running():
-        entries[loop] = machine_code(rules_for_cpu(further=further)[loop], *arguments)
-    return entries[loop]
+
+def _place(value: Any) -> str:
+    return f"{value.__module__}.{value.__qualname__}"
+
+
+def _meaning(value: Any) -> str:
+    """Return what a name in a rule stands for; modules and builtins are those of the versions installed."""
+    if _is_rule(value) or _is_tuple(value):
+        return _place(value)
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype} {value.shape} {value.tobytes().hex()}"
+    return repr(value) if isinstance(value, int | float | str | tuple | np.generic) else ""
+
+
+def _is_tuple(value: Any) -> bool:
+    return isinstance(value, type) and hasattr(value, "_fields")
+
+
+def _codes(code: CodeType) -> Iterator[CodeType]:
+    """Yield a code object and those in it."""
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _codes(constant)
+
+
+def _text_of(code: CodeType) -> str:
+    """Return the instructions of a code object with the names and constants that they use."""
+    return str([(step.opname, _argument(step.argval)) for step in dis.get_instructions(code)])
+
+
+def _argument(value: Any) -> str:
+    return "" if isinstance(value, CodeType) else repr(value)
 
 
 def _can_write(folder: Path) -> bool:
-    """Whether compiled rules can be cached in a folder; warns of the cost if not."""
+    """Return whether compiled rules can be cached in a folder; warns of the cost if not."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if os.access(folder, os.W_OK):
+            if not (folder / KEY_FILE).exists():
+                (folder / KEY_FILE).touch()
             return True
         reason = "it is not writable"
     except OSError as error:
@@ -310,12 +395,3 @@ def _warn(folder: Path, reason: str) -> None:
         RuntimeWarning,
         stacklevel=3,
     )
-
-
-def _fingerprint() -> str:
-    """A hash of the source text of all rules."""
-    commons = Path(__file__).parent
-    sources = sorted(
-        path for folder in (commons, commons.parent / "institutions") for path in folder.rglob("*.py")
-    )
-    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]

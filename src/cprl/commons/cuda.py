@@ -5,19 +5,20 @@ With NUMBA_ENABLE_CUDASIM=1 Numba simulates all of this without a GPU: slowly, a
 
 from collections.abc import Callable
 from functools import cache
-from math import isfinite
-from typing import Any, Final
+from typing import Any, Final, NamedTuple, cast
 
 import numba.cuda
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from cprl.commons.compiled import compiled
-from cprl.commons.game import Game, check_worlds_fit
-from cprl.commons.loops import ENTRIES, LOOPS, Loop, Played, one_scratch
+from cprl.commons.game import Game
+from cprl.commons.loops import ENTRIES, Played, one_scratch
+from cprl.commons.rules import Groups
 from cprl.commons.tables import Tables
-from cprl.commons.world import Actions, Scratch, empty_scratch
+from cprl.commons.world import Scratch, Worlds, empty_scratch
 from cprl.institutions.arrays import changed
+from cprl.values.arrays import Int64
 
 cuda: Any = numba.cuda
 
@@ -40,8 +41,8 @@ class CudaThreads:
                 "Numba finds no GPU; it needs NVIDIA's driver and the package numba-cuda "
                 "(install cprl[cuda12] or cprl[cuda13])"
             )
-        check_worlds_fit(game, worlds, free=_free_bytes())
         self.threads = worlds
+        self._launch = _blocks(worlds), THREADS_PER_BLOCK
         self.tables: Tables = self.place(game.tables)
         self._scratch = Scratch(
             *(
@@ -55,7 +56,7 @@ class CudaThreads:
         return changed(arrays, _placed)
 
     def wrap(self, memory: Any) -> NDArray[Any]:
-        """A Numba array on GPU memory of another owner, such as a torch tensor; shares the memory."""
+        """Return a Numba array on GPU memory of another owner, such as a torch tensor; shares the memory."""
         array: NDArray[Any] = cuda.as_cuda_array(memory)
         return array
 
@@ -69,58 +70,82 @@ class CudaThreads:
     def write(self, array: Any, values: NDArray[Any]) -> None:
         array.copy_to_device(np.asfortranarray(values))
 
-    def first_unknown(self, actions: Actions, known: int) -> int:
+    def first_unknown(self, actions: Int64, known: int) -> int:
         self._unknown.copy_to_device(np.full(1, NONE_UNKNOWN, np.int64))
-        kernels()["find_unknown"][_blocks(len(actions)), THREADS_PER_BLOCK](actions, known, self._unknown)
+        kernels(()).find_unknown[_blocks(len(actions)), THREADS_PER_BLOCK](actions, known, self._unknown)
         at = int(self._unknown.copy_to_host()[0])
         return -1 if at == NONE_UNKNOWN else at
 
-    def run(self, loop: Loop, game: tuple[Any, ...], argument: NDArray[Any]) -> None:
+    def run(self, task: int, game: tuple[Any, ...]) -> None:
         """See `cprl.commons.batch.Driver`; the loop starts on the default stream, and this returns before it
         has finished."""
-        launch = _blocks(len(argument)), THREADS_PER_BLOCK
-        worlds, tables, output, law, decisions, payments = game
-        if law is None:
-            kernels()[loop][launch](worlds, tables, output, argument, self._scratch)
-        else:
-            law = law._replace(decisions=decisions, payments=payments)
-            kernels()[f"governed {loop}"][launch](worlds, tables, output, law, argument, self._scratch)
+        kernel, arguments = to_run(game)
+        kernel[self._launch](*arguments, task, self._scratch)
+
+    def show(self, game: tuple[Any, ...]) -> None:
+        """See `cprl.commons.batch.Driver`."""
+        kernel, arguments = to_show(game)
+        kernel[self._launch](*arguments, self._scratch)
+
+
+def to_run(game: tuple[Any, ...]) -> tuple[Any, tuple[Any, ...]]:
+    """Return the kernel that runs a game, see `Driver.run`, and its arguments before the task."""
+    worlds, tables, output, law, *decided = game
+    arguments = _without_none(worlds), tables, output, law or (), *decided
+    return kernels(_absent(worlds, law)).run, arguments
+
+
+def to_show(game: tuple[Any, ...]) -> tuple[Any, tuple[Any, ...]]:
+    """Return the kernel that draws the boards of a game, see `Driver.show`, and its first arguments."""
+    worlds, tables, boards = game
+    return kernels(_absent(worlds, None)).show, (_without_none(worlds), tables, boards)
+
+
+def _absent(worlds: Worlds, law: Any) -> tuple[str, ...]:
+    """Return the names of the groups of rules that a game lacks, and "law" without institutions."""
+    groups = (name for name, group in worlds.groups._asdict().items() if group is None)
+    return *groups, *(("law",) if law is None else ())
+
+
+def _without_none(worlds: Worlds) -> Any:
+    """Return worlds with empty tuples in place of the groups that the game lacks: a kernel takes no None."""
+    return worlds._replace(groups=cast(Any, Groups)(*(group or () for group in worlds.groups)))
+
+
+def _nothing(arrays: Any, b: int) -> None:
+    """Take the place of the function that takes world b out of the arrays of a group that a game lacks."""
+    return
+
+
+class Kernels(NamedTuple):
+    """The kernels of games that lack the same groups; compiled at their first launch."""
+
+    run: Any
+    show: Any
+    find_unknown: Any
 
 
 @cache
-def kernels() -> dict[str, Any]:
-    """The kernels by name: for each loop one without institutions and one with them, and `find_unknown`;
-    compiled at their first launch."""
-    rules = compiled((*ENTRIES, one_scratch), cuda.jit(device=True))
-    cut = rules[one_scratch.__name__]
-    plain: dict[str, Any] = {loop: _kernel(rules[loop], cut) for loop in LOOPS}
-    governed = {f"governed {loop}": _governed_kernel(rules[loop], cut) for loop in LOOPS}
-    return {**plain, **governed, "find_unknown": _find_unknown(rules["first_unknown"])}
-
-
-def _kernel(loop: Callable[..., None], cut: Callable[..., Scratch]) -> Any:
-    """Thread b runs the loop on world b alone, without institutions: a kernel takes no None, a loop does."""
+def kernels(absent: tuple[str, ...]) -> Kernels:
+    """Return the kernels of games without these groups: thread b runs a loop on world b alone."""
+    others = {f"one_{name}": _nothing for name in absent}
+    rules = compiled((*ENTRIES, one_scratch), cuda.jit(device=True), **others)
+    run_worlds, show_worlds, cut = (rules[name] for name in ("run_worlds", "show_worlds", "one_scratch"))
 
     @cuda.jit
-    def kernel(worlds, tables, output, argument, scratch):  # type: ignore[no-untyped-def]
+    def run(worlds, tables, output, law, actions, decisions, which, task, scratch):  # type: ignore[no-untyped-def]
         b = cuda.grid(1)
-        if b < argument.shape[0]:
-            loop(Played(worlds, tables, output, None, None, None), argument, cut(scratch, b), b, b + 1)
-
-    return kernel
-
-
-def _governed_kernel(loop: Callable[..., None], cut: Callable[..., Scratch]) -> Any:
-    """Thread b runs the loop on world b alone, with institutions."""
+        if b < which.shape[0]:
+            played = Played(worlds, tables, output, law, actions, decisions, which)
+            run_worlds(played, task, cut(scratch, b), b, b + 1)
 
     @cuda.jit
-    def kernel(worlds, tables, output, law, argument, scratch):  # type: ignore[no-untyped-def]
+    def show(worlds, tables, boards, scratch):  # type: ignore[no-untyped-def]
         b = cuda.grid(1)
-        if b < argument.shape[0]:
-            game = Played(worlds, tables, output, law, law.decisions, law.payments)
-            loop(game, argument, cut(scratch, b), b, b + 1)
+        if b < boards.shape[0]:
+            show_worlds((worlds, tables, boards), cut(scratch, b), b, b + 1)
 
-    return kernel
+    return Kernels(run, show, _find_unknown(rules["first_unknown"]))
 
 
 def _find_unknown(first_unknown: Callable[..., int]) -> Any:
@@ -139,12 +164,6 @@ def _find_unknown(first_unknown: Callable[..., int]) -> Any:
 
 def _placed(array: NDArray[Any], is_of_worlds: bool) -> Any:
     return cuda.to_device(np.asfortranarray(array) if is_of_worlds else array)
-
-
-def _free_bytes() -> int | None:
-    """The free memory of the current GPU; None in Numba's simulator, which has the main memory."""
-    free = cuda.current_context().get_memory_info()[0]
-    return int(free) if isfinite(free) else None
 
 
 def _blocks(worlds: int) -> int:

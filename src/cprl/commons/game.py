@@ -5,27 +5,25 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from importlib import import_module
 from math import prod
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cprl.commons import colours
+from cprl.commons import cells
 from cprl.commons.maps import Map
 from cprl.commons.near import patches, sites_around
 from cprl.commons.observation import Observation
-from cprl.commons.readable import game_html
+from cprl.commons.quirks import paints_over
 from cprl.commons.rules import Rules
 from cprl.commons.spaces import Spaces
 from cprl.commons.tables import Tables, build_tables, check_sizes
-from cprl.commons.world import Bytes, Ints, StepOutput, empty_worlds
+from cprl.commons.world import StepOutput
 from cprl.commons.yields import sustainable_yield
 from cprl.institutions import COUNTS, Institution, law
-from cprl.institutions.arrays import Form, changed, forms_of
+from cprl.institutions.arrays import Form, forms_of
 from cprl.institutions.base import Ballot
-from cprl.institutions.ledger import Payments
-from cprl.system.memory import check_memory
 from cprl.values import Value
+from cprl.values.arrays import Int32, UInt8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,41 +39,32 @@ class Game(Value):
     institutions: tuple[Institution, ...] = ()
 
     def _repr_html_(self) -> str:
-        return game_html(self)
+        """Return the board and the rules in words, for notebooks; the game knows nothing of pictures."""
+        return import_module("cprl.pictures.readable").game_html(self)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         agents, rules = self.agents, self.rules
-        if self.observation.area == "full" and rules.walls_block_sight:
-            raise ValueError(
-                'Observation.area is "full" and Rules.walls_block_sight is True; allowed: area="window" '
-                "where walls block sight"
-            )
-        if rules.agent_1_right_moves_agent_0 and agents < 2:
-            raise ValueError(
-                f"Rules.agent_1_right_moves_agent_0 is True and the map has {agents} agent; "
-                "allowed: at least 2"
-            )
         if rules.respawn_at_spawns and not self.map.spawns:
             raise ValueError(
                 "Rules.respawn_at_spawns is True and Map.spawns is empty; allowed: a map with spawn places"
             )
-        for name in ("may_clean", "pollution_prob", "pollution_limit", "pollution_free"):
-            if name in rules.changed and not self.map.river:
-                raise ValueError(
-                    f"Rules.{name} is {rules.changed[name]} and Map.river is empty; allowed: a map with a "
-                    "river"
-                )
+        if bool(self.map.river) != (rules.river is not None):
+            count = len(self.map.river)
+            raise ValueError(
+                f"Map.river has {count} cell{'' if count == 1 else 's'} and Rules.river is {rules.river}; "
+                "allowed: Rules(river=River(...)) on a map with a river, and None on any other"
+            )
         if round(rules.first_stock_share * len(self.map.sites)) == 0 and rules.regrow_prob[0] == 0:
             raise ValueError(
                 f"Rules.first_stock_share is {rules.first_stock_share} of {len(self.map.sites)} sites, and "
                 "regrow_prob[0] is 0, so no apple can ever grow; allowed: a share of at least one site"
             )
         check_sizes(self.map, rules)
-        if self.observation.agents_apart and agents > colours.MAX_AGENTS_APART:
+        if self.observation.agents_apart and agents > cells.MAX_AGENTS_APART:
             raise ValueError(
                 f"Observation.agents_apart is True and the map has {agents} agents; allowed: at most "
-                f"{colours.MAX_AGENTS_APART}"
+                f"{cells.MAX_AGENTS_APART}"
             )
         law.check_institutions(self)
         warning = _why_out_of_reach(self)
@@ -119,27 +108,23 @@ class Game(Value):
         """The channels that show the board, which come first."""
         if self.observation.encoding == "rgb":
             return "red", "green", "blue"
-        return tuple(map(colours.class_name, self.cell_classes))
+        return tuple(map(cells.class_name, self.cell_classes))
 
     @property
     def cell_classes(self) -> tuple[int, ...]:
         """The classes of cells that can occur, in the order of the channels of "one_hot"."""
-        apart = [colours.FIRST_AGENT + agent for agent in range(self.agents)]
-        agents = apart if self.observation.agents_apart else [colours.OTHER]
-        hidden = [colours.HIDDEN] if self.rules.walls_block_sight else []
-        river = [colours.WATER, colours.WASTE, colours.CLEANING] if self.map.river else []
-        always = range(colours.GROUND, colours.BEAM + 1)
-        return *always, *sorted([*agents, colours.SELF, *hidden, *river])
+        apart = [cells.FIRST_AGENT + agent for agent in range(self.agents)]
+        agents = apart if self.observation.agents_apart else [cells.OTHER]
+        river = [cells.WATER, cells.WASTE, cells.CLEANING] if self.map.river else []
+        always = range(cells.GROUND, cells.BEAM + 1)
+        return *always, *sorted([*agents, cells.SELF, *river])
 
     @property
     def score_channels(self) -> tuple[str, ...]:
-        """The channels "scoreboard" and "stock_gauge", for those that are "planes"."""
+        """The channels "scoreboard" and "stock_gauge", for those that `Observation` has."""
         planes = {"scoreboard": -(-self.agents // prod(self._seen)), "stock_gauge": 1}
         return tuple(
-            name
-            for name, count in planes.items()
-            if getattr(self.observation, name) == "planes"
-            for _ in range(count)
+            name for name, count in planes.items() if getattr(self.observation, name) for _ in range(count)
         )
 
     @property
@@ -189,27 +174,27 @@ class Game(Value):
     @property
     def spaces(self) -> Spaces:
         """What each agent observes and may do."""
-        vectors = {"stock_gauge": 1, "scoreboard": self.agents}
         return Spaces(
             agents=self.agents,
             observation_shape=self.observation_shape,
             observation_scale=float(self.observation_highest),
             actions=len(self.actions),
-            vectors=tuple(
-                (name, size) for name, size in vectors.items() if getattr(self.observation, name) is True
-            ),
         )
 
-    def make(self, worlds: int, seed: int, device: Any = "cpu") -> Any:
-        """A `CommonsEnv` of so many worlds, as every game that an experiment plays makes its environment."""
+    def make(self, worlds: int, seed: int, device: Any = "cpu", first_world: int = 0) -> Any:
+        """Return a `CommonsEnv` of so many worlds, as every game that an experiment plays makes one.
+
+        Args:
+            first_world: the index of the first world, as `CommonsEnv` takes it.
+        """
         envs = import_module("cprl.envs.commons_env")  # the game itself knows nothing of torch
-        return envs.CommonsEnv(self, worlds, seed=seed, device=device)
+        return envs.CommonsEnv(self, worlds, seed=seed, device=device, first_world=first_world)
 
     @property
-    def palette(self) -> Bytes:
+    def palette(self) -> UInt8:
         """The colour of each class of cell: uint8 [classes, 3], red, green and blue."""
-        classes = colours.FIRST_AGENT + (self.agents if self.observation.agents_apart else 0)
-        return np.array([colours.class_colour(kind) for kind in range(classes)], np.uint8)
+        classes = cells.FIRST_AGENT + (self.agents if self.observation.agents_apart else 0)
+        return np.array([cells.class_colour(kind) for kind in range(classes)], np.uint8)
 
     @cached_property
     def tables(self) -> Tables:
@@ -221,14 +206,15 @@ class Game(Value):
         """The parameters of the game's institutions; computed once and cached."""
         return law.parameters(self)
 
-    @property
+    @cached_property
     def sustainable_yield(self) -> float:
-        """Apples a turn that the map can bear, see `cprl.commons.yields`."""
+        """Apples a turn that the map can bear, see `cprl.commons.yields`; computed once and cached."""
         return sustainable_yield(self.map, self.rules)
 
-    @property
-    def patches(self) -> Ints:
-        """The patch of each site, int32 [K]: sites that are connected by being near each other."""
+    @cached_property
+    def patches(self) -> Int32:
+        """The patch of each site, int32 [K]: sites that are connected by being near each other; computed once
+        and cached."""
         return patches(sites_around(self.map, self.rules))
 
     def __getstate__(self) -> dict[str, object]:
@@ -236,12 +222,15 @@ class Game(Value):
 
 
 def _why_out_of_reach(game: Game) -> str | None:
-    """A sentence that says why no agent can harvest any site, e.g. since a wall parts them; None if one can.
+    """Return a sentence that says why no agent can harvest any site, e.g. since a wall parts them; None if
+    one can.
 
     Agents walk over all cells but walls, also through each other's, since others may move away. `Boundaries`
     without a fine stop bites, not steps. Under `shuffle_starts` any agent may start at any start.
     """
     board = game.map
+    if not board.walls and not game.institutions:
+        return None
     allowed = np.array(
         [
             [all(rule.may_harvest(agent, *site) for rule in game.institutions) for site in board.sites]
@@ -259,7 +248,7 @@ def _why_out_of_reach(game: Game) -> str | None:
     starts = [(row, col) for row, col, _ in board.starts]
     begins = [board.spawns if start in board.spawns else (start,) for start in starts]
     of_sites = np.array([part[site] for site in board.sites])
-    walks = np.array([np.isin(of_sites, [part[cell] for cell in cells]) for cells in begins])
+    walks = np.array([np.isin(of_sites, [part[cell] for cell in places]) for places in begins])
     if game.rules.shuffle_starts:
         walks[:] = walks.any(0)
     if (allowed & walks).any():
@@ -273,36 +262,9 @@ def _why_out_of_reach(game: Game) -> str | None:
 
 
 def output_forms(game: Game, worlds: int) -> dict[str, Form]:
-    """The shape and dtype of each array of `StepOutput`, for B worlds of a game, and then of `Payments` if it
-    has institutions."""
-    sizes, vectors = {"B": worlds, "N": game.agents}, dict(game.spaces.vectors)
+    """Return the shape and dtype of each array of `StepOutput`, for B worlds of a game."""
+    sizes = {"B": worlds, "N": game.agents}
     turn = dict(zip("CXY", game.observation_shape, strict=True))
-    turn |= {"S": vectors.get("scoreboard", 0), "G": vectors.get("stock_gauge", 0)}
     turn |= {"P": 1, "M": game.agents} if game.map.river else {"P": 0, "M": 0}
-    forms = forms_of(StepOutput, **sizes, **turn, U=int(game.rules.paint_over))
-    if game.institutions:
-        forms |= forms_of(Payments, **sizes, C=len(COUNTS), V=len(game.ballots))
-    return forms
-
-
-OUTPUTS_HELD: Final = 3
-"""The step outputs that an environment holds at once, at least: the current one, the next, and a copy."""
-
-
-def bytes_of_worlds(game: Game, worlds: int) -> int:
-    """The bytes that B worlds take at least: their state, and `OUTPUTS_HELD` step outputs."""
-    arrays: list[NDArray[Any]] = [*empty_worlds(game, 1)]
-    if game.institutions:
-        changed(law.new_law(game, 1), lambda array, is_of_worlds: arrays.append(array) if is_of_worlds else 0)
-    outputs = sum(prod(shape) * np.dtype(dtype).itemsize for shape, dtype in output_forms(game, 1).values())
-    return worlds * (sum(array.nbytes for array in arrays) + OUTPUTS_HELD * outputs)
-
-
-def check_worlds_fit(game: Game, worlds: int, *, free: int | None = None) -> None:
-    """Raise a MemoryError if B worlds do not fit into memory; `free`: bytes of it, None for main memory."""
-    check_memory(
-        f"worlds is {worlds:,}: {'their arrays' if worlds > 1 else 'its arrays'}",
-        bytes_of_worlds(game, worlds),
-        "fewer worlds, or a smaller map, window or number of agents",
-        free=free,
-    )
+    governed = {"L": game.agents if game.institutions else 0, "counts": len(COUNTS), "V": len(game.ballots)}
+    return forms_of(StepOutput, **sizes, **turn, **governed, U=int(paints_over(game.rules.quirks)))

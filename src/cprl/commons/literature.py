@@ -120,7 +120,7 @@ _CLEANUP: Final = """
 
 _MELTING_POT: Final[dict[str, Any]] = {
     "regrow_prob": (0.0, 0.001, 0.005, 0.025),
-    "regrow_before_bites": True,
+    "growth": "before_bites",
     "beam_length_cells": 4,
     "beam_tapers": True,
     "beam_from_beside": True,
@@ -134,9 +134,7 @@ _MELTING_POT: Final[dict[str, Any]] = {
     "window_rows_behind": 1,
     "window_columns": 11,
     "episode_steps": 5000,
-    "end_prob": 0.15,
-    "end_from_step": 1099,
-    "end_every_steps": 100,
+    "random_end": {"prob": 0.15, "from_step": 1099, "every_steps": 100},
     "plays_on_when_empty": True,
 }
 _OPEN_RULES: Final[dict[str, Any]] = _MELTING_POT | {
@@ -149,7 +147,7 @@ _SSD: Final[dict[str, Any]] = {
     "regrow_prob": (0.0, 0.005, 0.02, 0.05),
     "regrow_radius_cells": 1.5,
     "regrow_under_agents": False,
-    "regrow_after_bites": True,
+    "growth": "after_bites",
     "beam_tapers": True,
     "beam_from_beside": True,
     "beam_stops_at_agents": True,
@@ -165,13 +163,12 @@ _CLEANUP_RULES: Final[dict[str, Any]] = _SSD | {
     "regrow_prob": (0.05,),
     "regrow_radius_cells": 0,
     "first_stock_share": 0.0,
-    "may_clean": True,
-    "pollution_prob": 0.5,
+    "river": {"may_clean": True, "pollution_prob": 0.5},
 }
 _SOCIALJAX: Final[dict[str, Any]] = {
     "regrow_prob": (0.0, 0.001, 0.005, 0.025),
     "regrow_under_agents": False,
-    "regrow_before_bites": True,
+    "growth": "before_bites",
     "beam_length_cells": 2,
     "beam_tapers": True,
     "freeze_steps": 0,
@@ -221,7 +218,7 @@ class Source(NamedTuple):
 
 
 def _open_field(maps: Any) -> "Map":
-    """A board of the size and number of sites of Perolat's open map, at places of our own."""
+    """Return a board of the size and number of sites of Perolat's open map, at places of our own."""
     board: Map = maps.random(20, 40, agents=12, density=246 / 800, clustering=0.8, seed=1)
     return board
 
@@ -235,7 +232,7 @@ def _lab(maps: Any) -> "Map":
 
 
 def _without_walls(drawing: str) -> str:
-    """A drawing without the ring of walls around it."""
+    """Return a drawing without the ring of walls around it."""
     return "\n".join(line[1:-1] for line in drawing.strip("\n").splitlines()[1:-1])
 
 
@@ -306,13 +303,15 @@ def game(name: str) -> "Game":
     from cprl.commons import maps
     from cprl.commons.game import Game
     from cprl.commons.observation import Observation
-    from cprl.commons.rules import Rules
+    from cprl.commons.river import River
+    from cprl.commons.rules import RandomEnd, Rules
     from cprl.institutions import Punishment
 
-    source = SOURCES[name]
+    source, kinds = SOURCES[name], {"river": River, "random_end": RandomEnd}
+    groups = {group: kind(**source.rules[group]) for group, kind in kinds.items() if group in source.rules}
     return Game(
         map=source.board(maps),
-        rules=Rules(**source.rules),
+        rules=Rules(**{**source.rules, **groups}),
         observation=Observation(area="full" if source.sees_all else "window"),
         institutions=(Punishment(**source.fines),) if source.fines else (),
     )

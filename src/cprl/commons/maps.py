@@ -9,17 +9,17 @@ signs, see `LEGENDS`. Everything outside the board is wall.
 from bisect import bisect_left, insort
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from importlib import import_module
 from inspect import cleandoc
 from math import isqrt
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cprl.commons.svg import board_svg
-from cprl.commons.world import DOWN, LEFT, RIGHT, UP
+from cprl.commons.headings import DOWN, LEFT, RIGHT, UP
 from cprl.values import Natural, PositiveShare, Range, Seed, Share, Value, Where, checked, refusal
+from cprl.values.arrays import Bool
 
 Cell = tuple[int, int]
 Start = tuple[int, int, int]
@@ -96,7 +96,8 @@ class Map(Value):
         return f"Map({self.height} x {self.width}, {len(self.sites)} sites, {self.agents} agents)"
 
     def _repr_html_(self) -> str:
-        return board_svg(self)
+        """Return the board as SVG, for notebooks; the game knows nothing of pictures."""
+        return import_module("cprl.pictures.svg").board_svg(self)
 
     @property
     def agents(self) -> int:
@@ -104,8 +105,8 @@ class Map(Value):
         return len(self.starts)
 
     def drawing(self) -> str:
-        """The board as a drawing for `parse`. An agent hides a site or spawn place on its cell; its index is
-        not shown."""
+        """Return the board as a drawing for `parse`. An agent hides a site or spawn place on its cell; its
+        index is not shown."""
         signs = [[GROUND] * self.width for _ in range(self.height)]
         for row, col in self.sites:
             signs[row][col] = SITE
@@ -213,7 +214,7 @@ _LARGEST_DRAWING_BYTES: Final = 10_000_000
 
 
 def _rows(drawing: str, signs: Mapping[str, Meaning]) -> list[str]:
-    """The rows of a drawing, all of them of the same length."""
+    """Return the rows of a drawing, all of them of the same length."""
     if " " in signs:
         lines = drawing.splitlines()
         full = [number for number, line in enumerate(lines) if line.strip()]
@@ -291,7 +292,7 @@ NAMES: Final = tuple(_DRAWINGS)
 
 
 def named(name: str) -> Map:
-    """A published board, by its name in `NAMES`."""
+    """Return a published board, by its name in `NAMES`."""
     checked("name", name, Literal[NAMES])
     board = parse(_DRAWINGS[name])
     starts = _NUMBERED_STARTS.get(name, board.starts)
@@ -368,7 +369,7 @@ _ROOM_SLICES: Final = tuple(
 def crosses(
     *, height: int, width: int, centres: Iterable[Cell], starts: Iterable[Start], walls: Iterable[Cell] = ()
 ) -> Map:
-    """A board whose sites form crosses: each centre and its four neighbours.
+    """Return a board whose sites form crosses: each centre and its four neighbours.
 
     Args:
         centres: (row, col) of the centre of each cross; a cell in two crosses is one site.
@@ -405,8 +406,8 @@ def rooms(entrances: Entrances = "single", *, agents: int = 12) -> Map:
     return replace(board, starts=tuple(starts[:agents]), walls=walls)
 
 
-def room_cells() -> NDArray[np.bool_]:
-    """The cells of each room of `rooms`, bool [4, 19, 53], in the order of `ROOM_NAMES`.
+def room_cells() -> Bool:
+    """Return the cells of each room of `rooms`, bool [4, 19, 53], in the order of `ROOM_NAMES`.
 
     Those of the corridor are in no room. They are the same without walls. Agent i begins in room i % 4.
     """
@@ -419,7 +420,7 @@ def room_cells() -> NDArray[np.bool_]:
 def random(
     height: int, width: int, *, agents: int, density: float, clustering: float = 0.0, seed: int = 0
 ) -> Map:
-    """A board with random sites and no walls; agents start on random cells without a site.
+    """Return a board with random sites and no walls; agents start on random cells without a site.
 
     Sites are placed one by one: with probability `clustering` on a free cell next to an existing site,
     otherwise on any free cell. At 0 they are independent; near 1 they form a single patch.
@@ -479,7 +480,7 @@ class _Cells:
         self._lengths = np.array(list(map(len, self._blocks)))
 
     def at(self, place: int) -> int:
-        """The cell at a place in ascending order."""
+        """Return the cell at a place in ascending order."""
         ends = self._lengths.cumsum()
         block = int(ends.searchsorted(place, side="right"))
         return self._blocks[block][place - int(ends[block])]

@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 
 from cprl.commons.maps import Map
 from cprl.commons.rules import Norm, Rules
-from cprl.commons.world import Indices, Ints
+from cprl.values.arrays import Bool, Float64, Int32, Int64, UInt32
 
 _PAIRS_AT_ONCE: Final = 2**20
 """Pairs of a site and a cell or site around it that are compared at once."""
 
 
 def distance(norm: Norm, rows: int, cols: int) -> float:
-    """The distance between two cells, in cells, from their difference in rows and columns."""
+    """Return the distance between two cells, in cells, from their difference in rows and columns."""
     if norm == "euclidean":
         return hypot(rows, cols)
     if norm == "manhattan":
@@ -24,8 +24,8 @@ def distance(norm: Norm, rows: int, cols: int) -> float:
 
 
 def near_cells(rules: Rules, *, rows: int, cols: int) -> list[tuple[int, int]]:
-    """The (rows, cols) from a cell to each other cell within `regrow_radius_cells`, so many rows and columns
-    away at most."""
+    """Return the (rows, cols) from a cell to each other cell within `regrow_radius_cells`, so many rows and
+    columns away at most."""
     reach = int(rules.regrow_radius_cells)
     return [
         (row, col)
@@ -35,8 +35,9 @@ def near_cells(rules: Rules, *, rows: int, cols: int) -> list[tuple[int, int]]:
     ]
 
 
-def neighbours(board: Map, rules: Rules) -> tuple[Ints, Indices]:
-    """The other sites within `regrow_radius_cells` of each site: `Tables.near_first`, `Tables.near_sites`."""
+def neighbours(board: Map, rules: Rules) -> tuple[Int32, UInt32]:
+    """Return the other sites within `regrow_radius_cells` of each site: `Tables.near_first`,
+    `Tables.near_sites`."""
     sites, middle = np.array(board.sites), (board.height - 1, board.width - 1)
     offsets = np.array(near_cells(rules, rows=middle[0], cols=middle[1]), np.int64).reshape(-1, 2)
     on_cell = np.full((board.height, board.width), -1, np.int32)
@@ -44,7 +45,7 @@ def neighbours(board: Map, rules: Rules) -> tuple[Ints, Indices]:
     is_near = np.zeros((2 * board.height - 1, 2 * board.width - 1), np.bool_)
     is_near[tuple((offsets + middle).T)] = True
     counts, sites_near = [], []
-    near: NDArray[np.bool_]
+    near: Bool
     others: NDArray[Any]
     at_once = max(1, _PAIRS_AT_ONCE // max(1, min(len(sites), len(offsets))))
     for first in range(0, len(sites), at_once):
@@ -64,8 +65,8 @@ def neighbours(board: Map, rules: Rules) -> tuple[Ints, Indices]:
     return first_of, np.concatenate(sites_near)
 
 
-def growth(rules: Rules, around: Ints) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The probability that a site grows an apple, by the number of apples near it.
+def growth(rules: Rules, around: Int32) -> tuple[Int64, Float64]:
+    """Return the probability that a site grows an apple, by the number of apples near it.
 
     Args:
         around: the number of sites near each site, [K].
@@ -83,11 +84,11 @@ def growth(rules: Rules, around: Ints) -> tuple[NDArray[np.int64], NDArray[np.fl
 
 
 def bites_at_once(rules: Rules) -> bool:
-    """Whether an agent that stays on a site bites its apple in the turn in which it grows."""
-    return rules.regrow_before_bites and rules.regrow_under_agents
+    """Return whether an agent that stays on a site bites its apple in the turn in which it grows."""
+    return rules.growth == "before_bites" and rules.regrow_under_agents
 
 
-def kept_rates(rules: Rules, probs: NDArray[np.float64]) -> NDArray[np.float64]:
+def kept_rates(rules: Rules, probs: Float64) -> Float64:
     """Return the apples a turn of a site that is bitten as soon as it holds one, [.., M], while at least m
     sites near it hold apples, from its probabilities of growth by their number m, [.., M].
 
@@ -98,18 +99,18 @@ def kept_rates(rules: Rules, probs: NDArray[np.float64]) -> NDArray[np.float64]:
     return lowest if bites_at_once(rules) else lowest / (1 + lowest)
 
 
-def sites_around(board: Map, rules: Rules) -> list[NDArray[np.int64]]:
+def sites_around(board: Map, rules: Rules) -> list[Int64]:
     """Return the sites near each site, int64 [..] each."""
     first, near = neighbours(board, rules)
     return np.split(near.astype(np.int64), first[1:-1])
 
 
-def patches(around: list[NDArray[np.int64]]) -> Ints:
+def patches(around: list[Int64]) -> Int32:
     """Return the patch of each site, int32 [K]: sites that are connected by being near each other."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
     ends = np.concatenate(around), np.repeat(np.arange(len(around)), list(map(len, around)))
     links = csr_array((np.ones(len(ends[0])), ends), shape=(len(around), len(around)))
-    patch: Ints = connected_components(links, directed=False)[1].astype(np.int32)
+    patch: Int32 = connected_components(links, directed=False)[1].astype(np.int32)
     return patch

@@ -23,15 +23,15 @@ class Observation(Value):
     agents_apart: bool = False
     """Whether each other agent has its own colour or channel; otherwise all other agents look the same."""
 
-    scoreboard: bool | Literal["planes"] = False
-    """Whether each agent also observes every agent's harvest in this episode, its own first. True: a vector
-    of apples, float32 [N], which tables alone read. "planes": channels, which all learners read. Cell n of
-    them, row by row, shows entry n modulo N: of h apples 255 h / (h + K), rounded, on a board of K sites. So
-    an agent with as many apples as the board has sites shows half of 255, and no harvest exceeds 255."""
+    scoreboard: bool = False
+    """Whether each agent also observes every agent's harvest in this episode, its own first, in further
+    channels. Cell n of them, row by row, shows entry n modulo N: of h apples 255 h / (h + K), rounded, on a
+    board of K sites. So an agent with as many apples as the board has sites shows half of 255, and no harvest
+    exceeds 255."""
 
-    stock_gauge: bool | Literal["planes"] = False
-    """Whether each agent also observes the share of all sites that hold an apple. True: a vector, float32
-    [1], 0..1. "planes": a channel, everywhere 255 times the share, rounded."""
+    stock_gauge: bool = False
+    """Whether each agent also observes the share of all sites that hold an apple, in a further channel:
+    everywhere 255 times the share, rounded."""
 
     @property
     def highest(self) -> int:

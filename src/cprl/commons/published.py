@@ -16,28 +16,17 @@ if TYPE_CHECKING:
     from cprl.commons.game import Game
 
 Board = Literal["single_basic", "single_complex", "two_complex", "commons"]
-Variant = Literal["published", "as_run", "as_run_10_april"]
+Variant = Literal["published", "as_run"]
 
 BOARDS: Final[tuple[Board, ...]] = get_args(Board)
 VARIANTS: Final[tuple[Variant, ...]] = get_args(Variant)
-"""`published`: as in the study's text; `as_run`: as in its program; `as_run_10_april`: as in its program for
-two agents from 10 to 13 April 2019, with a discount of 0.999 and `agent_1_right_moves_agent_0`; `two_complex`
-alone has it."""
+"""`published`: as in the study's text; `as_run`: as in its program."""
 
 TO_THE_EDGE_CELLS: Final = 7
 """A beam of this length crosses all rows of `two_complex`."""
 
-_AS_RUN: Final[dict[str, Any]] = {
-    "hits_to_tag": 2,
-    "pairwise_clashes": True,
-    "regrow_before_bites": True,
-    "freeze_counts_tag_turn": True,
-    "ends_one_turn_late": True,
-    "picture_shows_old_stock": True,
-    "paint_over": True,
-    "mark_behind_if_vertical": True,
-    "self_paint_stays": True,
-}
+_AS_RUN: Final[dict[str, Any]] = {"hits_to_tag": 2, "clashes": "pairwise", "growth": "before_bites"}
+"""Beside `Quirks2019`."""
 _TWO_AS_RUN: Final[dict[str, Any]] = {
     "window_rows": 5,
     "beam_length_cells": (TO_THE_EDGE_CELLS, 6, TO_THE_EDGE_CELLS, 7),
@@ -50,7 +39,6 @@ _BOARD_RULES: Final[dict[tuple[Board, Variant], dict[str, Any]]] = {
     ("single_basic", "as_run"): {"window_rows": 5, "may_fire": False},
     ("single_complex", "as_run"): {"window_rows": 5, "may_fire": False},
     ("two_complex", "as_run"): _TWO_AS_RUN,
-    ("two_complex", "as_run_10_april"): {**_TWO_AS_RUN, "agent_1_right_moves_agent_0": True},
     ("commons", "as_run"): {"window_rows": 7, "window_columns": 15, "beam_length_cells": 6},
 }
 GAMES: Final[tuple[tuple[Board, Variant], ...]] = tuple(_BOARD_RULES)
@@ -58,7 +46,8 @@ GAMES: Final[tuple[tuple[Board, Variant], ...]] = tuple(_BOARD_RULES)
 
 
 def names() -> tuple[str, ...]:
-    """The names of all games that `game` knows: the boards of the study, then those of the literature."""
+    """Return the names of all games that `game` knows: the boards of the study, then those of the
+    literature."""
     return *BOARDS, *SOURCES
 
 
@@ -79,13 +68,14 @@ def game(name: str, *, variant: Variant = "published") -> "Game":
         return game_of_literature(name)
     from cprl.commons import maps
     from cprl.commons.game import Game
+    from cprl.commons.quirks import Quirks2019
     from cprl.commons.rules import Rules
 
     if name not in BOARDS:
         raise refusal("board", name, ", ".join(names()))
     board = check_variant(name, variant)
-    quirks = {} if variant == "published" else _AS_RUN
-    return Game(map=maps.named(board), rules=Rules(**quirks, **_BOARD_RULES[board, variant]))
+    as_run = {} if variant == "published" else {**_AS_RUN, "quirks": Quirks2019()}
+    return Game(map=maps.named(board), rules=Rules(**as_run, **_BOARD_RULES[board, variant]))
 
 
 def check_variant(board: str, variant: Variant) -> Board:

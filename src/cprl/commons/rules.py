@@ -7,40 +7,51 @@ sequential_social_dilemma_games, harvest, [C] its cleanup; [SJ] SocialJax, harve
 `docs/game.md` describes the game in words.
 """
 
+import sys
 from dataclasses import dataclass, fields
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, NamedTuple, get_args, get_type_hints
 
+from cprl.commons import quirks, river
+from cprl.commons.chance import Probability
+from cprl.commons.quirks import Quirks2019
+from cprl.commons.river import CLEAN, River
 from cprl.values import MOST_INT32, Natural, Odd, Positive, Range, Value, Where
 
 ACTIONS: Final = ("forward", "backward", "left", "right", "turn_left", "turn_right", "beam", "stay")
 """The actions by index. If no agent may fire, there is no "beam", and 6 is "stay"."""
 
-HARVEST, CLEAN = "harvest", "clean"
-"""Further actions, the last ones, under `Rules.harvest_action` and `Rules.may_clean`."""
+HARVEST: Final = "harvest"
+"""A further action under `Rules.harvest_action`, before `cprl.commons.river.CLEAN`."""
 
+Clashes = Literal["all_back", "one_moves", "in_turn", "pairwise"]
+Growth = Literal["from_start", "before_bites", "after_bites"]
 Norm = Literal["euclidean", "manhattan", "chebyshev"]
 
 LARGEST_WINDOW_CELLS: Final = 1000
 """The largest number of rows or columns of a window."""
-SMALLEST_PROBABILITY: Final = 2**-32
-"""Chance is compared in 32 bits: a smaller probability could never come true, or would be rounded up."""
-
-Probability = Annotated[
-    float,
-    Where(
-        lambda value: value == 0 or SMALLEST_PROBABILITY <= value <= 1,
-        "a number that is 0, or 2**-32 (2.3e-10) to 1",
-    ),
-]
 Window = Annotated[int, Range(1, LARGEST_WINDOW_CELLS)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomEnd(Value):
+    """An episode is truncated by chance; prob 0.15 from turn 1,099 on every 100 turns in [MP]."""
+
+    prob: Probability
+    """The probability of that after each turn in which it can be."""
+
+    from_step: Positive = 1
+    """The first turn after which it can be."""
+
+    every_steps: Positive = 1
+    """The number of turns from there to the next one."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rules(Value):
     """The numbers of a game.
 
-    Defaults are those of `published`: every quirk of the study as run is off. Lists and arrays are stored as
-    tuples, so that rules can be compared, hashed and printed.
+    Defaults are those of `published`. A group of rules is a value of its own, or None for a game without it.
+    Lists and arrays are stored as tuples, so that rules can be compared, hashed and printed.
     """
 
     regrow_prob: Annotated[
@@ -70,8 +81,10 @@ class Rules(Value):
     regrow_under_agents: bool = True
     """Whether a site grows an apple while an agent stands on it; not in [SSD] and [SJ]."""
 
-    regrow_after_bites: bool = False
-    """[SSD] Growth is counted from the stock after the bites of the turn, not from that at its start."""
+    growth: Growth = "from_start"
+    """When apples grow: after the bites of the turn, as many as the stock at its start lets grow [W]; or
+    before the bites, so that an apple can grow and be harvested in the same turn [run, MP, SJ]; or after
+    them, as many as the stock that they leave lets grow [SSD]."""
 
     first_stock_share: Annotated[float, Range(0, 1)] = 1.0
     """The share of the sites that hold an apple when an episode begins, rounded to a number of sites; which
@@ -123,22 +136,6 @@ class Rules(Value):
     1 + `signals` times as many actions. An observation has a plane for each signal, with its largest value on
     the cells of agents that sent it in the last turn. Signals have no other effect."""
 
-    may_clean: bool = False
-    """[C] Whether agents may clean the river, `Map.river`: a further action "clean", a beam of the size of
-    the other one that removes the waste of the first cell of each column that has some, and ends there, at a
-    wall or at an agent. The picture shows it up to walls, as the other one: also beyond waste, and beyond
-    agents without `beam_stops_at_agents`."""
-
-    pollution_prob: Probability = 0.0
-    """[C] The probability per turn with which a clean cell of the river gets waste, tried cell by cell in an
-    order drawn by chance until one gets some; so it is one cell a turn at most."""
-
-    pollution_limit: Annotated[float, Range(0, 1)] = 0.4
-    """[C] The share of the river's cells with waste from which on no apple grows, and no waste comes."""
-
-    pollution_free: Annotated[float, Range(0, 1)] = 0.0
-    """[C] The share up to which apples grow with `regrow_prob`; between the two it falls linearly to 0."""
-
     window_rows: Window = 6
     """The rows of a window: the agent's own and those ahead of it [W]."""
 
@@ -154,22 +151,11 @@ class Rules(Value):
     ] = 13
     """The columns of a window, the agent's own in the middle [W]."""
 
-    walls_block_sight: bool = False
-    """Whether a window shows only cells in line of sight, that is, the straight line between the two cell
-    centres crosses the interior of no wall (ours)."""
-
     episode_steps: Positive = 1000
     """The number of turns after which an episode is truncated [W]."""
 
-    end_prob: Probability = 0.0
-    """The probability with which an episode is truncated by chance, after `end_from_step` turns and every
-    `end_every_steps` turns from there on; 0.15 from turn 1,099 on every 100 turns in [MP]."""
-
-    end_from_step: Positive = 1
-    """The first turn after which it can be."""
-
-    end_every_steps: Positive = 1
-    """The number of turns from there to the next one."""
+    random_end: RandomEnd | None = None
+    """How an episode is truncated by chance, if it is."""
 
     plays_on_when_empty: bool = False
     """Whether an episode goes on where no apple is left and none can grow [MP, SSD, SJ]."""
@@ -184,59 +170,19 @@ class Rules(Value):
     """Whether a tagged agent returns at a free place of `Map.spawns`, drawn by chance [MP, SJ], and not where
     it was tagged."""
 
-    clashes: Literal["all_back", "one_moves", "in_turn"] = "all_back"
+    clashes: Clashes = "all_back"
     """What becomes of agents that want the same cell: all go back (ours); or one gets it, drawn by chance,
     unless an agent stays on it [SSD, SJ]; or agents move one after another, in an order drawn at each turn,
-    and onto no cell where an agent is [MP]."""
+    and onto no cell where an agent is [MP]; or "pairwise" [run]: all move at once, then, pair by pair in the
+    order of agent indices, two agents on one cell, or two that swapped, both go back to where they began the
+    turn, even if a third agent stands there, and agents out of play return at once, even onto an occupied
+    cell."""
 
-    pairwise_clashes: bool = False
-    """[run] All agents move at once. Then, pair by pair in the order of agent indices, two agents on one
-    cell, or two that swapped, both go back to where they began the turn, even if a third agent stands there.
-    Agents out of play return at once, even onto an occupied cell."""
+    river: River | None = None
+    """[C] The rules of a river; a map with `Map.river` needs them, and another map has none."""
 
-    regrow_before_bites: bool = False
-    """[run] Apples grow before agents harvest, so an apple can grow and be harvested in the same turn."""
-
-    freeze_counts_tag_turn: bool = False
-    """[run] The turn of the tag counts as the first of `freeze_steps`, so the agent misses one turn less."""
-
-    ends_one_turn_late: bool = False
-    """[run] The episode terminates in the turn that begins with an empty stock, one turn later."""
-
-    picture_shows_old_stock: bool = False
-    """[run] The picture shows the apples of the start of the turn."""
-
-    paint_over: bool = False
-    """[run] Heading marks cover apples and agents of lower indices; beams cover everything."""
-
-    mark_behind_if_vertical: bool = False
-    """[run] The heading mark of an agent that faces up or down is painted behind the agent."""
-
-    self_paint_stays: bool = False
-    """[run] Windows are drawn in the order of agent indices; each agent's cell is painted as "self" and
-    stays so in the windows of later agents, whether the agent is in play or not."""
-
-    agent_1_right_moves_agent_0: bool = False
-    """[run] The action "right" of agent 1 moves agent 0 in its place, to the right of agent 0's own heading,
-    after agent 0's own action and even while agent 0 is out of play; a beam that agent 0 fires in this turn
-    begins where it fired. A fault of the program for two agents until 13 April 2019. At least two agents."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name, other in (
-            ("regrow_after_bites", "regrow_before_bites"),
-            ("clashes", "pairwise_clashes"),
-            ("clashes", "agent_1_right_moves_agent_0"),
-        ):
-            if {name, other} <= set(self.changed):
-                raise ValueError(
-                    f"Rules.{name} is {getattr(self, name)!r} and Rules.{other} is True; allowed: one of them"
-                )
-        if self.pollution_free >= self.pollution_limit:
-            raise ValueError(
-                f"Rules.pollution_free is {self.pollution_free} and Rules.pollution_limit is "
-                f"{self.pollution_limit}; allowed: a smaller share of waste than that"
-            )
+    quirks: Quirks2019 | None = None
+    """[run] What only the program of 2019 does."""
 
     def __repr__(self) -> str:
         return f"Rules({', '.join(f'{name}={value!r}' for name, value in self.changed.items())})"
@@ -257,7 +203,22 @@ class Rules(Value):
     def actions(self) -> tuple[str, ...]:
         """The names of the actions, by index: 8 of them, or 7 without a beam, and then perhaps "harvest" and
         "clean"; with signals all of them again for each signal, e.g. "forward 1"."""
-        last = (*((HARVEST,) if self.harvest_action else ()), *((CLEAN,) if self.may_clean else ()))
+        may_clean = self.river is not None and self.river.may_clean
+        last = (*((HARVEST,) if self.harvest_action else ()), *((CLEAN,) if may_clean else ()))
         silent = *(name for name in ACTIONS if self.may_fire or name != "beam"), *last
         spoken = (f"{name} {signal + 1}" for signal in range(self.signals) for name in silent)
         return *silent, *spoken
+
+
+class Groups(NamedTuple):
+    """What the compiled rules read and remember of each group of rules, by its name in `Rules`; None without
+    the group, and then nothing of what asks for it is compiled."""
+
+    river: river.Arrays | None
+    quirks: quirks.Arrays | None
+
+
+GROUPS: Final = {
+    name: sys.modules[get_args(kind)[0].__module__] for name, kind in get_type_hints(Groups).items()
+}
+"""The module of each group, which has its `Arrays` and `parameters`."""

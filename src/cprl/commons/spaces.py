@@ -13,9 +13,6 @@ Dtype = Annotated[str, Where(lambda name: name in DTYPES, ", ".join(map(repr, DT
 """By the name that numpy and torch share."""
 
 
-Name = Annotated[str, Where(bool, "the name of an entry")]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Spaces(Value, stored=False):
     """The observation and action spaces of N agents, the same for each.
@@ -34,5 +31,3 @@ class Spaces(Value, stored=False):
     """By which networks divide observations: the largest value of integers, 1 for floating-point numbers."""
     actions: Positive
     """How many actions A an agent chooses from."""
-    vectors: tuple[tuple[Name, Positive], ...] = ()
-    """Further entries under "agents" that agents observe, each with its length, e.g. ("scoreboard", N)."""

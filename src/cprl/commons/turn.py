@@ -1,229 +1,217 @@
 """The order of a turn and of an episode, and what institutions do in them, on one world."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from cprl.commons.apples import bite, fill, find_sprouts, grow, recount
+from cprl.commons.actions import act
+from cprl.commons.apples import bite_and_grow, fill, recount
 from cprl.commons.beam import find_hits, tag, take_out
-from cprl.commons.chance import BALLOT, DETECTION, END, STARTS, draw
+from cprl.commons.chance import BALLOT, DETECTION, END, draw
 from cprl.commons.moves import (
-    act,
     count_down,
     draw_starts,
-    note_moved_shooters,
     place_at_starts,
     return_to_play,
     settle_clashes,
-    settle_pairwise,
+    shuffle_starts,
 )
-from cprl.commons.river import begin_river, clean, count_waste, pollute
-from cprl.commons.tables import FURTHER, Tables
+from cprl.commons.quirks import ends_late, keep_old_stock
+from cprl.commons.river import begin_river, clean, count_waste, write_waste
 from cprl.commons.views import draw_institutions, draw_scores, draw_signals, draw_windows, has_apple_ahead
-from cprl.commons.world import PLAYING, TERMINATED, TRUNCATED, Actions, Scratch, StepOutput, Worlds
-from cprl.institutions import Law
-from cprl.institutions.law import begin, note_growth, open_turn, refresh, settle
+from cprl.commons.world import BEGIN, PLAY, PLAYING, REFRESH, TERMINATED, TRUNCATED
+from cprl.institutions.hooks import begin, open_turn, refresh, settle
 from cprl.institutions.ledger import charge, count_violation, forget_episode, forget_turn
 from cprl.institutions.sanctioner import appoint
 from cprl.institutions.sanctions import sanction_violation
 from cprl.institutions.votes import hold_ballot, is_due
+from cprl.values.arrays import Int64
+
+if TYPE_CHECKING:
+    from cprl.commons.tables import Tables
+    from cprl.commons.world import Scratch, StepOutput, Worlds
+    from cprl.institutions import Law
+
+
+def run_world(
+    world: Worlds,
+    tables: Tables,
+    task: int,
+    actions: Int64,
+    decisions: Int64,
+    output: StepOutput,
+    law: Law | None,
+    scratch: Scratch,
+) -> None:
+    """Do a task with a world, and write its output.
+
+    `law` is what institutions need; without any it is None, and Numba compiles nothing of what asks for it.
+
+    Args:
+        task: PLAY a turn, which a world that has ended sits out; BEGIN the next episode; or REFRESH the
+            output of a state that was set from outside.
+        actions: int64 [N].
+        decisions: int64 [N].
+    """
+    if task == PLAY and world.ended[0] == PLAYING:
+        play_turn(world, tables, actions, decisions, output, law, scratch)
+    else:
+        clear_events(world, law, output)
+        if task == BEGIN:
+            begin_episode(world, tables, law)
+        elif task == REFRESH:
+            recount(world, tables)
+            count_waste(world.groups.river)
+            refresh_institutions(world, law)
+    write_state(world, tables, output, scratch)
+    write_payments(world, tables, law, output)
 
 
 def play_turn(
-    world: Worlds, tables: Tables, actions: Actions, output: StepOutput, law: Law | None, scratch: Scratch
+    world: Worlds,
+    tables: Tables,
+    actions: Int64,
+    decisions: Int64,
+    output: StepOutput,
+    law: Law | None,
+    scratch: Scratch,
 ) -> None:
-    """Plays one turn; `actions`: int64 [N]. A world that has ended does not change and pays nothing.
-
-    `law` is what institutions need; without any it is None, and Numba compiles nothing of what it asks for.
-    """
-    if world.ended[0] != PLAYING:
-        clear_events(output)
-        write_state(world, tables, output, scratch)
-        if law is not None:
-            forget_turn(law.ledger)
-            write_payments(world, tables, law, output)
-        return
+    """Play one turn; `actions` and `decisions`: int64 [N]."""
     began_empty = world.stock_left[0] == 0
-    keep_old_stock(world, tables)
+    keep_old_stock(world, world.groups.quirks)
     world.step[0] += 1
-    if law is not None:
-        begin_turn(world, law)
+    begin_turn(world, law, decisions)
     count_down(world)
-    act(world, tables, actions, scratch)
-    if law is not None:
-        hold_fire(world, law)
-    if tables.pairwise_clashes:
-        settle_pairwise(world, scratch)
-    elif not (FURTHER and tables.moves_in_turn):
-        settle_clashes(world, tables, scratch)
-    note_moved_shooters(world, tables, scratch)
-    if FURTHER and tables.regrow_after_bites:
-        bite(world, tables, law, actions, output.harvest)
-    if FURTHER and world.waste.shape[0] > 0:
-        clean(world, tables, scratch, output.cleaned)
-    sprouts = find_sprouts(world, tables, scratch)
-    if FURTHER and world.waste.shape[0] > 0:
-        pollute(world, tables)
-    if tables.regrow_before_bites:
-        grow(world, tables, scratch, sprouts)
-    if not (FURTHER and tables.regrow_after_bites):
-        bite(world, tables, law, actions, output.harvest)
-    if not tables.regrow_before_bites:
-        grow(world, tables, scratch, sprouts)
-    output.regrown[0] = sprouts
+    act(world, tables, law, actions, scratch)
+    settle_clashes(world, tables, scratch)
+    clean(world, tables, world.groups.river, scratch, output.cleaned)
+    output.regrown[0] = bite_and_grow(world, tables, law, actions, scratch, output.harvest)
     find_hits(world, tables, output.hit_by)
     tag(world, tables, law, output.hit_by, output.tagged_by)
-    if law is not None:
-        pursue_violations(world, tables, law)
+    pursue_violations(world, law)
     check_end(world, tables, began_empty)
-    if law is not None:
-        settle(law, world.step[0], world.ended[0] != PLAYING)
-    for i in range(world.row.shape[0]):
-        output.fired[i] = world.fired[i]
-        world.on_board[i] = world.in_play[i]
+    end_turn(world, law)
+    note_events(world, output)
     return_to_play(world, tables, scratch)
-    write_state(world, tables, output, scratch)
-    if law is not None:
-        end_turn(world, law, scratch, sprouts)
-        write_payments(world, tables, law, output)
+    keep_on_board(world)
+    open_next_turn(world, law)
 
 
-def shuffle_starts(world: Worlds) -> None:
-    """Permutes the agents' starts, all permutations equally likely (Durstenfeld, "Algorithm 235: Random
-    permutation", 1964)."""
-    for i in range(world.row.shape[0] - 1, 0, -1):
-        word, _, _, _ = draw(world, STARTS | i)
-        j = int(word % np.uint64(i + 1))
-        world.row[i], world.row[j] = world.row[j], world.row[i]
-        world.col[i], world.col[j] = world.col[j], world.col[i]
-        world.heading[i], world.heading[j] = world.heading[j], world.heading[i]
-
-
-def begin_episode(
-    world: Worlds, tables: Tables, output: StepOutput, law: Law | None, scratch: Scratch
-) -> None:
-    """Starts the next episode: all sites hold an apple, all agents are at their starts, if the rules say
+def begin_episode(world: Worlds, tables: Tables, law: Law | None) -> None:
+    """Start the next episode: all sites hold an apple, all agents are at their starts, if the rules say
     nothing else; institutions forget the last one, but for what votes put in force."""
     world.episode[0] += 1
     world.step[0] = 0
     world.ended[0] = PLAYING
     fill(world, tables)
-    if FURTHER:
-        begin_river(world, tables)
+    begin_river(world.groups.river)
     place_at_starts(world, tables)
     if tables.shuffle_starts:
         shuffle_starts(world)
-    if FURTHER and (tables.spawns.shape[0] > 0 or tables.random_headings):
-        draw_starts(world, tables)
-    clear_events(output)
-    write_state(world, tables, output, scratch)
-    if law is not None:
-        begin_institutions(world, law)
-        write_payments(world, tables, law, output)
-
-
-def refresh_output(
-    world: Worlds, tables: Tables, output: StepOutput, law: Law | None, scratch: Scratch
-) -> None:
-    """Writes the output for a state that was set from outside, with no harvest, shots, hits, growth or
-    payments."""
-    recount(world, tables)
-    if FURTHER:
-        count_waste(world)
-    clear_events(output)
-    write_state(world, tables, output, scratch)
-    if law is not None:
-        refresh_institutions(world, law)
-        write_payments(world, tables, law, output)
-
-
-def keep_old_stock(world: Worlds, tables: Tables) -> None:
-    """Copies the stock at the start of the turn, for `picture_shows_old_stock`."""
-    if tables.picture_shows_old_stock:
-        for k in range(world.stock.shape[0]):
-            world.stock_before[k] = world.stock[k]
+    draw_starts(world, tables)
+    begin_institutions(world, law)
 
 
 def check_end(world: Worlds, tables: Tables, began_empty: bool) -> None:
-    """Ends the episode: TERMINATED if no apple is left and none can grow, else TRUNCATED if out of time."""
-    is_empty = began_empty if tables.ends_one_turn_late else world.stock_left[0] == 0
+    """End the episode: TERMINATED if no apple is left and none can grow, else TRUNCATED if out of time."""
+    is_empty = began_empty if ends_late(world.groups.quirks) else world.stock_left[0] == 0
     if is_empty and tables.never_from_nothing:
         world.ended[0] = TERMINATED
-    elif world.step[0] >= tables.episode_steps or (FURTHER and ends_by_chance(world, tables)):
+    elif world.step[0] >= tables.episode_steps or ends_by_chance(world, tables):
         world.ended[0] = TRUNCATED
 
 
 def ends_by_chance(world: Worlds, tables: Tables) -> bool:
-    """Whether this turn is one after which an episode may end by chance, and it does."""
+    """Return whether this turn is one after which an episode may end by chance, and it does."""
     later = world.step[0] - tables.end_from_step
     if tables.end_below == 0 or later < 0 or later % tables.end_every_steps > 0:
         return False
     return int(draw(world, END)[0]) < tables.end_below
 
 
-def clear_events(output: StepOutput) -> None:
-    """Writes an output without harvest, shots, hits and growth."""
-    agents = output.harvest.shape[0]
+def note_events(world: Worlds, output: StepOutput) -> None:
+    """Note who fired and who is on the board as the turn ends, and the reward without institutions."""
+    for i in range(world.row.shape[0]):
+        output.fired[i] = world.fired[i]
+        output.reward[i] = output.harvest[i]
+        world.on_board[i] = world.in_play[i]
+
+
+def keep_on_board(world: Worlds) -> None:
+    """Keep on the board who was tagged in this turn and is back in play already, as it misses no turn."""
+    for i in range(world.row.shape[0]):
+        if world.in_play[i] and world.tagged_step[i] == world.step[0]:
+            world.on_board[i] = True
+
+
+def clear_events(world: Worlds, law: Law | None, output: StepOutput) -> None:
+    """Write that there was no harvest, shot, hit, growth, fine or transfer."""
+    agents = world.row.shape[0]
     for i in range(agents):
         output.harvest[i] = 0.0
+        output.reward[i] = 0.0
         output.fired[i] = False
-        if FURTHER and output.cleaned.shape[0] > 0:
-            output.cleaned[i] = 0.0
         for j in range(agents):
             output.hit_by[i, j] = False
             output.tagged_by[i, j] = False
+    for i in range(output.cleaned.shape[0]):
+        output.cleaned[i] = 0.0
     output.regrown[0] = 0
+    if law is not None:
+        forget_turn(law.ledger)
 
 
 def write_state(world: Worlds, tables: Tables, output: StepOutput, scratch: Scratch) -> None:
-    """Writes the current state and every agent's observation into the output."""
+    """Write the current state and every agent's observation into the output."""
     for i in range(world.row.shape[0]):
         output.in_play[i] = world.in_play[i]
-        for j in range(output.scoreboard.shape[1]):
-            output.scoreboard[i, j] = world.harvested[(i + j) % world.row.shape[0]]
-        if output.stock_gauge.shape[1] > 0:
-            output.stock_gauge[i, 0] = world.stock_left[0] / world.stock.shape[0]
         if output.apple_ahead.shape[1] > 0:
             output.apple_ahead[i, 0] = has_apple_ahead(world, tables, i)
     output.stock[0] = world.stock_left[0]
-    if FURTHER and output.waste.shape[0] > 0:
-        output.waste[0] = world.waste_left[0]
+    write_waste(world.groups.river, output.waste)
     output.terminated[0] = world.ended[0] == TERMINATED
     output.truncated[0] = world.ended[0] == TRUNCATED
     output.done[0] = world.ended[0] != PLAYING
     draw_windows(world, tables, scratch, output.observation)
-    if FURTHER and tables.signals > 0:
+    if tables.signals > 0:
         draw_signals(world, tables, scratch, output.observation)
-    if FURTHER and tables.scoreboard_cells + tables.stock_gauge_cells > 0:
+    if tables.scoreboard_cells + tables.stock_gauge_cells > 0:
         draw_scores(world, tables, output.observation)
 
 
-def begin_turn(world: Worlds, law: Law) -> None:
-    """Clears the notes of the last turn; in the first one of an episode agents decide, and windows open."""
+def begin_turn(world: Worlds, law: Law | None, decisions: Int64) -> None:
+    """Clear the notes of the last turn; in the first one of an episode agents decide, and windows open."""
+    if law is None:
+        return
     forget_turn(law.ledger)
     if world.step[0] == 1:
         for ballot in range(law.votes.options.shape[0]):
             if is_due(law.votes, ballot, world.episode[0]):
                 words = draw(world, BALLOT + ballot)
-                hold_ballot(law.votes, law.ledger, ballot, law.decisions, words)
+                hold_ballot(law.votes, law.ledger, ballot, decisions, words)
         appoint(law.sanctioner, law.ledger)
         open_turn(law, 1, stock_share(world))
 
 
-def hold_fire(world: Worlds, law: Law) -> None:
-    """Takes back the shots of agents that may not fire."""
-    for i in range(world.row.shape[0]):
-        world.fired[i] = world.fired[i] and law.sanctioner.may_fire[i]
+def end_turn(world: Worlds, law: Law | None) -> None:
+    """Collect, pay and forgive what is due at the end of a turn."""
+    if law is not None:
+        settle(law, world.step[0], world.ended[0] != PLAYING)
 
 
-def end_turn(world: Worlds, law: Law, scratch: Scratch, sprouts: int) -> None:
-    """Begins what begins with the coming turn; `sprouts`: apples grown."""
-    for s in range(sprouts):
-        note_growth(law, scratch.sprouts[s])
-    open_turn(law, world.step[0] + 1, stock_share(world))
+def open_next_turn(world: Worlds, law: Law | None) -> None:
+    """Begin what begins with the coming turn."""
+    if law is not None:
+        open_turn(law, world.step[0] + 1, stock_share(world))
 
 
-def begin_institutions(world: Worlds, law: Law) -> None:
-    """Begins an episode: all is forgotten but what votes put in force. Before the first vote of a world, that
+def begin_institutions(world: Worlds, law: Law | None) -> None:
+    """Begin an episode: all is forgotten but what votes put in force. Before the first vote of a world, that
     is the first choice of each ballot."""
+    if law is None:
+        return
     forget_episode(law.ledger)
     begin(law)
     if world.episode[0] == 0:
@@ -233,19 +221,22 @@ def begin_institutions(world: Worlds, law: Law) -> None:
     open_turn(law, 1, stock_share(world))
 
 
-def refresh_institutions(world: Worlds, law: Law) -> None:
-    """Writes what follows from the rest of the memory and from the stock, without events."""
-    refresh(law, world.stock)
-    forget_turn(law.ledger)
+def refresh_institutions(world: Worlds, law: Law | None) -> None:
+    """Write what follows from the rest of the memory and from the stock, without events."""
+    if law is not None:
+        refresh(law, world.stock)
+        forget_turn(law.ledger)
 
 
 def stock_share(world: Worlds) -> float:
-    """The share of all sites that hold an apple, 0..1."""
+    """Return the share of all sites that hold an apple, 0..1."""
     return world.stock_left[0] / world.stock.shape[0]
 
 
-def pursue_violations(world: Worlds, tables: Tables, law: Law) -> None:
-    """Detects violations of this turn, or not, and lets those who are found out pay and miss turns."""
+def pursue_violations(world: Worlds, law: Law | None) -> None:
+    """Detect violations of this turn, or not, and let those who are found out pay and miss turns."""
+    if law is None:
+        return
     for i in range(world.row.shape[0]):
         law.ledger.detected[i] = False
         if count_violation(law.ledger, i, world.step[0]):
@@ -254,21 +245,23 @@ def pursue_violations(world: Worlds, tables: Tables, law: Law) -> None:
                 charge(law.ledger, i)
                 steps = sanction_violation(law.sanctions, law.ledger, i, world.step[0])
                 if steps > 0:
-                    take_out(world, tables, i, steps)
+                    take_out(world, i, steps)
 
 
-def write_payments(world: Worlds, tables: Tables, law: Law, output: StepOutput) -> None:
-    """Writes what institutions took, gave and counted in this turn, the reward, and what agents are shown."""
-    ledger, payments = law.ledger, law.payments
+def write_payments(world: Worlds, tables: Tables, law: Law | None, output: StepOutput) -> None:
+    """Write what institutions took, gave and counted in this turn, the reward, and what agents are shown."""
+    if law is None:
+        return
+    ledger = law.ledger
     if law.entries.places or law.entries.what.shape[0] > 0:
         draw_institutions(world, tables, law, output.observation)
     for i in range(world.row.shape[0]):
-        payments.fines[i] = ledger.fines[i]
-        payments.transfers[i] = ledger.transfers[i]
-        payments.reward[i] = output.harvest[i] - ledger.fines[i] + ledger.transfers[i]
-        payments.violated[i] = ledger.broke[i]
+        output.fines[i] = ledger.fines[i]
+        output.transfers[i] = ledger.transfers[i]
+        output.reward[i] = output.harvest[i] - ledger.fines[i] + ledger.transfers[i]
+        output.violated[i] = ledger.broke[i]
         for count in range(ledger.counts.shape[1]):
-            payments.counts[i, count] = ledger.counts[i, count]
-    for ballot in range(payments.in_force.shape[0]):
-        payments.in_force[ballot] = ledger.in_force[ballot]
-        payments.ballots_due[ballot] = world.step[0] == 0 and is_due(law.votes, ballot, world.episode[0])
+            output.counts[i, count] = ledger.counts[i, count]
+    for ballot in range(output.in_force.shape[0]):
+        output.in_force[ballot] = ledger.in_force[ballot]
+        output.ballots_due[ballot] = world.step[0] == 0 and is_due(law.votes, ballot, world.episode[0])

@@ -9,16 +9,19 @@ entry n modulo S. So a single entry fills a plane evenly, as is usual for number
 beside a board. Planes "scoreboard" and "stock_gauge" of `Observation` do the same, before them.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from cprl.commons.beam import beam_begin, beam_cell, beam_reach
-from cprl.commons.colours import (
+from cprl.commons.cells import (
     APPLE,
     BEAM,
     CLEANING,
     FIRST_AGENT,
     GROUND,
-    HIDDEN,
     MARK,
     OTHER,
     SELF,
@@ -26,134 +29,145 @@ from cprl.commons.colours import (
     WASTE,
     WATER,
 )
+from cprl.commons.headings import COL_STEP, ROW_STEP
 from cprl.commons.moves import cell_of
-from cprl.commons.tables import CLASS_SHIFT, FURTHER, LARGEST_CLASS, Tables
-from cprl.commons.world import COL_STEP, DOWN, ROW_STEP, UP, Bytes, Ints, Scratch, Worlds
-from cprl.institutions import Law
-from cprl.institutions.law import forbids, shown
+from cprl.commons.quirks import mark_ahead, paints_over, self_stays, shows_apple
+from cprl.commons.river import is_cleaning
+from cprl.institutions.hooks import forbids, shown
+from cprl.values.arrays import Int32, UInt8
+
+if TYPE_CHECKING:
+    from cprl.commons.river import Arrays as River
+    from cprl.commons.tables import Tables
+    from cprl.commons.world import Scratch, Worlds
+    from cprl.institutions import Law
+
+CLASS_SHIFT = 24
+"""A paint is a colour in 24 bits, and its class from this bit on."""
+LARGEST_CLASS = 255
 
 
 def class_of(paint: int) -> int:
-    """The class of a paint."""
+    """Return the class of a paint."""
     return (paint >> CLASS_SHIFT) & LARGEST_CLASS
 
 
-def paint_apples(world: Worlds, tables: Tables, picture: Ints) -> None:
-    """Paints ground, walls, the river and apples; `picture`: int32 [cells], paints."""
+def paint_apples(world: Worlds, tables: Tables, picture: Int32) -> None:
+    """Paint ground, walls, the river and apples; `picture`: int32 [cells], paints."""
     for cell in range(picture.shape[0]):
         picture[cell] = tables.background[cell]
-    if FURTHER:
-        for r in range(world.waste.shape[0]):
-            if world.waste[r] == 1:
-                picture[tables.river_cell[r]] = tables.paints[WASTE]
-    stock = world.stock_before if tables.picture_shows_old_stock else world.stock
+    paint_waste(tables, world.groups.river, picture)
     apple, ground = tables.paints[APPLE], tables.paints[GROUND]
-    for k in range(stock.shape[0]):
-        picture[tables.site_cell[k]] = apple if stock[k] == 1 else ground
+    for k in range(world.stock.shape[0]):
+        picture[tables.site_cell[k]] = apple if shows_apple(world, world.groups.quirks, k) else ground
+
+
+def paint_waste(tables: Tables, river: River | None, picture: Int32) -> None:
+    """Paint the cells of the river that have waste."""
+    if river is not None:
+        for r in range(river.waste.shape[0]):
+            if river.waste[r] == 1:
+                picture[river.cell[r]] = tables.paints[WASTE]
 
 
 def has_apple_ahead(world: Worlds, tables: Tables, i: int) -> bool:
-    """Whether the cell ahead of agent i holds an apple in the picture, under whatever covers it."""
+    """Return whether the cell ahead of agent i holds an apple in the picture, under whatever covers it."""
     heading = world.heading[i]
     cell = cell_of(world.row[i] + ROW_STEP[heading], world.col[i] + COL_STEP[heading], tables)
     site = tables.site_at[cell]
-    stock = world.stock_before if tables.picture_shows_old_stock else world.stock
-    return site >= 0 and stock[site] == 1
+    return site >= 0 and shows_apple(world, world.groups.quirks, site)
 
 
 def mark_cell(world: Worlds, tables: Tables, i: int) -> int:
-    """The cell of agent i's heading mark: ahead of it, or behind it under `mark_behind_if_vertical`."""
+    """Return the cell of agent i's heading mark."""
     heading = world.heading[i]
-    away = -1 if tables.mark_behind_if_vertical and heading in (UP, DOWN) else 1
-    row = world.row[i] + away * ROW_STEP[heading]
-    col = world.col[i] + away * COL_STEP[heading]
+    ahead = mark_ahead(heading, world.groups.quirks)
+    row = world.row[i] + ahead * ROW_STEP[heading]
+    col = world.col[i] + ahead * COL_STEP[heading]
     return cell_of(row, col, tables)
 
 
 def is_open_ground(kind: int) -> bool:
-    """Whether a class is ground that marks and beams cover: ground, or clean water."""
-    return kind == GROUND or (FURTHER and kind == WATER)
+    """Return whether a class is ground that marks and beams cover: ground, or clean water."""
+    return kind in (GROUND, WATER)
 
 
-def paint_mark(world: Worlds, tables: Tables, i: int, picture: Ints) -> None:
-    """Paints the heading mark of agent i: on ground only, under `paint_over` on anything but a wall."""
+def paint_mark(world: Worlds, tables: Tables, i: int, picture: Int32) -> None:
+    """Paint the heading mark of agent i: on ground only, under `Quirks2019.paint_over` on anything but a
+    wall."""
     cell = mark_cell(world, tables, i)
     kind = class_of(picture[cell])
-    if is_open_ground(kind) or (tables.paint_over and kind != WALL):
+    if is_open_ground(kind) or (paints_over(world.groups.quirks) and kind != WALL):
         picture[cell] = tables.paints[MARK]
 
 
-def paint_beam(world: Worlds, tables: Tables, shooter: int, kind_of_beam: int, picture: Ints) -> None:
-    """Paints the beam of a shooter, BEAM or CLEANING: over ground and marks only, under `paint_over` over
-    everything."""
+def paint_beam(world: Worlds, tables: Tables, shooter: int, kind_of_beam: int, picture: Int32) -> None:
+    """Paint the beam of a shooter, BEAM or CLEANING: over ground and marks only, under
+    `Quirks2019.paint_over` over everything."""
     for side in range(-tables.beam_half_width, tables.beam_half_width + 1):
         last = beam_reach(world, tables, shooter, side, world.on_board)
         for ahead in range(beam_begin(tables, side), last + 1):
             cell = beam_cell(world, tables, shooter, ahead, side)
             kind = class_of(picture[cell])
-            if tables.paint_over or kind == MARK or is_open_ground(kind):
+            if paints_over(world.groups.quirks) or kind == MARK or is_open_ground(kind):
                 picture[cell] = tables.paints[kind_of_beam]
 
 
 def paint_of(tables: Tables, i: int) -> int:
-    """The paint of agent i in the windows of other agents."""
+    """Return the paint of agent i in the windows of other agents."""
     return tables.paints[FIRST_AGENT + i if tables.agents_apart else OTHER]
 
 
-def paint_agents(world: Worlds, tables: Tables, picture: Ints) -> None:
-    """Paints heading marks, then beams, then agents."""
+def paint_agents(world: Worlds, tables: Tables, picture: Int32) -> None:
+    """Paint heading marks, then beams, then agents."""
     agents = world.row.shape[0]
     for i in range(agents):
         if world.on_board[i]:
             paint_mark(world, tables, i, picture)
-    for i in range(agents):
-        if world.fired[i]:
-            paint_beam(world, tables, i, BEAM, picture)
-        if FURTHER and world.cleans[i]:
-            paint_beam(world, tables, i, CLEANING, picture)
+    paint_beams(world, tables, picture)
     for i in range(agents):
         if world.on_board[i]:
             picture[cell_of(world.row[i], world.col[i], tables)] = paint_of(tables, i)
 
 
-def paint_agents_over(world: Worlds, tables: Tables, picture: Ints) -> None:
-    """[run] Paints mark and body of each agent in the order of indices, covering others; beams cover all."""
-    agents = world.row.shape[0]
-    for i in range(agents):
-        if world.on_board[i]:
-            paint_mark(world, tables, i, picture)
-            picture[cell_of(world.row[i], world.col[i], tables)] = paint_of(tables, i)
-    for i in range(agents):
+def paint_beams(world: Worlds, tables: Tables, picture: Int32) -> None:
+    """Paint what agents fired, and with what they cleaned."""
+    for i in range(world.row.shape[0]):
         if world.fired[i]:
             paint_beam(world, tables, i, BEAM, picture)
-        if FURTHER and world.cleans[i]:
+        if is_cleaning(world.groups.river, i):
             paint_beam(world, tables, i, CLEANING, picture)
 
 
-def paint(world: Worlds, tables: Tables, picture: Ints) -> None:
-    """Paints the whole board, with every agent as other agents see it."""
+def paint_agents_over(world: Worlds, tables: Tables, picture: Int32) -> None:
+    """[run] Paint mark and body of each agent in the order of indices, covering others; beams cover all."""
+    for i in range(world.row.shape[0]):
+        if world.on_board[i]:
+            paint_mark(world, tables, i, picture)
+            picture[cell_of(world.row[i], world.col[i], tables)] = paint_of(tables, i)
+    paint_beams(world, tables, picture)
+
+
+def paint(world: Worlds, tables: Tables, picture: Int32) -> None:
+    """Paint the whole board, with every agent as other agents see it."""
     paint_apples(world, tables, picture)
-    if tables.paint_over:
+    if paints_over(world.groups.quirks):
         paint_agents_over(world, tables, picture)
     else:
         paint_agents(world, tables, picture)
 
 
 def look(world: Worlds, tables: Tables, i: int, scratch: Scratch) -> None:
-    """Writes what agent i sees of the picture into `scratch.seen`: farthest row and leftmost column first."""
+    """Write what agent i sees of the picture into `scratch.seen`: farthest row and leftmost column first."""
     heading = world.heading[i]
     origin = 0 if tables.sees_all else cell_of(world.row[i], world.col[i], tables)
     to_cell = tables.window_cells[heading]
     for n in range(to_cell.shape[0]):
         scratch.seen[n] = scratch.picture[np.uint64(origin + to_cell[n])]
-    if tables.walls_block_sight:
-        for n in range(to_cell.shape[0]):
-            if not tables.in_sight[origin, heading, n]:
-                scratch.seen[n] = tables.paints[HIDDEN]
 
 
-def cut_window(world: Worlds, tables: Tables, i: int, scratch: Scratch, window: Bytes) -> None:
-    """Writes the observation of agent i: uint8 [C, X, Y]; in a window it is in the middle of the last row,
+def cut_window(world: Worlds, tables: Tables, i: int, scratch: Scratch, window: UInt8) -> None:
+    """Write the observation of agent i: uint8 [C, X, Y]; in a window it is in the middle of the last row,
     but for `window_rows_behind`.
 
     There are two passes, so that the second writes contiguous memory; unsigned indices avoid Numba's check
@@ -176,8 +190,8 @@ def cut_window(world: Worlds, tables: Tables, i: int, scratch: Scratch, window: 
             planes[2 * cells + n] = (paint >> 16) & 255
 
 
-def draw_windows(world: Worlds, tables: Tables, scratch: Scratch, observation: Bytes) -> None:
-    """Writes every agent's observation, itself shown as SELF; `observation`: uint8 [N, C, X, Y]."""
+def draw_windows(world: Worlds, tables: Tables, scratch: Scratch, observation: UInt8) -> None:
+    """Write every agent's observation, itself shown as SELF; `observation`: uint8 [N, C, X, Y]."""
     picture = scratch.picture
     paint(world, tables, picture)
     for i in range(world.row.shape[0]):
@@ -185,20 +199,20 @@ def draw_windows(world: Worlds, tables: Tables, scratch: Scratch, observation: B
         as_others_see_it = picture[cell]
         picture[cell] = tables.paints[SELF]
         cut_window(world, tables, i, scratch, observation[i])
-        if not tables.self_paint_stays:
+        if not self_stays(world.groups.quirks):
             picture[cell] = as_others_see_it
 
 
-def draw_board(world: Worlds, tables: Tables, scratch: Scratch, board: Bytes) -> None:
-    """Writes the classes of all cells of the board, without its rim; `board`: uint8 [H, W]."""
+def draw_board(world: Worlds, tables: Tables, scratch: Scratch, board: UInt8) -> None:
+    """Write the classes of all cells of the board, without its rim; `board`: uint8 [H, W]."""
     paint(world, tables, scratch.picture)
     for row in range(board.shape[0]):
         for col in range(board.shape[1]):
             board[row, col] = class_of(scratch.picture[cell_of(row, col, tables)])
 
 
-def draw_signals(world: Worlds, tables: Tables, scratch: Scratch, observation: Bytes) -> None:
-    """Writes who sent which signal in the last turn, after `draw_windows`, whose picture it takes;
+def draw_signals(world: Worlds, tables: Tables, scratch: Scratch, observation: UInt8) -> None:
+    """Write who sent which signal in the last turn, after `draw_windows`, whose picture it takes;
     `observation`: uint8 [N, C, X, Y]."""
     picture = scratch.picture
     for cell in range(picture.shape[0]):
@@ -219,8 +233,8 @@ def draw_signals(world: Worlds, tables: Tables, scratch: Scratch, observation: B
 HIGHEST = 255
 
 
-def draw_scores(world: Worlds, tables: Tables, observation: Bytes) -> None:
-    """Writes the scoreboard and the stock gauge as planes, see `Observation`; `observation`: uint8
+def draw_scores(world: Worlds, tables: Tables, observation: UInt8) -> None:
+    """Write the scoreboard and the stock gauge as planes, see `Observation`; `observation`: uint8
     [N, C, X, Y]."""
     agents, sites = world.row.shape[0], world.stock.shape[0]
     end = tables.score_begin + tables.scoreboard_cells
@@ -237,12 +251,12 @@ def draw_scores(world: Worlds, tables: Tables, observation: Bytes) -> None:
 
 
 def in_bytes(part: int, whole: int) -> int:
-    """A share as 0..255, rounded half up, in integers alone: the same on every device."""
+    """Return a share as 0..255, rounded half up, in integers alone: the same on every device."""
     return (2 * HIGHEST * part + whole) // (2 * whole)
 
 
-def draw_institutions(world: Worlds, tables: Tables, law: Law, observation: Bytes) -> None:
-    """Writes what institutions show each agent; `observation`: uint8 [N, C, X, Y]."""
+def draw_institutions(world: Worlds, tables: Tables, law: Law, observation: UInt8) -> None:
+    """Write what institutions show each agent; `observation`: uint8 [N, C, X, Y]."""
     cells = tables.window_cells.shape[1]
     for i in range(world.row.shape[0]):
         planes = observation[i].reshape(-1)
@@ -254,20 +268,17 @@ def draw_institutions(world: Worlds, tables: Tables, law: Law, observation: Byte
             draw_entries(law, i, world.step[0], planes[first:])
 
 
-def draw_forbidden(world: Worlds, tables: Tables, law: Law, i: int, plane: Bytes) -> None:
-    """Draws where agent i sees that its bites would break a rule about places; `plane`: uint8 [X * Y]."""
+def draw_forbidden(world: Worlds, tables: Tables, law: Law, i: int, plane: UInt8) -> None:
+    """Draw where agent i sees that its bites would break a rule about places; `plane`: uint8 [X * Y]."""
     origin = 0 if tables.sees_all else cell_of(world.row[i], world.col[i], tables)
     heading = world.heading[i]
     for n in range(plane.shape[0]):
-        plane[n] = 0
-        if not tables.walls_block_sight or tables.in_sight[origin, heading, n]:
-            cell = origin + tables.window_cells[heading, n]
-            if forbids(law, i, cell, tables.site_at[cell]):
-                plane[n] = HIGHEST
+        cell = origin + tables.window_cells[heading, n]
+        plane[n] = HIGHEST if forbids(law, i, cell, tables.site_at[cell]) else 0
 
 
-def draw_entries(law: Law, i: int, turn: int, planes: Bytes) -> None:
-    """Writes the entries shown to agent i, each into every S-th cell; `planes`: uint8 [cells]."""
+def draw_entries(law: Law, i: int, turn: int, planes: UInt8) -> None:
+    """Write the entries shown to agent i, each into every S-th cell; `planes`: uint8 [cells]."""
     entries = law.entries.what.shape[0]
     for entry in range(entries):
         value = int(HIGHEST * min(1.0, max(0.0, shown(law, entry, i, turn))) + 0.5)

@@ -3,9 +3,6 @@
 Modules, in the order in which one reads them:
     make_env         where an environment is put together; spaces_of; games as recipes hold them
     commons_env      CommonsEnv, TorchRL: B worlds at once
-    stage_games      what games share in which all act at once: specs, clock, memory, steps
-    matrix           MatrixGame: payoff tables, played once or several times
-    taking           TakingGame: how much to take of what is shared, once or several times
     drivers          where the worlds run: CPU threads or a GPU
     stepping          what environments share in a step: actions, recurrent states
     unwrap           what lies under an environment's transforms, and what its specs say of agents

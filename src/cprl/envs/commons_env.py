@@ -12,16 +12,16 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 
 from cprl import keys
-from cprl.commons.batch import Batch, Output, output_of, turn_of
+from cprl.commons.batch import Batch
 from cprl.commons.game import Game, output_forms
-from cprl.commons.picture import world_image
-from cprl.commons.world import PLAYING, Bytes, StepOutput
+from cprl.commons.quirks import paints_over
+from cprl.commons.world import PLAYING, StepOutput
 from cprl.envs.drivers import device_of, drawn_seed, driver_for
 from cprl.envs.stepping import begin_states, carry_on, chosen
-from cprl.institutions.ledger import Payments
+from cprl.pictures.image import world_image
 from cprl.system.compat import LeanStepEnv, flag_spec, unchecked_tensordict
-from cprl.system.memory import check_memory
 from cprl.values import Range, Seed, checked
+from cprl.values.arrays import UInt8
 
 WORLD_ENTRIES = ("stock", "regrown")
 DONE_ENTRIES = ("done", "terminated", "truncated")
@@ -32,7 +32,7 @@ _AHEAD_TURNS = 16
 _BALLOT_ENTRIES = (keys.IN_FORCE, keys.BALLOTS_DUE)
 _PAID_ENTRIES = tuple(key[-1] for key in (keys.FINES, keys.TRANSFERS, keys.VIOLATED, keys.COUNTS))
 """Entries of agents in games with institutions."""
-_REPLACED = frozenset((*StepOutput._fields, *Payments._fields, keys.STATE, keys.AGENTS, "next", "_reset"))
+_REPLACED = frozenset((*StepOutput._fields, keys.STATE, keys.AGENTS, "next", "_reset"))
 """The entries that the environment writes anew in each turn."""
 
 
@@ -83,12 +83,11 @@ class CommonsEnv(LeanStepEnv):
         self._size = worlds
         self._agents_size = torch.Size([worlds, game.agents])
         paid = _PAID_ENTRIES if game.institutions else ()
-        covered = keys.APPLE_AHEAD[1:] if game.rules.paint_over else ()
+        covered = keys.APPLE_AHEAD[1:] if paints_over(game.rules.quirks) else ()
         of_agents, of_worlds = (keys.CLEANED[1:], (keys.WASTE,)) if game.map.river else ((), ())
-        vectors = (name for name, _ in game.spaces.vectors)
-        self._agent_entries = (*_AGENT_ENTRIES, *of_agents, *covered, *paid, *vectors)
+        self._agent_entries = (*_AGENT_ENTRIES, *of_agents, *covered, *paid)
         self._world_entries = (*WORLD_ENTRIES, *of_worlds, *(_BALLOT_ENTRIES if game.ballots else ()))
-        self._decides, self._is_governed = game.decisions > 0, bool(game.institutions)
+        self._decides = game.decisions > 0
         self._with_state = state
         self._forms = {
             name: (shape, torch.from_numpy(np.empty(0, dtype)).dtype)
@@ -96,18 +95,23 @@ class CommonsEnv(LeanStepEnv):
         }
         self._colours = torch.from_numpy(game.palette).to(device)
         output_bytes = sum(prod(shape) * dtype.itemsize for shape, dtype in self._forms.values())
+        self._lacking = {
+            name: as_array(torch.empty(shape, dtype=dtype, device=device))
+            for name, (shape, dtype) in self._forms.items()
+            if not prod(shape)
+        }
+        """The arrays, in every turn, of entries that the game lacks: made anew they would take as long as a
+        world."""
         self._turns_ahead = _AHEAD_TURNS if output_bytes < _AHEAD_BYTES else 1
-        self._ahead: list[tuple[dict[str, Tensor], Output]] = []
+        self._ahead: list[tuple[dict[str, Tensor], StepOutput]] = []
         self._tensors: dict[str, Tensor]
         self.output: StepOutput
-        self._whole: Output
         self._show_in(*self._fresh())
         self._make_specs()
 
     def _make_specs(self) -> None:
         game, worlds, per_agent = self.game, self._size, self._agents_size
-        highest = {"observation": game.observation_highest, "harvest": 1, "stock_gauge": 1}
-        highest |= {"scoreboard": game.rules.episode_steps}
+        highest = {"observation": game.observation_highest, "harvest": 1}
         highest |= dict.fromkeys(WORLD_ENTRIES, len(game.map.sites)) | {"waste": len(game.map.river)}
         highest |= {"cleaned": game.rules.beam_width_cells}
 
@@ -139,32 +143,35 @@ class CommonsEnv(LeanStepEnv):
     def __repr__(self) -> str:
         return f"CommonsEnv({self.game!r}, worlds={self._size}, device={str(self.device)!r})"
 
-    def _fresh(self) -> tuple[dict[str, Tensor], Output]:
+    def _fresh(self) -> tuple[dict[str, Tensor], StepOutput]:
         """New memory for the output of a turn: as tensors by name, and the same memory as arrays."""
         if not self._ahead:
-            blocks = [
-                torch.empty((self._turns_ahead, *shape), dtype=dtype, device=self.device)
-                for shape, dtype in self._forms.values()
-            ]
-            tensors = zip(*(block.unbind() for block in blocks), strict=True)
-            arrays = zip(*(self._turns_of(block) for block in blocks), strict=True)
+            blocks = {
+                name: torch.empty((self._turns_ahead, *shape), dtype=dtype, device=self.device)
+                for name, (shape, dtype) in self._forms.items()
+                if name not in self._lacking
+            }
+            tensors = zip(*(block.unbind() for block in blocks.values()), strict=True)
+            arrays = zip(*(self._turns_of(blocks, name) for name in self._forms), strict=True)
             for turn, output in zip(tensors, arrays, strict=True):
-                self._ahead.append((dict(zip(self._forms, turn, strict=True)), output_of(output)))
+                self._ahead.append((dict(zip(blocks, turn, strict=True)), StepOutput(*output)))
         return self._ahead.pop()
 
-    def _show_in(self, tensors: dict[str, Tensor], output: Output) -> None:
-        """Sets the memory of the current output; faster than through attributes of a module."""
+    def _show_in(self, tensors: dict[str, Tensor], output: StepOutput) -> None:
+        """Set the memory of the current output; faster than through attributes of a module."""
         object.__setattr__(self, "_tensors", tensors)
-        object.__setattr__(self, "_whole", output)
-        object.__setattr__(self, "output", turn_of(output))
+        object.__setattr__(self, "output", output)
 
-    def _turns_of(self, block: Tensor) -> Any:
-        """The turns of a block as arrays."""
+    def _turns_of(self, blocks: Mapping[str, Tensor], name: str) -> Any:
+        """Return the turns of a block as arrays."""
+        if name in self._lacking:
+            return [self._lacking[name]] * self._turns_ahead
+        block = blocks[name]
         on_cpu = block.device.type == "cpu"
         return block.numpy() if on_cpu else [self._as_array(turn) for turn in block.unbind()]
 
     def _as_tensordict(self, tensors: dict[str, Tensor], reward: Tensor | None = None) -> TensorDict:
-        """The entries of one time step; without a reward, as `reset` returns them."""
+        """Return the entries of one time step; without a reward, as `reset` returns them."""
         agents = {name: tensors[name] for name in self._agent_entries}
         if reward is not None:
             agents["reward"] = reward
@@ -176,7 +183,7 @@ class CommonsEnv(LeanStepEnv):
         return unchecked_tensordict(entries, self.batch_size, self.device)
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
-        """Restarts from a seed, 0 to 2**64 - 1; see `EnvBase.set_seed`."""
+        """Restart from a seed, 0 to 2**64 - 1; see `EnvBase.set_seed`."""
         following: int | None = super().set_seed(checked("seed", seed, Seed | None), static_seed)
         return following
 
@@ -191,19 +198,19 @@ class CommonsEnv(LeanStepEnv):
         return begun
 
     def _begin(self, which: Tensor | None) -> dict[str, Tensor]:
-        """Starts the next episode of the marked worlds (bool [B, 1]; None for all), in new tensors."""
+        """Start the next episode of the marked worlds (bool [B, 1]; None for all), in new tensors."""
         before = self._tensors
         self._show_in(*self._fresh())
         if which is None:
-            self.worlds.begin(self._whole)
+            self.worlds.begin(self.output)
         else:
             for name, tensor in self._tensors.items():
                 tensor.copy_(before[name])
-            self.worlds.begin(self._whole, self._as_array(which.reshape(-1)))
+            self.worlds.begin(self.output, self._as_array(which.reshape(-1)))
         return self._tensors
 
     def load(self, state: Mapping[str, NDArray[Any]]) -> TensorDict:
-        """Sets all worlds to a state, and returns their entries as `reset` does.
+        """Set all worlds to a state, and return their entries as `reset` does.
 
         The events of the turn before are not told: harvest, fired, hit_by, tagged_by, regrown, and of
         institutions fines, transfers and violated are 0 and false, also where windows show the beam of an
@@ -220,7 +227,7 @@ class CommonsEnv(LeanStepEnv):
         self._show_in(tensors, output)
         return self._as_tensordict(tensors)
 
-    def render(self, *, world: int | None = None, cell_pixels: int = 24) -> Bytes:
+    def render(self, *, world: int | None = None, cell_pixels: int = 24) -> UInt8:
         """Images of the boards as they are now, e.g. for TorchRL's `PixelRenderTransform`.
 
         Returns:
@@ -235,10 +242,6 @@ class CommonsEnv(LeanStepEnv):
         if world is not None:
             world = checked("world", world, Annotated[int, Range(0, batch.size - 1)])
             return world_image(board, batch.show(self.output, world=world), cell_pixels=cell_pixels)
-        pixels = batch.size * (board.height * cell_pixels + 1) * (board.width * cell_pixels + 1)
-        check_memory(
-            f"images of {batch.size:,} worlds", 6 * pixels, "one world (world=0) or fewer cell_pixels"
-        )
         states = (batch.show(self.output, world=number) for number in range(batch.size))
         return np.stack([world_image(board, one, cell_pixels=cell_pixels) for one in states])
 
@@ -253,9 +256,8 @@ class CommonsEnv(LeanStepEnv):
         if stepped is not None:
             self._check_stepped(stepped.reshape(-1))
         self._show_in(*self._fresh())
-        self.worlds.play(actions, self._whole, decisions)
-        reward = self._tensors["reward"] if self._is_governed else self._tensors["harvest"].clone()
-        return self._as_tensordict(self._tensors, reward.unsqueeze(-1))
+        self.worlds.play(actions, self.output, decisions)
+        return self._as_tensordict(self._tensors, self._tensors["reward"].unsqueeze(-1))
 
     def _check_stepped(self, stepped: Tensor) -> None:
         """That the worlds that a "_step" mask, bool [B], leaves out have all ended."""
@@ -271,14 +273,14 @@ class CommonsEnv(LeanStepEnv):
         return chosen(tensordict, name, self._agents_size, self.device).contiguous()
 
     def _any_done(self) -> bool:
-        """Whether any world has ended; numpy counts in a tenth of the time that torch takes."""
+        """Return whether any world has ended; numpy counts in a tenth of the time that torch takes."""
         done = self.output.done
         return bool(np.count_nonzero(done) if isinstance(done, np.ndarray) else self._tensors["done"].any())
 
     def lean_step(
         self, tensordict: TensorDictBase, *, resets: bool = True
     ) -> tuple[TensorDictBase, TensorDictBase]:
-        """Does the same as `EnvBase.step_and_maybe_reset`, without its handling of keys.
+        """Do the same as `EnvBase.step_and_maybe_reset`, without its handling of keys.
 
         A test checks that they are equal, including the entries of policies. Without `resets` worlds that
         have ended stay as they are.

@@ -9,13 +9,14 @@ import torch
 from torch import Tensor
 
 from cprl.commons.batch import Driver
-from cprl.commons.game import Game, check_worlds_fit
+from cprl.commons.compiled import PLAIN, RULES_VARIABLE, runs_plain
+from cprl.commons.game import Game
 from cprl.commons.threads import CpuThreads
 from cprl.values import refusal
 
 
 def drawn_seed() -> int:
-    """A seed from torch's generator, for an environment without one.
+    """Return a seed from torch's generator, for an environment without one.
 
     Forked workers start with equal generators, so in a worker process the seed also depends on the name of
     the process, which `multiprocessing` makes unique among the children of a process.
@@ -28,7 +29,7 @@ def drawn_seed() -> int:
 
 
 def device_of(device: Any) -> torch.device:
-    """The device; raises a ValueError if torch knows none of this name."""
+    """Return the device; raises a ValueError if torch knows none of this name."""
     try:
         return torch.device(device)
     except (RuntimeError, TypeError, ValueError):
@@ -38,14 +39,19 @@ def device_of(device: Any) -> torch.device:
 def driver_for(
     game: Game, worlds: int, device: torch.device, threads: int | None
 ) -> tuple[Driver, Callable[[Tensor], Any]]:
-    """The driver that runs the worlds on a device, and the function that views a tensor as an array."""
+    """Return the driver that runs the worlds on a device, and the function that views a tensor as an
+    array."""
     if device.type == "cpu":
-        check_worlds_fit(game, worlds)
         return CpuThreads(game, worlds, threads=threads), Tensor.numpy
     if device.type != "cuda":
         raise ValueError(f'device is "{device}"; allowed: "cpu" and "cuda"')
     if threads is not None:
         raise refusal("threads", threads, "None on a GPU, where each world has its own thread")
+    if runs_plain():
+        raise ValueError(
+            f'device is "{device}" and {RULES_VARIABLE} is "{PLAIN}", or NUMBA_DISABLE_JIT is 1; allowed: '
+            'rules that run as plain Python on "cpu" alone'
+        )
     if not torch.cuda.is_available():
         raise ValueError(f'device is "{device}"; allowed: "cpu", because torch finds no GPU')
     from cprl.commons.cuda import CudaThreads

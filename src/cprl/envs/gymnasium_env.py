@@ -9,9 +9,9 @@ from typing import Any
 import gymnasium
 
 from cprl.commons.game import Game
-from cprl.commons.world import Bytes
-from cprl.envs.pettingzoo_env import RENDER_FPS, RENDER_MODES, CommonsParallelEnv, Observed
+from cprl.envs.pettingzoo_env import RENDER_FPS, RENDER_MODES, CommonsParallelEnv
 from cprl.values import Seed, checked
+from cprl.values.arrays import UInt8
 
 
 class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
@@ -39,18 +39,18 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observed, dict[str, Any]]:
-        """Begins the next episode, or the first episode of a new seed."""
+    ) -> tuple[UInt8, dict[str, Any]]:
+        """Begin the next episode, or the first episode of a new seed."""
         super().reset(seed=checked("seed", seed, Seed | None))
         self.world.reset(seed, options)
         return self.world.observation(0), self.world.info(0)
 
-    def step(self, action: int) -> tuple[Observed, float, bool, bool, dict[str, Any]]:
-        """Plays one turn; refuses an action that is no integer or out of range, with the world unchanged."""
+    def step(self, action: int) -> tuple[UInt8, float, bool, bool, dict[str, Any]]:
+        """Play one turn; refuse an action that is no integer or out of range, with the world unchanged."""
         world = self.world
         world.play([action])
         return world.observation(0), world.reward(0), world.terminated, world.truncated, world.info(0)
 
-    def render(self) -> Bytes:
+    def render(self) -> UInt8:
         """Return an image, uint8 [rows, columns, 3]; refused without a render mode."""
         return self.world.render()

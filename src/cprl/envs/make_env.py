@@ -2,7 +2,8 @@
 
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
-from typing import Any, Final, Protocol, runtime_checkable
+from inspect import signature
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -12,11 +13,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 from cprl import keys
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
-from cprl.envs.commons_env import CommonsEnv
-from cprl.envs.matrix import MatrixGame, nested_tuples
 from cprl.envs.state import env_state, load_env_state
-from cprl.envs.taking import TakingGame
-from cprl.envs.unwrap import commons_of
 from cprl.values import Custom, Seed, checked, made, refusal
 
 
@@ -24,10 +21,16 @@ from cprl.values import Custom, Seed, checked, made, refusal
 class PlayableGame(Protocol):
     """What an experiment can play: a frozen value; `cprl.Game` is one.
 
+    A recipe holds a game of the user's own by the name of its class, which stands at the top of a module.
+
     The environment that it makes has batch size [worlds], ("agents", "observation") [B, N, ...],
     ("agents", "action") int64 [B, N], ("agents", "reward") float32 [B, N, 1], and done, terminated and
     truncated bool [B, 1] at the root. Whatever its future depends on, besides the TensorDict that it is
     stepped with, is in its `state_dict`.
+
+    The environment may have two more attributes. `group_map` names the agents, as a list in its group
+    "agents". `joint_actions` names the A**N joint actions, the action of agent 0 first, e.g. ("CC", "CD",
+    "DC", "DD"); the viewer then plots their shares, of at most 16.
     """
 
     @property
@@ -35,10 +38,15 @@ class PlayableGame(Protocol):
         """The number of agents N."""
 
     def to_config(self) -> Mapping[str, Any]:
-        """The arguments that build it again, as JSON can hold them; lists are given back as tuples."""
+        """Return the arguments that build it again, as JSON can hold them; lists are given back as tuples."""
 
     def make(self, worlds: int, seed: int, device: Any) -> Any:
-        """An `EnvBase` of so many worlds side by side, whose chance follows from the seed."""
+        """Return an `EnvBase` of so many worlds side by side, whose chance follows from the seed.
+
+        A game may take a further argument `first_world`, the number of the first world, from 0: world b of a
+        batch then plays as the only world of a batch with `first_world=b`. Without it, a batch that begins
+        with world b is made with the seed `seed + b`.
+        """
 
 
 def make_env(
@@ -50,25 +58,24 @@ def make_env(
     first_world: int = 0,
     transforms: Iterable[Any] = (),
 ) -> EnvBase:
-    """An environment of a game, with transforms.
+    """Return an environment of a game, with transforms.
 
     Args:
         game: what is played, or a `Custom` that makes it.
         seed: of all chance.
-        first_world: the number of the first world, so that a world plays the same in batches of any size. A
-            game of the user's own is made with the seed `seed + first_world` instead.
+        first_world: the number of the first world, so that a world plays the same in batches of any size; see
+            `PlayableGame.make` for games that do not take it.
         transforms: TorchRL transforms, or a `Custom` for each.
     """
     playable: Any = made(game)
-    env: EnvBase
-    if isinstance(playable, Game):
-        env = CommonsEnv(playable, worlds, seed=seed, device=device, first_world=first_world)
-    elif isinstance(playable, MatrixGame | TakingGame):
-        env = playable.make(worlds, seed, device, first_world=first_world)
-    elif isinstance(playable, PlayableGame) and not isinstance(playable, type):
-        env = playable.make(worlds, checked("seed + first_world", seed + first_world, Seed), device)
-    else:
+    if not isinstance(playable, PlayableGame) or isinstance(playable, type):
         raise refusal("game", playable, "a cprl.Game, or a game with agents, to_config and make")
+    make: Any = playable.make
+    env: EnvBase
+    if "first_world" in signature(make).parameters:
+        env = make(worlds, seed, device, first_world=first_world)
+    else:
+        env = make(worlds, checked("seed + first_world", seed + first_world, Seed), device)
     chain = [made(transform) for transform in transforms]
     if chain:
         env = TransformedEnv(env, Compose(*chain))
@@ -77,7 +84,7 @@ def make_env(
 
 
 def spaces_of(env: EnvBase) -> Spaces:
-    """What each agent of an environment observes and may do, transforms included."""
+    """Return what each agent of an environment observes and may do, transforms included."""
     observation, action = _spec(env, "observation"), _spec(env, "action")
     if not isinstance(action, Categorical) or action.ndim != 2:
         raise ValueError(
@@ -95,18 +102,12 @@ def spaces_of(env: EnvBase) -> Spaces:
         shape, dtype = seen.shape, seen.dtype
     is_float = dtype.is_floating_point
     highest = float(observation.high.max()) if isinstance(observation, Bounded) and not is_float else 1.0
-    commons = commons_of(env)
-    known = () if commons is None else commons.game.spaces.vectors
-    vectors = tuple(
-        (name, size) for name, size in known if (keys.AGENTS, name) in env.observation_spec.keys(True)
-    )
     return Spaces(
         agents=agents,
         observation_shape=tuple(shape[2:]),
         observation_dtype=str(dtype).removeprefix("torch."),
         observation_scale=highest,
         actions=int(action.n),
-        vectors=vectors,
     )
 
 
@@ -120,7 +121,7 @@ def _first_observation(env: EnvBase) -> Tensor:
 
 
 def check_env(env: EnvBase, worlds: int) -> None:
-    """Raises a ValueError, with what is allowed, for an environment that a training could not play."""
+    """Raise a ValueError, with what is allowed, for an environment that a training could not play."""
     if tuple(env.batch_size) != (worlds,):
         raise ValueError(f"the environment has batch size {list(env.batch_size)}; allowed: [{worlds}]")
     spaces = spaces_of(env)
@@ -144,13 +145,9 @@ def _spec(env: EnvBase, name: str) -> Any:
     return spec
 
 
-OF_CPRL: Final[tuple[type[Any], ...]] = (Game, MatrixGame, TakingGame)
-"""Games that a recipe holds as values, and whose chance follows from the seed alone."""
-
-
 def stored_game(game: object) -> object:
-    """As a recipe holds it: a game of the user's by the name of its class."""
-    if type(game) in OF_CPRL or isinstance(game, Game | Custom) or not isinstance(game, PlayableGame):
+    """Return a game as a recipe holds it: one of the user's own by the name of its class."""
+    if isinstance(game, Game | Custom) or not isinstance(game, PlayableGame):
         return game
     kind = type(game)
     if "<" in kind.__qualname__:
@@ -162,17 +159,22 @@ def stored_game(game: object) -> object:
 
 
 def game_of(stored: Custom) -> Custom | PlayableGame:
-    """The game whose class and arguments these are; the same where they only make one."""
+    """Return the game whose class and arguments these are; the same where they only make one."""
     kind = stored.resolve()
     if not (isinstance(kind, type) and hasattr(kind, "to_config") and hasattr(kind, "make")):
         return stored
     try:
-        game = kind(**{name: nested_tuples(value) for name, value in stored.arguments.items()})
+        game = kind(**{name: _nested_tuples(value) for name, value in stored.arguments.items()})
     except (TypeError, ValueError) as error:
         raise ValueError(f"experiment.game: {stored.target} does not take its arguments: {error}") from error
     return game if isinstance(game, PlayableGame) and stored_game(game) == stored else stored
 
 
+def _nested_tuples(value: Any) -> Any:
+    """Return lists in lists as tuples in tuples."""
+    return tuple(map(_nested_tuples, value)) if isinstance(value, list) else value
+
+
 def is_playable(value: Any) -> bool:
-    """Whether it is a game, of cprl or of the user's own, or the `Custom` that makes one."""
+    """Return whether it is a game, of cprl or of the user's own, or the `Custom` that makes one."""
     return isinstance(value, Game | Custom | PlayableGame) and not isinstance(value, type)

@@ -5,23 +5,20 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import parallel_to_aec
 
 from cprl import keys
-from cprl.commons.batch import Batch, Output, turn_of
+from cprl.commons.batch import Batch
 from cprl.commons.game import Game
-from cprl.commons.picture import world_image
-from cprl.commons.world import Bytes, GovernedOutput
 from cprl.envs.drivers import drawn_seed
-from cprl.institutions.ledger import Payments
+from cprl.pictures.image import world_image
 from cprl.values import Range, checked, refusal, shown
+from cprl.values.arrays import Int64, UInt8
 
 RENDER_MODES: Final = ("rgb_array",)
 RENDER_FPS: Final = 15
 
-Observed = NDArray[Any] | dict[str, NDArray[Any]]
 Infos = dict[str, dict[str, Any]]
 
 
@@ -49,7 +46,8 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         checked("render_mode", render_mode, Literal[RENDER_MODES] | None)
         self.game, self.render_mode = game, render_mode
         self.batch = Batch(game, 1, seed=drawn_seed() if seed is None else seed)
-        self._show_in(self.batch.new_output())
+        self.output = self.batch.new_output()
+        """What the last turn gave."""
         self._decisions = np.zeros((1, game.agents), np.int64)
         self.possible_agents = list(game.agent_names)
         self.agents: list[str] = []
@@ -60,36 +58,21 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.game!r})"
 
-    def _show_in(self, output: Output) -> None:
-        self._whole, self.output = output, turn_of(output)
-
-    @property
-    def payments(self) -> Payments | None:
-        """What institutions output in the last turn; None for a game without any."""
-        return self._whole.payments if isinstance(self._whole, GovernedOutput) else None
-
     def _observation_space(self) -> spaces.Space[Any]:
-        """A Box of uint8 [C, X, Y]; with a scoreboard or stock gauge, a Dict with it as "observation"."""
-        game = self.game
-        seen = spaces.Box(0, game.observation_highest, game.observation_shape, np.uint8)
-        highest = {"scoreboard": game.rules.episode_steps, "stock_gauge": 1}
-        vectors: dict[str, spaces.Space[Any]] = {
-            name: spaces.Box(0, highest[name], (size,), np.float32) for name, size in game.spaces.vectors
-        }
-        return spaces.Dict({"observation": seen, **vectors}) if vectors else seen
+        return spaces.Box(0, self.game.observation_highest, self.game.observation_shape, np.uint8)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """A Box of uint8 [C, X, Y], or a Dict that holds it as "observation"; always the same object."""
+        """Return a Box of uint8 [C, X, Y], always the same object."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """A Discrete space, the indices of `Game.actions`; always the same object."""
+        """Return a Discrete space, the indices of `Game.actions`; always the same object."""
         return self.action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Observed], Infos]:
-        """Begins the next episode, or the first episode of a new seed.
+    ) -> tuple[dict[str, UInt8], Infos]:
+        """Begin the next episode, or the first episode of a new seed.
 
         Args:
             options: "decisions", a dict by agent, is what agents decide in this episode where institutions
@@ -99,11 +82,11 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         if seed is not None:
             self.batch.set_seed(seed)
         self._decisions = decided
-        self._show_in(self.batch.begin(self.batch.new_output()))
+        self.output = self.batch.begin(self.batch.new_output())
         self.agents = list(self.possible_agents)
         return self._observations(), self._infos()
 
-    def _decided(self, decisions: Any) -> NDArray[np.int64]:
+    def _decided(self, decisions: Any) -> Int64:
         """Decisions by name as int64 [1, N]; the first option of an agent that is not named."""
         options, decided = self.game.decisions, np.zeros((1, self.game.agents), np.int64)
         if decisions and not options:
@@ -118,8 +101,8 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
 
     def step(
         self, actions: dict[str, int]
-    ) -> tuple[dict[str, Observed], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
-        """Plays one turn with one action per agent; actions that do not fit, and steps before or after an
+    ) -> tuple[dict[str, UInt8], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
+        """Play one turn with one action per agent; actions that do not fit, and steps before or after an
         episode, raise a ValueError and leave the world unchanged."""
         self._check_begun("the first step")
         if not self.agents:
@@ -136,7 +119,7 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         return output
 
     def play(self, actions: Sequence[Any]) -> None:
-        """Plays one turn with one action per agent, in their order; see `step`. An ended world stays as it
+        """Play one turn with one action per agent, in their order; see `step`. An ended world stays as it
         is."""
         self._check_begun("the first step")
         known = Annotated[int, Range(0, len(self.game.actions) - 1)]
@@ -145,32 +128,30 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
             for name, action in zip(self.possible_agents, actions, strict=True)
         ]
         output, decisions = self.batch.new_output(), self._decisions if self.game.decisions else None
-        self._show_in(self.batch.play(np.array([row], np.int64), output, decisions))
+        self.output = self.batch.play(np.array([row], np.int64), output, decisions)
 
-    def observation(self, agent: int) -> Observed:
-        """The observation of an agent, an element of its `observation_space`."""
-        seen = self.output.observation[0, agent]
-        vectors = {name: getattr(self.output, name)[0, agent] for name, _ in self.game.spaces.vectors}
-        return {"observation": seen, **vectors} if vectors else seen
+    def observation(self, agent: int) -> UInt8:
+        """Return the observation of an agent, an element of its `observation_space`."""
+        seen: UInt8 = self.output.observation[0, agent]
+        return seen
 
     def reward(self, agent: int) -> float:
-        """The reward of an agent in the last turn: its harvest, less fines and plus transfers."""
-        payments = self.payments
-        return float((self.output.harvest if payments is None else payments.reward)[0, agent])
+        """Return the reward of an agent in the last turn: its harvest, less fines and plus transfers."""
+        return float(self.output.reward[0, agent])
 
     def info(self, agent: int) -> dict[str, Any]:
-        """What `infos` holds of an agent after the last turn."""
-        output, payments = self.output, self.payments
+        """Return what `infos` holds of an agent after the last turn."""
+        output = self.output
         info: dict[str, Any] = {
             "harvest": float(output.harvest[0, agent]),
             "in_play": bool(output.in_play[0, agent]),
             "fired": bool(output.fired[0, agent]),
             "tagged": bool(output.tagged_by[0, agent].any()),
         }
-        if payments is not None:
-            info[keys.FINES[-1]] = float(payments.fines[0, agent])
-            info[keys.TRANSFERS[-1]] = float(payments.transfers[0, agent])
-            info[keys.VIOLATED[-1]] = bool(payments.violated[0, agent])
+        if self.game.institutions:
+            info[keys.FINES[-1]] = float(output.fines[0, agent])
+            info[keys.TRANSFERS[-1]] = float(output.transfers[0, agent])
+            info[keys.VIOLATED[-1]] = bool(output.violated[0, agent])
         return info
 
     @property
@@ -188,20 +169,20 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         if not self.batch.has_begun:
             raise ValueError(f"the episode has not begun; allowed: reset() before {what}")
 
-    def state(self) -> Bytes:
-        """The whole board in RGB: uint8 [3, H, W]."""
+    def state(self) -> UInt8:
+        """Return the whole board in RGB: uint8 [3, H, W]."""
         self._check_begun("state()")
         board = self.game.palette[self.batch.boards(self.output)[0]]
         return np.ascontiguousarray(board.transpose(2, 0, 1))
 
-    def render(self) -> Bytes:
+    def render(self) -> UInt8:
         """Return an image, uint8 [rows, columns, 3]."""
         if self.render_mode is None:
             raise ValueError('render_mode is None, so there is no render(); allowed: "rgb_array", when made')
         self._check_begun("render()")
         return world_image(self.game.map, self.batch.show(self.output))
 
-    def _observations(self) -> dict[str, Observed]:
+    def _observations(self) -> dict[str, UInt8]:
         return {name: self.observation(i) for i, name in enumerate(self.agents)}
 
     def _infos(self) -> Infos:
@@ -211,10 +192,11 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
 def parallel_env(
     game: Game, seed: int | None = None, *, render_mode: str | None = None
 ) -> CommonsParallelEnv:
-    """The game as a PettingZoo `ParallelEnv`; see `CommonsParallelEnv`."""
+    """Return the game as a PettingZoo `ParallelEnv`; see `CommonsParallelEnv`."""
     return CommonsParallelEnv(game, seed=seed, render_mode=render_mode)
 
 
 def env(game: Game, seed: int | None = None, *, render_mode: str | None = None) -> AECEnv[str, Any, int]:
-    """The game as a PettingZoo `AECEnv`: agents act one by one; a turn is played after the last has acted."""
+    """Return the game as a PettingZoo `AECEnv`: agents act one by one; a turn is played after the last has
+    acted."""
     return parallel_to_aec(parallel_env(game, seed, render_mode=render_mode))

@@ -27,7 +27,7 @@ def env_state(env: EnvBase) -> dict[str, Any]:
 
 
 def load_env_state(env: EnvBase, state: Mapping[str, Any]) -> None:
-    """Puts an environment, made with the same arguments, where `env_state` found it."""
+    """Put an environment, made with the same arguments, where `env_state` found it."""
     commons = commons_of(env)
     if commons is None:
         base_env(env).load_state_dict(state["worlds"])
@@ -44,13 +44,13 @@ _EXTRA: Final = "_extra_state"
 
 
 def transforms_state(env: EnvBase) -> dict[str, Any]:
-    """What the transforms have learned or been told, e.g. the statistics of a normalisation; nothing of the
-    worlds themselves."""
+    """Return what the transforms have learned or been told, e.g. the statistics of a normalisation; nothing
+    of the worlds themselves."""
     return {name: value for name, value in _all_of_transforms(env).items() if not _is_of_worlds(env, name)}
 
 
 def load_transforms_state(env: EnvBase, state: Mapping[str, Any]) -> None:
-    """Gives the transforms of an environment what those of another had; what they keep of its own worlds
+    """Give the transforms of an environment what those of another had; what they keep of its own worlds
     stays.
     """
     if isinstance(env, TransformedEnv):
@@ -58,8 +58,8 @@ def load_transforms_state(env: EnvBase, state: Mapping[str, Any]) -> None:
 
 
 def _is_of_worlds(env: EnvBase, name: str) -> bool:
-    """Whether a transform keeps this of the worlds themselves: latest observations, or the extra state of a
-    transform that has `remembers_worlds`."""
+    """Return whether a transform keeps this of the worlds themselves: latest observations, or the extra state
+    of a transform that has `remembers_worlds`."""
     if _FRAMES in name:
         return True
     if not name.endswith(f".{_EXTRA}") or not isinstance(env, TransformedEnv):
@@ -78,7 +78,7 @@ def _all_of_transforms(env: EnvBase) -> dict[str, Any]:
 
 
 def _load(env: TransformedEnv, state: dict[str, Any]) -> None:
-    """Loads a copy of the state of transforms; what they keep of the worlds may be missing."""
+    """Load a copy of the state of transforms; what they keep of the worlds may be missing."""
     transforms = env.transform if isinstance(env.transform, Compose) else [env.transform]
     kinds = ", ".join(type(transform).__name__ for transform in transforms)
     try:  # a copy, since some transforms keep the very tensors that they are given
@@ -97,18 +97,18 @@ def _load(env: TransformedEnv, state: dict[str, Any]) -> None:
 
 
 def carried_state(carried: TensorDictBase) -> dict[str, Any]:
-    """The TensorDict that an environment is stepped with as nested tables of tensors."""
+    """Return the TensorDict that an environment is stepped with as nested tables of tensors."""
     table: dict[str, Any] = carried.to_dict()
     return table
 
 
 def load_carried(fresh: TensorDictBase, state: Mapping[str, Any]) -> TensorDictBase:
-    """The TensorDict of `carried_state`, in the form of what `env.reset()` gives."""
+    """Return the TensorDict of `carried_state`, in the form of what `env.reset()` gives."""
     return fresh.empty(recurse=True).update(dict(state))
 
 
 def _array(name: str, tensor: Any) -> Any:
-    """The array of a tensor that `_tensor` made of an array of this name."""
+    """Return the array of a tensor that `_tensor` made of an array of this name."""
     if name in _UNSIGNED and isinstance(tensor, Tensor) and tensor.dtype == torch.int64:
         return tensor.numpy(force=True).view(np.uint64)
     return tensor
@@ -119,5 +119,5 @@ _UNSIGNED: Final = ("seed", "number")
 
 
 def _tensor(array: NDArray[Any]) -> Tensor:
-    """The same bytes as a tensor; torch keeps unsigned numbers as signed ones."""
+    """Return the same bytes as a tensor; torch keeps unsigned numbers as signed ones."""
     return torch.from_numpy(array.view(np.int64) if array.dtype == np.uint64 else array)

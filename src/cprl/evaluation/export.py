@@ -22,6 +22,7 @@ from cprl.system.defaults import FILM_SEED as SEED
 from cprl.system.output import say
 from cprl.system.working import say_how_far, working
 from cprl.values import Positive, checked
+from cprl.values.arrays import Int64, UInt8
 
 Format = Literal["csv", "minari"]
 _INDICES: Final = ("episode", "turn", "agent")
@@ -32,9 +33,9 @@ _HEADINGS: Final = np.array(["up", "right", "down", "left"])
 class Exported(NamedTuple):
     """An episode of T turns of N agents."""
 
-    observation: NDArray[np.uint8]
+    observation: UInt8
     """[T + 1, N, ...], before each turn and after the last one."""
-    action: NDArray[np.int64]
+    action: Int64
     """[T, N], by number."""
     columns: dict[str, NDArray[Any]]
     """[T, N] each, the columns of a CSV after episode, turn and agent: "action" by name where the game names

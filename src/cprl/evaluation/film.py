@@ -9,12 +9,9 @@ from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from cprl import keys
-from cprl.commons.readable import growth_of, in_lower_case, legend_of
-from cprl.commons.world import Bytes
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.film_pictures import (
     DEFAULT_WIDTH,
@@ -31,13 +28,14 @@ from cprl.evaluation.lanes import commons_game
 from cprl.measuring.episodes import Episode, tracker_of
 from cprl.measuring.evaluate import turns
 from cprl.measuring.series import Observer
+from cprl.pictures.readable import growth_of, in_lower_case, legend_of
 from cprl.runs.files import refuse_to_write_over
 from cprl.system.defaults import FILM_SUFFIXES as SUFFIXES
-from cprl.system.memory import check_memory
 from cprl.system.output import legible
 from cprl.system.working import working
 from cprl.training.agents import LoadedRun
 from cprl.values import Positive, Range, Value, Where, checked, refusal
+from cprl.values.arrays import Bool, UInt8
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.replay import Decisions, Offences, events
 
@@ -215,13 +213,13 @@ def film_video(
     every = style.every or (1 if path.suffix == ".mp4" else ceil(length / GIF_FRAMES))
     chosen = sorted({*range(0, length, every), length - 1})
 
-    def draw(turns: Sequence[int]) -> Iterator[Bytes]:
+    def draw(turns: Sequence[int]) -> Iterator[UInt8]:
         """Yield the pictures after these turns, and the end card."""
         for before, turn in pairwise((-1, *turns)):
             yield joined([panel.draw(turn, since=before + 1) for panel in panels])
         yield joined([panel.draw(length, since=length, card=True) for panel in panels])
 
-    def joined(pictures: Sequence[Bytes]) -> Bytes:
+    def joined(pictures: Sequence[UInt8]) -> UInt8:
         return np.concatenate([np.concatenate(pictures, 1), words], 0)
 
     games = [commons_game(population.run) for population in fresh]
@@ -232,8 +230,6 @@ def film_video(
         write_mp4(path, draw(chosen), fps=style.fps)
     else:
         samples = list(draw(chosen[:: ceil(len(chosen) / _SAMPLES)]))
-        pictures = f"every is {every}: {len(chosen):,} pictures"
-        check_memory(pictures, len(chosen) * samples[0].size, "fewer or smaller pictures")
         write_gif(path, draw(chosen), samples, fps=style.fps)
     return path, tuple(panel.played.episode for panel in panels)
 
@@ -269,11 +265,11 @@ class _Panel(NamedTuple):
     title: str
     picture: EpisodePicture
     played: Recorded
-    violated: NDArray[np.bool_]
+    violated: Bool
     """[T + 1, N], which agents broke a rule in the turn that led to each board."""
     is_typical: bool
 
-    def draw(self, turn: int, *, since: int, card: bool = False) -> Bytes:
+    def draw(self, turn: int, *, since: int, card: bool = False) -> UInt8:
         """Draw the population after a turn of the film's clock, or at its end if that was before.
 
         Args:

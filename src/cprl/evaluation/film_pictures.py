@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from cprl.commons.colours import APPLE, GROUND, PALETTE, Colour, agent_colour
+from cprl.commons.cells import APPLE, GROUND, Colour
 from cprl.commons.maps import Map
-from cprl.commons.picture import world_image
-from cprl.commons.world import Bytes, Shown
+from cprl.commons.world import Shown
+from cprl.pictures.colours import PALETTE, agent_colour
+from cprl.pictures.image import world_image
 from cprl.runs.files import write_atomically
+from cprl.values.arrays import Int32, Int64, UInt8
 
 SMALLEST_WIDTH: Final = 240
 DEFAULT_WIDTH: Final = 640
@@ -102,7 +104,7 @@ class EpisodePicture:
         end: str = "",
         card: str = "",
         violators: Sequence[int] = (),
-    ) -> Bytes:
+    ) -> UInt8:
         """Return the picture of the last of these moments.
 
         Args:
@@ -174,7 +176,7 @@ class EpisodePicture:
         font = _fitting(text, right - 3 * edge, 2 * edge)
         draw.text((self.size[0] / 2, self._middle), text, colour, font, anchor="mm")
 
-    def _plot_stock(self, draw: ImageDraw.ImageDraw, stock: NDArray[np.int64]) -> None:
+    def _plot_stock(self, draw: ImageDraw.ImageDraw, stock: Int64) -> None:
         """Draw the apples on the board, [T], as an area."""
         left = self._unit
         sites = len(self.board.sites)
@@ -183,7 +185,7 @@ class EpisodePicture:
         floor = self._axes_top + self._plot_height
         draw.polygon([(path[0][0], floor), *path, (path[-1][0], floor)], PALETTE[APPLE], PALETTE[APPLE])
 
-    def _plot_harvests(self, draw: ImageDraw.ImageDraw, harvests: NDArray[np.int32]) -> None:
+    def _plot_harvests(self, draw: ImageDraw.ImageDraw, harvests: Int32) -> None:
         """Draw each agent's harvest so far, [T, N], as a line in its colour, which a legend repeats."""
         left = 2 * self._unit + self._half
         most = self._most or int(harvests.max(initial=0))
@@ -240,7 +242,7 @@ def _fitting(text: str, room: float, largest: int) -> ImageFont.FreeTypeFont:
     return _font(largest if wide <= room else max(1, int(largest * room / wide)))
 
 
-def note(text: str, width: int) -> Bytes:
+def note(text: str, width: int) -> UInt8:
     """Return a text in small type, to stand below pictures: uint8 [height, width, 3], the height even."""
     edge = max(10, width // 96)
     font = _font(max(10, min(14, width // 60)))
@@ -272,7 +274,7 @@ def check_can_write_mp4(path: Path) -> None:
         )
 
 
-def write_gif(path: Path, pictures: Iterable[Bytes], samples: Sequence[Bytes], *, fps: float) -> None:
+def write_gif(path: Path, pictures: Iterable[UInt8], samples: Sequence[UInt8], *, fps: float) -> None:
     """Write a GIF that repeats, with one palette for all pictures.
 
     Args:
@@ -285,7 +287,7 @@ def write_gif(path: Path, pictures: Iterable[Bytes], samples: Sequence[Bytes], *
     palette = known.astype(np.uint8).tobytes() + bytes(3)
     index = np.full(2**24, -1, np.int16)
 
-    def indexed(picture: Bytes) -> Image.Image:
+    def indexed(picture: UInt8) -> Image.Image:
         # Pillow's own quantize takes colours for equal that differ by up to 4.
         packed = picture @ np.array([1 << 16, 1 << 8, 1], np.int32)
         new = np.unique(packed[index[packed] < 0])
@@ -307,7 +309,7 @@ def write_gif(path: Path, pictures: Iterable[Bytes], samples: Sequence[Bytes], *
     )
 
 
-def write_mp4(path: Path, pictures: Iterator[Bytes], *, fps: float) -> None:
+def write_mp4(path: Path, pictures: Iterator[UInt8], *, fps: float) -> None:
     """Write an MP4, whose last picture stays for a while."""
     from imageio_ffmpeg import write_frames
 

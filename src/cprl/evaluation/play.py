@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase
 
 from cprl import keys
 from cprl.commons import maps
-from cprl.commons.colours import APPLE, BEAM, CLEANING, WALL, WASTE, WATER, picture_colour
+from cprl.commons.cells import APPLE, BEAM, CLEANING, WALL, WASTE, WATER
 from cprl.commons.game import Game
 from cprl.commons.maps import SIGN_OF_HEADING
 from cprl.commons.published import Variant, check_board
@@ -34,6 +34,7 @@ from cprl.experiment import presets
 from cprl.measuring import social
 from cprl.measuring.evaluate import Policy, turns
 from cprl.measuring.registry import title
+from cprl.pictures.colours import picture_colour
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import Scripted
 from cprl.runs.episodes import read_rows

@@ -46,7 +46,6 @@ from cprl.evaluation.pages import heading
 from cprl.measuring.registry import INCOME
 from cprl.measuring.statistics import Estimate, Family, difference, estimate
 from cprl.measuring.table import Label, by_replica, where
-from cprl.measuring.windows import Values
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.system.defaults import Fresh
 from cprl.system.working import working
@@ -54,6 +53,7 @@ from cprl.terminal import style
 from cprl.terminal.panels import draw_dots
 from cprl.terminal.tables import Cell, Cells, Change
 from cprl.values import refusal
+from cprl.values.arrays import Float64
 
 _NAMES: Final = ("prisoner's dilemma", "chicken", "stag hunt", "no dilemma")
 _MIX: Final = "restrained_agents"
@@ -63,12 +63,12 @@ _MIX: Final = "restrained_agents"
 class Payoffs(NamedTuple):
     """The payoffs of a Schelling diagram of N agents, by replica."""
 
-    restrained: Values
+    restrained: Float64
     """R(k), float64 [R, N]: the mean return of a restrained agent, by the number k = 0 to N - 1 of others
     that are restrained."""
-    greedy: Values
+    greedy: Float64
     """G(k), float64 [R, N]: that of a greedy agent."""
-    group: Values
+    group: Float64
     """float64 [R, N + 1]: the mean return of all agents together, by how many of them are restrained."""
 
 
@@ -82,14 +82,14 @@ def payoffs_of(table: pa.Table) -> Payoffs:
     )
 
 
-def _payoffs(table: pa.Table, number: str, mixes: Sequence[int]) -> Values:
+def _payoffs(table: pa.Table, number: str, mixes: Sequence[int]) -> Float64:
     """Return a number by replica and by how many agents are restrained, [R, K]."""
     rows = by_replica(where(table, **{_MIX: tuple(mixes)}), number, [_MIX])
     rows = rows.sort_by([("replica", "ascending"), (_MIX, "ascending")])
     return np.asarray(rows["value"].to_numpy()).reshape(-1, len(mixes))
 
 
-def margins(restrained: Values, greedy: Values) -> Family:
+def margins(restrained: Float64, greedy: Float64) -> Family:
     """Return the margins that make a dilemma, in the unit of the payoffs, replicas paired: "restraint",
     R(N-1) - G(0), what an agent gains if all restrain themselves instead of none; "company", R(N-1) - R(0),
     what a restrained agent gains if all others are restrained, too; "fear", G(0) - R(0); and "greed",
@@ -136,7 +136,7 @@ def title_of(payoffs: Payoffs) -> str:
     return name + between_the_ends(payoffs.restrained, payoffs.greedy)
 
 
-def between_the_ends(restrained: Values, greedy: Values) -> str:
+def between_the_ends(restrained: Float64, greedy: Float64) -> str:
     """Return where greed pays between the ends of a diagram although it does not at them, or the other way
     round, as what follows a dilemma's name; "" for nowhere.
 
@@ -261,7 +261,7 @@ def draw_schelling(table: pa.Table, path: Path | str, *, width: style.Width = "p
     return Path(path)
 
 
-def _draw_line(axes: Axes, values: Values, **look: Any) -> None:
+def _draw_line(axes: Axes, values: Float64, **look: Any) -> None:
     """Draw the means of [R, K] at 0 to K - 1 with their intervals."""
     means = [estimate(of_mix) for of_mix in values.T]
     draw_dots(axes, range(len(means)), means, linestyle="-", **look)

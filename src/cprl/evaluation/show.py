@@ -17,29 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cprl import keys
-from cprl.commons.colours import (
-    APPLE,
-    BEAM,
-    CLEANING,
-    GREY,
-    PALETTE,
-    WALL,
-    WASTE,
-    WATER,
-    agent_colour,
-    agent_mark,
-    line_colour,
-)
+from cprl.commons.cells import APPLE, BEAM, CLEANING, WALL, WASTE, WATER
 from cprl.commons.game import Game
 from cprl.commons.maps import Map
-from cprl.commons.picture import EMPTY_SITE_COLOUR
-from cprl.commons.readable import NO_RULES, growth_of, legend_of, meaning_of, rules_of
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.film import check_titles, titles_of
 from cprl.evaluation.fresh import FreshEpisode, Recorded, fresh_episodes, record, say_which
 from cprl.evaluation.lanes import commons_game
 from cprl.measuring.episodes import Episode
 from cprl.measuring.social import equality
+from cprl.pictures.colours import GREY, PALETTE, agent_colour, agent_mark, line_colour
+from cprl.pictures.image import EMPTY_SITE_COLOUR
+from cprl.pictures.readable import NO_RULES, growth_of, legend_of, meaning_of, rules_of
 from cprl.population import learned
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.system.working import working

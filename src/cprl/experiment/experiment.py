@@ -9,10 +9,10 @@ from typing import Annotated, Any, Final, Literal
 from cprl.algorithms import Tabular
 from cprl.algorithms.base import TeamAlgorithm, TrainingEngine
 from cprl.commons.game import Game
-from cprl.commons.readable import game_html
 from cprl.envs.make_env import PlayableGame, game_of, stored_game
 from cprl.measuring.episodes import check_own_metrics
 from cprl.objectives.preferences import check_preference
+from cprl.pictures.readable import game_html
 from cprl.population import (
     AgentSpec,
     Frozen,

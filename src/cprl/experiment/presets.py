@@ -52,7 +52,7 @@ def dqn_settings(board: Board, *, variant: Variant = "published") -> "DQNSetting
     check_variant(board, variant)
     as_run = variant != "published"
     return DQNSettings(
-        gamma=0.999 if variant == "as_run_10_april" else 0.995,
+        gamma=0.995,
         epsilon_decay_steps=1_000_000 if board == "commons" else 500_000,
         relu_on_outputs=as_run,
         glorot_uniform=as_run,

@@ -31,15 +31,8 @@ from matplotlib.axes import Axes
 from cprl.evaluation.cross_play import OF_FOCAL, PAIR, Runs, named_runs
 from cprl.evaluation.lanes import agents_of, fresh_for, play, said, shifted, together
 from cprl.evaluation.pages import heading, matrix_cells
-from cprl.measuring.statistics import CONFIDENCE, HOLM, Estimate, Family, curve_interval, estimate, judged
-from cprl.measuring.table import FOCAL, ROLE, by_replica
-from cprl.system.defaults import EGTA_RESAMPLES, Fresh
-from cprl.system.working import say_how_far, working
-from cprl.terminal import style
-from cprl.terminal.panels import draw_line, draw_matrix, matrix_height
-from cprl.terminal.tables import Cells
-from cprl.theory.payoff_table import PayoffTable, Values, compositions
-from cprl.theory.solutions import (
+from cprl.experimental.payoff_table import PayoffTable, compositions
+from cprl.experimental.solutions import (
     MOST_PROFILES,
     MOST_STRATEGIES,
     AlphaRank,
@@ -50,7 +43,15 @@ from cprl.theory.solutions import (
     replicator,
     replicator_ends,
 )
+from cprl.measuring.statistics import CONFIDENCE, HOLM, Estimate, Family, curve_interval, estimate, judged
+from cprl.measuring.table import FOCAL, ROLE, by_replica
+from cprl.system.defaults import EGTA_RESAMPLES, Fresh
+from cprl.system.working import say_how_far, working
+from cprl.terminal import style
+from cprl.terminal.panels import draw_line, draw_matrix, matrix_height
+from cprl.terminal.tables import Cells
 from cprl.values import Range, checked
+from cprl.values.arrays import Float64
 
 COMPOSITION: Final = "composition"
 """The label that says how many agents play as each run."""
@@ -174,14 +175,14 @@ class Analysis:
     run, with the share of the resamples that have it too; NaN for a single replica."""
     equilibria: tuple[Equilibrium, ...]
     """By nashpy, of a game of two agents, of a larger one of its reduction; empty for more than 6 runs."""
-    in_support: Values = field(repr=False)
+    in_support: Float64 = field(repr=False)
     """float64 [S]: the share of the resamples in which a run is played in a symmetric equilibrium of two
     agents; NaN for a single replica, more than 6 runs, and for a game of more agents."""
     ends: Ends = field(repr=False)
     """Where replicator dynamics end."""
 
     @property
-    def pairs(self) -> Values:
+    def pairs(self) -> Float64:
         """What an agent of a run gets where all others play as another, float64 [R, S, S]."""
         return np.array([game.pairs for game in self.games])
 
@@ -332,7 +333,7 @@ def composition_text(counts: Sequence[int], names: Sequence[str]) -> str:
     return ", ".join(f"{count} {name}" for count, name in zip(counts, names, strict=True) if count)
 
 
-def mixture_text(mixture: Values, names: Sequence[str]) -> str:
+def mixture_text(mixture: Float64, names: Sequence[str]) -> str:
     """Return a mixture in words, e.g. "dqn 0.75, ppo 0.25"; one strategy by its name alone."""
     played = [(name, share) for name, share in zip(names, mixture, strict=True) if share >= _LEAST]
     return played[0][0] if len(played) == 1 else ", ".join(f"{name} {share:.2f}" for name, share in played)
@@ -427,7 +428,7 @@ def _draw_line(axes: Axes, analysis: Analysis) -> None:
     axes.set_title("replicator dynamics, filled: attracts")
 
 
-def _fixed_points(shares: Values, gains: Values) -> list[tuple[float, bool]]:
+def _fixed_points(shares: Float64, gains: Float64) -> list[tuple[float, bool]]:
     """Return where nothing changes, and whether shares nearby move there."""
     points = [(0.0, bool(gains[0] < 0)), (1.0, bool(gains[-1] > 0))]
     for place in np.flatnonzero(gains[:-1] * gains[1:] < 0):

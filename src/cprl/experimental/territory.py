@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 from matplotlib.axes import Axes
 
-from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, agent_colour
+from cprl.commons.cells import APPLE, GROUND, WALL
 from cprl.commons.maps import Map
 from cprl.evaluation.evaluate import opened
 from cprl.evaluation.lanes import (
@@ -26,6 +26,7 @@ from cprl.experimental import movement
 from cprl.experimental.movement import Array, Trace, overlap, owners, trace, visits
 from cprl.measuring.statistics import estimates
 from cprl.measuring.table import labelled, where
+from cprl.pictures.colours import PALETTE, agent_colour
 from cprl.system.defaults import Fresh
 from cprl.system.working import working
 from cprl.terminal import style

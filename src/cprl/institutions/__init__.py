@@ -1,8 +1,8 @@
 """Institutions: rules that people make, a module a kind, and their scalar rules.
 
 Values: `Game(..., institutions=(Quota(share=0.8), Tax(rate=0.2)))`. A module has the value, `Arrays`, which
-are its parameters and what it remembers of B worlds, `parameters`, which fills them, and the hooks of a turn
-at which it acts, see `cprl.institutions.law`. In reading order:
+are its parameters and what it remembers of B worlds, `parameters`, which fills them, and its rules, which act
+at the hooks of a turn. In reading order:
 
     arrays      tuples of arrays, allocated and cut into worlds
     ledger      what all share: who broke what, what is owed, taken and given
@@ -19,10 +19,11 @@ at which it acts, see `cprl.institutions.law`. In reading order:
     mediation   Mediation of tags
     punishment  Punishment: fines that cost the one who fines
     sanctioner  Sanctioner: who may fire
-    law         all of them together, compiled by `cprl.commons` for every target
+    hooks       when in a turn the rules of each are called
+    law         all of them together: their kinds, their arrays, and whether they fit a game
 """
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 from cprl.institutions import (
     boundaries,
@@ -38,10 +39,9 @@ from cprl.institutions import (
     taxes,
     votes,
 )
-from cprl.institutions.arrays import Longs
 from cprl.institutions.base import Institution
 from cprl.institutions.boundaries import Boundaries
-from cprl.institutions.ledger import COUNTS, Entries, Ledger, Payments
+from cprl.institutions.ledger import COUNTS, Entries, Ledger
 from cprl.institutions.mediation import Mediation
 from cprl.institutions.monitoring import Monitoring
 from cprl.institutions.patches import ClosedPatches
@@ -57,11 +57,8 @@ from cprl.institutions.votes import Vote
 
 class Law(NamedTuple):
     """What institutions need in a turn of B worlds: the `Arrays` of each module, in the order in which their
-    rules are called, and more."""
+    rules are called, and what all share."""
 
-    decisions: Annotated[Longs, "B N"]
-    """Read in the first turn of an episode."""
-    payments: Payments
     ledger: Ledger
     entries: Entries
     boundaries: boundaries.Arrays

@@ -1,9 +1,9 @@
 """Tuples of arrays whose annotations say dtype and shape, once: allocated here, and cut into worlds.
 
-`taken: Annotated[Ints, "B Q N", STEPS]` is int32 with an axis for each word: a letter, whose length whoever
+`taken: Annotated[Int32, "B Q N", STEPS]` is int32 with an axis for each word: a letter, whose length whoever
 allocates it says, or a number. An axis B is the first one, of worlds; without it an array is a parameter.
-`STATE` and `STEPS` mark what is part of the state of a world, `DERIVED` what is computed from the state; what
-is not marked holds nothing between turns.
+`Kept` marks what is part of the state of a world, e.g. `STATE` and `STEPS`, and `DERIVED` what is computed
+from the state; what is not marked holds nothing between turns.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -13,7 +13,6 @@ from typing import (
     Any,
     Final,
     NamedTuple,
-    TypeAlias,
     TypeVar,
     cast,
     get_args,
@@ -22,17 +21,23 @@ from typing import (
 )
 
 import numpy as np
-from numpy.typing import NDArray
 
-Ints: TypeAlias = NDArray[np.int32]
-Bytes: TypeAlias = NDArray[np.uint8]
-Bools: TypeAlias = NDArray[np.bool_]
-Floats: TypeAlias = NDArray[np.float32]
-Numbers: TypeAlias = NDArray[np.float64]
-Longs: TypeAlias = NDArray[np.int64]
+from cprl.values import MOST_INT32
 
-STATE: Final = "state"
-STEPS: Final = "state, up to Rules.episode_steps"
+
+class Kept(NamedTuple):
+    """That an array is part of the state of a world, and what is in it."""
+
+    low: int = 0
+    """The smallest entry."""
+    high: int | str = MOST_INT32
+    """The largest entry; a name is that of a number of the game, see `cprl.commons.state.numbers`."""
+    cleared: bool = True
+    """Whether all entries are 0 when an episode begins."""
+
+
+STATE: Final = Kept()
+STEPS: Final = Kept(high="episode_steps")
 DERIVED: Final = "derived"
 
 Tuple = TypeVar("Tuple", bound=tuple[Any, ...])
@@ -45,8 +50,8 @@ class Field(NamedTuple):
 
     axes: tuple[str, ...]
     dtype: type[np.generic]
-    lasts: str = ""
-    """`STATE`, `STEPS`, `DERIVED` or nothing."""
+    lasts: Kept | str = ""
+    """How it is kept, `DERIVED`, or nothing."""
 
     @property
     def is_of_worlds(self) -> bool:
@@ -55,7 +60,7 @@ class Field(NamedTuple):
 
 @cache
 def _fields(kind: Any) -> Mapping[str, Any]:
-    """The `Field` of each array of a tuple; of whatever else it holds the annotation."""
+    """Return the `Field` of each array of a tuple; of whatever else it holds the annotation."""
     hints = get_type_hints(kind, include_extras=True)
     for name, hint in hints.items():
         if get_origin(hint) is Annotated:
@@ -65,11 +70,12 @@ def _fields(kind: Any) -> Mapping[str, Any]:
 
 
 def forms_of(kind: Any, **sizes: int) -> dict[str, Form]:
-    """The shape and dtype of each array of a tuple; `sizes`: the length of each axis by its letter."""
-    return {
-        name: (tuple(sizes[axis] if axis in sizes else int(axis) for axis in field.axes), field.dtype)
-        for name, field in _fields(kind).items()
-    }
+    """Return the shape and dtype of each array of a tuple; `sizes`: the length of each axis by its letter."""
+    return {name: (_shape(field, sizes), field.dtype) for name, field in _fields(kind).items()}
+
+
+def _shape(field: Field, sizes: Mapping[str, int]) -> tuple[int, ...]:
+    return tuple(sizes[axis] if axis in sizes else int(axis) for axis in field.axes)
 
 
 def filled(kind: type[Tuple], values: Mapping[str, Any], **sizes: int) -> Tuple:
@@ -80,15 +86,16 @@ def filled(kind: type[Tuple], values: Mapping[str, Any], **sizes: int) -> Tuple:
     """
     fields, entries = _fields(kind), {}
     for name, field in fields.items():
-        if not isinstance(field, Field):
+        if _tuple_in(field) is not None:
+            entries[name] = values[name]
+        elif not isinstance(field, Field):
             entries[name] = field(values[name])
         elif name in values:
             entries[name] = np.ascontiguousarray(values[name], field.dtype)
             sizes |= dict(zip(field.axes, entries[name].shape, strict=True))
     for name, field in fields.items():
         if name not in entries:
-            shape = [sizes[axis] if axis in sizes else int(axis) for axis in field.axes]
-            entries[name] = np.zeros(shape, field.dtype)
+            entries[name] = np.zeros(_shape(field, sizes), field.dtype)
     made: Tuple = cast(Any, kind)(**{name: entries[name] for name in fields})
     return made
 
@@ -109,32 +116,53 @@ def changed(arrays: Tuple, change: Callable[[Any, bool], Any]) -> Tuple:
     return made
 
 
-def lasting(arrays: Any, *kinds: str) -> Iterator[tuple[str, Any, str]]:
-    """The name of each array of a tuple, and of the tuples in it, that lasts, the array, and what its
-    annotation says of that; `kinds`: of these only."""
+def lasting(arrays: Any, *, derived: bool = False) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the name of each array of a tuple, and of the tuples in it, that is part of the state of a world,
+    the array, and its `Kept`; with `derived` also what is computed from the state, with `DERIVED`."""
     kind: Any = type(arrays)
     for name, entry in zip(arrays._fields, arrays, strict=True):
         field = _fields(kind)[name]
         if isinstance(entry, tuple):
-            yield from lasting(entry, *kinds)
-        elif isinstance(field, Field) and field.lasts in kinds:
+            yield from lasting(entry, derived=derived)
+        elif isinstance(field, Field) and (isinstance(field.lasts, Kept) or (derived and field.lasts)):
             yield name, entry, field.lasts
 
 
-def slicer(kind: type[Tuple], *, every: bool = False) -> Callable[[Tuple, int], Tuple]:
-    """Return a function that takes world b out of a tuple of arrays, sharing their memory; what has no axis
-    of worlds stays, unless `every` says that all have one in front of those of their annotations.
+def names_kept(kind: Any) -> list[str]:
+    """Return the names of the arrays of a kind of tuple that are part of the state of a world."""
+    fields = _fields(kind).items()
+    return [name for name, field in fields if isinstance(field, Field) and isinstance(field.lasts, Kept)]
+
+
+def slicer(kind: Any, *, every: bool = False) -> Callable[[Any, int], Any]:
+    """Return a function that takes world b out of a tuple of arrays, and of the tuples in it, sharing their
+    memory; what has no axis of worlds stays, unless `every` says that all have one in front of those of their
+    annotations. Of a tuple that may be None it takes None.
 
     It is written out field by field, so that the rules can call it: Numba compiles no loop over a tuple whose
     entries differ in type.
     """
     names: dict[str, Any] = {"__name__": __name__, "kind": kind}
-    entries = ", ".join(
-        f"arrays.{name}[b]"
-        if every or (isinstance(field, Field) and field.is_of_worlds)
-        else f"arrays.{name}"
-        for name, field in _fields(kind).items()
-    )
-    exec(f"def one_{kind.__name__.lower()}(arrays, b):\n    return kind({entries})\n", names)
-    function: Callable[[Tuple, int], Tuple] = names[f"one_{kind.__name__.lower()}"]
+    entries = []
+    for name, field in _fields(kind).items():
+        entry = f"arrays.{name}"
+        inner = _tuple_in(field)
+        if inner is not None:
+            names[f"one_{name}"] = slicer(inner, every=every)
+            entry = f"one_{name}({entry}, b)"
+        elif every or (isinstance(field, Field) and field.is_of_worlds):
+            entry += "[b]"
+        entries.append(entry)
+    name = f"one_{kind.__name__.lower()}"
+    lines = f"def {name}(arrays, b):", "if arrays is None: return None", f"return kind({', '.join(entries)})"
+    exec("\n    ".join(lines), names)
+    function: Callable[[Any, int], Any] = names[name]
     return function
+
+
+def _tuple_in(field: Any) -> type[Any] | None:
+    """Return the kind of tuple that an annotation names, also one that may be None; None for another."""
+    kinds = [
+        kind for kind in (field, *get_args(field)) if isinstance(kind, type) and hasattr(kind, "_fields")
+    ]
+    return kinds[0] if kinds and not isinstance(field, Field) else None

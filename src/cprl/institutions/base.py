@@ -66,20 +66,20 @@ class Institution(Value, stored=False):
         return False
 
     def ballot(self, agents: int) -> Ballot | None:
-        """What N agents decide about it, if they do."""
+        """Return what N agents decide about it, if they do."""
         return None
 
     def shows(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
-        """What it shows agents, of its `entries`, each with the number of which one: by default its own among
-        those of its kind. `ballot`: the number of its ballot, or of the next one."""
+        """Return what it shows agents, of its `entries`, each with the number of which one: by default its
+        own among those of its kind. `ballot`: the number of its ballot, or of the next one."""
         return [(entry, number) for entry in self.entries]
 
     def may_harvest(self, agent: int, row: int, col: int) -> bool:
-        """Whether an agent can ever harvest a cell."""
+        """Return whether an agent can ever harvest a cell."""
         return True
 
     def check(self, game: Any) -> None:
-        """Refuses a game in which it has no meaning."""
+        """Refuse a game in which it has no meaning."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +103,8 @@ Kind = TypeVar("Kind", bound=Institution)
 
 
 def with_ballots(game: Any, kind: type[Kind]) -> list[tuple[Kind, int]]:
-    """The institutions of a kind in a game, voted on or not, each with the number of its ballot, or -1."""
+    """Return the institutions of a kind in a game, voted on or not, each with the number of its ballot, or
+    -1."""
     return [
         (institution.rule, ballot if institution.ballot(game.agents) else -1)
         for institution, ballot in numbered(game)
@@ -112,8 +113,8 @@ def with_ballots(game: Any, kind: type[Kind]) -> list[tuple[Kind, int]]:
 
 
 def columns(kind: type[Kind], arrays: Any, game: Any) -> dict[str, Any]:
-    """The parameters in `Arrays` that are named like fields of a kind, by institution in a game, 0 for None;
-    `ballot` is the number of its ballot, or -1."""
+    """Return the parameters in `Arrays` that are named like fields of a kind, by institution in a game, 0 for
+    None; `ballot` is the number of its ballot, or -1."""
     rules = with_ballots(game, kind)
     names = [name for name in arrays._fields if name != "ballot" and hasattr(kind, name)]
     return {
@@ -123,7 +124,7 @@ def columns(kind: type[Kind], arrays: Any, game: Any) -> dict[str, Any]:
 
 
 def numbered(game: Any) -> Iterator[tuple[Institution, int]]:
-    """The institutions of a game, each with the number of ballots before it."""
+    """Yield the institutions of a game, each with the number of ballots before it."""
     ballots = 0
     for institution in game.institutions:
         yield institution, ballots
@@ -131,12 +132,13 @@ def numbered(game: Any) -> Iterator[tuple[Institution, int]]:
 
 
 def threshold(prob: float) -> int:
-    """The threshold below which a uniform 32-bit word falls with this probability, to within 2**-33."""
+    """Return the threshold below which a uniform 32-bit word falls with this probability, to within
+    2**-33."""
     return round(prob * 2**32)
 
 
 def check_agent_indices(name: str, indices: Sequence[int], agents: int) -> None:
-    """Checks that all indices are of agents of the game."""
+    """Check that all indices are of agents of the game."""
     for agent in indices:
         if agent >= agents:
             raise ValueError(f"{name} has agent {agent}; allowed on this map: 0 to {agents - 1}")
@@ -147,7 +149,7 @@ OF_ELECTIONS: Final = ("period_episodes", "override_prob")
 
 
 def check_no_election(institution: Institution, elects: str) -> None:
-    """Checks that an institution without an election says nothing about how one is held.
+    """Check that an institution without an election says nothing about how one is held.
 
     Args:
         elects: what it would have to be for an election, in words.

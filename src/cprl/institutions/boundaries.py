@@ -6,10 +6,10 @@ from typing import Annotated, Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
-from cprl.institutions.arrays import Bools, Numbers
 from cprl.institutions.base import Amount, Institution, columns, with_ballots
-from cprl.institutions.ledger import FOREIGN_BITES, OWN_BITES, TRESPASSES, Ledger, violate
+from cprl.institutions.ledger import OWN_BITES, TRESPASSES, Ledger, violate
 from cprl.values import Where, shown
+from cprl.values.arrays import Bool, Float64
 
 OPEN: Final = "."
 """The sign of a cell that everybody may use."""
@@ -17,7 +17,6 @@ NOBODY: Final = "-"
 """The sign of a cell that nobody may use: a reserve."""
 SIGNS: Final = digits + ascii_lowercase
 """The signs of the regions of agents 0, 1, ..., where `owners` is None."""
-COUNT: Final = FOREIGN_BITES
 
 Regions = Annotated[
     tuple[str, ...],
@@ -77,7 +76,7 @@ class Boundaries(Institution):
         return cls(regions=(row,) * height, **fields)
 
     def signs_of(self, agent: int) -> str:
-        """The signs of the regions that an agent may use."""
+        """Return the signs of the regions that an agent may use."""
         if self.owners is not None:
             return self.owners[agent]
         return SIGNS[agent] if agent < len(SIGNS) else ""
@@ -113,13 +112,13 @@ class Boundaries(Institution):
 class Arrays(NamedTuple):
     """All boundaries of a game, one per index of axis R."""
 
-    may_use: Annotated[Bools, "R N cells"]
+    may_use: Annotated[Bool, "R N cells"]
     """Whether the agent may use the cell; cells as in `cprl.commons.tables.Tables`."""
-    is_stopped: Annotated[Bools, "R"]
-    fine: Annotated[Numbers, "R"]
-    step_is_violation: Annotated[Bools, "R"]
-    step_fine: Annotated[Numbers, "R"]
-    observed: Annotated[Bools, "R"]
+    is_stopped: Annotated[Bool, "R"]
+    fine: Annotated[Float64, "R"]
+    step_is_violation: Annotated[Bool, "R"]
+    step_fine: Annotated[Float64, "R"]
+    observed: Annotated[Bool, "R"]
 
 
 def parameters(game: Any) -> dict[str, Any]:
@@ -141,26 +140,30 @@ def parameters(game: Any) -> dict[str, Any]:
     }
 
 
-def breaks(boundaries: Arrays, ledger: Ledger, r: int, i: int, cell: int, site: int, turn: int) -> bool:
+def is_foreign(boundaries: Arrays, r: int, i: int, cell: int) -> bool:
+    """Return whether agent i may not use a cell."""
     return not boundaries.may_use[r, i, cell]
 
 
-def note_bite(boundaries: Arrays, ledger: Ledger, i: int, cell: int, site: int, turn: int) -> None:
+def count_own_bites(boundaries: Arrays, ledger: Ledger, i: int, cell: int) -> None:
+    """Count a harvest of agent i on a cell that it may use."""
     for r in range(boundaries.fine.shape[0]):
         ledger.counts[i, OWN_BITES] += boundaries.may_use[r, i, cell]
 
 
-def note_step(boundaries: Arrays, ledger: Ledger, i: int, cell: int) -> None:
+def note_trespass(boundaries: Arrays, ledger: Ledger, i: int, cell: int) -> None:
+    """Note that agent i ends its move on a cell that it may not use, if it may not."""
     for r in range(boundaries.step_fine.shape[0]):
-        if not boundaries.may_use[r, i, cell]:
+        if is_foreign(boundaries, r, i, cell):
             if boundaries.step_is_violation[r]:
                 violate(ledger, i, TRESPASSES, boundaries.step_fine[r])
             else:
                 ledger.counts[i, TRESPASSES] += 1
 
 
-def forbids(boundaries: Arrays, ledger: Ledger, i: int, cell: int, site: int) -> bool:
+def shows_foreign(boundaries: Arrays, i: int, cell: int) -> bool:
+    """Return whether agent i sees that it may not use a cell."""
     for r in range(boundaries.observed.shape[0]):
-        if boundaries.observed[r] and not boundaries.may_use[r, i, cell]:
+        if boundaries.observed[r] and is_foreign(boundaries, r, i, cell):
             return True
     return False

@@ -5,7 +5,8 @@ Letters of axes here and in the modules of institutions: B worlds, N agents, C c
 
 from typing import Annotated, Final, NamedTuple
 
-from cprl.institutions.arrays import STATE, STEPS, Bools, Floats, Ints, Numbers
+from cprl.institutions.arrays import STATE, STEPS, Kept
+from cprl.values.arrays import Bool, Float64, Int32
 
 COUNTS: Final = (
     *("own_bites", "foreign_bites", "trespasses", "excess_bites", "closed_bites"),
@@ -22,36 +23,36 @@ UNJUST_TAGS, VIOLATIONS, DETECTIONS, SANCTIONS, RETURNS = range(5, 10)
 class Ledger(NamedTuple):
     """What institutions share. All but `in_force` is cleared at an episode's begin."""
 
-    in_force: Annotated[Numbers, "B V", STATE]
+    in_force: Annotated[Float64, "B V", Kept(cleared=False)]
     """What each ballot decided: a tax rate, a quota's share or an agent index."""
-    violation_step: Annotated[Ints, "B N", STEPS]
+    violation_step: Annotated[Int32, "B N", STEPS]
     """The step of the last violation; 0 for never."""
-    detected: Annotated[Bools, "B N", STATE]
+    detected: Annotated[Bool, "B N", STATE]
     """Whether a violation was detected in the last turn."""
-    counts: Annotated[Ints, "B N C", STATE]
+    counts: Annotated[Int32, "B N C", STATE]
     """The `COUNTS` of this episode."""
-    sanctioned: Annotated[Bools, "B N"]
+    sanctioned: Annotated[Bool, "B N"]
     """Whether the agent was sanctioned in an earlier turn of this episode."""
-    broke: Annotated[Bools, "B N"]
+    broke: Annotated[Bool, "B N"]
     """Whether the agent violated a rule in this turn."""
-    unjust: Annotated[Bools, "B N"]
+    unjust: Annotated[Bool, "B N"]
     """Whether the agent tagged unjustly in this turn."""
-    due: Annotated[Numbers, "B N"]
+    due: Annotated[Float64, "B N"]
     """The fines that follow if this turn's violations are detected."""
-    fines: Annotated[Numbers, "B N"]
+    fines: Annotated[Float64, "B N"]
     """Apples taken in this turn."""
-    transfers: Annotated[Numbers, "B N"]
+    transfers: Annotated[Float64, "B N"]
     """Apples given in this turn."""
 
 
 class Entries(NamedTuple):
     """What agents are shown of institutions, one entry per index of axis E."""
 
-    module: Annotated[Ints, "E"]
-    """The index in `cprl.institutions.law.MODULES`."""
-    what: Annotated[Ints, "E"]
+    module: Annotated[Int32, "E"]
+    """The index of the module among the fields of `cprl.institutions.Law`."""
+    what: Annotated[Int32, "E"]
     """The index in the `entries` of its kind."""
-    argument: Annotated[Ints, "E"]
+    argument: Annotated[Int32, "E"]
     """Which one of its kind."""
     places: bool
     """Whether agents see where bites are forbidden."""
@@ -59,21 +60,8 @@ class Entries(NamedTuple):
     """The channel of observations that is the first one of institutions."""
 
 
-class Payments(NamedTuple):
-    """What institutions output in a turn, written into arrays that the caller provides: the entries of these
-    names in `cprl.keys`."""
-
-    reward: Annotated[Floats, "B N"]
-    fines: Annotated[Floats, "B N"]
-    transfers: Annotated[Floats, "B N"]
-    violated: Annotated[Bools, "B N"]
-    counts: Annotated[Ints, "B N C"]
-    in_force: Annotated[Floats, "B V"]
-    ballots_due: Annotated[Bools, "B V"]
-
-
 def forget_episode(ledger: Ledger) -> None:
-    """Clears what is noted within an episode."""
+    """Clear what is noted within an episode."""
     for i in range(ledger.violation_step.shape[0]):
         ledger.violation_step[i] = 0
         ledger.detected[i] = False
@@ -82,7 +70,7 @@ def forget_episode(ledger: Ledger) -> None:
 
 
 def forget_turn(ledger: Ledger) -> None:
-    """Clears what is noted within a turn."""
+    """Clear what is noted within a turn."""
     for i in range(ledger.broke.shape[0]):
         ledger.sanctioned[i] = ledger.counts[i, SANCTIONS] > 0
         ledger.broke[i] = False
@@ -93,14 +81,14 @@ def forget_turn(ledger: Ledger) -> None:
 
 
 def violate(ledger: Ledger, i: int, count: int, fine: float) -> None:
-    """Notes a violation of agent i, of one kind of count, that costs a fine if it is detected."""
+    """Note a violation of agent i, of one kind of count, that costs a fine if it is detected."""
     ledger.broke[i] = True
     ledger.counts[i, count] += 1
     ledger.due[i] += fine
 
 
 def count_violation(ledger: Ledger, i: int, turn: int) -> bool:
-    """Counts a turn in which agent i violated a rule; returns whether it did."""
+    """Count a turn in which agent i violated a rule; return whether it did."""
     ledger.broke[i] = ledger.broke[i] or ledger.unjust[i]
     if ledger.broke[i]:
         ledger.counts[i, VIOLATIONS] += 1

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, NamedTuple
 
-from cprl.institutions.arrays import Bools, Ints, Numbers
 from cprl.institutions.base import Amount, Institution, columns
 from cprl.institutions.ledger import UNJUST_TAGS, Ledger
 from cprl.values import Positive
+from cprl.values.arrays import Bool, Float64, Int32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,23 +46,23 @@ class Mediation(Institution):
 class Arrays(NamedTuple):
     """The mediation of a game: of axis M there is one, or none."""
 
-    turns: Annotated[Ints, "M"]
-    refund: Annotated[Numbers, "M"]
+    turns: Annotated[Int32, "M"]
+    refund: Annotated[Float64, "M"]
 
 
 def parameters(game: Any) -> dict[str, Any]:
     return columns(Mediation, Arrays, game)
 
 
-def mediate(mediation: Arrays, ledger: Ledger, tagged_by: Bools, turn: int) -> None:
-    """Refunds agents that were tagged but broke no rule in the last turns; `tagged_by`: bool [N, N]."""
+def mediate(mediation: Arrays, ledger: Ledger, tagged_by: Bool, turn: int) -> None:
+    """Refund agents that were tagged but broke no rule in the last turns; `tagged_by`: bool [N, N]."""
     if mediation.turns.shape[0] > 0:
         for i in range(tagged_by.shape[0]):
             refund_tag(mediation, ledger, tagged_by, i, turn)
 
 
-def refund_tag(mediation: Arrays, ledger: Ledger, tagged_by: Bools, i: int, turn: int) -> None:
-    """Refunds agent i for a tag, if there was any and it was unjust."""
+def refund_tag(mediation: Arrays, ledger: Ledger, tagged_by: Bool, i: int, turn: int) -> None:
+    """Refund agent i for a tag, if there was any and it was unjust."""
     shooters = 0
     for j in range(tagged_by.shape[0]):
         shooters += tagged_by[i, j]
@@ -77,11 +77,11 @@ def refund_tag(mediation: Arrays, ledger: Ledger, tagged_by: Bools, i: int, turn
 
 
 def has_mark(mediation: Arrays, ledger: Ledger, i: int, turn: int) -> bool:
-    """Whether agent i violated a rule in the turns before this one that justify a tag in it."""
+    """Return whether agent i violated a rule in the turns before this one that justify a tag in it."""
     return ledger.violation_step[i] > 0 and turn - ledger.violation_step[i] < mediation.turns[0]
 
 
-def shown(mediation: Arrays, ledger: Ledger, what: int, offset: int, i: int, turn: int) -> float:
+def show_mark(mediation: Arrays, ledger: Ledger, offset: int, i: int, turn: int) -> float:
     """1 if the agent so many indices after i violated a rule in the last turns."""
     agent = (i + offset) % ledger.fines.shape[0]
     return 1.0 if has_mark(mediation, ledger, agent, turn + 1) else 0.0

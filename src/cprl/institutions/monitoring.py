@@ -86,22 +86,21 @@ def parameters(game: Any) -> dict[str, Any]:
     return {"detected_below": below, "cost": monitoring.cost, "payer": payer, "ballot": ballot}
 
 
-def settle(monitoring: Arrays, ledger: Ledger, turn: int, is_over: bool) -> None:
-    """Charges the cost of inspection to who monitors, or to all in equal parts."""
+def charge_inspection(monitoring: Arrays, ledger: Ledger) -> None:
+    """Charge the cost of inspection to who monitors, or to all in equal parts."""
     if monitoring.cost == 0:
         return
-    agents = ledger.fines.shape[0]
+    agents, payer = ledger.fines.shape[0], monitoring.payer
+    if monitoring.ballot >= 0:
+        payer = int(ledger.in_force[monitoring.ballot])
     for i in range(agents):
-        if monitoring.ballot >= 0:
-            if ledger.in_force[monitoring.ballot] == i:
-                ledger.fines[i] += monitoring.cost
-        elif monitoring.payer < 0:
-            ledger.fines[i] += monitoring.cost / agents
-        elif monitoring.payer == i:
+        if payer == i:
             ledger.fines[i] += monitoring.cost
+        elif payer < 0:
+            ledger.fines[i] += monitoring.cost / agents
 
 
-def shown(monitoring: Arrays, ledger: Ledger, what: int, ballot: int, i: int, turn: int) -> float:
+def show_monitoring(monitoring: Arrays, ledger: Ledger, what: int, ballot: int, i: int) -> float:
     """1 if a violation of the agent was detected in the last turn; with an election, 1 if it monitors."""
     if what == 0:
         return 1.0 if ledger.detected[i] else 0.0

@@ -2,16 +2,14 @@
 
 import warnings
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Final, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from cprl.institutions.arrays import DERIVED, Bools, Bytes, Ints, Numbers
+from cprl.institutions.arrays import DERIVED
 from cprl.institutions.base import Amount, Limit, columns, with_ballots
-from cprl.institutions.ledger import CLOSED_BITES, Ledger
 from cprl.values import Natural
-
-COUNT: Final = CLOSED_BITES
+from cprl.values.arrays import Bool, Float64, Int32, UInt8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +33,7 @@ class ClosedPatches(Limit):
     counts: ClassVar[tuple[str, ...]] = ("closed_bites",)
 
     def check(self, game: Any) -> None:
-        """Warns (UserWarning) if no patch ever opens, so that nobody gets an apple."""
+        """Warn (UserWarning) if no patch ever opens, so that nobody gets an apple."""
         largest = int(np.bincount(game.patches).max())
         if self.is_stopped and self.below > largest:
             warnings.warn(
@@ -49,18 +47,18 @@ class ClosedPatches(Limit):
 class Arrays(NamedTuple):
     """The patches of a game, one per index of axis P; none without `ClosedPatches`."""
 
-    patch_of: Annotated[Ints, "K"]
+    patch_of: Annotated[Int32, "K"]
     """The patch of each site."""
-    sites: Annotated[Ints, "P"]
+    sites: Annotated[Int32, "P"]
     """Sites per patch."""
-    below: Annotated[Ints, "L"]
+    below: Annotated[Int32, "L"]
     """Of axis L there is one, or none."""
-    is_stopped: Annotated[Bools, "L"]
-    fine: Annotated[Numbers, "L"]
-    observed: Annotated[Bools, "L"]
-    closed: Annotated[Bools, "B P", DERIVED]
+    is_stopped: Annotated[Bool, "L"]
+    fine: Annotated[Float64, "L"]
+    observed: Annotated[Bool, "L"]
+    closed: Annotated[Bool, "B P", DERIVED]
     """Whether the patch is closed in the coming turn."""
-    stock: Annotated[Ints, "B P", DERIVED]
+    stock: Annotated[Int32, "B P", DERIVED]
     """Apples on each patch."""
 
 
@@ -70,40 +68,35 @@ def parameters(game: Any) -> dict[str, Any]:
     return {"patch_of": patch_of, "sites": sites, **columns(ClosedPatches, Arrays, game)}
 
 
-def breaks(patches: Arrays, ledger: Ledger, p: int, i: int, cell: int, site: int, turn: int) -> bool:
+def is_patch_closed(patches: Arrays, site: int) -> bool:
+    """Return whether the patch of a site is closed."""
     return patches.closed[patches.patch_of[site]]
 
 
-def note_bite(patches: Arrays, ledger: Ledger, i: int, cell: int, site: int, turn: int) -> None:
+def count_apple(patches: Arrays, site: int, change: int) -> None:
+    """Count an apple that has appeared on a site, change 1, or is gone from it, change -1."""
     if patches.sites.shape[0] > 0:
-        patches.stock[patches.patch_of[site]] -= 1
+        patches.stock[patches.patch_of[site]] += change
 
 
-def note_growth(patches: Arrays, ledger: Ledger, site: int) -> None:
-    if patches.sites.shape[0] > 0:
-        patches.stock[patches.patch_of[site]] += 1
-
-
-def refresh(patches: Arrays, ledger: Ledger, stock: Bytes) -> None:
+def count_apples(patches: Arrays, stock: UInt8) -> None:
+    """Count the apples on each patch; `stock`: uint8 [K]."""
     if patches.sites.shape[0] > 0:
         for p in range(patches.sites.shape[0]):
             patches.stock[p] = 0
         for site in range(stock.shape[0]):
             patches.stock[patches.patch_of[site]] += stock[site]
-        close(patches)
+        close_patches(patches)
 
 
-def open_turn(patches: Arrays, ledger: Ledger, turn: int, stock_share: float) -> None:
-    close(patches)
-
-
-def close(patches: Arrays) -> None:
-    """Writes which patches are closed in the coming turn."""
+def close_patches(patches: Arrays) -> None:
+    """Write which patches are closed in the coming turn."""
     for p in range(patches.sites.shape[0]):
         patches.closed[p] = patches.stock[p] < patches.below[0]
 
 
-def forbids(patches: Arrays, ledger: Ledger, i: int, cell: int, site: int) -> bool:
+def shows_closed(patches: Arrays, site: int) -> bool:
+    """Return whether agents see that the patch of a site is closed; -1: where there is no site."""
     if patches.observed.shape[0] == 0 or not patches.observed[0] or site < 0:
         return False
-    return patches.closed[patches.patch_of[site]]
+    return is_patch_closed(patches, site)

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, NamedTuple
 
-from cprl.institutions.arrays import Bools, Numbers
 from cprl.institutions.base import Amount, Institution, columns
 from cprl.institutions.ledger import Ledger
+from cprl.values.arrays import Bool, Float64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -14,8 +14,8 @@ class Punishment(Institution):
     "Cooperation and punishment in public goods experiments", 2000).
 
     An agent that several tag at once pays for each of them. Fines go to nobody. With `Rules.freeze_steps` of
-    0 a tagged agent misses no turn; it is only absent from the windows of the turn in which it is tagged.
-    Agents observe nothing of it.
+    0 the tagged agent misses no turn and stays in the windows of others, and under `respawn_at_spawns` it
+    goes on at a spawn place, as soon as one is free. Agents observe nothing of it.
     """
 
     fine: Amount = 2.0
@@ -37,17 +37,17 @@ class Punishment(Institution):
 class Arrays(NamedTuple):
     """The punishment of a game: of axis P there is one, or none."""
 
-    fine: Annotated[Numbers, "P"]
-    cost: Annotated[Numbers, "P"]
-    shot_cost: Annotated[Numbers, "P"]
+    fine: Annotated[Float64, "P"]
+    cost: Annotated[Float64, "P"]
+    shot_cost: Annotated[Float64, "P"]
 
 
 def parameters(game: Any) -> dict[str, Any]:
     return columns(Punishment, Arrays, game)
 
 
-def punish(punishment: Arrays, ledger: Ledger, tagged_by: Bools, fired: Bools) -> None:
-    """Fines tagged agents, and whoever fired and tagged them; `tagged_by`: bool [N, N], `fired`: bool [N]."""
+def punish(punishment: Arrays, ledger: Ledger, tagged_by: Bool, fired: Bool) -> None:
+    """Fine tagged agents, and whoever fired and tagged them; `tagged_by`: bool [N, N], `fired`: bool [N]."""
     if punishment.fine.shape[0] == 0:
         return
     for i in range(tagged_by.shape[0]):

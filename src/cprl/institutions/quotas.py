@@ -5,12 +5,12 @@ import warnings
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, NamedTuple
 
-from cprl.institutions.arrays import STATE, STEPS, Bools, Ints, Numbers
+from cprl.institutions.arrays import STEPS, Kept
 from cprl.institutions.base import Amount, Limit, columns, with_ballots
-from cprl.institutions.ledger import EXCESS_BITES, Ledger
+from cprl.institutions.ledger import Ledger
 from cprl.values import Positive, Range
+from cprl.values.arrays import Bool, Float64, Int32
 
-COUNT: Final = EXCESS_BITES
 ROUNDING: Final = 1e-9
 """Apples by which a quota may be exceeded: the rounding of its computation."""
 
@@ -48,20 +48,20 @@ class Quota(Limit):
 class Arrays(NamedTuple):
     """All quotas of a game, one per index of axis Q."""
 
-    unit: Annotated[Numbers, "Q"]
+    unit: Annotated[Float64, "Q"]
     """Apples per agent and window at a share of 1."""
-    full: Annotated[Numbers, "Q"]
+    full: Annotated[Float64, "Q"]
     """The most apples that an agent may harvest in a window, for what agents are shown."""
-    share: Annotated[Numbers, "Q"]
-    ballot: Annotated[Ints, "Q"]
+    share: Annotated[Float64, "Q"]
+    ballot: Annotated[Int32, "Q"]
     """The ballot that decides the share; -1 for none."""
-    window_steps: Annotated[Ints, "Q"]
-    by_stock: Annotated[Bools, "Q"]
-    is_stopped: Annotated[Bools, "Q"]
-    fine: Annotated[Numbers, "Q"]
-    allowed: Annotated[Numbers, "B Q", STATE]
+    window_steps: Annotated[Int32, "Q"]
+    by_stock: Annotated[Bool, "Q"]
+    is_stopped: Annotated[Bool, "Q"]
+    fine: Annotated[Float64, "Q"]
+    allowed: Annotated[Float64, "B Q", Kept(cleared=False)]
     """The apples that an agent may harvest in the current window."""
-    taken: Annotated[Ints, "B Q N", STEPS]
+    taken: Annotated[Int32, "B Q N", STEPS]
     """Apples harvested in the current window."""
 
 
@@ -77,7 +77,7 @@ def parameters(game: Any) -> dict[str, Any]:
 
 
 def _warn_of_less_than_an_apple(quota: Quota, apples_a_turn: float) -> None:
-    """Warns of a quota that stops every bite although its share is not 0."""
+    """Warn of a quota that stops every bite although its share is not 0."""
     apples = apples_a_turn * quota.window_steps
     if quota.fine is None and 0 < apples < 1 - ROUNDING:
         warnings.warn(
@@ -89,7 +89,8 @@ def _warn_of_less_than_an_apple(quota: Quota, apples_a_turn: float) -> None:
         )
 
 
-def open_turn(quotas: Arrays, ledger: Ledger, turn: int, stock_share: float) -> None:
+def open_windows(quotas: Arrays, ledger: Ledger, turn: int, stock_share: float) -> None:
+    """Begin the windows that begin with a turn; `stock_share`: the share of all sites that hold an apple."""
     for q in range(quotas.window_steps.shape[0]):
         if (turn - 1) % quotas.window_steps[q] == 0:
             share = quotas.share[q]
@@ -102,17 +103,20 @@ def open_turn(quotas: Arrays, ledger: Ledger, turn: int, stock_share: float) -> 
                 quotas.taken[q, i] = 0
 
 
-def breaks(quotas: Arrays, ledger: Ledger, q: int, i: int, cell: int, site: int, turn: int) -> bool:
+def is_used_up(quotas: Arrays, q: int, i: int) -> bool:
+    """Return whether one more harvest of agent i is above its quota."""
     return quotas.taken[q, i] + 1 > quotas.allowed[q] + ROUNDING
 
 
-def note_bite(quotas: Arrays, ledger: Ledger, i: int, cell: int, site: int, turn: int) -> None:
+def use_quotas(quotas: Arrays, i: int) -> None:
+    """Count a harvest of agent i."""
     for q in range(quotas.window_steps.shape[0]):
         quotas.taken[q, i] += 1
 
 
-def shown(quotas: Arrays, ledger: Ledger, what: int, q: int, i: int, turn: int) -> float:
-    """The apples left to agent i, relative to the most that they can be; the part of the window left."""
+def show_quota(quotas: Arrays, what: int, q: int, i: int, turn: int) -> float:
+    """Return the apples left to agent i, relative to the most that they can be; the part of the window
+    left."""
     if what == 1:
         return (quotas.window_steps[q] - turn % quotas.window_steps[q]) / quotas.window_steps[q]
     left = quotas.allowed[q] - quotas.taken[q, i]

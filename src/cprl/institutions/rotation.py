@@ -1,14 +1,12 @@
 """Rotation: agents take turns in harvesting."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Final, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
-from cprl.institutions.arrays import Bools, Ints, Numbers
 from cprl.institutions.base import Amount, Limit, columns
-from cprl.institutions.ledger import CLOSED_BITES, Ledger
+from cprl.institutions.ledger import Ledger
 from cprl.values import Positive
-
-COUNT: Final = CLOSED_BITES
+from cprl.values.arrays import Bool, Float64, Int32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,21 +33,22 @@ class Rotation(Limit):
 class Arrays(NamedTuple):
     """All rotations of a game, one per index of axis R."""
 
-    window_steps: Annotated[Ints, "R"]
-    is_stopped: Annotated[Bools, "R"]
-    fine: Annotated[Numbers, "R"]
+    window_steps: Annotated[Int32, "R"]
+    is_stopped: Annotated[Bool, "R"]
+    fine: Annotated[Float64, "R"]
 
 
 def parameters(game: Any) -> dict[str, Any]:
     return columns(Rotation, Arrays, game)
 
 
-def breaks(rotations: Arrays, ledger: Ledger, r: int, i: int, cell: int, site: int, turn: int) -> bool:
+def is_out_of_turn(rotations: Arrays, ledger: Ledger, r: int, i: int, turn: int) -> bool:
+    """Return whether a turn is not agent i's to harvest."""
     return (turn - 1) // rotations.window_steps[r] % ledger.fines.shape[0] != i
 
 
-def shown(rotations: Arrays, ledger: Ledger, what: int, r: int, i: int, turn: int) -> float:
+def show_rotation(rotations: Arrays, ledger: Ledger, what: int, r: int, i: int, turn: int) -> float:
     """1 if agent i may harvest in the coming turn; the part of the window that is left."""
     if what == 0:
-        return 0.0 if breaks(rotations, ledger, r, i, 0, 0, turn + 1) else 1.0
+        return 0.0 if is_out_of_turn(rotations, ledger, r, i, turn + 1) else 1.0
     return (rotations.window_steps[r] - turn % rotations.window_steps[r]) / rotations.window_steps[r]

@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, NamedTuple
 
-from cprl.institutions.arrays import DERIVED, Bools, Bytes
+from cprl.institutions.arrays import DERIVED
 from cprl.institutions.base import Ballot, Institution, check_agent_indices, check_no_election, with_ballots
 from cprl.institutions.ledger import Ledger
 from cprl.values import AgentIndices, Positive, Share
+from cprl.values.arrays import Bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,11 +54,11 @@ class Sanctioner(Institution):
 class Arrays(NamedTuple):
     """Who may fire."""
 
-    named: Annotated[Bools, "N"]
+    named: Annotated[Bool, "N"]
     """Whether the agent may fire where none is elected."""
     ballot: int
     """The ballot that elects who may fire; -1 for none."""
-    may_fire: Annotated[Bools, "B N", DERIVED]
+    may_fire: Annotated[Bool, "B N", DERIVED]
     """Whether the agent may fire now."""
 
 
@@ -67,12 +68,8 @@ def parameters(game: Any) -> dict[str, Any]:
     return {"named": [agent in named for agent in range(game.agents)], "ballot": ballot}
 
 
-def refresh(sanctioner: Arrays, ledger: Ledger, stock: Bytes) -> None:
-    appoint(sanctioner, ledger)
-
-
 def appoint(sanctioner: Arrays, ledger: Ledger) -> None:
-    """Writes who may fire: the elected agent, or those that the game names."""
+    """Write who may fire: the elected agent, or those that the game names."""
     for i in range(sanctioner.may_fire.shape[0]):
         if sanctioner.ballot >= 0:
             sanctioner.may_fire[i] = ledger.in_force[sanctioner.ballot] == i
@@ -80,6 +77,6 @@ def appoint(sanctioner: Arrays, ledger: Ledger) -> None:
             sanctioner.may_fire[i] = sanctioner.named[i]
 
 
-def shown(sanctioner: Arrays, ledger: Ledger, what: int, argument: int, i: int, turn: int) -> float:
+def show_may_fire(sanctioner: Arrays, i: int) -> float:
     """1 if the agent may fire."""
     return 1.0 if sanctioner.may_fire[i] else 0.0

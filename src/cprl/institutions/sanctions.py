@@ -5,10 +5,11 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from cprl.institutions.arrays import STATE, STEPS, Bools, Ints, Numbers
+from cprl.institutions.arrays import STATE, STEPS
 from cprl.institutions.base import A_RULE_TO_BREAK, Amount, Institution, with_ballots
 from cprl.institutions.ledger import SANCTIONS, Ledger
 from cprl.values import Natural, Positive, Where
+from cprl.values.arrays import Bool, Float64, Int32
 
 Offence = Literal["tags", "violations", "both"]
 Freezes = Annotated[
@@ -86,17 +87,17 @@ class GraduatedSanctions(Institution):
 class Arrays(NamedTuple):
     """The sanctions of a game, one per index of axis L, of levels, and the level of each agent."""
 
-    steps: Annotated[Ints, "N L"]
+    steps: Annotated[Int32, "N L"]
     """The time-out by shooter and level; [N, 0] without `GraduatedSanctions`."""
-    fine: Annotated[Numbers, "fines"]
+    fine: Annotated[Float64, "fines"]
     """By level."""
     recovery: int
     """Turns; 0 for never."""
     of_tags: bool
     of_violations: bool
-    level: Annotated[Ints, "B N", STATE]
+    level: Annotated[Int32, "B N", STATE]
     """The level of the next sanction."""
-    offence_step: Annotated[Ints, "B N", STEPS]
+    offence_step: Annotated[Int32, "B N", STEPS]
     """The step of the last offence, or at which the level last fell."""
 
 
@@ -114,19 +115,20 @@ def parameters(game: Any) -> dict[str, Any]:
     return {"steps": steps, "fine": (), "recovery": 0, "of_tags": False, "of_violations": False}
 
 
-def begin(sanctions: Arrays, ledger: Ledger) -> None:
+def forget_offences(sanctions: Arrays) -> None:
+    """Forget the offences of the last episode."""
     for i in range(sanctions.level.shape[0]):
         sanctions.level[i] = 0
         sanctions.offence_step[i] = 0
 
 
 def time_out(sanctions: Arrays, shooter: int, i: int) -> int:
-    """The turns that agent i misses for an offence at its level; `shooter`: who sanctions."""
+    """Return the turns that agent i misses for an offence at its level; `shooter`: who sanctions."""
     return sanctions.steps[shooter, min(sanctions.level[i], sanctions.steps.shape[1] - 1)]
 
 
 def offend(sanctions: Arrays, ledger: Ledger, i: int, turn: int) -> None:
-    """Counts an offence of agent i, which pays the fine of its level and rises by one."""
+    """Count an offence of agent i, which pays the fine of its level and rises by one."""
     ledger.fines[i] += sanctions.fine[min(sanctions.level[i], sanctions.fine.shape[0] - 1)]
     sanctions.level[i] += 1
     sanctions.offence_step[i] = turn
@@ -134,9 +136,9 @@ def offend(sanctions: Arrays, ledger: Ledger, i: int, turn: int) -> None:
 
 
 def sanction_tag(
-    sanctions: Arrays, ledger: Ledger, tagged_by: Bools, i: int, turn: int, freeze_steps: int
+    sanctions: Arrays, ledger: Ledger, tagged_by: Bool, i: int, turn: int, freeze_steps: int
 ) -> int:
-    """Lets agent i pay for being tagged, where that is an offence; returns the turns that it misses,
+    """Let agent i pay for being tagged, where that is an offence; return the turns that it misses,
     `freeze_steps` where it is none."""
     if not sanctions.of_tags:
         return freeze_steps
@@ -149,7 +151,7 @@ def sanction_tag(
 
 
 def sanction_violation(sanctions: Arrays, ledger: Ledger, i: int, turn: int) -> int:
-    """Lets agent i pay for a detected violation, where that is an offence; returns the turns that it
+    """Let agent i pay for a detected violation, where that is an offence; return the turns that it
     misses."""
     if not sanctions.of_violations:
         return 0
@@ -158,8 +160,8 @@ def sanction_violation(sanctions: Arrays, ledger: Ledger, i: int, turn: int) -> 
     return steps
 
 
-def settle(sanctions: Arrays, ledger: Ledger, turn: int, is_over: bool) -> None:
-    """Lowers the level of agents that have had no offence in the last turns, this one included."""
+def forgive(sanctions: Arrays, turn: int) -> None:
+    """Lower the level of agents that have had no offence in the last turns, this one included."""
     if sanctions.recovery > 0:
         for i in range(sanctions.level.shape[0]):
             if sanctions.level[i] > 0 and turn - sanctions.offence_step[i] >= sanctions.recovery:
@@ -167,7 +169,7 @@ def settle(sanctions: Arrays, ledger: Ledger, turn: int, is_over: bool) -> None:
                 sanctions.offence_step[i] = turn
 
 
-def shown(sanctions: Arrays, ledger: Ledger, what: int, argument: int, i: int, turn: int) -> float:
-    """The agent's level, relative to the last one."""
+def show_level(sanctions: Arrays, i: int) -> float:
+    """Return the agent's level, relative to the last one."""
     last = max(1, sanctions.fine.shape[0] - 1, sanctions.steps.shape[1] - 1)
     return min(sanctions.level[i], last) / last

@@ -1,14 +1,11 @@
 """ClosedSeason: times in which nobody may harvest."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Final, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
-from cprl.institutions.arrays import Bools, Ints, Numbers
 from cprl.institutions.base import Amount, Limit, columns
-from cprl.institutions.ledger import CLOSED_BITES, Ledger
 from cprl.values import Natural, Positive
-
-COUNT: Final = CLOSED_BITES
+from cprl.values.arrays import Bool, Float64, Int32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,29 +41,25 @@ class ClosedSeason(Limit):
 class Arrays(NamedTuple):
     """All closed seasons of a game, one per index of axis S."""
 
-    period_steps: Annotated[Ints, "S"]
-    closed_steps: Annotated[Ints, "S"]
-    is_stopped: Annotated[Bools, "S"]
-    fine: Annotated[Numbers, "S"]
+    period_steps: Annotated[Int32, "S"]
+    closed_steps: Annotated[Int32, "S"]
+    is_stopped: Annotated[Bool, "S"]
+    fine: Annotated[Float64, "S"]
 
 
 def parameters(game: Any) -> dict[str, Any]:
     return columns(ClosedSeason, Arrays, game)
 
 
-def is_closed(seasons: Arrays, s: int, turn: int) -> bool:
-    """Whether a season is closed in a turn, counted from 1."""
+def is_season_closed(seasons: Arrays, s: int, turn: int) -> bool:
+    """Return whether a season is closed in a turn, counted from 1."""
     return (turn - 1) % seasons.period_steps[s] >= seasons.period_steps[s] - seasons.closed_steps[s]
 
 
-def breaks(seasons: Arrays, ledger: Ledger, s: int, i: int, cell: int, site: int, turn: int) -> bool:
-    return is_closed(seasons, s, turn)
-
-
-def shown(seasons: Arrays, ledger: Ledger, what: int, s: int, i: int, turn: int) -> float:
+def show_season(seasons: Arrays, what: int, s: int, turn: int) -> float:
     """1 if the coming turn is closed; the part of a period until that changes."""
     if what == 0:
-        return 1.0 if is_closed(seasons, s, turn + 1) else 0.0
+        return 1.0 if is_season_closed(seasons, s, turn + 1) else 0.0
     period, within = seasons.period_steps[s], turn % seasons.period_steps[s]
     open_steps = period - seasons.closed_steps[s]
     return ((open_steps if within < open_steps else period) - within) / period

@@ -5,10 +5,11 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from cprl.institutions.arrays import STATE, Ints, Numbers
+from cprl.institutions.arrays import STATE
 from cprl.institutions.base import Amount, Institution, check_agent_indices, with_ballots
 from cprl.institutions.ledger import Ledger
 from cprl.values import Natural, Positive, Share, Where
+from cprl.values.arrays import Float64, Int32
 
 Redistribution = Literal["equal", "none"]
 Brackets = Annotated[
@@ -94,18 +95,18 @@ class Levies(Institution):
 class Arrays(NamedTuple):
     """All taxes and levies of a game, one per index of axis T; levies are two taxes."""
 
-    from_: Annotated[Numbers, "T brackets"]
-    """Where each bracket begins; infinite for those that a tax lacks."""
-    rate: Annotated[Numbers, "T brackets"]
-    ballot: Annotated[Ints, "T"]
+    from_: Annotated[Float64, "T bounds"]
+    """Where each bracket begins, and then where the last one ends; infinite for those that a tax lacks."""
+    rate: Annotated[Float64, "T brackets"]
+    ballot: Annotated[Int32, "T"]
     """The ballot that decides the rate; -1 for none."""
-    steps: Annotated[Ints, "T"]
+    steps: Annotated[Int32, "T"]
     """Turns per period."""
-    group: Annotated[Ints, "T N"]
+    group: Annotated[Int32, "T N"]
     """The group within which it is paid out; -1 where it is lost."""
-    income: Annotated[Numbers, "B T N", STATE]
+    income: Annotated[Float64, "B T N", STATE]
     """Apples harvested in the current period."""
-    owed: Annotated[Numbers, "B N"]
+    owed: Annotated[Float64, "B N"]
     """The tax that each agent owes."""
 
 
@@ -118,7 +119,7 @@ def parameters(game: Any) -> dict[str, Any]:
         rows.append((-1, 1, levies.group_of, ((0.0, levies.local_rate),)))
         rows.append((-1, 1, (0,) * game.agents, ((0.0, levies.joint_rate),)))
     most = max((len(brackets) for *_, brackets in rows), default=1)
-    from_, rate = np.full((len(rows), most), np.inf), np.zeros((len(rows), most))
+    from_, rate = np.full((len(rows), most + 1), np.inf), np.zeros((len(rows), most))
     for tax_number, (*_, brackets) in enumerate(rows):
         from_[tax_number, : len(brackets)], rate[tax_number, : len(brackets)] = np.transpose(brackets)
     ballots, steps, groups, _ = zip(*rows, strict=True) if rows else ((), (), (), ())
@@ -126,19 +127,21 @@ def parameters(game: Any) -> dict[str, Any]:
     return {"from_": from_, "rate": rate, "ballot": ballots, "steps": steps, "group": group_of}
 
 
-def begin(taxes: Arrays, ledger: Ledger) -> None:
+def forget_income(taxes: Arrays) -> None:
+    """Forget the harvests of the last episode."""
     for tax in range(taxes.income.shape[0]):
         for i in range(taxes.income.shape[1]):
             taxes.income[tax, i] = 0.0
 
 
-def note_bite(taxes: Arrays, ledger: Ledger, i: int, cell: int, site: int, turn: int) -> None:
+def note_income(taxes: Arrays, i: int) -> None:
+    """Note a harvest of agent i."""
     for tax in range(taxes.steps.shape[0]):
         taxes.income[tax, i] += 1.0
 
 
-def settle(taxes: Arrays, ledger: Ledger, turn: int, is_over: bool) -> None:
-    """Collects and pays out the taxes whose period ends with this turn, or with the episode."""
+def collect_taxes(taxes: Arrays, ledger: Ledger, turn: int, is_over: bool) -> None:
+    """Collect and pay out the taxes whose period ends with this turn, or with the episode."""
     agents = ledger.fines.shape[0]
     for tax in range(taxes.steps.shape[0]):
         if (is_over or turn % taxes.steps[tax] == 0) and has_income(taxes, tax):
@@ -152,7 +155,7 @@ def settle(taxes: Arrays, ledger: Ledger, turn: int, is_over: bool) -> None:
 
 
 def has_income(taxes: Arrays, tax: int) -> bool:
-    """Whether any agent harvested in the period of a tax."""
+    """Return whether any agent harvested in the period of a tax."""
     for i in range(taxes.income.shape[1]):
         if taxes.income[tax, i] > 0:
             return True
@@ -160,22 +163,20 @@ def has_income(taxes: Arrays, tax: int) -> bool:
 
 
 def tax_of(taxes: Arrays, ledger: Ledger, tax: int, i: int) -> float:
-    """The apples that agent i owes on its harvest of the period."""
+    """Return the apples that agent i owes on its harvest of the period."""
     income, owed = taxes.income[tax, i], 0.0
     if taxes.ballot[tax] >= 0:
         return ledger.in_force[taxes.ballot[tax]] * income
     for bracket in range(taxes.rate.shape[1]):
         from_ = taxes.from_[tax, bracket]
         if income > from_:
-            upper = income
-            if bracket + 1 < taxes.from_.shape[1]:
-                upper = min(income, taxes.from_[tax, bracket + 1])
+            upper = min(income, taxes.from_[tax, bracket + 1])
             owed += taxes.rate[tax, bracket] * (upper - from_)
     return owed
 
 
 def pay_out(taxes: Arrays, ledger: Ledger, tax: int, i: int) -> None:
-    """Gives agent i its equal part of what its group owed."""
+    """Give agent i its equal part of what its group owed."""
     pool, members = 0.0, 0
     for j in range(ledger.fines.shape[0]):
         if taxes.group[tax, j] == taxes.group[tax, i]:

@@ -5,12 +5,12 @@ from typing import Annotated, Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
-from cprl.institutions.arrays import Bools, Ints, Longs, Numbers
 from cprl.institutions.base import MOST_APPLES, Amount, Ballot, Institution, threshold
 from cprl.institutions.ledger import Ledger
 from cprl.institutions.quotas import Quota
 from cprl.institutions.taxes import Tax
 from cprl.values import Positive, Share, Where
+from cprl.values.arrays import Bool, Float64, Int32, Int64
 
 MOST_DECISIONS: Final = 2**20
 """The largest number of options that an agent chooses from."""
@@ -75,13 +75,13 @@ class Vote(Institution):
 class Arrays(NamedTuple):
     """All ballots of a game, one per index of axis V."""
 
-    options: Annotated[Ints, "V"]
+    options: Annotated[Int32, "V"]
     """The number of choices."""
-    choices: Annotated[Numbers, "V choices"]
-    is_election: Annotated[Bools, "V"]
-    episodes: Annotated[Ints, "V"]
+    choices: Annotated[Float64, "V choices"]
+    is_election: Annotated[Bool, "V"]
+    episodes: Annotated[Int32, "V"]
     """Held in every such number of episodes."""
-    override: Annotated[Longs, "V"]
+    override: Annotated[Int64, "V"]
     """Overridden if a uniform 32-bit word is below this threshold."""
 
 
@@ -100,27 +100,27 @@ def parameters(game: Any) -> dict[str, Any]:
 
 
 def is_due(ballots: Arrays, ballot: int, episode: int) -> bool:
-    """Whether a ballot is held in an episode, counted from 0."""
+    """Return whether a ballot is held in an episode, counted from 0."""
     return episode % ballots.episodes[ballot] == 0
 
 
 def choice_of(ballots: Arrays, ballot: int, decision: int) -> int:
-    """The choice that a decision makes on a ballot; see `cprl.Game.ballots`."""
+    """Return the choice that a decision makes on a ballot; see `cprl.Game.ballots`."""
     for before in range(ballot):
         decision //= ballots.options[before]
     return decision % ballots.options[ballot]
 
 
-def votes_for(ballots: Arrays, ballot: int, decisions: Longs, choice: int) -> int:
-    """The number of agents whose decision makes this choice; `decisions`: int64 [N]."""
+def votes_for(ballots: Arrays, ballot: int, decisions: Int64, choice: int) -> int:
+    """Return the number of agents whose decision makes this choice; `decisions`: int64 [N]."""
     votes = 0
     for i in range(decisions.shape[0]):
         votes += choice_of(ballots, ballot, decisions[i]) == choice
     return votes
 
 
-def median_choice(ballots: Arrays, ballot: int, decisions: Longs) -> int:
-    """The median of the N choices, of two middle ones the lower."""
+def median_choice(ballots: Arrays, ballot: int, decisions: Int64) -> int:
+    """Return the median of the N choices, of two middle ones the lower."""
     votes, choice = votes_for(ballots, ballot, decisions, 0), 0
     while 2 * votes < decisions.shape[0]:
         choice += 1
@@ -128,8 +128,8 @@ def median_choice(ballots: Arrays, ballot: int, decisions: Longs) -> int:
     return choice
 
 
-def elected_choice(ballots: Arrays, ballot: int, decisions: Longs, word: np.uint64) -> int:
-    """The choice with most votes; a uniform 32-bit word decides among those with equally many."""
+def elected_choice(ballots: Arrays, ballot: int, decisions: Int64, word: np.uint64) -> int:
+    """Return the choice with most votes; a uniform 32-bit word decides among those with equally many."""
     most, tied = 0, 0
     for choice in range(ballots.options[ballot]):
         votes = votes_for(ballots, ballot, decisions, choice)
@@ -150,10 +150,10 @@ def hold_ballot(
     ballots: Arrays,
     ledger: Ledger,
     ballot: int,
-    decisions: Longs,
+    decisions: Int64,
     words: tuple[np.uint64, np.uint64, np.uint64, np.uint64],
 ) -> None:
-    """Puts the result of a ballot in force: what agents decided, or what the authority from outside draws."""
+    """Put the result of a ballot in force: what agents decided, or what the authority from outside draws."""
     if np.int64(words[0]) < ballots.override[ballot]:
         choice = np.int64(words[1] % np.uint64(ballots.options[ballot]))
     elif ballots.is_election[ballot]:
@@ -163,6 +163,6 @@ def hold_ballot(
     ledger.in_force[ballot] = ballots.choices[ballot, choice]
 
 
-def shown(ballots: Arrays, ledger: Ledger, what: int, ballot: int, i: int, turn: int) -> float:
-    """The value in force, relative to the highest choice."""
+def show_in_force(ballots: Arrays, ledger: Ledger, ballot: int) -> float:
+    """Return the value in force, relative to the highest choice."""
     return ledger.in_force[ballot] / ballots.choices[ballot, ballots.options[ballot] - 1]

@@ -14,7 +14,6 @@ from cprl.commons.spaces import Spaces
 from cprl.keys import Turn
 from cprl.objectives.preferences import Preference, WantedRewards, check_preference
 from cprl.policies.rng import lane_names, lane_seeds
-from cprl.system.memory import check_memory
 from cprl.values import Natural, Range, Value
 
 StartFrom: TypeAlias = Mapping[str, Mapping[str, Tensor]]
@@ -59,8 +58,6 @@ class LearningAgents(Value, stored=False):
             raise ValueError(
                 f"agents is {agents}; allowed: one or more of the agents 0 to {everyone - 1}, each once"
             )
-        least_bytes = 4096 * len(agents) * self.replicas  # of names, seeds and generators
-        check_memory(f"{self.replicas} replicas of {len(agents)} agents", least_bytes, "fewer replicas")
 
     @property
     def names(self) -> list[str]:

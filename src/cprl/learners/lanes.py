@@ -19,10 +19,8 @@ from cprl.learners.transitions import LaneTurn, by_lane, joint_actions, lane_tur
 from cprl.learners.trial import TRIAL_LANES, fitting_engine
 from cprl.networks.agent import acting_part
 from cprl.networks.recurrent import state_cells_of
-from cprl.networks.specification import refuse_unseen
 from cprl.policies.lanes import LaneActor
 from cprl.policies.rng import EVALUATION, seed_of
-from cprl.system.memory import check_memory
 
 MakeTeam = Callable[[Sequence[nn.Module]], nn.Module]
 """Makes the networks of a team from those of its members: `AgentNetworks`, a `cprl.networks.team.Team` first.
@@ -32,8 +30,6 @@ STATE_BEFORE, STATE = keys.RECURRENT_STATE_BEFORE[-1], keys.RECURRENT_STATE[-1]
 """Entries of the states of recurrent networks in a turn."""
 _SHARED: Final = 1
 """The last number of the seed of the parts that a team adds to its members' networks."""
-_COPIES: Final = 6
-"""Of a lane's weights while it trains: as made, stacked, target, gradient and two of the optimiser."""
 
 
 class Acts(Protocol):
@@ -77,7 +73,6 @@ class Lanes:
     """
 
     def __init__(self, who: LearningAgents, method: Method) -> None:
-        refuse_unseen(who.spaces)
         self.who, self.method = who, method
         self.spaces, self.agents, self.replicas = who.spaces, who.agents, who.replicas
         self.worlds = who.worlds
@@ -178,7 +173,6 @@ class Lanes:
         make_network = self.method.make_network
         first, *others = self.who.seeds(purpose)[:: self._sharing]
         networks = [init_network(make_network, first)]
-        _check_networks(networks[0], 1 + len(others), self.who.device)
         self.state_cells = state_cells_of(acting_part(networks[0]))
         networks += [init_network(make_network, seed) for seed in others]
         starts = [self.who.start_from.get(name, {}) for name in self.who.names]
@@ -322,17 +316,6 @@ class LaneLearner(Learner):
 def _equal(weights: Mapping[str, Tensor], others: Mapping[str, Tensor]) -> bool:
     return weights.keys() == others.keys() and all(
         torch.equal(value, others[name]) for name, value in weights.items()
-    )
-
-
-def _check_networks(network: nn.Module, lanes: int, device: str | torch.device) -> None:
-    """Raises a TooLargeError if a device has too little memory to train a network like this for each lane."""
-    size = sum(value.numel() * value.element_size() for value in network.parameters())
-    check_memory(
-        f"the networks of {lanes} learners, {size / 2**20:,.1f} MiB each, with targets and optimisers",
-        lanes * size * _COPIES,
-        "smaller networks or fewer replicas",
-        device=device,
     )
 
 

@@ -158,9 +158,8 @@ class TorchRLReplayLearner(ReplayLearner):
         # as they fill, so a machine with too little memory would fail hours later.
         check_memory(
             f"the replay buffers of {len(lanes)} agents x {settings.buffer_size:,} transitions",
-            2 * form.stored_bytes(len(lanes), settings.buffer_size)
-            + form.sampled_bytes(len(lanes), settings.batch_size),
-            'a smaller buffer_size or batch_size, fewer replicas, or engine="compiled", which needs half',
+            2 * form.stored_bytes(len(lanes), settings.buffer_size),
+            'a smaller buffer_size, fewer replicas, or engine="compiled", which needs half',
             device=lanes.who.device,
         )
         return StockBuffers(

@@ -73,11 +73,6 @@ class TransitionForm:
         beside = 8 * prod(self.action_shape) + 4 * prod(self.reward_shape) + 8 + 1 + 1
         return columns * (_rows(turns) * row + turns * beside)
 
-    def sampled_bytes(self, lanes: int, batch_size: int) -> int:
-        """Of the observations of a sample, as stored and as numbers of networks."""
-        observation = prod(self.observation_shape) * (self.dtype.itemsize + 4)
-        return lanes * batch_size * self.sequence_steps * 2 * observation
-
 
 def gather(
     fields: Fields,
@@ -246,8 +241,8 @@ class Ring:
         what = f"{lanes} learners x {turns * self.worlds:,} transitions"
         check_memory(
             f"the replay buffers of {what}",
-            needed + form.sampled_bytes(lanes, batch_size),
-            "a smaller buffer_size or batch_size, or fewer replicas",
+            needed,
+            "a smaller buffer_size or fewer replicas",
             device=self.device,
         )
         if needed >= 2**20:

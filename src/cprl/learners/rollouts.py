@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
-from math import prod
 from typing import Any, Final
 
 import torch
@@ -23,7 +22,6 @@ from cprl.networks.agent import AgentNetworks, parts_of
 from cprl.networks.recurrent import state_shape_of
 from cprl.policies.rng import EXPLORATION, SAMPLING, WEIGHTS, LaneRng
 from cprl.system.compiling import Compiled
-from cprl.system.memory import check_memory
 
 ACTOR, CRITIC = range(2)
 """Positions of the actor and the critic among an agent's networks."""
@@ -353,12 +351,6 @@ class Rollout:
     def __init__(self, lanes: Lanes, steps: int, rollouts: int | None = None) -> None:
         form, device, self._lanes = lanes.form(), lanes.who.device, lanes
         axes = (*(() if rollouts is None else (rollouts,)), len(lanes), lanes.worlds, steps)
-        check_memory(
-            f"the rollouts of {len(lanes)} learners x {prod(axes) // len(lanes):,} steps",
-            prod(axes) * (2 * prod(form.observation_shape) * (form.dtype.itemsize + 4) + 64),
-            "fewer rollout_steps or fewer replicas",
-            device=device,
-        )
         forms: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
             "observation": (form.observation_shape, form.dtype),
             "action": (form.action_shape, torch.int64),

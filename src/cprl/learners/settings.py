@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from typing import Annotated, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cprl.networks.mlp import Layers
 from cprl.values import MOST_INT64, Custom, Natural, Positive, Range, Share, Steps, Value
+from cprl.values.arrays import Float64, Int64
 
 Optimizer = Literal["adam", "adamw", "rmsprop", "keras_rmsprop", "sgd"]
 """Optimisers of `torch.optim` with torch's defaults; "keras_rmsprop" is `torch.optim.RMSprop` with the decay
@@ -206,7 +206,7 @@ class TabularSettings(Exploring):
     """The largest number of states in an agent's table; one more raises a MemoryError. A state takes the
     bytes of its observation, 16 per action and about 150 more."""
 
-    def rates(self, visits: NDArray[np.int64]) -> NDArray[np.float64]:
+    def rates(self, visits: Int64) -> Float64:
         """alpha of values with these numbers of visits, the current one included."""
         if self.learning_rate == "1/visits":
             return 1.0 / visits.astype(np.float64) ** self.visits_power

@@ -28,7 +28,7 @@ from cprl.learners.base import Learner, LearningAgents
 from cprl.learners.settings import TabularSettings
 from cprl.learners.transitions import by_lane, lane_turn
 from cprl.policies.rng import EVALUATION, EXPLORATION
-from cprl.policies.tabular import NEVER_MET, QTables, TableNetwork, TabularActor, observed_entries, states_of
+from cprl.policies.tabular import NEVER_MET, QTables, TableNetwork, TabularActor, states_of
 
 
 class TabularLearner(Learner):
@@ -52,7 +52,6 @@ class TabularLearner(Learner):
                 self.tables.add_lane(lane, start["states"].numpy(), start["values"].numpy())
         self.actor = self._actor(EXPLORATION, worlds=self.worlds)
         self.actor.epsilon = settings.epsilon(0)
-        self._observed = observed_entries(who.spaces)
         columns = torch.arange(self.lanes * self.worlds)
         self._columns = by_lane(columns, replicas=self.replicas, worlds=self.worlds).T.numpy()
         """Where the lanes stand in a turn, of one world after the other, int64 [W, L]."""
@@ -82,10 +81,10 @@ class TabularLearner(Learner):
         if isinstance(whole.next_world[keys.DONE], Tensor):  # on a GPU; tables are on the CPU
             whole = Turn.of(whole.batch.cpu())
         turn = lane_turn(self.agents, whole, self._wanted(whole))
-        seen = states_of(whole.batch[keys.AGENTS], self._observed, self.agents)
+        seen = states_of(whole.batch[keys.OBSERVATION], self.agents)
         rows = self.tables.find_or_add(seen, self._lane_of)
         on = np.flatnonzero(~turn.terminated)
-        next_seen = states_of(whole.batch["next", keys.AGENTS], self._observed, self.agents)
+        next_seen = states_of(whole.batch["next", *keys.OBSERVATION], self.agents)
         next_rows = np.full(len(rows), NEVER_MET, np.int64)
         next_states, lanes = [next_seen[column] for column in on], [self._lane_of[column] for column in on]
         next_rows[on] = self.tables.find_or_add(next_states, lanes)
@@ -118,8 +117,8 @@ class TabularLearner(Learner):
 
     def values(self, batch: TensorDictBase | Turn) -> Tensor:
         """The highest action value of each agent at the end of a turn, [B, S]."""
-        after = Turn.of(batch).batch["next", keys.AGENTS]
-        rows = self.tables.find(states_of(after, self._observed, self.agents), self._lane_of)
+        after = Turn.of(batch).batch["next", *keys.OBSERVATION]
+        rows = self.tables.find(states_of(after, self.agents), self._lane_of)
         return torch.from_numpy(self.tables.values[rows].max(1)).view(-1, len(self.agents))
 
     def networks(self) -> dict[str, nn.Module]:
@@ -137,12 +136,11 @@ class TabularLearner(Learner):
         return states
 
     def state_dict(self) -> dict[str, Any]:
-        """The full state of all lanes, of which "networks" repeats "tables" as `cprl.load` reads them; it is
-        empty where there is no such form, see `Tabular.make_network`."""
+        """The full state of all lanes, of which "networks" repeats "tables" as `cprl.load` reads them."""
         turns = [{name: torch.from_numpy(array) for name, array in turn.items()} for turn in self._turns]
         return {
             "tables": self.tables.state_dict(),
-            "networks": self._network_states() if self._observed == ("observation",) else {},
+            "networks": self._network_states(),
             "exploration": self.actor.rng.state_dict(),
             "steps": self.steps,
             "turns": turns,
@@ -161,12 +159,5 @@ class TabularLearner(Learner):
 
 
 def table_network(spaces: Spaces) -> TableNetwork:
-    names = observed_entries(spaces)
-    if names != ("observation",):
-        planes = ", ".join(f'{name}="planes"' for name in names[1:])
-        raise ValueError(
-            f"agents of this game observe {', '.join(names)}; allowed for agents of a population: "
-            f"observation alone, of which Observation({planes}) makes them a part; a TabularLearner that is "
-            "passed to train reads them as they are"
-        )
+    """Return the network that holds an agent's table, still empty."""
     return TableNetwork(spaces.observation_shape, spaces.actions, observation_dtype=spaces.observation_dtype)

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 
 from cprl import keys
 from cprl.commons.game import Game
-from cprl.commons.yields import sustainable_yield
+from cprl.commons.yields import unproven
 from cprl.envs.unwrap import agent_count, commons_of
 from cprl.institutions import COUNTS, Institution
 from cprl.keys import Turn
@@ -36,6 +36,7 @@ from cprl.measuring.registry import (
     reported_in,
 )
 from cprl.values import Custom, Positive, checked, words_of_metric
+from cprl.values.arrays import Float64, Int64
 
 Array = NDArray[Any]
 Turns = dict[str, Array]
@@ -58,45 +59,45 @@ class Episode:
     terminated: bool
     """True if the game itself ended, e.g. no apple was left and none could grow; else the episode was
     truncated at its time limit."""
-    return_: NDArray[np.float64]
+    return_: Float64
     """[N], the undiscounted sum of rewards of each agent."""
     metrics: Mapping[str, float]
     """By the names of `cprl.measuring.registry.METRICS`, then what was decided, as "institutions/in_force_0",
     and those of the user's own; NaN where undefined. Metrics that need entries that the game does not report
     are missing."""
-    harvest: NDArray[np.float64] | None = None
+    harvest: Float64 | None = None
     """[N], apples harvested. This field and all below are None if the game does not report the entries that
     they need, see `cprl.measuring.registry.NEEDS`."""
-    in_play_steps: NDArray[np.int64] | None = None
+    in_play_steps: Int64 | None = None
     """[N], steps in which the agent was in play."""
-    shots: NDArray[np.int64] | None = None
+    shots: Int64 | None = None
     """[N], beams fired."""
-    hits: NDArray[np.int64] | None = None
+    hits: Int64 | None = None
     """[N], the number of agents hit by each agent's beams, summed over steps."""
-    tagged: NDArray[np.int64] | None = None
+    tagged: Int64 | None = None
     """[N], how often each agent was tagged out; by two agents in one step counts once."""
-    tagged_by: NDArray[np.int64] | None = None
+    tagged_by: Int64 | None = None
     """[N, N], how often the agent of the row was tagged by the agent of the column."""
-    wanted_return: NDArray[np.float64] | None = None
+    wanted_return: Float64 | None = None
     """[N], the sum of the rewards that each agent wanted in a training, see `cprl.objectives.preferences`;
     NaN for agents that do not learn. None outside of a training."""
     stock_left: int | None = None
     """Apples on the board at the end."""
     depletion_step: int | None = None
     """The first step that left no apple on the board, or -1."""
-    fines: NDArray[np.float64] | None = None
+    fines: Float64 | None = None
     """[N], what institutions took from each agent, taxes included, in units of reward. This field and all
     below are of games that report what institutions do."""
-    transfers: NDArray[np.float64] | None = None
+    transfers: Float64 | None = None
     """[N], what institutions gave each agent."""
-    violations: NDArray[np.int64] | None = None
+    violations: Int64 | None = None
     """[N], steps in which the agent broke a rule of an institution."""
-    counts: Mapping[str, NDArray[np.int64]] | None = None
+    counts: Mapping[str, Int64] | None = None
     """[N] by name, what the game's institutions counted, see `cprl.measuring.registry.counts_for`."""
-    decision: NDArray[np.int64] | None = None
+    decision: Int64 | None = None
     """[N], what each agent had decided, see `cprl.Game.ballots`; None in games that ask
     nothing."""
-    in_force: NDArray[np.float64] | None = None
+    in_force: Float64 | None = None
     """[V], what was decided for this episode: tax rates, quotas, the agent elected."""
 
     def __post_init__(self) -> None:
@@ -285,7 +286,7 @@ class EpisodeTracker:
         ]
 
     @property
-    def returns(self) -> NDArray[np.float64]:
+    def returns(self) -> Float64:
         """A copy of the returns so far of the running episodes, [B, N]; zeros before the first turn."""
         returns = self._running.get("return")
         return np.zeros((self.worlds, self.agents)) if returns is None else returns.copy()
@@ -468,9 +469,12 @@ def tracker_of(env: EnvBase, metrics: Sequence[Custom] = ()) -> EpisodeTracker:
 
 
 def yield_of_game(game: Game) -> dict[str, float]:
-    """Return the sustainable yield of a game, in apples a turn, and its first stock."""
+    """Return the sustainable yield of a game, in apples a turn, and its first stock; nothing where no yield
+    is proven."""
+    if unproven(game.rules):
+        return {}
     return {
-        "sustainable_yield": sustainable_yield(game.map, game.rules),
+        "sustainable_yield": game.sustainable_yield,
         "first_stock": float(game.tables.first_stock),
     }
 

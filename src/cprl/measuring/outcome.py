@@ -20,7 +20,8 @@ import pyarrow.compute as pc
 
 from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME
 from cprl.measuring.table import where, world_of
-from cprl.measuring.windows import LAST_EPISODES, Values, mean_of_worlds, rounds_of
+from cprl.measuring.windows import LAST_EPISODES, mean_of_worlds, rounds_of
+from cprl.values.arrays import Float64
 
 BEGINS: Final = "begins"
 RISING: Final = "rising"
@@ -309,7 +310,7 @@ def outcome_of(table: pa.Table, *, random: float) -> Outcome:
     worlds = [world_of(of_one) for of_one in replicas]
     lanes = len(np.unique(worlds[0]))
 
-    def means(number: str, episodes: int) -> list[Values]:
+    def means(number: str, episodes: int) -> list[Float64]:
         values = (of_one[number].to_numpy() for of_one in replicas)
         return [mean_of_worlds(*of_one, episodes) for of_one in zip(values, worlds, strict=True)]
 

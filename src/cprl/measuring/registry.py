@@ -24,7 +24,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import keys
-from cprl.commons.colours import APPLE, BLUE, GREEN, GREY, ORANGE, PALETTE, PURPLE, VERMILION, Colour
+from cprl.commons.cells import APPLE, Colour
 from cprl.institutions import COUNTS, Institution, Levies, ledger
 from cprl.measuring.social import (
     Groups,
@@ -35,7 +35,9 @@ from cprl.measuring.social import (
     mean_of_defined,
     share_of,
 )
+from cprl.pictures.colours import BLUE, GREEN, GREY, ORANGE, PALETTE, PURPLE, VERMILION
 from cprl.values import OWN_METRICS
+from cprl.values.arrays import Float64
 
 Array = NDArray[Any]
 
@@ -450,7 +452,7 @@ SOCIAL: Final = tuple(name for name in METRICS if not METRICS[name].is_of_instit
 """Those that say something of every game, as far as it reports their entries."""
 
 
-def measured(totals: Mapping[str, Any], names: Iterable[str] = METRICS) -> dict[str, NDArray[np.float64]]:
+def measured(totals: Mapping[str, Any], names: Iterable[str] = METRICS) -> dict[str, Float64]:
     """Return the metrics all of whose totals and constants are given, by name, each float64 [...].
 
     Args:

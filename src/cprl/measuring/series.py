@@ -14,8 +14,8 @@ from torchrl.envs import EnvBase
 from cprl.envs.unwrap import agent_names
 from cprl.measuring.episodes import Episode
 from cprl.measuring.registry import INSTITUTIONS, OF_AGENTS
-from cprl.measuring.windows import Values
 from cprl.system.times import Speed
+from cprl.values.arrays import Float64
 
 OF_GROUP: Final = ("social/", INSTITUTIONS)
 """How the names of numbers begin that are of all agents together."""
@@ -126,7 +126,7 @@ class Series:
         self._waiting: dict[int, dict[int, list[dict[str, float]]]] = {}
         """By the number of W episodes, and by replica."""
 
-    def add(self, episode: Episode, numbers: Mapping[str, float]) -> dict[str, Values] | None:
+    def add(self, episode: Episode, numbers: Mapping[str, float]) -> dict[str, Float64] | None:
         """Add the numbers of an episode of a replica.
 
         Returns:
@@ -166,7 +166,7 @@ class Series:
         self._waiting = deepcopy(state["waiting"])
 
 
-def mean_of(values: Values) -> float:
+def mean_of(values: Float64) -> float:
     """Return the mean of the defined values; NaN if none is defined."""
     defined = values[~np.isnan(values)]
     return float(defined.mean()) if len(defined) else float("nan")

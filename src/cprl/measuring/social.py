@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-Values = NDArray[np.float64]
+from cprl.values.arrays import Float64
+
 Groups = Sequence[Sequence[int]]
 """The indices of the agents of each group of nested enterprises; each agent belongs to one group."""
 
@@ -23,13 +23,13 @@ _ROUNDING = 1e-6
 """The share of all an agent got and gave below which its income is 0: payments are float32."""
 
 
-def share_of(part: Any, whole: Any) -> Values:
+def share_of(part: Any, whole: Any) -> Float64:
     """Return part / whole, undefined where nothing is in the whole."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(np.greater(whole, 0), np.divide(part, whole), np.nan)
 
 
-def equality(incomes: Any) -> Values:
+def equality(incomes: Any) -> Float64:
     """Return 1 - Gini of the incomes of N agents, [..., N]: 1 - sum_ij |x_i - x_j| / (2 N sum_i x_i).
 
     It is from 1/N, where one agent has everything, to 1, where all have the same. It is undefined where
@@ -42,7 +42,7 @@ def equality(incomes: Any) -> Values:
     return np.where((incomes < 0).any(-1), np.nan, value)
 
 
-def incomes_of(harvest: Any, fines: Any, transfers: Any) -> Values:
+def incomes_of(harvest: Any, fines: Any, transfers: Any) -> Float64:
     """Return harvest - fines + transfers of each agent, float64 [..., N]; below 0 where fines exceed all
     else.
 
@@ -54,7 +54,7 @@ def incomes_of(harvest: Any, fines: Any, transfers: Any) -> Values:
     return np.where(is_rounding, 0.0, incomes)
 
 
-def equality_within(incomes: Any, groups: Groups) -> Values:
+def equality_within(incomes: Any, groups: Groups) -> Float64:
     """Return the mean `equality` within those of G groups where it is defined, [...].
 
     Principle 8 of Ostrom, "Governing the Commons" (1990): nested enterprises.
@@ -63,13 +63,13 @@ def equality_within(incomes: Any, groups: Groups) -> Values:
     return mean_of_defined(np.stack([equality(incomes[..., list(group)]) for group in groups], -1))
 
 
-def equality_between(incomes: Any, groups: Groups) -> Values:
+def equality_between(incomes: Any, groups: Groups) -> Float64:
     """Return the `equality` of the groups' mean incomes, each group counted once, [...]; principle 8."""
     incomes = np.asarray(incomes, np.float64)
     return equality(np.stack([incomes[..., list(group)].mean(-1) for group in groups], -1))
 
 
-def mean_of_defined(values: Values) -> Values:
+def mean_of_defined(values: Float64) -> Float64:
     """Return the mean over the last axis of the values that are defined; undefined where none is."""
     is_defined = ~np.isnan(values)
     return share_of(np.where(is_defined, values, 0.0).sum(-1), is_defined.sum(-1))

@@ -15,11 +15,11 @@ from typing import Any, Final, Self
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cprl.measuring.registry import METRICS, bounds
 from cprl.measuring.table import by_replica, clock_of, numbers_in
-from cprl.measuring.windows import Values
+from cprl.values.arrays import Bool, Float64
 
 CONFIDENCE: Final = 0.95
 
@@ -147,7 +147,7 @@ def difference(values: ArrayLike, reference: ArrayLike, *, paired: bool) -> Esti
     return estimate(first - second)
 
 
-def holm(p_values: ArrayLike) -> NDArray[np.bool_]:
+def holm(p_values: ArrayLike) -> Bool:
     """Return which of several differences are not 0, with a level of 5 % for a mistake in any of them.
 
     S. Holm, "A simple sequentially rejective multiple test procedure" (1979): the smallest of m p-values is
@@ -173,7 +173,7 @@ HOLM: Final = "* not 0 by Holm's method"
 """What a star after a difference means; "for ..." says which comparisons."""
 
 
-def curve_interval(curves: ArrayLike) -> tuple[Values, Values, Values]:
+def curve_interval(curves: ArrayLike) -> tuple[Float64, Float64, Float64]:
     """Return the mean of several curves and its 95 % interval by Student's t at each episode.
 
     Args:
@@ -196,7 +196,7 @@ def curve_interval(curves: ArrayLike) -> tuple[Values, Values, Values]:
     return middle, middle - reach, middle + reach
 
 
-def _estimate(value: float, *samples: Values) -> Estimate:
+def _estimate(value: float, *samples: Float64) -> Estimate:
     """Return a mean, or the difference of two, with its interval by t, of the degrees of freedom of Welch.
 
     `scipy.stats.ttest_1samp` and `ttest_ind` give the same, much slower, and warn of samples without spread.
@@ -217,7 +217,7 @@ def _estimate(value: float, *samples: Values) -> Estimate:
     return replace(one, low=value - reach, high=value + reach, p_value=p_value)
 
 
-def _sample(values: ArrayLike) -> Values:
+def _sample(values: ArrayLike) -> Float64:
     sample = np.asarray(values, np.float64)
     if sample.ndim != 1 or not len(sample) or not np.isfinite(sample).all():
         raise ValueError(f"values is {sample.tolist()}; allowed: [R], a finite number for each replica")

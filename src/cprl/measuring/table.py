@@ -17,7 +17,6 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
 from cprl.measuring.registry import (
     COLLECTIVE_RETURN,
@@ -30,8 +29,7 @@ from cprl.measuring.registry import (
     is_own,
     measured,
 )
-
-Numbers = NDArray[np.int64]
+from cprl.values.arrays import Int64
 
 ROLE: Final = "role"
 """The column that says what an agent is among others: `FOCAL`, `BACKGROUND`, or `BOTH` in self-play."""
@@ -223,7 +221,7 @@ def clock_of(table: pa.Table) -> float:
     return float(pc.max(steps).as_py()) if len(steps) else inf
 
 
-def world_of(table: pa.Table) -> Numbers:
+def world_of(table: pa.Table) -> Int64:
     """Return the world of each row; of a table that has none, the replica."""
     name = "world" if "world" in table.column_names else "replica"
     return np.asarray(table[name].to_numpy().astype(np.int64))

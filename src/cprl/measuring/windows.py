@@ -8,11 +8,9 @@ from typing import Final
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
-from cprl.measuring.table import Numbers, labels_of, world_of
-
-Values = NDArray[np.float64]
+from cprl.measuring.table import labels_of, world_of
+from cprl.values.arrays import Float64, Int64
 
 LAST_EPISODES: Final = 30
 """Those at the end of a training, unless somebody says how many."""
@@ -47,7 +45,7 @@ def rounds_of(number: int, worlds: int) -> int:
     return -(-number // worlds)
 
 
-def episodes_after(world: Numbers) -> Numbers:
+def episodes_after(world: Int64) -> Int64:
     """Return how many later episodes its world has, of each episode of a replica, [E] in order."""
     order = np.argsort(world, kind="stable")
     counts = np.unique(world, return_counts=True)[1]
@@ -56,7 +54,7 @@ def episodes_after(world: Numbers) -> Numbers:
     return after
 
 
-def mean_of_worlds(values: Values, worlds: Numbers, window: int) -> Values:
+def mean_of_worlds(values: Float64, worlds: Int64, window: int) -> Float64:
     """Return the mean of the last episodes at each episode of a replica, in which every world counts alike.
 
     Args:
@@ -81,7 +79,7 @@ def mean_of_worlds(values: Values, worlds: Numbers, window: int) -> Values:
     return np.asarray(means.mean(0))
 
 
-def running_mean(values: Values, window: int = SMOOTHED_EPISODES) -> Values:
+def running_mean(values: Float64, window: int = SMOOTHED_EPISODES) -> Float64:
     """Return means over `window` consecutive values, each at the position of the first,
     [..., len - window + 1].
 
@@ -92,17 +90,17 @@ def running_mean(values: Values, window: int = SMOOTHED_EPISODES) -> Values:
     sums = np.cumsum(_after_a_zero(np.where(is_defined, values, 0.0)), -1)
     counts = np.cumsum(_after_a_zero(is_defined.astype(np.float64)), -1)
     with np.errstate(invalid="ignore"):
-        means: Values = (sums[..., window:] - sums[..., :-window]) / (
+        means: Float64 = (sums[..., window:] - sums[..., :-window]) / (
             counts[..., window:] - counts[..., :-window]
         )
     return means
 
 
-def centres(values: Values, window: int) -> Values:
+def centres(values: Float64, window: int) -> Float64:
     """The episode at the centre of each running mean over `window` of these values, [..., E] to [...]."""
     window = min(window, values.shape[-1])
     return np.arange(values.shape[-1] - window + 1) + (window - 1) / 2
 
 
-def _after_a_zero(values: Values) -> Values:
+def _after_a_zero(values: Float64) -> Float64:
     return np.concatenate([np.zeros((*values.shape[:-1], 1)), values], -1)

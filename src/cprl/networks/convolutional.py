@@ -9,7 +9,7 @@ from typing import Annotated, Any, Unpack
 from torch import Tensor, nn
 
 from cprl.commons.spaces import Spaces
-from cprl.networks.mlp import MOST_CELLS, MOST_LAYERS, Layers, Options, check_size, glorot_uniform_, layers
+from cprl.networks.mlp import MOST_CELLS, MOST_LAYERS, Layers, Options, glorot_uniform_, layers
 from cprl.values import Value, Where
 
 Channels = Annotated[Layers, Where(bool, f"1 to {MOST_LAYERS} layers, each an integer in 1..{MOST_CELLS}")]
@@ -62,8 +62,7 @@ class ConvNetwork(nn.Module):
         self.highest, self.outputs, self.observation_dims = highest, outputs, len(observation_shape)
         *planes, rows, columns = observation_shape
         steps = list(pairwise((prod(planes), *form.channels)))
-        features, weights = form.channels[-1] * rows * columns, sum(a * b for a, b in steps)
-        check_size((features, *form.hidden_cells, outputs), more=form.kernel_cells**2 * weights)
+        features = form.channels[-1] * rows * columns
         self._window = prod(planes), rows, columns
         self.convolutions = nn.ModuleList(
             nn.Conv2d(before, after, form.kernel_cells, padding=form.kernel_cells // 2)

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from math import prod
 from typing import Annotated, Final, TypedDict, Unpack
 
@@ -10,7 +9,6 @@ from torch import Tensor, nn
 from torchrl import modules
 
 from cprl.commons.spaces import Spaces
-from cprl.system.memory import check_memory
 from cprl.values import Range, Value, Where
 
 MOST_LAYERS: Final = 64
@@ -26,13 +24,6 @@ Layers = Annotated[
     ),
 ]
 """Units of each hidden layer; none is a linear network."""
-
-
-def check_size(sizes: Sequence[int], more: int = 0) -> None:
-    """Raise a TooLargeError if there is too little memory for a network with layers of so many units, inputs
-    and outputs included, and `more` weights."""
-    weights = more + sum((before + 1) * after for before, after in pairwise(sizes))
-    check_memory(f"the {weights:,} weights of a network", 4 * weights, "smaller layers")
 
 
 class Options(TypedDict, total=False):
@@ -79,7 +70,6 @@ class MLPNetwork(nn.Module):
         glorot_uniform: bool = False,
     ) -> None:
         super().__init__()
-        check_size((prod(observation_shape), *hidden_cells, actions))
         self.highest, self.relu_on_outputs = highest, relu_on_outputs
         self.observation_dims, self.outputs = len(observation_shape), actions
         self.layers = layers(prod(observation_shape), actions, hidden_cells, relu_on_outputs=relu_on_outputs)

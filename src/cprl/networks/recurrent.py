@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from cprl.commons.spaces import Spaces
 from cprl.networks.convolutional import Conv
-from cprl.networks.mlp import MLP, Cells, Options, check_size
+from cprl.networks.mlp import MLP, Cells, Options
 from cprl.networks.stacked import lane_state, refuse_other_forms, stack_lanes
 from cprl.values import Value, Where
 
@@ -97,8 +97,6 @@ class RecurrentNetwork(nn.Module):
     def __init__(self, encoder: nn.Module, outputs: int, *, kind: Kind, recurrent_cells: int) -> None:
         super().__init__()
         of_encoder: Any = encoder
-        gates = 4 if kind == "LSTM" else 3
-        check_size((of_encoder.outputs, gates * recurrent_cells, outputs), more=gates * recurrent_cells**2)
         self.encoder, self.outputs = encoder, outputs
         self.observation_dims: int = of_encoder.observation_dims
         self.state_shape = (2 * recurrent_cells if kind == "LSTM" else recurrent_cells,)

@@ -34,7 +34,6 @@ def new_network(
         shape: the shape of its input if that is not one observation: (S, *observation_shape) for the central
             critic of S agents. A network of your own gets it as `spaces.observation_shape`.
     """
-    refuse_unseen(spaces)
     if not isinstance(network, Custom):
         return network.make(spaces, outputs, shape=shape, **options)
     for name, value in options.items():
@@ -48,17 +47,6 @@ def new_network(
         spaces = replace(spaces, observation_shape=tuple(shape))
         name += " of a critic, whose observation has the members first,"
     return _users_network(network, name, spaces, outputs)
-
-
-def refuse_unseen(spaces: Spaces) -> None:
-    """Raises a ValueError if agents observe entries other than "observation", which networks do not read."""
-    if spaces.vectors:
-        names = " and ".join(f'("agents", "{name}")' for name, _ in spaces.vectors)
-        planes = ", ".join(f'{name}="planes"' for name, _ in spaces.vectors)
-        raise ValueError(
-            f'agents observe {names}; allowed for networks: ("agents", "observation") alone, of which '
-            f"Observation({planes}) makes it a part; a TabularLearner reads the entry as it is"
-        )
 
 
 def _users_network(network: Custom, name: str, spaces: Spaces, outputs: int) -> nn.Module:

@@ -13,7 +13,6 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 from tensordict import TensorDictBase
@@ -24,10 +23,10 @@ from torchrl.envs import Transform
 
 from cprl import keys
 from cprl.values import Range, Share, Value, Where, checked
+from cprl.values.arrays import Float64
 
 Array = Any
 """A numpy array, or a tensor."""
-Doubles = NDArray[np.float64]
 Weight = Annotated[float, Range(0, 1e6)]
 Angle = Annotated[float, Where(lambda angle: -pi <= angle <= pi, "radians in -pi..pi, e.g. math.radians(45)")]
 
@@ -54,12 +53,12 @@ class InequityAversion(Value):
     beta: Weight
     smoothing: Share
 
-    def wanted(self, rewards: Doubles, smoothed: Doubles) -> Doubles:
+    def wanted(self, rewards: Float64, smoothed: Float64) -> Float64:
         """What agents want who get these rewards, [B, N], and have these smoothed ones."""
         # [B, one, other]: above 0 where one is behind
         difference = smoothed[:, None, :] - smoothed[:, :, None]
         behind, ahead = difference.clip(min=0).sum(-1), (-difference).clip(min=0).sum(-1)
-        loss: Doubles = (self.alpha * behind + self.beta * ahead) / (rewards.shape[1] - 1)
+        loss: Float64 = (self.alpha * behind + self.beta * ahead) / (rewards.shape[1] - 1)
         return rewards - loss
 
 
@@ -83,7 +82,7 @@ class SocialValueOrientation(Value):
     angle: Angle
     weight: Weight
 
-    def wanted(self, rewards: Doubles, _smoothed: Doubles) -> Doubles:
+    def wanted(self, rewards: Float64, _smoothed: Float64) -> Float64:
         of_others = _mean_of_others(rewards)
         plain = abs(np.arctan2(of_others, rewards) - self.angle)
         shorter = np.where(plain > pi, 2 * pi - plain, plain)
@@ -107,12 +106,12 @@ class Exchange(Value):
 
     share: Share
 
-    def wanted(self, rewards: Doubles, _smoothed: Doubles) -> Doubles:
+    def wanted(self, rewards: Float64, _smoothed: Float64) -> Float64:
         return (1 - self.share) * rewards + self.share * _mean_of_others(rewards)
 
 
-def _mean_of_others(rewards: Doubles) -> Doubles:
-    of_others: Doubles = (rewards.sum(-1)[:, None] - rewards) / (rewards.shape[1] - 1)
+def _mean_of_others(rewards: Float64) -> Float64:
+    of_others: Float64 = (rewards.sum(-1)[:, None] - rewards) / (rewards.shape[1] - 1)
     return of_others
 
 
@@ -156,7 +155,7 @@ class WantedRewards:
             preference: [agent for agent, other in enumerate(self._listed) if other == preference]
             for preference in kinds
         }
-        self._smoothed: dict[Preference, Doubles] = {}
+        self._smoothed: dict[Preference, Float64] = {}
         self._agents: int | None = None
         self.now: Array | None = None
         """[B, N], the wanted rewards of the latest turn; None before the first."""

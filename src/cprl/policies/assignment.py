@@ -31,7 +31,7 @@ class AgentPolicies(TensorDictModuleBase):
         decisions: what the agents decide, where a game asks them (`Game.decisions`); None in other games.
 
     Reads ("agents", "observation"), uint8 [B, N, C, X, Y], and the other entries of "agents" that an actor's
-    `in_keys` name, e.g. "stock_gauge"; writes ("agents", "action"), int64 [B, N].
+    `in_keys` name, e.g. "apple_ahead"; writes ("agents", "action"), int64 [B, N].
     Where actors are recurrent it also reads "recurrent_state" and writes it and "recurrent_state_before".
     With decisions it also reads "ballots_due", and writes ("agents", "decision"), int64 [B, N].
     """

@@ -11,16 +11,13 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl.commons.game import Game
 from cprl.policies.rng import EVALUATION, EXHIBITION, EXPLORATION, lane_names, lane_seeds
 from cprl.values import Positive, Range, Share, Value
-
-Longs = NDArray[np.int64]
-Doubles = NDArray[np.float64]
+from cprl.values.arrays import Bool, Float64, Int64
 
 UNTRIED = -np.inf
 """The value of a choice that an agent has never made."""
@@ -34,15 +31,15 @@ def ballot_sizes(game: Game) -> tuple[int, ...]:
     return tuple(len(ballot.choices) for ballot in game.ballots)
 
 
-def choices_of(decision: Longs, sizes: Sequence[int]) -> Longs:
+def choices_of(decision: Int64, sizes: Sequence[int]) -> Int64:
     """The choice on each ballot, int64 [..., V], that decisions, int64 [...], make."""
     return np.stack(np.unravel_index(decision, tuple(sizes), order="F"), -1)
 
 
-def decision_of(choices: Longs, sizes: Sequence[int]) -> Longs:
+def decision_of(choices: Int64, sizes: Sequence[int]) -> Int64:
     """The decisions, int64 [...], that make these choices, int64 [..., V]."""
     places = np.cumprod([1, *sizes[:-1]], dtype=np.int64)
-    decisions: Longs = (choices * places).sum(-1)
+    decisions: Int64 = (choices * places).sum(-1)
     return decisions
 
 
@@ -74,8 +71,8 @@ class Decider(nn.Module):
         seeds: Sequence[Sequence[int]],
         agents: int,
         worlds: int = 1,
-        values: Doubles | None = None,
-        epsilon: Doubles | None = None,
+        values: Float64 | None = None,
+        epsilon: Float64 | None = None,
         by_chance: Sequence[bool] | None = None,
     ) -> None:
         super().__init__()
@@ -105,7 +102,7 @@ class Decider(nn.Module):
         assert self._held is not None
         return self._held
 
-    def learn(self, replica: int, decision: Longs, returns: Doubles) -> None:
+    def learn(self, replica: int, decision: Int64, returns: Float64) -> None:
         """Learns from an episode of a replica that has ended.
 
         Args:
@@ -113,7 +110,7 @@ class Decider(nn.Module):
             returns: float64 [N], what each of them wants to be high.
         """
 
-    def _choose(self, due: NDArray[np.bool_]) -> None:
+    def _choose(self, due: Bool) -> None:
         """Chooses anew on the ballots that are due, bool [R x k, V]."""
         worlds = np.flatnonzero(due.any(1))
         replicas, numbers = worlds // self.worlds, self._numbers(worlds)
@@ -124,12 +121,12 @@ class Decider(nn.Module):
         new = np.where(numbers[..., 0] < chance[..., None], drawn, self.best()[replicas])
         self._choices[worlds] = np.where(due[worlds, None], new, self._choices[worlds])
 
-    def best(self) -> Longs:
+    def best(self) -> Int64:
         """The choice with the highest value on each ballot, int64 [R, N, V]."""
         of_ballots = np.split(self.values, np.cumsum(self.sizes)[:-1], axis=-1)
         return np.stack([values.argmax(-1) for values in of_ballots], -1)
 
-    def _numbers(self, worlds: Longs) -> Doubles:
+    def _numbers(self, worlds: Int64) -> Float64:
         """Two uniform numbers in 0..1 for each of these worlds, agent and ballot, [worlds, N, V, 2]."""
         numbers = np.empty((len(worlds), self.agents, len(self.sizes), 2))
         together = np.stack([worlds // self.worlds, self._decided[worlds]], 1)
@@ -221,7 +218,7 @@ class BanditDecider(Decider):
         """int64 [R], episodes learned from."""
         self._explore_as_due()
 
-    def learn(self, replica: int, decision: Longs, returns: Doubles) -> None:
+    def learn(self, replica: int, decision: Int64, returns: Float64) -> None:
         """Learns from an episode of a replica; a return that is not finite is left out."""
         firsts = np.cumsum([0, *self.sizes[:-1]])
         for agent, made in enumerate(choices_of(decision, self.sizes) + firsts):
@@ -312,7 +309,7 @@ def _seeds(seed: int, replicas: Sequence[int], agents: int, purpose: int) -> lis
 
 def _table(
     sizes: Sequence[int], stored: Mapping[int, Sequence[Tensor]], *, replicas: int, agents: int
-) -> Doubles:
+) -> Float64:
     """The values of all choices, float64 [R, N, C]."""
     values = np.full((replicas, agents, sum(sizes)), UNTRIED)
     for agent, of_replicas in stored.items():

@@ -7,8 +7,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cprl.system.memory import check_memory
-
 DRAWN_AHEAD: Final = 1024
 """Steps whose numbers are generated at once."""
 
@@ -50,11 +48,6 @@ class LaneRng:
 
     def __init__(self, seeds: Sequence[Sequence[int]], count: int, *, ahead: int = DRAWN_AHEAD) -> None:
         self.lanes, self.count, self._ahead = len(seeds), count, ahead
-        check_memory(
-            f"random numbers of {self.lanes:,} agents, {self.count:,} a step and {self._ahead} steps ahead,",
-            8 * 2 * self._ahead * self.lanes * self.count,
-            "smaller batches or rollouts, fewer evaluation episodes or fewer replicas",
-        )
         self._chance = [np.random.Generator(np.random.Philox(np.random.SeedSequence(seed))) for seed in seeds]
         self._numbers = torch.empty((0, self.lanes, count), dtype=torch.float64)
         self._used = 0

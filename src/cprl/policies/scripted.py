@@ -1,7 +1,7 @@
 """ScriptedActor: agents that follow a scripted policy and do not learn.
 
-They see what a learning agent sees: their observation window. Under `Rules.paint_over`, where an agent's own
-heading mark covers the cell ahead of it, they also see whether this cell holds an apple.
+They see what a learning agent sees: their observation window. Under `Quirks2019.paint_over`, where an agent's
+own heading mark covers the cell ahead of it, they also see whether this cell holds an apple.
 
 | policy | behaviour |
 |---|---|
@@ -24,21 +24,16 @@ heading mark covers the cell ahead of it, they also see whether this cell holds 
 - "greedy", "sustainable" and "pacifist" never fire. Without a beam, "territorial" equals "greedy", and
   "aggressive" follows other agents.
 - "aggressive" first turns towards an agent that is farther to its side than ahead of it.
-- With `Rules.self_paint_stays`, as in the study as run, an agent sees some other agents, even some out of
-  play, in its own colour: it treats every cell of that colour except its own as another agent.
+- With `Quirks2019.self_paint_stays`, as in the study as run, an agent sees some other agents, even some out
+  of play, in its own colour: it treats every cell of that colour except its own as another agent.
 
 The social outcomes of Perolat et al. (2017), `cprl.measuring.social`, distinguish all of them but "random":
 the harvest and how long it lasts ("greedy", "sustainable"), and peace ("territorial", "aggressive").
 """
 
-import hashlib
-from collections.abc import Callable, Sequence
-from functools import cache
-from pathlib import Path
-from types import FunctionType
+from collections.abc import Sequence
 from typing import Any, Final, Literal, get_args
 
-import numba
 import numpy as np
 import torch
 from tensordict import TensorDictBase
@@ -46,17 +41,17 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl import keys
-from cprl.commons import colours
-from cprl.commons.compiled import CPU_OPTIONS, compiled, kept_in, kept_on_disk
-from cprl.commons.decoding import UNSEEN, classes_seen
+from cprl.commons import cells
+from cprl.commons.compiled import compiled_for_cpu
 from cprl.commons.game import Game
 from cprl.commons.near import near_cells
+from cprl.commons.quirks import paints_over
 from cprl.commons.spaces import Spaces
-from cprl.commons.world import Bytes
+from cprl.pictures.decoding import UNSEEN, classes_seen
 from cprl.policies import scripted_rules
 from cprl.policies.lanes import ActorOfLanes, LaneActor
 from cprl.policies.scripted_rules import AGENT, APPLE, NUMBERS, OPEN, UNKNOWN, WALL, Frame, Scratch, Settings
-from cprl.system.process import cache_folder
+from cprl.values.arrays import UInt8
 
 ScriptedPolicy = Literal["random", "greedy", "sustainable", "territorial", "aggressive", "pacifist"]
 SCRIPTED_POLICIES: Final[tuple[ScriptedPolicy, ...]] = get_args(ScriptedPolicy)
@@ -104,7 +99,7 @@ class ScriptedActor(ActorOfLanes):
                 "no window shows what is under an agent"
             )
         self.policy, self.game, self.epsilon = policy, game, 0.0
-        if game.rules.paint_over:
+        if paints_over(game.rules.quirks):
             self.in_keys = ("observation", keys.APPLE_AHEAD[1])
         self._settings, self._role_of_class = _settings(game, spare), _roles()
         self._rim, self._frame = _frame(game)
@@ -119,11 +114,11 @@ class ScriptedActor(ActorOfLanes):
 
         Args:
             observation: uint8 [replicas x k, S, C, X, Y].
-            apple_ahead: `cprl.keys.APPLE_AHEAD`, bool [replicas x k, S, 1], under `Rules.paint_over`.
+            apple_ahead: `cprl.keys.APPLE_AHEAD`, bool [replicas x k, S, 1], under `Quirks2019.paint_over`.
         """
         explores = exploration_type() in (ExplorationType.RANDOM, None)
         chosen = np.empty(observation.shape[:2], np.int64)
-        _choose_all()(
+        compiled_for_cpu(scripted_rules.choose_all, inline=False)(
             SCRIPTED_POLICIES.index(self.policy),
             float(self.epsilon) if explores else 0.0,
             self._framed(observation, apple_ahead),
@@ -135,7 +130,7 @@ class ScriptedActor(ActorOfLanes):
         )
         return torch.from_numpy(chosen).to(observation.device)
 
-    def _framed(self, observation: Tensor, apple_ahead: Tensor | None) -> Bytes:
+    def _framed(self, observation: Tensor, apple_ahead: Tensor | None) -> UInt8:
         """The roles of the cells each agent sees, in a frame of wall: uint8 [replicas x k x S, cells]."""
         ahead = observation.numpy(force=True)[..., : self.game.rules.window_rows, :]
         seen, rim = classes_seen(self.game, ahead), self._rim
@@ -197,39 +192,21 @@ def _frame(game: Game) -> tuple[int, Frame]:
     rim = max(1, reach)
     stride = columns + 2 * rim
     near = [row * stride + col for row, col in near_cells(rules, rows=reach, cols=reach)]
-    cells = np.add.outer((np.arange(rows) + rim) * stride, np.arange(columns) + rim)
+    window = np.add.outer((np.arange(rows) + rim) * stride, np.arange(columns) + rim)
     return rim, Frame(
         stride=stride,
-        middle=int(cells[-1, columns // 2]),
-        cells=cells.reshape(-1).astype(np.int32),
+        middle=int(window[-1, columns // 2]),
+        cells=window.reshape(-1).astype(np.int32),
         neighbours=np.array([-stride, -1, 1, stride], np.int32),
         near=np.array(near, np.int32),
     )
 
 
-def _roles() -> Bytes:
+def _roles() -> UInt8:
     """The role of each class of cell, uint8 [256]."""
     roles = np.full(256, AGENT, np.uint8)
-    open_ground = (colours.GROUND, colours.MARK, colours.BEAM)
-    roles[[*open_ground, colours.WATER, colours.WASTE, colours.CLEANING]] = OPEN
-    roles[colours.APPLE], roles[colours.WALL] = APPLE, WALL
-    roles[[colours.HIDDEN, UNSEEN]] = UNKNOWN
+    open_ground = (cells.GROUND, cells.MARK, cells.BEAM)
+    roles[[*open_ground, cells.WATER, cells.WASTE, cells.CLEANING]] = OPEN
+    roles[cells.APPLE], roles[cells.WALL] = APPLE, WALL
+    roles[UNSEEN] = UNKNOWN
     return roles
-
-
-@cache
-def _choose_all() -> Callable[..., None]:
-    """`scripted_rules.choose_all`, compiled, and cached on disk under a hash of the source of its module."""
-    text = Path(scripted_rules.__file__).read_bytes()
-    name = f"choose_all_{hashlib.sha256(text).hexdigest()[:16]}"
-
-    def jit(function: FunctionType) -> Any:
-        options = dict(CPU_OPTIONS)
-        if function.__name__ != "choose_all":
-            options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-            return numba.njit(**options)(function)
-        function.__name__ = function.__qualname__ = name
-        return kept_on_disk(function, **options)
-
-    with kept_in(cache_folder() / "scripted"):
-        return compiled([scripted_rules.choose_all], jit)["choose_all"]

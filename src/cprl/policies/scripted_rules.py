@@ -7,12 +7,11 @@ sees, their distance in steps, and the first step; then what it does. `cprl.poli
 plain functions.
 """
 
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cprl.commons.world import Actions, Bools, Bytes, Ints
+from cprl.values.arrays import Bool, Float64, Int32, Int64, UInt8
 
 OPEN, APPLE, AGENT, UNKNOWN, WALL = range(5)
 """The roles of cells; paths can reach those up to AGENT. The agent's own cell is OPEN."""
@@ -25,30 +24,30 @@ class Frame(NamedTuple):
     """The number of cells per row, frame included."""
     middle: int
     """The index of the agent's cell."""
-    cells: Ints
+    cells: Int32
     """int32 [X * Y], the indices of the window's cells in reading order."""
-    neighbours: Ints
+    neighbours: Int32
     """int32 [4], the offsets to the cell ahead, on the left, on the right and behind."""
-    near: Ints
+    near: Int32
     """int32 [n], the offsets to all cells that count as near; the frame is wide enough for them."""
 
 
 class Scratch(NamedTuple):
     """Working memory, [cells] each: one entry for each cell of a framed window."""
 
-    blocked: Bools
+    blocked: Bool
     """bool, the cells that no path passes through."""
-    targets: Bools
+    targets: Bool
     """bool, the cells to walk to."""
-    steps: Ints
+    steps: Int32
     """int32, the distance of each cell from the agent in steps; -1 if it cannot be reached."""
-    others_steps: Ints
+    others_steps: Int32
     """int32, the distance of each cell from the nearest other agent, likewise."""
-    queue: Ints
+    queue: Int32
     """int32, the cells that the search has reached, in the order of their distance."""
 
 
-def spread(roles: Bytes, frame: Frame, blocked: Bools, steps: Ints, queue: Ints, known: int) -> None:
+def spread(roles: UInt8, frame: Frame, blocked: Bool, steps: Int32, queue: Int32, known: int) -> None:
     """Breadth-first search from the first `known` cells of the queue; fills in `steps`.
 
     `steps` is 0 at these cells and -1 elsewhere. The search reaches blocked cells but does not pass them.
@@ -67,7 +66,7 @@ def spread(roles: Bytes, frame: Frame, blocked: Bools, steps: Ints, queue: Ints,
                 known += 1
 
 
-def count_own_steps(roles: Bytes, frame: Frame, scratch: Scratch) -> None:
+def count_own_steps(roles: UInt8, frame: Frame, scratch: Scratch) -> None:
     """Computes the distance of each cell from the agent."""
     scratch.steps[:] = -1
     scratch.steps[frame.middle] = 0
@@ -75,7 +74,7 @@ def count_own_steps(roles: Bytes, frame: Frame, scratch: Scratch) -> None:
     spread(roles, frame, scratch.blocked, scratch.steps, scratch.queue, 1)
 
 
-def count_others_steps(roles: Bytes, frame: Frame, scratch: Scratch) -> None:
+def count_others_steps(roles: UInt8, frame: Frame, scratch: Scratch) -> None:
     """Computes the distance of each cell from the nearest other agent."""
     known = 0
     scratch.others_steps[:] = -1
@@ -107,7 +106,7 @@ def step_to(frame: Frame, goal: int, scratch: Scratch) -> int:
     return cell
 
 
-def is_beside_an_agent(roles: Bytes, frame: Frame, cell: int) -> bool:
+def is_beside_an_agent(roles: UInt8, frame: Frame, cell: int) -> bool:
     """Whether a visible other agent is adjacent to a cell."""
     agents = 0
     for offset in frame.neighbours:
@@ -115,7 +114,7 @@ def is_beside_an_agent(roles: Bytes, frame: Frame, cell: int) -> bool:
     return agents > 0
 
 
-def apples_near(roles: Bytes, frame: Frame, cell: int) -> int:
+def apples_near(roles: UInt8, frame: Frame, cell: int) -> int:
     """The number of visible apples near a cell, without one on the cell itself."""
     count = 0
     for away in frame.near:
@@ -136,8 +135,6 @@ WALK_ON_PROB: Final = 0.9
 WAIT_PROB: Final = 0.5
 """The probability that an agent waits where another agent may want the same cell: if both go, neither gets
 it (docs/game.md)."""
-
-Numbers: TypeAlias = NDArray[np.float64]
 
 
 class Settings(NamedTuple):
@@ -160,7 +157,7 @@ class Settings(NamedTuple):
     """The number of other apples near an apple that "sustainable" harvests."""
 
 
-def target_apples(roles: Bytes, frame: Frame, scratch: Scratch) -> None:
+def target_apples(roles: UInt8, frame: Frame, scratch: Scratch) -> None:
     """Makes all apples targets and blocks the cells of other agents."""
     for cell in frame.cells:
         scratch.targets[cell] = roles[cell] == APPLE
@@ -173,14 +170,14 @@ def exclude_apple(scratch: Scratch, cell: int) -> None:
     scratch.blocked[cell] = True
 
 
-def exclude_sparse_apples(roles: Bytes, frame: Frame, settings: Settings, scratch: Scratch) -> None:
+def exclude_sparse_apples(roles: UInt8, frame: Frame, settings: Settings, scratch: Scratch) -> None:
     """Excludes the targets with fewer than `spare` other apples near them."""
     for cell in frame.cells:
         if scratch.targets[cell] and apples_near(roles, frame, cell) < settings.spare:
             exclude_apple(scratch, cell)
 
 
-def exclude_apples_nearer_to_others(roles: Bytes, frame: Frame, scratch: Scratch) -> None:
+def exclude_apples_nearer_to_others(roles: UInt8, frame: Frame, scratch: Scratch) -> None:
     """Excludes the targets that another agent reaches in fewer steps."""
     count_own_steps(roles, frame, scratch)
     count_others_steps(roles, frame, scratch)
@@ -190,7 +187,7 @@ def exclude_apples_nearer_to_others(roles: Bytes, frame: Frame, scratch: Scratch
 
 
 def walk_to(
-    roles: Bytes, frame: Frame, goal: int, number: float, settings: Settings, scratch: Scratch
+    roles: UInt8, frame: Frame, goal: int, number: float, settings: Settings, scratch: Scratch
 ) -> int:
     """The action for the first step on a shortest path to a reachable cell; may wait for another agent."""
     cell = step_to(frame, goal, scratch)
@@ -201,7 +198,7 @@ def walk_to(
     return RIGHT if cell == frame.middle + 1 else FORWARD
 
 
-def wander(roles: Bytes, frame: Frame, number: float, scratch: Scratch) -> int:
+def wander(roles: UInt8, frame: Frame, number: float, scratch: Scratch) -> int:
     """Walks forward with WALK_ON_PROB if the cell ahead is free; otherwise turns left or right."""
     ahead = frame.middle - frame.stride
     if roles[ahead] <= APPLE and not scratch.blocked[ahead]:
@@ -211,7 +208,7 @@ def wander(roles: Bytes, frame: Frame, number: float, scratch: Scratch) -> int:
     return TURN_LEFT if number < 0.5 else TURN_RIGHT
 
 
-def has_target(roles: Bytes, frame: Frame, settings: Settings, guards: bool) -> bool:
+def has_target(roles: UInt8, frame: Frame, settings: Settings, guards: bool) -> bool:
     """Whether a beam would cover a visible agent; with `guards`, one that is near a visible apple."""
     for side in range(-settings.beam_half_width, settings.beam_half_width + 1):
         begin = 0 if settings.beam_from_beside and side != 0 else 1
@@ -228,7 +225,7 @@ def has_target(roles: Bytes, frame: Frame, settings: Settings, guards: bool) -> 
     return False
 
 
-def pursue(roles: Bytes, frame: Frame, number: float, settings: Settings, scratch: Scratch) -> int:
+def pursue(roles: UInt8, frame: Frame, number: float, settings: Settings, scratch: Scratch) -> int:
     """Turns towards the nearest reachable agent or walks towards it; -1 if there is none."""
     for cell in frame.cells:
         scratch.targets[cell] = roles[cell] == AGENT
@@ -243,7 +240,7 @@ def pursue(roles: Bytes, frame: Frame, number: float, settings: Settings, scratc
 
 
 def choose(
-    policy: int, roles: Bytes, frame: Frame, numbers: Numbers, settings: Settings, scratch: Scratch
+    policy: int, roles: UInt8, frame: Frame, numbers: Float64, settings: Settings, scratch: Scratch
 ) -> int:
     """The action of one agent.
 
@@ -276,12 +273,12 @@ def choose(
 def choose_all(
     policy: int,
     epsilon: float,
-    roles: Bytes,
+    roles: UInt8,
     frame: Frame,
-    numbers: Numbers,
+    numbers: Float64,
     settings: Settings,
     scratch: Scratch,
-    chosen: Actions,
+    chosen: Int64,
 ) -> None:
     """The actions of n agents; each is random with probability `epsilon`.
 

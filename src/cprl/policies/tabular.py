@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl.commons.spaces import Spaces
 from cprl.policies.lanes import ActorOfLanes
+from cprl.values.arrays import Float64, Int64, UInt8
 
 NEVER_MET = 0
 """The row of states that are in no table; its values stay 0."""
@@ -32,12 +32,12 @@ class QTables:
         """int64 [rows, A], how often each value was updated."""
         self.size = 1
 
-    def find(self, states: Sequence[bytes], lanes: Sequence[int]) -> NDArray[np.int64]:
+    def find(self, states: Sequence[bytes], lanes: Sequence[int]) -> Int64:
         """The row of each state in the table of its lane, int64 [n]; `NEVER_MET` if it has none."""
         rows = [self.rows[lane].get(state, NEVER_MET) for state, lane in zip(states, lanes, strict=True)]
         return np.array(rows, np.int64)
 
-    def find_or_add(self, states: Sequence[bytes], lanes: Sequence[int]) -> NDArray[np.int64]:
+    def find_or_add(self, states: Sequence[bytes], lanes: Sequence[int]) -> Int64:
         """As `find`, but adds a row for each state that has none."""
         rows = self.find(states, lanes)
         for n in np.flatnonzero(rows == NEVER_MET).tolist():  # of two that are the same the first adds it
@@ -57,12 +57,12 @@ class QTables:
         rows[state], self.size = self.size, self.size + 1
         return rows[state]
 
-    def add_lane(self, lane: int, states: NDArray[np.uint8], values: NDArray[np.float64]) -> None:
+    def add_lane(self, lane: int, states: UInt8, values: Float64) -> None:
         """Adds n states, uint8 [n, bytes], with their values [n, A] to the table of a lane."""
         rows = self.find_or_add([state.tobytes() for state in states], [lane] * len(states))
         self.values[rows] = values
 
-    def of_lane(self, lane: int) -> tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.int64]]:
+    def of_lane(self, lane: int) -> tuple[UInt8, Float64, Int64]:
         """Copies of the n states that a lane has met, uint8 [n, bytes], their values and visits, [n, A]."""
         states, rows = list(self.rows[lane]), list(self.rows[lane].values())
         flat = np.frombuffer(b"".join(states), np.uint8).reshape(len(states), -1 if states else 0)
@@ -92,22 +92,18 @@ class QTables:
         self.size = len(self.values)
 
 
-def observed_entries(spaces: Spaces) -> tuple[str, ...]:
-    """The names of all entries that agents observe."""
-    return ("observation", *(name for name, _ in spaces.vectors))
+def states_of(observation: Tensor, agents: Sequence[int] | None = None) -> list[bytes]:
+    """Return the B x S states of agents, world by world: the bytes of what each observes.
 
-
-def states_of(
-    observed: TensorDictBase, names: Sequence[str], agents: Sequence[int] | None = None
-) -> list[bytes]:
-    """The B x S states of agents, world by world: the bytes of everything that each observes, of entries
-    [B, S, ...]."""
-    arrays = [observed.get(name).numpy(force=True) for name in names]
+    Args:
+        observation: [B, N, ...].
+        agents: the S agents; None for all N.
+    """
+    array = observation.numpy(force=True)
     if agents is not None:
-        arrays = [array[:, list(agents)] for array in arrays]
-    count = arrays[0].shape[0] * arrays[0].shape[1]
-    flat = [np.ascontiguousarray(array).reshape(count, -1).view(np.uint8) for array in arrays]
-    return [state.tobytes() for state in (flat[0] if len(flat) == 1 else np.concatenate(flat, 1))]
+        array = array[:, list(agents)]
+    flat = np.ascontiguousarray(array).reshape(array.shape[0] * array.shape[1], -1)
+    return [state.tobytes() for state in flat]
 
 
 class TableNetwork(nn.Module):
@@ -157,8 +153,7 @@ class TabularActor(ActorOfLanes):
     Args:
         tables: the tables of the lanes, with lane = replica x S + agent.
 
-    Reads "observation", [replicas x k, S, C, X, Y], and "stock_gauge" and "scoreboard" if the game has them;
-    writes "action", int64 [replicas x k, S].
+    Reads "observation", [replicas x k, S, C, X, Y]; writes "action", int64 [replicas x k, S].
     """
 
     stochastic = False
@@ -167,17 +162,17 @@ class TabularActor(ActorOfLanes):
         self, tables: QTables, spaces: Spaces, *, seeds: Sequence[Sequence[int]], agents: int, worlds: int = 1
     ) -> None:
         super().__init__(seeds, agents, worlds, 2)
-        self.in_keys = observed_entries(spaces)
         self.tables, self.actions, self.epsilon = tables, spaces.actions, 1.0
         lanes = np.arange(self.rng.lanes).reshape(self.replicas, 1, agents)
         self._lanes = np.broadcast_to(lanes, (self.replicas, worlds, agents)).reshape(-1).tolist()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        rows = self.tables.find(states_of(tensordict, self.in_keys), self._lanes)
+        observation = tensordict.get("observation")
+        rows = self.tables.find(states_of(observation), self._lanes)
         chosen = self.tables.values[rows].argmax(1)
         if exploration_type() in (ExplorationType.RANDOM, None):
             drawn = self.rng.next().numpy().reshape(self.replicas, self.agents, self.worlds, 2)
             explores, which = drawn.transpose(3, 0, 2, 1).reshape(2, -1)
             chosen = np.where(explores < self.epsilon, (which * self.actions).astype(np.int64), chosen)
-        action = torch.from_numpy(chosen.reshape(-1, self.agents)).to(tensordict.get("observation").device)
+        action = torch.from_numpy(chosen.reshape(-1, self.agents)).to(observation.device)
         return tensordict.set("action", action)

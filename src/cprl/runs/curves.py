@@ -8,12 +8,13 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from cprl.measuring.table import Numbers, complete, metrics_in, where, world_of
-from cprl.measuring.windows import Values, last_of
+from cprl.measuring.table import complete, metrics_in, where, world_of
+from cprl.measuring.windows import last_of
 from cprl.runs.episodes import read_episodes
+from cprl.values.arrays import Float64, Int64
 
 
-def curves_of(run: Path, *, last: int | None = None) -> dict[str, Values]:
+def curves_of(run: Path, *, last: int | None = None) -> dict[str, Float64]:
     """Read every metric that a run's game reports, and each agent's return as `return_0` and so on.
 
     Args:
@@ -26,7 +27,7 @@ def curves_of(run: Path, *, last: int | None = None) -> dict[str, Values]:
     return as_curves(read_episodes(run), last=last)
 
 
-def as_curves(table: pa.Table, *, last: int | None = None) -> dict[str, Values]:
+def as_curves(table: pa.Table, *, last: int | None = None) -> dict[str, Float64]:
     """Like `curves_of`, from a table of `read_episodes`."""
     if not table.num_rows:
         return {}
@@ -40,7 +41,7 @@ def as_curves(table: pa.Table, *, last: int | None = None) -> dict[str, Values]:
     return curves
 
 
-def worlds_of(table: pa.Table) -> Numbers:
+def worlds_of(table: pa.Table) -> Int64:
     """Return the world of each episode of the curves of a table, int64 [R, E]; of a table that has none, the
     replica."""
     first = where(table.sort_by(_ORDER), agent=0)
@@ -50,7 +51,7 @@ def worlds_of(table: pa.Table) -> Numbers:
 _ORDER: Final = [("replica", "ascending"), ("episode", "ascending"), ("agent", "ascending")]
 
 
-def _places(first: pa.Table) -> Numbers:
+def _places(first: pa.Table) -> Int64:
     """Return the rows of one agent in which each episode of each replica stands, int64 [R, E]: as many as all
     replicas have."""
     _, starts, counts = np.unique(first["replica"].to_numpy(), return_index=True, return_counts=True)

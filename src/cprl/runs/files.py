@@ -36,7 +36,7 @@ RECIPE_FORMAT: Final = 2
 """Of `recipe.json`, and of the journal and `report.json` beside it."""
 MANIFEST_FORMAT: Final = 1
 """Of `manifest.json`, and of what it lists: weights, tables, transforms, decisions."""
-TRAINING_STATE_FORMAT: Final = 6
+TRAINING_STATE_FORMAT: Final = 7
 """Of checkpoints."""
 STUDY_FORMAT: Final = 1
 """Of `study.json`."""

@@ -10,7 +10,7 @@ from typing import Any, Final, Self
 from torchrl.record.loggers import CSVLogger, Logger, get_logger
 
 from cprl.measuring.series import OF_GROUP, mean_of
-from cprl.measuring.windows import Values
+from cprl.values.arrays import Float64
 
 PACKAGES: Final = ("tensorboard", "wandb")
 """The loggers that have a name, which is that of the package that each needs."""
@@ -106,7 +106,7 @@ class LoggerCallback:
         self._last: dict[str, int] = {}
         """The last step that the logger has of each number, where it resumes."""
 
-    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: Mapping[str, Float64]) -> None:
         """Write the numbers of an episode that all replicas have ended."""
         written = {name: mean_of(values) for name, values in numbers.items()}
         for name, values in numbers.items():

@@ -17,7 +17,6 @@ from posixpath import normpath
 from typing import Annotated, Any, Final, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cprl.commons import maps
 from cprl.commons.maps import Map
@@ -43,6 +42,7 @@ from cprl.values import (
     trusting,
     words,
 )
+from cprl.values.arrays import Float64
 
 ALL: Final = "*"
 
@@ -109,6 +109,8 @@ def _named(holder: Any, name: str, at: list[str]) -> list[tuple[Any, Any]]:
     if name in names:
         return [(holder, int(name) if isinstance(holder, list) else name)]
     has = f"{where} has {', '.join(names)}" if names else f"{where} is {shown(holder)}"
+    if holder is None:
+        has += f"; give the base one, or vary {where} as a whole"
     raise ValueError(f"the path {path} matches nothing{meant(name, names)}; {has}")
 
 
@@ -264,7 +266,7 @@ def drawn(
         yield combination
 
 
-def _shares(dimensions: int, draws: int, seed: int, design: Design) -> Iterable[NDArray[np.float64]]:
+def _shares(dimensions: int, draws: int, seed: int, design: Design) -> Iterable[Float64]:
     most = _TRIES * draws
     if design == "random":
         return (np.random.default_rng([seed, number]).random(dimensions) for number in range(most))
@@ -272,7 +274,7 @@ def _shares(dimensions: int, draws: int, seed: int, design: Design) -> Iterable[
 
     rng = np.random.default_rng(seed)
     if design == "latin_hypercube":
-        points: NDArray[np.float64] = qmc.LatinHypercube(dimensions, rng=rng).random(draws)
+        points: Float64 = qmc.LatinHypercube(dimensions, rng=rng).random(draws)
     else:
         points = qmc.Sobol(dimensions, rng=rng).random_base2((most - 1).bit_length())
     return points

@@ -25,7 +25,7 @@ from cprl.measuring.outcome import DECLINE, HARVESTING, NO_BETTER, RECOVERY, TRA
 from cprl.measuring.registry import COLLECTIVE_RETURN, bounds, title
 from cprl.measuring.statistics import Estimate, Family, curve_interval, form_for
 from cprl.measuring.table import WINDOWS, by_replica, where
-from cprl.measuring.windows import SMOOTHED_EPISODES, Values, running_mean
+from cprl.measuring.windows import SMOOTHED_EPISODES, running_mean
 from cprl.studies.tables.comparing import (
     INTERVALS,
     Kind,
@@ -42,6 +42,7 @@ from cprl.studies.tables.table import RANDOM, TRAINING, Design, StudyTable
 from cprl.terminal.panels import draw_cells, draw_dots, draw_line, draw_matrix, width_of_cells
 from cprl.terminal.style import CHARACTER, DASHES, EMPTY, MEAN, RANDOM_LINE, SHADES, Width, drawing, wrapped
 from cprl.values import refusal
+from cprl.values.arrays import Float64
 
 MOST_CONDITIONS: Final = 60
 """A figure with a row or panel for each condition has at most so many."""
@@ -434,7 +435,7 @@ def _draw_courses(
     return windows or {1}
 
 
-def _windows_of(rows: pa.Table, number: str) -> Values:
+def _windows_of(rows: pa.Table, number: str) -> Float64:
     """Return a column of the windows that all replicas of a condition have, [R, W]."""
     replicas = [
         where(rows, replica=replica)[number].to_numpy() for replica in rows["replica"].unique().to_pylist()

@@ -11,11 +11,10 @@ from typing import Final
 from markdown_it import MarkdownIt
 
 from cprl.commons.game import Game
-from cprl.commons.readable import growth_of, meaning_of, rule_of, tag_of
 from cprl.evaluation.evaluate import evaluate_run
 from cprl.evaluation.fresh import fresh_episode
 from cprl.evaluation.show import Page, data_of, page
-from cprl.measuring.windows import Values
+from cprl.pictures.readable import growth_of, meaning_of, rule_of, tag_of
 from cprl.population import learned
 from cprl.runs.curves import curves_of
 from cprl.studies.results import SUMMARY, answer_of
@@ -28,6 +27,7 @@ from cprl.terminal.summary import compared
 from cprl.terminal.tables import markdown
 from cprl.training.agents import LoadedRun, load
 from cprl.training.course import course_of
+from cprl.values.arrays import Float64
 
 _LARGEST_SVG_BYTES: Final = 300_000
 
@@ -99,7 +99,7 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
     return page(name, _html("\n\n".join(before)), data, after_it)
 
 
-def _curves(run: LoadedRun) -> dict[str, Values]:
+def _curves(run: LoadedRun) -> dict[str, Float64]:
     """The curves of the training; none of a run that has played no episode."""
     try:
         return curves_of(run.path)

@@ -1,9 +1,10 @@
-"""Devices and their free memory: what would not fit is refused before anything is allocated.
+"""Devices and their free memory: what would fail only after hours, or without a word, is refused before
+anything is allocated.
 
 torch is imported where a device is asked for, so that the game, which does without, can use this too.
 """
 
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any
 
 import psutil
 
@@ -23,8 +24,6 @@ def _is_device(value: Any) -> bool:
 
 
 Device = Annotated[str, Where(_is_device, '"cpu", "cuda:0"')]
-_SMALL: Final = 2**20
-"""Bytes that are not worth the question how many are free."""
 
 
 class TooLargeError(ValueError, MemoryError):
@@ -32,6 +31,7 @@ class TooLargeError(ValueError, MemoryError):
 
 
 def free_bytes(device: "str | torch.device" = "cpu") -> int:
+    """Return how many bytes a device has free."""
     if str(device).startswith("cuda"):
         import torch
 
@@ -39,23 +39,19 @@ def free_bytes(device: "str | torch.device" = "cpu") -> int:
     return int(psutil.virtual_memory().available)
 
 
-def check_memory(
-    what: str, needed: int, instead: str, *, device: "str | torch.device" = "cpu", free: int | None = None
-) -> None:
-    """Refuses what would not fit: what takes the memory, in the plural, and how many bytes it takes,
-    estimated.
+def check_memory(what: str, needed: int, instead: str, *, device: "str | torch.device" = "cpu") -> None:
+    """Refuse what would not fit, where memory is granted at once and missing only when it is written.
 
     Args:
-        instead: what to use in its place.
-        free: how many bytes are free; None to ask the device.
+        what: What takes the memory, in the plural.
+        needed: How many bytes it takes, estimated.
+        instead: What to use in its place.
     """
-    if needed <= _SMALL:
-        return
-    free = free_bytes(device) if free is None else free
+    free = free_bytes(device)
     if needed > free:
         raise TooLargeError(f"{what} take {gib(needed)}; {gib(free)} are free: use {instead}")
 
 
 def gib(size: int) -> str:
-    """A number of bytes in GiB, for people."""
+    """Return a number of bytes in GiB, for people."""
     return f"{size / 2**30:,.2f} GiB" if size < 2**70 else f"more than {2**40:,} GiB"

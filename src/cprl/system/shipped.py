@@ -86,9 +86,8 @@ def shipped_recipes() -> dict[str, Recipe]:
 def recipe_named(name: str) -> Recipe:
     recipes = shipped_recipes()
     if name not in recipes:
-        raise ValueError(
-            f"there is no recipe {name!r}{meant(name, recipes)}; allowed: those that cprl recipe lists"
-        )
+        hint = meant(name, recipes) or "; cprl recipe lists them"
+        raise ValueError(f"there is no recipe {name!r}{hint}")
     return recipes[name]
 
 

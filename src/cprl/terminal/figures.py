@@ -10,11 +10,12 @@ from matplotlib.axes import Axes
 
 from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, unit, with_unit
 from cprl.measuring.table import complete, episodes
-from cprl.measuring.windows import SMOOTHED_EPISODES, Values, mean_of_worlds, rounds_of
+from cprl.measuring.windows import SMOOTHED_EPISODES, mean_of_worlds, rounds_of
 from cprl.runs.curves import as_curves, episode_of_turn, worlds_of
 from cprl.runs.episodes import read_episodes, read_evaluations
 from cprl.terminal import style
 from cprl.terminal.style import MARK, Width
+from cprl.values.arrays import Float64
 
 PARTS: Final = 20
 """A running mean takes in at most one part in so many of a training, so that short ones keep their course."""
@@ -93,7 +94,7 @@ def training_curve(
     return path
 
 
-def _numbers(curves: Mapping[str, Values]) -> list[str]:
+def _numbers(curves: Mapping[str, Float64]) -> list[str]:
     """Return what has a panel: collective return and survival, or the income of a game without a harvest;
     violations and fines of a game with institutions."""
     main = (COLLECTIVE_RETURN, "survival_steps") if COLLECTIVE_RETURN in curves else (INCOME,)
@@ -108,7 +109,7 @@ def _mean(table: pa.Table, name: str) -> float:
     return float(np.mean(episodes(table, name)["value"].to_numpy()))
 
 
-def _draw(axes: Axes, values: Values, at: Values, means: Values) -> None:
+def _draw(axes: Axes, values: Float64, at: Float64, means: Float64) -> None:
     """Draw a number of each episode, [R, E], and its running means, [R, M]."""
     replicas, length = values.shape
     dot = "." if length < 3 else None  # a line needs two points
@@ -133,7 +134,7 @@ def _draw_evaluations(axes: Axes, evaluations: pa.Table | None, name: str) -> No
     axes.plot(at, rows["value_mean"].to_numpy(), **style.EVALUATED, label=label, zorder=3.5)
 
 
-def _mark_peak(axes: Axes, name: str, at: Values, means: Values, number: int) -> None:
+def _mark_peak(axes: Axes, name: str, at: Float64, means: Float64, number: int) -> None:
     """Mark the highest and the last running mean, of so many episodes, of the mean over replicas."""
     mean = means.mean(0)
     top = int(mean.argmax())

@@ -10,8 +10,8 @@ from matplotlib.colors import Normalize
 from numpy.typing import ArrayLike
 
 from cprl.measuring.statistics import Estimate
-from cprl.measuring.windows import Values
 from cprl.terminal.style import CHARACTER, EMPTY, MEAN, Sheet, draw_cell, wrapped
+from cprl.values.arrays import Float64
 
 _BAND: Final = 0.2
 """How opaque a band is."""
@@ -33,7 +33,7 @@ Pair = tuple[Any, Any]
 
 
 def draw_line(
-    axes: Axes, at: ArrayLike, curve: tuple[Values, Values, Values], *, color: str = MEAN, **look: Any
+    axes: Axes, at: ArrayLike, curve: tuple[Float64, Float64, Float64], *, color: str = MEAN, **look: Any
 ) -> None:
     """Draw a line with the band of its interval.
 

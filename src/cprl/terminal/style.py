@@ -24,7 +24,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import Normal, Stroke
 
-from cprl.commons.colours import agent_colour
+from cprl.pictures.colours import agent_colour
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.terminal.tables import lines_of
 from cprl.values import checked, refusal

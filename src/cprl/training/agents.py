@@ -1,7 +1,7 @@
 """The agents of a population, of whatever kind; those that earlier runs learned are read by `load`."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -556,7 +556,7 @@ def check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game
         spaces: what agents observe, transforms included.
         game: what is played; None for a game that is not a `Game`.
     """
-    if game is None or replace(spaces, vectors=()) == replace(game.spaces, vectors=()):
+    if game is None or spaces == game.spaces:
         return
     for spec, agents in groups:
         if isinstance(spec, Scripted) and spec.policy != "random":

@@ -24,6 +24,7 @@ from cprl.experiment.experiment import OnNan
 from cprl.keys import Turn
 from cprl.learners.base import Learner
 from cprl.training.learning import LaneLosses
+from cprl.values.arrays import Float64
 
 EVERY_TURNS: Final = 16
 """Turns between two looks at the sums; to look in every step took 3 to 8 % of a training."""
@@ -48,7 +49,7 @@ class NotFinite:
     """What is not finite, and since when."""
 
     what: str
-    """"loss", "weights", "reward" or the name of an entry that agents observe."""
+    """"loss", "weights", "reward" or "observation"."""
     replica: int
     """The replica, in whichever of its worlds."""
     agent: int
@@ -65,7 +66,7 @@ class FiniteCheck:
     """Checks the numbers of a training; `Training` calls it.
 
     Args:
-        spaces: what agents observe; entries of integers are not looked at.
+        spaces: what agents observe; observations of integers are not looked at.
         worlds: the worlds W of each replica.
     """
 
@@ -82,30 +83,28 @@ class FiniteCheck:
         """Each agent and kind of number once, in the order in which they were reported."""
         self.saved_step = 0
         """The step of the state that was last saved or loaded, 0 for none."""
-        is_float = "float" in spaces.observation_dtype
-        self._entries = (*(("observation",) if is_float else ()), *dict(spaces.vectors))
-        self._sums: dict[str, Tensor] = {}
+        self._observes_floats = "float" in spaces.observation_dtype
+        self._sums: Tensor | None = None
         self._is_fresh = True
         self._weights_step = 0
 
     def add(self, turn: Turn) -> None:
         """Sums up what agents observe after a turn, [B]; this needs no synchronisation with a GPU."""
-        if not self._entries:
+        if not self._observes_floats:
             return
         seen = [turn.next_agents]
         if self._is_fresh:  # the first observation after a reset was nobody's next
             seen.append(turn.agents)
             self._is_fresh = False
-        for name in self._entries:
-            for agents in seen:
-                entry = torch.as_tensor(agents[name])
-                sums = entry.reshape(*entry.shape[:2], -1).sum(-1, dtype=torch.float64)
-                self._sums[name] = sums + self._sums[name] if name in self._sums else sums
+        for agents in seen:
+            observation = torch.as_tensor(agents["observation"])
+            sums = observation.reshape(*observation.shape[:2], -1).sum(-1, dtype=torch.float64)
+            self._sums = sums if self._sums is None else sums + self._sums
 
     def check(
         self,
         losses: Mapping[tuple[int, ...], LaneLosses],
-        returns: NDArray[np.float64],
+        returns: Float64,
         step: int,
         *,
         weights: bool = False,
@@ -126,9 +125,9 @@ class FiniteCheck:
         for agents, lane_losses in losses.items():
             of_losses = _marked("loss", lane_losses.total, agents, step)
             findings += [loss for loss in of_losses if ("weights", *loss.place[1:]) not in known]
-        for name, sums in self._sums.items():
-            of_replicas = self._by_replica(sums.numpy(force=True))
-            findings += _marked(name, of_replicas, range(sums.shape[1]), step)
+        if self._sums is not None:
+            of_replicas = self._by_replica(self._sums.numpy(force=True))
+            findings += _marked("observation", of_replicas, range(self._sums.shape[1]), step)
         if weights or any(finding.place not in known for finding in findings):
             for agents, learner in self.learners.items():
                 sound = np.where(learner.finite().numpy(force=True), 0.0, np.nan)

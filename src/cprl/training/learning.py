@@ -6,7 +6,6 @@ from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
@@ -14,6 +13,7 @@ from cprl.learners.base import Learner
 from cprl.policies.assignment import AgentIndices, agent_indices
 from cprl.policies.decisions import Decider
 from cprl.values import MOST_INT64, Range, checked
+from cprl.values.arrays import Float64
 
 Learners: TypeAlias = Mapping[tuple[int, ...], Learner]
 """By the indices of their agents."""
@@ -70,9 +70,9 @@ class WantedReturns:
             turn = turn.numpy(force=True) if isinstance(turn, Tensor) else turn
             self.returns[:, columns] += turn[:, columns]
 
-    def take(self, world: int) -> NDArray[np.float64]:
+    def take(self, world: int) -> Float64:
         """The wanted return of each agent of a world, [N], whose next episode begins at 0."""
-        taken: NDArray[np.float64] = self.returns[world].copy()
+        taken: Float64 = self.returns[world].copy()
         self.returns[world] = self._first
         return taken
 

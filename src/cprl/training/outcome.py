@@ -15,7 +15,8 @@ import pyarrow.parquet as pq
 import torch
 from torchrl.envs import EnvBase
 
-from cprl.envs.make_env import OF_CPRL, make_env
+from cprl.commons.game import Game
+from cprl.envs.make_env import make_env
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.envs.unwrap import commons_of
 from cprl.experiment import Experiment
@@ -198,9 +199,9 @@ def _means(episodes: Sequence[Episode]) -> dict[str, float]:
 
 
 def is_same_later(experiment: Experiment) -> bool:
-    """Return whether random play is the same before and after a training: the game is one of cprl's, whose
+    """Return whether random play is the same before and after a training: the game is a `cprl.Game`, whose
     chance depends on seeds alone, and has no transforms, which may learn in between."""
-    return isinstance(experiment.game, OF_CPRL) and not experiment.transforms
+    return isinstance(experiment.game, Game) and not experiment.transforms
 
 
 def _keeps_decisions(env: EnvBase) -> bool:

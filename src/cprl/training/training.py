@@ -25,7 +25,6 @@ from cprl.keys import Turn
 from cprl.learners.base import Learner
 from cprl.measuring.episodes import Episode, tracker_of
 from cprl.measuring.series import Observer
-from cprl.measuring.windows import Values
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import Decider
 from cprl.runs.checkpoints import Checkpointer
@@ -43,6 +42,7 @@ from cprl.training.learning import (
     losses_of,
 )
 from cprl.values import Custom, shown
+from cprl.values.arrays import Float64
 
 
 class StepCollector(BaseCollector):
@@ -411,7 +411,7 @@ class Callback(Protocol):
         loggers and the viewer of a run, and by callbacks that come later in a `Training`.
         """
 
-    def on_numbers(self, episode: int, numbers: dict[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: dict[str, Float64]) -> None:
         """All replicas have ended an episode, counted from 0: its numbers by name, [R] of each replica, NaN
         where undefined; of replicas in W worlds the last of W, whose means these are.
 

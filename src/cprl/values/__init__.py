@@ -9,7 +9,7 @@ numbers as Python's, whole numbers of a float field as floats. A refusal is a Va
 
 A table is what JSON can hold of a value, `{"kind": "DQN", ...its fields}`; a tuple is a list there. Reading a
 table is strict: what is not known is refused by the place where it stands. `cprl.values.custom` has Custom,
-something of the user's own by its name.
+something of the user's own by its name, `cprl.values.arrays` the types of numpy arrays.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping

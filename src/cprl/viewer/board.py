@@ -8,14 +8,14 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from cprl.commons.colours import APPLE, BEAM, FIRST_AGENT, GROUND, PALETTE, WALL, agent_colour, agent_mark
-from cprl.commons.decoding import UNSEEN
-from cprl.commons.picture import DIGIT_HIGH, INK_COLOUR, MARK_COLOUR, POINTS, number_paths
-from cprl.commons.world import Bytes
+from cprl.commons.cells import APPLE, BEAM, FIRST_AGENT, GROUND, WALL
+from cprl.pictures.colours import PALETTE, agent_colour, agent_mark
+from cprl.pictures.decoding import UNSEEN
+from cprl.pictures.image import DIGIT_HIGH, INK_COLOUR, MARK_COLOUR, POINTS, number_paths
+from cprl.values.arrays import Bool, Float32, UInt8
 from cprl.viewer.names import EMPTY_SITE, TEXT
 from cprl.viewer.scene import Scene, windows_of
 
-Floats = NDArray[np.float32]
 Frames = Mapping[str, NDArray[Any]]
 """Columns of `FrameRecorder.take`, [T, ...] each, with windows as classes of `classes_seen`."""
 
@@ -38,12 +38,12 @@ class Strokes(NamedTuple):
 
     owner: NDArray[np.intp]
     """The agent of each line [S]."""
-    shape: Floats
+    shape: Float32
     """float32 [4, S, P, 2], the corners (x, y) of each line, in cells from the middle of the agent's cell."""
 
     def placed(
-        self, centres: Floats, heading: NDArray[np.integer], drawn: NDArray[np.bool_]
-    ) -> tuple[Floats, NDArray[np.intp], NDArray[np.intp]]:
+        self, centres: Float32, heading: NDArray[np.integer], drawn: Bool
+    ) -> tuple[Float32, NDArray[np.intp], NDArray[np.intp]]:
         """Return the lines of all frames.
 
         Args:
@@ -63,7 +63,7 @@ class Strokes(NamedTuple):
 
 
 @cache
-def strokes(agents: int, lines_of: Callable[[int], list[Floats]]) -> Strokes:
+def strokes(agents: int, lines_of: Callable[[int], list[Float32]]) -> Strokes:
     """Return the lines of so many agents, by a function that draws one: [4, P, 2] each."""
     lines = [(agent, line) for agent in range(agents) for line in lines_of(agent)]
     shape = np.zeros((4, len(lines), POINTS, 2), np.float32)
@@ -73,7 +73,7 @@ def strokes(agents: int, lines_of: Callable[[int], list[Floats]]) -> Strokes:
     return Strokes(np.array([agent for agent, _ in lines], np.intp), shape)
 
 
-def number_and_heading(agent: int) -> list[Floats]:
+def number_and_heading(agent: int) -> list[Float32]:
     """Return the triangle, and behind it the digits: a number is upright whatever the heading."""
     front = _front(agent) - _DEEP - 2 * RADIUS_CELLS
     back = 0.5 - (_RIM if agent_mark(agent) in ("ring", "stripe") else 0.02)
@@ -82,15 +82,15 @@ def number_and_heading(agent: int) -> list[Floats]:
     return [_triangle(agent), *(behind + digit * scale for digit in number_paths(agent))]
 
 
-def number(agent: int) -> list[Floats]:
+def number(agent: int) -> list[Float32]:
     """Return the digits in the middle."""
     scale = _scale(agent, room=0.7)
-    return [np.broadcast_to(digit * scale, (4, POINTS, 2)) for digit in number_paths(agent)]
+    return [np.broadcast_to(digit * scale, (4, *digit.shape)) for digit in number_paths(agent)]
 
 
-def _turned(*corners: tuple[float, float]) -> Floats:
+def _turned(*corners: tuple[float, float]) -> Float32:
     """Return a line of an agent that is headed up, for each heading: [4, corners, 2]."""
-    turned: Floats = np.einsum("pk,hkd->hpd", np.array(corners), _TURNS).astype(np.float32)
+    turned: Float32 = np.einsum("pk,hkd->hpd", np.array(corners), _TURNS).astype(np.float32)
     return turned
 
 
@@ -99,7 +99,7 @@ def _front(agent: int) -> float:
     return _EDGE - (_RIM if agent_mark(agent) == "ring" else 0)
 
 
-def _triangle(agent: int) -> Floats:
+def _triangle(agent: int) -> Float32:
     tip = _front(agent)
     base = tip - _DEEP
     inside = (0.0, -base - 0.4 * _DEEP)
@@ -112,7 +112,7 @@ def _scale(agent: int, *, room: float) -> float:
     return min(_GRID, (room - 2 * RADIUS_CELLS) / points)
 
 
-def mark(agent: int) -> list[Floats]:
+def mark(agent: int) -> list[Float32]:
     """Return what tells agents of the same hue apart."""
     edge = 0.5 - RADIUS_CELLS
     corner = 0.25
@@ -225,11 +225,11 @@ def _stock(scene: Scene, frames: Frames) -> tuple[NDArray[np.intp], Any]:
     return changed, columns.partition([3] * len(apples))
 
 
-def _pictures(images: Bytes) -> Any:
+def _pictures(images: UInt8) -> Any:
     return rr.SegmentationImage.columns(buffer=images.reshape(len(images), -1))
 
 
-def boards(scene: Scene, frames: Frames) -> Bytes:
+def boards(scene: Scene, frames: Frames) -> UInt8:
     """Boards with a border of wall: apples, sites without one and agents in play, in a class of their own.
 
     Returns:
@@ -286,7 +286,7 @@ def _out(frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
     return {"out": (changed, squares), "out/numbers": (changed, digits)}
 
 
-def centres_of(frames: Frames) -> NDArray[np.float32]:
+def centres_of(frames: Frames) -> Float32:
     """Return the positions of agents on the image, (x, y): [(T), N, 2]."""
     return np.stack([frames["col"], frames["row"]], -1).astype(np.float32) + RIM_CELLS + 0.5
 
@@ -297,7 +297,7 @@ def _changes(rows: NDArray[Any]) -> NDArray[np.intp]:
     return np.flatnonzero(np.concatenate([[True], (flat[1:] != flat[:-1]).any(1)]))
 
 
-def mosaic(windows: Bytes) -> Bytes:
+def mosaic(windows: UInt8) -> UInt8:
     """Return the windows of all agents in one image, with UNSEEN between them.
 
     Args:

@@ -11,19 +11,19 @@ from typing import Any, Final, Self
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from cprl.commons.readable import rules_of
 from cprl.envs.commons_env import CommonsEnv
-from cprl.envs.unwrap import agent_names, base_env, commons_of
+from cprl.envs.unwrap import action_count, agent_names, commons_of
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import Policy
 from cprl.measuring.registry import reported_by
 from cprl.measuring.series import Observer
-from cprl.measuring.windows import Values
+from cprl.pictures.readable import rules_of
 from cprl.policies.present import PresentPolicy
 from cprl.runs.episodes import stored_episodes
 from cprl.runs.recipe import rules_of_own
 from cprl.system.output import console
 from cprl.system.process import at_signals
+from cprl.values.arrays import Float64
 from cprl.viewer.exhibition import Exhibition
 from cprl.viewer.frames import Filming, Wall
 from cprl.viewer.logger import RerunLogger, recording_id
@@ -123,7 +123,7 @@ class ViewerCallback:
             Events(self.logger, self.filming, every=ceil(every / worlds)),
         ]
         if curves.joint:
-            self._views.append(JointActions(self.logger, actions=base_env(env).game.actions))
+            self._views.append(JointActions(self.logger, actions=action_count(env)))
         if commons is not None:
             self._views += self._views_of_boards(commons, exhibited)
         if not is_replay:
@@ -207,7 +207,7 @@ class ViewerCallback:
         for view in self._views:
             view.on_episode(episode, learning)
 
-    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: Mapping[str, Float64]) -> None:
         """Draw the numbers of an episode that all replicas have ended."""
         self._episode = episode + 1
         self._set_time(episode)

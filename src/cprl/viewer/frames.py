@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from cprl import keys
-from cprl.commons.colours import BEAM
-from cprl.commons.decoding import UNSEEN, classes_seen
+from cprl.commons.cells import BEAM
 from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode
+from cprl.pictures.decoding import UNSEEN, classes_seen
+from cprl.values.arrays import UInt8
 from cprl.viewer.board import Frames, boards, image_form
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import DIED, TEXT
@@ -154,7 +155,7 @@ _FEWEST_STEPS: Final = 10
 """Steps from one row of the file to the next, at least."""
 _LABELLED: Final = 8
 """The largest number of boards whose labels say "turn" before its number."""
-_Row: TypeAlias = tuple[int, int, int, NDArray[np.uint8], list[str], NDArray[np.uint8]]
+_Row: TypeAlias = tuple[int, int, int, UInt8, list[str], UInt8]
 """A step, episode and frame, the image, and the text of each board and its colour."""
 
 

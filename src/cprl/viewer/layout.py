@@ -18,25 +18,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TimelineColumn
 
-from cprl.commons.colours import (
-    APPLE,
-    BLUE,
-    FIRST_AGENT,
-    GREEN,
-    GREY,
-    ORANGE,
-    PALETTE,
-    PURPLE,
-    VERMILION,
-    Colour,
-    agent_colour,
-    class_colour,
-    class_name,
-    line_colour,
-    picture_colour,
-)
-from cprl.commons.decoding import UNSEEN
-from cprl.commons.picture import EMPTY_SITE_COLOUR
+from cprl.commons.cells import APPLE, FIRST_AGENT, Colour, class_colour, class_name
 from cprl.measuring.registry import (
     COLLECTIVE_RETURN,
     EQUALITY,
@@ -50,6 +32,20 @@ from cprl.measuring.registry import (
     title,
 )
 from cprl.measuring.series import SPEED, logged
+from cprl.pictures.colours import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PALETTE,
+    PURPLE,
+    VERMILION,
+    agent_colour,
+    line_colour,
+    picture_colour,
+)
+from cprl.pictures.decoding import UNSEEN
+from cprl.pictures.image import EMPTY_SITE_COLOUR
 from cprl.viewer.board import OUT_STROKE_CELLS, board_form, board_styles, image_form
 from cprl.viewer.names import (
     BACKGROUND,

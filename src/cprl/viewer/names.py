@@ -3,9 +3,10 @@
 from collections.abc import Mapping
 from typing import Final
 
-from cprl.commons.colours import BLUE, GREEN, GREY, ORANGE, VERMILION, Colour
-from cprl.commons.decoding import UNSEEN
+from cprl.commons.cells import Colour
 from cprl.measuring import outcome
+from cprl.pictures.colours import BLUE, GREEN, GREY, ORANGE, VERMILION
+from cprl.pictures.decoding import UNSEEN
 
 HEADER: Final = "header"
 """The entity of the text that people read first."""

@@ -12,14 +12,14 @@ from typing import Any, Final, Self, TypeAlias
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
-from cprl.commons.colours import GREEN, GREY, GROUND, ORANGE, PALETTE, PURPLE, WALL, agent_colour
+from cprl.commons.cells import GROUND, WALL
 from cprl.envs.commons_env import CommonsEnv
 from cprl.institutions import Boundaries
 from cprl.measuring.episodes import Episode
-from cprl.measuring.windows import Values
+from cprl.pictures.colours import GREEN, GREY, ORANGE, PALETTE, PURPLE, agent_colour
+from cprl.values.arrays import Bool, Float32, Float64, Int64, UInt8
 from cprl.viewer.board import RIM_CELLS
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import DIED, TEXT
@@ -155,10 +155,10 @@ class Axes:
             f"{self.origin}/title": _texts([TITLE], [title]),
         }
 
-    def _placed(self, x: Any, y: Any) -> NDArray[np.float32]:
+    def _placed(self, x: Any, y: Any) -> Float32:
         """Return where numbers are in the view: [points, 2]."""
         share = np.stack([np.asarray(x) / self.x_end, np.asarray(y) / self.y_end], -1)
-        placed: NDArray[np.float32] = (share * (PLOT_WIDE, -PLOT_HIGH) + (0, PLOT_HIGH)).astype(np.float32)
+        placed: Float32 = (share * (PLOT_WIDE, -PLOT_HIGH) + (0, PLOT_HIGH)).astype(np.float32)
         return placed
 
 
@@ -207,7 +207,7 @@ _DARKEST: Final = 0.35
 """The brightness of a cell that was visited once; 1 is the cell with the longest stay."""
 
 
-def visits_drawn(visits: NDArray[np.int64], scene: Scene) -> NDArray[np.uint8]:
+def visits_drawn(visits: Int64, scene: Scene) -> UInt8:
     """Return maps of visits [N, H, W]: uint8 [N, H + 2, W + 2, 3], with a rim of wall. The brightness goes by
     the square root of the share of the longest time that any agent spent on one cell."""
     share = np.sqrt(visits / max(1, visits.max()))
@@ -250,7 +250,7 @@ def turns(seen: Seen) -> Archetypes:
     )
 
 
-def lorenz_curve(harvest: NDArray[np.float64]) -> NDArray[np.float64]:
+def lorenz_curve(harvest: Float64) -> Float64:
     """Return the share of the harvest that the k agents with the least have together, k = 0..N; [N + 1].
 
     The area between it and the diagonal, doubled, is the Gini coefficient, 1 - equality. NaN without harvest.
@@ -261,7 +261,7 @@ def lorenz_curve(harvest: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([[0.0], np.sort(harvest).cumsum() / total])
 
 
-def gini(curve: NDArray[np.float64]) -> float:
+def gini(curve: Float64) -> float:
     """Return the Gini coefficient of a Lorenz curve [N + 1], 0 for equal shares."""
     return float(1 - (curve[1:] + curve[:-1]).sum() / (len(curve) - 1))
 
@@ -291,7 +291,7 @@ def lorenz(seen: Seen) -> Archetypes:
     return axes_of_lorenz(seen).lines(title, lines, colours=[GREY, GREEN, ORANGE], radii=[0.3, 0.5, 1.0])
 
 
-def _lorenz_curves(seen: Seen) -> list[NDArray[np.float64]]:
+def _lorenz_curves(seen: Seen) -> list[Float64]:
     harvests = [episode.harvest for episode in seen.episodes if episode.harvest is not None]
     return [lorenz_curve(harvest) for harvest in harvests if harvest.sum() > 0]
 
@@ -365,7 +365,7 @@ class Pictures(View):
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         self._episodes.append(episode)
 
-    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: Mapping[str, Float64]) -> None:
         before = self._ended
         self._ended = episode + 1
         for name, picture in self._pictures.items():
@@ -403,7 +403,7 @@ class Pictures(View):
             self._logger.log_row(entity, archetype)
 
 
-Regions: TypeAlias = list[tuple[list[int], NDArray[np.bool_]]]
+Regions: TypeAlias = list[tuple[list[int], Bool]]
 """The owners of each region, and its cells, bool [H, W]."""
 _OPACITY: Final = 170
 _INSET_CELLS, _BORDER_CELLS = 0.08, 0.04
@@ -434,7 +434,7 @@ def borders(regions: Regions) -> Any:
     return rr.LineStrips2D(strips, colors=colours, radii=_BORDER_CELLS, draw_order=-4.0)
 
 
-def _borders(cells: NDArray[np.bool_]) -> list[list[tuple[float, float]]]:
+def _borders(cells: Bool) -> list[list[tuple[float, float]]]:
     """Return the sides of cells beyond which the region ends, (x, y), a little inside of it."""
     around = np.pad(cells, 1)
     strips = []

@@ -11,12 +11,13 @@ from tensordict import TensorDictBase
 from torch import nn
 
 from cprl import keys
-from cprl.commons.colours import agent_colour
 from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode
 from cprl.measuring.registry import FINES, TRANSFERS
+from cprl.pictures.colours import agent_colour
 from cprl.policies.assignment import AgentPolicies, agent_indices
 from cprl.policies.lanes import LaneActor
+from cprl.values.arrays import Float32, Float64
 from cprl.viewer.board import centres_of
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import BACKGROUND, GIVEN, PAID
@@ -161,9 +162,9 @@ class Offences:
         self._logger = logger
         self._env = env
         self._names = logger.curves.agents
-        self._amounts: dict[str, list[NDArray[np.float64]]] = {PAID: [], GIVEN: []}
+        self._amounts: dict[str, list[Float64]] = {PAID: [], GIVEN: []}
         """[N] in each turn."""
-        self._strips: list[NDArray[np.float32]] = []
+        self._strips: list[Float32] = []
         self._labels: list[list[str]] = []
         """Marks, and what they say, of each frame."""
         mark = rr.LineStrips2D.from_fields(colors=[_WHITE], radii=[_RADIUS_CELLS], show_labels=False)
@@ -203,7 +204,7 @@ class Offences:
         self._logger.log_columns(_VIOLATORS, at, marks.partition(list(map(len, self._strips))))
 
 
-def _of_agents(batch: TensorDictBase, name: str) -> NDArray[np.float64]:
+def _of_agents(batch: TensorDictBase, name: str) -> Float64:
     """Return an entry of the agents of the first world in a turn, [N]; zeros where the game lacks it."""
     agents: Any = batch["next", keys.AGENTS]
     entry = agents.get(name, None)

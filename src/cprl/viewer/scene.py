@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 from math import ceil
 from typing import Any, Final
 
@@ -11,11 +10,11 @@ import rerun as rr
 from numpy.typing import NDArray
 from torchrl.envs import EnvBase
 
-from cprl.commons.colours import Colour
+from cprl.commons.cells import Colour
 from cprl.commons.game import Game
+from cprl.commons.quirks import self_stays
 from cprl.envs.commons_env import CommonsEnv
-from cprl.envs.matrix import MatrixGame
-from cprl.envs.unwrap import base_env
+from cprl.envs.unwrap import joint_actions
 from cprl.measuring.episodes import decisions_of, metrics_of
 from cprl.measuring.registry import (
     COLLECTIVE_RETURN,
@@ -26,10 +25,11 @@ from cprl.measuring.registry import (
     SOCIAL,
     left_out,
 )
+from cprl.values.arrays import Float32
 from cprl.viewer.names import TEXT
 
 MOST_JOINT: Final = 16
-"""Joint actions that have a line each."""
+"""Joint actions that have a line each; of a game with more none has."""
 _MOST_BOARDS: Final = 16
 """Of the worlds of a replica, side by side."""
 
@@ -134,7 +134,7 @@ def curves_of(
     own: Sequence[str] = (),
 ) -> Curves:
     """Return the numbers of an environment that are plotted, and metrics of the user's own by their names."""
-    game = getattr(base_env(env), "game", None)
+    joint = joint_actions(env)
     return Curves(
         agents=agents,
         replicas=env.batch_size.numel() // worlds,
@@ -143,22 +143,8 @@ def curves_of(
         metrics=(*metrics_of(env, reported), *own),
         has_tags="tagged_by" in reported,
         in_force=decisions_of(env) if "in_force" in reported else (),
-        joint=joint_actions(game) if isinstance(game, MatrixGame) else (),
+        joint=joint if len(joint) <= MOST_JOINT else (),
     )
-
-
-def joint_actions(game: MatrixGame) -> tuple[str, ...]:
-    """Return the joint actions of a small game in letters, that of agent 0 first: C and D in a social dilemma
-    of two, where both are paid more if both choose action 0, else A and so on. None of a large game."""
-    if game.actions**game.agents > MOST_JOINT:
-        return ()
-    letters = "ABCDEFGHIJKLMNOP"[: game.actions]
-    payoffs = np.array(game.payoffs)
-    if payoffs.shape == (2, 2, 2) and (payoffs[..., 0] == payoffs[..., 1].T).all():
-        (reward, sucker), (temptation, punishment) = payoffs[..., 0]
-        if reward > max(punishment, sucker) and (temptation > reward or punishment > sucker):
-            letters = "CD"
-    return tuple(map("".join, product(letters, repeat=game.agents)))
 
 
 def scene_of(env: CommonsEnv, curves: Curves, *, is_replay: bool = False) -> Scene:
@@ -180,7 +166,8 @@ def scene_of(env: CommonsEnv, curves: Curves, *, is_replay: bool = False) -> Sce
 def _caption(game: Game) -> str:
     if game.observation.agents_apart:
         return "each agent in a colour of its own"
-    also = "; as run also agents of lower number" if game.rules.self_paint_stays else ""
+    stays = self_stays(game.rules.quirks)
+    also = "; as run also agents of lower number" if stays else ""
     return "itself blue at the bottom" + (f"{also}; others red" if game.agents > 1 else "")
 
 
@@ -254,9 +241,9 @@ class Panels:
         return rr.Points2D.from_fields(positions=self.tops, radii=[0.0], colors=colours, show_labels=True)
 
     @property
-    def tops(self) -> NDArray[np.float32]:
+    def tops(self) -> Float32:
         """Where the text of each board stands, (x, y)."""
-        tops: NDArray[np.float32] = self.corners[:, ::-1] + (self.size[1] / 2, 0.1 - self._label)
+        tops: Float32 = self.corners[:, ::-1] + (self.size[1] / 2, 0.1 - self._label)
         return tops.astype(np.float32)
 
 

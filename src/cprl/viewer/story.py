@@ -16,8 +16,9 @@ from cprl.measuring.outcome import BEGINS, EXPLORING, Course
 from cprl.measuring.registry import COLLECTIVE_RETURN
 from cprl.measuring.series import logged, mean_of
 from cprl.measuring.statistics import Estimate, estimate_if_finite
-from cprl.measuring.windows import LAST_EPISODES, Values, rounds_of
+from cprl.measuring.windows import LAST_EPISODES, rounds_of
 from cprl.system.times import CLOCK
+from cprl.values.arrays import Float64
 from cprl.viewer import names
 from cprl.viewer.frames import Filming
 from cprl.viewer.logger import RerunLogger
@@ -219,7 +220,7 @@ class Story(View):
             together = episode.episode // self._curves.worlds
             self._died[together] = self._died.get(together, 0) + died
 
-    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: Mapping[str, Float64]) -> None:
         before = self._ended
         self._ended = episode + 1
         died = self._died.pop(episode // self._curves.worlds, None)
@@ -369,7 +370,7 @@ class CompilingNotice(View):
         self._before_s = CLOCK.total_s
         Thread(target=self._watch, daemon=True, name="cprl compiling").start()
 
-    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: Mapping[str, Float64]) -> None:
         self.close()
 
     def close(self) -> None:

@@ -10,14 +10,13 @@ from typing import Final
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from cprl import keys
 from cprl.measuring.episodes import Episode
 from cprl.measuring.registry import INCOME, OF_AGENTS
 from cprl.measuring.series import OF_GROUP, STEPS, Recent, mean_of
-from cprl.measuring.windows import Values
+from cprl.values.arrays import Float64
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import JOINT, RANDOM_PLAY
 
@@ -38,7 +37,7 @@ class View:
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Add an episode of a replica."""
 
-    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: Mapping[str, Float64]) -> None:
         """Add an episode that all replicas have ended; see `cprl.training.Callback`."""
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
@@ -88,7 +87,7 @@ class Plots(View):
                 f"{RANDOM_PLAY}/{name}", ([0, 0], [0, 1], [0, 0]), points, live_only=True
             )
 
-    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: Mapping[str, Float64]) -> None:
         curves = self._logger.curves
         if curves.unit == "return":
             numbers = {**numbers, INCOME: np.sum([numbers[f"{name}/return"] for name in curves.agents], 0)}
@@ -118,7 +117,7 @@ class JointActions(View):
         self._worlds = np.arange(curves.replicas * curves.worlds)
         self._places = actions ** np.arange(len(curves.agents))[::-1]
         self._counts = np.zeros((len(self._worlds), len(curves.joint)))
-        self._shares: dict[int, list[NDArray[np.float64]]] = {}
+        self._shares: dict[int, list[Float64]] = {}
         """Of the episodes that replicas have ended, by the number of W episodes."""
         self._recent = [Recent(curves.mean_over, each=curves.worlds) for _ in curves.joint]
 
@@ -133,7 +132,7 @@ class JointActions(View):
             self._shares.setdefault(together, []).append(counts / counts.sum())
         counts[:] = 0
 
-    def on_numbers(self, episode: int, numbers: Mapping[str, Values]) -> None:
+    def on_numbers(self, episode: int, numbers: Mapping[str, Float64]) -> None:
         if shares := self._shares.pop(episode // self._logger.curves.worlds, None):
             means = zip(self._recent, np.mean(shares, 0), strict=True)
             self._logger.log_lines(JOINT, [recent.add(share) for recent, share in means])

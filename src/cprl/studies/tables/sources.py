@@ -15,7 +15,7 @@ from cprl.envs.unwrap import clock_in
 from cprl.experiment import Experiment
 from cprl.measuring.outcome import RULE, outcome_of
 from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, INCOME_EQUALITY, INSTITUTIONS, METRICS, TOTALS
-from cprl.measuring.table import WINDOWS, Numbers, by_replica, complete, metrics_in, where, world_of
+from cprl.measuring.table import WINDOWS, by_replica, complete, metrics_in, where, world_of
 from cprl.measuring.windows import episodes_after, rounds_of
 from cprl.population import any_learns
 from cprl.runs.checkpoints import REPORT
@@ -42,6 +42,7 @@ from cprl.studies.tables.table import (
 from cprl.studies.trials import State, trials_of
 from cprl.system.output import legible
 from cprl.values import Positive, checked
+from cprl.values.arrays import Int64
 
 REASONS: Final[dict[State, str]] = {
     "missing": "was not begun",
@@ -299,7 +300,7 @@ def _labels_of(source: Source, part: str) -> dict[str, str]:
     return {"condition": source.condition, "checksum": source.checksum, "run": source.name, "part": part}
 
 
-def _places(world: Numbers, window: int) -> Numbers:
+def _places(world: Int64, window: int) -> Int64:
     """Return the number of the window of each episode of a replica, [E]."""
     lanes = len(np.unique(world))
     if lanes == 1 or window == 1:

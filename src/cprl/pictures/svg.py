@@ -1,21 +1,21 @@
-"""A board as a picture (SVG)."""
+"""The board of a map as SVG."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from cprl.commons.colours import APPLE, GROUND, PALETTE, WALL, WASTE, WATER, Colour, agent_colour
-
-if TYPE_CHECKING:
-    from cprl.commons.maps import Map
+from cprl.commons.cells import APPLE, GROUND, WALL, WASTE, WATER, Colour
+from cprl.commons.maps import Map
+from cprl.pictures.colours import PALETTE, agent_colour
 
 _CELL: Final = 20
 _WIDEST: Final = 640
-"""Pixels."""
+"""The pixels of a cell, and the largest width of a picture in pixels."""
 
 
-def board_svg(board: "Map") -> str:
-    """A board as an episode begins, all apples on it, as SVG."""
-    wide, high = board.width * _CELL, board.height * _CELL
+def board_svg(board: Map) -> str:
+    """Return a board as an episode begins, all apples on it, as SVG."""
+    wide = board.width * _CELL
+    high = board.height * _CELL
     parts = [_square((0, 0), PALETTE[GROUND], across=wide, down=high)]
     for places, kind, inset in (
         (board.walls, WALL, 0),
@@ -26,7 +26,8 @@ def board_svg(board: "Map") -> str:
         parts += [_square(place, PALETTE[kind], inset=inset) for place in places]
     for agent, (row, col, heading) in enumerate(board.starts):
         parts.append(_square((row, col), agent_colour(agent), inset=1))
-        x, y = (col + 0.5) * _CELL, (row + 0.5) * _CELL
+        x = (col + 0.5) * _CELL
+        y = (row + 0.5) * _CELL
         tip = f'<path d="M0 -9l3 4h-6z" transform="translate({x:g} {y:g}) rotate({90 * heading})"/>'
         parts.append(tip + f'<text x="{x:g}" y="{y:g}">{agent}</text>')
     return (
@@ -40,6 +41,7 @@ def board_svg(board: "Map") -> str:
 def _square(
     place: Sequence[int], colour: Colour, *, inset: int = 0, across: int = _CELL, down: int = _CELL
 ) -> str:
-    x, y = place[1] * _CELL + inset, place[0] * _CELL + inset
+    x = place[1] * _CELL + inset
+    y = place[0] * _CELL + inset
     fill = "".join(f"{part:02x}" for part in colour)
     return f'<rect x="{x}" y="{y}" width="{across - 2 * inset}" height="{down - 2 * inset}" fill="#{fill}"/>'

@@ -24,7 +24,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cprl.theory.payoff_table import PayoffTable, Values, mixture_of
+from cprl.experimental.payoff_table import PayoffTable, mixture_of
+from cprl.values.arrays import Float64
 
 _PACKAGES: Final = {"open_spiel": "alpha-rank and replicator dynamics", "nashpy": "equilibria"}
 MOST_STRATEGIES: Final = 6
@@ -48,9 +49,9 @@ _SAME_END: Final = 0.01
 class Equilibrium:
     """What two agents play, so that neither gains if it alone plays anything else."""
 
-    first: Values
+    first: Float64
     """float64 [S], the shares of the strategies that one agent plays."""
-    second: Values
+    second: Float64
     """float64 [S], those of the other."""
 
     @property
@@ -92,9 +93,9 @@ def equilibria(table: PayoffTable) -> tuple[Equilibrium, ...]:
 class AlphaRank:
     """How often compositions and strategies are seen in the long run."""
 
-    compositions: Values
+    compositions: Float64
     """float64 [C], of the rows of the table; sums to 1."""
-    shares: Values
+    shares: Float64
     """float64 [S], the mean share of the agents that play a strategy; sums to 1."""
 
 
@@ -123,7 +124,7 @@ def alpha_rank(table: PayoffTable) -> AlphaRank:
     return AlphaRank(compositions=frequencies, shares=frequencies @ table.counts / table.agents)
 
 
-def _long_run(table: PayoffTable) -> Values:
+def _long_run(table: PayoffTable) -> Float64:
     """The share of each profile of N agents, [S^N], the last agent's strategy changing fastest."""
     rank = extra("open_spiel.python.egt.alpharank")
     tables = [_heuristic(table.normalised)] * table.agents
@@ -135,9 +136,9 @@ def _long_run(table: PayoffTable) -> Values:
     raise last
 
 
-def _shares(measured: Any) -> Values:
-    shares: Values = np.maximum(np.asarray(measured, dtype=np.float64), 0.0)
-    whole: Values = shares / shares.sum()
+def _shares(measured: Any) -> Float64:
+    shares: Float64 = np.maximum(np.asarray(measured, dtype=np.float64), 0.0)
+    whole: Float64 = shares / shares.sum()
     return whole
 
 
@@ -149,7 +150,7 @@ def _heuristic(table: PayoffTable) -> Any:
     return made
 
 
-def replicator(table: PayoffTable, mixture: ArrayLike) -> Values:
+def replicator(table: PayoffTable, mixture: ArrayLike) -> Float64:
     """How fast the shares of the strategies change, float64 [S], which sums to 0: by OpenSpiel.
 
     Args:
@@ -164,9 +165,9 @@ def replicator(table: PayoffTable, mixture: ArrayLike) -> Values:
 class Ends:
     """Where replicator dynamics end."""
 
-    mixtures: Values
+    mixtures: Float64
     """float64 [K, S], the points of rest that were reached, the most frequent first."""
-    shares: Values
+    shares: Float64
     """float64 [K], of the starts that end there."""
     unsettled: float
     """The share of the starts that go on for ever, or for very long."""
@@ -181,7 +182,7 @@ def replicator_ends(table: PayoffTable, *, starts: int = STARTS, seed: int = 0) 
     rng = np.random.default_rng(seed)
     reached = [_end(table, mixture) for mixture in rng.dirichlet(np.ones(table.strategies), starts)]
     settled = [mixture for mixture in reached if mixture is not None]
-    groups: list[list[Values]] = []
+    groups: list[list[Float64]] = []
     for mixture in settled:
         near = [group for group in groups if np.abs(group[0] - mixture).max() < _SAME_END]
         if near:
@@ -196,7 +197,7 @@ def replicator_ends(table: PayoffTable, *, starts: int = STARTS, seed: int = 0) 
     )
 
 
-def _end(table: PayoffTable, start: Values) -> Values | None:
+def _end(table: PayoffTable, start: Float64) -> Float64 | None:
     """Where the dynamics end, or None if they are not at rest after a long time.
 
     Shares hardly change where a strategy that gets more is rare, too; that is no rest.
@@ -205,11 +206,11 @@ def _end(table: PayoffTable, start: Values) -> Values | None:
 
     scaled, flow = table.normalised, extra("open_spiel.python.egt.dynamics").replicator
 
-    def speed(_: float, cells: Values) -> Values:
+    def speed(_: float, cells: Float64) -> Float64:
         shares = _shares(cells)
         return np.asarray(flow(shares, scaled.against_shares(shares)), dtype=np.float64)
 
-    def is_at_rest(cells: Values) -> bool:
+    def is_at_rest(cells: Float64) -> bool:
         shares = _shares(cells)
         payoffs = scaled.against_shares(shares)
         gains = payoffs - shares @ payoffs

@@ -1,14 +1,15 @@
 """Games of people who share a resource: agents choose at once how much they take, once or several times."""
 
-from dataclasses import KW_ONLY, dataclass
-from typing import Annotated, Final, NamedTuple
+from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass, fields
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
 import torch
+from sharing_games import Above0, SharingGame, of_table
+from stage_games import StageGame
 from torch import Tensor
 
-from cprl.envs.stage_games import StageGame
-from cprl.theory.sharing import Above0, SharingGame
 from cprl.values import Range
 
 _MOST_TOTALS: Final = 2**22
@@ -20,18 +21,19 @@ most that it can take, and the share that all took of the most that all can take
 
 @dataclass(frozen=True)
 class TakingGame(StageGame):
-    """A `cprl.theory.SharingGame` that agents play: all choose at once how much they take of what they share.
+    """A `SharingGame` that agents play: all choose at once how much they take of what they share.
 
     Agents are paid `SharingGame.payoffs`. They choose one of `levels` evenly spaced amounts from 0 to
     `most_each`. Of each remembered turn, the last one first, agents observe the numbers of `OBSERVED`, all
     0 for a turn before the first. When it ends, see `StageGame`.
 
     A recipe holds games whose worth is a `PowerWorth`. A worth of your own, e.g. a `CallableWorth`, can be
-    played; in an experiment the game is then a `Custom` of a function that makes it.
+    played; in an experiment the game is then a `Custom` of a function that makes it. A recipe has `sharing`
+    as a table of its fields, of which the game can be made too.
     """
 
     sharing: SharingGame
-    """What agents are paid, and how many they are; e.g. `cprl.theory.herders(5)`."""
+    """What agents are paid, and how many they are; e.g. `herders(5)`."""
     _: KW_ONLY
     levels: Annotated[int, Range(2, 2**16)] = 21
     """From how many evenly spaced amounts an agent chooses, 0 the first."""
@@ -40,6 +42,8 @@ class TakingGame(StageGame):
     or what the game itself allows, `SharingGame.most_each`, if that is less."""
 
     def __post_init__(self) -> None:
+        if isinstance(self.sharing, Mapping):
+            object.__setattr__(self, "sharing", of_table(SharingGame, self.sharing, "TakingGame.sharing"))
         super().__post_init__()
         limit = self.sharing.most_each
         if self.most is None and self.sharing.nash_total <= 0:
@@ -53,6 +57,11 @@ class TakingGame(StageGame):
                 f"TakingGame.levels is {self.levels}; allowed for {self.agents:,} agents: so many that they "
                 f"have fewer than {_MOST_TOTALS:,} totals"
             )
+
+    def to_config(self) -> dict[str, Any]:
+        """Return the arguments that make it, as a recipe holds them."""
+        arguments = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {**arguments, "sharing": self.sharing.to_config()}
 
     @property
     def agents(self) -> int:

@@ -7,11 +7,11 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from html import escape
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
-from cprl.commons.svg import board_svg
+from cprl.commons.game import Game
 from cprl.institutions import (
     Boundaries,
     ClosedPatches,
@@ -30,27 +30,27 @@ from cprl.institutions import (
 )
 from cprl.institutions.base import Kind
 from cprl.institutions.monitoring import ELECTED
-
-if TYPE_CHECKING:
-    from cprl.commons.game import Game
+from cprl.pictures.svg import board_svg
 
 
-def game_html(game: "Game", own: str = "") -> str:
-    """A game's board and its rules in words, as HTML; `own`: rules of the user's own, in words."""
-    rules = "; ".join(filter(None, (rules_of(game), own))) or NO_RULES
+def game_html(game: Game, own_rules: str = "") -> str:
+    """Return a game's board and rules in words, as HTML; `own_rules`: rules of the user's own, in words."""
+    rules = "; ".join(filter(None, (rules_of(game), own_rules))) or NO_RULES
     return f"<p>{escape(growth_of(game))} Rules: {escape(rules)}.</p>{board_svg(game.map)}"
 
 
 NO_RULES: Final = "none beyond the game"
 
 
-def growth_of(game: "Game") -> str:
-    """How apples grow back, for readers who see the game for the first time."""
-    rules, probs = game.rules, game.rules.regrow_prob
-    if game.map.river:
+def growth_of(game: Game) -> str:
+    """Say how apples grow back, for readers who see the game for the first time."""
+    rules = game.rules
+    river = rules.river
+    probs = rules.regrow_prob
+    if river is not None:
         return (
             "Agents pick apples. Apples grow slower the more waste is in the river, and not at all where it "
-            f"covers {_percent(rules.pollution_limit)} of it{'; agents can clean it' * rules.may_clean}."
+            f"covers {_percent(river.pollution_limit)} of it{'; agents can clean it' * river.may_clean}."
         )
     if not any(probs):
         return "Agents pick apples, which do not grow back."
@@ -64,22 +64,22 @@ def growth_of(game: "Game") -> str:
     )
 
 
-def rules_of(game: "Game | None") -> str:
-    """The institutions of a game, each with its first number and all that are not the defaults, e.g.
+def rules_of(game: Game | None) -> str:
+    """Name the institutions of a game, each with its first number and all that are not the defaults, e.g.
     "quota (share 0.25, fine 2), monitoring (prob 0.5)"."""
     return ", ".join(rule_of(institution) for institution in (game.institutions if game else ()))
 
 
 def rule_of(institution: Institution, *, is_voted_on: bool = False) -> str:
-    """An institution with its first number and all that are not the defaults; without a rate or share that
-    is not used, since it is voted on or there are brackets."""
+    """Name an institution with its first number and all that are not the defaults; without a rate or share
+    that is not used, since it is voted on or there are brackets."""
     words = in_lower_case(type(institution).__name__)
     has_brackets = isinstance(institution, Tax) and len(institution.brackets) > 0
     unused = {"rate", "share"} if is_voted_on or has_brackets else set[str]()
     settings: list[str] = []
     for field in fields(institution):
         value = getattr(institution, field.name)
-        numbers = [one for one in (value if isinstance(value, tuple) else (value,)) if _is_number(one)]
+        numbers = _numbers(value)
         if isinstance(value, Institution):
             settings.append(f"on {rule_of(value, is_voted_on=True)}")
         elif numbers and field.name not in unused and (value != field.default or not (settings or unused)):
@@ -87,31 +87,33 @@ def rule_of(institution: Institution, *, is_voted_on: bool = False) -> str:
     return f"{words} ({', '.join(settings)})" if settings else words
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+def _numbers(value: object) -> list[float]:
+    """Return the numbers that a field holds: those of a tuple, or the value itself if it is one."""
+    values = value if isinstance(value, tuple) else (value,)
+    return [each for each in values if isinstance(each, int | float) and not isinstance(each, bool)]
 
 
 def in_lower_case(name: str) -> str:
-    """The name of a class in words, e.g. "closed season"."""
+    """Return the name of a class in words, e.g. "closed season"."""
     return re.sub("(?<=[a-z])(?=[A-Z])", " ", name).lower()
 
 
-def tag_of(game: "Game") -> str:
-    """What it takes to tag an agent in this game and what that does to it, e.g. "after 2 hits an agent leaves
-    the board for 24 turns"; "" where nobody can be tagged, or nothing follows."""
+def tag_of(game: Game) -> str:
+    """Say what it takes to tag an agent in this game and what that does to it, e.g. "after 2 hits an agent
+    leaves the board for 24 turns"; "" where nobody can be tagged, or nothing follows."""
     rules = game.rules
     if not rules.may_fire or game.agents == 1:
         return ""
     sanctions = _sanctions_of_tags(game)
     punishment = _first(game, Punishment)
-    missed = turns_missed(game, sanctions)
+    missed = _turns_missed(game, sanctions)
     effects = []
     if punishment is not None and punishment.fine:
         effects.append(f"is fined {_apples(punishment.fine)} by each who tags it")
     if sanctions is not None and any(sanctions.fines):
         effects.append(f"pays {_by_level(sanctions.fines, 'apple')}")
     if any(missed):
-        place = "" if rules.pairwise_clashes else ", longer while its cell is taken"
+        place = "" if rules.clashes == "pairwise" else ", longer while its cell is taken"
         place = " and returns at a free spawn place" if rules.respawn_at_spawns else place
         effects.append(f"leaves the board for {_missed(missed, sanctions)}{place}")
     elif rules.respawn_at_spawns:
@@ -120,26 +122,28 @@ def tag_of(game: "Game") -> str:
     return f"{who} {' and '.join(effects)}" if effects else ""
 
 
-def turns_missed(game: "Game", sanctions: GraduatedSanctions | None) -> tuple[int, ...]:
-    """The turns that an agent misses after a tag, or after any other offence, by the level of sanctions, and
-    by who tags it where sanctions have a table."""
+def _turns_missed(game: Game, sanctions: GraduatedSanctions | None) -> tuple[int, ...]:
+    """Return the turns that an agent misses after a tag, or after any other offence, by the level of
+    sanctions, and by who tags it where sanctions have a table."""
     steps = np.ravel(game.rules.freeze_steps if sanctions is None else sanctions.freeze_steps).tolist()
-    return tuple(max(0, each - game.rules.freeze_counts_tag_turn) for each in steps)
+    quirks = game.rules.quirks
+    counts_tag_turn = quirks is not None and quirks.freeze_counts_tag_turn
+    return tuple(max(0, each - counts_tag_turn) for each in steps)
 
 
-def _sanctions_of_tags(game: "Game") -> GraduatedSanctions | None:
-    """The sanctions of a game that take the place of `Rules.freeze_steps`."""
+def _sanctions_of_tags(game: Game) -> GraduatedSanctions | None:
+    """Return the sanctions of a game that take the place of `Rules.freeze_steps`."""
     sanctions = _first(game, GraduatedSanctions)
     return None if sanctions is None or sanctions.on == "violations" else sanctions
 
 
-def _first(game: "Game", kind: type[Kind]) -> Kind | None:
-    """The institution of a kind of which a game has one at most."""
-    return next((one for one in game.institutions if isinstance(one, kind)), None)
+def _first(game: Game, kind: type[Kind]) -> Kind | None:
+    """Return the institution of a kind of which a game has one at most."""
+    return next((each for each in game.institutions if isinstance(each, kind)), None)
 
 
-def meaning_of(institution: Institution, game: "Game") -> str:
-    """What an institution does in this game, in sentences for readers who do not know its settings."""
+def meaning_of(institution: Institution, game: Game) -> str:
+    """Say what an institution does in this game, in sentences for readers who do not know its settings."""
     match institution:
         case Boundaries():
             return _boundaries(institution, game)
@@ -181,10 +185,10 @@ def meaning_of(institution: Institution, game: "Game") -> str:
             return words + f" Each shot costs {_number(shot_cost)}." * (shot_cost > 0)
         case Sanctioner():
             return _sanctioner(institution)
-    raise TypeError(f"{type(institution).__name__} has no sentence in cprl.commons.readable")
+    raise TypeError(f"{type(institution).__name__} has no sentence in cprl.pictures.readable")
 
 
-def _boundaries(boundaries: Boundaries, game: "Game") -> str:
+def _boundaries(boundaries: Boundaries, game: Game) -> str:
     bite = boundaries.bite_fine
     step = boundaries.step_fine
     may_not = "cannot" if bite is None else "may not"
@@ -194,20 +198,20 @@ def _boundaries(boundaries: Boundaries, game: "Game") -> str:
     return f"{words} A turn that ends in another's region {_costs(step, game)}."
 
 
-def _quota_unit(quota: Quota, game: "Game") -> float:
-    """The apples that an agent may pick in a window of turns where the quota's share is 1."""
+def _quota_unit(quota: Quota, game: Game) -> float:
+    """Return the apples that an agent may pick in a window of turns where the quota's share is 1."""
     return game.sustainable_yield * quota.window_steps / game.agents
 
 
-def _quota(quota: Quota, game: "Game", most: str) -> str:
-    """What a quota of at most so much means."""
+def _quota(quota: Quota, game: Game, most: str) -> str:
+    """Say what a quota of at most so much means."""
     fewer = ", fewer if the board is not full when it begins" if quota.by_stock else ""
     words = f"Each agent may pick at most {most} in each window of {_turns(quota.window_steps)}{fewer}."
     return words + (" More cannot be picked." if quota.is_stopped else _breach(quota.fine, game))
 
 
 def _tax(tax: Tax, rate: str = "") -> str:
-    """What a tax means; `rate`: what is said of it where it is voted on."""
+    """Say what a tax means; `rate`: what is said of it where it is voted on."""
     goes = "shared equally among all" if tax.redistribution == "equal" else "lost"
     if not tax.brackets:
         return f"{rate or _percent(tax.rate)} of what each agent picks is taken and {goes}."
@@ -216,7 +220,7 @@ def _tax(tax: Tax, rate: str = "") -> str:
     return f"{words}: {brackets}."
 
 
-def _vote(vote: Vote, game: "Game") -> str:
+def _vote(vote: Vote, game: Game) -> str:
     choices = ", ".join(map(_number, vote.choices))
     words = f"Agents vote on {vote.on.voted_on}, {choices}, {_every(vote.period_episodes)}: the median counts"
     words += _override(vote.override_prob)
@@ -233,14 +237,14 @@ def _sanctioner(sanctioner: Sanctioner) -> str:
     return f"{words}{_override(sanctioner.override_prob)}."
 
 
-def _graduated_sanctions(sanctions: GraduatedSanctions, game: "Game") -> str:
-    is_broken = any(one.can_be_broken for one in game.institutions)
+def _graduated_sanctions(sanctions: GraduatedSanctions, game: Game) -> str:
+    is_broken = any(institution.can_be_broken for institution in game.institutions)
     offences = []
     if sanctions.on != "violations" and game.rules.may_fire:
         offences.append("to be tagged")
     if sanctions.on != "tags" and is_broken:
         offences.append(f"a turn in which it breaks a rule{_noticed(game)}")
-    turns = _missed(turns_missed(game, sanctions), sanctions)
+    turns = _missed(_turns_missed(game, sanctions), sanctions)
     words = f"An agent's offences ({' or '.join(offences)}) cost it a time-out of {turns}"
     words += f" and {_by_level(sanctions.fines, 'apple')}" * any(sanctions.fines)
     if sanctions.recovery_steps is None:
@@ -249,20 +253,20 @@ def _graduated_sanctions(sanctions: GraduatedSanctions, game: "Game") -> str:
 
 
 def _may(fine: float | None) -> str:
-    """Whether something cannot be done, or may not be, at a price."""
+    """Return "can" where a rule stops what it forbids, "may" where that has a price."""
     return "can" if fine is None else "may"
 
 
-def _breach(fine: float | None, game: "Game") -> str:
-    """What happens to who picks against a rule, after the sentence about the rule; "" if nobody can."""
+def _breach(fine: float | None, game: Game) -> str:
+    """Say what happens to who picks against a rule, after the sentence about the rule; "" if nobody can."""
     return "" if fine is None else f" Each apple picked against this rule {_costs(fine, game)}."
 
 
-def _costs(fine: float, game: "Game") -> str:
+def _costs(fine: float, game: Game) -> str:
     return f"costs {_apples(fine)}{_noticed(game)}" if fine else "is a violation, but costs nothing by itself"
 
 
-def _noticed(game: "Game") -> str:
+def _noticed(game: Game) -> str:
     return " if it is noticed" if _first(game, Monitoring) else ""
 
 
@@ -287,14 +291,14 @@ def _agents(indices: Sequence[int]) -> str:
 
 
 def _missed(missed: Sequence[int], sanctions: GraduatedSanctions | None) -> str:
-    """The turns of a time-out, by level, or from the least to the most where they depend on who tags, too."""
+    """Say the turns of a time-out, by level; the least and the most where they depend on who tags, too."""
     if sanctions is not None and sanctions.is_table:
         return f"{min(missed):,} to {_turns(max(missed))}, by who tags it and how often it was tagged"
     return _by_level(missed, "turn")
 
 
 def _by_level(numbers: Sequence[float], unit: str) -> str:
-    """The amounts of levels, e.g. "4 turns (24, then 99 as offences add up)"; the last one holds for all
+    """Say the amounts of levels, e.g. "4 turns (24, then 99 as offences add up)"; the last one holds for all
     higher levels."""
     levels = [*numbers]
     while len(levels) > 1 and levels[-1] == levels[-2]:
@@ -323,12 +327,12 @@ def _percent(share: float) -> str:
     return f"{_number(100 * share)}%"
 
 
-def legend_of(games: Iterable["Game"]) -> str:
-    """What the signs on the boards of these games mean, in sentences; only signs that can appear."""
+def legend_of(games: Iterable[Game]) -> str:
+    """Say what the signs on the boards of these games mean, in sentences; only signs that can appear."""
     return " ".join(dict.fromkeys(sign for game in games for sign in _signs(game)))
 
 
-def _signs(game: "Game") -> list[str]:
+def _signs(game: Game) -> list[str]:
     signs = [
         "A number on a colour is an agent, its triangle points where it looks.",
         "Green is an apple, dim a place without one.",

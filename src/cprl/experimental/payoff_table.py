@@ -17,12 +17,10 @@ from math import comb, factorial, prod
 from typing import Annotated, Final, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cprl.values import Range, checked, refusal
-
-Counts = NDArray[np.int64]
-Values = NDArray[np.float64]
+from cprl.values.arrays import Float64, Int64
 
 MOST_COMPOSITIONS: Final = 100_000
 _SUM: Final = 1e-6
@@ -31,7 +29,7 @@ _ROUNDING: Final = 1e-9
 """Of payoffs, as a share of their range."""
 
 
-def compositions(agents: int, strategies: int) -> Counts:
+def compositions(agents: int, strategies: int) -> Int64:
     """How many of N agents play each of S strategies, int64 [C, S], every way once; the first row has all of
     them play strategy 0, the last one the last strategy.
     """
@@ -53,7 +51,7 @@ class PayoffTable:
 
     agents: int
     """The number of agents N, at least 2."""
-    payoffs: Values
+    payoffs: Float64
     """float64 [C, S], in units of one's own: what an agent gets who plays a strategy, for each row of
     `counts`; finite where somebody plays it, elsewhere whatever is given becomes NaN."""
 
@@ -88,7 +86,7 @@ class PayoffTable:
         return int(self.payoffs.shape[1])
 
     @cached_property
-    def counts(self) -> Counts:
+    def counts(self) -> Int64:
         """int64 [C, S]: how many agents play each strategy."""
         return compositions(self.agents, self.strategies)
 
@@ -98,15 +96,15 @@ class PayoffTable:
         return {tuple(counts): row for row, counts in enumerate(self.counts.tolist())}
 
     @cached_property
-    def deviations(self) -> Values:
+    def deviations(self) -> Float64:
         """float64 [C', S]: what an agent gets who plays a strategy, by how many of the other N - 1 play each,
         in the rows of `compositions(N - 1, S)`."""
         rows = [[self.rows[counts] for counts in self._with_one_more(others)] for others in self._others[0]]
-        values: Values = self.payoffs[rows, np.arange(self.strategies)]
+        values: Float64 = self.payoffs[rows, np.arange(self.strategies)]
         return values
 
     @cached_property
-    def pairs(self) -> Values:
+    def pairs(self) -> Float64:
         """float64 [S, S]: entry [i, j] is what one agent gets who plays i, where all others play j."""
         others, _ = self._others
         alike = [int(others[:, strategy].argmax()) for strategy in range(self.strategies)]
@@ -124,7 +122,7 @@ class PayoffTable:
         low, high = float(np.nanmin(self.payoffs)), float(np.nanmax(self.payoffs))
         return PayoffTable(agents=self.agents, payoffs=(self.payoffs - low) / ((high - low) or 1.0))
 
-    def against(self, mixture: ArrayLike) -> Values:
+    def against(self, mixture: ArrayLike) -> Float64:
         """What an agent gets by its strategy, float64 [S], if each of the others plays one by chance.
 
         It is the mean over what the N - 1 others play, so it is also defined for strategies that nobody
@@ -133,14 +131,14 @@ class PayoffTable:
         """
         return self.against_shares(mixture_of(mixture, self.strategies))
 
-    def against_shares(self, shares: Values) -> Values:
+    def against_shares(self, shares: Float64) -> Float64:
         """`against`, of float64 [S] that is known to be shares."""
         others, ways = self._others
-        values: Values = (ways * np.prod(shares**others, axis=1)) @ self.deviations
+        values: Float64 = (ways * np.prod(shares**others, axis=1)) @ self.deviations
         return values
 
     @cached_property
-    def _others(self) -> tuple[Counts, Values]:
+    def _others(self) -> tuple[Int64, Float64]:
         """What the N - 1 others may play, and in how many ways, [C', S] and [C']."""
         others = compositions(self.agents - 1, self.strategies)
         ways = [factorial(self.agents - 1) // prod(map(factorial, counts)) for counts in others.tolist()]
@@ -159,12 +157,12 @@ class PayoffTable:
         }
         return [counts for counts in self.rows if counts not in left]
 
-    def _with_one_more(self, others: Counts) -> list[tuple[int, ...]]:
+    def _with_one_more(self, others: Int64) -> list[tuple[int, ...]]:
         """The counts if one more agent plays each strategy in turn."""
         return list(map(tuple, (others + np.eye(self.strategies, dtype=np.int64)).tolist()))
 
 
-def mixture_of(mixture: ArrayLike, strategies: int) -> Values:
+def mixture_of(mixture: ArrayLike, strategies: int) -> Float64:
     """Shares of strategies, float64 [S], that sum to 1."""
     shares = np.asarray(mixture, np.float64)
     is_mixture = shares.shape == (strategies,) and (shares >= 0).all() and abs(shares.sum() - 1) < _SUM

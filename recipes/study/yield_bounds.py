@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from cprl.commons.maps import Map
 from cprl.commons.near import bites_at_once, growth, kept_rates, patches, sites_around
 from cprl.commons.rules import Rules
+from cprl.commons.yields import check_proven
 
 NODES: Final = 500
 """Of the search in each patch of sites, by default: enough for a proof on those of all published boards."""
@@ -60,6 +61,7 @@ def yield_bounds(board: Map, rules: Rules, *, nodes: int = NODES) -> YieldBounds
             f"Map.river has {len(board.river)} cells, whose waste keeps apples from growing; allowed: a map "
             "without a river"
         )
+    check_proven(rules)
     around = sites_around(board, rules)
     of_site, rows = growth(rules, np.array(list(map(len, around)), np.int32))
     probs = np.broadcast_to(rows[of_site], (len(around), rows.shape[1]))

@@ -7,28 +7,30 @@ Sources: Foerster et al. (2018), "Learning with Opponent-Learning Awareness", AA
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any, Final, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 import torch
+from stage_games import StageGame
 from torch import Tensor
 
-from cprl.envs.stage_games import StageGame
 from cprl.values import MOST_NUMBER, refusal
 
 _MOST_PAYOFFS: Final = 2**16
+_MOST_NAMED: Final = 16
+"""Joint actions that have a name each."""
 
 
 @dataclass(frozen=True)
 class MatrixGame(StageGame):
-    """A game of N agents who choose among A actions each, at once, and are paid by a table. When it ends, see
-    `StageGame`.
+    """A game of N agents who choose among A actions each, at once, and are paid by a table.
 
-    Of each remembered joint action, the last one first, agents observe A**N + 1 numbers of which one is 1.
-    Each agent sees joint actions from its own side: its own action first, then those of the following
-    agents, cyclically. Of two agents with two actions, agent 0 sees the joint action (1, 0) as number 2 of
-    0..3, agent 1 as number 1. The number A**N stands for a turn before the first.
+    When it ends, see `StageGame`. Of each remembered joint action, the last one first, agents observe
+    A**N + 1 numbers of which one is 1. Each agent sees joint actions from its own side: its own action first,
+    then those of the following agents, cyclically. Of two agents with two actions, agent 0 sees the joint
+    action (1, 0) as number 2 of 0..3, agent 1 as number 1. The number A**N stands for a turn before the
+    first.
     """
 
     payoffs: Any
@@ -48,6 +50,26 @@ class MatrixGame(StageGame):
     def actions(self) -> int:
         """The number of actions A of each agent."""
         return len(self.payoffs)
+
+    @property
+    def joint_actions(self) -> tuple[str, ...]:
+        """The joint actions of a small game in letters, that of agent 0 first: C and D in a social dilemma of
+        two, where both are paid more if both choose action 0, else A and so on. None of a large game."""
+        if self.actions**self.agents > _MOST_NAMED:
+            return ()
+        letters = "CD" if self._is_dilemma else "ABCDEFGHIJKLMNOP"[: self.actions]
+        return tuple(map("".join, product(letters, repeat=self.agents)))
+
+    @property
+    def _is_dilemma(self) -> bool:
+        """Whether two agents with the same payoffs are paid more if both choose action 0, and one is tempted
+        by action 1 or fears the other's."""
+        payoffs = np.array(self.payoffs)
+        if payoffs.shape != (2, 2, 2) or not (payoffs[..., 0] == payoffs[..., 1].T).all():
+            return False
+        (reward, sucker), (temptation, punishment) = payoffs[..., 0]
+        is_better = reward > max(punishment, sucker)
+        return bool(is_better and (temptation > reward or punishment > sucker))
 
     def tables(self, device: torch.device) -> "_Tables":
         joint, agents = self.actions**self.agents, torch.arange(self.agents)
@@ -94,12 +116,11 @@ def _table(payoffs: Any) -> tuple[Any, ...]:
         raise ValueError(f"{name} has {table.size:,} numbers; allowed: up to {_MOST_PAYOFFS:,}")
     if not (np.abs(table) <= MOST_NUMBER).all():
         raise ValueError(f"{name} has {np.abs(table).max():g}; allowed: numbers up to {MOST_NUMBER:g}")
-    return tuple(map(nested_tuples, table.tolist()))
+    return tuple(map(_nested_tuples, table.tolist()))
 
 
-def nested_tuples(value: Any) -> Any:
-    """Return lists in lists as tuples in tuples."""
-    return tuple(map(nested_tuples, value)) if isinstance(value, list) else value
+def _nested_tuples(value: Any) -> Any:
+    return tuple(map(_nested_tuples, value)) if isinstance(value, list) else value
 
 
 class Clock(TypedDict, total=False):

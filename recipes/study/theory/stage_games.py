@@ -1,4 +1,8 @@
-"""Stage games: all that happens is the agents' joint action, once or for several turns; B worlds at once."""
+"""Stage games: all that happens is the agents' joint action, once or for several turns; B worlds at once.
+
+Games of one's own: frozen values with `agents`, `to_config` and `make`, as `cprl.envs.make_env` asks for.
+matrix_games.py and taking_games.py have such games; cprl itself knows none of them.
+"""
 
 from dataclasses import dataclass
 from math import log1p
@@ -21,13 +25,13 @@ _REPLACED: Final = frozenset(
     (keys.AGENTS, keys.DONE, keys.TERMINATED, keys.TRUNCATED, "next", "_reset", "observation", "reward")
 )
 """The entries that the environment writes anew in each turn."""
-_LENGTH: Final = np.uint64(5 << 28)
-"""The first counter of the draw of how many turns an episode lasts; `cprl.commons.chance` has it for spawn
-places, of which these games have none."""
+_EPISODE_LENGTH: Final = np.uint64(15 << 28)
+"""The purpose of the only draw, of how many turns an episode lasts: the last of the 16 that four bits hold.
+`cprl.commons.chance` counts those of a commons from 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class StageGame(Value, stored=False):
+class StageGame(Value):
     """A game of N agents who act at once, for one turn or several: what `StageEnv` asks of a game.
 
     An episode of one turn terminates. One of several is truncated: its end is a clock that nobody sees, so
@@ -49,12 +53,17 @@ class StageGame(Value, stored=False):
             raise ValueError(f"{name}.continue_prob is {self.continue_prob}; allowed for one turn: 1.0")
 
     @property
+    def joint_actions(self) -> tuple[str, ...]:
+        """The names of the joint actions, which the viewer plots; () for no plot."""
+        return ()
+
+    @property
     def remembered(self) -> int:
         """The number of turns that agents observe: `memory`, or what its default means."""
         return int(self.turns > 1) if self.memory is None else self.memory
 
-    def make(self, worlds: int, seed: int, device: Any, *, first_world: int = 0) -> "StageEnv":
-        """Its environment, so many worlds."""
+    def make(self, worlds: int, seed: int, device: Any, first_world: int = 0) -> "StageEnv":
+        """Return its environment, so many worlds."""
         return StageEnv(self, worlds, seed=seed, device=device, first_world=first_world)
 
     def tables(self, device: torch.device) -> Any:
@@ -102,7 +111,9 @@ class StageEnv(LeanStepEnv):
         first_world = checked("first_world", first_world, Annotated[int, Range(0, 2**32 - 1)])
         device = device_of(device)
         super().__init__(device=device, batch_size=torch.Size([worlds]))
-        self.game, self._first_world = game, first_world
+        self.game = game
+        self.joint_actions = game.joint_actions
+        self._first_world = first_world
         self.group_map = {keys.AGENTS: [f"agent_{agent}" for agent in range(game.agents)]}
         self._agents_size = torch.Size([worlds, game.agents])
         for name, dtype in _STATE.items():
@@ -217,7 +228,7 @@ class StageEnv(LeanStepEnv):
         episode: Any = state["episode"].numpy(force=True).astype(np.uint64)
         world: Any = (np.arange(len(episode)) + self._first_world).astype(np.uint64)[:, None]
         zero = np.zeros_like(episode)
-        word = philox4x32(_LENGTH + zero, zero, episode, world, seed & LOW_WORD, seed >> WORD_BITS)[0]
+        word = philox4x32(_EPISODE_LENGTH + zero, zero, episode, world, seed & LOW_WORD, seed >> WORD_BITS)[0]
         unit = (word.astype(np.float64) + 0.5) / 2**32
         length = 1.0 + np.floor(np.log(unit) / log1p(self.game.continue_prob - 1.0))
         last_turn = np.minimum(length, self.game.turns).astype(np.int64)

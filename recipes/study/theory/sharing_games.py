@@ -6,16 +6,18 @@ an n-th of that: in the symmetric equilibrium v(X) + X v'(X) / n = c, at the gro
 v(X) + X v'(X) = c.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 from functools import cached_property
 from math import inf
-from typing import Annotated, Final, Protocol, runtime_checkable
+from typing import Annotated, Any, Final, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cprl.values import Positive, Range, Value, Where, checked
+
+T = TypeVar("T")
 
 _STEP: Final = 1e-6
 """Of the numerical slope, as a share of the range."""
@@ -76,7 +78,7 @@ class PowerWorth(Value):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CallableWorth(Value, stored=False):
+class CallableWorth(Value):
     """A function of your own: positive below `most`, falling there to 0, and never less steeply."""
 
     function: Callable[[float], float]
@@ -117,13 +119,25 @@ class SharingGame(Value):
     agents: Positive
     """The number of agents n."""
     worth: Worth
-    """v, what a unit is worth."""
+    """v, what a unit is worth; a table of the fields of a `PowerWorth` is made one."""
     cost: Cost
     """c, what a unit costs who takes it."""
     most_each: Above0 | None = None
     """The most that an agent can take; None for as much as it wants."""
     payment: Annotated[float, Range(-_MOST, _MOST)] = 0.0
     """e, what each agent is paid whatever it takes."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.worth, Mapping):
+            object.__setattr__(self, "worth", of_table(PowerWorth, self.worth, "SharingGame.worth"))
+        super().__post_init__()
+
+    def to_config(self) -> dict[str, Any]:
+        """Return the arguments that make it, as JSON can hold them; refuse a worth of your own."""
+        if not isinstance(self.worth, PowerWorth):
+            return super().to_config()  # which refuses it by its place
+        arguments = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {**arguments, "worth": self.worth.to_config()}
 
     def payoffs(self, taken: ArrayLike) -> NDArray[np.float64]:
         """What agents are paid, float64 [..., n].
@@ -242,6 +256,14 @@ def appropriation(
     worth = PowerWorth(top=linear, factor=quadratic, power=1.0)
     tokens, outside = checked("tokens", tokens, Above0), checked("outside", outside, Cost)
     return SharingGame(agents=agents, worth=worth, cost=outside, most_each=tokens, payment=tokens * outside)
+
+
+def of_table(kind: type[T], table: Mapping[str, Any], name: str) -> T:
+    """Return a value of the table of its fields; raise a ValueError with its name for other fields."""
+    try:
+        return kind(**table)
+    except TypeError as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def _root(falling: Callable[[float], float], most: float) -> float:
