@@ -350,14 +350,13 @@ def with_groups(experiment: "Experiment", flags: Sequence[str]) -> "Experiment":
         kinds = [kind for kind in get_args(hint) if is_dataclass(kind)]
         said = [place[3] for place in places if place[:3] == ["__game", "rules", name] and len(place) > 3]
         if kinds and said and getattr(game.rules, name) is None:
-            groups[name] = _group(kinds[0], f"--game.rules.{name}", said)
+            groups[name] = _group(kinds[0], f"--game.rules.{name.replace('_', '-')}", said)
     return replace(experiment, game=replace(game, rules=replace(game.rules, **groups)))
 
 
-def _group(kind: Any, place: str, said: Collection[str]) -> Any:
+def _group(kind: Any, flag: str, said: Collection[str]) -> Any:
     """Make a group of rules of which words set some fields, all that it requires among them."""
     known = [field.name for field in fields(kind)]
-    flag = place.replace("_", "-")
     for name in said:
         if name.removeprefix("no_") not in known:
             raise ValueError(

@@ -30,8 +30,9 @@ def act(world: Worlds, tables: Tables, law: Law | None, actions: Int64, scratch:
     """Let each agent in play turn, fire or move; clashing moves are cancelled later, under "in_turn" at once.
     `actions`: int64 [N].
 
-    No agent moves onto a wall or off the board. An agent that may not fire does not, and its weapon is hot
-    all the same."""
+    No agent moves onto a wall or off the board. An agent that may not fire does not, and has to wait as if it
+    had.
+    """
     if tables.clashes == IN_TURN:
         draw_order(world, scratch)
     for n in range(world.row.shape[0]):

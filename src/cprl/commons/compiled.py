@@ -24,6 +24,7 @@ import numba
 import numpy as np
 from filelock import FileLock
 
+from cprl.institutions.arrays import is_record
 from cprl.system.libraries import relying_on
 from cprl.system.process import cache_folder, obey_parent
 from cprl.system.times import CLOCK
@@ -266,8 +267,7 @@ def compiled_for_cpu(entry: Callable[..., Any], *, inline: bool = True) -> Any:
 
     Args:
         inline: whether the rules become one piece of code, which runs faster and takes so long to compile
-        that
-            a process of its own does it.
+            that a process of its own does it.
     """
     return entry if runs_plain() else _compiled_for_cpu(entry, inline)
 
@@ -325,7 +325,7 @@ def _note_function(function: FunctionType, parts: dict[Any, str]) -> None:
             parts[function] += f" {[_meaning(getattr(value, inner, None)) for inner in names]}"
         if _is_rule(value):
             _note_function(value, parts)
-        elif _is_tuple(value):
+        elif is_record(value):
             _note_tuple(value, parts)
 
 
@@ -335,7 +335,7 @@ def _note_tuple(kind: Any, parts: dict[Any, str]) -> None:
         return
     parts[kind] = f"{_place(kind)} {kind._fields}"
     for hint in get_type_hints(kind).values():
-        for inner in filter(_is_tuple, (hint, *get_args(hint))):
+        for inner in filter(is_record, (hint, *get_args(hint))):
             _note_tuple(inner, parts)
 
 
@@ -345,15 +345,11 @@ def _place(value: Any) -> str:
 
 def _meaning(value: Any) -> str:
     """Return what a name in a rule stands for; modules and builtins are those of the versions installed."""
-    if _is_rule(value) or _is_tuple(value):
+    if _is_rule(value) or is_record(value):
         return _place(value)
     if isinstance(value, np.ndarray):
         return f"{value.dtype} {value.shape} {value.tobytes().hex()}"
     return repr(value) if isinstance(value, int | float | str | tuple | np.generic) else ""
-
-
-def _is_tuple(value: Any) -> bool:
-    return isinstance(value, type) and hasattr(value, "_fields")
 
 
 def _codes(code: CodeType) -> Iterator[CodeType]:

@@ -11,7 +11,7 @@ from cprl.commons.game import Game
 from cprl.commons.rules import GROUPS
 from cprl.commons.world import empty_worlds
 from cprl.institutions import ledger
-from cprl.institutions.arrays import Kept, lasting
+from cprl.institutions.arrays import lasting
 from cprl.institutions.law import MODULES, check_names, new_law
 from cprl.values import shown
 
@@ -49,6 +49,7 @@ def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
             f"{sorted(expected)}"
         )
     arrays = {name: _as_array(name, state[name]) for name in expected}
+    highest = numbers(game)
     for name, (form, how) in expected.items():
         array = arrays[name]
         if array.shape != form.shape or array.dtype != form.dtype:
@@ -56,7 +57,8 @@ def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
                 f"state[{name!r}] is {array.dtype} {list(array.shape)}; allowed: {form.dtype} "
                 f"{list(form.shape)}"
             )
-        _check_range(name, array, how, game)
+        high = highest[how.high] if isinstance(how.high, str) else how.high
+        _check_range(name, array, how.low, high)
     return arrays
 
 
@@ -68,15 +70,14 @@ def _as_array(name: str, values: Any) -> NDArray[Any]:
         raise ValueError(f"state[{name!r}] is {shown(values)}; allowed: an array on the CPU") from error
 
 
-def _check_range(name: str, array: NDArray[Any], how: Kept, game: Game) -> None:
+def _check_range(name: str, array: NDArray[Any], low: int, high: int) -> None:
     """Refuse an entry out of range; numbers with a fraction have no upper bound."""
     if array.dtype == np.bool_:
         return
     if array.dtype == np.float64:
         wrong, allowed = ~(np.isfinite(array) & (array >= 0)), "a number of at least 0"
     else:
-        high = numbers(game)[how.high] if isinstance(how.high, str) else how.high
-        wrong, allowed = (array < how.low) | (array > high), f"{how.low} to {high}"
+        wrong, allowed = (array < low) | (array > high), f"{low} to {high}"
     if wrong.any():
         index = tuple(int(entry) for entry in np.argwhere(wrong)[0])
         raise ValueError(f"state[{name!r}]{list(index)} is {array[index]}; allowed: {allowed}")

@@ -109,19 +109,14 @@ class CpuThreads:
         entry = SHOW.get(self._kind)
         if entry is None:
             entry = SHOW[self._kind] = machine_code(show_worlds, game, self._scratch[0], 0, self._worlds)
-        run = partial(entry, game)
-        if self.threads == 1:
-            run(self._scratch[0], 0, self._worlds)
-        else:
-            self._share(run)
+        self._share(partial(entry, game))
 
     def _share(self, run: Callable[..., None]) -> None:
         """Run a loop in all threads, each on its share of the worlds; the calling thread takes the last
         one."""
         bounds = [self._worlds * t // self.threads for t in range(self.threads + 1)]
         *others, last_share = zip(self._scratch, bounds, bounds[1:], strict=False)
-        pool = _pool(os.getpid(), self.threads - 1)
-        shares = [pool.submit(run, scratch, first, last) for scratch, first, last in others]
+        shares = [_pool(os.getpid(), len(others)).submit(run, *share) for share in others]
         run(*last_share)
         for share in shares:
             share.result()

@@ -160,9 +160,11 @@ def slicer(kind: Any, *, every: bool = False) -> Callable[[Any, int], Any]:
     return function
 
 
+def is_record(kind: Any) -> bool:
+    """Return whether something is a kind of named tuple."""
+    return isinstance(kind, type) and hasattr(kind, "_fields")
+
+
 def _tuple_in(field: Any) -> type[Any] | None:
     """Return the kind of tuple that an annotation names, also one that may be None; None for another."""
-    kinds = [
-        kind for kind in (field, *get_args(field)) if isinstance(kind, type) and hasattr(kind, "_fields")
-    ]
-    return kinds[0] if kinds and not isinstance(field, Field) else None
+    return next(filter(is_record, (field, *get_args(field))), None)
