@@ -20,22 +20,24 @@ from rich.console import Console
 from rich.table import Table
 
 from cprl.algorithms import DQN, DQNSettings
-from cprl.learners.engine import Engine, FunctionalEngine, ListEngine, UpdateRule
-from cprl.learners.ring import Ring, TransitionForm
+from cprl.learners.networks import LaneNetworks
+from cprl.learners.optimizers import UpdateRule
+from cprl.learners.ring import Ring
+from cprl.learners.transitions import TransitionForm
 from cprl.networks.mlp import MLPNetwork
 
 SHAPE, ACTIONS, BATCH, TRANSITIONS = (3, 7, 15), 8, 8, 4096
 
-WAYS: dict[str, Callable[..., Engine]] = {
-    "list of TorchRL losses": ListEngine,
-    "vmapped, compiled": partial(FunctionalEngine, batching="vmapped"),
-    "lane axis, not compiled": partial(FunctionalEngine, batching="lane_axis", compile=False),
-    "lane axis, compiled": partial(FunctionalEngine, batching="lane_axis"),
+WAYS: dict[str, Callable[..., LaneNetworks]] = {
+    "a list": partial(LaneNetworks, update="list"),
+    "vmapped, compiled": partial(LaneNetworks, update="vmapped", compile=True),
+    "stacked, not compiled": partial(LaneNetworks, update="stacked"),
+    "stacked, compiled": partial(LaneNetworks, update="stacked", compile=True),
 }
 MEASURED_BEFORE = {  # on such a machine, before this library was begun
-    "list of TorchRL losses": (1388, 5292, 21_811, 89_852),
+    "a list": (1388, 5292, 21_811, 89_852),
     "vmapped, compiled": (113, 285, 1008, 3361),
-    "lane axis, compiled": (86, 166, 459, 1471),
+    "stacked, compiled": (86, 166, 459, 1471),
     "a C++ kernel for this network alone": (21, 67, 316, 1246),
 }
 LANES = (1, 4, 16, 64)
@@ -58,22 +60,22 @@ def filled(lanes: int) -> Ring:
     return ring
 
 
-def update_us(engine: str, lanes: int, repeats: int) -> float:
+def update_us(way: str, lanes: int, repeats: int) -> float:
     """Microseconds of one update of all lanes, the best of several repeats."""
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     torch.manual_seed(0)
     networks = [MLPNetwork(SHAPE, ACTIONS) for _ in range(lanes)]
-    update = WAYS[engine](
+    together = WAYS[way](
         networks, DQN(settings=DQNSettings(gamma=0.995)).make_loss, UpdateRule(learning_rate=1e-5)
     )
     buffer, best = filled(lanes), float("inf")
     for _ in range(20):
-        update.update(buffer)
+        together.learn(buffer.draw())
     for _ in range(repeats):
         turns, started = 0, time.perf_counter()
         while time.perf_counter() - started < 0.3:
-            update.update(buffer)
+            together.learn(buffer.draw())
             turns += 1
         best = min(best, (time.perf_counter() - started) / turns)
     return best * 1e6
@@ -81,7 +83,7 @@ def update_us(engine: str, lanes: int, repeats: int) -> float:
 
 def add_rows(table: Table, rows: dict[str, Sequence[float]]) -> None:
     """A row for each way: microseconds and, in brackets, how many times as fast as the list."""
-    reference = rows["list of TorchRL losses"]
+    reference = rows["a list"]
     for name, row in rows.items():
         cells = (f"{us:,.0f} ({base / us:.0f}x)" for us, base in zip(row, reference, strict=True))
         table.add_row(name, *cells)

@@ -31,6 +31,7 @@ from cprl import CommonsEnv, presets
 from cprl.algorithms import DQN, MADDPG, MAPPO, PPO, QMIX, VDN, DQNSettings, RolloutSettings
 from cprl.policies.assignment import AgentPolicies
 from cprl.population import AgentSpec, Learning, Team
+from cprl.runs.schedule import Schedule
 from cprl.system.process import prepare_process
 from cprl.training.agents import Population
 from cprl.training.training import Training
@@ -223,7 +224,7 @@ def measure(name: str, rounds: int) -> dict[str, float]:
     case, plain = CASES[name], Plain()
     env = CommonsEnv(GAME, case.worlds, seed=0)
     population = Population(env, case.agents, seed=0, worlds=case.worlds)
-    training = Training(env, population.learners, steps=2**60, worlds=case.worlds)
+    training = Training(env, population.learners, Schedule(steps=2**60, worlds=case.worlds))
     (learner,) = population.learners.values()
     plain.rollout()
     for _ in range(max(case.turns, TURNS + 2)):  # compiles

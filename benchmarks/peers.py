@@ -2,8 +2,8 @@
 
 Rollouts of 64 turns, 4 epochs, minibatches of 2,048 turns, two hidden layers of 32 units, one thread; env
 steps a second of the processor, an env step being a turn of one world. "TorchRL's tutorial" is made of the
-parts of its multi-agent PPO tutorial, as examples/torchrl_ippo.py is: `Collector`, `MultiAgentMLP`,
-`ClipPPOLoss`, GAE. The plain loop is that of benchmarks/many_worlds.py.
+parts of its multi-agent PPO tutorial, as examples/other_trainers/torchrl_ippo.py is: `Collector`,
+`MultiAgentMLP`, `ClipPPOLoss`, GAE. The plain loop is that of benchmarks/many_worlds.py.
 
     python benchmarks/peers.py [--rollouts 3]
 """
@@ -26,7 +26,7 @@ from torchrl.objectives import ClipPPOLoss, ValueEstimators
 from cprl import CommonsEnv, keys
 from cprl.system.process import prepare_process
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "examples" / "other_trainers"))
 from torchrl_ippo import ENDS, LOG_PROB, LOGITS, VALUE, OwnMLPs
 
 

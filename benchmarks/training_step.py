@@ -25,13 +25,14 @@ from rich.console import Console
 from rich.table import Table
 
 from cprl import CommonsEnv, presets
-from cprl.algorithms.off_policy import DQN
-from cprl.learners.base import LearningAgents
-from cprl.learners.replay import ReplayLearner
+from cprl.algorithms import DQN
+from cprl.algorithms.base import TrainingEngine
+from cprl.learners.lanes import Lanes
+from cprl.learners.learner import Learner
 from cprl.measuring.episodes import EpisodeTracker
 from cprl.policies.assignment import AgentPolicies
 from cprl.system.process import prepare_process
-from cprl.training import Training
+from cprl.training import Schedule, Training
 
 CASES: Final[tuple[tuple[presets.Board, int, int], ...]] = (
     ("single_complex", 1, 1),
@@ -42,8 +43,8 @@ CASES: Final[tuple[tuple[presets.Board, int, int], ...]] = (
 PARTS: Final[dict[str, tuple[type, str]]] = {
     "policy": (AgentPolicies, "forward"),
     "environment": (CommonsEnv, "_step_and_maybe_reset"),
-    "replay write": (ReplayLearner, "store"),
-    "update": (ReplayLearner, "update"),
+    "replay write": (Learner, "store"),
+    "update": (Learner, "update"),
     "tracking": (EpisodeTracker, "add"),
 }
 STEPS: Final = 200
@@ -71,16 +72,17 @@ def seconds(step: Callable[[], object]) -> float:
     return time.perf_counter() - started
 
 
-def measure(board: presets.Board, agents: int, replicas: int, repeats: int) -> dict[str, float]:
+def measure(
+    board: presets.Board, agents: int, replicas: int, repeats: int, engine: TrainingEngine
+) -> dict[str, float]:
     """Microseconds of each part, of a whole step, and of an update alone; and the ratio of the last two."""
     prepare_process(0)
     game = presets.game(board)
     settings = replace(presets.dqn_settings(board), buffer_size=20_000)
     agents = tuple(range(agents))
-    learner = DQN(settings=settings).make_learner(
-        LearningAgents(game.spaces, agents=agents, replicas=replicas)
-    )
-    training = Training(CommonsEnv(game, replicas, seed=0), {agents: learner}, episodes=10**9)
+    lanes = Lanes(game.spaces, agents=agents, replicas=replicas)
+    learner = DQN(settings=settings).make_learner(lanes, engine)
+    training = Training(CommonsEnv(game, replicas, seed=0), {agents: learner}, Schedule(episodes=10**9))
     while training.steps < 500:
         training.step()
     best: dict[str, float] = {}
@@ -104,17 +106,18 @@ def measure(board: presets.Board, agents: int, replicas: int, repeats: int) -> d
     return best
 
 
-def main(*, repeats: int = 15) -> None:
+def main(*, repeats: int = 15, engine: TrainingEngine = "compiled") -> None:
     """Prints the table.
 
     Args:
         repeats: of which the best counts.
+        engine: "compiled" or "eager".
     """
-    table = Table("microseconds a step", title="one whole training step, one thread, compiled")
+    table = Table("microseconds a step", title=f"one whole training step, one thread, {engine}")
     columns = []
     with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as process:
         for board, agents, replicas in CASES:
-            columns.append(process.submit(measure, board, agents, replicas, repeats).result())
+            columns.append(process.submit(measure, board, agents, replicas, repeats, engine).result())
             table.add_column(f"{agents * replicas} lanes", justify="right")
     for part in PARTS:
         table.add_row(

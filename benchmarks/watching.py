@@ -30,14 +30,14 @@ from rich.table import Table
 from tensordict import TensorDict, TensorDictBase
 
 from cprl import CommonsEnv, presets
-from cprl.algorithms.off_policy import DQN
-from cprl.learners.base import LearningAgents
+from cprl.algorithms import DQN
+from cprl.learners.lanes import Lanes
 from cprl.measuring import Episode
 from cprl.measuring.series import Observer
 from cprl.policies.lanes import random_agents
 from cprl.policies.present import PresentPolicy
 from cprl.system.process import prepare_process
-from cprl.training import Training
+from cprl.training import Schedule, Training
 from cprl.viewer.callback import ViewerCallback
 
 AGENTS: Final = (0, 1, 2, 3)
@@ -86,11 +86,9 @@ def cost(run: Path, repeats: int) -> Cost:
     prepare_process(0)
     game = presets.game("commons")
     settings = replace(presets.dqn_settings("commons"), buffer_size=20_000)
-    learner = DQN(settings=settings).make_learner(
-        LearningAgents(game.spaces, agents=AGENTS, replicas=REPLICAS)
-    )
+    learner = DQN(settings=settings).make_learner(Lanes(game.spaces, agents=AGENTS, replicas=REPLICAS))
     env = CommonsEnv(game, REPLICAS, seed=0)
-    training = Training(env, {AGENTS: learner}, episodes=10**9)
+    training = Training(env, {AGENTS: learner}, Schedule(episodes=10**9))
     steps = game.rules.episode_steps
 
     clock = Watched()
@@ -163,7 +161,7 @@ def size(run: Path, episodes: int) -> tuple[int, int]:
     with ViewerCallback(run, env, title="size", episodes=episodes) as watch:
         witness = Witness(watch)
         observer = Observer([watch], env)
-        training = Training(env, {}, others=at_random, episodes=10**9, callbacks=[witness])
+        training = Training(env, {}, Schedule(episodes=10**9), others=at_random, callbacks=[witness])
         unseen = TensorDict({}, [REPLICAS])
         for number in range(episodes):
             if watch.filming.is_shown(number):

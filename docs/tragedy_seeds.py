@@ -13,8 +13,8 @@ from cprl.measuring.statistics import Estimate, estimate
 from cprl.measuring.windows import running_mean
 from cprl.runs.curves import as_curves, curves_of
 from cprl.runs.episodes import read_table
-from cprl.training.agents import load
-from cprl.training.course import course_of
+from cprl.terminal.course import course_of
+from cprl.training.stored import load
 
 HEADING = (
     "| seed | replicas | peak of 10 episodes, apples | its episode | last 30 episodes, apples "

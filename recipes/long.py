@@ -22,6 +22,7 @@ def experiment() -> cprl.Experiment:
         game=presets.game("commons", variant="as_run"),
         agents=(Learning(PPO(settings=settings)),) * 4,
         steps=100_000_000,
+        engine="compiled",
         replicas=4,
         worlds=256,
     )

@@ -2,15 +2,15 @@
 
     python recipes/own_loop.py --watch serve
 
-The loop is made of TorchRL's replay buffer, `QValueActor`, `EGreedyModule` and `DQNLoss`; the run directory,
-the live view, the best weights and the summary are cprl's. It has no checkpoints, and is several times slower
-than the other recipes, in which cprl does all this for many agents at once. Its schedule is its own: the
-published one (recipes/single_basic.py, with 8 replicas) takes an hour. Without cprl's parts the same agent is
-examples/single_agent.py.
+The loop is that of `cprl.learners.plain.train_plainly`, in which an agent learns by TorchRL's stock parts;
+the run directory, the live view, the best weights and the summary are cprl's. It has no checkpoints, and is
+several times slower than the other recipes. Its schedule is its own: the published one
+(recipes/single_basic.py, with 8 replicas) takes an hour. Without cprl's parts the same agent is
+examples/other_trainers/single_agent.py.
 """
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from math import nan
 from pathlib import Path
@@ -19,29 +19,26 @@ from statistics import fmean
 import pyarrow as pa
 import torch
 import tyro
-from tensordict.nn import TensorDictSequential
 from torch import nn
-from torchrl.data import Categorical, LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.modules import EGreedyModule, QValueActor
-from torchrl.objectives import DQNLoss, HardUpdate
 from torchrl.record.loggers import Logger
 
 import cprl
 from cprl import CommonsEnv, presets
 from cprl.algorithms import DQN
+from cprl.algorithms.base import q_actor
 from cprl.commands.recipe import in_a_sentence
-from cprl.learners.settings import DQNSettings
-from cprl.learners.transitions import transitions_of
+from cprl.learners.base import AnyLearner
+from cprl.learners.lanes import Lanes
 from cprl.measuring.episodes import Episode, EpisodeTracker
 from cprl.measuring.evaluate import evaluate, mean_return
 from cprl.measuring.series import Observer
 from cprl.measuring.table import labelled, where
-from cprl.networks.mlp import MLPNetwork
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
 from cprl.population import Learning, exploration_steps
 from cprl.runs.episodes import EpisodeTable, table_of
 from cprl.runs.recipe import start_run
+from cprl.runs.schedule import Schedule
 from cprl.runs.weights import load_weights, save_weights
 from cprl.system.output import printed, say
 from cprl.system.shipped import cprl_here
@@ -68,7 +65,7 @@ class BestWeights:
     def __init__(
         self,
         run: Path,
-        networks: Mapping[str, nn.Module],
+        networks: Callable[[], Mapping[str, nn.Module]],
         *,
         policy: nn.Module,
         env: CommonsEnv,
@@ -96,7 +93,7 @@ class BestWeights:
             return
         if reached > self.best_return:
             self.best_return, self.best_episode = reached, self._episodes
-            self.path = save_weights(self.run, self.networks, name="best")
+            self.path = save_weights(self.run, self.networks(), name="best")
 
 
 def main(
@@ -118,59 +115,48 @@ def main(
     """
     check_watch(watch, can_be_off=False)
     game = presets.game("single_basic")
-    settings = replace(presets.dqn_settings("single_basic"), **SHORT)
+    algorithm = DQN(settings=replace(presets.dqn_settings("single_basic"), **SHORT))
     title = f"single_basic, published rules, short schedule, {episodes} episodes"
     experiment = cprl.Experiment(
         name="own_loop",
         game=game,
-        agents=(Learning(DQN(settings=settings)),),
+        agents=(Learning(algorithm),),
         episodes=episodes,
         seed=seed,
         evaluation_episodes=evaluation_episodes,
     )
 
-    torch.manual_seed(seed)
     torch.set_num_threads(1)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     run = start_run(out, experiment.name, experiment.to_recipe)
     env, trial = CommonsEnv(game, seed=seed), CommonsEnv(game, 16, seed=seed + 1)
 
-    network = MLPNetwork(
-        game.observation_shape,
-        len(game.actions),
-        hidden_cells=settings.hidden_cells,
-        highest=game.observation.highest,
-    )
-    spec = Categorical(len(game.actions), shape=(), dtype=torch.int64)
-    greedy = QValueActor(network, spec=spec, action_space="categorical")
-    explore = EGreedyModule(spec=spec, eps_init=settings.epsilon_start, eps_end=settings.epsilon_end)
-    policy = AgentPolicies([TensorDictSequential(greedy, explore)])  # explores under ExplorationType.RANDOM
-    loss = DQNLoss(greedy, loss_function="l2", action_space="categorical", delay_value=True)
-    loss.make_value_estimator(gamma=settings.gamma)
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(settings.buffer_size),
-        batch_size=settings.batch_size,
-        generator=torch.Generator().manual_seed(seed),
-    )
+    lanes = Lanes(game.spaces, agents=(0,), replicas=1, seed=seed)
+    learner = algorithm.make_learner(lanes, "torchrl")
+    policy = AgentPolicies({(0,): learner.evaluation_actor(worlds=16)})
 
-    networks = {"agent_0": network}
+    def networks() -> dict[str, nn.Module]:
+        return {"agent_0": learner.networks()["replica_0/agent_0"]}
+
     live, shown = None if watch == "file" else watch, experiment.to_config()
     with (
         ViewerCallback(run, env, title=title, episodes=episodes, recipe=shown, live=live) as viewer,
         EpisodeTable(run / "episodes.parquet") as table,
-        ProgressBar(game, episodes=episodes) as bar,
+        ProgressBar(Schedule(episodes=episodes), game) as bar,
     ):
         best = BestWeights(run, networks, policy=policy, env=trial, logger=viewer.logger)
         callbacks = [table, viewer, best, bar]
-        learn(env, policy, network, explore, loss, buffer, settings, episodes, callbacks=callbacks)
-    save_weights(run, networks)
+        learn(env, learner, episodes, callbacks=callbacks)
+    save_weights(run, networks())
 
     fresh = CommonsEnv(game, evaluation_episodes, seed=seed + 2)
     played = {"random": evaluate(fresh, AgentPolicies([RandomActor(len(game.actions), seed=seed)]))}
-    played["greedy, last"] = evaluate(fresh, policy)
+    network = networks()["agent_0"]
+    greedy = AgentPolicies([q_actor(network)])
+    played["greedy, last"] = evaluate(fresh, greedy)
     if best.path:
         network.load_state_dict(load_weights(best.path)["agent_0"])
-        played[f"greedy, best (episode {best.best_episode})"] = evaluate(fresh, policy)
+        played[f"greedy, best (episode {best.best_episode})"] = evaluate(fresh, greedy)
     ends = exploration_steps(experiment.agents)
     table = pa.concat_tables(labelled(table_of(episodes), policy=name) for name, episodes in played.items())
     random = where(table, policy="random")
@@ -182,45 +168,25 @@ def main(
     return run
 
 
-def learn(
-    env: CommonsEnv,
-    policy: AgentPolicies,
-    network: MLPNetwork,
-    explore: EGreedyModule,
-    loss: DQNLoss,
-    buffer: TensorDictReplayBuffer,
-    settings: DQNSettings,
-    episodes: int,
-    *,
-    callbacks: Sequence[Callback],
-) -> None:
-    """One update a turn, as Mnih et al. (2015) do it; the target network is replaced as episodes end."""
-    adam = torch.optim.Adam(loss.parameters(), lr=settings.learning_rate, eps=settings.adam_eps, fused=True)
-    # HardUpdate copies at every (interval + 1)-th step, and once when it is made.
-    target = HardUpdate(loss, value_network_update_interval=settings.target_every_episodes - 1)
+def learn(env: CommonsEnv, learner: AnyLearner, episodes: int, *, callbacks: Sequence[Callback]) -> None:
+    """Acts, stores, learns and measures, turn by turn."""
     tracker = EpisodeTracker(1, env.game.agents)
     observer = Observer(callbacks, env)
-    losses = []
-    for step, turn in enumerate(StepCollector(env, policy), start=1):
-        buffer.extend(transitions_of(0, turn))
-        explore.eps.fill_(settings.epsilon(step))
-        if len(buffer) >= settings.learning_starts:
-            error = loss(buffer.sample())["loss"]
-            adam.zero_grad()
-            error.backward()
-            adam.step()
-            losses.append(error.item())
+    losses: list[float] = []
+    for turn in StepCollector(env, AgentPolicies({learner.agents: learner.actor})):
+        learner.store(turn)
+        loss = learner.update()
+        if loss is not None:
+            losses.append(loss.item())
         observer.on_step(turn)
         for episode in tracker.add(turn):
-            with torch.no_grad():
-                values = network(turn["next", "agents", "observation"][:, 0])
             learning = {
                 "agent_0/loss": fmean(losses) if losses else nan,
-                "agent_0/epsilon": settings.epsilon(step),
-                "agent_0/q": values.max().item(),
+                "agent_0/epsilon": learner.actor.epsilon,
+                "agent_0/q": learner.values(turn).item(),
             }
             losses.clear()
-            target.step()
+            learner.end_episode(turn["next", "done"][:, 0])
             observer.on_episode(episode, learning)
             if episode.episode + 1 == episodes:
                 return

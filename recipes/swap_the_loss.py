@@ -2,16 +2,17 @@
 
     python recipes/swap_the_loss.py --loss dqn              5 replicas of 1000 episodes
     python recipes/swap_the_loss.py --loss ppo
+    PYTHONPATH=examples/own_algorithm python recipes/swap_the_loss.py --loss cql
 
-docs/algorithms.md shows how to write a loss of your own.
+"cql" and "iql" are algorithms of one's own; examples/own_loss.py has losses, DQN(settings=REPLAY, loss=...).
 """
 
 from dataclasses import replace
 from typing import Literal
 
 import cprl
-from cprl import presets
-from cprl.algorithms import CQL, DQN, IQL, PPO, SAC, RolloutSettings
+from cprl import Custom, presets
+from cprl.algorithms import DQN, PPO, SAC, RolloutSettings
 from cprl.population import Learning
 
 REPLAY = replace(presets.dqn_settings("two_complex"), learning_rate=1e-4, epsilon_decay_steps=100_000)
@@ -21,9 +22,9 @@ decay."""
 LOSSES = {
     "dqn": DQN(settings=REPLAY),
     "double_dqn": DQN(settings=REPLAY, double=True),
-    "cql": CQL(settings=REPLAY),
+    "cql": Custom("cql:CQL", arguments={"settings": REPLAY, "conservative_weight": 0.1}),
     "sac": SAC(settings=REPLAY),
-    "iql": IQL(settings=REPLAY),
+    "iql": Custom("iql:IQL", arguments={"settings": REPLAY, "expectile": 0.7, "temperature": 3.0}),
     "ppo": PPO(settings=RolloutSettings()),
 }
 

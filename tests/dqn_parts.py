@@ -1,16 +1,22 @@
 """Learners of plain DQN, and its loss over one network, for tests of learners and engines."""
 
-from dataclasses import replace
+from dataclasses import fields
 
 import numpy as np
 import torch
+from c51 import C51
+from cql import CQL
+from iql import IQL
 from tensordict import TensorDict
 
 from cprl import Game, Rules, algorithms, maps
 from cprl.algorithms import DQN, DQNSettings, OffPolicy, OnPolicy
-from cprl.learners.base import LearningAgents
-from cprl.learners.replay import ReplayLearner
-from cprl.learners.transitions import LaneTurn
+from cprl.learners.draw import Draw
+from cprl.learners.lanes import Lanes
+from cprl.learners.plain import PlainNetworks
+from cprl.learners.ring import Ring
+from cprl.learners.transitions import LaneTurn, made_up
+from cprl.objectives.functional import weights_of
 
 MEADOW = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -21,24 +27,27 @@ KINDS = [
     kind
     for kind in map(vars(algorithms).get, algorithms.__all__)
     if issubclass(kind, OffPolicy | OnPolicy) and kind not in (OffPolicy, OnPolicy)
-]
-"""All algorithms whose lanes an engine updates."""
+] + [C51, CQL, IQL]
+"""All algorithms that a `Learner` learns by, those of the examples included."""
 
 
-def make_learner(algorithm, spaces, *, engine="compiled", **who):
-    return algorithm.make_learner(LearningAgents(spaces, **who), engine)
+def make_learner(algorithm, spaces, *, engine="compiled", **lanes):
+    return algorithm.make_learner(Lanes(spaces, **lanes), engine)
 
 
-def learner_of_parts(kind, algorithm, spaces, *, parts=(), options=(), **who):
-    """A learner of a kind, with parts of a `Method` in place of the algorithm's, and options of its kind."""
-    method = replace(algorithm.method(spaces), **{"batching": None, **dict(parts)})
-    return kind(LearningAgents(spaces, **who), method, **dict(options))
+def changed(algorithm, **methods):
+    """An algorithm of a subclass that has other methods, or says another `update`."""
+    kind = type(algorithm)
+    named = {name: staticmethod(value) if callable(value) else value for name, value in methods.items()}
+    own = type(kind.__name__, (kind,), named)
+    return own(**{field.name: getattr(algorithm, field.name) for field in fields(algorithm)})
 
 
-def dqn_learner(spaces, *, settings, kind=ReplayLearner, make_loss=None, engine=None, compile=None, **who):
-    parts = {"batching": engine} if make_loss is None else {"make_loss": make_loss, "batching": engine}
-    options = {} if compile is None else {"compile": compile}
-    return learner_of_parts(kind, DQN(settings=settings), spaces, parts=parts, options=options, **who)
+def dqn_learner(spaces, *, settings, make_loss=None, update=None, engine="compiled", **lanes):
+    methods = {} if make_loss is None else {"make_loss": make_loss}
+    methods |= {} if update is None else {"update": update}
+    algorithm = changed(DQN(settings=settings), **methods) if methods else DQN(settings=settings)
+    return make_learner(algorithm, spaces, engine=engine, **lanes)
 
 
 def dqn_loss(network, *, gamma):
@@ -71,6 +80,41 @@ def transitions(observation, action, next_observation, reward, ends, **entries):
         for entries in (before, after)
     )
     return made.set("next", made_after)
+
+
+def learn(learner, batch):
+    """The losses of one step of a learner's networks by a batch, [L, b]."""
+    return learner.lane_networks.learn(Draw.of(batch))
+
+
+def watch_steps(learner, seen):
+    """Adds what `seen` gives of each batch that a learner learns from to a list, which it returns."""
+    found, step = [], learner.lane_networks.learn
+
+    def watched(draw):
+        found.append(seen(draw))
+        return step(draw)
+
+    learner.lane_networks.learn = watched
+    return found
+
+
+def weights_at(networks, place):
+    """The weights of a network and its targets, by their names in the loss."""
+    if isinstance(networks, PlainNetworks):
+        return weights_of(networks.losses[place])
+    return {name: value[place] for name, value in {**networks.params, **networks.targets}.items()}
+
+
+def made_up_batch(form, lanes, actions):
+    """Transitions [L, 8] of such a form, always the same; one in eight ends an episode."""
+    ring = Ring(
+        form, seeds=[(lane,) for lane in range(lanes)], transitions=8 + form.steps_ahead, batch_size=8
+    )
+    batch = made_up(ring.get(torch.arange(8).expand(lanes, -1)), actions)
+    for name in ("done", "terminated"):
+        batch["next", name][:, -1] = True
+    return batch
 
 
 def write(ring, transitions):

@@ -15,7 +15,7 @@ from cprl.learners.settings import DQNSettings
 from cprl.measuring.series import Observer
 from cprl.pictures.decoding import classes_seen
 from cprl.policies.lanes import RandomActor
-from cprl.training import train
+from cprl.training import Schedule, train
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.scene import Scene
 
@@ -99,4 +99,4 @@ def watched_training(run):
     )
     env = CommonsEnv(GAME, seed=1)
     with ViewerCallback(run, env, title="run", episodes=4) as viewer:
-        train(env, {(0,): learner}, others={1: RandomActor(8)}, episodes=4, callbacks=[viewer])
+        train(env, {(0,): learner}, Schedule(episodes=4), others={1: RandomActor(8)}, callbacks=[viewer])

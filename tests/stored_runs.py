@@ -39,6 +39,8 @@ MEADOW = Game(
 
 DQN, PPO, SAC, C51 = (Learning(ALGORITHMS[name]) for name in ("DQN", "PPO", "SAC", "C51"))
 
+cprl.trust("c51:C51", "cql:CQL", "iql:IQL")
+
 SEED = 77
 
 

@@ -49,6 +49,7 @@ from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
 from cprl.runs.curves import curves_of
 from cprl.runs.episodes import COLUMNS, LEFT_OUT, EpisodeTable, read_episodes, table_of
+from cprl.runs.schedule import Schedule
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import compared, summarise
@@ -329,7 +330,7 @@ def test_the_terminal_shows_it_too(tmp_path, monkeypatch):
     console = Console(file=output, width=200)
     with (
         EpisodeTable(tmp_path / "episodes.parquet") as table,
-        ProgressBar(episodes=9, replicas=2, console=console) as bar,
+        ProgressBar(Schedule(episodes=9), replicas=2, console=console) as bar,
     ):
         episodes = play(MatrixGame(2), tit_for_tat, 12, callbacks=[table, bar])
     assert "return 12.5" in output.getvalue()

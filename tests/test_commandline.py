@@ -23,13 +23,13 @@ from cprl.commands import main as cli
 from cprl.commands.recipe import RunOptions, parse, recipe_main, refuse_mistyped_flags
 from cprl.institutions import Boundaries, GraduatedSanctions, Quota
 from cprl.networks import MLP
-from cprl.objectives.preferences import Exchange
+from cprl.objectives.rewards import Exchange
 from cprl.population import Learning, Scripted, Team
 from cprl.runs.recipe import resume_command, start_run
 from cprl.system import shipped
 from cprl.system.output import Output, console, printed
 from cprl.system.shipped import command_of, cprl_here, import_from, is_shipped, recipe_named, shipped_recipes
-from cprl.values import Custom, trusted, trusting
+from cprl.values import Custom, custom_targets, trusted, trusting
 
 ROOT = Path(__file__).parents[1]
 RECIPES = sorted(
@@ -338,6 +338,7 @@ def test_the_command_of_every_stored_result_still_gives_its_experiment(path):
     if Path(script).stem == "no_beam":  # a script of before two_complex.py had --no-beam
         script, given = "recipes/two_complex.py", ["--no-beam", "--variant", "as_run", "--episodes", *given]
     given, _ = parse(recipe(Path(script).stem).experiment, [script, *given])
+    cprl.trust(*custom_targets(stored["experiment"]))
     assert given == Experiment.from_recipe(stored)
 
 

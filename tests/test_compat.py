@@ -12,12 +12,14 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+from typing import Annotated, NamedTuple
 
 import numba
 import numpy as np
 import pytest
 import rerun as rr
 import torch
+from cql import bootstrap_from_target
 from filelock import FileLock
 from tensordict import TensorDict
 from torch import nn
@@ -27,11 +29,14 @@ from torchrl.modules import QValueActor
 from torchrl.objectives import DiscreteCQLLoss, DQNLoss, SoftUpdate, ValueEstimators
 
 from cprl import CommonsEnv, Game, Rules, keys, maps
+from cprl.algorithms import PPO, RolloutSettings
 from cprl.commons import compiled
+from cprl.institutions.arrays import slicer
 from cprl.objectives.functional import FunctionalLoss, total, weights_of
 from cprl.system import compat
 from cprl.system.compat import torchrl
 from cprl.system.libraries import fitting_versions, relying_on, require
+from cprl.values.arrays import Float64
 
 SOURCE = Path(compat.__file__).parents[1]
 SHORT = Game(
@@ -193,7 +198,7 @@ def q_loss(kind=DQNLoss):
     loss = kind(q_actor(), delay_value=True, action_space="categorical")
     loss.make_value_estimator(ValueEstimators.TD0, gamma=0.5)
     if kind is DiscreteCQLLoss:
-        compat.bootstrap_from_target(loss.value_estimator)
+        bootstrap_from_target(loss.value_estimator)
     return loss
 
 
@@ -211,6 +216,27 @@ def test_a_loss_does_not_warn_of_targets_that_are_promised():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         loss(transitions(4))
+
+
+def test_the_entropy_of_a_ppo_loss_is_vmapped_once_it_is_taken_by_its_formula():
+    network, spaces = PPO(settings=RolloutSettings()), Game(map=maps.parse("A>"), rules=Rules()).spaces
+    parts = network.make_network(spaces)
+    seen = torch.rand(2, 3, *spaces.observation_shape)
+
+    def entropy_of(loss):
+        def of_lane(observation):
+            policy = loss.actor_network.get_dist(TensorDict({"observation": observation}, [3]))
+            return loss._get_entropy(policy, adv_shape=torch.Size([3]))
+
+        return torch.vmap(of_lane)(seen)
+
+    loss = network.make_loss(parts)
+    with pytest.raises(RuntimeError, match="data-dependent control flow"):
+        entropy_of(loss)
+    compat.entropy_by_formula(loss)
+    logits = parts["actor"](seen)
+    expected = torch.distributions.Categorical(logits=logits).entropy().unsqueeze(-1)
+    torch.testing.assert_close(entropy_of(loss), expected)
 
 
 def test_a_loss_refuses_updaters_of_torchrl_by_the_names_of_its_targets():
@@ -422,6 +448,66 @@ def test_numba_gives_the_machine_code_of_a_function_unless_it_is_told_not_to_com
     assert plain((np.arange(5.0),)) == 10
 
 
+class Grown(NamedTuple):
+    """Arrays of worlds within others."""
+
+    by: Annotated[Float64, "B K"]
+
+
+class Meadow(NamedTuple):
+    """Records, with one that is missing and an array that has gaps."""
+
+    apples: Annotated[Float64, "B K"]
+    gains: Annotated[Float64, "K"]
+    grown: Grown
+    rain: Grown | None
+
+
+one_meadow = slicer(Meadow)
+
+
+def rained(rain, site):
+    if rain is None:
+        return 0.0
+    return rain.by[site]
+
+
+def grow(meadow, times):
+    for site in range(meadow.apples.shape[0]):
+        meadow.apples[site] += times * meadow.gains[site]
+        meadow.grown.by[site] = times
+        meadow.apples[site] += rained(meadow.rain, site)
+
+
+def grown_meadow(meadow, again):
+    for world in range(meadow.apples.shape[0]):
+        one = one_meadow(meadow, world)
+        grow(one, 2.0)
+        for (other,) in (again,):
+            grow(one_meadow(other, world), 1.0)
+    return meadow.apples[0, 0]
+
+
+rained.__module__ = grow.__module__ = "cprl.tests"  # whose functions are rules
+
+
+@pytest.mark.parametrize("rains", [False, True])
+def test_numba_takes_records_by_reference_and_rules_as_parts_of_one_piece(rains, tmp_path, monkeypatch):
+    def meadow():
+        gains = np.arange(12.0)[::4]  # with gaps
+        rain = Grown(np.full((2, 3), 0.5)) if rains else None
+        return Meadow(np.arange(6.0).reshape(2, 3), gains, Grown(np.zeros((2, 3))), rain)
+
+    monkeypatch.setenv("CPRL_CACHE", str(tmp_path))
+    monkeypatch.setenv(compiled.RULES_VARIABLE, compiled.COMPILED)
+    plain, fast, other, same = (meadow() for _ in range(4))
+    code = compiled.machine_code(grown_meadow, fast, (other,))
+    assert grown_meadow(plain, (same,)) == code(fast, (other,))
+    for made, wanted in ((fast, plain), (other, same)):
+        np.testing.assert_array_equal(made.apples, wanted.apples)
+        np.testing.assert_array_equal(made.grown.by, wanted.grown.by)
+
+
 def test_numba_keeps_compiled_functions_where_it_is_told(tmp_path):
     before = numba.config.CACHE_DIR
     with compiled.kept_in(tmp_path):
@@ -543,6 +629,7 @@ def test_a_process_that_never_ends_to_compile_is_waited_for_no_longer_than_some_
 COMPILES_IN_STEP = """
 import sys, time
 from pathlib import Path
+from typing import Annotated, NamedTuple
 import numpy as np
 from cprl.commons import compiled
 from cprl.system import compat
@@ -621,6 +708,7 @@ def test_a_policy_that_is_nan_changes_nothing_of_the_others():
 _RECORDINGS = """
 import os, sys
 from pathlib import Path
+from typing import Annotated, NamedTuple
 import rerun as rr
 from cprl.system.compat import end_recordings
 from cprl.viewer.logger import RerunLogger

@@ -18,7 +18,7 @@ from cprl.algorithms import DQN, DQNSettings
 from cprl.system import compiling
 from cprl.system.compiling import Compiled, largest_difference
 from cprl.system.process import prepare_process
-from cprl.training import Training
+from cprl.training import Schedule, Training
 
 
 def scaled_in_place(owner, values, factor):
@@ -169,26 +169,26 @@ def trained(case, *, seed=0, steps=60):
     prepare_process(seed)
     learner = make_learner(CASES[case], PATCH.spaces, agents=AGENTS, replicas=2, seed=seed)
     env = CommonsEnv(PATCH, 2, seed=seed)
-    training = Training(env, {AGENTS: learner}, episodes=10**6)
+    training = Training(env, {AGENTS: learner}, Schedule(episodes=10**6))
     with warnings.catch_warnings():
         for kind in (DeprecationWarning, FutureWarning):
             warnings.simplefilter("ignore", kind)
         while training.steps < steps:
             training.step()
-    assert learner.engine._compiled.enabled
+    assert learner.lane_networks._compiled.enabled
     return learner
 
 
 def digest(learner):
     """Of all weights, targets, moments and stored transitions, to the bit."""
-    engine = learner.engine
+    networks = learner.lane_networks
     tensors = [
-        *engine.params.values(),
-        *engine.targets.values(),
-        *engine._mean.values(),
-        *engine._square.values(),
+        *networks.params.values(),
+        *networks.targets.values(),
+        *networks.means.values(),
+        *networks.squares.values(),
     ]
-    tensors += learner.buffer.fields.values()
+    tensors += learner.memory.buffer.fields.values()
     whole = hashlib.sha256()
     for tensor in tensors:
         whole.update(tensor.detach().contiguous().numpy().tobytes())
@@ -268,8 +268,8 @@ def test_a_learner_that_shares_code_trains_its_own_weights_alone(compilations):
     second = trained("another gamma")
     assert len(compilations) == 2
     assert digest(first) == before
-    own = {tensor.data_ptr() for tensor in first.engine.params.values()}
-    assert own.isdisjoint(tensor.data_ptr() for tensor in second.engine.params.values())
+    own = {tensor.data_ptr() for tensor in first.lane_networks.params.values()}
+    assert own.isdisjoint(tensor.data_ptr() for tensor in second.lane_networks.params.values())
 
 
 def scaled(owner, values):

@@ -28,10 +28,10 @@ from cprl import CommonsEnv, Experiment
 from cprl.algorithms import DQN, Tabular, TabularSettings
 from cprl.evaluation import Fresh, crossplay, evaluate_run
 from cprl.measuring.table import where
-from cprl.objectives.preferences import InequityAversion
+from cprl.objectives.rewards import InequityAversion
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in
-from cprl.training import train
+from cprl.training import Schedule, train
 
 
 def shared(algorithm, agents=FOUR):
@@ -97,10 +97,10 @@ def test_a_run_is_stored_loaded_and_evaluated_plays_frozen_and_others_start_from
 WAYS = {
     "VDN": ("vmapped",),
     "QMIX": ("vmapped",),
-    **dict.fromkeys(("MAPPO", "IPPO", "MADDPG", "recurrent IPPO"), ("lane_axis",)),
-    "recurrent PPO": ("lane_axis", "lane_axis_flat"),
-    "recurrent PPO, LSTM": ("lane_axis_flat",),
-    **{f"recurrent DQN, {name}": ("lane_axis", "lane_axis_flat", "vmapped") for name in DQNS},
+    **dict.fromkeys(("MAPPO", "IPPO", "MADDPG", "recurrent IPPO"), ("stacked",)),
+    "recurrent PPO": ("stacked", "vmapped"),
+    "recurrent PPO, LSTM": ("stacked",),
+    **{f"recurrent DQN, {name}": ("stacked", "vmapped") for name in DQNS},
 }
 
 
@@ -108,10 +108,10 @@ WAYS = {
 @pytest.mark.parametrize(("name", "way"), [(name, way) for name, ways in WAYS.items() for way in ways])
 def test_every_engine_learns_what_a_list_of_torchrls_losses_does(name, way, monkeypatch):
     kind = type(GROUPS[name][0].algorithm)
-    assert kind.batching == way or name not in TEAMS, "this is the way that it names"
+    assert kind.update == way or name not in TEAMS, "this is the way that it names"
 
-    def learned(batching):
-        monkeypatch.setattr(kind, "batching", batching)
+    def learned(update):
+        monkeypatch.setattr(kind, "update", update)
         agents = population(GROUPS[name])
         trained(agents, episodes=3)
         return weights(agents)
@@ -173,8 +173,8 @@ def test_a_training_that_was_stopped_within_an_episode_and_a_rollout_goes_on_bit
             train(
                 CommonsEnv(GAME, 2, seed=3),
                 agents.learners,
+                Schedule(episodes=7),
                 others=agents.others,
-                episodes=7,
                 callbacks=[Stopping(stop_at)],
                 checkpointer=checkpoints,
             )

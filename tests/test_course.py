@@ -7,7 +7,7 @@ import pytest
 
 from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
 from cprl.population import Learning, Scripted
-from cprl.training.course import course_of
+from cprl.terminal.course import course_of
 
 RISE_AND_FALL = [*[300.0] * 20, *[600.0] * 40, *[200.0] * 40]
 LENGTHS = [*[1000.0] * 60, *[450.0] * 40]

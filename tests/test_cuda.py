@@ -21,7 +21,7 @@ from cprl.learners.settings import DQNSettings
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
-from cprl.training import train
+from cprl.training import Schedule, train
 
 SCRIPT = Path(__file__).with_name("cuda_in_simulator.py")
 GAMES = [f"{board}:{variant}" for board, variant in presets.GAMES]
@@ -106,11 +106,11 @@ def test_an_agent_learns_on_the_gpu():
     settings = DQNSettings(buffer_size=500, learning_starts=50)
     how = {"agents": (0,), "replicas": 1, "engine": "torchrl", "device": "cuda"}
     learner = make_learner(DQN(settings=settings), game.spaces, **how)
-    network = learner.engine.parts[0][0]
+    network = learner.lane_networks.parts[0][0]
     before = [weights.clone() for weights in network.parameters()]
     random = RandomActor(8, device="cuda")
-    train(env, {(0,): learner}, others={1: random}, episodes=1)
-    assert learner.buffer.each[0].storage[:10]["observation"].is_cuda
+    train(env, {(0,): learner}, Schedule(episodes=1), others={1: random})
+    assert learner.memory.buffer.each[0].storage[:10]["observation"].is_cuda
     assert all(not torch.equal(*pair) for pair in zip(before, network.parameters(), strict=True))
     policies = AgentPolicies({(0,): learner.evaluation_actor(8), 1: random})
     assert len(evaluate(CommonsEnv(game, 8, device="cuda"), policies)) == 8

@@ -28,7 +28,7 @@ from cprl.policies.lanes import random_agents
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
-from cprl.training import Training, train
+from cprl.training import Schedule, Training, train
 from cprl.training.agents import Population
 from cprl.training.outcome import evaluate_population, exhibited, random_play
 
@@ -99,7 +99,7 @@ def trained_for(steps, agents, *, worlds=2, engine="eager", transforms=(), **opt
     env, noting = make_env(MEADOW, worlds=worlds, seed=4, transforms=transforms), Noting()
     population = Population(env, agents, seed=6, engine=engine)
     options |= {"others": population.others, "decisions": population.decisions, "callbacks": [noting]}
-    training = Training(env, population.learners, episodes=1000, **options)
+    training = Training(env, population.learners, Schedule(episodes=1000), **options)
     training.start()
     for _ in range(steps):
         training.step()
@@ -232,7 +232,7 @@ def test_a_majority_finds_the_tax_that_pays_it_more(board, majority, choice):
     game = Game(map=board, rules=RULES, institutions=(VOTE,))
     env = CommonsEnv(game, 4, seed=1)
     population = Population(env, (replace(TABULAR, decisions=Bandit(epsilon_decay_episodes=60)),) * 3, seed=2)
-    train(env, population.learners, decisions=population.decisions, episodes=120)
+    train(env, population.learners, Schedule(episodes=120), decisions=population.decisions)
     best = population.decisions.best()[:, majority, 0]
     assert (best == choice).all(), population.decisions.values
     played = evaluate(CommonsEnv(game, 4, seed=9), population.policy(1), explore=True)
@@ -408,12 +408,12 @@ def test_decisions_are_given_where_they_are_asked_for_and_nowhere_else():
     env = make_env(MEADOW, worlds=1)
     population = Population(env, (Scripted(),) * 3)
     with pytest.raises(ValueError, match="decisions is None"):
-        Training(env, {}, others=population.others, episodes=1)
+        Training(env, {}, Schedule(episodes=1), others=population.others)
     plain = make_env(replace(MEADOW, institutions=()), worlds=1)
     alone = Population(plain, (Scripted(),) * 3)
     assert alone.decisions is None
     with pytest.raises(ValueError, match="decisions is a Decider"):
-        Training(plain, {}, others=alone.others, decisions=population.decisions, episodes=1)
+        Training(plain, {}, Schedule(episodes=1), others=alone.others, decisions=population.decisions)
     with pytest.raises(ValueError, match=r"agents\[0\].decisions is Bandit\(step_size=0.1.*allowed"):
         replace(OWN, game=replace(MEADOW, institutions=()))
     with pytest.raises(ValueError, match=r"agents\[1\].decisions is Bandit"):

@@ -9,7 +9,7 @@ from cprl import CommonsEnv, Game, Rules, maps
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import LaneActor
 from cprl.policies.scripted import scripted_lanes
-from cprl.training import train
+from cprl.training import Schedule, train
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.replay import Decisions
 from cprl.viewer.scene import APART, BAR, HIGH, decision_panels
@@ -45,7 +45,7 @@ def replay(run):
     with ViewerCallback(run, env, title="replay", episodes=1, is_replay=True) as viewer:
         policies, logger = AgentPolicies(actors), viewer.logger
         shown = Decisions(logger, logger.scene, policies, actions=GAME.actions)
-        train(env, {}, others=actors, episodes=1, callbacks=[Remembers(), viewer, shown])
+        train(env, {}, Schedule(episodes=1), others=actors, callbacks=[Remembers(), viewer, shown])
     return run / "run.rrd", taken, shown
 
 
@@ -102,13 +102,13 @@ def test_agents_without_values_say_so(played):
     ]
 
 
-def test_asking_for_preferences_draws_no_random_numbers():
+def test_asking_for_action_values_draws_no_random_numbers():
     observation = torch.zeros(1, 1, 3, 3, 5, dtype=torch.uint8)
     asked, other = (LaneActor(fixed, 8, seeds=[(3, 0)], agents=1, stochastic=True) for _ in range(2))
     chosen = []
     for _ in range(20):
-        assert asked.preferences(observation).sum() == pytest.approx(1)
+        assert asked.action_values(observation).sum() == pytest.approx(1)
         chosen.append((asked.choose(observation).item(), other.choose(observation).item()))
     assert all(one == two for one, two in chosen)
     assert len(set(chosen)) > 1
-    assert LaneActor(None, 8, seeds=[(3, 0)], agents=1).preferences(observation) is None
+    assert LaneActor(None, 8, seeds=[(3, 0)], agents=1).action_values(observation) is None

@@ -232,7 +232,7 @@ def test_every_command_in_the_docs_has_these_options(words, monkeypatch, capsys)
 
 
 def test_links_between_pages_lead_somewhere():
-    for page in [*PAGES, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md"]:
+    for page in [*PAGES, *map(ROOT.joinpath, ("CHANGELOG.md", "CONTRIBUTING.md", "examples/README.md"))]:
         for target, heading in re.findall(r"\]\(([^)#:]+)#?([^):]*)\)", page.read_text()):
             path = page.parent / target
             assert path.exists(), f"{page.name} links to {target}"

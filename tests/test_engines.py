@@ -1,5 +1,5 @@
-"""Engines: every one trains each lane as TorchRL's loss and torch's optimiser train it alone; algorithms name
-theirs, a trial finds it for losses of users."""
+"""Updates: each word trains every lane as TorchRL's loss and torch's optimiser train it alone; algorithms say
+theirs, for losses of users it is found."""
 
 import warnings
 from copy import deepcopy
@@ -9,34 +9,39 @@ from functools import partial
 import dqn_parts as parts
 import pytest
 import torch
+from c51 import C51
 from dqn_parts import KINDS, dqn_learner, dqn_loss, make_learner
 from dqn_parts import MEADOW as GAME
+from iql import IQL
 from test_population import weights
 from test_ring import ACTIONS, SHAPE, filled
 from torch import nn
-from torchrl.envs.transforms import RewardScaling
 from torchrl.modules import QValueActor
-from torchrl.objectives import DQNLoss, HardUpdate, SoftUpdate
+from torchrl.objectives import ClipPPOLoss, DQNLoss, HardUpdate, SoftUpdate
 
 from cprl import CommonsEnv
-from cprl.algorithms import DQN, IQL, MADDPG, QMIX, SAC, VDN, DistributionalDQN, DQNSettings, RolloutSettings
+from cprl.algorithms import (
+    DQN,
+    MADDPG,
+    PPO,
+    QMIX,
+    SAC,
+    VDN,
+    DQNSettings,
+    RolloutSettings,
+)
 from cprl.algorithms.base import OffPolicy, OnPolicy, TeamAlgorithm
-from cprl.learners import lanes
-from cprl.learners.engine import WAYS, FunctionalEngine, ListEngine, UpdateRule
-from cprl.learners.ring import Horizon, TransitionForm
-from cprl.learners.trial import fitting_engine, trial_batch
+from cprl.learners.draw import Draw
+from cprl.learners.networks import LaneNetworks
+from cprl.learners.optimizers import UpdateRule
+from cprl.learners.transitions import Horizon
 from cprl.networks import GRU, Conv
 from cprl.networks.mlp import MLPNetwork
 from cprl.networks.stacked import StackedMLP
-from cprl.training import train
+from cprl.training import Schedule, train
 from cprl.values import Custom
 
-ENGINES = {
-    "list": ListEngine,
-    "vmapped": partial(FunctionalEngine, batching="vmapped", compile=False),
-    "lane_axis": partial(FunctionalEngine, batching="lane_axis", compile=False),
-}
-COMPILED = partial(FunctionalEngine, batching="lane_axis", compile=True)
+UPDATES = ("list", "vmapped", "stacked")
 MAKE_LOSS = partial(dqn_loss, gamma=0.9)
 OPTIMIZERS = {
     "adam": partial(torch.optim.Adam, eps=1e-6),
@@ -62,15 +67,16 @@ def networks(lanes, dtype=torch.float32, **options):
     return made
 
 
-def trained(engine, lanes, *, steps=40, **of_rule):
-    """An engine after some steps, in which targets are copied for lane after lane."""
+def trained(update, lanes, *, steps=40, compile=False, **of_rule):
+    """The networks of lanes after some steps, in which targets are copied for lane after lane."""
     rule = UpdateRule(learning_rate=1e-2, adam_eps=1e-6, **of_rule)
-    update, ring = engine(networks(lanes, torch.float64), MAKE_LOSS, rule), filled(lanes)
+    together = LaneNetworks(networks(lanes, torch.float64), MAKE_LOSS, rule, update=update, compile=compile)
+    ring = filled(lanes)
     for step in range(steps):
-        update.update(ring)
+        together.learn(Draw.of(ring.sample()))
         if rule.tau is None:
-            update.copy_to_targets(torch.tensor([step % 20 == lane for lane in lanes]))
-    return update
+            together.copy_to_targets(torch.tensor([step % 20 == lane for lane in lanes]))
+    return together
 
 
 def by_hand(lane, *, optimizer="adam", tau=None, loss_share=1.0, max_grad_norm=None):
@@ -95,49 +101,49 @@ def in_order(tensors):
     return torch.cat([tensor.detach().flatten() for tensor in tensors]).sort().values
 
 
-def weights_of(update, lane):
+def weights_of(together, lane):
     """The weights of a lane and its targets."""
-    named = update.weights(lane)
+    named = parts.weights_at(together, lane)
     groups = ("value_network_params:", "target_value_network_params:")
     return [in_order([named[name] for name in named if name.startswith(group)]) for group in groups]
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("update", UPDATES)
 @pytest.mark.parametrize("rule", RULES, ids=str)
-def test_every_engine_trains_each_lane_as_torch_and_torchrl_train_it_alone(engine, rule):
-    update = trained(ENGINES[engine], [0, 1, 2], **rule)
+def test_every_update_trains_each_lane_as_torch_and_torchrl_train_it_alone(update, rule):
+    together = trained(update, [0, 1, 2], **rule)
     start = in_order(networks([0], torch.float64)[0].parameters())
-    assert not torch.equal(weights_of(update, 0)[0], start)
+    assert not torch.equal(weights_of(together, 0)[0], start)
     for lane in range(3):
-        torch.testing.assert_close(weights_of(update, lane), by_hand(lane, **rule), rtol=1e-10, atol=1e-10)
+        torch.testing.assert_close(weights_of(together, lane), by_hand(lane, **rule), rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_targets_begin_with_weights_of_their_own_and_change_for_the_marked_lanes_alone(engine):
-    rule = UpdateRule(learning_rate=1e-3)
-    update = ENGINES[engine](networks([0, 1]), MAKE_LOSS, rule, target_networks=networks([10, 11]))
+@pytest.mark.parametrize("update", UPDATES)
+def test_targets_begin_with_weights_of_their_own_and_change_for_the_marked_lanes_alone(update):
+    rule, targets = UpdateRule(learning_rate=1e-3), networks([10, 11])
+    together = LaneNetworks(networks([0, 1]), MAKE_LOSS, rule, update=update, target_networks=targets)
     for lane in range(2):
-        weights, targets = weights_of(update, lane)
+        weights, targets = weights_of(together, lane)
         assert torch.equal(weights, in_order(networks([lane])[0].parameters()))
         assert torch.equal(targets, in_order(networks([10 + lane])[0].parameters()))
-    update.update(filled([0, 1]))
-    update.copy_to_targets(torch.tensor([False, True]))
-    assert torch.equal(weights_of(update, 0)[1], in_order(networks([10])[0].parameters()))
-    assert torch.equal(*weights_of(update, 1))
+    together.learn(Draw.of(filled([0, 1]).sample()))
+    together.copy_to_targets(torch.tensor([False, True]))
+    assert torch.equal(weights_of(together, 0)[1], in_order(networks([10])[0].parameters()))
+    assert torch.equal(*weights_of(together, 1))
 
 
 @pytest.mark.parametrize("optimizer", OPTIMIZERS)
-@pytest.mark.parametrize("engine", ["list", "lane_axis"])
-def test_an_engine_continues_from_its_state_with_every_optimiser(engine, optimizer):
-    first, second = (trained(ENGINES[engine], [0, 1], steps=0, optimizer=optimizer) for _ in range(2))
+@pytest.mark.parametrize("update", ["list", "stacked"])
+def test_networks_continue_from_their_state_with_every_optimiser(update, optimizer):
+    first, second = (trained(update, [0, 1], steps=0, optimizer=optimizer) for _ in range(2))
     ring, same = filled([0, 1]), filled([0, 1])
     for _ in range(5):
-        first.update(ring)
-        same.draw()
+        first.learn(Draw.of(ring.sample()))
+        same.places()
     second.load_state_dict(deepcopy(first.state_dict()))
     for _ in range(5):
-        assert torch.equal(first.update(ring), second.update(same))
+        assert torch.equal(first.learn(Draw.of(ring.sample())), second.learn(Draw.of(same.sample())))
 
 
 def test_the_stacked_networks_give_what_each_gives():
@@ -159,13 +165,13 @@ def test_a_failing_compile_falls_back_with_one_warning(monkeypatch):
 
     monkeypatch.setattr(torch, "compile", lambda *_, **__: run)
     with pytest.warns(RuntimeWarning, match="torch.compile failed, updates run uncompiled.*no C") as caught:
-        update = trained(COMPILED, [0, 1])
+        together = trained("stacked", [0, 1], compile=True)
     assert len(caught) == 1
-    eager = trained(ENGINES["lane_axis"], [0, 1])
-    assert all(map(torch.equal, weights_of(update, 1), weights_of(eager, 1)))
+    eager = trained("stacked", [0, 1])
+    assert all(map(torch.equal, weights_of(together, 1), weights_of(eager, 1)))
 
 
-# Which way of updating is taken.
+# Which word is taken.
 
 SETTINGS = DQNSettings(
     buffer_size=150, batch_size=4, learning_rate=1e-3, hidden_cells=(8,), target_every_episodes=2
@@ -174,47 +180,71 @@ ROLLOUTS = RolloutSettings(rollout_steps=8, minibatch_size=4)
 
 
 CELLS = GRU(recurrent_cells=4)
-WITH_NETWORKS = [(kind, network) for kind in KINDS for network in (None, Conv(channels=(2,)))]
+VMAPPED = [kind for kind in KINDS if kind is not C51]
+"""All whose losses torch vmaps; that of C51 reads a number in Python."""
+WITH_NETWORKS = [(kind, network) for kind in VMAPPED for network in (None, Conv(channels=(2,)))]
 WITH_NETWORKS += [(kind, CELLS) for kind in KINDS if kind.can_be_recurrent]
 
 
 @pytest.mark.parametrize(("kind", "network"), WITH_NETWORKS, ids=str)
-def test_the_way_that_an_algorithm_names_is_the_first_that_a_trial_finds(kind, network, monkeypatch):
+def test_an_own_loss_of_an_algorithm_that_says_nothing_learns_the_same_and_is_no_list(kind, network):
+    """Each lane learns what it would by the word that the algorithm says."""
     steps = {"sequence_steps": 4} if network is CELLS else {}
-    settings = ROLLOUTS if issubclass(kind, OnPolicy) else DQNSettings(buffer_size=50, **steps)
+    settings = ROLLOUTS if issubclass(kind, OnPolicy) else DQNSettings(buffer_size=50, adam_eps=1e-3, **steps)
     algorithm = kind(settings=settings, network=network)
+    own = parts.changed(algorithm, make_loss=algorithm.make_loss)
     reward = "team" if issubclass(kind, TeamAlgorithm) else "individual"
-    named = partial(make_learner, algorithm, GAME.spaces, agents=(0, 1), replicas=2, reward_kind=reward)
+    how = {"agents": (0, 1), "replicas": 2, "reward": reward, "engine": "eager", "seed": 1}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        learner = named(engine="eager")
-        monkeypatch.setattr(kind, "batching", None)
-        found = named(engine="eager")
-    assert found.engine.batching == learner.engine.batching
-    torch.testing.assert_close(weights(found), weights(learner), rtol=0, atol=0)  # a trial changes nothing
+        said, found = (make_learner(each, GAME.spaces, **how) for each in (algorithm, own))
+    assert found.lane_networks.update == "vmapped"
+    torch.testing.assert_close(weights(found), weights(said), rtol=0, atol=0)  # the look changes nothing
+    for each in (said, found):
+        train(CommonsEnv(GAME, 2, seed=3), {(0, 1): each}, Schedule(episodes=2))
+    torch.testing.assert_close(weights(found), weights(said), rtol=1e-4, atol=1e-5)
 
 
-def test_no_trial_is_made_for_algorithms_that_name_their_way_but_for_what_users_change_of_them(monkeypatch):
-    @dataclass(frozen=True, kw_only=True)
-    class Own(DQN):
-        """With a loss that may be another one."""
+@dataclass(frozen=True, kw_only=True)
+class Same(DQN):
+    """Changes nothing."""
 
-    trials = []
-    monkeypatch.setattr(lanes, "fitting_engine", lambda *given: trials.append(given) or "list")
+
+@dataclass(frozen=True, kw_only=True)
+class OwnLoss(DQN):
+    """With a loss of its own."""
+
+    def make_loss(self, network):
+        return super().make_loss(network)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnWord(OwnLoss):
+    """Says how it is updated."""
+
+    update = "vmapped"
+
+
+def test_a_class_says_its_update_for_its_own_loss_and_for_subclasses_that_keep_it():
     own_network = Custom("test_engines:own_network")
-    for algorithm, count in ((DQN, 0), (Own, 1), (partial(DQN, network=own_network), 2)):
-        settings = DQNSettings(buffer_size=50)
-        make_learner(algorithm(settings=settings), GAME.spaces, agents=(0, 1), replicas=2)
-        assert len(trials) == count
+    for algorithm, word in (
+        (DQN, "stacked"),
+        (Same, "stacked"),
+        (OwnLoss, None),
+        (OwnWord, "vmapped"),
+        (partial(DQN, network=own_network), None),
+        (QMIX, "vmapped"),
+    ):
+        assert algorithm(settings=SETTINGS).said_update() == word
 
 
 class OwnNetwork(nn.Module):
     """A user's."""
 
-    def __init__(self, actions=ACTIONS):
+    def __init__(self, spaces):
         super().__init__()
-        self.layers = nn.Sequential(nn.Flatten(-3), nn.LazyLinear(6), nn.Tanh(), nn.Linear(6, actions))
-        self(torch.zeros(1, *SHAPE))
+        self.layers = nn.Sequential(nn.Flatten(-3), nn.LazyLinear(6), nn.Tanh(), nn.Linear(6, spaces.actions))
+        self(torch.zeros(1, *spaces.observation_shape))
 
     def forward(self, observation):
         return self.layers(observation.float() / 255)
@@ -242,6 +272,10 @@ class LookingAtNumbers(DQNLoss):
         return out
 
 
+class LookingAtTheMean(LookingAtNumbers, OverAllLanes):
+    """Both."""
+
+
 def loss_of(kind):
     def make(network):
         actor = QValueActor(network, spec=None, action_space="categorical")
@@ -252,26 +286,123 @@ def loss_of(kind):
     return make
 
 
-@pytest.mark.parametrize(
-    ("make_network", "make_loss", "way"),
-    [
-        (lambda: networks([0])[0], MAKE_LOSS, "lane_axis"),
-        (OwnNetwork, MAKE_LOSS, "vmapped"),
-        (lambda: networks([0])[0], loss_of(OverAllLanes), "vmapped"),
-        (OwnNetwork, loss_of(LookingAtNumbers), "list"),
-    ],
-    ids=["ours", "own network", "a loss that would mix lanes", "a loss that cannot be vmapped"],
-)
-def test_a_trial_finds_the_fastest_way_and_warns_of_the_slow_one_alone(make_network, make_loss, way):
-    trial = trial_batch(2, TransitionForm(observation_shape=SHAPE), ACTIONS)
-    made = [make_network() for _ in range(2)]
+class Clipped(ClipPPOLoss):
+    """Normalises advantages over all that a call has: with a lane axis, over all lanes."""
+
+
+def clipped(algorithm, network, *, normalize_advantage):
+    loss = algorithm.make_loss(network)
+    own = Clipped(
+        loss.actor_network,
+        loss.critic_network,
+        loss_critic_type="l2",
+        normalize_advantage=normalize_advantage,
+    )
+    own.forward = partial(ask_in_python, own.forward)
+    return own
+
+
+def ask_in_python(forward, tensordict):
+    assert float(tensordict["advantage"].sum()) < 1e9
+    return forward(tensordict)
+
+
+def counted(name):
+    """A kind of loss that keeps something of each call under a name."""
+
+    class Counting(DQNLoss):
+        def __init__(self, *given, **options):
+            super().__init__(*given, **options)
+            self.register_buffer("mean", torch.zeros(()))
+            self.calls, self.seen = 0, []
+
+        def forward(self, tensordict):
+            rewards = tensordict["next", "reward"].detach()
+            if name == "buffer, replaced":
+                self.mean = 0.9 * self.mean + 0.1 * rewards.mean()
+            if name == "buffer, in place":
+                self.mean.mul_(0.9).add_(0.1 * rewards.mean())
+            if name == "number":
+                self.calls += 1
+            if name == "tensor":
+                self.first = getattr(self, "first", rewards.mean())
+            if name == "list":
+                self.seen.append(1.0)
+            out, first = super().forward(tensordict), getattr(self, "first", 0.0)
+            return out.set("loss", out["loss"] * (1 + self.mean + first) / (1 + self.calls))
+
+    return Counting
+
+
+KEPT = ["buffer, replaced", "buffer, in place", "number", "tensor"]
+
+
+def found_for(algorithm):
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
-        assert fitting_engine(made, make_loss, trial) == way
-    assert bool(warned) == (way not in WAYS)
+        learner = make_learner(algorithm, GAME.spaces, agents=(0, 1), replicas=2, engine="eager", seed=7)
+    return learner, [str(warning.message) for warning in warned]
+
+
+@pytest.mark.parametrize(
+    ("own", "update"),
+    [
+        ({"make_loss": loss_of(DQNLoss)}, "vmapped"),
+        ({"make_network": lambda spaces: OwnNetwork(spaces)}, "vmapped"),
+        ({"make_loss": loss_of(OverAllLanes)}, "vmapped"),
+        ({"make_loss": loss_of(LookingAtNumbers)}, "list"),
+        ({"make_loss": loss_of(LookingAtTheMean)}, "list"),
+    ],
+    ids=["TorchRL's", "own network", "mixes lanes", "cannot be vmapped", "cannot be vmapped and mixes lanes"],
+)
+def test_the_fastest_update_that_leaves_lanes_alone_is_found_and_the_slow_one_is_warned_of(own, update):
+    learner, warned = found_for(parts.changed(DQN(settings=SETTINGS), **own))
+    assert learner.lane_networks.update == update
+    assert [message for message in warned if "many times slower" in message] == warned
+    assert bool(warned) == (update == "list")
     if warned:
-        assert "many times slower" in str(warned[0].message)
-        assert ".item()" in str(warned[0].message)
+        assert ".item()" in warned[0]
+
+
+def test_a_loss_that_normalises_over_its_batch_is_not_stacked():
+    for normalize in (False, True):
+        algorithm = PPO(settings=ROLLOUTS)
+        own = parts.changed(algorithm, make_loss=partial(clipped, algorithm, normalize_advantage=normalize))
+        learner, warned = found_for(own)
+        assert learner.lane_networks.update == "list"
+        assert len(warned) == 1
+
+
+@pytest.mark.parametrize("name", KEPT)
+def test_what_a_loss_keeps_is_each_lanes_own_and_is_in_the_state(name):
+    algorithm = parts.changed(DQN(settings=SETTINGS), make_loss=loss_of(counted(name)))
+    (whole, warned), (stopped, _), (resumed, _) = (found_for(algorithm) for _ in range(3))
+    assert whole.lane_networks.update == "list"
+    assert "keeps of a call" in warned[0] or "in-place" in warned[0]
+    played(whole, 40)
+    env = CommonsEnv(GAME, 2, seed=3)
+    moment = env.reset()
+    for step in range(40):
+        learner = stopped if step < 25 else resumed
+        if step == 25:
+            resumed.load_state_dict(deepcopy(stopped.state_dict()))
+        moment["agents", "action"] = learner.actor.choose(moment["agents", "observation"])
+        turn, moment = env.step_and_maybe_reset(moment)
+        learner.store(turn)
+        learner.update()
+        if turn["next", "done"].any():
+            learner.end_episode(turn["next", "done"].flatten())
+    torch.testing.assert_close(weights(resumed), weights(whole), rtol=0, atol=0)
+    kept = [loss.kept() for loss in whole.lane_networks.losses]
+    if name != "number":
+        numbers = [float(own["attributes"].get("first", own["buffers"]["mean"])) for own in kept]
+        assert len(set(numbers)) > 1, "each lane's own"
+
+
+def test_a_loss_that_keeps_what_no_checkpoint_has_is_refused_by_name():
+    algorithm = parts.changed(DQN(settings=SETTINGS), make_loss=loss_of(counted("list")))
+    with pytest.raises(ValueError, match="the loss Counting keeps its seen, a list, from call to call"):
+        found_for(algorithm)
 
 
 # What learners make of their settings.
@@ -284,9 +415,12 @@ def played(learner, steps=40):
 def learner(engine="eager", algorithm=DQN, **settings):
     made = algorithm(settings=replace(SETTINGS, **settings))
     reward = "team" if algorithm in (VDN, QMIX) else "individual"
-    return make_learner(
-        made, GAME.spaces, agents=(0, 1), replicas=2, engine=engine, seed=7, reward_kind=reward
-    )
+    return make_learner(made, GAME.spaces, agents=(0, 1), replicas=2, engine=engine, seed=7, reward=reward)
+
+
+def learner_in_worlds(engine, *, worlds, **settings):
+    algorithm = DQN(settings=replace(SETTINGS, **settings))
+    return make_learner(algorithm, GAME.spaces, agents=(0, 1), replicas=1, worlds=worlds, engine=engine)
 
 
 def updates_in(losses):
@@ -298,10 +432,8 @@ def test_updates_come_from_the_first_possible_step_on_every_so_many_steps_and_so
     """16 transitions are wanted first, the 16th is the first step that counts."""
     often = learner(engine)
     assert updates_in(played(often, steps=18)) == [16, 17, 18]
-    steps = []
     fourth = learner(engine, steps_per_update=4, updates_per_step=2)
-    update = fourth.engine.update
-    fourth.engine.update = lambda ring: steps.append(1) or update(ring)
+    steps = parts.watch_steps(fourth, lambda draw: 1)
     losses = played(fourth, steps=30)
     assert updates_in(losses) == [19, 23, 27]
     assert losses[18].shape == (2, 2)
@@ -315,14 +447,14 @@ def test_updates_come_from_the_first_possible_step_on_every_so_many_steps_and_so
 def test_steps_an_update_and_updates_that_wait_for_several_steps_agree(update_every):
     """A loop that asks for k updates after every k steps gets as many as one that asks after each."""
     often = learner(steps_per_update=4, learning_starts=1)
-    train(CommonsEnv(GAME, 2, seed=3), {(0, 1): often}, episodes=2, update_every=update_every)
-    assert often.engine.steps == often.steps // update_every * update_every // 4
+    train(CommonsEnv(GAME, 2, seed=3), {(0, 1): often}, Schedule(episodes=2, update_every=update_every))
+    assert often.lane_networks.updates == often.steps // update_every * update_every // 4
 
 
 @pytest.mark.parametrize("engine", ["eager", "torchrl"])
 def test_hard_targets_are_copied_every_so_many_episodes_of_each_replica_and_with_tau_never(engine):
     def copied(of):
-        return [torch.equal(*weights_of(of.engine, lane)) for lane in range(4)]
+        return [torch.equal(*weights_of(of.lane_networks, lane)) for lane in range(4)]
 
     hard, soft = learner(engine, own_target_weights=True), learner(engine, tau=0.01)
     assert copied(hard) == [False] * 4, "targets begin with weights of their own"
@@ -343,9 +475,9 @@ def test_hard_targets_are_copied_every_so_many_episodes_of_each_replica_and_with
 def test_soft_targets_move_by_tau_after_every_update(engine):
     soft = learner(engine, tau=0.25)
     played(soft, steps=SETTINGS.learning_starts - 1)
-    before = {name: value.clone() for name, value in soft.engine.weights(0).items()}
+    before = {name: value.clone() for name, value in parts.weights_at(soft.lane_networks, 0).items()}
     played(soft, steps=1)
-    now = soft.engine.weights(0)
+    now = parts.weights_at(soft.lane_networks, 0)
     for target in [name for name in now if name.startswith("target_")]:
         wanted = before[target] + 0.25 * (now[target.removeprefix("target_")] - before[target])
         torch.testing.assert_close(now[target], wanted)
@@ -362,8 +494,8 @@ def test_a_target_bootstraps_by_the_discount_of_its_steps():
     """target = sum of r + gamma**steps max Q'(s'), without the last term behind a terminal state."""
     ring = filled([0, 1], steps=40, horizon=Horizon(3, 0.9))
     batch = ring.sample()
-    update = ENGINES["lane_axis"](networks([0, 1]), MAKE_LOSS, UpdateRule(learning_rate=0.1))
-    losses = update.update_from(batch)
+    together = LaneNetworks(networks([0, 1]), MAKE_LOSS, UpdateRule(learning_rate=0.1), update="stacked")
+    losses = together.learn(Draw.of(batch))
     for turns, network, loss in zip(batch, networks([0, 1]), losses.tolist(), strict=True):
         with torch.no_grad():
             value = network(turns["observation"]).gather(-1, turns["action"][:, None])
@@ -395,11 +527,16 @@ def ignores_steps(network):
     [
         (partial(learner, algorithm=IQL, n_steps=3), "DiscreteIQLLoss does not read"),  # of TorchRL 0.14.1
         (partial(learner, "torchrl", n_steps=3), "n_steps is 3"),
+        *(
+            (partial(learner_in_worlds, engine, worlds=16, buffer_size=size), "in 16 worlds: 32 or more")
+            for engine in ("eager", "torchrl")
+            for size in (8, 16)
+        ),
         (partial(DQNSettings, n_steps=17), "n_steps is 17.*learning_starts"),
         (partial(DQNSettings, n_steps=17, buffer_size=6), "n_steps is 17.*buffer_size"),
         *(
             (partial(learner, engine, algorithm=kind, relu_on_outputs=True), "relu_on_outputs is True")
-            for kind in (SAC, IQL, DistributionalDQN)
+            for kind in (SAC, IQL, C51)
             for engine in ("eager", "torchrl")
         ),
     ],
@@ -417,33 +554,3 @@ def test_losses_that_cannot_learn_from_returns_of_several_steps_are_refused(make
     settings = replace(SETTINGS, n_steps=3)
     with pytest.raises(ValueError, match=message):
         dqn_learner(GAME.spaces, agents=(0, 1), replicas=2, settings=settings, make_loss=make_loss)
-
-
-class Counting(RewardScaling):
-    """A transform with a state."""
-
-    def __init__(self, **options):
-        super().__init__(0.0, 10.0, in_keys=[("next", "reward")], **options)
-        self.register_buffer("calls", torch.zeros((), dtype=torch.int64))
-
-    def forward(self, tensordict):
-        self.calls += 1
-        return super().forward(tensordict)
-
-
-def test_transforms_of_the_replay_buffer_run_with_torchrls_engine_alone():
-    counting = (Custom("test_engines:Counting"),)
-    made, plain = learner("torchrl", replay_transforms=counting), learner("torchrl")
-    losses, plain_losses = played(made, 24), played(plain, 24)
-    (transform,) = made.buffer.each[0].transform
-    assert int(transform.calls) == 24 - SETTINGS.learning_starts + 1
-    assert made.buffer.each[0].storage[:]["next", "reward"].max() == 1.0, "what is stored stays as it was"
-    assert not torch.equal(losses[-1], plain_losses[-1])
-    other = learner("torchrl", replay_transforms=counting)
-    other.load_state_dict(made.state_dict())
-    assert int(other.buffer.each[0].transform[0].calls) == int(transform.calls)
-    with pytest.raises(ValueError, match=r'replay_transforms is .*engine="torchrl"'):
-        learner(replay_transforms=counting)
-    wrong = Custom("torchrl.envs:RewardScaling", {"loc": 0.0, "scale": 2.0})
-    with pytest.raises(ValueError, match=r"torchrl.envs:RewardScaling cannot transform .*'reward' not found"):
-        learner("torchrl", replay_transforms=(wrong,))

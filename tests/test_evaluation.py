@@ -61,8 +61,9 @@ from cprl.population import Frozen, Scripted
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.recipe import start_run
 from cprl.system.process import one_thread
-from cprl.training import train
-from cprl.training.agents import Population, StoredAgent, stored_policies
+from cprl.training import Schedule, train
+from cprl.training.agents import Population
+from cprl.training.stored import StoredAgent, stored_policies
 
 
 @pytest.fixture(scope="module")
@@ -236,7 +237,7 @@ def test_an_agent_values_actions_alone_as_among_others_to_the_last_bit():
             [[agents[lane] for lane in lanes]], spaces, replicas=lanes, worlds=1, seed=0
         )
         (actor,) = (own for own in network.modules() if isinstance(own, LaneActor))
-        return actor.preferences(seen[lanes])
+        return actor.action_values(seen[lanes])
 
     with one_thread():
         together = values(range(8))
@@ -262,7 +263,7 @@ def test_a_run_that_has_not_ended_plays_by_its_newest_checkpoint(tmp_path):
                 raise Stopped
 
     with pytest.raises(Stopped), Stops(run) as checkpoints:
-        train(env, agents.learners, others=agents.others, episodes=9, checkpointer=checkpoints)
+        train(env, agents.learners, Schedule(episodes=9), others=agents.others, checkpointer=checkpoints)
     fresh = Fresh(episodes=3, greedy=True)
     found = cprl.evaluate_run(run, fresh)
     assert "training-000000000030" in said(found, "weights")

@@ -1,6 +1,8 @@
-"""The examples in miniature: cprl's games under other people's trainers."""
+"""The examples run as they stand; those of other people's trainers in miniature."""
 
 import importlib.util
+import re
+import runpy
 import sys
 from collections import Counter
 from dataclasses import replace
@@ -14,7 +16,27 @@ from cprl import Game, Rules, maps, presets
 from cprl.envs import parallel_env
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
+OTHERS = EXAMPLES / "other_trainers"
+OWN = EXAMPLES / "own_algorithm"
+NUMBER = r"[+-]?(\d+\.\d+|nan)"
+INTERVAL = rf"{NUMBER} \[{NUMBER}, {NUMBER}\]"
+PRINTS = {
+    "run": rf"runs/run-\S+: {NUMBER} apples at first, {NUMBER} in the end",
+    "resume": r"stopped; on the command line: cprl run runs/\S+ --resume\n(.*\n)*the same episodes: True",
+    "extend": "the same episodes: True",
+    "own_metric": rf"largest_share, trained: {INTERVAL}\nlargest_share, random: {INTERVAL}",
+    "own_network": "agent_0: ConvNetwork, [0-9,]+ weights\n.*agent_1: Tanh, [0-9,]+ weights",
+    "own_loss": rf"__main__:huber: {NUMBER}, {NUMBER} apples\n__main__:Hysteretic: {NUMBER}, {NUMBER} apples",
+    "own_institution": rf"fee 0.5: \d+ shots, which cost {NUMBER} apples",
+    "own_game": rf"trained, agent_0/return: {INTERVAL}\nrandom, agent_0/return: {INTERVAL}",
+    "evaluate": rf"collective_return, trained - random: {INTERVAL}\ntensor\(\[\[",
+    "sweep": rf"collective_return, freeze_steps=25: {INTERVAL}\n.*/summary.md",
+    "plot": r"runs/plot-\S+/own\.png",
+    "c51": rf"agent_0: {NUMBER} apples\nreplica_0/agent_1: {NUMBER} apples",
+    "cql": rf"agent_0: {NUMBER} apples\nreplica_0/agent_1: {NUMBER} apples",
+    "iql": r"agent_0: [01]\.\d\d\nreplica_0/agent_1: [01]\.\d\d",
+}
+"""What each example prints at its end."""
 EASY = Game(
     map=maps.parse(">.A.\n....\n.A.<"), rules=Rules(regrow_prob=(0.5,), may_fire=False, episode_steps=60)
 )
@@ -29,6 +51,44 @@ RLLIB = [
 ]
 
 
+OF_CPRL = sorted([*EXAMPLES.glob("*.py"), *OWN.glob("*.py")])
+
+
+@pytest.mark.parametrize("path", [*OF_CPRL, *OTHERS.glob("*.py")], ids=lambda path: path.stem)
+def test_an_example_is_short_says_what_it_shows_and_has_a_place_in_the_one_list(path):
+    lines = path.read_text().splitlines()
+    assert len(lines) <= (110 if path.parent == OWN else 60)
+    if path.parent == OTHERS:
+        page = (EXAMPLES.parent / "docs" / "algorithms.md").read_text()
+        assert f"| `{path.relative_to(EXAMPLES.parent)} " in page
+        return
+    assert re.match(r'"""How to .*\.$', lines[0])
+    assert re.match(r'Prints .*\."""$', lines[1])
+    assert f"]({path.relative_to(EXAMPLES)})" in (EXAMPLES / "README.md").read_text()
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("path", OF_CPRL, ids=lambda path: path.stem)
+def test_an_example_prints_at_its_end_what_it_says(path, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(path), run_name="__main__")
+    assert re.search(PRINTS[path.stem], capsys.readouterr().out)
+
+
+@pytest.mark.integration
+@pytest.mark.filterwarnings("ignore:no agent can harvest:UserWarning")
+@pytest.mark.parametrize("name", ["resume", "extend"])
+def test_runs_are_compared_alike_where_nobody_harvests_and_numbers_are_undefined(
+    name, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    source = (EXAMPLES / f"{name}.py").read_text()
+    far = source.replace(r".A>.A.\nAA..AA\n.A.<A.", r"A#.>.<")
+    assert far != source
+    exec(compile(far, name, "exec"), {"__name__": "__main__"})
+    assert capsys.readouterr().out.endswith("the same episodes: True\n")
+
+
 def game_of(env):
     """The seed and the number of the episode that a world plays: all that its chance depends on."""
     world = env.batch.now
@@ -40,20 +100,13 @@ def example(monkeypatch):
     """Loads an example, as a module that can be pickled."""
 
     def loaded(name):
-        spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+        spec = importlib.util.spec_from_file_location(name, OTHERS / f"{name}.py")
         module = importlib.util.module_from_spec(spec)
         monkeypatch.setitem(sys.modules, name, module)
         spec.loader.exec_module(module)
         return module
 
     return loaded
-
-
-def test_an_example_has_less_than_sixty_lines_and_a_row_in_the_docs():
-    page = (EXAMPLES.parent / "docs" / "algorithms.md").read_text()
-    for name in NAMES:
-        assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) < 60, name
-        assert f"| `examples/{name}.py " in page
 
 
 @pytest.mark.integration

@@ -12,14 +12,16 @@ import torch
 from matrix_game import MatrixGame
 from recordings import column
 from rerun.chunk import RrdReader
+from tensordict import TensorDict
 from torchrl.envs import Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import Custom, Experiment, Game, River, Rules, maps
 from cprl.algorithms import DQN, MAPPO, PPO, DQNSettings, RolloutSettings
 from cprl.envs.make_env import make_env
+from cprl.policies.present import FirstReplica
 from cprl.population import Learning, Scripted, Team
-from cprl.training import train
+from cprl.training import Schedule, train
 from cprl.training.agents import Population
 from cprl.training.outcome import exhibited, fresh_env, random_play
 from cprl.viewer import exhibition
@@ -167,7 +169,7 @@ def test_an_exhibition_changes_nothing_that_is_learned(name, tmp_path, monkeypat
                 how = {"episodes": episodes, "live": "serve", "exhibited": shown}
                 viewer = viewing.enter_context(ViewerCallback(tmp_path, env, title="run", **how))
                 callbacks.append(viewer)
-            train(env, agents, others=population.others, episodes=episodes, callbacks=callbacks)
+            train(env, agents, Schedule(episodes=episodes), others=population.others, callbacks=callbacks)
             if watched:
                 played.append(viewer.exhibition.steps)
         weights = [net.state_dict() for net in population.networks().values()]
@@ -182,16 +184,17 @@ def test_an_exhibition_changes_nothing_that_is_learned(name, tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_the_present_policy_computes_its_own_replica_alone_and_acts_as_in_evaluation(name):
+def test_the_present_policy_acts_in_its_replica_as_in_evaluation(name):
     _, population = population_of(EXPERIMENTS[name])
     for learner in population.learners.values():
         of_all = learner.evaluation_actor(1)
-        alone = learner.evaluation_actor(1).of_first_replica()
+        alone = FirstReplica(learner.evaluation_actor(1), population.replicas)
         shape = of_all.replicas, of_all.agents, *population.spaces.observation_shape
         seen = torch.randint(0, 256, shape, dtype=torch.uint8)
         with set_exploration_type(ExplorationType.RANDOM):
             for _ in range(20):
-                assert torch.equal(alone.choose(seen[:1]), of_all.choose(seen)[:1])
+                moment = TensorDict({"observation": seen[:1]}, [1])
+                assert torch.equal(alone(moment)["action"], of_all.choose(seen)[:1])
 
 
 def test_it_plays_ten_to_twelve_steps_a_second_however_often_the_training_asks(kept):
@@ -250,7 +253,9 @@ def test_it_plays_the_weights_and_the_exploration_of_the_moment(tmp_path):
     (learner,) = population.learners.values()
     learner.actor.epsilon = 0.0
     seen = world.reset()
-    last = [value for value in learner.engine.params.values() if len(value) == value.shape[-1] == 8][-1]
+    last = [value for value in learner.lane_networks.params.values() if len(value) == value.shape[-1] == 8][
+        -1
+    ]
     for best in (2, 5):
         with torch.no_grad():
             last.zero_()

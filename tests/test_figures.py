@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from iql import IQL
 from matplotlib.collections import PolyCollection
 from matplotlib.image import imread
 from matplotlib.text import Text
@@ -21,7 +22,7 @@ from test_results import an_episode
 
 import cprl
 from cprl import Game, Rules, maps, presets
-from cprl.algorithms import DQN, IQL, MADDPG, PPO, PR2, SAC
+from cprl.algorithms import DQN, MADDPG, PPO, PR2, SAC
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.measuring.windows import centres
 from cprl.population import Learning, Scripted, Team, exploration_steps

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from dqn_parts import dqn_learner, make_learner
+from c51 import C51
+from dqn_parts import make_learner
 from matrix_game import MatrixGame
 from torchrl.envs import Transform, TransformedEnv
 
@@ -16,13 +17,14 @@ from cprl import CommonsEnv, Custom, Experiment, Game, Rules, algorithms, load, 
 from cprl.algorithms import DQN, PPO, PR2, DQNSettings, LOLASettings, RolloutSettings
 from cprl.commands.recipe import parse
 from cprl.envs.make_env import spaces_of
-from cprl.learners.engine import ListEngine
+from cprl.learners.lanes import Lanes
+from cprl.learners.learner import Learner
 from cprl.learners.lola import LOLANetworks
-from cprl.learners.replay import ReplayLearner
+from cprl.learners.plain import PlainNetworks
 from cprl.networks.finite import all_finite, finite_lanes
 from cprl.population import Learning
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in
-from cprl.training import Training, train
+from cprl.training import Schedule, Training, train
 from cprl.training.finite import FiniteCheck, NotFinite, NotFiniteError, places
 from cprl.training.learning import LaneLosses
 
@@ -42,11 +44,11 @@ REPLAY = DQNSettings(
 )
 ROLLOUT = RolloutSettings(rollout_steps=6, minibatch_size=3, epochs=2, hidden_cells=(8,), learning_rate=1e-3)
 LOOK = LOLASettings(rollout_steps=6, hidden_cells=(8,))
-STOCK, TEAM = {"engine": "torchrl"}, {"reward_kind": "team"}
+STOCK, TEAM = {"engine": "torchrl"}, {"reward": "team"}
 LEARNERS = {
     "DQN": (DQN(settings=REPLAY), {}),
     "DQN with soft updates": (DQN(settings=replace(REPLAY, tau=0.1)), {}),
-    "C51": (algorithms.DistributionalDQN(settings=REPLAY, atoms=5), {}),
+    "C51": (C51(settings=REPLAY, atoms=5), {}),
     "SAC": (algorithms.SAC(settings=REPLAY), {}),
     "PR2": (PR2(settings=REPLAY), {}),
     "PR2 of TorchRL": (PR2(settings=REPLAY), STOCK),
@@ -68,7 +70,7 @@ REPLICAS, BROKEN = 3, (1, 0)
 
 def learner_named(name, **changes):
     algorithm, settings = LEARNERS[name]
-    settings = {"engine": "eager", "reward_kind": "individual", "replicas": REPLICAS, **settings, **changes}
+    settings = {"engine": "eager", "reward": "individual", "replicas": REPLICAS, **settings, **changes}
     return make_learner(algorithm, GAME.spaces, agents=(0, 1), seed=5, **settings)
 
 
@@ -77,14 +79,14 @@ def tensors_of(learner, replica, agent):
     if hasattr(learner, "tables"):
         lane = replica * len(learner.agents) + agent
         return [torch.from_numpy(learner.tables.values)[list(learner.tables.rows[lane].values())[-1]]]
-    of_replica = len(learner._lanes) // learner.replicas
+    of_replica = len(learner.lanes) // learner.replicas
     lane = replica * of_replica + (agent if of_replica > 1 else 0)
-    if isinstance(learner.engine, ListEngine):
-        return [weights.data for weights in learner.engine.losses[lane].parameters()]
-    if isinstance(learner.engine, LOLANetworks):
-        stacks = (learner.engine.actors, learner.engine.playing)
+    if isinstance(learner.lane_networks, LOLANetworks):
+        stacks = (learner.lane_networks.actors, learner.lane_networks.players)
         return [weights.data[replica] for stack in stacks for weights in stack[agent].parameters()]
-    return [weights[lane] for weights in learner.engine.params.values()]
+    if isinstance(learner.lane_networks, PlainNetworks):
+        return [weights.data for weights in learner.lane_networks.losses[lane].parameters()]
+    return [weights[lane] for weights in learner.lane_networks.params.values()]
 
 
 class Breaks:
@@ -106,11 +108,12 @@ class Breaks:
         self.returns.setdefault(episode.world, []).append(episode.return_.tolist())
 
 
-def play(learner, *, breaks=-1, episodes=3, **changes):
+def play(learner, *, breaks=-1, episodes=3, on_nan="stop"):
     """The training of a learner that breaks at a step, and what was seen of it."""
     seen = Breaks(breaks)
     env = CommonsEnv(GAME, learner.replicas, seed=2)
-    training = train(env, {learner.agents: learner}, episodes=episodes, callbacks=[seen], **changes)
+    schedule = Schedule(episodes=episodes, on_nan=on_nan)
+    training = train(env, {learner.agents: learner}, schedule, callbacks=[seen])
     return training, seen
 
 
@@ -225,7 +228,7 @@ def poisoned(entry, *, step, learning_starts=4, steps=5, **changes):
     env = TransformedEnv(MatrixGame(3, steps=steps), Poison(entry, world=2, agent=1, step=step, **changes))
     algorithm = DQN(settings=replace(REPLAY, learning_starts=learning_starts))
     learner = make_learner(algorithm, spaces_of(env), agents=(0, 1), replicas=3, engine="eager")
-    return Training(env, {(0, 1): learner}, episodes=3)
+    return Training(env, {(0, 1): learner}, Schedule(episodes=3))
 
 
 def step(training, steps):
@@ -260,7 +263,8 @@ def test_what_a_game_gives_is_looked_at_every_sixteen_steps_and_when_episodes_en
 
 def a_training(**changes):
     learner = learner_named("DQN")
-    return Training(CommonsEnv(GAME, REPLICAS, seed=2), {(0, 1): learner}, episodes=9, **changes)
+    schedule = Schedule(episodes=9, **changes)
+    return Training(CommonsEnv(GAME, REPLICAS, seed=2), {(0, 1): learner}, schedule)
 
 
 def test_no_checkpoint_holds_what_is_not_finite_and_the_last_one_is_kept(tmp_path):
@@ -312,21 +316,15 @@ def test_with_continue_the_last_sound_checkpoint_is_kept_beside_the_others(tmp_p
 
 
 def test_a_learner_of_somebodys_own_that_refuses_nan_is_explained():
-    class Refuses(ReplayLearner):
+    class Refuses(Learner):
         def update(self):
             losses = super().update()
             if not self.finite().all():
                 raise RuntimeError("probability tensor contains either `inf`, `nan` or element < 0")
             return losses
 
-    learner = dqn_learner(
-        GAME.spaces,
-        kind=Refuses,
-        agents=(0, 1),
-        replicas=REPLICAS,
-        settings=REPLAY,
-        compile=False,
-    )
+    lanes = Lanes(GAME.spaces, agents=(0, 1), replicas=REPLICAS)
+    learner = Refuses(DQN(settings=REPLAY), lanes, "eager")
     with pytest.raises(NotFiniteError, match="at step 6 the weights of agent 0 in replica 1 are") as caught:
         play(learner, breaks=5)
     assert "probability tensor" in str(caught.value.__context__)

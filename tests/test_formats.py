@@ -13,7 +13,10 @@ import torch
 from golden import RESULTS, WITH_THE_FAULT
 
 import cprl
+from cprl import presets
+from cprl.algorithms import DQN, DQNSettings
 from cprl.experiment import Experiment
+from cprl.population import Learning, Scripted
 from cprl.runs.checkpoints import read_checkpoint
 from cprl.runs.curves import curves_of
 from cprl.runs.episodes import EpisodeTable, read_episodes
@@ -24,13 +27,16 @@ from cprl.runs.files import (
     TRAINING_STATE_FORMAT,
     RunLock,
     checksum,
+    refuse_missing,
     verify,
+    write_listed,
 )
-from cprl.runs.recipe import read_recipe
+from cprl.runs.recipe import read_recipe, refuse_another_run, start_run, write_on_nan
 from cprl.studies import Study, read_study
 from cprl.studies.report import report
 from cprl.studies.tables.sources import circumstances_of
 from cprl.system.output import console, say
+from cprl.values import custom_targets
 
 STORED = Path(__file__).parent / "stored" / "run"
 """A run with a manifest: two episodes of `single_basic`, whose recipe has its command line."""
@@ -40,7 +46,9 @@ STUDIES = sorted(path.parent for path in {*RESULTS.rglob("study.json")} - WITH_T
 
 @pytest.mark.parametrize("run", RUNS, ids=lambda run: f"{run.parent.name}-{run.name}")
 def test_a_stored_run_is_read(run):
-    experiment = Experiment.from_recipe(read_recipe(run), directory=run)
+    recipe = read_recipe(run)
+    cprl.trust(*custom_targets(recipe["experiment"]))
+    experiment = Experiment.from_recipe(recipe, directory=run)
     assert experiment == Experiment.from_recipe(experiment.to_recipe(), directory=None)
     table = read_episodes(run)
     assert set(table["agent"].to_pylist()) == set(range(experiment.game.agents))
@@ -61,6 +69,56 @@ def test_the_checksums_of_a_stored_run_still_hold():
 def test_a_stored_study_is_read(study):
     cprl.trust("torchrl.envs:CatFrames")
     assert read_study(study).all_conditions
+
+
+def as_before(table):
+    """A stored table with the field of DQNSettings that left."""
+    if isinstance(table, list):
+        return list(map(as_before, table))
+    if not isinstance(table, dict):
+        return table
+    had = {"replay_transforms": []} if table.get("kind") == "DQNSettings" else {}
+    return {name: as_before(entry) for name, entry in table.items()} | had
+
+
+DQN_RUN = Experiment(
+    name="dqn",
+    game=presets.game("single_basic"),
+    agents=(Learning(DQN(settings=DQNSettings(buffer_size=100))),),
+    episodes=2,
+    engine="eager",
+)
+
+
+def test_recipes_and_studies_with_a_field_that_left_are_read_as_long_as_it_did_nothing(tmp_path):
+    recipe = DQN_RUN.to_recipe()
+    earlier = as_before(recipe)
+    assert earlier != recipe
+    assert Experiment.from_recipe(earlier) == DQN_RUN
+    run = start_run(tmp_path / "run", "dqn", lambda run: earlier)
+    write_listed(run, "evaluation/random.parquet", lambda file: file.write(b"x"))
+    refuse_another_run(run, DQN_RUN.to_recipe, Experiment)
+    write_on_nan(run, "continue")
+    read = Experiment.from_recipe(read_recipe(run), directory=run)
+    assert read == replace(DQN_RUN, on_nan="continue")
+    refuse_missing(run)
+    study = Study(DQN_RUN, {"agents.0": [DQN_RUN.agents[0], Scripted("greedy")]})
+    table = as_before(study.to_config())
+    assert table != study.to_config()
+    assert Study.from_config(table) == study
+    used = json.loads(json.dumps(earlier).replace('"replay_transforms": []', '"replay_transforms": ["x"]'))
+    with pytest.raises(ValueError, match=r"replay_transforms is no field of DQNSettings"):
+        Experiment.from_recipe(used)
+
+
+@pytest.mark.parametrize(("kind", "now"), [("CQL", "cql"), ("IQL", "iql"), ("DistributionalDQN", "c51")])
+def test_an_algorithm_that_left_is_refused_by_the_example_that_has_it(kind, now):
+    table = json.loads(json.dumps(DQN_RUN.to_config()).replace('"kind": "DQN"', f'"kind": "{kind}"'))
+    with pytest.raises(
+        ValueError, match=rf"algorithm\.kind is '{kind}', which cprl no longer has: .*{now}\.py"
+    ):
+        Experiment.from_config(table)
+    assert (Path(__file__).parents[1] / f"examples/own_algorithm/{now}.py").exists()
 
 
 @pytest.fixture

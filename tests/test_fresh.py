@@ -18,8 +18,8 @@ from cprl.runs.recipe import start_run
 from cprl.runs.weights import save_weights
 from cprl.studies.report import report
 from cprl.system.defaults import FILM_SEED, PLAY_SEED
-from cprl.training.agents import load
 from cprl.training.outcome import make_agents
+from cprl.training.stored import load
 from cprl.values import trust
 
 TURNS, APPLES = [9.0, 2.0, 4.0, 14.0], [20.0, 3.0, 11.0, 30.0]

@@ -37,7 +37,7 @@ from cprl.policies.lanes import random_agents
 from cprl.runs.curves import as_curves
 from cprl.runs.episodes import OF_INSTITUTIONS as COLUMNS
 from cprl.runs.episodes import EpisodeTable, read_episodes, stored_episodes, table_of
-from cprl.training import train
+from cprl.training import Schedule, train
 
 NAN = float("nan")
 EVERYTHING = (*OPTIONAL, *OF_INSTITUTIONS)
@@ -431,7 +431,7 @@ def test_trainings_and_evaluations_measure_what_concerns_the_game_behind_transfo
             seen.append(numbers_of(episode, learning, ["agent_0", "agent_1", "agent_2"]))
 
     agents = random_agents(game.spaces, (0, 1, 2), replicas=2, seed=1)
-    train(env, {}, others=agents, episodes=1, callbacks=[Sees()])
+    train(env, {}, Schedule(episodes=1), others=agents, callbacks=[Sees()])
     assert names <= set(seen[0])
     first, *_ = evaluate(env, RandomPolicy(env.action_spec))
     assert "institutions/income_equality_between" in first.metrics

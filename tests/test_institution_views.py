@@ -29,7 +29,7 @@ from cprl.population import Scripted
 from cprl.runs.episodes import read_episodes
 from cprl.terminal.figures import training_curve
 from cprl.terminal.summary import compared, summarise
-from cprl.training import train
+from cprl.training import Schedule, train
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.layout import layout, styles
 from cprl.viewer.pictures import borders, regions_of
@@ -65,7 +65,13 @@ def recorded(folder, env, *, replicas=1, episodes=2, callbacks=(), **options):
     others = random_agents(GAME.spaces, tuple(range(AGENTS)), replicas=replicas, seed=1)
     with ViewerCallback(folder, env, title="run", episodes=episodes, **options) as viewer:
         watching = [made(viewer) if callable(made) else made for made in callbacks]
-        train(env, {}, others=others, episodes=episodes, callbacks=[*watching[:1], viewer, *watching[1:]])
+        train(
+            env,
+            {},
+            Schedule(episodes=episodes),
+            others=others,
+            callbacks=[*watching[:1], viewer, *watching[1:]],
+        )
     return viewer
 
 

@@ -20,7 +20,7 @@ from cprl import Custom, maps
 from cprl.algorithms import DQN, PPO, RolloutSettings
 from cprl.commands import main as cli
 from cprl.commons.spaces import Spaces
-from cprl.policies.rng import DRAWN_AHEAD, SAMPLING, LaneRng, lane_seeds
+from cprl.policies.rng import DRAWN_AHEAD, LaneRng, Purpose, lane_seeds
 from cprl.population import Frozen, Learning, Scripted
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in, is_ending, read_checkpoint
 from cprl.runs.episodes import EpisodeTable, read_episodes, read_table
@@ -219,6 +219,31 @@ def test_a_finished_run_that_is_resumed_says_so_and_stays_as_it_is(whole, tmp_pa
     copy = export_results(whole, tmp_path / "copy")
     resumed(FIELD, copy)
     assert f"{copy} is finished; it keeps no state of its training" in capsys.readouterr().out
+
+
+@pytest.mark.integration
+def test_a_run_that_another_process_finishes_while_agents_are_made_stays_as_it_is(
+    whole, tmp_path, monkeypatch, capsys
+):
+    make_agents = running.make_agents
+    with monkeypatch.context() as patch:
+        patch.setattr(running, "write_evaluation", interrupted)
+        with pytest.raises(InterruptionError):
+            run(FIELD, tmp_path / "run")
+
+    def slowly(*arguments, **options):
+        made = make_agents(*arguments, **options)
+        monkeypatch.setattr(running, "make_agents", make_agents)
+        resumed(FIELD, tmp_path / "run", keep_checkpoint=False)
+        return made
+
+    monkeypatch.setattr(running, "make_agents", slowly)
+    assert resumed(FIELD, tmp_path / "run") == tmp_path / "run"
+    before = contents(tmp_path / "run")
+    assert capsys.readouterr().out.count(f"{tmp_path / 'run'} is finished; ") == 1
+    resumed(FIELD, tmp_path / "run")
+    assert contents(tmp_path / "run") == before
+    assert_same(tmp_path / "run", whole)
 
 
 @pytest.fixture(scope="module")
@@ -695,11 +720,11 @@ def test_few_numbers_of_rollout_learners_are_drawn_ahead():
 
     algorithm = PPO(settings=RolloutSettings(hidden_cells=(4,)))
     learner = make_learner(algorithm, spaces, agents=(0, 1), replicas=1, engine="eager", seed=4)
-    seeds = lane_seeds(4, replicas=range(1), agents=(0, 1), purpose=SAMPLING)
+    seeds = lane_seeds(4, replicas=range(1), agents=(0, 1), purpose=Purpose.SAMPLING)
     many = LaneRng(seeds, 250, ahead=DRAWN_AHEAD)
     for _ in range(70):  # more than are drawn ahead
-        assert torch.equal(learner.rng.next(), many.next())
-    assert learner.state_dict()["draws"]["numbers"].numel() <= 2 * 2**14
+        assert torch.equal(learner.memory.rng.next(), many.next())
+    assert learner.state_dict()["memory"]["order"]["numbers"].numel() <= 2 * 2**14
 
 
 def test_a_lock_file_that_says_nothing_is_taken(tmp_path):

@@ -16,7 +16,7 @@ from cprl.envs.make_env import make_env, spaces_of
 from cprl.networks import Conv
 from cprl.objectives import loaded_dice, lola_gradients, look_ahead_losses, looked_ahead
 from cprl.population import Scripted, Team
-from cprl.training import train
+from cprl.training import Schedule, train
 from cprl.training.agents import Population
 
 SETTINGS = LOLASettings(
@@ -57,7 +57,7 @@ def equal(some, others):
 def test_an_update_takes_two_rollouts_of_the_present_weights_or_one_and_one_for_each_member():
     for estimator, rollouts in (("policy_gradient", 2), ("dice", 3)):
         learner = learner_of(estimator)
-        assert learner.rollouts == rollouts
+        assert learner.memory.rollouts == rollouts
         for _ in range(2):
             losses = play(learner, 12 * rollouts)
             assert [loss is None for loss in losses] == [True] * (12 * rollouts - 1) + [False]
@@ -66,27 +66,27 @@ def test_an_update_takes_two_rollouts_of_the_present_weights_or_one_and_one_for_
 
 def test_dices_others_act_by_their_weights_ahead_and_what_is_stored_evaluated_and_kept_are_the_present_ones():
     learner = learner_of("dice")
-    engine, present = learner.engine, actor_weights(learner.engine.actors)
+    networks, present = learner.lane_networks, actor_weights(learner.lane_networks.actors)
     seen = torch.eye(4)[None, :2].expand(2, -1, -1).clone()
-    before = learner.evaluation_actor(1).preferences(seen)
+    before = learner.evaluation_actor(1).action_values(seen)
     play(learner, 12)
     for member in PAIR:
-        playing = actor_weights(engine.playing)
+        playing = actor_weights(networks.players)
         assert equal(playing[member], present[member])
         assert not equal(playing[1 - member], present[1 - member])
-        assert torch.equal(learner.evaluation_actor(1).preferences(seen), before)
+        assert torch.equal(learner.evaluation_actor(1).action_values(seen), before)
         lane = learner.networks()[f"replica_1/agent_{1 - member}"].state_dict()
         kept = learner.state_dict()["networks"][f"replica_1/agent_{1 - member}"]
         assert all(torch.equal(kept[name], value) for name, value in lane.items())
         assert torch.equal(lane["layers.2.bias"], present[1 - member][3][1, 0])
         play(learner, 12)
-    assert not equal(actor_weights(engine.actors)[0], present[0])
-    assert all(map(equal, actor_weights(engine.playing), actor_weights(engine.actors)))
+    assert not equal(actor_weights(networks.actors)[0], present[0])
+    assert all(map(equal, actor_weights(networks.players), actor_weights(networks.actors)))
 
 
 def by_hand(learner, rollouts, gamma):
     """The losses of the members over rollouts [R, P, T] of the learner's columns, by parameters."""
-    columns = learner._columns(learner.rollouts)
+    columns = learner.memory.batch(learner.lane_networks, learner.memory.rollouts)
     names = ("observation", "action", "reward", "done")
     taken = {name: columns[name][:, rollouts].squeeze(2) for name in names}  # of one world
     done = taken["done"][..., :1]
@@ -120,35 +120,35 @@ def undisturbed(estimator):
         critic_epochs=0,
         rollout_steps=30,
     )
-    for value in learner.engine.critics.parameters():
+    for value in learner.lane_networks.critics.parameters():
         value.data.zero_()
     return learner
 
 
 def test_the_step_of_policy_gradients_is_lolas_gradient_of_the_two_rollouts():
     learner = undisturbed("policy_gradient")
-    start = actor_weights(learner.engine.actors)
+    start = actor_weights(learner.lane_networks.actors)
     play(learner, 60)
     objectives = [by_hand(learner, [rollout], 0.9) for rollout in (0, 1)]
-    slopes, _ = lola_gradients(objectives, start, rate=1.0)
-    for of, before, after in zip(slopes, start, actor_weights(learner.engine.actors), strict=True):
+    slopes = lola_gradients(objectives, start, rate=1.0)
+    for of, before, after in zip(slopes, start, actor_weights(learner.lane_networks.actors), strict=True):
         for slope, was, now in zip(of, before, after, strict=True):
             torch.testing.assert_close(now, was - 0.5 * slope, rtol=1e-4, atol=1e-5)
 
 
 def test_the_step_of_dice_differentiates_through_the_others_step_and_the_step_is_that_which_acts():
     learner = undisturbed("dice")
-    start = actor_weights(learner.engine.actors)
+    start = actor_weights(learner.lane_networks.actors)
     play(learner, 30)
     first = by_hand(learner, [0], 0.9)
     ahead = looked_ahead(first, start, rate=1.0)
-    for own, wanted in zip(actor_weights(learner.engine.playing)[1], ahead[1], strict=True):
+    for own, wanted in zip(actor_weights(learner.lane_networks.players)[1], ahead[1], strict=True):
         torch.testing.assert_close(own, wanted.detach(), rtol=1e-4, atol=1e-5)
     play(learner, 60)
     parameters = [[value.clone().requires_grad_() for value in of] for of in start]
     outer = [by_hand(learner, [rollout], 0.9) for rollout in (1, 2)]
     look_ahead_losses(first, outer, parameters, rate=1.0).sum().backward()
-    for of, after in zip(parameters, actor_weights(learner.engine.actors), strict=True):
+    for of, after in zip(parameters, actor_weights(learner.lane_networks.actors), strict=True):
         for was, now in zip(of, after, strict=True):
             torch.testing.assert_close(now, was.detach() - 0.5 * was.grad, rtol=1e-4, atol=1e-5)
 
@@ -156,7 +156,7 @@ def test_the_step_of_dice_differentiates_through_the_others_step_and_the_step_is
 def test_the_loss_is_the_negative_discounted_return_of_the_present_weights():
     for estimator, rollouts in (("policy_gradient", 2), ("dice", 1)):
         learner, turns = learner_of(estimator, gamma=0.5, rollout_steps=5), []
-        losses = play(learner, 5 * learner.rollouts, turns)[-1]
+        losses = play(learner, 5 * learner.memory.rollouts, turns)[-1]
         # World 0 of the small game has episodes of 5 turns: each rollout is one.
         paid = torch.stack([turn["next", "agents", "reward"][0, :, 0] for turn in turns[: 5 * rollouts]])
         wanted = -(paid.unflatten(0, (rollouts, 5)) * 0.5 ** torch.arange(5.0)[:, None]).sum(1).mean(0)
@@ -168,26 +168,27 @@ def test_critics_learn_and_advantages_are_normalised_where_asked_and_gradients_c
         "policy_gradient", normalize_advantage=True, critic_learning_rate=0.01, critic_epochs=200
     )
     play(learner, 23)
-    learner._phase = 0
-    before = actor_weights(learner.engine.critics)
-    observation, rollouts, target = learner._batch(2)
+    learner.memory._phase = 0
+    before = actor_weights(learner.lane_networks.critics)
+    rollouts = learner.memory.batch(learner.lane_networks, 2)
+    observation, target = (rollouts[name].flatten(1, 2) for name in ("observation", "target"))
     advantage = rollouts["advantage"].squeeze(2)  # of one world
     torch.testing.assert_close(advantage.mean(2), torch.zeros(2, 2, 2, 1), atol=1e-5, rtol=0)
     torch.testing.assert_close(advantage.std(2), torch.ones(2, 2, 2, 1), atol=1e-3, rtol=0)
 
     def error():
         with torch.no_grad():
-            return float((learner.engine.critics(observation) - target).square().mean())
+            return float((learner.lane_networks.critics(observation) - target).square().mean())
 
     first = error()
     for _ in range(200):
-        learner.engine.update_critics(observation, target)
+        learner.lane_networks.update_critics(observation, target)
     assert error() < first / 2
-    assert not equal(actor_weights(learner.engine.critics)[1], before[1])
+    assert not equal(actor_weights(learner.lane_networks.critics)[1], before[1])
     clipped = learner_of("policy_gradient", max_grad_norm=1e-3, optimizer="sgd", learning_rate=1.0)
-    start = actor_weights(clipped.engine.actors)
+    start = actor_weights(clipped.lane_networks.actors)
     play(clipped, 24)
-    for was, now in zip(start, actor_weights(clipped.engine.actors), strict=True):
+    for was, now in zip(start, actor_weights(clipped.lane_networks.actors), strict=True):
         moved = torch.cat([(b - a).flatten(1) for a, b in zip(was, now, strict=True)], 1).norm(dim=1)
         assert (moved < 1.01e-3).all()
         assert (moved > 0.9e-3).all()
@@ -246,9 +247,9 @@ def course(estimator, *, updates, look_ahead_rate):
     env = make_env(prisoners_dilemma(turns=TURNS), worlds=REPLICAS, seed=0)
     agents = Population(env, (Team(algorithm, PAIR, reward="individual"),), seed=1, engine="eager")
     (learner,) = agents.learners.values()
-    episodes = updates * learner.rollouts * SAMPLED.rollout_steps // TURNS
+    episodes = updates * learner.memory.rollouts * SAMPLED.rollout_steps // TURNS
     returns = Returns()
-    train(env, agents.learners, episodes=episodes, callbacks=[returns])
+    train(env, agents.learners, Schedule(episodes=episodes), callbacks=[returns])
     late = np.array([returns.of[replica][-episodes // 10 :] for replica in range(REPLICAS)])
     return late.mean((1, 2)) / TURNS
 

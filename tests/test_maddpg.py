@@ -19,8 +19,8 @@ from cprl import CommonsEnv
 from cprl.algorithms import DQN, MADDPG, DQNSettings
 from cprl.algorithms.base import q_actor
 from cprl.envs import make_env
-from cprl.learners.ring import Horizon, Ring, TransitionForm
-from cprl.learners.transitions import LaneTurn
+from cprl.learners.ring import Ring
+from cprl.learners.transitions import Horizon, LaneTurn, TransitionForm
 from cprl.networks import MLP
 from cprl.objectives import MADDPGLoss
 from cprl.objectives.maddpg import sampled_one_hot, straight_through
@@ -64,6 +64,7 @@ VALUES = [[[1.0], [2.0], [3.0], [4.0]], [[10.0], [20.0], [30.0], [40.0]]]
 
 def two_transitions(**entries):
     seen_next, reward = [[[1.0], [1.0]], [[1.0], [-1.0]]], [[[5.0], [6.0]], [[7.0], [8.0]]]
+    entries = {"noise": torch.full((2, 2, 2), 0.5), **entries}
     return transitions(torch.ones(2, 2, 1), [[0, 1], [1, 0]], seen_next, reward, [[False], [True]], **entries)
 
 
@@ -89,7 +90,9 @@ def test_critics_judge_the_actions_that_were_taken_and_several_steps_are_discoun
     # 5 + 0.25 * 5 = 6.25 and 6 + 0.25 * 50 = 18.5.
     assert out["target_value"].squeeze(-1).tolist() == [[6.25, 18.5], [7.0, 8.0]]
     assert out["loss_value"].tolist() == [1.25**2 + 31.5**2, 2.0**2 + 42.0**2]
-    assert set(batch.keys()) == {"observation", "action", "next", "steps_to_next_obs"}, "not written to"
+    assert set(batch.keys()) == {"observation", "action", "noise", "next", "steps_to_next_obs"}, (
+        "not written to"
+    )
 
 
 def test_an_actors_own_action_is_a_new_one_and_the_others_are_those_of_the_batch():
@@ -151,18 +154,26 @@ def test_samples_invert_the_cumulative_distribution():
     assert slope.tolist() == [-0.125, 0.25, -0.125]
 
 
-def test_without_noise_samples_come_from_torchs_generator_and_with_it_not():
+def test_samples_come_from_the_noise_of_the_batch_and_none_from_torchs_generator():
     loss = loss_of(Linear([[0.0, 0.0]], [[0.0, 0.0]]), LinearCritics(*VALUES), reduction="none")
+    before = torch.random.get_rng_state()
     seen = []
     for seed in (1, 2, 1):
-        torch.manual_seed(seed)
-        seen.append([loss(two_transitions())["loss_actor"].tolist() for _ in range(8)])
+        chance = torch.Generator().manual_seed(seed)
+        given = [torch.rand(2, 2, 2, generator=chance) for _ in range(8)]
+        seen.append([loss(two_transitions(noise=noise))["loss_actor"].tolist() for noise in given])
     assert seen[0] == seen[2] != seen[1]
-    before = torch.random.get_rng_state()
-    noise = torch.rand(2, 2, 2, generator=torch.Generator().manual_seed(0))
-    same = [loss(two_transitions(noise=noise))["loss_actor"].tolist() for _ in range(2)]
-    assert same[0] == same[1]
     assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_a_batch_without_noise_is_refused_by_name():
+    loss = loss_of(Linear(*SURE), LinearCritics(*VALUES))
+    assert "noise" in loss.in_keys
+    with pytest.raises(ValueError, match=r'"noise" is missing; allowed: float \[.., members, 2\]'):
+        loss(two_transitions().exclude("noise"))
+    loss.set_keys(noise="uniform")
+    with pytest.raises(ValueError, match='"uniform" is missing'):
+        loss(two_transitions())
 
 
 @pytest.mark.integration
@@ -189,7 +200,8 @@ def test_the_loss_works_with_torchrl_alone():
     updater, optimizer = SoftUpdate(loss, tau=0.05), torch.optim.Adam(loss.parameters(), lr=0.02)
     before = loss.target_actor_network_params.get(("module", "weight")).clone()
     for _ in range(200):
-        out = loss(buffer.sample())
+        batch = buffer.sample()
+        out = loss(batch.set("noise", torch.rand(32, 2, 2)))
         optimizer.zero_grad()
         (out["loss_actor"] + out["loss_value"]).backward()
         optimizer.step()
@@ -269,11 +281,18 @@ class NoisyLoss(DQNLoss):
 @dataclass(frozen=True, kw_only=True)
 class Noisy(DQN):
     noise_numbers: ClassVar[int] = 3
+    update = "stacked"
 
     def make_loss(self, network):
         loss = NoisyLoss(q_actor(network), delay_value=True, action_space="categorical")
         loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
         return loss
+
+
+def test_maddpg_without_noise_is_refused_before_anything_is_learned():
+    without = type("Without", (MADDPG,), {"noise_numbers": 0})(settings=REPLAY)
+    with pytest.raises(ValueError, match='"noise" is missing; allowed'):
+        make_learner(without, MEADOW.spaces, agents=(0, 1), replicas=1, engine="eager")
 
 
 @pytest.mark.integration
@@ -316,7 +335,7 @@ def expected_returns(payoffs, *, turns):
     team = Team(MADDPG(settings=SETTINGS), tuple(range(game.agents)), reward="individual")
     (learner,) = Population(env, [team], seed=1, engine="eager").learners.values()
     played(learner, env, turns)
-    probs = learner.evaluation_actor(1).preferences(env.reset()["agents", "observation"]).numpy()
+    probs = learner.evaluation_actor(1).action_values(env.reset()["agents", "observation"]).numpy()
     found = []
     for of_agents in probs:
         value = table

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from dqn_parts import MEADOW, make_learner
+from dqn_parts import MEADOW, learn, make_learner, watch_steps, weights_at
 from torch.nn import functional
 
 import cprl
@@ -15,13 +15,14 @@ from cprl import CommonsEnv, Experiment, Game, Rules, Study, algorithms, maps
 from cprl.algorithms import DQN, PPO, DQNSettings, LOLASettings, RolloutSettings
 from cprl.commands.recipe import parse
 from cprl.envs.make_env import make_env
-from cprl.learners.ring import Horizon, Ring, TransitionForm
-from cprl.learners.transitions import LaneTurn
+from cprl.learners.ring import Ring
+from cprl.learners.transitions import Horizon, LaneTurn, TransitionForm
 from cprl.measuring.episodes import Episode
 from cprl.measuring.series import Series
 from cprl.networks import GRU
 from cprl.population import Learning, Team
 from cprl.runs.episodes import read_episodes, read_table
+from cprl.runs.schedule import Schedule
 from cprl.training.agents import Population
 from cprl.training.training import Training
 
@@ -65,11 +66,11 @@ class Record:
         self.episodes.append((episode, learning))
 
 
-def training(agents, *, replicas=2, first=0, worlds=WORLDS, game=MEADOW, **how):
+def training(agents, *, replicas=2, first=0, worlds=WORLDS, game=MEADOW, callbacks=(), **length):
     env = make_env(game, worlds=replicas * worlds, seed=4, first_world=first * worlds)
     population = Population(env, agents, seed=4, worlds=worlds, first_replica=first, engine="eager")
-    length = how if {"steps", "episodes"} & set(how) else {"steps": 40 * worlds, **how}
-    made = Training(env, population.learners, worlds=worlds, others=population.others, **length)
+    schedule = Schedule(worlds=worlds, **(length or {"steps": 40 * worlds}))
+    made = Training(env, population.learners, schedule, others=population.others, callbacks=callbacks)
     return population, made
 
 
@@ -116,9 +117,7 @@ def test_steps_are_counted_over_worlds_and_episodes_over_the_replica():
     record = Record()
     population, run = training((Learning(DQN(settings=settings)),) * 2, episodes=7, callbacks=[record])
     (learner,) = population.learners.values()
-    updates = []
-    update = learner.engine.update
-    learner.engine.update = lambda ring: updates.append(run.steps) or update(ring)
+    updates = watch_steps(learner, lambda draw: run.steps)
     while not run.is_over:
         run.step()
         assert learner.steps == run.steps
@@ -148,10 +147,9 @@ def test_fewer_updates_than_turns_and_targets_by_the_episodes_of_a_replica():
     settings = replace(SETTINGS, steps_per_update=7, learning_starts=10)
     population, run = training((Learning(DQN(settings=settings)),) * 2, steps=300)
     (learner,) = population.learners.values()
-    updates, copies = [], []
-    update, copy = learner.engine.update, learner.engine.copy_to_targets
-    learner.engine.update = lambda ring: updates.append(run.steps) or update(ring)
-    learner.engine.copy_to_targets = lambda due: copies.append((run.steps, due.tolist())) or copy(due)
+    updates, copies = watch_steps(learner, lambda draw: run.steps), []
+    copy = learner.lane_networks.copy_to_targets
+    learner.lane_networks.copy_to_targets = lambda due: copies.append((run.steps, due.tolist())) or copy(due)
     run.run()
     # From the turn on that has 10 steps, 12, of which the steps of that turn count.
     assert updates == [
@@ -239,8 +237,8 @@ def test_an_update_of_dqn_in_two_worlds_is_the_one_by_hand():
     networks = learner.networks()
     for turn in played:
         learner.store(turn)
-    numbers = learner.buffer.rng.next().clone()  # by which the update would draw
-    learner.buffer.rng._used -= 1
+    numbers = learner.memory.buffer.rng.next().clone()  # by which the update would draw
+    learner.memory.buffer.rng._used -= 1
     losses = learner.update()
     for agent in range(2):
         network = networks[f"replica_0/agent_{agent}"]
@@ -277,7 +275,11 @@ def test_an_update_of_ppo_in_two_worlds_is_the_one_by_hand():
     learner, played = learner_of(algorithm, 2), turns_of(2, 14)
     actors = learner.networks()
     critics = [
-        {name: value.clone() for name, value in learner.engine.weights(agent).items() if "critic" in name}
+        {
+            name: value.clone()
+            for name, value in weights_at(learner.lane_networks, agent).items()
+            if "critic" in name
+        }
         for agent in range(2)
     ]
     for turn in played:
@@ -335,8 +337,8 @@ def test_the_same_experience_in_another_order_of_worlds_gives_the_same_update():
     one, other = in_two_orders(DQN(settings=replace(SETTINGS, learning_starts=30)))
     places = torch.arange(14).repeat(2, 3)
     for learner in (one, other):  # of all that is stored
-        worlds = learner.buffer.columns.repeat_interleave(14, 1)
-        learner.engine.update_from(learner.buffer.get(places, worlds))
+        worlds = learner.memory.buffer.columns.repeat_interleave(14, 1)
+        learn(learner, learner.memory.buffer.get(places, worlds))
     torch.testing.assert_close(weights([one]), weights([other]), rtol=0, atol=1e-5)
 
 
@@ -375,12 +377,14 @@ def test_what_compiled_pieces_of_a_rollout_say_is_what_the_networks_say():
         eager.store(turn)
     ends = {tuple(turn["next", "done"].flatten().tolist()) for turn in turns}
     assert len(ends) > 2, "they end at times of their own"
-    columns = compiled._rollout.fields
+    columns = compiled.memory.rollout.fields
     seen, following = columns["observation"], columns["next_observation"]
     assert torch.equal(seen[1, 2], torch.stack([turn["agents", "observation"][2, 1] for turn in turns]))
-    actors, critics = (partial(compiled.engine.outputs, part=part) for part in (0, 1))
+    actors, critics = (partial(compiled.lane_networks.outputs, part=part) for part in (0, 1))
     by_networks = actors(seen), critics(seen), critics(following)
-    torch.testing.assert_close(compiled._evaluated(columns), by_networks, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        compiled.memory._evaluated(compiled.lane_networks), by_networks, rtol=1e-4, atol=1e-5
+    )
     torch.testing.assert_close(compiled.update(), eager.update(), rtol=1e-4, atol=1e-5)
 
 

@@ -50,8 +50,8 @@ def test_a_game_and_an_experiment_say_what_they_are():
     with_own = replace(experiment, **own)._repr_html_()
     assert "Rules: quota (share 0.25); laws:RichPay." in with_own
     assert "Code of its own: transforms: laws:RichPay; metrics: fair:gap." in with_own
-    soft = replace(learning, algorithm=cprl.Custom("soft_q:soft_q"))
-    assert "by soft_q:soft_q" in replace(experiment, agents=(soft,) * 4)._repr_html_()
+    soft = replace(learning, algorithm=cprl.Custom("soft_q:SoftQ"))
+    assert "by soft_q:SoftQ" in replace(experiment, agents=(soft,) * 4)._repr_html_()
     for part in ("<b>a&lt;b</b>: 2 agents by DQN", "2 replicas of 4 worlds", "quota (share 0.25", "<svg"):
         assert part in html
 
@@ -77,13 +77,14 @@ BAR = """
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.policies.lanes import LaneActor
 from cprl.terminal import progress
-from cprl.training import train
+from cprl.training import Schedule, train
 
 progress._NOTEBOOK_PERIOD_S = 0.0
 game = Game(map=maps.parse(".A>\\n..A"), rules=Rules(window_rows=3, window_columns=3, episode_steps=5))
-with progress.ProgressBar(game, episodes=9) as bar:
+schedule = Schedule(episodes=9)
+with progress.ProgressBar(schedule, game) as bar:
     walker = LaneActor(None, 8, seeds=[(0,)], agents=1)
-    train(CommonsEnv(game, 1), {}, others={(0,): walker}, episodes=9, callbacks=[bar])
+    train(CommonsEnv(game, 1), {}, schedule, others={(0,): walker}, callbacks=[bar])
 """
 
 

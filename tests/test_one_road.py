@@ -15,7 +15,7 @@ from cprl.algorithms import DQN, PPO, QMIX, DQNSettings, RolloutSettings
 from cprl.commands import main as cli
 from cprl.evaluation.film import film
 from cprl.networks import GRU, Conv
-from cprl.objectives.preferences import Exchange
+from cprl.objectives.rewards import Exchange
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.checkpoints import checkpoints_in
 from cprl.runs.episodes import read_episodes

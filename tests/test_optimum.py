@@ -3,14 +3,16 @@
 from statistics import fmean
 
 import pytest
+from c51 import C51
+from cql import CQL
+from iql import IQL
 
 from cprl import CommonsEnv, Game, Rules, maps
-from cprl.algorithms.off_policy import CQL, DQN, IQL, SAC, DistributionalDQN
-from cprl.algorithms.on_policy import A2C, PPO, Reinforce
+from cprl.algorithms import A2C, DQN, PPO, SAC, Reinforce
 from cprl.learners.settings import DQNSettings, RolloutSettings
 from cprl.measuring.evaluate import evaluate
 from cprl.population import Learning
-from cprl.training import train
+from cprl.training import Schedule, train
 from cprl.training.agents import Population
 
 STEPS = 24
@@ -47,7 +49,7 @@ ONCE = RolloutSettings(
 ALGORITHMS = {
     "DQN": DQN(settings=REPLAY),
     "double DQN": DQN(settings=REPLAY, double=True),
-    "C51": DistributionalDQN(settings=REPLAY, atoms=21, highest_return=6.0),
+    "C51": C51(settings=REPLAY, atoms=21, highest_return=6.0),
     "CQL": CQL(settings=REPLAY),
     "SAC": SAC(settings=REPLAY, target_entropy_weight=0.1),
     "IQL": IQL(settings=REPLAY),
@@ -71,7 +73,7 @@ def test_a_lone_agent_comes_close_to_the_optimum(name):
     population = Population(env, [Learning(ALGORITHMS[name])], seed=1, engine="eager")
     untrained = share_of_the_optimum(population)
     episodes = 125 if isinstance(ALGORITHMS[name].settings, DQNSettings) else 400
-    train(CommonsEnv(GAME, REPLICAS, seed=1), population.learners, episodes=episodes)
+    train(CommonsEnv(GAME, REPLICAS, seed=1), population.learners, Schedule(episodes=episodes))
     shares = share_of_the_optimum(population)
     assert fmean(untrained) < 0.5
     assert fmean(shares) > 0.9, shares

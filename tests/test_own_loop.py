@@ -81,7 +81,10 @@ def test_weights_that_harvest_nothing_are_never_the_best(tmp_path):
     def always(action):
         return lambda batch: batch.set(("agents", "action"), torch.full((2, 1), action))
 
-    best = LOOP.BestWeights(tmp_path, {"agent_0": nn.Linear(1, 1)}, policy=always(stay), env=env, every=1)
+    def networks():
+        return {"agent_0": nn.Linear(1, 1)}
+
+    best = LOOP.BestWeights(tmp_path, networks, policy=always(stay), env=env, every=1)
     best.on_episode(None, {})
     assert (best.path, best.best_episode) == (None, -1)
     best.policy = always(forward)

@@ -93,7 +93,7 @@ def test_what_is_printed_says_in_a_line_what_one_asks_first():
     for rules in (cprl.Rules(), cprl.Rules(freeze_steps=5, may_fire=False)):  # by what they change
         assert eval(repr(rules), {"Rules": cprl.Rules}) == rules
         assert len(repr(rules)) < 60
-    learner = dqn_learner(game.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=0, compile=False)
+    learner = dqn_learner(game.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=0, engine="eager")
     assert is_short(learner, "agents=(0, 1)", "replicas=2")
 
 

@@ -5,20 +5,22 @@ from typing import ClassVar
 
 import pytest
 import torch
-from dqn_parts import learner_of_parts, q_table
+from c51 import C51
+from cql import CQL
+from dqn_parts import changed, make_learner, q_table
+from iql import IQL
 
 import cprl
 from cprl import CommonsEnv, Experiment, Game, Observation, Rules, maps
+from cprl.algorithms import A2C, DQN, PPO, PR2, SAC, Reinforce, Tabular
 from cprl.algorithms.base import OffPolicy
-from cprl.algorithms.off_policy import CQL, DQN, IQL, PR2, SAC, DistributionalDQN, Tabular
-from cprl.algorithms.on_policy import A2C, PPO, Reinforce
 from cprl.evaluation import Fresh, evaluate_run
-from cprl.learners.replay import ReplayLearner
-from cprl.learners.rollouts import RolloutLearner
+from cprl.learners.replay import Replay
+from cprl.learners.rollouts import Rollouts
 from cprl.learners.settings import DQNSettings, RolloutSettings, TabularSettings
 from cprl.networks.agent import acting_part
 from cprl.population import Frozen, Learning, Scripted
-from cprl.training import train
+from cprl.training import Schedule, train
 from cprl.training.agents import Population
 
 GAME = Game(
@@ -46,7 +48,7 @@ ALGORITHMS = {
     "double DQN": DQN(settings=REPLAY, double=True),
     "Huber DQN": DQN(settings=REPLAY, loss_function="smooth_l1"),
     "log-cosh DQN": DQN(settings=replace(REPLAY, optimizer="keras_rmsprop"), loss_function="log_cosh"),
-    "C51": DistributionalDQN(settings=REPLAY, atoms=7),
+    "C51": C51(settings=REPLAY, atoms=7),
     "CQL": CQL(settings=REPLAY),
     "SAC": SAC(settings=REPLAY),
     "IQL": IQL(settings=REPLAY),
@@ -55,8 +57,7 @@ ALGORITHMS = {
     "A2C": A2C(settings=replace(ROLLOUTS, epochs=1)),
     "REINFORCE": Reinforce(settings=replace(ROLLOUTS, epochs=1)),
 }
-WAYS = dict.fromkeys(ALGORITHMS, "lane_axis")
-WAYS |= {"C51": "lane_axis_flat", "SAC": "vmapped", "IQL": "vmapped"}
+UPDATES = dict.fromkeys(ALGORITHMS, "stacked") | {"SAC": "vmapped", "IQL": "vmapped"}
 FOUR = tuple(range(4))
 
 
@@ -75,12 +76,11 @@ class Returns:
         self.of.setdefault(episode.world, []).append(episode.return_.tolist())
 
 
-def trained(agents, *, episodes=6, first=0, **how):
+def trained(agents, *, episodes=6, first=0, update_every=1):
     env = CommonsEnv(GAME, agents.replicas, seed=agents.seed, first_world=first)
     returns = Returns()
-    training = train(
-        env, agents.learners, others=agents.others, episodes=episodes, callbacks=[returns], **how
-    )
+    schedule = Schedule(episodes=episodes, update_every=update_every)
+    training = train(env, agents.learners, schedule, others=agents.others, callbacks=[returns])
     return training, returns.of
 
 
@@ -112,23 +112,16 @@ def test_each_loss_takes_the_fastest_way_that_agrees_with_a_list_of_torchrls_los
     algorithm = ALGORITHMS[name]
     (learner,) = population([Learning(algorithm)] * 4, replicas=1).learners.values()
     named, by_list = (
-        learner_of_parts(
-            type(learner),
-            algorithm,
-            GAME.spaces,
-            parts={"batching": way},
-            options={"compile": False},
-            agents=FOUR,
-            replicas=1,
-            seed=3,
+        make_learner(
+            changed(algorithm, update=update), GAME.spaces, agents=FOUR, replicas=1, seed=3, engine="eager"
         )
-        for way in (WAYS[name], "list")
+        for update in (UPDATES[name], "list")
     )
     for each in (learner, named, by_list):
-        train(CommonsEnv(GAME, 1, seed=3), {FOUR: each}, episodes=5)
+        train(CommonsEnv(GAME, 1, seed=3), {FOUR: each}, Schedule(episodes=5))
     for lane in range(4):
         state, state_by_name, reference = (
-            each.engine.network_state(lane) for each in (learner, named, by_list)
+            each.lane_networks.network_state(lane) for each in (learner, named, by_list)
         )
         for key, value in reference.items():
             assert torch.equal(state[key], state_by_name[key]), "this is the way that is found"
@@ -138,9 +131,9 @@ def test_each_loss_takes_the_fastest_way_that_agrees_with_a_list_of_torchrls_los
 def test_unlike_agents_sit_side_by_side_in_one_training_and_like_ones_are_lanes():
     dqn, ppo = Learning(ALGORITHMS["DQN"]), Learning(ALGORITHMS["PPO"])
     mixed = population([dqn, ppo, dqn, Scripted("greedy")])
-    assert {agents: type(learner) for agents, learner in mixed.learners.items()} == {
-        (0, 2): ReplayLearner,
-        (1,): RolloutLearner,
+    assert {agents: type(learner.memory) for agents, learner in mixed.learners.items()} == {
+        (0, 2): Replay,
+        (1,): Rollouts,
     }
     assert list(mixed.others) == [(3,)]
     before = weights(mixed)
@@ -183,7 +176,7 @@ def test_agents_that_follow_a_script_are_not_called_trained(tmp_path, capsys):
 
 @pytest.mark.integration
 def test_a_mixed_run_is_kept_evaluated_and_built_again_from_its_directory(tmp_path, capsys):
-    members = [Learning(ALGORITHMS["C51"]), Learning(ALGORITHMS["PPO"]), Scripted("greedy"), Scripted()]
+    members = [Learning(ALGORITHMS["DQN"]), Learning(ALGORITHMS["PPO"]), Scripted("greedy"), Scripted()]
     run, _ = ran(tmp_path, members)
     told = capsys.readouterr().out
     assert "agents act at random in 5%" in " ".join(told.split())
@@ -326,7 +319,9 @@ def test_a_tabular_agent_is_paid_for_itself_or_for_the_group(reward_kind):
         [Scripted("greedy"), Learning(algorithm, reward=reward_kind), *[Scripted("greedy")] * 2]
     )
     witness = Witness()
-    train(CommonsEnv(GAME, 2), agents.learners, others=agents.others, episodes=10, callbacks=[witness])
+    train(
+        CommonsEnv(GAME, 2), agents.learners, Schedule(episodes=10), others=agents.others, callbacks=[witness]
+    )
     values = {}
     for replica in range(2):
         table = q_table(agents.learners[1,], replica)
@@ -359,9 +354,9 @@ def test_learners_that_do_not_fit_are_refused_before_training_and_the_refusal_sa
         population([dqn] * 3)
     with pytest.raises(ValueError, match="ClipPPOLoss is on-policy and cannot learn from a replay buffer"):
         population([Learning(PPOFromReplay(settings=REPLAY))] * 4)
-    parts = {"make_network": lambda: acting_part(ppo.make_network(GAME.spaces))}
+    bare = changed(ppo, make_network=lambda spaces: acting_part(ppo.make_network(spaces)))
     with pytest.raises(ValueError, match="an agent has the networks "):
-        learner_of_parts(RolloutLearner, ppo, GAME.spaces, parts=parts, agents=[0], replicas=1)
+        make_learner(bare, GAME.spaces, agents=[0], replicas=1)
     with pytest.raises(ValueError, match="update_every is 7"):
         trained(population([Learning(ppo)] * 4), update_every=7)
 

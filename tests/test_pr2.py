@@ -15,12 +15,11 @@ from torchrl.objectives import SoftUpdate, ValueEstimators
 from cprl import CommonsEnv, Game, Rules, keys, maps
 from cprl.algorithms import PR2, VDN, DQNSettings
 from cprl.envs import make_env
-from cprl.learners.engine import FunctionalEngine
 from cprl.learners.transitions import joint_actions
 from cprl.objectives import PR2Loss
 from cprl.objectives.pr2 import chosen, marginal, soft_value
 from cprl.population import Learning, Scripted
-from cprl.training import train
+from cprl.training import Schedule, train
 from cprl.training.agents import Population
 
 GAME = Game(
@@ -149,20 +148,19 @@ def test_a_lane_stores_its_own_action_first_then_those_of_the_others_by_their_in
     turn = env.step(moment)
     assert joint_actions((0, 2), keys.Turn.of(turn)).tolist() == [[0, 1, 2], [2, 0, 1], [3, 4, 5], [5, 3, 4]]
     learner.store(turn)
-    assert learner.buffer.fields["action"][0].tolist() == [[0, 1, 2], [2, 0, 1], [3, 4, 5], [5, 3, 4]]
+    assert learner.memory.buffer.fields["action"][0].tolist() == [[0, 1, 2], [2, 0, 1], [3, 4, 5], [5, 3, 4]]
 
 
 def test_agents_act_on_what_they_see_themselves_by_the_policy_of_their_joint_values():
     agents = population((PR2S,) * 3)
     (learner,) = agents.learners.values()
-    assert isinstance(learner.engine, FunctionalEngine)
-    assert not learner.engine._vmapped, "the lane axis, the fastest way"
+    assert learner.lane_networks.update == "stacked", "the fastest way"
     seen = CommonsEnv(GAME, 2, seed=3).reset()[keys.OBSERVATION]
     network = agents.networks()["replica_1/agent_2"]
     joint = network.joint_values(seen[1, 2])
     assert joint.shape == (2, 8, 8)
     torch.testing.assert_close(network(seen[1, 2]).softmax(-1), marginal(joint, 1.0).softmax(-1))
-    logits = learner.engine.outputs(seen.flatten(0, 1).unsqueeze(1))
+    logits = learner.lane_networks.outputs(seen.flatten(0, 1).unsqueeze(1))
     torch.testing.assert_close(logits[5, 0], network(seen[1, 2]))
     with set_exploration_type(ExplorationType.RANDOM):
         assert learner.actor.choose(seen).shape == (2, 3)
@@ -180,8 +178,8 @@ def test_a_team_does_not_see_peers_of_its_own():
     class Seeing(VDN):
         sees_peers_actions: ClassVar[bool] = True
 
-    how = {"agents": (0, 1), "replicas": 2, "seed": 1, "reward_kind": "team"}
-    with pytest.raises(ValueError, match=r"^sees_peers is True"):
+    how = {"agents": (0, 1), "replicas": 2, "seed": 1, "reward": "team"}
+    with pytest.raises(ValueError, match=r"^sees_peers_actions is True"):
         make_learner(Seeing(settings=SETTINGS), GAME.spaces, engine="eager", **how)
 
 
@@ -207,7 +205,7 @@ def test_ten_pairs_of_learners_end_at_the_policy_of_exact_values(game, temperatu
     learning = Learning(PR2(settings=settings, temperature=temperature))
     env = make_env(game, worlds=10, seed=0)
     agents = Population(env, (learning, learning), seed=0, engine="eager")
-    train(env, agents.learners, episodes=1000)
+    train(env, agents.learners, Schedule(episodes=1000))
     networks = agents.networks()
     assert len(networks) == 20
     for name, network in networks.items():

@@ -15,7 +15,7 @@ from cprl.policies.lanes import LaneActor
 from cprl.system.times import CLOCK, Speed
 from cprl.terminal import progress
 from cprl.terminal.progress import ProgressBar
-from cprl.training import Training, train
+from cprl.training import Schedule, Training, train
 
 GAME = Game(map=maps.parse(".A>\n..A"), rules=Rules(window_rows=3, window_columns=3, episode_steps=5))
 
@@ -25,10 +25,10 @@ def lines(monkeypatch, *, before):
     monkeypatch.setattr(progress, "_LINE_PERIOD_S", 0.0)
     told = io.StringIO()
     walker = LaneActor(None, 8, seeds=[(0,), (1,)], agents=1)
-    with ProgressBar(GAME, episodes=9, replicas=2, console=Console(file=told, width=200)) as bar:
+    with ProgressBar(Schedule(episodes=9), GAME, replicas=2, console=Console(file=told, width=200)) as bar:
         episodes = 6 + before // 2
         training = Training(
-            CommonsEnv(GAME, 2), {}, others={(0,): walker}, episodes=episodes, callbacks=[bar]
+            CommonsEnv(GAME, 2), {}, Schedule(episodes=episodes), others={(0,): walker}, callbacks=[bar]
         )
         training.steps, training._played = 5 * before // 2, [before // 2] * 2
         training.run()
@@ -37,7 +37,9 @@ def lines(monkeypatch, *, before):
 
 def test_the_bar_shows_square_brackets_of_the_title_as_they_are():
     told = io.StringIO()
-    with ProgressBar(GAME, episodes=9, title="run [a]", console=Console(file=told, force_terminal=True)):
+    with ProgressBar(
+        Schedule(episodes=9), GAME, title="run [a]", console=Console(file=told, force_terminal=True)
+    ):
         pass
     assert "run [a]" in told.getvalue()
 
@@ -46,7 +48,9 @@ def test_the_bar_is_one_line_of_80_columns(monkeypatch):
     monkeypatch.setattr(progress, "_BAR_PERIOD_S", 0.0)
     told = io.StringIO()
     console = Console(file=told, force_terminal=True, width=80, legacy_windows=False)
-    with ProgressBar(GAME, episodes=1200, title="a title of many words " * 4, console=console) as bar:
+    with ProgressBar(
+        Schedule(episodes=1200), GAME, title="a title of many words " * 4, console=console
+    ) as bar:
         for _ in range(30):
             bar.on_step(TensorDict(batch_size=[4]))
         bar._progress.refresh()
@@ -71,8 +75,8 @@ def test_a_notebook_has_one_line_with_a_bar_that_fills(monkeypatch):
 
     monkeypatch.setattr("IPython.display.display", display)
     walker = LaneActor(None, 8, seeds=[(0,)], agents=1)
-    with ProgressBar(GAME, episodes=4, console=Console(file=told, force_jupyter=True)) as bar:
-        train(CommonsEnv(GAME, 1), {}, others={(0,): walker}, episodes=4, callbacks=[bar])
+    with ProgressBar(Schedule(episodes=4), GAME, console=Console(file=told, force_jupyter=True)) as bar:
+        train(CommonsEnv(GAME, 1), {}, Schedule(episodes=4), others={(0,): walker}, callbacks=[bar])
     assert told.getvalue() == ""
     full = [line.count("█") for line in shown]
     assert full == sorted(full)
@@ -80,14 +84,16 @@ def test_a_notebook_has_one_line_with_a_bar_that_fills(monkeypatch):
 
 
 def test_the_return_is_the_mean_of_the_last_episodes_of_all_worlds():
-    with ProgressBar(GAME, episodes=9, replicas=2, worlds=2, console=Console(file=io.StringIO())) as bar:
+    with ProgressBar(
+        Schedule(episodes=9, worlds=2), GAME, replicas=2, console=Console(file=io.StringIO())
+    ) as bar:
         for harvest in (100.0, 7.0, 1.0, 2.0, 4.0):
             bar.on_episode(SimpleNamespace(return_=np.array([harvest]), harvest=None, steps=5), {})
         assert bar._return == "3.5"  # (7 + 1 + 2 + 4) / 4
 
 
 def test_the_bar_never_counts_more_episodes_than_there_are():
-    with ProgressBar(GAME, episodes=3, console=Console(file=io.StringIO())) as bar:
+    with ProgressBar(Schedule(episodes=3), GAME, console=Console(file=io.StringIO())) as bar:
         for _ in range(3):
             bar.on_episode(SimpleNamespace(return_=np.ones(1), harvest=None, steps=5), {})
         for _ in range(4):  # of an episode beyond the last one
@@ -96,10 +102,12 @@ def test_the_bar_never_counts_more_episodes_than_there_are():
 
 
 def test_the_bar_counts_the_episodes_that_run_in_every_world():
-    with ProgressBar(GAME, episodes=20, replicas=2, worlds=3, console=Console(file=io.StringIO())) as bar:
+    with ProgressBar(
+        Schedule(episodes=20, worlds=3), GAME, replicas=2, console=Console(file=io.StringIO())
+    ) as bar:
         walker = LaneActor(None, 8, seeds=[(0,), (1,)], agents=1, worlds=3)
         training = Training(
-            CommonsEnv(GAME, 6), {}, others={(0,): walker}, worlds=3, episodes=20, callbacks=[bar]
+            CommonsEnv(GAME, 6), {}, Schedule(episodes=20, worlds=3), others={(0,): walker}, callbacks=[bar]
         )
         for _ in range(12):  # 2.4 episodes of each world
             training.step()
@@ -116,7 +124,7 @@ def test_lines_count_episodes_from_where_a_stopped_training_was(monkeypatch):
 def printed(*, steps, compile_s=0.0):
     """What a bar prints of so many steps of one world, a millisecond each, the first with a compilation."""
     told, batch = io.StringIO(), TensorDict(batch_size=[1])
-    with ProgressBar(GAME, episodes=1000, console=Console(file=told, width=200)) as bar:
+    with ProgressBar(Schedule(episodes=1000), GAME, console=Console(file=told, width=200)) as bar:
         with CLOCK.running():
             time.sleep(compile_s)
         for _ in range(steps):

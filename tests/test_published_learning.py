@@ -5,14 +5,16 @@ from dataclasses import replace
 
 import pytest
 import torch
+from cql import CQL
 from dqn_parts import make_learner, transitions
+from iql import IQL
 from torch import nn
 from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss, ValueEstimators
 
 from cprl import presets
-from cprl.algorithms import CQL, DQN, IQL, MADDPG, PR2, SAC, DQNSettings
-from cprl.learners.engine import UpdateRule, torch_optimizer
+from cprl.algorithms import DQN, MADDPG, PR2, SAC, DQNSettings
+from cprl.learners.optimizers import UpdateRule, torch_optimizer
 from cprl.objectives import LogCoshDQNLoss, log_cosh
 from cprl.objectives.td import DISTANCES, distance
 from cprl.system.compat import promise_targets
@@ -121,7 +123,7 @@ def test_as_run_the_loss_is_that_of_keras_over_all_outputs():
     algorithm = DQN(settings=settings, loss_function="log_cosh")
     spaces = presets.game("two_complex", variant="as_run").spaces
     learner = make_learner(algorithm, spaces, agents=(0,), replicas=1, engine="torchrl")
-    engine, chance = learner.engine, torch.Generator().manual_seed(1)
+    engine, chance = learner.lane_networks, torch.Generator().manual_seed(1)
     (loss,), (network,) = engine.losses, engine.parts[0]
     seen, seen_next = torch.randint(256, (2, 8, *spaces.observation_shape), generator=chance).to(torch.uint8)
     action, reward = torch.arange(8) % spaces.actions, torch.rand(8, 1, generator=chance)
@@ -131,7 +133,9 @@ def test_as_run_the_loss_is_that_of_keras_over_all_outputs():
     outputs = network(seen).detach()
     targets = outputs.clone()
     targets[range(8), action] = reward.squeeze(-1) + settings.gamma * following
-    assert engine.learn(0, batch).item() == pytest.approx(log_cosh(outputs - targets).mean().item(), rel=1e-5)
+    assert engine.learn_of(0, batch).item() == pytest.approx(
+        log_cosh(outputs - targets).mean().item(), rel=1e-5
+    )
 
 
 @pytest.mark.parametrize("kind", [DQN, PR2, MADDPG])

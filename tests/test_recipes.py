@@ -26,7 +26,7 @@ from cprl.runs.weights import load_weights, save_weights
 from cprl.studies import StudyTable
 from cprl.studies.study import Condition
 from cprl.studies.tables.sources import design_of
-from cprl.training import train
+from cprl.training import Schedule, train
 from cprl.training.agents import Population
 
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -179,7 +179,7 @@ def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, caps
     assert json.loads((run / "report.json").read_text())["training_s"] > 0
     if name == "commons":
         game, settings = presets.game("commons"), presets.dqn_settings("commons", variant=variant)
-        plain = dqn_learner(game.spaces, agents=[0], replicas=1, settings=settings, compile=False)
+        plain = dqn_learner(game.spaces, agents=[0], replicas=1, settings=settings, engine="eager")
         network = plain.networks()["replica_0/agent_0"]
         before = next(network.parameters()).clone()
         network.load_state_dict(weights["replica_1/agent_2"])  # which fit an ordinary network of one agent
@@ -268,7 +268,7 @@ def test_fifty_episodes_of_commons_in_eight_replicas_are_those_of_each_alone(tmp
         env = CommonsEnv(game, 1, seed=5, first_world=replica)
         (tmp_path / f"alone_{replica}").mkdir()
         with EpisodeTable(tmp_path / f"alone_{replica}" / "episodes.parquet") as table:
-            train(env, {(0, 1, 2, 3): alone}, episodes=50, callbacks=[table])
+            train(env, {(0, 1, 2, 3): alone}, Schedule(episodes=50), callbacks=[table])
         told = read_episodes(tmp_path / f"alone_{replica}").to_pydict()
         for agent in range(4):
             mine = [v for a, v in zip(told["agent"], told["return"], strict=True) if a == agent]
@@ -316,7 +316,7 @@ def test_a_run_that_was_stopped_is_loaded_from_its_newest_checkpoint(tmp_path, m
     assert loaded.weights_from == newest
     assert sorted(loaded.networks) == ["replica_0/agent_0", "replica_1/agent_0"]
     (of_learner,) = read_checkpoint(newest)["learners"]
-    kept = of_learner["update"]["own"]["value_network_params:module.0.module.weights.0"]
+    kept = of_learner["lane_networks"]["params"]["value_network_params:module.0.module.weights.0"]
     for replica in (0, 1):
         first = next(loaded.networks[f"replica_{replica}/agent_0"].parameters())
         assert torch.equal(first, kept[replica].T)
@@ -351,9 +351,12 @@ def test_the_run_of_a_plain_agent_is_loaded_too_or_says_which_file_cannot_be_rea
     with pytest.raises(ValueError, match=r"checkpoints/final\.pt"):
         cprl.load(run)
     weights.write_bytes(content)
-    (run / "checkpoints" / "best.pt").unlink(missing_ok=True)
-    with pytest.raises(ValueError, match=r"best\.pt holds no weights: .*No such file"):
+    with pytest.raises(ValueError, match=r"none\.pt holds no weights: .*No such file"):
+        cprl.load(run, weights="none")
+    best = (run / "checkpoints" / "best.pt").rename(run / "elsewhere")
+    with pytest.raises(ValueError, match=r"lacks checkpoints/best\.pt, which its manifest\.json lists"):
         cprl.load(run, weights="best")
+    best.rename(run / "checkpoints" / "best.pt")
     content = json.loads((run / "recipe.json").read_text())
     content["experiment"]["game"]["rules"]["hits_to_tag"] = 0
     (run / "recipe.json").write_text(json.dumps(content))

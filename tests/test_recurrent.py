@@ -7,7 +7,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from dqn_parts import make_learner
+from c51 import C51
+from cql import CQL
+from dqn_parts import learn, make_learner
+from iql import IQL
 from matrix_games import stag_hunt
 from recall_game import Recall
 from stock_collector import stock_collector
@@ -22,7 +25,19 @@ from torchrl.modules import GRUModule, LSTMModule, set_recurrent_mode
 
 import cprl
 from cprl import CommonsEnv, Custom, Experiment, algorithms
-from cprl.algorithms import DQN, PPO, DQNSettings, LOLASettings, RolloutSettings
+from cprl.algorithms import (
+    DQN,
+    LOLA,
+    MADDPG,
+    PPO,
+    PR2,
+    QMIX,
+    SAC,
+    VDN,
+    DQNSettings,
+    LOLASettings,
+    RolloutSettings,
+)
 from cprl.envs import make_env, spaces_of
 from cprl.evaluation.film import film
 from cprl.evaluation.play import open_session
@@ -32,7 +47,7 @@ from cprl.networks import GRU, LSTM, MLP, Conv
 from cprl.networks.stacked import lane_state, stack_lanes
 from cprl.policies.assignment import AgentPolicies
 from cprl.population import Learning, Team
-from cprl.training import train
+from cprl.training import Schedule, train
 from cprl.training.training import StepCollector
 
 SMALL = GRU(encoder=MLP(hidden_cells=(6,)), recurrent_cells=5)
@@ -224,8 +239,8 @@ def test_a_rollout_is_evaluated_as_it_was_played_across_rollouts_and_episodes():
             batch = next(turns)
             learner.store(batch)
             before = batch["agents", "recurrent_state_before"]
-            acted.append(learner.actor.preferences(batch["agents", "observation"], before))
-        found = learner._batch()
+            acted.append(learner.actor.action_values(batch["agents", "observation"], before))
+        found = learner.memory._batch(learner.lane_networks)
         chances = torch.stack(acted, 1).flatten(0, 0).transpose(1, 2).flatten(0, 1)  # [R, T, S, A] to lanes
         chosen = chances.gather(-1, found["action"].unsqueeze(-1)).squeeze(-1)
         torch.testing.assert_close(found["action_log_prob"], chosen.log())
@@ -236,7 +251,7 @@ def test_a_rollout_is_evaluated_as_it_was_played_across_rollouts_and_episodes():
         own = logits.log_softmax(-1).gather(-1, half["action"][6][:, None])[:, 0]
         torch.testing.assert_close(own, half["action_log_prob"][6])
         assert (half["recurrent_state"][6, 0] != 0).any()
-        learner._rollout.size = 0  # the same weights play on
+        learner.memory.rollout.size = 0  # the same weights play on
 
 
 def test_the_critic_goes_on_from_rollout_to_rollout_and_values_the_state_after_each_turn():
@@ -248,7 +263,7 @@ def test_the_critic_goes_on_from_rollout_to_rollout_and_values_the_state_after_e
     )
     policy = AgentPolicies({(0,): learner.actor})
     turns, played = iter(StepCollector(env, policy)), []
-    critic = dict(learner.engine._parts)["critic"]
+    critic = dict(learner.lane_networks.parts)["critic"]
 
     def wanted(history):
         """The value after the latest turn, step by step since its episode began."""
@@ -262,10 +277,11 @@ def test_the_critic_goes_on_from_rollout_to_rollout_and_values_the_state_after_e
         played.append(next(turns))
         learner.store(played[-1])
         torch.testing.assert_close(learner.values(played[-1]), wanted(played)[0])
-        if learner._rollout.is_full:
-            _, _, next_value, _ = learner._states.evaluate(learner.engine, learner._rollout.fields)
+        if learner.memory.rollout.is_full:
+            memory = learner.memory
+            _, _, next_value, _ = memory.states.evaluate(learner.lane_networks, memory.rollout.fields)
             torch.testing.assert_close(next_value[0, 0, -1:], wanted(played)[0])
-            learner._rollout.size = 0
+            learner.memory.rollout.size = 0
             torch.testing.assert_close(learner.values(played[-1]), wanted(played)[0])
 
 
@@ -291,7 +307,7 @@ def test_a_sequence_is_what_was_played_from_some_turn_on(steps):
     """Also where the ring has come round three times; episodes last up to 12 turns, sequences 6."""
     learner = learner_of(DQNS["GRU"])
     played = play(learner, steps)
-    batch, starts = learner.buffer.sample(), []
+    batch, starts = learner.memory.buffer.sample(), []
     assert batch.batch_size == torch.Size([8, 4, 6])
     for lane in range(8):
         actions = torch.stack([turn["agents", "action"].flatten()[lane] for turn in played])
@@ -323,8 +339,8 @@ def test_a_sequence_is_what_was_played_from_some_turn_on(steps):
 def test_every_turn_is_sampled_once_enough_follow_it():
     learner = learner_of(DQNS["GRU"], replicas=1)
     play(learner, 100)
-    oldest, written = learner.buffer.oldest()
-    drawn = torch.cat([learner.buffer.draw()[0] for _ in range(200)], 1)
+    oldest, written = learner.memory.buffer.oldest()
+    drawn = torch.cat([learner.memory.buffer.places()[0] for _ in range(200)], 1)
     places = {int(place) % 60 for place in range(int(oldest[0]), written - 5)}
     assert set(drawn.flatten().tolist()) == places
 
@@ -339,7 +355,7 @@ def test_the_loss_is_that_of_a_network_that_goes_through_the_turns_by_itself(dou
     play(learner, 40)
     for _ in range(3):
         learner.update()
-    networks, batch = learner.networks(), learner.buffer.sample()
+    networks, batch = learner.networks(), learner.memory.buffer.sample()
 
     def values(network, turns):
         found, state = [], None
@@ -360,7 +376,7 @@ def test_the_loss_is_that_of_a_network_that_goes_through_the_turns_by_itself(dou
             bootstrap = 0.995 * after.gather(-1, best)[:, 0] * goes_on
             errors.append(chosen - sequence["next", "reward"][:, 0] - bootstrap)
         wanted.append(torch.cat(errors).square().mean())
-    found = learner.engine.update_from(batch)
+    found = learn(learner, batch)
     torch.testing.assert_close(found, torch.stack(wanted).detach())
 
 
@@ -430,15 +446,16 @@ def test_states_of_other_policies_are_refused(ran):
 
 
 OF_ONE_SIZE = GRU(recurrent_cells=4), LSTM(recurrent_cells=3)
-OF_TURNS = ("DistributionalDQN", "CQL", "SAC", "IQL", "PR2", "VDN", "QMIX", "MADDPG", "LOLA")
+OF_TURNS = (C51, CQL, SAC, IQL, PR2, VDN, QMIX, MADDPG, LOLA)
 
 
 @pytest.mark.parametrize("network", [SMALL, LONG])
-@pytest.mark.parametrize("name", OF_TURNS)
-def test_algorithms_that_learn_from_single_transitions_are_refused_by_name(name, network):
-    settings = LOLASettings() if name == "LOLA" else REPLAY
-    with pytest.raises(ValueError, match=rf"{name}.network is (GRU|LSTM).*does not learn from sequences"):
-        getattr(algorithms, name)(settings=settings, network=network)
+@pytest.mark.parametrize("kind", OF_TURNS)
+def test_algorithms_that_learn_from_single_transitions_are_refused_by_name(kind, network):
+    settings = LOLASettings() if kind is LOLA else REPLAY
+    refused = rf"{kind.__name__}.network is (GRU|LSTM).*does not learn from sequences"
+    with pytest.raises(ValueError, match=refused):
+        kind(settings=settings, network=network)
 
 
 @pytest.mark.parametrize(
@@ -455,7 +472,6 @@ def test_algorithms_that_learn_from_single_transitions_are_refused_by_name(name,
         (lambda: stack_lanes([cell.make(GAME.spaces, 8) for cell in OF_ONE_SIZE]), "2 architectures"),
         (lambda: replace(SEQUENCES, n_steps=2), "sequence_steps is 6"),
         (lambda: DQNSettings(sequence_steps=17), "sequence_steps is 17"),
-        (lambda: replace(SEQUENCES, replay_transforms=(Custom("a:B"),)), "sequence_steps is 6"),
     ],
 )
 def test_what_does_not_fit_is_refused_by_name(wrong, message):
@@ -515,7 +531,7 @@ def test_memory_is_what_a_game_of_recall_needs(algorithm, settings, episodes):
         made = algorithm(settings=replace(settings, **changes), network=network)
         learner = make_learner(made, spaces_of(env), agents=(0,), replicas=8, engine="eager")
         returns = Returns()
-        train(env, {(0,): learner}, episodes=episodes, callbacks=[returns])
+        train(env, {(0,): learner}, Schedule(episodes=episodes), callbacks=[returns])
         return [float(np.mean(own[-100:])) for own in returns.of.values()]
 
     turns = {"sequence_steps": 6} if algorithm is DQN else {}

@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 import torch
-from dqn_parts import dqn_learner, dqn_loss, learner_of_parts, make_learner, played
+from dqn_parts import changed, dqn_learner, dqn_loss, make_learner, played, watch_steps
 from tensordict.nn import TensorDictModule
 from test_networks import GAME, REPLAY, ROLLOUTS, SPACES
 from torchrl.modules import QValueActor
@@ -14,9 +14,6 @@ from torchrl.objectives import ClipPPOLoss, DQNLoss, HardUpdate, KLPENPPOLoss, S
 from cprl import CommonsEnv, Observation
 from cprl.algorithms import A2C, DQN, PPO
 from cprl.algorithms.base import policy
-from cprl.learners.engine import ListEngine
-from cprl.learners.reference import TorchRLRolloutLearner
-from cprl.learners.rollouts import RolloutLearner
 
 FLOATS = replace(SPACES, observation_dtype="float32", observation_scale=1.0)
 
@@ -42,15 +39,15 @@ def test_floats_are_not_rounded_into_bytes_and_are_learned_from_where_the_spaces
     learner, turn = new(FLOATS), float_turn()
     learner.store(turn)
     if kind == "replay":
-        kept = learner.buffer.get(torch.zeros(2, 1, dtype=torch.int64))["observation"][:, 0]
+        kept = learner.memory.buffer.get(torch.zeros(2, 1, dtype=torch.int64))["observation"][:, 0]
     else:
-        kept = learner._rollout.fields["observation"][:, 0, 0]
+        kept = learner.memory.rollout.fields["observation"][:, 0, 0]
     assert torch.equal(kept, turn["agents", "observation"][0])
 
 
 @pytest.mark.parametrize("updater", [partial(SoftUpdate, tau=0.1), HardUpdate], ids=["soft", "hard"])
-@pytest.mark.parametrize("engine", [None, "list", "vmapped", "lane_axis"])
-def test_a_target_updater_of_torchrls_that_would_have_no_effect_is_refused(updater, engine):
+@pytest.mark.parametrize("update", [None, "list", "vmapped", "stacked"])
+def test_a_target_updater_of_torchrls_that_would_have_no_effect_is_refused(updater, update):
     updaters = []
 
     def make_loss(network):
@@ -61,23 +58,21 @@ def test_a_target_updater_of_torchrls_that_would_have_no_effect_is_refused(updat
     with pytest.raises(
         ValueError, match=r"a SoftUpdate or HardUpdate was built on the DQNLoss; .* set tau or"
     ):
-        dqn_learner(SPACES, agents=(0,), replicas=1, settings=REPLAY, make_loss=make_loss, engine=engine)
+        dqn_learner(SPACES, agents=(0,), replicas=1, settings=REPLAY, make_loss=make_loss, update=update)
 
 
-def test_a_target_updater_on_the_loss_of_an_engine_is_refused():
+def test_a_target_updater_on_the_loss_of_a_learner_is_refused():
     learner = make_learner(DQN(settings=REPLAY), SPACES, agents=(0,), replicas=1, engine="eager")
     with pytest.raises(ValueError, match=r"a SoftUpdate or HardUpdate .* DQNLoss; .* set tau or"):
-        SoftUpdate(learner.engine.loss.module, tau=0.1)
+        SoftUpdate(learner.lane_networks.losses[0].module, tau=0.1)
 
 
 ONE = {"agents": (0,), "replicas": 1}
 
 
-def rollout_learner(make_loss, *, kind=RolloutLearner, settings=ROLLOUTS, **who):
-    who = {"agents": (0, 1), "replicas": 1, **who}
-    options = {"compile": False} if kind is RolloutLearner else {}
-    parts = {"make_loss": make_loss}
-    return learner_of_parts(kind, PPO(settings=settings), SPACES, parts=parts, options=options, **who)
+def rollout_learner(make_loss, *, engine="eager", settings=ROLLOUTS, **lanes):
+    lanes = {"agents": (0, 1), "replicas": 1, **lanes}
+    return make_learner(changed(PPO(settings=settings), make_loss=make_loss), SPACES, engine=engine, **lanes)
 
 
 @pytest.mark.parametrize("algorithm", [PPO, A2C])
@@ -89,9 +84,9 @@ def test_advantages_by_another_estimator_than_that_of_the_loss_are_refused(algor
         loss.make_value_estimator(estimator, **how)
         return loss
 
-    for kind in (RolloutLearner, TorchRLRolloutLearner):
+    for engine in ("eager", "torchrl"):
         with pytest.raises(ValueError, match=rf"has the value estimator {estimator}; allowed: GAE, "):
-            rollout_learner(make_loss, kind=kind)
+            rollout_learner(make_loss, engine=engine)
 
 
 def test_gae_by_other_numbers_than_those_of_the_settings_is_refused():
@@ -126,22 +121,22 @@ def kl_loss(network):
 
 
 def test_ppo_with_a_kl_penalty_gets_the_old_logits_and_each_agent_a_penalty_of_its_own():
-    with pytest.warns(RuntimeWarning, match="agents would share buffers that the loss changes: beta"):
+    with pytest.warns(RuntimeWarning, match="agents would share what the loss keeps of a call: beta"):
         learner = rollout_learner(kl_loss, replicas=2)
-    assert isinstance(learner.engine, ListEngine)
-    assert not rollout_learner(PPO(settings=ROLLOUTS).make_loss)._reads_logits, "others do not carry them"
-    seen = []
-    update_from = learner.engine.update_from
-    learner.engine.update_from = lambda batch: seen.append(batch) or update_from(batch)
+    assert learner.lane_networks.update == "list"
+    assert not rollout_learner(PPO(settings=ROLLOUTS).make_loss).memory._reads_logits, (
+        "others do not carry them"
+    )
+    seen = watch_steps(learner, lambda draw: draw.gather(draw.columns))
     losses = [loss for loss in played(learner, CommonsEnv(GAME, 2, seed=3), 24) if loss is not None]
     assert torch.isfinite(torch.stack(losses)).all()
     first = seen[0]
     chosen = first["logits"].log_softmax(-1).gather(-1, first["action"].unsqueeze(-1)).squeeze(-1)
     torch.testing.assert_close(chosen, first["action_log_prob"])
-    penalties = [loss.beta for loss in learner.engine.losses]
+    penalties = [loss.module.beta for loss in learner.lane_networks.losses]
     assert all(float(beta) != 1.0 for beta in penalties), "it adapts"
     assert len({beta.data_ptr() for beta in penalties}) == 4
-    assert any("beta" in own for own in learner.state_dict()["update"]["losses"])
+    assert all("beta" in kept["buffers"] for kept in learner.state_dict()["lane_networks"]["losses"])
 
 
 class Demanding(ClipPPOLoss):
@@ -176,14 +171,14 @@ class OnlyTheCritics(ClipPPOLoss):
         return super().forward(tensordict)["loss_critic"]
 
 
-@pytest.mark.parametrize("kind", [RolloutLearner, TorchRLRolloutLearner])
-def test_a_loss_of_rollouts_that_returns_none_is_refused_too(kind):
+@pytest.mark.parametrize("engine", ["eager", "torchrl"])
+def test_a_loss_of_rollouts_that_returns_none_is_refused_too(engine):
     def make_loss(network):
         made = PPO(settings=ROLLOUTS).make_loss(network)
         return OnlyTheCritics(made.actor_network, made.critic_network)
 
     with pytest.raises(ValueError, match="the loss test_refusals:OnlyTheCritics returns a Tensor; allowed: "):
-        rollout_learner(make_loss, kind=kind)
+        rollout_learner(make_loss, engine=engine)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,8 +21,9 @@ from cprl.learners.settings import DQNSettings
 from cprl.learners.transitions import lane_turn, transitions_of
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import LaneActor, RandomActor
+from cprl.policies.present import FirstReplica
 from cprl.runs.episodes import EpisodeTable, read_episodes
-from cprl.training import train
+from cprl.training import Schedule, train
 from cprl.training.training import StepCollector
 
 SETTINGS = DQNSettings(
@@ -34,11 +35,11 @@ SETTINGS = DQNSettings(
     epsilon_decay_steps=100,
     target_every_episodes=2,
 )
-ENGINES = ["list", "vmapped", "lane_axis"]
+UPDATES = ["list", "vmapped", "stacked"]
 
 
-def learner(engine="lane_axis", *, game=GAME, agents=(0, 1), settings=SETTINGS, **how):
-    return dqn_learner(game.spaces, agents=agents, settings=settings, engine=engine, compile=False, **how)
+def learner(update="stacked", *, game=GAME, agents=(0, 1), settings=SETTINGS, **how):
+    return dqn_learner(game.spaces, agents=agents, settings=settings, update=update, engine="eager", **how)
 
 
 @pytest.mark.integration
@@ -46,7 +47,7 @@ def test_every_replica_is_told_of_so_many_episodes_and_of_its_losses(tmp_path):
     with EpisodeTable(tmp_path / "episodes.parquet") as table:
         witness = Witness()
         env = CommonsEnv(GAME, 3, seed=1)
-        train(env, {(0, 1): learner(replicas=3)}, episodes=5, callbacks=[table, witness])
+        train(env, {(0, 1): learner(replicas=3)}, Schedule(episodes=5), callbacks=[table, witness])
     rows = read_episodes(tmp_path).to_pydict()
     for replica in range(3):
         told = zip(rows["replica"], rows["agent"], rows["episode"], strict=True)
@@ -84,30 +85,32 @@ def test_the_lean_collector_yields_what_torchrls_own_yields(worlds):
 
 
 def test_the_transitions_of_an_agent_are_its_own_under_torchrls_default_keys():
-    env = CommonsEnv(GAME, 2)
-    turns = env.rollout(12, break_when_any_done=False)
-    flat = transitions_of(1, turns)
-    assert flat.batch_size == (24,)
-    assert torch.equal(flat["observation"], turns[keys.OBSERVATION][:, :, 1].flatten(0, 1))
-    assert torch.equal(flat["action"], turns[keys.ACTION][:, :, 1].flatten())
-    assert torch.equal(flat["next", "reward"], turns["next", "agents", "reward"][:, :, 1].flatten(0, 1))
-    for name in ("done", "terminated", "truncated"):
-        assert torch.equal(flat["next", name], turns["next", name].flatten(0, 1))
-    assert flat["observation"].dtype == torch.uint8
+    for turn in CommonsEnv(GAME, 2).rollout(12, break_when_any_done=False).unbind(1):
+        lanes = lane_turn((1,), keys.Turn.of(turn), turn["next", "agents", "reward"][..., 0].numpy())
+        own = transitions_of(lanes._asdict())
+        assert own.batch_size == (2,)
+        assert torch.equal(own["observation"], turn[keys.OBSERVATION][:, 1])
+        assert torch.equal(own["action"], turn[keys.ACTION][:, 1])
+        assert torch.equal(own["next", "observation"], turn["next", "agents", "observation"][:, 1])
+        assert torch.equal(own["next", "reward"], turn["next", "agents", "reward"][:, 1])
+        for name in ("done", "terminated"):
+            assert torch.equal(own["next", name], turn["next", name])
+        assert own["observation"].dtype == torch.uint8
 
 
 def test_transitions_of_lanes_are_those_of_the_agents():
-    batch = CommonsEnv(GAME, 3).rollout(1)[:, 0]
+    turn = CommonsEnv(GAME, 3).rollout(1)[:, 0]
+    before, after = turn["agents"], turn["next", "agents"]
     for agents in ((0, 1), (1,), (1, 0)):
-        lanes = lane_turn(agents, keys.Turn.of(batch), batch["next", "agents", "reward"][..., 0].numpy())
+        lanes = lane_turn(agents, keys.Turn.of(turn), after["reward"][..., 0].numpy())
         for place, agent in enumerate(agents):
-            alone = transitions_of(agent, batch)
             own = lanes._make(entry if entry is None else entry[place :: len(agents)] for entry in lanes)
-            assert np.array_equal(own.observation, alone["observation"])
-            assert np.array_equal(own.action, alone["action"])
-            assert np.array_equal(own.next_observation, alone["next", "observation"])
-            for name in ("reward", "done", "terminated"):
-                assert np.array_equal(getattr(own, name), alone["next", name].squeeze(-1))
+            assert np.array_equal(own.observation, before["observation"][:, agent])
+            assert np.array_equal(own.action, before["action"][:, agent])
+            assert np.array_equal(own.next_observation, after["observation"][:, agent])
+            assert np.array_equal(own.reward, after["reward"][:, agent, 0])
+            for name in ("done", "terminated"):
+                assert np.array_equal(getattr(own, name), turn["next", name][:, 0])
 
 
 @pytest.mark.integration
@@ -145,26 +148,29 @@ def test_lanes_by_worlds_reach_the_right_network():
         for agent in range(2):
             lane = 2 * (world // 3) + agent
             seen = windows[world, agent].expand(4, 1, *GAME.observation_shape)
-            assert chosen[world, agent] == agents.engine.outputs(seen)[lane, 0].argmax()
+            assert chosen[world, agent] == agents.lane_networks.outputs(seen)[lane, 0].argmax()
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("engine", ENGINES)
-def test_the_first_replica_alone_acts_with_the_weights_of_the_moment(engine):
-    agents = learner(engine, replicas=3)
-    alone = agents.evaluation_actor(1).of_first_replica()
+@pytest.mark.parametrize("update", UPDATES)
+def test_the_first_replica_alone_acts_with_the_weights_of_the_moment(update):
+    agents = learner(update, replicas=3)
+    actor, of_all = (agents.evaluation_actor(1) for _ in range(2))
+    alone = FirstReplica(actor, replicas=3)
     env = CommonsEnv(GAME, 3, seed=3)
     windows = torch.randint(0, 256, (3, 2, *GAME.observation_shape), dtype=torch.uint8)
-    before = alone.values(windows[0, :, None])
-    train(env, {(0, 1): agents}, episodes=3)
-    now = agents.engine.outputs(windows.flatten(0, 1)[:, None])[:2]
-    torch.testing.assert_close(alone.values(windows[0, :, None]), now)
+    before = actor.action_values(windows)[0]
+    train(env, {(0, 1): agents}, Schedule(episodes=3))
+    now = agents.lane_networks.outputs(windows.flatten(0, 1)[:, None])[:2, 0]
+    torch.testing.assert_close(actor.action_values(windows)[0], now)
     assert (before - now).abs().max() > 1e-4, "it has learned since"
-    of_all = agents.evaluation_actor(1)
-    of_all.epsilon = alone.epsilon = 0.5
+    seen = TensorDict({"observation": windows[:1]}, [1])
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert torch.equal(alone(seen)["action"][0], now.argmax(-1))
+    of_all.epsilon = actor.epsilon = 0.5
     with set_exploration_type(ExplorationType.RANDOM):
         for _ in range(20):
-            assert torch.equal(alone.choose(windows[:1]), of_all.choose(windows)[:1])
+            assert torch.equal(alone(seen)["action"], of_all.choose(windows)[:1])
 
 
 def test_seats_take_every_agent_once():
@@ -211,7 +217,7 @@ def transitions(count, *, reward=0.0, terminated=False, truncated=False):
 def test_the_clock_running_out_is_no_end_for_the_target_but_depletion_is(ending, bootstraps):
     # target = r + gamma max_a Q'(s', a), without the second term behind a terminal state;
     # loss = mean (Q - target)^2
-    engine, batch = stock_learner().engine, transitions(8, reward=1.0, **ending)
+    engine, batch = stock_learner().lane_networks, transitions(8, reward=1.0, **ending)
     (loss,), (network,) = engine.losses, engine.parts[0]
     with torch.no_grad():
         value = network(batch["observation"]).gather(-1, batch["action"][:, None])[:, 0]
@@ -236,5 +242,5 @@ def test_the_actor_follows_the_learner_and_epsilon_its_steps():
     for _ in range(50):
         agent.update()
     assert not torch.equal(before, chosen())
-    best = agent.engine.parts[0][0](seen[:, 0]).argmax(-1)
+    best = agent.lane_networks.parts[0][0](seen[:, 0]).argmax(-1)
     assert torch.equal(chosen()[:, 0], best)

@@ -18,7 +18,7 @@ from cprl.evaluation.show import show
 from cprl.institutions import Quota
 from cprl.studies.report import report
 from cprl.terminal.summary import compared
-from cprl.training.agents import load
+from cprl.training.stored import load
 from cprl.values import trust
 
 STUDY = Path(__file__).parents[1] / "docs" / "results" / "studies" / "beam"

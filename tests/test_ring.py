@@ -7,7 +7,8 @@ from dqn_parts import write
 from tensordict import TensorDict, assert_close
 from torchrl.envs.transforms import MultiStepTransform
 
-from cprl.learners.ring import Horizon, Ring, TransitionForm
+from cprl.learners.ring import Ring, stored_bytes
+from cprl.learners.transitions import Horizon, TransitionForm
 
 SHAPE, ACTIONS = (3, 4, 5), 6
 FORM = TransitionForm(observation_shape=SHAPE)
@@ -66,18 +67,18 @@ def test_every_transition_kept_is_what_came_and_the_last_ones_are_kept(lanes):
 
 def test_lanes_draw_for_themselves_and_uniformly():
     ring = filled([0, 1, 2], steps=30, transitions=20)
-    drawn = torch.stack([ring.draw()[0] for _ in range(3000)])
+    drawn = torch.stack([ring.places()[0] for _ in range(3000)])
     assert not torch.equal(drawn[:, 0], drawn[:, 1])
     counts = torch.stack([torch.bincount(drawn[:, lane].flatten(), minlength=20) for lane in range(3)])
     assert (counts - 600).abs().max() < 6 * 600**0.5
     alone = filled([1], steps=30, transitions=20)
-    assert torch.equal(torch.stack([alone.draw()[0] for _ in range(3000)])[:, 0], drawn[:, 1])
+    assert torch.equal(torch.stack([alone.places()[0] for _ in range(3000)])[:, 0], drawn[:, 1])
 
 
 def test_a_ring_goes_on_as_it_was_from_its_state_and_a_sample_is_what_is_drawn():
     lanes = [0, 1, 2]
     ring, other, same = filled(lanes, steps=73), filled(lanes, steps=5), filled(lanes, steps=73)
-    assert_close(filled(lanes, steps=73).sample(), same.get(*same.draw()))
+    assert_close(filled(lanes, steps=73).sample(), same.get(*same.places()))
     other.load_state_dict(ring.state_dict())
     for step in range(73, 120):
         assert_close(ring.sample(), other.sample())
@@ -109,7 +110,7 @@ def test_returns_of_several_steps_are_what_one_works_out_by_hand(lanes, n_steps)
         oldest, written = ring.oldest()
         if written < n_steps:
             continue
-        index, column = ring.draw()
+        index, column = ring.places()
         batch = ring.get(index, column)
         for place, lane in enumerate(lanes):
             for drawn, turn in zip(index[place].tolist(), batch[place], strict=True):
@@ -142,11 +143,11 @@ def test_returns_of_several_steps_are_those_of_torchrls_multi_step_transform():
 
 
 def test_what_it_takes_is_told_before_and_what_cannot_fit_is_refused(caplog):
-    assert TransitionForm(observation_shape=(3, 7, 15)).stored_bytes(20, 100_000) < 0.8e9
+    assert stored_bytes(TransitionForm(observation_shape=(3, 7, 15)), 20, 100_000) < 0.8e9
     with caplog.at_level("INFO", logger="cprl"):
         Ring(FORM, seeds=[(0,), (1,)], transitions=10_000, batch_size=8)
     assert "Replay buffers of 2 learners x 10,000 transitions: 0.00 GiB of " in caplog.text
     taken = sum(field.numel() * field.element_size() for field in filled([0, 1]).fields.values())
-    assert taken == FORM.stored_bytes(2, 40)
+    assert taken == stored_bytes(FORM, 2, 40)
     with pytest.raises(MemoryError, match=r"200 learners x 10,000,000 .* take [\d.]+ GiB; .* are free"):
         Ring(FORM, seeds=[(lane,) for lane in range(200)], transitions=10_000_000, batch_size=8)

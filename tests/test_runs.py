@@ -39,6 +39,7 @@ from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
 from cprl.runs.length import Length
 from cprl.runs.recipe import read_recipe, refuse_another_run, resume_command, runs_in, start_run
+from cprl.runs.schedule import Schedule
 from cprl.studies.factors import changed
 from cprl.system.shipped import cprl_here
 from cprl.training.training import StepCollector, Training
@@ -151,7 +152,7 @@ def test_fields_that_a_later_version_has_are_no_difference_while_they_have_their
     """A version that did not know a field did what its default says."""
     defaults = {field.name: field.default for field in fields(Experiment) if field.default is not MISSING}
     assert {"update_every", "seed", "on_nan"} <= defaults.keys()
-    default = replace(EXPERIMENT, **{**defaults, "episodes": EXPERIMENT.episodes})
+    default = replace(EXPERIMENT, **{**defaults, "engine": "compiled", "episodes": EXPERIMENT.episodes})
     run = begin(tmp_path / "run", default)
 
     def without_later_fields(recipe):
@@ -490,7 +491,7 @@ def test_a_training_hands_out_numbers_of_its_replicas_and_worlds():
 
     kept = []
     agents = {agent: RandomActor(2, seed=agent) for agent in (0, 1)}
-    training = Training(MatrixGame(6), {}, others=agents, episodes=6, worlds=3, callbacks=[Keeps()])
+    training = Training(MatrixGame(6), {}, Schedule(episodes=6, worlds=3), others=agents, callbacks=[Keeps()])
     training.run()
     assert [episode for episode, _ in kept] == [2, 5]
     for _, numbers in kept:

@@ -41,6 +41,13 @@ def test_an_agent_out_of_play_sends_nothing_and_a_new_episode_begins_in_silence(
     assert planes(play.turn("stay 1").again(), 0) == [[]]
 
 
+@pytest.mark.parametrize("apart", [False, True])
+def test_no_paint_is_the_number_of_a_signal_so_that_signals_are_written_onto_the_picture(apart):
+    game = Play(BOARD, signals=15, observation=Observation(agents_apart=apart)).game
+    paints = game.tables.paints
+    assert not ((paints >= 1) & (paints <= game.rules.signals)).any()
+
+
 @pytest.mark.parametrize("encoding", ["rgb", "one_hot"])
 @pytest.mark.parametrize("area", ["window", "full"])
 @pytest.mark.parametrize("governed", [False, True])

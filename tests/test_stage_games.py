@@ -248,7 +248,7 @@ def test_agents_with_other_numbers_see_and_get_the_same_to_the_bit():
 
 
 def test_a_worth_of_the_users_own_is_a_game_by_the_name_of_the_function_that_makes_it():
-    with pytest.raises(ValueError, match=r"^SharingGame\.worth is a CallableWorth, which a recipe"):
+    with pytest.raises(ValueError, match=r"^SharingGame\.worth\.function is a function, which a recipe"):
         replace(HERDERS, game=own_game())
     experiment = replace(HERDERS, game=Custom("test_stage_games:own_game"))
     cprl.trust("test_stage_games:own_game")

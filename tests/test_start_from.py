@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from dqn_parts import weights_at
 from same_runs import assert_same_training
 from stored_runs import command
 from test_finite import GAME, REPLAY, ROLLOUT
@@ -16,11 +17,11 @@ from cprl import CommonsEnv, Experiment
 from cprl.algorithms import DQN, IPPO, MADDPG, MAPPO, PPO, QMIX, SAC, VDN, Tabular, TabularSettings
 from cprl.commands.recipe import parse
 from cprl.measuring.evaluate import evaluate
-from cprl.objectives.preferences import Exchange
+from cprl.objectives.rewards import Exchange
 from cprl.population import Frozen, Learning, Scripted, Team
 from cprl.runs.checkpoints import checkpoints_in
 from cprl.runs.weights import load_weights, save_weights
-from cprl.training import train
+from cprl.training import Schedule, train
 from cprl.training.agents import Population
 
 FOUR = replace(GAME, map=cprl.maps.parse(".A>.A.A\nA<A.v.A\n..<.A.A"))
@@ -115,8 +116,8 @@ def test_who_starts_from_stored_weights_wants_what_it_is_told(stored):
     spec = replace(ALONE[0], reward=Exchange(0.5), start_from=Frozen(f"{stored}/alone", 0, replica=None))
     agents = population([spec, *[Scripted()] * 3])
     (learner,) = agents.learners.values()
-    assert learner.wants.preferences == Exchange(0.5)
-    train(CommonsEnv(FOUR, 2, seed=1), agents.learners, others=agents.others, episodes=1)
+    assert learner.rewards.reward == Exchange(0.5)
+    train(CommonsEnv(FOUR, 2, seed=1), agents.learners, Schedule(episodes=1), others=agents.others)
 
 
 def test_where_to_start_is_a_flag():
@@ -133,9 +134,7 @@ def test_targets_start_with_the_same_weights_and_the_optimiser_and_exploration_a
     settings = replace(REPLAY, own_target_weights=own_target_weights)
     spec = Learning(DQN(settings=settings), start_from=Frozen(f"{stored}/alone", 0))
     (learner,) = population([spec, *[Scripted()] * 3], engine=engine).learners.values()
-    weights = (
-        dict(learner.engine.losses[0].state_dict()) if engine == "torchrl" else learner.engine.weights(0)
-    )
+    weights = weights_at(learner.lane_networks, 0)
     targets = [own for name, own in weights.items() if name.startswith("target_")]
     trained = [own for name, own in weights.items() if not name.startswith("target_")]
     trained = [own for own in trained if own.is_floating_point() and own.ndim]

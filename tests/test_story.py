@@ -28,7 +28,7 @@ from cprl.pictures.colours import PALETTE, agent_colour
 from cprl.pictures.readable import rules_of
 from cprl.policies.lanes import random_agents
 from cprl.runs.episodes import EpisodeTable
-from cprl.training import train
+from cprl.training import Schedule, train
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.frames import Filming, Wall
 from cprl.viewer.layout import layout
@@ -437,7 +437,7 @@ def trained(folder, *, game=SMALL, replicas=2, episodes=6):
     seen = Remembers(env)
     with ViewerCallback(folder, env, title="run", episodes=episodes) as viewer:
         others = random_agents(game.spaces, tuple(range(game.agents)), replicas=replicas, seed=1)
-        train(env, {}, others=others, episodes=episodes, callbacks=[seen, viewer])
+        train(env, {}, Schedule(episodes=episodes), others=others, callbacks=[seen, viewer])
     return folder / "run.rrd", viewer, seen
 
 

@@ -15,9 +15,10 @@ from same_runs import assert_same_study, attempts_of, still_alive, written_at
 from tiny_study import FREEZE, GAMMA, OFTEN_SAVED
 
 from cprl import Study
+from cprl.runs.states import state_of
 from cprl.studies import InProcess, run_study
 from cprl.studies.study import STATUS
-from cprl.studies.trials import state_of, trials_of
+from cprl.studies.trials import trials_of
 
 TESTS = Path(__file__).parent
 GRID = {FREEZE: [2, 5], GAMMA: [0.5, 0.9]}
@@ -32,10 +33,11 @@ print("failed" if failed else "whole")
 ON = ("Processes(2)", "Ray(jobs=2)")
 ENDED_WITHIN_S = {ON[0]: 10.0, ON[1]: 30.0}
 """A process that is just being started has to import what tells it that its parent died."""
+UNFINISHED = ("begun", "stopped")
 STAGES = {
-    "a trial is begun": lambda out: any(runs_in(out, "unfinished")),
+    "a trial is begun": lambda out: any(runs_in(out, *UNFINISHED)),
     "trials train": lambda out: any(
-        list(run.glob("checkpoints/training-*")) for run in runs_in(out, "unfinished")
+        list(run.glob("checkpoints/training-*")) for run in runs_in(out, *UNFINISHED)
     ),
     "some trials are finished, others train": lambda out: (
         len(runs_in(out, "finished")) >= 3 and STAGES["trials train"](out)
@@ -48,8 +50,8 @@ def study_of(factors, episodes=24):
     return Study(replace(OFTEN_SAVED, episodes=episodes), factors, replicas=4, block=2)
 
 
-def runs_in(out, state):
-    return [run for run in (out / "runs").glob("*-s*") if state_of(run) == state]
+def runs_in(out, *states):
+    return [run for run in (out / "runs").glob("*-s*") if state_of(run) in states]
 
 
 def started(out, on, factors=GRID, episodes=24):
@@ -159,7 +161,7 @@ def test_a_study_that_is_asked_to_stop_saves_and_the_same_line_continues_it(tmp_
     assert "Stopped; 8 trials are left. The same line again continues the study." in printed(out)
     assert still_alive(trials, 5) == []
     assert not list((out / "runs").glob("*/run.lock"))
-    begun = runs_in(out, "unfinished")
+    begun = runs_in(out, *UNFINISHED)
     assert all(list(run.glob("checkpoints/training-*.pt")) for run in begun)
     logs = [(out / STATUS / f"{run.name}.log").read_text() for run in begun]
     assert all("Stopped; everything up to step" in log for log in logs)

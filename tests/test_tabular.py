@@ -12,13 +12,13 @@ from matrix_games import prisoners_dilemma
 
 from cprl import CommonsEnv, Game, Observation, Rules, maps
 from cprl.envs import make_env, spaces_of
-from cprl.learners.base import LearningAgents
+from cprl.learners.lanes import Lanes
 from cprl.learners.settings import TabularSettings
 from cprl.learners.tabular import TabularLearner
 from cprl.measuring.evaluate import evaluate
 from cprl.policies.assignment import AgentPolicies
 from cprl.policies.tabular import NEVER_MET, QTables
-from cprl.training import train
+from cprl.training import Schedule, train
 
 SEES_ALL = {"window_rows": 4, "window_columns": 7, "may_fire": False}
 GAUGE = Observation(stock_gauge=True)
@@ -156,9 +156,9 @@ def test_the_model_is_the_game_and_what_is_observed_tells_the_state(known):
 
 
 def learned(game, settings, *, episodes, replicas=2, seed=0):
-    who = LearningAgents(game.spaces, agents=[0], replicas=replicas, seed=seed)
+    who = Lanes(game.spaces, agents=[0], replicas=replicas, seed=seed)
     learner = TabularLearner(who, settings)
-    train(CommonsEnv(game, replicas, seed=seed), {(0,): learner}, episodes=episodes)
+    train(CommonsEnv(game, replicas, seed=seed), {(0,): learner}, Schedule(episodes=episodes))
     return learner
 
 
@@ -217,7 +217,7 @@ def test_with_regrowth_it_learns_the_values_too():
 
 
 def learner_of(game, settings):
-    learner = TabularLearner(LearningAgents(game.spaces, agents=[0], replicas=1), settings)
+    learner = TabularLearner(Lanes(game.spaces, agents=[0], replicas=1), settings)
     learner.game = game
     return learner
 
@@ -270,9 +270,9 @@ def test_the_learned_policy_plays_through_its_evaluation_actor():
 
 def test_the_table_of_an_agent_that_observes_floating_point_numbers_is_kept_as_a_network():
     env = make_env(prisoners_dilemma(turns=5), worlds=2)
-    who = LearningAgents(spaces_of(env), agents=(0, 1), replicas=2)
+    who = Lanes(spaces_of(env), agents=(0, 1), replicas=2)
     learner = TabularLearner(who, TabularSettings(gamma=0.0, learning_rate=1.0))
-    train(env, {(0, 1): learner}, episodes=20)
+    train(env, {(0, 1): learner}, Schedule(episodes=20))
     table, network = q_table(learner, 0), learner.networks()["replica_0/agent_0"]
     seen = torch.from_numpy(table["observation"])
     assert seen.dtype == torch.float32

@@ -7,24 +7,22 @@ from statistics import fmean
 import pytest
 import test_optimum
 import torch
+from dqn_parts import learn, made_up_batch, watch_steps
 from tensordict import TensorDict
 from test_population import ALGORITHMS, GAME, REPLAY, ROLLOUTS, population, ran, trained, weights
 from test_recurrent import DQNS
 from test_recurrent import ON_POLICY as RECURRENT
 
 from cprl import CommonsEnv, Custom, Game, Rules, maps
-from cprl.algorithms import Tabular, TabularSettings
+from cprl.algorithms import DQN, IPPO, MADDPG, MAPPO, QMIX, VDN, Tabular, TabularSettings
 from cprl.algorithms.base import TeamAlgorithm
-from cprl.algorithms.off_policy import DQN
-from cprl.algorithms.teams import IPPO, MADDPG, MAPPO, QMIX, VDN
-from cprl.learners.ring import TransitionForm
 from cprl.learners.settings import DEFAULT_HIDDEN_CELLS
-from cprl.learners.trial import trial_batch
+from cprl.learners.transitions import TransitionForm
 from cprl.measuring.evaluate import evaluate
 from cprl.networks import Conv
 from cprl.networks.team import Mixing
 from cprl.population import Frozen, Learning, Scripted, Team
-from cprl.training import train
+from cprl.training import Schedule, train
 from cprl.training.agents import Population
 
 TEAMS = {
@@ -64,7 +62,7 @@ def test_the_loss_of_vdn_is_that_of_the_sum_of_its_members_values():
     agents, learner = team_of("VDN", replicas=1)
     networks = list(agents.networks().values())
     form = TransitionForm(observation_shape=(4, *GAME.observation_shape), action_shape=(4,))
-    batch = trial_batch(1, form, len(GAME.actions))
+    batch = made_up_batch(form, 1, len(GAME.actions))
     (turn,) = batch
     ends = turn["next", "terminated"].squeeze(-1)
     assert 0 < ends.sum() < 8
@@ -76,7 +74,7 @@ def test_the_loss_of_vdn_is_that_of_the_sum_of_its_members_values():
         chosen = values(turn["observation"]).gather(-1, turn["action"].unsqueeze(-1)).sum((1, 2))
         best = values(turn["next", "observation"]).amax(-1).sum(1)
         target = turn["next", "reward"].squeeze(-1) + REPLAY.gamma * ~ends * best
-    torch.testing.assert_close(learner.engine.update_from(batch), (target - chosen).square().mean()[None])
+    torch.testing.assert_close(learn(learner, batch), (target - chosen).square().mean()[None])
 
 
 def first_turn(replicas=1):
@@ -103,7 +101,7 @@ def test_members_are_paid_what_each_wants_or_for_all_agents_also_those_outside_t
     ((agents, learner),) = agents.learners.items()
     assert agents == (1, 2)
     learner.store(first_turn(2))
-    fields = learner.buffer.fields
+    fields = learner.memory.buffer.fields
     assert fields["reward"][0].tolist() == [paid, paid]
     assert fields["action"][0].tolist() == [[1, 2], [1, 2]]
 
@@ -124,12 +122,9 @@ def test_the_critic_of_mappo_sees_what_all_see_that_of_ippo_what_one_sees(name, 
 def test_advantages_are_normalised_within_a_team(name):
     _, learner = team_of(name)
     env = CommonsEnv(GAME, 2, seed=3)
-    seen = []
-    update_at = learner.engine.update_at
-    learner.engine.update_at = lambda batch, place: seen.append((batch, place)) or update_at(batch, place)
-    train(env, {FOUR: learner}, episodes=2)
-    teams = torch.arange(2)[:, None]
-    advantage = torch.cat([batch["advantage"][teams, place] for batch, place in seen[:2]], 1)
+    seen = watch_steps(learner, lambda draw: draw.gather(draw.columns)["advantage"])
+    train(env, {FOUR: learner}, Schedule(episodes=2))
+    advantage = torch.cat(seen[:2], 1)
     assert advantage.shape == (2, 20, 4, 1)
     torch.testing.assert_close(advantage.flatten(1).mean(1), torch.zeros(2), atol=1e-5, rtol=0)
     torch.testing.assert_close(advantage.flatten(1).std(1), torch.ones(2), atol=1e-4, rtol=0)
@@ -244,13 +239,13 @@ def test_the_loss_is_the_mean_over_the_transitions_of_all_members():
     agents = population([shared(DQN(settings=REPLAY), (1, 3)), Scripted(), Scripted()], replicas=2)
     (learner,) = agents.learners.values()
     network = agents.networks()["replica_1/agent_1"]
-    batch = trial_batch(4, TransitionForm(observation_shape=GAME.observation_shape), len(GAME.actions))
+    batch = made_up_batch(TransitionForm(observation_shape=GAME.observation_shape), 4, len(GAME.actions))
     mine = batch[2:].reshape(-1)  # lanes are replicas times members
     with torch.no_grad():  # r + gamma max Q', the target is still a copy
         chosen = network(mine["observation"]).gather(-1, mine["action"].unsqueeze(-1))
         best = network(mine["next", "observation"]).amax(-1, keepdim=True)
         target = mine["next", "reward"] + REPLAY.gamma * ~mine["next", "terminated"] * best
-    losses = learner.engine.update_from(batch)
+    losses = learn(learner, batch)
     assert losses.shape == (2,), "of each network"
     torch.testing.assert_close(losses[1], (target - chosen).square().mean())
 
@@ -259,7 +254,7 @@ def test_a_member_acts_on_what_it_sees_itself_and_is_paid_for_itself():
     agents = population([shared(DQN(settings=REPLAY), (1, 2)), Scripted(), Scripted()])
     (learner,) = agents.learners.values()
     learner.store(first_turn(2))
-    assert learner.buffer.fields["reward"][0].tolist() == [1.0, 2.0, 1.0, 2.0]
+    assert learner.memory.buffer.fields["reward"][0].tolist() == [1.0, 2.0, 1.0, 2.0]
     seen = CommonsEnv(GAME, 2, seed=9).reset()["agents", "observation"][:, 1:3]
     actor = learner.evaluation_actor(1)
     actor.epsilon = 0.0
@@ -286,9 +281,9 @@ def test_weights_that_differ_are_refused_as_a_start(tmp_path, monkeypatch):
 
 
 def test_sharing_takes_the_engine_that_agents_of_their_own_take():
-    for name, way in (("DQN", "lane_axis"), ("SAC", "vmapped"), ("C51", "lane_axis_flat")):
+    for name, way in (("DQN", "stacked"), ("SAC", "vmapped"), ("C51", "stacked")):
         (learner,) = population([shared(EVERY[name])]).learners.values()
-        assert (learner.engine.sharing, learner.engine.batching) == (4, way)
+        assert (learner.lane_networks.sharing, learner.lane_networks.update) == (4, way)
 
 
 ROWS = Game(
@@ -319,7 +314,7 @@ def test_a_team_comes_close_to_the_optimum(name):
         return [float(episode.return_.sum()) / 48 for episode in played]
 
     untrained = share()
-    train(CommonsEnv(ROWS, 4, seed=1), team.learners, episodes=400 if name.endswith("PPO") else 125)
+    train(CommonsEnv(ROWS, 4, seed=1), team.learners, Schedule(episodes=400 if name.endswith("PPO") else 125))
     assert fmean(untrained) < 0.5
     shares = share()
     assert fmean(shares) > 0.9, shares

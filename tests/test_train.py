@@ -11,7 +11,8 @@ from stock_collector import stock_collector
 
 from cprl import CommonsEnv, Game, Rules, maps
 from cprl.algorithms import DQN, LOLA, PPO, LOLASettings, RolloutSettings
-from cprl.learners.replay import ReplayLearner
+from cprl.learners.lanes import Lanes
+from cprl.learners.learner import Learner
 from cprl.learners.settings import DEFAULT_HIDDEN_CELLS, DQNSettings
 from cprl.measuring.evaluate import evaluate, mean_return
 from cprl.networks import GRU
@@ -19,7 +20,7 @@ from cprl.policies.assignment import AgentPolicies
 from cprl.policies.lanes import RandomActor
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.episodes import EpisodeTable, read_episodes
-from cprl.training import Training, train
+from cprl.training import Schedule, Training, train
 
 GAME = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"),
@@ -52,8 +53,8 @@ def learner(agent=0, *, seed=0):
 
 def test_observers_see_every_turn_and_every_episode_and_each_learner_stores_its_own_turns():
     witness, learners = Witness(), {(0,): learner(0), (1,): learner(1)}
-    train(CommonsEnv(GAME), learners, episodes=5, callbacks=[witness])
-    first, second = (one.buffer.each[0][:]["observation"] for one in learners.values())
+    train(CommonsEnv(GAME), learners, Schedule(episodes=5), callbacks=[witness])
+    first, second = (one.memory.buffer.each[0][:]["observation"] for one in learners.values())
     assert not torch.equal(first, second)
     turns = {len(first), len(second), learners[0,].steps, sum(episode.steps for episode in witness.episodes)}
     assert turns == {len(witness.turns)}
@@ -63,6 +64,10 @@ def test_observers_see_every_turn_and_every_episode_and_each_learner_stores_its_
     assert np.isfinite(witness.learning[-1]["agent_0/loss"])
     harvest = sum(float(turn["next", "agents", "harvest"].sum()) for turn in witness.turns)
     assert harvest == sum(episode.harvest.sum() for episode in witness.episodes)
+
+
+def train_with(worlds, *, agent, episodes, **arguments):
+    train(CommonsEnv(GAME, worlds), {(0,): learner(agent)}, Schedule(episodes=episodes), **arguments)
 
 
 @pytest.mark.parametrize(
@@ -79,29 +84,38 @@ def test_observers_see_every_turn_and_every_episode_and_each_learner_stores_its_
 def test_what_cannot_be_trained_is_refused(worlds, arguments, message):
     given = {"agent": 0, "others": OTHER, "episodes": 1, **arguments}
     with pytest.raises(ValueError, match=message):
-        train(CommonsEnv(GAME, worlds), {(0,): learner(given.pop("agent"))}, **given)
+        train_with(worlds, **given)
+
+
+@pytest.mark.parametrize("odd", [10, {"episodes": 3}, None, Schedule])
+def test_what_is_no_schedule_is_refused_by_name(odd):
+    with pytest.raises(ValueError, match=r"^schedule is .*; allowed: a Schedule$"):
+        train(CommonsEnv(GAME), {(0,): learner(0)}, odd)
 
 
 def test_learning_may_wait_for_several_steps_and_then_catches_up():
-    class Counting(ReplayLearner):
+    class Counting(Learner):
         def update(self):
             updated_at.append(self.steps)
             return super().update()
 
     updated_at = []
     settings = replace(SETTINGS, learning_starts=1)
-    small = {"agents": (0, 1), "replicas": 2, "compile": False}
-    agents = dqn_learner(GAME.spaces, kind=Counting, settings=settings, **small)
-    training = train(CommonsEnv(GAME, 2), {(0, 1): agents}, episodes=2, update_every=3)
+    lanes = Lanes(GAME.spaces, agents=(0, 1), replicas=2)
+    agents = Counting(DQN(settings=settings), lanes, "eager")
+    training = train(CommonsEnv(GAME, 2), {(0, 1): agents}, Schedule(episodes=2, update_every=3))
     bouts = training.steps // 3
     assert updated_at == [3 * (bout + 1) for bout in range(bouts) for _ in range(3)]
 
 
 def test_torchrls_own_collector_trains_the_same():
-    def course(**arguments):
+    def course(*, update_every=1, **arguments):
         witness = Witness()
-        agents = dqn_learner(GAME.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=3, compile=False)
-        train(CommonsEnv(GAME, 2, seed=3), {(0, 1): agents}, episodes=4, callbacks=[witness], **arguments)
+        agents = dqn_learner(
+            GAME.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=3, engine="eager"
+        )
+        schedule = Schedule(episodes=4, update_every=update_every)
+        train(CommonsEnv(GAME, 2, seed=3), {(0, 1): agents}, schedule, callbacks=[witness], **arguments)
         weights = agents.networks()["replica_1/agent_0"].state_dict().values()
         losses = [learning["agent_1/loss"] for learning in witness.learning]
         returns = [episode.return_.tolist() for episode in witness.episodes]
@@ -115,10 +129,10 @@ def test_torchrls_own_collector_trains_the_same():
 
 def test_checkpoints_of_what_keeps_no_state_are_refused_before_anything_is_played(tmp_path):
     env, witness = CommonsEnv(GAME), Witness()
-    saving = {"episodes": 1, "checkpointer": Checkpointer(tmp_path), "callbacks": [witness]}
-    agents = dqn_learner(GAME.spaces, agents=(0, 1), replicas=1, settings=SETTINGS, compile=False)
+    saving = {"checkpointer": Checkpointer(tmp_path), "callbacks": [witness]}
+    agents = dqn_learner(GAME.spaces, agents=(0, 1), replicas=1, settings=SETTINGS, engine="eager")
     with pytest.raises(ValueError, match="a Collector has no state to resume from"):
-        train(env, {(0, 1): agents}, make_collector=stock_collector, **saving)
+        train(env, {(0, 1): agents}, Schedule(episodes=1), make_collector=stock_collector, **saving)
     assert witness.turns == []
 
 
@@ -133,7 +147,11 @@ def test_what_was_played_before_an_interruption_is_kept(tmp_path):
     table = EpisodeTable(tmp_path / "episodes.parquet")
     with pytest.raises(KeyboardInterrupt), table:
         train(
-            CommonsEnv(GAME), {(0,): learner()}, others=agents, episodes=9, callbacks=[table, Interrupting()]
+            CommonsEnv(GAME),
+            {(0,): learner()},
+            Schedule(episodes=9),
+            others=agents,
+            callbacks=[table, Interrupting()],
         )
     assert read_episodes(tmp_path)["episode"].to_pylist() == [0, 0, 1, 1, 2, 2]
 
@@ -149,7 +167,7 @@ def train_twice(agents):
     came = [Witness(), Witness()]
     for seed, witness in enumerate(came):
         env = CommonsEnv(UNEVEN, 3, seed=seed)
-        train(env, {(0, 1): agents}, episodes=1, callbacks=[witness])
+        train(env, {(0, 1): agents}, Schedule(episodes=1), callbacks=[witness])
     first, second = ([turn.clone() for turn in witness.turns] for witness in came)
     assert 0 < first[-1]["next", "done"].sum() < 3
     return first, second
@@ -170,9 +188,9 @@ def test_what_a_second_training_stores_does_not_follow_the_last_turn_of_the_firs
         done[len(first) - 1] = True
         places = torch.arange(len(came) - steps)
         if engine == "eager":
-            stored = agents.buffer.get(places.expand(6, -1))[lane]
+            stored = agents.memory.buffer.get(places.expand(6, -1))[lane]
         else:
-            stored = agents.buffer.each[lane].storage[:][: len(places)]
+            stored = agents.memory.buffer.each[lane].storage[:][: len(places)]
         for place in places.tolist():
             rewards, last = 0.0, place
             for ahead in range(steps):
@@ -203,11 +221,14 @@ def test_a_second_training_begins_its_rollouts_anew(algorithm, engine, wanted):
     def weights():
         return [value for network in agents.networks().values() for value in network.state_dict().values()]
 
-    first = Training(CommonsEnv(UNEVEN, 3, seed=0), {(0, 1): agents}, episodes=1)
+    first = Training(CommonsEnv(UNEVEN, 3, seed=0), {(0, 1): agents}, Schedule(episodes=1))
     for _ in range(11):
         first.step()
-    before, second = weights(), Training(CommonsEnv(UNEVEN, 3, seed=1), {(0, 1): agents}, episodes=1)
-    states = agents.state_dict().get("recurrent")
+    before, second = (
+        weights(),
+        Training(CommonsEnv(UNEVEN, 3, seed=1), {(0, 1): agents}, Schedule(episodes=1)),
+    )
+    states = agents.state_dict()["memory"].get("recurrent")
     assert states is None or states["ended"].all()
     for _ in range(wanted):
         assert all(map(torch.equal, weights(), before))
@@ -261,9 +282,9 @@ def test_two_callbacks_of_one_class_each_have_their_own_state():
             self.count = state["count"]
 
     def training(*firsts):
-        agents = dqn_learner(GAME.spaces, agents=(0, 1), replicas=1, settings=SETTINGS, compile=False)
+        agents = dqn_learner(GAME.spaces, agents=(0, 1), replicas=1, settings=SETTINGS, engine="eager")
         counts = [Counts(first) for first in firsts]
-        return Training(CommonsEnv(GAME, seed=0), {(0, 1): agents}, episodes=1, callbacks=counts)
+        return Training(CommonsEnv(GAME, seed=0), {(0, 1): agents}, Schedule(episodes=1), callbacks=counts)
 
     one, other = training(10, 20), training(0, 0)
     one.step()

@@ -29,13 +29,14 @@ from cprl.runs.checkpoints import FOLDER as CHECKPOINTS
 from cprl.runs.episodes import read_episodes, read_table
 from cprl.runs.files import LOCK_FILE, RunLock, RunLockedError, write_json
 from cprl.runs.recipe import read_recipe, start_run, write_circumstances
+from cprl.runs.states import state_of
 from cprl.studies import InProcess, Processes, Ray, executors, progress, read_study, run
 from cprl.studies.progress import Overview, Progress, table_of
 from cprl.studies.results import write_results
 from cprl.studies.run import trials_with
 from cprl.studies.status import PATIENCE_S, Status, StatusFile
 from cprl.studies.study import STATUS
-from cprl.studies.trials import Outcome, Task, begin_from_shorter, state_of, trials_of
+from cprl.studies.trials import Outcome, Task, begin_from_shorter, trials_of
 from cprl.training import running
 
 STUDY = Study(TINY, {FREEZE: [5, 25]})
@@ -87,7 +88,7 @@ def test_what_a_process_left_that_was_killed_before_its_recipe_or_first_checkpoi
         ended = ("report.json", "manifest.json", "episodes.parquet", CHECKPOINTS, "evaluation")
         ignored = shutil.ignore_patterns(*ended)
         shutil.copytree(undisturbed, first.directory, ignore=ignored, dirs_exist_ok=True)
-        assert state_of(first.directory) == "unfinished"
+        assert state_of(first.directory) == "begun"
     else:
         (first.directory / "recipe.json.0123abcd.partial").write_text("{")
         (first.directory / LOCK_FILE).write_text("")
@@ -156,7 +157,7 @@ def test_the_lock_of_another_host_is_taken_over_once_its_trial_is_silent(tmp_pat
     clock = SimpleNamespace(now=0.0, episodes=0)
 
     def wait(seconds):
-        assert state_of(directory) == "unfinished"
+        assert state_of(directory) == "begun"
         clock.now += 10.0
         if clock.now < 50:  # its last signs of life
             status.path.write_text(json.dumps({"episodes": clock.now}))
@@ -216,7 +217,7 @@ def test_a_finished_run_with_fewer_episodes_or_without_a_file_is_refused_and_an_
     for state in ("finished", "unfinished"):
         write_run(tmp_path / state / trial.name, shorter, lambda *_: 1, is_finished=state == "finished")
     assert trial.state(tmp_path / "finished") == "refused"
-    assert trial.state(tmp_path / "unfinished") == "unfinished"
+    assert trial.state(tmp_path / "unfinished") == "begun"
     directory = write_run(tmp_path / "runs" / trial.name, trial.experiment, lambda *_: 1)
     (directory / "evaluation" / "trained.parquet").unlink()
     (failed,) = run_study(study, tmp_path, progress=False, results=False).failed

@@ -19,9 +19,8 @@ import torch
 from tensordict import TensorDict
 
 from cprl import CommonsEnv, Game, Rules, maps
+from cprl.algorithms import DQN, QMIX, VDN
 from cprl.algorithms.base import TeamAlgorithm
-from cprl.algorithms.off_policy import DQN
-from cprl.algorithms.teams import QMIX, VDN
 from cprl.learners.settings import DQNSettings
 from cprl.population import Learning, Team
 from cprl.training.agents import Population
@@ -104,7 +103,7 @@ def test_qmix_dares_and_coordinates_where_independent_learners_and_vdn_play_safe
     learner = taught(VDN(settings=SETTINGS))
     assert returns(learner) == [7.0] * REPLICAS
     with torch.no_grad():
-        values = learner.engine.outputs(seen(torch.full((REPLICAS,), DARING)).unsqueeze(1)).squeeze(1)
+        values = learner.lane_networks.outputs(seen(torch.full((REPLICAS,), DARING)).unsqueeze(1)).squeeze(1)
     by_choice = values.unflatten(-1, (4, 2)).mean(-2)
     sums = by_choice[:, 0, :, None] + by_choice[:, 1, None, :]
     # row and column means 0.5 and 4.5, less the mean 2.5

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from boards import Play, drawn, only_quirks
 
-from cprl import Observation, maps
+from cprl import Observation, Quirks2019, maps
 from cprl.commons.cells import APPLE, GROUND, MARK, OTHER, WALL
 
 
@@ -39,6 +39,20 @@ def test_the_window_turns_with_the_agent_and_shows_its_own_row_last(turns, seen)
 def test_everything_outside_the_board_is_wall():
     play = Play("A>.\n...", window_rows=4, window_columns=5)
     assert windows(play, 0) == [["#####", "#####", "##m.#", "##S.#"]]
+
+
+@pytest.mark.parametrize("quirks", [None, Quirks2019()])
+def test_what_was_painted_before_leaves_no_trace_in_windows_also_beyond_the_board(quirks):
+    board = """
+        <A^
+        v.>
+    """
+    rules = {"window_rows": 4, "window_columns": 5, "signals": 2, "quirks": quirks}
+    play = Play(board, **rules)
+    for action in ("beam 2", "turn_left 1", "backward", "beam", "turn_right 2", "left 1", "beam 1", "stay"):
+        play.turn(action)
+        first_picture = Play(board, **rules).put(**play.batch.state())
+        assert np.array_equal(play.output.observation, first_picture.output.observation)
 
 
 def test_each_agent_sees_itself_blue_and_others_red():

@@ -16,14 +16,14 @@ from cprl.commands.recipe import parse
 from cprl.envs import spaces_of
 from cprl.institutions import Tax
 from cprl.measuring.episodes import EpisodeTracker
-from cprl.objectives.preferences import Exchange, InequityAversion, SocialValueOrientation, WantedRewards
+from cprl.objectives.rewards import Exchange, InequityAversion, RewardModel, SocialValueOrientation
 from cprl.population import Learning, Scripted, Team
 from cprl.runs.episodes import read_episodes
-from cprl.training import Training, train
+from cprl.training import Schedule, Training, train
 from cprl.training.agents import Population
 
 AVERSE = InequityAversion(alpha=5, beta=0.05, smoothing=0.9)
-PREFERENCES = {
+REWARDS = {
     "individual": "individual",
     "team": "team",
     "averse": AVERSE,
@@ -50,7 +50,7 @@ BOARD = Game(
 )
 
 
-def learner_of(name, preference, agents=(0, 1)):
+def learner_of(name, reward, agents=(0, 1)):
     algorithm, engine = LEARNERS[name]
     return make_learner(
         algorithm,
@@ -59,7 +59,7 @@ def learner_of(name, preference, agents=(0, 1)):
         replicas=2,
         seed=3,
         engine=engine,
-        reward_kind=preference,
+        reward=reward,
     )
 
 
@@ -68,12 +68,12 @@ def batches(turns):
     return MatrixGame(2).rollout(turns, break_when_any_done=False).unbind(1)
 
 
-def on_paper(preference, found):
+def on_paper(reward, found):
     """The wanted rewards of turns, [T, R, N]."""
-    wants = WantedRewards(preference)
+    model = RewardModel(reward)
     return np.stack(
         [
-            wants.add(batch["next", "agents", "reward"][..., 0].numpy(), batch["next", "done"][:, 0].numpy())
+            model.add(batch["next", "agents", "reward"][..., 0].numpy(), batch["next", "done"][:, 0].numpy())
             for batch in found
         ]
     )
@@ -82,24 +82,24 @@ def on_paper(preference, found):
 def stored(name, learner, turns):
     """The rewards that a learner holds, [T, L]."""
     if name == "replay":
-        return learner.buffer.fields["reward"][:turns].numpy()
+        return learner.memory.buffer.fields["reward"][:turns].numpy()
     if name == "replay of torchrl":
-        own = [buffer.storage[:turns]["next", "reward"][:, 0] for buffer in learner.buffer.each]
+        own = [buffer.storage[:turns]["next", "reward"][:, 0] for buffer in learner.memory.buffer.each]
         return torch.stack(own, 1).numpy()
     if name == "tables":
         return np.stack([turn["reward"] for turn in learner._turns])
     if name == "look ahead":
-        return learner._rollouts.fields["reward"][0, :, 0, :turns].T.numpy()
-    return learner._rollout.fields["reward"][:, 0, :turns].transpose(0, 1).reshape(turns, -1).numpy()
+        return learner.memory.rollout.fields["reward"][0, :, 0, :turns].T.numpy()
+    return learner.memory.rollout.fields["reward"][:, 0, :turns].transpose(0, 1).reshape(turns, -1).numpy()
 
 
-@pytest.mark.parametrize("preference", PREFERENCES.values(), ids=PREFERENCES)
+@pytest.mark.parametrize("reward", REWARDS.values(), ids=REWARDS)
 @pytest.mark.parametrize("name", LEARNERS)
-def test_a_learner_stores_what_its_agents_want(name, preference):
+def test_a_learner_stores_what_its_agents_want(name, reward):
     found = batches(17)
-    expected = on_paper(preference, found)
+    expected = on_paper(reward, found)
     assert expected.std() > 0
-    learner = learner_of(name, preference)
+    learner = learner_of(name, reward)
     for batch in found:
         given = batch["next", "agents", "reward"].clone()
         learner.store(batch)
@@ -125,7 +125,7 @@ def test_a_learner_remembers_where_its_state_was_taken(name):
     for batch in found[:8]:  # within an episode of both replicas
         first.store(batch)
     state = first.state_dict()
-    assert state["wants"]["smoothed"].shape == (1, 2, 2)
+    assert state["rewards"]["smoothed"].shape == (2, 2)
     then.load_state_dict(state)
     for batch in found[8:]:
         then.store(batch)
@@ -159,7 +159,7 @@ def test_the_wanted_return_is_the_sum_of_the_episode_and_the_return_stays_that_o
     env, kept = CommonsEnv(BOARD, 2, seed=3), Kept()
     dqn = DQN(settings=REPLAY)
     agents = population([Learning(dqn, reward=AVERSE), Learning(dqn), Scripted("greedy")], env)
-    train(env, agents.learners, others=agents.others, episodes=3, callbacks=[kept])
+    train(env, agents.learners, Schedule(episodes=3), others=agents.others, callbacks=[kept])
     tracker, wanted, total = EpisodeTracker(2, 3), np.zeros((2, 3)), []
     for batch, rewards in zip(kept.batches, on_paper(AVERSE, kept.batches), strict=True):
         wanted += rewards
@@ -178,7 +178,7 @@ def test_what_is_wanted_is_made_of_what_is_left_after_fines_and_transfers():
     taxed = replace(BOARD, institutions=(Tax(rate=0.5),))
     env, kept = CommonsEnv(taxed, 2, seed=3), Kept()
     agents = population([Learning(DQN(settings=REPLAY), reward="team"), *[Scripted("greedy")] * 2], env)
-    train(env, agents.learners, others=agents.others, episodes=3, callbacks=[kept])
+    train(env, agents.learners, Schedule(episodes=3), others=agents.others, callbacks=[kept])
     fines, transfers, harvest = (
         sum(float(batch["next", "agents", name].sum()) for batch in kept.batches)
         for name in ("fines", "transfers", "harvest")
@@ -193,9 +193,9 @@ def test_a_second_training_begins_without_what_the_first_remembered():
     learner = learner_of("replay", AVERSE)
     for batch in batches(3):
         learner.store(batch)
-    assert learner.wants.state_dict()
-    Training(MatrixGame(2), {(0, 1): learner}, episodes=1)
-    assert learner.wants.state_dict() == {}
+    assert learner.rewards.state_dict()
+    Training(MatrixGame(2), {(0, 1): learner}, Schedule(episodes=1))
+    assert learner.rewards.state_dict() == {}
 
 
 EXPERIMENT = Experiment(
@@ -210,7 +210,7 @@ EXPERIMENT = Experiment(
 
 
 @pytest.mark.integration
-def test_a_run_keeps_preferences_in_its_recipe_and_its_table(tmp_path):
+def test_a_run_keeps_rewards_in_its_recipe_and_its_table(tmp_path):
     run = cprl.run(EXPERIMENT, tmp_path / "run", watch="off")
     loaded = cprl.load(run)
     assert loaded.experiment == EXPERIMENT
@@ -230,7 +230,7 @@ def test_a_run_keeps_preferences_in_its_recipe_and_its_table(tmp_path):
         cprl.run(changed, run, resume=True, watch="off")
 
 
-def test_preferences_are_flags_by_their_place():
+def test_rewards_are_flags_by_their_place():
     given, _ = parse(
         lambda: EXPERIMENT, ["mine.py", "--agents.0.reward.alpha", "2", "--agents.1.reward", "team"]
     )
@@ -242,9 +242,8 @@ def test_preferences_are_flags_by_their_place():
 class Deaf(DQN):
     """An algorithm of somebody's own, whose learner knows two rewards."""
 
-    def make_learner(self, who, engine="compiled"):
-        learner = super().make_learner(replace(who, reward_kind="individual"), engine)
-        return learner if who.reward_kind == "individual" else object()
+    def make_learner(self, lanes, engine="compiled"):
+        return super().make_learner(replace(lanes, reward="individual"), engine)
 
 
 @pytest.mark.parametrize(
@@ -253,7 +252,7 @@ class Deaf(DQN):
         ([Team(algorithms.QMIX(settings=REPLAY), (0, 1), reward=AVERSE)], "reward is InequityAversion"),
         (
             [Learning(Deaf(settings=REPLAY), reward=AVERSE)] * 2,
-            "reward is InequityAversion, which the learner of Deaf does not have as its `wants`",
+            "reward is InequityAversion, which the learner of Deaf does not have as its `rewards`",
         ),
     ],
 )
@@ -266,5 +265,5 @@ def test_agents_without_others_are_refused():
     alone = Game(map=maps.parse("A.>.A"), rules=Rules(may_fire=False))
     with pytest.raises(ValueError, match=r"experiment\.agents\[0\]\.reward is Exchange.* a game of 1 agent"):
         replace(EXPERIMENT, game=alone, agents=[Learning(DQN(settings=REPLAY), reward=Exchange(0.5))])
-    with pytest.raises(ValueError, match=r"reward_kind is Exchange, which compares an agent with others"):
-        make_learner(DQN(settings=REPLAY), alone.spaces, agents=(0,), replicas=1, reward_kind=Exchange(0.5))
+    with pytest.raises(ValueError, match=r"reward is Exchange, which compares an agent with others"):
+        make_learner(DQN(settings=REPLAY), alone.spaces, agents=(0,), replicas=1, reward=Exchange(0.5))

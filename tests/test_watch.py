@@ -38,7 +38,7 @@ from cprl import CommonsEnv
 from cprl.commands import main as cli
 from cprl.commands.recipe import parse
 from cprl.learners.settings import DQNSettings
-from cprl.training import train
+from cprl.training import Schedule, train
 from cprl.viewer import live as streams
 from cprl.viewer import page
 from cprl.viewer.callback import ViewerCallback
@@ -65,7 +65,7 @@ class Doing:
 def course(run=None, *, live=None, episodes=8, others=()):
     """Weights, torch's generator and returns after a training of two replicas, watched if a run is given."""
     torch.manual_seed(1)
-    agents = dqn_learner(GAME.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=1, compile=False)
+    agents = dqn_learner(GAME.spaces, agents=(0, 1), replicas=2, settings=SETTINGS, seed=1, engine="eager")
     env, returns = CommonsEnv(GAME, 2, seed=1), []
 
     class Keeping:
@@ -74,10 +74,10 @@ def course(run=None, *, live=None, episodes=8, others=()):
 
     callbacks = [Keeping(), *others]
     if run is None:
-        train(env, {(0, 1): agents}, episodes=episodes, callbacks=callbacks)
+        train(env, {(0, 1): agents}, Schedule(episodes=episodes), callbacks=callbacks)
     else:
         with ViewerCallback(run, env, title="run", episodes=episodes, live=live) as viewer:
-            train(env, {(0, 1): agents}, episodes=episodes, callbacks=[*callbacks, viewer])
+            train(env, {(0, 1): agents}, Schedule(episodes=episodes), callbacks=[*callbacks, viewer])
     weights = [value.tolist() for net in agents.networks().values() for value in net.state_dict().values()]
     return repr((weights, torch.get_rng_state().tolist(), returns))
 

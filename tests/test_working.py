@@ -103,7 +103,7 @@ def test_nothing_is_said_beside_a_bar(said):
 
 def test_a_compilation_says_so_while_it_works(said):
     with CLOCK.running():
-        said.wait_for("compiling the rules (about a minute, once), ")
+        said.wait_for("compiling the rules (10 to 20 s, once), ")
 
 
 def test_a_line_of_a_terminal_gives_way_to_what_is_printed_and_vanishes(said, monkeypatch, capsys):
@@ -198,7 +198,7 @@ def test_the_first_game_of_an_empty_cache_says_that_it_compiles_before_it_has(tm
     with started(["-c", FIRST_GAME], tmp_path) as process:
         lines = [line.strip() for line in process.stdout]
     said = lines[lines.index("begins") + 1 : lines.index("began")]
-    assert said[0] == "compiling the rules (about a minute, once), 1 s so far"
+    assert said[0] == "compiling the rules (10 to 20 s, once), 1 s so far"
     seconds = [int(re.search(r"(\d+) s so far", line)[1]) for line in said]
     assert seconds == sorted(seconds)
 

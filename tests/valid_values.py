@@ -8,7 +8,7 @@ from tiny_study import GAME, LEARNING, TINY
 
 import cprl
 from cprl import algorithms, institutions, population
-from cprl.objectives import preferences
+from cprl.objectives import rewards
 from cprl.values import KINDS
 
 REQUIRED = {
@@ -18,9 +18,9 @@ REQUIRED = {
     "Team": lambda: population.Team(algorithms.VDN(settings=algorithms.DQNSettings()), agents=(0, 1)),
     "Frozen": lambda: population.Frozen("runs/none", agent=0),
     "RandomEnd": lambda: cprl.RandomEnd(prob=0.15),
-    "InequityAversion": lambda: preferences.InequityAversion(alpha=5, beta=0.05, smoothing=0.9),
-    "SocialValueOrientation": lambda: preferences.SocialValueOrientation(angle=0.5, weight=1.0),
-    "Exchange": lambda: preferences.Exchange(0.5),
+    "InequityAversion": lambda: rewards.InequityAversion(alpha=5, beta=0.05, smoothing=0.9),
+    "SocialValueOrientation": lambda: rewards.SocialValueOrientation(angle=0.5, weight=1.0),
+    "Exchange": lambda: rewards.Exchange(0.5),
     "Boundaries": lambda: institutions.Boundaries.strips(height=3, width=5, agents=2),
     "Levies": lambda: institutions.Levies(groups=((0,), (1,))),
     "Vote": lambda: institutions.Vote(on=institutions.Tax()),

@@ -22,6 +22,8 @@ from statistics import median
 from types import ModuleType
 from typing import Any
 
+from cprl.runs.schedule import Schedule
+
 WORLDS, AGENTS, TURNS = 256, 7, 8
 MINIBATCHES = 500
 """Of a rollout of 1,000 turns."""
@@ -87,7 +89,7 @@ def of_cprl(network: str) -> Iterator[float]:
     team = Team(ippo, agents=tuple(range(AGENTS)), reward="team", share_parameters=True)
     env = CommonsEnv(presets.game("socialjax/harvest_open-v1"), WORLDS, seed=0)
     population = Population(env, (team,), seed=0, worlds=WORLDS)
-    training = Training(env, population.learners, steps=2**60, worlds=WORLDS)
+    training = Training(env, population.learners, Schedule(steps=2**60, worlds=WORLDS))
     for _ in range(TURNS + 2):  # compiles
         training.step()
     while True:

@@ -24,7 +24,7 @@ from cprl.measuring.table import by_replica, where
 from cprl.measuring.windows import running_mean
 from cprl.runs.curves import curves_of
 from cprl.studies.exploit import BEST, compared, exploitability, plan_responses
-from cprl.training.agents import LoadedRun, load
+from cprl.training.stored import LoadedRun, load
 from cprl.values.arrays import Float64
 
 POINTS: Final = 2_000

@@ -35,6 +35,7 @@ def experiment() -> cprl.Experiment:
             ),
         ),
         steps=100_000_000,
+        engine="compiled",
         replicas=2,
         worlds=256,
     )

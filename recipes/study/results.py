@@ -37,7 +37,7 @@ from cprl.runs.recipe import read_recipe
 from cprl.runs.weights import lacks_weights
 from cprl.studies.study import UNNAMED, Condition
 from cprl.system.defaults import SEED, Fresh
-from cprl.training.agents import LoadedRun, load
+from cprl.training.stored import LoadedRun, load
 
 Values = NDArray[np.float64]
 

@@ -4,6 +4,7 @@ A package imports only from those above it:
     values       frozen values: a field's annotation says its range; tables that JSON holds, and back; Custom
     system       compilation, caches, memory, output, private parts of libraries
     keys         the TensorDict entries, their shapes and types
+    recurrent_state  the states of recurrent networks from turn to turn: written, carried, read
     institutions  rules that people make: boundaries, quotas, taxes, sanctions, votes; numpy alone
     commons      the game: maps, rules, turns; numpy and numba alone
     pictures     games for people: boards as images and SVG, rules in words, the colours of all pictures
@@ -63,11 +64,12 @@ if TYPE_CHECKING:
     from cprl.evaluation import crossplay, evaluate_run, gains
     from cprl.experiment import Experiment, presets
     from cprl.measuring.statistics import differences, estimates
+    from cprl.runs.schedule import Schedule
     from cprl.studies import Study, run_study
     from cprl.system.defaults import Fresh
     from cprl.training import train
-    from cprl.training.agents import load
     from cprl.training.running import run
+    from cprl.training.stored import load
     from cprl.values import Custom, trust
 
     __version__: str
@@ -84,6 +86,7 @@ __all__ = [
     "RandomEnd",
     "River",
     "Rules",
+    "Schedule",
     "Study",
     "__version__",
     "algorithms",
@@ -130,13 +133,14 @@ _MODULES: Final = {
     "RandomEnd": "cprl.commons.rules",
     "River": "cprl.commons.river",
     "Rules": "cprl.commons.rules",
+    "Schedule": "cprl.runs.schedule",
     "Study": "cprl.studies",
     "crossplay": "cprl.evaluation",
     "differences": "cprl.measuring.statistics",
     "estimates": "cprl.measuring.statistics",
     "evaluate_run": "cprl.evaluation",
     "gains": "cprl.evaluation",
-    "load": "cprl.training.agents",
+    "load": "cprl.training.stored",
     "recipe_main": "cprl.commands.recipe",
     "run": "cprl.training.running",
     "run_study": "cprl.studies",

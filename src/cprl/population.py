@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final, TypeAlias
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
 from cprl.learners.settings import Exploring
-from cprl.objectives.preferences import Preference
+from cprl.objectives.rewards import Reward
 from cprl.policies.decisions import Bandit
 from cprl.policies.scripted import ScriptedPolicy
 from cprl.values import AgentIndices, Custom, Natural, Value, Where, checked
@@ -68,14 +68,14 @@ class Learning(Value):
     Args:
         algorithm: e.g. `cprl.algorithms.DQN(settings=...)`.
         reward: what it wants: "individual", its own reward; "team", the sum of the rewards of all agents of
-            the game; or a value of `cprl.objectives.preferences`, e.g. `Exchange(0.5)`.
+            the game; or a value of `cprl.objectives.rewards`, e.g. `Exchange(0.5)`.
         start_from: the agent whose weights its acting network, and the target of it, start with; None for
             new ones. The optimiser, critics, exploration and decisions begin anew.
         decisions: how it learns what it decides, in a game with votes or elections; None for `Bandit()`.
     """
 
     algorithm: Algorithm | Custom
-    reward: Preference = "individual"
+    reward: Reward = "individual"
     start_from: Frozen | None = None
     decisions: Bandit | None = None
 
@@ -107,7 +107,7 @@ class Team(Value):
 
     algorithm: Algorithm | Custom
     agents: AgentIndices
-    reward: Preference = "team"
+    reward: Reward = "team"
     start_from: Frozen | None = None
     decisions: Bandit | None = None
     share_parameters: bool = False

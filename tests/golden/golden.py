@@ -18,6 +18,9 @@ from pathlib import Path
 import numpy as np
 
 FOLDER = Path(__file__).parent
+sys.path.insert(0, str(FOLDER.parents[1] / "examples" / "own_algorithm"))
+OWN_ALGORITHMS = "c51:C51", "cql:CQL", "iql:IQL"
+"""Those of the examples, which trainings and stored runs name."""
 RESULTS = FOLDER.parents[1] / "docs" / "results"
 _EXPERIMENT_3 = RESULTS / "studies" / "experiment_3"
 WITH_THE_FAULT = {_EXPERIMENT_3 / "study.json", _EXPERIMENT_3 / "runs" / "both" / "recipe.json"}

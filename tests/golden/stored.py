@@ -8,12 +8,13 @@ import sys
 from itertools import pairwise
 from pathlib import Path
 
-from golden import RESULTS, WITH_THE_FAULT, checksum, columns
+from golden import OWN_ALGORITHMS, RESULTS, WITH_THE_FAULT, checksum, columns
 
 import cprl
 from cprl.measuring.table import numbers_in, where
 
 TEN_TARGETS = "commons_targets_10"
+cprl.trust(*OWN_ALGORITHMS)
 
 
 def runs() -> dict[str, Path]:

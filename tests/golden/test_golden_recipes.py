@@ -13,6 +13,7 @@ import pytest
 from golden import RESULTS, WITH_THE_FAULT, assert_held
 
 from cprl import Experiment, Study
+from cprl.experiment.engine import engine_of
 from cprl.values import trust
 
 ROOT = Path(__file__).parents[2]
@@ -80,11 +81,16 @@ def shortened(value):
     ]
 
 
+def trained_by(experiment):
+    """The table of an experiment, with the engine that trains it in place of "auto"."""
+    return {**experiment.to_config(), "engine": engine_of(experiment)}
+
+
 @pytest.mark.integration
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: below(path, ROOT))
 def test_a_recipe_makes_the_experiment_that_it_made(path, monkeypatch):
     made = {
-        f"{below(path, ROOT)} {words}".strip(): shortened(experiment.to_config())
+        f"{below(path, ROOT)} {words}".strip(): shortened(trained_by(experiment))
         for words, experiment in experiments(module_of(path, monkeypatch))
     }
     if made:

@@ -11,21 +11,23 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from golden import columns
+from golden import OWN_ALGORITHMS, columns
 
 EPISODES, REPLICAS = 3, 2
 
 
 def experiments() -> dict[str, dict[str, object]]:
     """The experiments by family and name."""
+    from c51 import C51
+    from cql import CQL
+    from iql import IQL
+
     import cprl
     from cprl import Game, Observation, maps, presets
     from cprl.algorithms import (
         A2C,
-        CQL,
         DQN,
         IPPO,
-        IQL,
         LOLA,
         MADDPG,
         MAPPO,
@@ -34,7 +36,6 @@ def experiments() -> dict[str, dict[str, object]]:
         QMIX,
         SAC,
         VDN,
-        DistributionalDQN,
         DQNSettings,
         LOLASettings,
         Reinforce,
@@ -44,8 +45,10 @@ def experiments() -> dict[str, dict[str, object]]:
     )
     from cprl.institutions import Monitoring, Quota, Sanctioner, Tax, Vote
     from cprl.networks import GRU, LSTM, Conv
-    from cprl.objectives.preferences import Exchange, InequityAversion, SocialValueOrientation
+    from cprl.objectives.rewards import Exchange, InequityAversion, SocialValueOrientation
     from cprl.population import Learning, Scripted, Team
+
+    cprl.trust(*OWN_ALGORITHMS)
 
     def board(variant: str) -> Game:
         rules = presets.game("commons", variant=variant).rules
@@ -122,7 +125,7 @@ def experiments() -> dict[str, dict[str, object]]:
         },
         "off-policy": {
             "cql": two(CQL(settings=plain)),
-            "c51": two(DistributionalDQN(settings=plain, atoms=11)),
+            "c51": two(C51(settings=plain, atoms=11)),
             "sac": two(SAC(settings=plain)),
             "iql": two(IQL(settings=plain)),
             "pr2": two(PR2(settings=plain)),

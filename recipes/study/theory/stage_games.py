@@ -14,10 +14,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 
-from cprl import keys
+from cprl import keys, recurrent_state
 from cprl.commons.chance import LOW_WORD, WORD_BITS, philox4x32
 from cprl.envs.drivers import device_of, drawn_seed
-from cprl.envs.stepping import begin_states, carry_on, chosen
+from cprl.envs.stepping import carry_on, chosen
 from cprl.system.compat import LeanStepEnv, flag_spec, unchecked_tensordict
 from cprl.values import Positive, PositiveShare, Range, Seed, Value, checked
 
@@ -201,7 +201,7 @@ class StageEnv(LeanStepEnv):
         which = None if tensordict is None else tensordict.get("_reset", None)
         begun = self._reset_worlds(None if which is None else which.reshape(-1, 1))
         if tensordict is not None:
-            begin_states(begun, tensordict, which)
+            recurrent_state.carry(begun, tensordict, which)
         return begun
 
     def _reset_worlds(self, which: Tensor | None) -> TensorDict:

@@ -250,7 +250,7 @@ def visits(
     _begin(fresh.seed, run, files=files)
 
     from cprl.experimental.territory import draw_visits, territory_cells, territory_of
-    from cprl.training.agents import load
+    from cprl.training.stored import load
 
     loaded = load(run)
     table = territory_of(loaded, fresh)

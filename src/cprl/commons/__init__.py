@@ -25,6 +25,8 @@ In reading order:
     views        the picture of the board and the agents' windows, on one world
     turn         the order of a turn and of an episode, on one world
     loops        the loops over worlds that a thread runs
+    records      records of arrays, as compiled code hands them on
+    linking      rules as parts of one piece of machine code
     compiled     compiles the rules for a target, or runs them as plain Python
     threads      CpuThreads: runs the loops on CPU threads
     cuda         CudaThreads: runs the loops on a GPU

@@ -1,7 +1,8 @@
 """Compiles the rules: every target is built from the same plain Python functions.
 
 What relies on private parts of Numba is here, each in a function or constant of its own: `CPU_OPTIONS`,
-`kept_in`, `kept_on_disk`, `_is_kept` and `machine_code`. `tests/test_compat.py` has a test for each.
+`kept_in`, `kept_on_disk`, `_is_kept` and `machine_code`; and in `cprl.commons.records` and `linking`.
+`tests/test_compat.py` has a test for each.
 """
 
 import dis
@@ -24,6 +25,8 @@ import numba
 import numpy as np
 from filelock import FileLock
 
+from cprl.commons.linking import AS_PART, AS_WHOLE
+from cprl.commons.records import VERSION, by_reference, type_of, with_local
 from cprl.institutions.arrays import is_record
 from cprl.system.libraries import relying_on
 from cprl.system.process import cache_folder, obey_parent
@@ -226,7 +229,7 @@ def machine_code(entry: Callable[..., Any], *arguments: Any) -> Callable[..., An
     with relying_on("numba", "Dispatcher.compile"):
         compile_for = compiled_for_cpu(entry).compile
     with CLOCK.running():
-        code: Callable[..., Any] = compile_for(tuple(map(numba.typeof, arguments)))
+        code: Callable[..., Any] = compile_for(tuple(map(type_of, arguments)))
     return code
 
 
@@ -247,7 +250,9 @@ def compiled(
                 called: Any = names.get(name)
                 if _is_rule(called):
                     names[name] = compile_one(called)
-            done[function] = jit(FunctionType(function.__code__, names, function.__name__))
+            copy = FunctionType(function.__code__, names, function.__name__)
+            copy.__dict__.update(function.__dict__)
+            done[function] = jit(copy)
         return done[function]
 
     return {function.__name__: compile_one(function) for function in functions}
@@ -282,22 +287,32 @@ def _compiled_for_cpu(entry: Any, inline: bool) -> Any:
     inner = options | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     if inline:
         inner["forceinline"] = True
-    folder = cache_folder() / "rules" / f"{entry.__name__}-{code_key(entry, **inner)}"
+        options["no_cfunc_wrapper"] = True
+        inner |= AS_PART
+        options |= AS_WHOLE
+    key = code_key(entry, records=VERSION, inline=inline, **CPU_OPTIONS)
+    folder = cache_folder() / "rules" / f"{entry.__name__}-{key}"
 
     def jit(function: FunctionType) -> Any:
-        if function.__code__ is not entry.__code__:
-            return numba.njit(**inner)(function)
+        sliced = getattr(function, "sliced", None)
+        if sliced is not None:
+            return by_reference(sliced)
+        if function.__code__ is entry.__code__ and not inline:
+            return kept(function)
+        return numba.njit(**inner)(function)
+
+    def kept(function: FunctionType) -> Any:
         if not _can_write(folder):
             return numba.njit(**options)(function)
         # Numba asks when the file of a function was changed, and where it is, which says nothing of the rules
         # that it calls: so it stands in a file of its folder.
-        place = {"co_filename": str(folder / KEY_FILE), "co_firstlineno": 1}
-        function.__code__ = function.__code__.replace(**place)
+        function.__code__ = function.__code__.replace(co_filename=str(folder / KEY_FILE), co_firstlineno=1)
         in_child = partial(_compiled_for_cpu, entry, inline) if inline else None
         return kept_on_disk(function, in_child=in_child, **options)
 
     with _ONE_AT_A_TIME, kept_in(folder):
-        return compiled([entry], jit)[entry.__name__]
+        made = compiled([entry], jit)[entry.__name__]
+        return kept(with_local(entry, made)) if inline else made
 
 
 def code_key(entry: Any, **options: Any) -> str:

@@ -46,7 +46,7 @@ class CudaThreads:
         self.tables: Tables = self.place(game.tables)
         self._scratch = Scratch(
             *(
-                cuda.to_device(np.zeros((worlds, *array.shape), array.dtype, order="F"))
+                cuda.to_device(np.asfortranarray(np.broadcast_to(array, (worlds, *array.shape))))
                 for array in empty_scratch(game)
             )
         )

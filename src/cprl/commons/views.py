@@ -53,9 +53,15 @@ def class_of(paint: int) -> int:
 
 
 def paint_apples(world: Worlds, tables: Tables, picture: Int32) -> None:
-    """Paint ground, walls, the river and apples; `picture`: int32 [cells], paints."""
-    for cell in range(picture.shape[0]):
-        picture[cell] = tables.background[cell]
+    """Paint ground, walls, the river and apples; `picture`: int32 [cells], paints.
+
+    The rim's rows, most of the picture of a small board, stay as `empty_scratch` painted them.
+    """
+    above = tables.rim * tables.stride
+    below = picture.shape[0] - above
+    board, background = picture[above:below], tables.background[above:below]
+    for cell in range(board.shape[0]):
+        board[cell] = background[cell]
     paint_waste(tables, world.groups.river, picture)
     apple, ground = tables.paints[APPLE], tables.paints[GROUND]
     for k in range(world.stock.shape[0]):
@@ -212,11 +218,9 @@ def draw_board(world: Worlds, tables: Tables, scratch: Scratch, board: UInt8) ->
 
 
 def draw_signals(world: Worlds, tables: Tables, scratch: Scratch, observation: UInt8) -> None:
-    """Write who sent which signal in the last turn, after `draw_windows`, whose picture it takes;
-    `observation`: uint8 [N, C, X, Y]."""
+    """Write who sent which signal in the last turn, after `draw_windows`, onto whose picture it writes the
+    numbers of signals: no paint is as small; `observation`: uint8 [N, C, X, Y]."""
     picture = scratch.picture
-    for cell in range(picture.shape[0]):
-        picture[cell] = 0
     for i in range(world.row.shape[0]):
         if world.on_board[i] and world.signal[i] > 0:
             picture[cell_of(world.row[i], world.col[i], tables)] = world.signal[i]

@@ -128,7 +128,7 @@ class Scratch(NamedTuple):
     sprouts: Annotated[Int32, "K"]
     """The sites that grow an apple in this turn come first."""
     picture: Annotated[Int32, "cells"]
-    """The board and a rim of wall around it, as paints (see `Tables.paints`)."""
+    """The board and a rim of wall around it, as paints (see `Tables.paints`); nothing paints over the rim."""
     seen: Annotated[Int32, "window"]
     """The paints of the window being written, X * Y of them."""
 
@@ -171,11 +171,13 @@ CACHE_LINE_BYTES = 128
 
 
 def empty_scratch(game: "Game") -> Scratch:
-    """Return the working memory of one thread."""
+    """Return the working memory of one thread: zeros, but for the rim of the picture."""
     sites, cells, window = len(game.map.sites), game.tables.background.size, game.tables.window_cells.shape[1]
     words = 4 * -(-sites // SITES_PER_DRAW)
     forms = forms_of(Scratch, N=game.agents, K=sites, words=words, cells=cells, window=window)
     arrays: list[Any] = [
         np.zeros(length + CACHE_LINE_BYTES, dtype)[:length] for (length,), dtype in forms.values()
     ]
-    return Scratch(*arrays)
+    scratch = Scratch(*arrays)
+    scratch.picture[:] = game.tables.background
+    return scratch

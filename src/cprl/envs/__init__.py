@@ -4,7 +4,7 @@ Modules, in the order in which one reads them:
     make_env         where an environment is put together; spaces_of; games as recipes hold them
     commons_env      CommonsEnv, TorchRL: B worlds at once
     drivers          where the worlds run: CPU threads or a GPU
-    stepping          what environments share in a step: actions, recurrent states
+    stepping          what environments share in a step: actions, what is carried on
     unwrap           what lies under an environment's transforms, and what its specs say of agents
     state            the state of an environment and its transforms, for checkpoints
     pettingzoo_env   parallel_env and env, one world

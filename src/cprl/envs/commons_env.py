@@ -11,13 +11,13 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 
-from cprl import keys
+from cprl import keys, recurrent_state
 from cprl.commons.batch import Batch
 from cprl.commons.game import Game, output_forms
 from cprl.commons.quirks import paints_over
 from cprl.commons.world import PLAYING, StepOutput
 from cprl.envs.drivers import device_of, drawn_seed, driver_for
-from cprl.envs.stepping import begin_states, carry_on, chosen
+from cprl.envs.stepping import carry_on, chosen
 from cprl.pictures.image import world_image
 from cprl.system.compat import LeanStepEnv, flag_spec, unchecked_tensordict
 from cprl.values import Range, Seed, checked
@@ -194,7 +194,7 @@ class CommonsEnv(LeanStepEnv):
         which = None if tensordict is None else tensordict.get("_reset", None)
         begun = self._as_tensordict(self._begin(which))
         if tensordict is not None:
-            begin_states(begun, tensordict, which)
+            recurrent_state.carry(begun, tensordict, which)
         return begun
 
     def _begin(self, which: Tensor | None) -> dict[str, Tensor]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
+from dataclasses import replace
 from inspect import signature
 from typing import Any, Protocol, runtime_checkable
 
@@ -14,7 +15,7 @@ from cprl import keys
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.envs.state import env_state, load_env_state
-from cprl.values import Custom, Seed, checked, made, refusal
+from cprl.values import Custom, Seed, checked, custom_of, made, refusal
 
 
 @runtime_checkable
@@ -146,16 +147,11 @@ def _spec(env: EnvBase, name: str) -> Any:
 
 
 def stored_game(game: object) -> object:
-    """Return a game as a recipe holds it: one of the user's own by the name of its class."""
+    """Return a game as a recipe holds it: one of the user's own by its class, and what it is made from."""
     if isinstance(game, Game | Custom) or not isinstance(game, PlayableGame):
         return game
-    kind = type(game)
-    if "<" in kind.__qualname__:
-        raise ValueError(
-            f"experiment.game is a {kind.__qualname__}, which no recipe can name; allowed: a class at the "
-            "top of a module"
-        )
-    return Custom(f"{kind.__module__}:{kind.__qualname__}", arguments=game.to_config())
+    stored: Custom = custom_of(type(game))
+    return replace(stored, arguments=game.to_config())
 
 
 def game_of(stored: Custom) -> Custom | PlayableGame:

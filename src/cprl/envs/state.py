@@ -39,14 +39,12 @@ def load_env_state(env: EnvBase, state: Mapping[str, Any]) -> None:
 
 _FRAMES: Final = "_cat_buffers"
 """In the name of what `torchrl.envs.CatFrames` keeps of the worlds themselves, their latest observations."""
-_EXTRA: Final = "_extra_state"
-"""The end of the name under which torch has what a module's `get_extra_state` gives."""
 
 
 def transforms_state(env: EnvBase) -> dict[str, Any]:
     """Return what the transforms have learned or been told, e.g. the statistics of a normalisation; nothing
     of the worlds themselves."""
-    return {name: value for name, value in _all_of_transforms(env).items() if not _is_of_worlds(env, name)}
+    return {name: value for name, value in _all_of_transforms(env).items() if _FRAMES not in name}
 
 
 def load_transforms_state(env: EnvBase, state: Mapping[str, Any]) -> None:
@@ -54,18 +52,7 @@ def load_transforms_state(env: EnvBase, state: Mapping[str, Any]) -> None:
     stays.
     """
     if isinstance(env, TransformedEnv):
-        _load(env, {name: value for name, value in state.items() if not _is_of_worlds(env, name)})
-
-
-def _is_of_worlds(env: EnvBase, name: str) -> bool:
-    """Return whether a transform keeps this of the worlds themselves: latest observations, or the extra state
-    of a transform that has `remembers_worlds`."""
-    if _FRAMES in name:
-        return True
-    if not name.endswith(f".{_EXTRA}") or not isinstance(env, TransformedEnv):
-        return False
-    owner = dict(env.transform.named_modules()).get(name.removesuffix(f".{_EXTRA}"))
-    return bool(getattr(owner, "remembers_worlds", False))
+        _load(env, {name: value for name, value in state.items() if _FRAMES not in name})
 
 
 def _all_of_transforms(env: EnvBase) -> dict[str, Any]:
@@ -88,7 +75,7 @@ def _load(env: TransformedEnv, state: dict[str, Any]) -> None:
             f"the transforms {kinds} refuse the state of the same transforms: {error}; allowed: transforms "
             "whose load_state_dict takes what their state_dict gives"
         ) from error
-    wrong = sorted(name for name in (*missing, *unexpected) if not _is_of_worlds(env, name))
+    wrong = sorted(name for name in (*missing, *unexpected) if _FRAMES not in name)
     if wrong:
         raise ValueError(
             f"the state of the transforms {kinds} lacks, or has beyond theirs, {', '.join(wrong)}; allowed: "

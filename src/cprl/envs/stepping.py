@@ -6,12 +6,11 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from cprl import keys
+from cprl import keys, recurrent_state
 from cprl.system.compat import put_all
 
 _WHOLE_NUMBERS: Final = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
 """The dtypes of actions that convert to int64 without a change of any number."""
-_STATE: Final = keys.RECURRENT_STATE[1]
 
 
 def chosen(tensordict: TensorDictBase, name: str, size: torch.Size, device: torch.device) -> Tensor:
@@ -40,34 +39,11 @@ def carry_on(
 
     Args:
         replaced: the entries that the environment writes anew itself, at the root and under "agents".
-        began: the worlds whose episode begins, bool [B, 1], in which recurrent states do; None for none.
+        began: the worlds whose episode begins, bool [B, 1], where recurrent states are zero; None for none.
     """
     put_all(carried, {name: value for name, value in turn.items() if name not in replaced})
     of_agents = keys.entry(turn, keys.AGENTS).items()
     others = {name: value for name, value in of_agents if name not in replaced}
     put_all(keys.entry(carried, keys.AGENTS), others)
-    if began is not None and _STATE in others:
-        begin_states(carried, turn, began)
-
-
-def begin_states(
-    carried: TensorDictBase, before: TensorDictBase, began: TensorDictBase | Tensor | None
-) -> None:
-    """Carry ("agents", "recurrent_state") on, with zeros where an episode begins; nothing where there is
-    none.
-
-    Args:
-        carried: the input of the next turn, which gets it.
-        before: a TensorDict that may have it, [B, N, M].
-        began: the worlds whose episode begins, bool [B, 1], or a turn with which their last one has ended;
-            None for all.
-    """
-    agents = before.get(keys.AGENTS, None)
-    states = agents.get(_STATE, None) if isinstance(agents, TensorDictBase) else None
-    if states is None:
-        return
-    if isinstance(began, TensorDictBase):
-        began = began["next"][keys.DONE]
-    none = torch.zeros_like(states)
-    going_on = none if began is None else torch.where(began.reshape(-1, 1, 1), none, states)
-    keys.put(keys.entry(carried, keys.AGENTS), _STATE, going_on)
+    if began is not None and recurrent_state.AFTER in others:
+        recurrent_state.carry(carried, turn, began)

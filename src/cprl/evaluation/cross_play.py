@@ -28,7 +28,7 @@ from cprl.system.working import working
 from cprl.terminal import style
 from cprl.terminal.summary import rewards_of, says_nothing
 from cprl.terminal.tables import Cells
-from cprl.training.agents import LoadedRun
+from cprl.training.stored import LoadedRun
 from cprl.values import checked, refusal
 
 SELF_PLAY: Final = -1

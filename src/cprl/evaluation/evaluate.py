@@ -13,7 +13,7 @@ from cprl.evaluation.lanes import agents_of, fresh_for, play, scripted, together
 from cprl.evaluation.pages import heading
 from cprl.system.defaults import Fresh
 from cprl.system.working import working
-from cprl.training.agents import LoadedRun, load
+from cprl.training.stored import LoadedRun, load
 from cprl.values import differences, to_config
 
 MOST_DIFFERENCES: Final = 3

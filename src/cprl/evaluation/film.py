@@ -33,7 +33,7 @@ from cprl.runs.files import refuse_to_write_over
 from cprl.system.defaults import FILM_SUFFIXES as SUFFIXES
 from cprl.system.output import legible
 from cprl.system.working import working
-from cprl.training.agents import LoadedRun
+from cprl.training.stored import LoadedRun
 from cprl.values import Positive, Range, Value, Where, checked, refusal
 from cprl.values.arrays import Bool, UInt8
 from cprl.viewer.callback import ViewerCallback

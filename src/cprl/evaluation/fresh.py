@@ -31,7 +31,7 @@ from cprl.runs.episodes import read_rows
 from cprl.system.defaults import FILM_SEED as SEED
 from cprl.system.output import say
 from cprl.system.working import working
-from cprl.training.agents import LoadedRun
+from cprl.training.stored import LoadedRun
 from cprl.values import Natural, Range, Seed, checked
 
 EPISODES_TRIED: Final = 5

@@ -27,7 +27,8 @@ from cprl.runs.episodes import table_of
 from cprl.system.defaults import Fresh
 from cprl.system.output import legible
 from cprl.system.working import say_how_far
-from cprl.training.agents import LoadedRun, Population, StoredAgent, in_a_row, load, stored_policies
+from cprl.training.agents import Population
+from cprl.training.stored import LoadedRun, StoredAgent, in_a_row, load, stored_policies
 from cprl.values import Custom, made, refusal
 
 Agent: TypeAlias = Callable[[int], StoredAgent]

@@ -10,7 +10,7 @@ from cprl.terminal import style
 from cprl.terminal.panels import draw_matrix, matrix_height
 from cprl.terminal.summary import OVER_REPLICAS
 from cprl.terminal.tables import Cell, Cells, Change
-from cprl.training.agents import LoadedRun
+from cprl.training.stored import LoadedRun
 
 
 def heading(what: str, fresh: Fresh, runs: Iterable[LoadedRun], each: str = "", end: str = "") -> str:

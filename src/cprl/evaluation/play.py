@@ -41,7 +41,8 @@ from cprl.runs.episodes import read_rows
 from cprl.system.defaults import PLAY_SEED
 from cprl.system.output import OUT, console, say
 from cprl.system.working import working
-from cprl.training.agents import LoadedRun, Population, load
+from cprl.training.agents import Population
+from cprl.training.stored import LoadedRun, load
 from cprl.values import Range, checked, refusal
 
 KEYS: Final = {

@@ -28,7 +28,7 @@ from cprl.evaluation.fresh import fresh_episodes, unstored
 from cprl.evaluation.show import data_of, page
 from cprl.population import Scripted
 from cprl.system.defaults import SANDBOX_EPISODES as EPISODES
-from cprl.training.agents import LoadedRun, load
+from cprl.training.stored import LoadedRun, load
 from cprl.values import Positive, Range, Value, checked, hints_of
 
 FOR_TRAINED: Final = "changes nothing for scripted agents"
@@ -305,8 +305,8 @@ def sandbox_page() -> str:
     )
     before = (
         "<p>Move a slider: an episode is played by your rules. The first quota, tax or sanction is compiled, "
-        "for about a minute, once. Scripted agents do not mind what rules cost them; agents that are trained "
-        "do.</p>"
+        "for 10 to 20 seconds, once. Scripted agents do not mind what rules cost them; agents that are "
+        "trained do.</p>"
         f'<div class="controls"><label>board <select name="board">{boards}</select></label>{sliders}</div>'
         '<button id="train">Train these</button> <button id="recipe">Copy as recipe</button> '
         '<span id="said" class="faint" role="status"></span><p id="results" role="status"></p>'

@@ -46,7 +46,8 @@ from cprl.terminal import style
 from cprl.terminal.panels import draw_dots
 from cprl.terminal.summary import OVER_REPLICAS
 from cprl.terminal.tables import Cell, Cells, Change
-from cprl.training.agents import LoadedRun, check_scripted, load
+from cprl.training.agents import check_scripted
+from cprl.training.stored import LoadedRun, load
 from cprl.values import Value, Where, refusal
 
 Focal: TypeAlias = Literal["majority", "minority"]

@@ -32,7 +32,7 @@ from cprl.pictures.readable import NO_RULES, growth_of, legend_of, meaning_of, r
 from cprl.population import learned
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.system.working import working
-from cprl.training.agents import LoadedRun
+from cprl.training.stored import LoadedRun
 from cprl.values import refusal
 from cprl.viewer.pictures import regions_of
 

@@ -2,6 +2,7 @@
 
 Modules:
     experiment  Experiment: everything that decides a training
+    engine      which engine trains it, if it says "auto"
     presets     the published games and hyper-parameters by name
 """
 

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from cprl.algorithms import Tabular
-from cprl.algorithms.base import TeamAlgorithm, TrainingEngine
+from cprl.algorithms.base import TeamAlgorithm
 from cprl.commons.game import Game
 from cprl.envs.make_env import PlayableGame, game_of, stored_game
+from cprl.experiment.engine import Engine, engine_of
 from cprl.measuring.episodes import check_own_metrics
-from cprl.objectives.preferences import check_preference
+from cprl.objectives.rewards import check_reward
 from cprl.pictures.readable import game_html
 from cprl.population import (
     AgentSpec,
@@ -26,6 +27,7 @@ from cprl.population import (
 from cprl.runs.files import RECIPE_FORMAT, written_by_another
 from cprl.runs.length import Length
 from cprl.runs.recipe import recipe_config, rules_of_own, with_runs_moved
+from cprl.runs.schedule import OnNan, Schedule
 from cprl.system.memory import Device
 from cprl.values import (
     MOST_INT64,
@@ -40,14 +42,12 @@ from cprl.values import (
     described,
     differences,
     hints_of,
+    refusal,
     shown,
     to_config,
 )
 
 LoggerName = Literal["tensorboard", "wandb"]
-OnNan = Literal["stop", "continue"]
-"""What a training does when a number is not finite: "stop" ends it by a `NotFiniteError`; "continue" warns
-once of each agent and trains on."""
 MOST_SEED: Final = 2**64 - 2
 """Evaluation plays worlds of the next seed."""
 
@@ -56,7 +56,8 @@ MOST_SEED: Final = 2**64 - 2
 class Experiment(Value, stored=False, called="experiment"):
     """What is trained and how; equals what `recipe.json` holds.
 
-    Lists become tuples, though type checkers ask for tuples. Two are equal where their recipes are.
+    Lists become tuples, though type checkers ask for tuples. Two are equal where their recipes are, of
+    which "auto" says the engine that it stands for.
     """
 
     name: DirectoryName
@@ -91,9 +92,10 @@ class Experiment(Value, stored=False, called="experiment"):
     """TorchRL's loggers that get every series: "tensorboard", "wandb", or one of your own."""
     device: Device = "cpu"
     """Where agents learn, e.g. "cpu" or "cuda:0"."""
-    engine: TrainingEngine = "compiled"
+    engine: Engine = "auto"
     """How updates are computed: "compiled" by torch, several times faster and in need of a C++ compiler;
-    "eager", the same uncompiled; "torchrl", stock TorchRL, one agent after the other."""
+    "eager", the same uncompiled; "auto", a short training "eager" and a long one "compiled", see
+    `cprl.experiment.engine`; "torchrl", stock TorchRL, one agent after the other."""
     on_nan: OnNan = "stop"
     """What happens when a loss, weight, reward or observation is NaN or infinite: "stop" ends the training;
     "continue" warns, and the others train on."""
@@ -125,6 +127,11 @@ class Experiment(Value, stored=False, called="experiment"):
         return f"Code of its own: {said}." if said else ""
 
     @property
+    def title(self) -> str:
+        """What a figure, a summary or a recording of it is called."""
+        return f"{self.name}, {self.trained_in}, {self.length}"
+
+    @property
     def trained_for(self) -> str:
         """How long it trains, in words."""
         return f"trained for {self.length} in {self.trained_in}"
@@ -141,14 +148,21 @@ class Experiment(Value, stored=False, called="experiment"):
         clock = getattr(getattr(self.game, "rules", None), "episode_steps", None)
         return Length.of(vars(self), clock)
 
+    @property
+    def schedule(self) -> Schedule:
+        """How long each replica trains, in how many worlds, and when its agents learn."""
+        return Schedule(**{name: getattr(self, name) for name in hints_of(Schedule)})
+
     def __post_init__(self) -> None:
+        if isinstance(self.game, type):
+            raise refusal("experiment.game", self.game, f"a game, such as {self.game.__name__}(...)")
         super().__post_init__()
         if isinstance(self.game, PlayableGame):
             checked("experiment.game.agents", self.game.agents, Positive)
         self.to_config()
         check_own_metrics(self.metrics)
         _check_numbers(self)
-        _check_agents(self)
+        _check_agents(self, self.schedule)
         _check_engine(self)
 
     def to_config(self) -> dict[str, Any]:
@@ -187,7 +201,10 @@ class Experiment(Value, stored=False, called="experiment"):
             raise ValueError(f"{error}{written_by_another(recipe)}") from error
 
     def __eq__(self, other: object) -> bool:
-        return self.to_config() == other.to_config() if isinstance(other, Experiment) else NotImplemented
+        if not isinstance(other, Experiment):
+            return NotImplemented
+        ours, theirs = ({**each.to_config(), "engine": engine_of(each)} for each in (self, other))
+        return ours == theirs
 
     def __hash__(self) -> int:
         return hash((self.name, self.length, self.replicas, self.seed))
@@ -201,10 +218,6 @@ _MOST_WORLDS: Final = 2**22
 
 
 def _check_numbers(experiment: Experiment) -> None:
-    if (experiment.episodes is None) == (experiment.steps is None):
-        raise ValueError(
-            f"experiment.episodes is {experiment.episodes} and steps {experiment.steps}; allowed: one of them"
-        )
     most = _MOST_WORLDS // experiment.replicas
     for name in ("worlds", "evaluation_episodes"):
         if getattr(experiment, name) > most:
@@ -216,11 +229,11 @@ def _check_numbers(experiment: Experiment) -> None:
         if target.startswith("__main__:"):
             raise ValueError(
                 f"experiment has {target}, of the script that runs, which nothing else can import; allowed: "
-                "a module of its own, and its name"
+                "the class or function itself, or a module of its own, and its name"
             )
 
 
-def _check_agents(experiment: Experiment) -> None:
+def _check_agents(experiment: Experiment, schedule: Schedule) -> None:
     if not isinstance(experiment.game, Custom):
         try:
             specs_by_agent(experiment.agents, experiment.game.agents)
@@ -232,21 +245,17 @@ def _check_agents(experiment: Experiment) -> None:
         if (stored := stored_of(spec)) is not None:
             _check_stored(where if stored is spec else f"{where}.start_from", stored, experiment.replicas)
         if isinstance(spec, Learning | Team) and not isinstance(experiment.game, Custom):
-            check_preference(f"{where}.reward", spec.reward, experiment.game.agents)
+            check_reward(f"{where}.reward", spec.reward, experiment.game.agents)
         if isinstance(spec, Team) and isinstance(spec.algorithm, TeamAlgorithm):
-            spec.algorithm._check_team(len(spec.agents), spec.reward)
-        settings = getattr(getattr(spec, "algorithm", None), "settings", None)
-        if settings is not None and hasattr(settings, "refuse_worlds"):
+            spec.algorithm.check_team(len(spec.agents), spec.reward)
+        settings: Any = getattr(getattr(spec, "algorithm", None), "settings", None)
+        if hasattr(settings, "refuse_worlds"):
             try:
-                settings.refuse_worlds(experiment.worlds)
+                settings.refuse_worlds(schedule.worlds)
             except ValueError as error:
                 raise ValueError(f"{where}.algorithm.settings: {error}") from error
-        steps = getattr(settings, "rollout_steps", None)
-        if steps is not None and steps % experiment.update_every:
-            raise ValueError(
-                f"experiment.update_every is {experiment.update_every}; it must divide "
-                f"{where}.algorithm.settings.rollout_steps, {steps}"
-            )
+        rollout_steps = getattr(settings, "rollout_steps", schedule.update_every)
+        schedule.refuse_rollouts(rollout_steps, f"{where}.algorithm.settings.rollout_steps")
 
 
 def _check_stored(where: str, stored: Frozen, replicas: int) -> None:
@@ -270,5 +279,5 @@ def _check_engine(experiment: Experiment) -> None:
             what = "a Team" if isinstance(spec, Team) else "Tabular"
             raise ValueError(
                 f'experiment.agents[{place}] is {what}, which engine="torchrl" cannot train; allowed: '
-                '"compiled", "eager"'
+                '"auto", "compiled", "eager"'
             )

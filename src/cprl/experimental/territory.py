@@ -31,7 +31,7 @@ from cprl.system.defaults import Fresh
 from cprl.system.working import working
 from cprl.terminal import style
 from cprl.terminal.tables import Cells
-from cprl.training.agents import LoadedRun
+from cprl.training.stored import LoadedRun
 from cprl.values import checked, refusal
 
 Policy = Literal["trained", "random"]

@@ -134,6 +134,13 @@ def names_kept(kind: Any) -> list[str]:
     return [name for name, field in fields if isinstance(field, Field) and isinstance(field.lasts, Kept)]
 
 
+class Sliced(NamedTuple):
+    """What the function of a `slicer` does with each entry of a kind of tuple: takes world b out of it, True,
+    or leaves it, False; or does with each entry of the tuple that it is."""
+
+    parts: tuple[Any, ...]
+
+
 def slicer(kind: Any, *, every: bool = False) -> Callable[[Any, int], Any]:
     """Return a function that takes world b out of a tuple of arrays, and of the tuples in it, sharing their
     memory; what has no axis of worlds stays, unless `every` says that all have one in front of those of their
@@ -144,20 +151,27 @@ def slicer(kind: Any, *, every: bool = False) -> Callable[[Any, int], Any]:
     """
     names: dict[str, Any] = {"__name__": __name__, "kind": kind}
     entries = []
+    parts: list[Any] = []
     for name, field in _fields(kind).items():
         entry = f"arrays.{name}"
         inner = _tuple_in(field)
         if inner is not None:
-            names[f"one_{name}"] = slicer(inner, every=every)
+            one: Any = slicer(inner, every=every)
+            names[f"one_{name}"] = one
             entry = f"one_{name}({entry}, b)"
+            parts.append(one.sliced)
         elif every or (isinstance(field, Field) and field.is_of_worlds):
             entry += "[b]"
+            parts.append(True)
+        else:
+            parts.append(False)
         entries.append(entry)
     name = f"one_{kind.__name__.lower()}"
     lines = f"def {name}(arrays, b):", "if arrays is None: return None", f"return kind({', '.join(entries)})"
     exec("\n    ".join(lines), names)
-    function: Callable[[Any, int], Any] = names[name]
-    return function
+    function: Any = names[name]
+    function.sliced = Sliced(tuple(parts))
+    return cast(Callable[[Any, int], Any], function)
 
 
 def is_record(kind: Any) -> bool:

@@ -1,16 +1,21 @@
 """How agents learn, many at once.
 
 Modules, in the order in which one reads them:
-    settings     the hyper-parameters, with their units and sources
-    base         who learns, and what the training loop asks of a learner
-    transitions  the turns of some agents, as replay and rollouts store them
-    ring         the replay buffer of all lanes
-    engine       one update of all lanes: with a lane axis, vmapped, or as a list of stock parts; compiled
-    trial        which way of updating fits a user's loss, and which losses are refused
-    lanes        a lane is one agent of one replica, or a team: seeds, networks, actors
-    replay       ReplayLearner: learns from a replay buffer
-    rollouts     RolloutLearner: learns from rollouts of the present policy
-    reference    both by stock TorchRL parts, one agent after the other
-    lola         LOLALearner: learns with the other members' learning in view
-    tabular      TabularLearner: Q-learning in tables
+    plain          the same by TorchRL's stock parts, one agent after the other; a training in one function
+    settings       the hyperparameters, with their units and sources
+    learner        Learner: an algorithm, its lanes, their memory and networks; what it asks of an algorithm
+    lanes          Lanes: who learns apart; one agent of one replica, or a team
+    transitions    the turns of some agents, as memories store them
+    draw           Draw: a batch to learn from that is not yet gathered
+    ring           the replay buffer of all lanes
+    replay         Replay: learns from the latest turns, in any order
+    rollouts       Rollouts: learns from the latest turns of the present policy
+    networks       LaneNetworks: the networks of all lanes, which act and learn; stacked, vmapped or a list
+    optimizers     how a gradient changes weights
+    choose_update  how the lanes of a user's loss are updated
+    kept           what a loss keeps from call to call
+    refusals       which losses and networks are refused
+    lola           the memory and networks of teams that learn with the others' learning in view
+    tabular        TabularLearner: Q-learning in tables
+    base           what the training loop asks of any learner
 """

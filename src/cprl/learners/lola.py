@@ -1,24 +1,26 @@
-"""LOLALearner: teams whose members learn with the others' learning in view."""
+"""LOLA: the memory and the networks of teams whose members learn with the others' learning in view."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
-from typing import Any
+from typing import Any, Final
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor, nn
+from torchrl.objectives import LossModule
 
 from cprl.keys import Turn
-from cprl.learners.base import LearningAgents
-from cprl.learners.engine import UpdateRule, shortened, torch_optimizer
-from cprl.learners.lanes import Acts, LaneLearner, Method
-from cprl.learners.rollouts import Rollout, advantages, refuse_other_parts
+from cprl.learners.draw import Draw
+from cprl.learners.lanes import Lanes
+from cprl.learners.optimizers import UpdateRule, clip_by_norm, torch_optimizer
+from cprl.learners.refusals import refuse_other_parts
+from cprl.learners.rollouts import Rollout, advantages
 from cprl.learners.settings import LOLASettings
+from cprl.learners.transitions import LaneTurn
 from cprl.networks.finite import finite_lanes
 from cprl.networks.stacked import lane_state, stack_lanes
 from cprl.objectives import LOLADiCELoss, dice_objective
 from cprl.objectives.functional import total
-from cprl.policies.rng import EXPLORATION, WEIGHTS
 
 
 class Members(nn.ModuleList):
@@ -45,19 +47,31 @@ class LOLANetworks(nn.Module):
 
     Args:
         networks: `AgentNetworks` of "actor" and "critic" for each lane, replica by replica.
+        make_loss: makes the loss, a `LOLALoss` or `LOLADiCELoss`, from an `nn.ModuleList` of the members'
+            networks.
+        members: their number S.
     """
 
     loss: Any
+    update: Final = "stacked"
+    """How its loss sees the replicas, see `cprl.learners.networks.Update`."""
 
-    def __init__(self, networks: Sequence[Any], method: Method, *, members: int) -> None:
+    def __init__(
+        self,
+        networks: Sequence[Any],
+        make_loss: Callable[[Any], LossModule],
+        settings: LOLASettings,
+        *,
+        members: int,
+    ) -> None:
         super().__init__()
-        settings: LOLASettings = method.settings
+        self.settings = settings
         stacks: list[Any] = [stack_lanes(networks[member::members]) for member in range(members)]
         self.actors, self.critics = (
             Members([stack[name] for stack in stacks]) for name in ("actor", "critic")
         )
-        self.playing = deepcopy(self.actors)
-        loss = method.make_loss(nn.ModuleList(stacks))
+        self.players = deepcopy(self.actors)
+        loss = make_loss(nn.ModuleList(stacks))
         self.ahead = deepcopy(self.actors) if isinstance(loss, LOLADiCELoss) else None
         object.__setattr__(self, "loss", loss)  # no submodule: its weights are those of the actors
         self.rule = UpdateRule.of(settings)
@@ -67,11 +81,40 @@ class LOLANetworks(nn.Module):
             torch_optimizer(of_critics, self.critics.parameters(), fused=None),
         ]
 
+    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Tensor:
+        """The outputs of actors, part 0, or critics, with their present weights, [R x S, k, ...]."""
+        return (self.actors, self.critics)[part].outputs(observation)
+
+    def playing(self, *seen: Tensor) -> Tensor:
+        """The outputs by which members act in training."""
+        return self.players.outputs(*seen)
+
+    def network_state(self, lane: int) -> dict[str, Tensor]:
+        """Copies of the present weights of an actor."""
+        return self.actors.network_state(lane)
+
     def play(self, member: int | None) -> None:
         """From now on all act by their present weights; with a member, the others by those ahead."""
-        for number, network in enumerate(self.playing):
+        for number, network in enumerate(self.players):
             weights = self.actors if member in (None, number) or self.ahead is None else self.ahead
             network.load_state_dict(weights[number].state_dict())
+
+    def learn(self, draw: Draw) -> Tensor:
+        """Takes a step of all policies, then `critic_epochs` of the critics; returns each member's loss, [L].
+
+        The batch are rollouts [R, P, W, T] of `LOLARollouts`. A loss is the mean discounted return of the
+        pieces of rollouts of the present weights, negative.
+        """
+        batch = draw.gather(draw.columns)
+        rollouts = batch.exclude("target", "reward")
+        self.update_policies(rollouts.flatten(1, 2) if self.ahead is None else rollouts)
+        for _ in range(self.settings.critic_epochs):
+            self.update_critics(batch["observation"].flatten(1, 2), batch["target"].flatten(1, 2))
+        self.play(None)
+        judged = batch[:, : 2 if self.ahead is None else 1]
+        nothing = torch.zeros_like(judged["reward"])
+        returns = dice_objective(nothing, judged["reward"], gamma=self.settings.gamma, done=judged["done"])
+        return -returns.mean((1, 2)).flatten()
 
     def look_ahead(self, rollouts: TensorDict) -> None:
         """Puts the weights ahead to those after a naive step, from rollouts [R, B, T] of the present ones."""
@@ -93,7 +136,8 @@ class LOLANetworks(nn.Module):
             for network in self.actors:
                 weights = list(network.parameters())
                 gradients = [weight.grad for weight in weights if weight.grad is not None]
-                for weight, slope in zip(weights, shortened(gradients, self.rule.max_grad_norm), strict=True):
+                clipped = clip_by_norm(gradients, self.rule.max_grad_norm)
+                for weight, slope in zip(weights, clipped, strict=True):
                     weight.grad = slope
         policies.step()
 
@@ -106,15 +150,15 @@ class LOLANetworks(nn.Module):
         critics.step()
 
     def finite(self) -> Tensor:
-        """Whether the weights and moments of each member are finite, bool [R, S]."""
+        """Whether the weights and moments of each member are finite, bool [R x S]."""
         states = {weight: state for optimizer in self.optimizers for weight, state in optimizer.state.items()}
-        stacks = [self.actors, self.critics, self.playing, *([] if self.ahead is None else [self.ahead])]
+        stacks = [self.actors, self.critics, self.players, *([] if self.ahead is None else [self.ahead])]
         sound = []
         for member in range(len(self.actors)):
             weights = [weight for stack in stacks for weight in stack[member].parameters()]
             moments = [value for weight in weights for value in states.get(weight, {}).values() if value.ndim]
             sound.append(finite_lanes([*weights, *moments]))
-        return torch.stack(sound, -1)
+        return torch.stack(sound, -1).flatten()
 
     def get_extra_state(self) -> list[dict[str, Any]]:
         """The state of both optimisers; part of `state_dict`."""
@@ -125,129 +169,74 @@ class LOLANetworks(nn.Module):
             optimizer.load_state_dict(moments)
 
 
-class LOLALearner(LaneLearner):
-    """R teams of S agents that learn with opponent-learning awareness, from rollouts of T turns of W worlds.
+class LOLARollouts:
+    """Stores P rollouts of T turns of W worlds, one after the other, and then gives them as one batch.
 
-    An update takes P rollouts, one after the other in the worlds of the training. With `LOLALoss` they are
-    two, of the present weights, which are its two independent batches. With `LOLADiCELoss` they are 1 + S:
-    one of the present weights; then for each member one in which the others act by their weights ahead.
-    Networks, evaluation and checkpoints have the present weights throughout.
-
-    Each replica learns exactly as it would alone. Updates are not compiled.
+    With a `LOLALoss` they are two, of the present weights, which are its two independent batches. With a
+    `LOLADiCELoss` they are 1 + S: one of the present weights; then for each member one in which the others
+    act by their weights ahead. Networks, evaluation and checkpoints have the present weights throughout.
 
     Args:
-        who: the members, two or more; `start_from` is that of actors, critics are new.
-        method: makes a member's "actor" and "critic", and the loss, a `LOLALoss` or `LOLADiCELoss`, from an
-            `nn.ModuleList` of the members' networks.
-        compile: whether torch compiles acting.
+        rollouts: P.
     """
 
-    settings: LOLASettings
-    engine: LOLANetworks
+    sequence_steps: Final = 1
 
-    def __init__(self, who: LearningAgents, method: Method, *, compile: bool = True) -> None:
-        super().__init__(who, method)
-        networks = self._lanes.new_networks(WEIGHTS)
-        refuse_other_parts(networks[0])
-        members = len(self.agents)
-        self.engine = LOLANetworks(networks, method, members=members)
-        self._looks_ahead = isinstance(self.engine.loss, LOLADiCELoss)
-        self.rollouts = 1 + members if self._looks_ahead else 2
-        """The number P of rollouts that an update takes."""
-        self.actor = self._lanes.actor(self.engine.playing, EXPLORATION, worlds=self.worlds, compile=compile)
-        self._rollouts = Rollout(self._lanes, self.rollout_steps, self.rollouts)
+    def __init__(self, lanes: Lanes, settings: LOLASettings, network: nn.Module, *, rollouts: int) -> None:
+        refuse_other_parts(network)
+        self.lanes, self.settings, self.rollouts = lanes, settings, rollouts
+        self.form = lanes.form()
+        self.rollout = Rollout(lanes, settings.rollout_steps, self.form, rollouts)
         self._phase = 0
 
-    @property
-    def present(self) -> Acts:
-        return self.engine.actors
+    def write(self, turn: Turn, lane_turn: LaneTurn) -> None:
+        """Stores a turn, as all agents had it, and as these lanes did."""
+        self.rollout.refuse_full()
+        self.rollout.write(lane_turn, self._phase)
 
-    @property
-    def rollout_steps(self) -> int:
-        return self.settings.rollout_steps
+    def due(self, networks: LOLANetworks) -> Iterator[Draw]:
+        """All rollouts, after the last one. After the others the next one may be of weights ahead."""
+        if not self.rollout.is_full:
+            return
+        self.rollout.size, self._phase = 0, self._phase + 1
+        if self._phase == self.rollouts:
+            self._phase = 0
+            yield Draw.of(self.batch(networks, self.rollouts))
+        elif networks.ahead is not None:
+            if self._phase == 1:
+                present = self.batch(networks, 1)
+                networks.look_ahead(present.exclude("target", "reward").flatten(1, 2))
+            networks.play(self._phase - 1)
 
-    def begin(self) -> None:
-        """Drops the rollouts that an earlier training left unfinished; see `Learner`."""
-        self._rollouts.size, self._phase = 0, 0
-        self.engine.play(None)
-
-    def store(self, batch: TensorDictBase | Turn) -> None:
-        turn = Turn.of(batch)
-        self._rollouts.refuse_full()
-        self._rollouts.write(self._lanes.turn(turn, self._wanted(turn)), self._phase)
-        self.steps += self.worlds
-
-    def update(self) -> Tensor | None:
-        """Updates after the last rollout; returns each member's loss, [R, S], or None if there is no update.
-
-        The loss is the mean discounted return of the pieces of rollouts of the present weights, negative.
-        """
-        if not self._rollouts.is_full:
-            return None
-        self._rollouts.size, self._phase = 0, self._phase + 1
-        if self._phase < self.rollouts:
-            if self._looks_ahead:
-                self._play_ahead(self._phase - 1)
-            return None
-        self._phase = 0
-        observation, rollouts, target = self._batch(self.rollouts)
-        losses = self._losses(1 if self._looks_ahead else 2)
-        self.engine.update_policies(rollouts if self._looks_ahead else rollouts.flatten(1, 2))
-        for _ in range(self.settings.critic_epochs):
-            self.engine.update_critics(observation, target)
-        self.engine.play(None)
-        return losses
-
-    def _play_ahead(self, member: int) -> None:
-        """The next rollout is that of a member whose others have looked ahead."""
-        if member == 0:
-            _, rollouts, _ = self._batch(1)
-            self.engine.look_ahead(rollouts.flatten(1, 2))
-        self.engine.play(member)
-
-    def _columns(self, rollouts: int) -> dict[str, Tensor]:
-        """Fields of the first rollouts, [R, P, W, T, S, ...]."""
-        size = self.replicas, len(self.agents)
-        return {
+    @torch.no_grad()
+    def batch(self, networks: LOLANetworks, rollouts: int) -> TensorDict:
+        """The first rollouts, [R, P, W, T], of entries [.., S, ...]: with advantages, and under "target" what
+        critics should say, [.., S, 1]."""
+        size = self.lanes.replicas, len(self.lanes.agents)
+        columns = {
             name: field[:rollouts].view(rollouts, *size, *field.shape[2:]).movedim((1, 2), (0, 4))
-            for name, field in self._rollouts.fields.items()
+            for name, field in self.rollout.fields.items()
         }
-
-    def _batch(self, rollouts: int) -> tuple[Tensor, TensorDict, Tensor]:
-        """Of the first rollouts: observations [R, P x W, T, S, *shape], the input of the loss [R, P, W, T],
-        and what critics should say, [R, P x W, T, S, 1]."""
-        columns = self._columns(rollouts)
-        critics = self.engine.critics
+        critics = networks.critics
         options: dict[str, Any] = {"settings": self.settings, "over": (2, 3), "time_dim": 3}
-        with torch.no_grad():
-            value, following = critics(columns["observation"]), critics(columns["next_observation"])
-            advantage, target = advantages(columns, value, following, **options)
-        entries = {
-            "observation": columns["observation"],
-            "action": columns["action"],
-            "advantage": advantage,
-            "done": columns["done"][..., :1],
-        }
-        size = (self.replicas, rollouts, self.worlds, self.rollout_steps)
-        return columns["observation"].flatten(1, 2), TensorDict(entries, size), target.flatten(1, 2)
+        value, following = critics(columns["observation"]), critics(columns["next_observation"])
+        advantage, target = advantages(columns, value, following, **options)
+        entries = {name: columns[name] for name in ("observation", "action", "reward")}
+        entries |= {"advantage": advantage, "target": target, "done": columns["done"][..., :1]}
+        return TensorDict(entries, columns["reward"].shape[:4])
 
-    def _losses(self, rollouts: int) -> Tensor:
-        """The negative mean returns of the first rollouts, [R, S]."""
-        columns = self._columns(rollouts)
-        reward, done = columns["reward"], columns["done"][..., :1]
-        returns = dice_objective(torch.zeros_like(reward), reward, gamma=self.settings.gamma, done=done)
-        return -returns.mean((1, 2))
+    def values(self, networks: LOLANetworks, turn: Turn) -> Tensor:
+        """What critics say of the state after a turn, [L, W, 1]."""
+        return networks.critics.outputs(self.lanes.seen_next(turn))
 
-    def values(self, batch: TensorDictBase | Turn) -> Tensor:
-        with torch.no_grad():
-            expected = self.engine.critics.outputs(self._lanes.seen_next(Turn.of(batch)))
-        return self._lanes.by_world(expected)
+    def cut(self, networks: LOLANetworks) -> None:
+        """Drops the rollouts that a training left unfinished."""
+        self.rollout.size = self._phase = 0
+        networks.play(None)
 
     def state_dict(self) -> dict[str, Any]:
-        rollouts = {"rollouts": self._rollouts.fields, "size": self._rollouts.size, "phase": self._phase}
-        return {**super().state_dict(), **rollouts}
+        return {**self.rollout.state_dict(), "phase": self._phase}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        super().load_state_dict(state)
-        self._rollouts.load(state["rollouts"], state["size"])
+        self.rollout.load_state_dict(state)
         self._phase = int(state["phase"])

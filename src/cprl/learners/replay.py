@@ -1,156 +1,120 @@
-"""ReplayLearner: independent agents that learn from replay, all of them in one update."""
+"""Replay: the memory of agents that learn from the latest turns, in any order."""
 
-from collections.abc import Mapping
-from copy import deepcopy
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor
+from torchrl.objectives import LossModule
 
+from cprl import recurrent_state
 from cprl.keys import Turn
-from cprl.learners.base import LearningAgents
-from cprl.learners.engine import COMPILED_STEPS, UpdateRule
-from cprl.learners.lanes import STATE, LaneLearner, Method
-from cprl.learners.ring import Horizon, Ring
+from cprl.learners.draw import Draw
+from cprl.learners.lanes import Lanes
+from cprl.learners.networks import LaneNetworks
+from cprl.learners.refusals import refuse_for_replay
+from cprl.learners.ring import Ring
 from cprl.learners.settings import DQNSettings
-from cprl.learners.trial import refuse_for_replay, trial_batch
-from cprl.policies.rng import EXPLORATION, NOISE, SAMPLING, TARGET_WEIGHTS, WEIGHTS
+from cprl.learners.transitions import LaneTurn, TransitionForm, made_up
+from cprl.policies.rng import Purpose
 
 
-class ReplayLearner(LaneLearner):
-    """R x S independent agents, such as those of DQN: S agents of each of R replicas.
+class Replay:
+    """Stores the latest turns in a ring, and gives a batch every `steps_per_update` steps.
 
-    Each lane has its own network, target network, optimiser state, replay buffer and random numbers, and
-    learns exactly as it would alone. The loss is TorchRL's, see `cprl.learners.engine`. Recurrent networks
-    learn from sequences of `sequence_steps` turns, which begin with the states by which agents acted; the
-    update of more than `COMPILED_STEPS` is not compiled.
+    Recurrent networks learn from sequences of `sequence_steps` turns, which begin with the states by which
+    agents acted.
 
     Args:
-        compile: whether torch compiles acting and the update.
+        form: what is stored of a turn and sampled.
+        loss: of one lane, which is refused if it cannot learn from replay.
+        stochastic: whether networks output policies; else they output action values.
     """
 
-    settings: DQNSettings
-    buffer: Any
-    takes_transforms = False
-    """Whether batches pass through `DQNSettings.replay_transforms`."""
-
-    def __init__(self, who: LearningAgents, method: Method, *, compile: bool = True) -> None:
-        super().__init__(who, method)
-        settings: DQNSettings = method.settings
-        if settings.replay_transforms and not self.takes_transforms:
-            raise ValueError(
-                f"settings.replay_transforms is {settings.replay_transforms}; allowed: (), or with "
-                'Experiment(engine="torchrl") any'
-            )
-        lanes = self._lanes
-        networks = lanes.new_networks(WEIGHTS)
+    def __init__(
+        self, lanes: Lanes, settings: DQNSettings, form: TransitionForm, loss: LossModule, *, stochastic: bool
+    ) -> None:
+        settings.refuse_worlds(lanes.worlds)
+        self.lanes, self.settings, self.form, self.stochastic = lanes, settings, form, stochastic
+        self.sequence_steps = settings.sequence_steps
         self._refuse_other_sequences()
-        horizon = Horizon(settings.n_steps, settings.gamma) if settings.n_steps > 1 else None
-        self._form = lanes.form(horizon, settings.sequence_steps)
-        loss = method.make_loss(deepcopy(networks[0]))
-        refuse_for_replay(loss, settings, lambda: self._trial(1)[0])
-        targets = lanes.new_networks(TARGET_WEIGHTS) if settings.own_target_weights else None
-        share = 1 / self.spaces.actions if settings.mean_over_all_outputs else 1.0
-        rule = UpdateRule.of(settings, loss_share=share)
-        is_short = settings.sequence_steps <= COMPILED_STEPS
-        self.engine = self._make_engine(networks, targets, rule=rule, compile=compile and is_short)
+        refuse_for_replay(loss, settings, lambda: self.example(1)[0])
         self.buffer = self._make_buffer()
-        self.actor = lanes.actor(self.engine, EXPLORATION, worlds=self.worlds, compile=compile)
-        self.actor.epsilon = settings.epsilon(0)
-        self._episodes = torch.zeros(self.replicas, dtype=torch.int64)
-        self._owed = 0
-        """Steps since the last update, of those that count, from `learning_starts` on."""
-        self._first_update = max(settings.learning_starts, (self._form.steps_ahead + 1) * self.worlds)
-        """The steps before the first update, by when each world has stored what a sample reads."""
+        self._steps, self._owed = 0, 0
+        """Steps stored; and those since the last update, of those that count, from `learning_starts` on."""
+        self._first_update = max(settings.learning_starts, (form.steps_ahead + 1) * lanes.worlds)
+        """The first step that counts, by when each world has stored what a sample reads."""
 
     def _refuse_other_sequences(self) -> None:
         """Raises a ValueError unless recurrent networks, and they alone, learn from sequences."""
-        steps, is_recurrent = self.settings.sequence_steps, self._lanes.state_cells > 0
+        steps, is_recurrent = self.sequence_steps, self.form.state_cells > 0
         if is_recurrent != (steps > 1):
             kind, allowed = ("a", "2 or more") if is_recurrent else ("no", "1")
             raise ValueError(
                 f"settings.sequence_steps is {steps}; allowed with {kind} recurrent network: {allowed}"
             )
-        if is_recurrent and self._lanes.is_team:
+        if is_recurrent and self.lanes.are_teams:
             raise ValueError("the networks are recurrent; allowed for teams that learn from replay: others")
 
-    def _trial(self, lanes: int) -> TensorDict:
-        return trial_batch(lanes, self._form, self.spaces.actions, device=self.who.device)
-
     def _make_buffer(self) -> Any:
-        """What transitions are stored in and sampled from: `write`, `cut`, and what the engine asks for."""
+        lanes = self.lanes
         return Ring(
-            self._form,
-            seeds=self._lanes.seeds(SAMPLING),
-            noise_seeds=self._lanes.seeds(NOISE),
+            self.form,
+            seeds=lanes.seeds(Purpose.SAMPLING),
+            noise_seeds=lanes.seeds(Purpose.NOISE),
             transitions=self.settings.buffer_size,
             batch_size=self.settings.batch_size,
-            columns=self._lanes.columns,
-            device=self.who.device,
+            columns=lanes.columns,
+            device=lanes.device,
         )
 
-    def begin(self) -> None:
-        """Ends the episodes that an earlier training left unfinished; see `Learner`."""
+    def write(self, turn: Turn, lane_turn: LaneTurn) -> None:
+        """Stores a turn, as all agents had it, and as these lanes did."""
+        self.buffer.write(lane_turn)
+        self._steps += self.lanes.worlds
+        self._owed += self.lanes.worlds * (self._steps >= self._first_update)
+
+    def due(self, networks: LaneNetworks) -> Iterator[Draw]:
+        """The batches to learn from after a turn: `updates_per_step` for every `steps_per_update` steps
+        that count; none before the first update and between updates."""
+        every, worlds = self.settings.steps_per_update, self.lanes.worlds
+        # One that updates after every step may do so whenever it asks.
+        updates = worlds if every == 1 else min(self._owed // every, worlds)
+        if self._steps < self._first_update or not updates:
+            return
+        self._owed = max(0, self._owed - every * updates)
+        for _ in range(updates * self.settings.updates_per_step):
+            yield self.buffer.draw()
+
+    def example(self, lanes: int) -> TensorDict:
+        """A made-up batch of so many lanes, in the form of those that are due, [lanes, 8]."""
+        form = self.form
+        turns = 8 + form.steps_ahead
+        seeds = [(lane,) for lane in range(lanes)]
+        ring = Ring(form, seeds=seeds, transitions=turns, batch_size=8, device=self.lanes.device)
+        places = torch.arange(8, device=ring.device).expand(lanes, -1)
+        batch = ring.get(places)
+        if form.noise_shape:
+            batch.set("noise", torch.zeros(*batch.batch_size, *form.noise_shape, device=ring.device))
+        return made_up(batch, self.lanes.spaces.actions)
+
+    def values(self, networks: LaneNetworks, turn: Turn) -> Tensor:
+        """The highest action value at the end of a turn, [L, W, ..]; NaN where a network outputs a policy."""
+        if self.stochastic:
+            return torch.full((len(self.lanes), self.lanes.worlds, *self.lanes.members), torch.nan)
+        cells = self.form.state_cells
+        states = [self.lanes.by_lane(self.lanes.states(turn, recurrent_state.AFTER, cells))] if cells else []
+        outputs = networks.outputs(self.lanes.seen_next(turn), *states)
+        return (outputs[0] if cells else outputs).amax(-1)  # type: ignore[no-any-return]
+
+    def cut(self, networks: LaneNetworks) -> None:
+        """Ends the episodes that a training left unfinished: what is stored next does not follow them."""
         self.buffer.cut()
 
-    def store(self, batch: TensorDictBase | Turn) -> None:
-        turn = Turn.of(batch)
-        self.buffer.write(self._lanes.turn(turn, self._wanted(turn)))
-        self.steps += self.worlds
-        self._owed += self.worlds * (self.steps >= self._first_update)
-        self.actor.explore_with(self.settings.epsilon(self.steps))
-
-    def update(self) -> Tensor | None:
-        """Updates every lane as often as a turn asks for: `updates_per_step` times for every
-        `steps_per_update` of the W steps; returns the mean losses [R, S], or None before the first update and
-        between updates."""
-        every = self.settings.steps_per_update
-        # One that updates after every step may do so whenever it asks.
-        due = self.worlds if every == 1 else min(self._owed // every, self.worlds)
-        if self.steps < self._first_update or not due:
-            return None
-        self._owed = max(0, self._owed - every * due)
-        losses = self.engine.update(self.buffer)
-        if (updates := due * self.settings.updates_per_step) > 1:
-            others = [self.engine.update(self.buffer) for _ in range(updates - 1)]
-            losses = torch.stack([losses, *others]).mean(0)
-        return self._lanes.by_agent(losses)
-
-    def end_episode(self, ended: Tensor) -> None:
-        """Counts an episode of the marked worlds, bool [B]: the weights of a replica are copied to targets
-        every `target_every_episodes` episodes. With `tau` these move after every update instead."""
-        before = self._episodes
-        self._episodes = before + ended.view(self.replicas, self.worlds).sum(1)
-        if self.settings.tau is not None:
-            return
-        every = self.settings.target_every_episodes
-        due = self._episodes // every > before // every
-        if due.any():
-            self.engine.copy_to_targets(self._lanes.of_replicas(due))
-
-    def values(self, batch: TensorDictBase | Turn) -> Tensor:
-        """The highest action value of each agent at the end of a turn, [B, S]; NaN where its network
-        outputs a policy."""
-        if self._lanes.method.stochastic:
-            return torch.full((self.replicas * self.worlds, len(self.agents)), torch.nan)
-        turn, is_recurrent = Turn.of(batch), self._lanes.state_cells > 0
-        states = [self._lanes.by_lane(self._lanes.states_in(turn, STATE))] if is_recurrent else []
-        with torch.no_grad():
-            outputs = self.engine.outputs(self._lanes.seen_next(turn), *states)
-        return self._lanes.by_world((outputs[0] if is_recurrent else outputs).amax(-1))
-
     def state_dict(self) -> dict[str, Any]:
-        return {
-            **super().state_dict(),
-            **self.buffer.state_dict(),
-            "owed": self._owed,
-            "episodes": self._episodes,
-        }
+        return {**self.buffer.state_dict(), "steps": self._steps, "owed": self._owed}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        super().load_state_dict(state)
         self.buffer.load_state_dict(state)
-        self._owed = int(state["owed"])
-        self.actor.epsilon = self.settings.epsilon(self.steps)
-        self._episodes = state["episodes"].clone()
+        self._steps, self._owed = int(state["steps"]), int(state["owed"])

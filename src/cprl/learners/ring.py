@@ -9,7 +9,6 @@ that TorchRL's losses read.
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from math import prod
 from typing import Any, Final, NamedTuple
 
@@ -18,60 +17,18 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from cprl.learners.transitions import LaneTurn, array_of, refuse_other_dtype
+from cprl import recurrent_state
+from cprl.learners.draw import Draw
+from cprl.learners.transitions import Horizon, LaneTurn, TransitionForm, array_of, refuse_other_dtype
 from cprl.policies.rng import DRAWN_AHEAD, LaneRng
 from cprl.system.memory import check_memory, free_bytes
 
 FIELDS: Final = ("observation", "action", "reward", "done", "terminated", "row")
 """What a ring holds, in the order in which it holds it."""
-STATE: Final = "recurrent_state"
+STATE: Final = recurrent_state.AFTER
 """What a ring for sequences holds besides."""
 
 Fields = dict[str, Tensor]
-
-
-class Horizon(NamedTuple):
-    """Returns of several steps: how many rewards they sum, and by which discount."""
-
-    steps: int
-    gamma: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class TransitionForm:
-    """What a lane stores of a turn, and what is sampled of it."""
-
-    observation_shape: tuple[int, ...]
-    """(C, X, Y); (S, C, X, Y) if a lane is a team of S agents."""
-    observation_dtype: str = "uint8"
-    action_shape: tuple[int, ...] = ()
-    """Of a lane's action: () for one agent, (S,) for a team."""
-    reward_shape: tuple[int, ...] = ()
-    """Of a lane's reward: (S,) for a team whose members have their own, else ()."""
-    noise_shape: tuple[int, ...] = ()
-    """Of the uniform numbers that the loss reads with each transition: the entry "noise", float32
-    [L, b, *noise_shape]; () for none."""
-    horizon: Horizon | None = None
-    """Steps and discount of n-step returns, sampled in place of rewards; None for single steps."""
-    state_cells: int = 0
-    """The numbers K of the state of a lane's recurrent network; 0 for one without."""
-    sequence_steps: int = 1
-    """Turns of sampled sequences; 1 for transitions."""
-
-    @property
-    def dtype(self) -> torch.dtype:
-        dtype: torch.dtype = getattr(torch, self.observation_dtype)
-        return dtype
-
-    @property
-    def steps_ahead(self) -> int:
-        """The turns after its first one that a sample reads."""
-        return (self.horizon.steps if self.horizon else self.sequence_steps) - 1
-
-    def stored_bytes(self, columns: int, turns: int) -> int:
-        row = prod(self.observation_shape) * self.dtype.itemsize + 4 * self.state_cells
-        beside = 8 * prod(self.action_shape) + 4 * prod(self.reward_shape) + 8 + 1 + 1
-        return columns * (_rows(turns) * row + turns * beside)
 
 
 def gather(
@@ -119,6 +76,18 @@ def gather(
     )
     entries = {"observation": seen(row), "action": fields["action"][index, column], "next": following}
     return TensorDict({**entries, **more}, index.shape)
+
+
+class _OfRing(NamedTuple):
+    """Gathers transitions from the fields of a ring, then places, their columns and perhaps noise."""
+
+    rows: int
+    horizon: Horizon | None
+
+    def __call__(self, columns: Sequence[Tensor]) -> TensorDict:
+        index, column, *noise = columns[len(FIELDS) :]
+        fields = dict(zip(FIELDS, columns, strict=False))
+        return gather(fields, index, column, self.rows, self.horizon, *noise)
 
 
 def sequences(fields: Fields, index: Tensor, column: Tensor, rows: int, steps: int) -> TensorDict:
@@ -181,6 +150,13 @@ def _rows(turns: int) -> int:
     return turns + max(8, round(turns * ENDS_PER_TRANSITION)) + 2 * LOOKS_EVERY + 2
 
 
+def stored_bytes(form: TransitionForm, columns: int, turns: int) -> int:
+    """The bytes of so many turns of each of so many columns."""
+    row = prod(form.observation_shape) * form.dtype.itemsize + 4 * form.state_cells
+    beside = 8 * prod(form.action_shape) + 4 * prod(form.reward_shape) + 8 + 1 + 1
+    return columns * (_rows(turns) * row + turns * beside)
+
+
 def steps_ahead(count: int) -> int:
     """Steps whose numbers are generated at once, `count` for each: they are part of every checkpoint."""
     return min(DRAWN_AHEAD, max(1, NUMBERS_AHEAD // count))
@@ -237,7 +213,7 @@ class Ring:
         self.capacity = turns = transitions // self.worlds
         """Turns T that are kept."""
         self.rows, self._ahead = _rows(turns), form.steps_ahead
-        needed = form.stored_bytes(count, turns)
+        needed = stored_bytes(form, count, turns)
         what = f"{lanes} learners x {turns * self.worlds:,} transitions"
         check_memory(
             f"the replay buffers of {what}",
@@ -303,23 +279,6 @@ class Ring:
         if self._written % LOOKS_EVERY == 0:
             self._forget()
 
-    def fill(self, actions: int, chance: torch.Generator) -> None:
-        """Fills every place with synthetic transitions; one in eight ends an episode."""
-        turn = torch.arange(self.capacity)[:, None]
-        for name, field in self.fields.items():
-            if name == "row":
-                field.copy_(turn)
-            elif name == "action":
-                field.copy_(torch.randint(actions, field.shape, generator=chance))
-            elif field.dtype == torch.bool and name != "observation":
-                field.copy_(turn % 8 == 7)
-            elif field.dtype == torch.uint8:
-                field.copy_(torch.randint(256, field.shape, generator=chance))
-            else:
-                numbers = torch.rand(field.shape, generator=chance)
-                field.copy_(numbers.round() if name == "observation" else numbers)
-        self._written = self.capacity
-
     def cut(self) -> None:
         """Ends the running episodes, as a time limit would: what is written next does not follow them."""
         if self._written:
@@ -337,8 +296,8 @@ class Ring:
                 break
             self._oldest += lost
 
-    def draw(self) -> tuple[Tensor, Tensor]:
-        """The places of a sample, int64 [L, b], and the columns, [L, b], or [L, 1] of lanes in one world."""
+    def places(self) -> tuple[Tensor, Tensor]:
+        """The places of the next sample, int64 [L, b], and their columns, [L, b], or [L, 1] in one world."""
         oldest, written = self.oldest()
         written -= self._ahead  # the newest transitions have no full return or sequence yet
         numbers = array_of(self.rng.next().to(self.device))
@@ -350,7 +309,7 @@ class Ring:
         return torch.as_tensor((oldest[:, None] + numbers) % self.capacity), self.columns
 
     def _draw_of_worlds(self, oldest: Tensor, written: int, numbers: Tensor) -> tuple[Tensor, Tensor]:
-        """As `draw`, from numbers in 0..1, [L, b]: all transitions of a lane's worlds one after the other."""
+        """As `places`, from numbers in 0..1, [L, b]: all turns of a lane's worlds one after the other."""
         ends = (written - oldest[self.columns]).clamp(min=0).cumsum(1)
         at = (numbers * ends[:, -1:]).long()
         world = torch.searchsorted(ends, at, right=True)
@@ -367,10 +326,19 @@ class Ring:
 
     def sample(self) -> TensorDict:
         """The next sample: transitions [L, b], or sequences, with the entry "noise" if the loss samples."""
-        batch = self.get(*self.draw())
+        batch = self.get(*self.places())
         if self.noise is not None:
             batch.set("noise", self.noise.next())
         return batch
+
+    def draw(self) -> Draw:
+        """The next sample, not yet gathered; sequences are."""
+        if self.sequence_steps > 1:
+            return Draw.of(self.sample())
+        index, column = self.places()
+        noise = [] if self.noise is None else [self.noise.next()]
+        columns = [*self.fields.values(), index, column, *noise]
+        return Draw(_OfRing(self.rows, self.horizon), columns, (self.sizes, index.shape))
 
     def state_dict(self) -> dict[str, Any]:
         """The written part of all fields, and the states of random numbers; once the ring is full, the

@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal
 import numpy as np
 
 from cprl.networks.mlp import Layers
-from cprl.values import MOST_INT64, Custom, Natural, Positive, Range, Share, Steps, Value
+from cprl.values import MOST_INT64, Natural, Positive, Range, Share, Steps, Value
 from cprl.values.arrays import Float64, Int64
 
 Optimizer = Literal["adam", "adamw", "rmsprop", "keras_rmsprop", "sgd"]
@@ -32,11 +32,11 @@ class Exploring(Value, stored=False):
     epsilon_start: Share = 1.0
     """Probability of a random action at the start."""
     epsilon_end: Share = 0.1
-    """Probability of a random action after the decay."""
+    """Probability of a random action after the decay; with 0 exploration ends."""
     epsilon_hold_steps: LongSteps = 800
-    """Steps at `epsilon_start` before the decay."""
+    """Steps at `epsilon_start` before the decay; a turn of W worlds is W steps."""
     epsilon_decay_steps: Steps = 500_000
-    """Steps of the linear decay after the hold."""
+    """Steps of the linear decay after the hold, likewise."""
     epsilon_evaluation: Share = 0.05
     """Probability of a random action in evaluation."""
 
@@ -47,7 +47,27 @@ class Exploring(Value, stored=False):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DQNSettings(Exploring):
+class Falling(Value, stored=False):
+    """A learning rate that can change while an agent learns, along a line: it falls, or rises if its end is
+    above its start."""
+
+    learning_rate: LearningRate
+    """The optimiser's step size."""
+    learning_rate_end: Annotated[float, Range(0, 100)] | None = None
+    """The optimiser's step size at the end of the line; None for one that stays as it is."""
+    learning_rate_decay_steps: Steps = 1_000_000
+    """Environment steps of the line, from the first one on; a turn of W worlds is W steps."""
+
+    def learning_rate_at(self, step: int) -> float:
+        """The optimiser's step size at a step, counted from 0."""
+        if self.learning_rate_end is None:
+            return self.learning_rate
+        done = min(1.0, step / self.learning_rate_decay_steps)
+        return self.learning_rate + done * (self.learning_rate_end - self.learning_rate)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DQNSettings(Exploring, Falling):
     """Hyperparameters of one independent DQN agent; the defaults are the published ones.
 
     Source: M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement Learning" (2019), appendix A,
@@ -60,8 +80,10 @@ class DQNSettings(Exploring):
     batch_size: Positive = 8
     """Transitions in a minibatch, or sequences of `sequence_steps` transitions."""
     learning_starts: Steps = 16
-    """Transitions stored before the first update; after that `updates_per_step` updates follow every
-    `steps_per_update` steps. A turn of W worlds is W steps."""
+    """Transitions stored before steps count for updates: `updates_per_step` updates follow every
+    `steps_per_update` of them, the last of these included. So the first update comes at this step, or with
+    `steps_per_update` above the worlds W up to `steps_per_update` - 1 steps later: after step 19 for 16, in
+    one world with `steps_per_update=4`. A turn of W worlds is W steps."""
     gamma: Share = 0.995
     """Discount factor per step."""
     learning_rate: LearningRate = 1e-5
@@ -87,14 +109,16 @@ class DQNSettings(Exploring):
     """See `Optimizer`; [run] "adam", and "keras_rmsprop" in some versions of experiment 5."""
     tau: Annotated[float, Range(1e-6, 1)] | None = None
     """Soft target updates: the fraction by which targets move towards the network after each update;
-    None for a copy every `target_every_episodes` episodes."""
-    replay_transforms: tuple[Custom, ...] = ()
-    """TorchRL transforms of the replay buffer, in order: sampled batches pass through them, and stored
-    transitions through their inverse. Random transforms use torch's global generator."""
+    None for a copy every `target_every_updates` updates or `target_every_episodes` episodes."""
+    target_every_updates: Annotated[int, Range(1, MOST_INT64)] | None = None
+    """Updates between copies of the network to its target, a period that does not depend on how long
+    episodes last; None for a copy every `target_every_episodes` episodes. A turn of W worlds has W x
+    `updates_per_step` / `steps_per_update` updates. Mnih et al. (2015) took 10,000."""
     target_every_episodes: Steps = 3
-    """Episodes between copies of the network to its target if `tau` is None; experiment 5 used 3 or 10."""
+    """Episodes, of all W worlds together, between copies of the network to its target, if `tau` and
+    `target_every_updates` are None; experiment 5 used 3 or 10."""
     relu_on_outputs: bool = False
-    """[run] Whether the Q values pass through ReLU too; refused for C51, SAC and IQL."""
+    """[run] Whether the Q values pass through ReLU too; refused for SAC."""
     glorot_uniform: bool = False
     """[run] Whether weights are initialised Glorot-uniform and biases to zero; else torch's default."""
     own_target_weights: bool = False
@@ -105,6 +129,11 @@ class DQNSettings(Exploring):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.tau is not None and self.target_every_updates is not None:
+            raise ValueError(
+                f"DQNSettings.target_every_updates is {self.target_every_updates}; allowed with tau "
+                f"{self.tau}, by which targets move after each update: None"
+            )
         longest = max(1, min(self.learning_starts, self.buffer_size // 2))
         for name, turns in {"n_steps": self.n_steps, "sequence_steps": self.sequence_steps}.items():
             if turns > longest:
@@ -112,9 +141,14 @@ class DQNSettings(Exploring):
                     f"DQNSettings.{name} is {turns}; allowed: up to learning_starts, "
                     f"{self.learning_starts}, and half of buffer_size, {self.buffer_size}"
                 )
-        if self.sequence_steps > 1 and (self.n_steps > 1 or self.replay_transforms):
-            other = f"n_steps {self.n_steps}" if self.n_steps > 1 else "replay_transforms"
-            raise ValueError(f"DQNSettings.sequence_steps is {self.sequence_steps}; allowed with {other}: 1")
+        if self.sequence_steps > 1 and self.n_steps > 1:
+            raise ValueError(
+                f"DQNSettings.sequence_steps is {self.sequence_steps}; allowed with n_steps {self.n_steps}: 1"
+            )
+
+    def updates_in(self, steps: int, *, worlds: int) -> int:
+        """Return how many updates an agent has in so many steps of all worlds W of a replica."""
+        return steps // self.steps_per_update * self.updates_per_step
 
     def refuse_worlds(self, worlds: int) -> None:
         """Raises a ValueError where a replica of so many worlds W cannot learn by these."""
@@ -162,14 +196,23 @@ class _OfRollouts(Value, stored=False):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RolloutSettings(_OfRollouts):
+class RolloutSettings(_OfRollouts, Falling):
     """Hyperparameters of one independent on-policy agent."""
+
+    only_in_play: bool = False
+    """Whether losses and the normalisation of advantages leave out the turns in which an agent was out of
+    play, in which its actions did nothing. If not, agents learn from them too, as in the study."""
 
     epochs: Positive = 4
     """Passes over each rollout."""
     minibatch_size: Positive = 50
     """Steps in a minibatch, of all worlds of a replica; must divide the `rollout_steps` x W steps of its W
     worlds, and `rollout_steps` or be a multiple of it."""
+
+    def updates_in(self, steps: int, *, worlds: int) -> int:
+        """Return how many updates an agent has in so many steps of all worlds W of a replica."""
+        rollout_steps = self.rollout_steps * worlds
+        return steps // rollout_steps * self.epochs * (rollout_steps // self.minibatch_size)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -24,54 +24,63 @@ from torch import Tensor, nn
 from cprl import keys
 from cprl.commons.spaces import Spaces
 from cprl.keys import Turn
-from cprl.learners.base import Learner, LearningAgents
+from cprl.learners.lanes import Lanes
 from cprl.learners.settings import TabularSettings
-from cprl.learners.transitions import by_lane, lane_turn
-from cprl.policies.rng import EVALUATION, EXPLORATION
-from cprl.policies.tabular import NEVER_MET, QTables, TableNetwork, TabularActor, states_of
+from cprl.learners.transitions import lane_turn
+from cprl.objectives.rewards import RewardModel
+from cprl.policies.lanes import LaneActor
+from cprl.policies.rng import Purpose
+from cprl.policies.tabular import NEVER_MET, QTables, TableNetwork, states_of
 
 
-class TabularLearner(Learner):
+class TabularLearner:
     """R x S independent tabular agents: S agents of each of R replicas, each with its own table.
 
-    A `cprl.learners.base.Learner`; its tables are in the CPU's memory.
+    A `cprl.learners.base.AnyLearner`; its tables are in the CPU's memory.
 
     Args:
-        who: with the tables with which lanes start in `start_from`; each value counts as never updated.
+        lanes: who learns, with the tables with which agents start in `start_from`; each value counts as never
+            updated.
 
     Raises:
         MemoryError: from `store`, if an agent visits more than `settings.max_states` states.
     """
 
-    def __init__(self, who: LearningAgents, settings: TabularSettings) -> None:
-        super().__init__(who, settings)
-        self.tables = QTables(self.lanes, who.spaces.actions, max_states=settings.max_states)
-        for lane, name in enumerate(who.names):
-            if name in who.start_from:
-                start = who.start_from[name]
+    def __init__(self, lanes: Lanes, settings: TabularSettings) -> None:
+        self.lanes, self.settings, self.spaces = lanes, settings, lanes.spaces
+        self.agents, self.replicas, self.worlds = lanes.agents, lanes.replicas, lanes.worlds
+        self.rewards, self.steps = RewardModel(lanes.reward), 0
+        self.tables = QTables(len(lanes), lanes.spaces.actions, max_states=settings.max_states)
+        for lane, name in enumerate(lanes.names):
+            if name in lanes.start_from:
+                start = lanes.start_from[name]
                 self.tables.add_lane(lane, start["states"].numpy(), start["values"].numpy())
-        self.actor = self._actor(EXPLORATION, worlds=self.worlds)
+        self.actor = self._actor(Purpose.EXPLORATION, worlds=self.worlds)
         self.actor.epsilon = settings.epsilon(0)
-        columns = torch.arange(self.lanes * self.worlds)
-        self._columns = by_lane(columns, replicas=self.replicas, worlds=self.worlds).T.numpy()
+        self._columns = lanes.columns.T.numpy()
         """Where the lanes stand in a turn, of one world after the other, int64 [W, L]."""
-        lane_of = np.empty(len(columns), np.int64)
-        lane_of[self._columns] = np.arange(self.lanes)
+        lane_of = np.empty(self._columns.size, np.int64)
+        lane_of[self._columns] = np.arange(len(lanes))
         self._lane_of: list[int] = lane_of.tolist()
         """The lane of each place in a turn."""
         self._turns: deque[dict[str, NDArray[Any]]] = deque()
 
-    @property
-    def lanes(self) -> int:
-        return self.replicas * len(self.agents)
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(agents={self.agents}, replicas={self.replicas})"
 
-    def _actor(self, purpose: int, *, worlds: int) -> TabularActor:
-        return TabularActor(
-            self.tables, self.spaces, seeds=self.who.seeds(purpose), agents=len(self.agents), worlds=worlds
-        )
+    def begin(self) -> None:
+        """Does nothing: a queued turn knows nothing of those after it."""
 
-    def evaluation_actor(self, worlds: int) -> TabularActor:
-        actor = self._actor(EVALUATION, worlds=worlds)
+    def end_episode(self, ended: Tensor) -> None:
+        """Does nothing: there are no targets."""
+
+    def _actor(self, purpose: Purpose, *, worlds: int) -> LaneActor:
+        seeds = self.lanes.seeds(purpose)
+        actions = self.spaces.actions
+        return LaneActor(self.tables.outputs, actions, seeds=seeds, agents=len(self.agents), worlds=worlds)
+
+    def evaluation_actor(self, worlds: int) -> LaneActor:
+        actor = self._actor(Purpose.EVALUATION, worlds=worlds)
         actor.epsilon = self.settings.epsilon_evaluation
         return actor
 
@@ -80,11 +89,11 @@ class TabularLearner(Learner):
         whole = Turn.of(batch)
         if isinstance(whole.next_world[keys.DONE], Tensor):  # on a GPU; tables are on the CPU
             whole = Turn.of(whole.batch.cpu())
-        turn = lane_turn(self.agents, whole, self._wanted(whole))
-        seen = states_of(whole.batch[keys.OBSERVATION], self.agents)
-        rows = self.tables.find_or_add(seen, self._lane_of)
+        rewards, done = whole.next_agents["reward"], whole.next_world[keys.DONE]
+        turn = lane_turn(self.agents, whole, self.rewards.add(rewards[..., 0], done[..., 0]))
+        rows = self.tables.find_or_add(states_of(turn.observation), self._lane_of)
         on = np.flatnonzero(~turn.terminated)
-        next_seen = states_of(whole.batch["next", *keys.OBSERVATION], self.agents)
+        next_seen = states_of(turn.next_observation)
         next_rows = np.full(len(rows), NEVER_MET, np.int64)
         next_states, lanes = [next_seen[column] for column in on], [self._lane_of[column] for column in on]
         next_rows[on] = self.tables.find_or_add(next_states, lanes)
@@ -110,15 +119,18 @@ class TabularLearner(Learner):
         return torch.from_numpy(squares).view(self.replicas, len(self.agents))
 
     def finite(self) -> Tensor:
-        sound = np.ones(self.lanes, np.bool_)
+        sound = np.ones(len(self.lanes), np.bool_)
         if not np.isfinite(self.tables.values[: self.tables.size].sum()):
-            sound = np.array([np.isfinite(self.tables.of_lane(lane)[1]).all() for lane in range(self.lanes)])
+            sound = np.array(
+                [np.isfinite(self.tables.of_lane(lane)[1]).all() for lane in range(len(self.lanes))]
+            )
         return torch.from_numpy(sound).view(self.replicas, len(self.agents))
 
     def values(self, batch: TensorDictBase | Turn) -> Tensor:
         """The highest action value of each agent at the end of a turn, [B, S]."""
         after = Turn.of(batch).batch["next", *keys.OBSERVATION]
-        rows = self.tables.find(states_of(after, self.agents), self._lane_of)
+        seen = after[:, list(self.agents)].flatten(0, 1).numpy(force=True)
+        rows = self.tables.find(states_of(seen), self._lane_of)
         return torch.from_numpy(self.tables.values[rows].max(1)).view(-1, len(self.agents))
 
     def networks(self) -> dict[str, nn.Module]:
@@ -130,7 +142,7 @@ class TabularLearner(Learner):
 
     def _network_states(self) -> dict[str, dict[str, Tensor]]:
         states = {}
-        for lane, name in enumerate(self.who.names):
+        for lane, name in enumerate(self.lanes.names):
             seen, values, _ = self.tables.of_lane(lane)
             states[name] = {"states": torch.from_numpy(seen), "values": torch.from_numpy(values)}
         return states
@@ -144,7 +156,7 @@ class TabularLearner(Learner):
             "exploration": self.actor.rng.state_dict(),
             "steps": self.steps,
             "turns": turns,
-            "wants": self.wants.state_dict(),
+            "rewards": self.rewards.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -155,7 +167,7 @@ class TabularLearner(Learner):
         self._turns = deque(
             {name: field.numpy().copy() for name, field in turn.items()} for turn in state["turns"]
         )
-        self.wants.load_state_dict(state["wants"])
+        self.rewards.load_state_dict(state["rewards"])
 
 
 def table_network(spaces: Spaces) -> TableNetwork:

@@ -1,14 +1,57 @@
 """Transitions of single agents: those of lanes, and under TorchRL's default keys, which its losses read."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from tensordict import TensorDict, TensorDictBase
+import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from cprl import keys
 from cprl.keys import Turn
+
+
+class Horizon(NamedTuple):
+    """Returns of several steps: how many rewards they sum, and by which discount."""
+
+    steps: int
+    gamma: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransitionForm:
+    """What a lane stores of a turn, and what is sampled of it."""
+
+    observation_shape: tuple[int, ...]
+    """(C, X, Y); (S, C, X, Y) if a lane is a team of S agents."""
+    observation_dtype: str = "uint8"
+    action_shape: tuple[int, ...] = ()
+    """Of a lane's action: () for one agent, (S,) for a team."""
+    reward_shape: tuple[int, ...] = ()
+    """Of a lane's reward: (S,) for a team whose members have their own, else ()."""
+    noise_shape: tuple[int, ...] = ()
+    """Of the uniform numbers that the loss reads with each transition: the entry "noise", float32
+    [L, b, *noise_shape]; () for none."""
+    horizon: Horizon | None = None
+    """Steps and discount of n-step returns, sampled in place of rewards; None for single steps."""
+    state_cells: int = 0
+    """The numbers K of the state of a lane's recurrent network; 0 for one without."""
+    sequence_steps: int = 1
+    """Turns of sampled sequences; 1 for transitions."""
+    has_in_play: bool = False
+    """Whether it is stored who is in play."""
+
+    @property
+    def dtype(self) -> torch.dtype:
+        dtype: torch.dtype = getattr(torch, self.observation_dtype)
+        return dtype
+
+    @property
+    def steps_ahead(self) -> int:
+        """The turns after its first one that a sample reads."""
+        return (self.horizon.steps if self.horizon else self.sequence_steps) - 1
 
 
 class LaneTurn(NamedTuple):
@@ -32,6 +75,8 @@ class LaneTurn(NamedTuple):
     """float32 [C, K], before the turn, of lanes with a recurrent network."""
     next_recurrent_state: Any = None
     """After it, likewise."""
+    in_play: Any = None
+    """bool [C], of teams [C, S]: whether it was in play, of lanes that learn from such turns alone."""
 
 
 def lane_turn(agents: Sequence[int], turn: Turn, rewards: Any, *, are_team: bool = False) -> LaneTurn:
@@ -95,25 +140,14 @@ def array_of(tensor: Tensor) -> Any:
     return tensor.numpy() if tensor.is_cpu else tensor
 
 
-def transitions_of(agent: int, batch: TensorDictBase) -> TensorDict:
-    """The transitions of one agent from a collector's batch.
-
-    Args:
-        batch: entries of `cprl.keys` at the root and under "next", with any batch size.
-
-    Returns:
-        A flat TensorDict [transitions] of "observation" uint8 [.., 3, X, Y], "action" int64 [..] and "next":
-        "observation", "reward" float32 [.., 1], "done", "terminated", "truncated" bool [.., 1].
-        Turns that the agent spends out of play are included, with the action that it chose.
-    """
-    size, after = batch.batch_size, batch.get("next")
-    flags = {name: after.get(name) for name in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)}
-
-    def of(owner: TensorDictBase, *names: str) -> dict[str, Tensor]:
-        return {name: owner.get((keys.AGENTS, name)).select(len(size), agent) for name in names}
-
-    following = TensorDict({**of(after, "observation", "reward"), **flags}, size)
-    return TensorDict({**of(batch, "observation", "action"), "next": following}, size).reshape(-1)
+def transitions_of(fields: Mapping[str, Any]) -> TensorDict:
+    """The fields of a `LaneTurn`, of any batch size, as transitions under TorchRL's default keys."""
+    named = {name: torch.as_tensor(field) for name, field in fields.items() if field is not None}
+    size = named["done"].shape
+    following = {name: named[name].unsqueeze(-1) for name in ("reward", "done", "terminated")}
+    following["observation"] = named["next_observation"]
+    now = {name: named[name] for name in ("observation", "action")}
+    return TensorDict({**now, "next": TensorDict(following, size)}, size)
 
 
 def refuse_other_dtype(dtype: Any, allowed: Any) -> None:
@@ -123,3 +157,19 @@ def refuse_other_dtype(dtype: Any, allowed: Any) -> None:
             f"observations are {dtype}; allowed: {allowed}, from Spaces.observation_dtype: make the learner "
             "with the Spaces of the transformed environment"
         )
+
+
+def made_up(batch: TensorDict, actions: int) -> TensorDict:
+    """A batch in the form of another one, of other observations, actions and numbers; always the same."""
+    rng = torch.Generator().manual_seed(0)
+
+    def other(name: Any, entry: Tensor) -> Tensor:
+        if entry.is_floating_point():
+            return torch.rand(entry.shape, generator=rng).to(entry)
+        if name == "action" or entry.dtype == torch.uint8:
+            highest = actions if name == "action" else 256
+            return torch.randint(highest, entry.shape, generator=rng).to(entry)
+        return entry
+
+    made: TensorDict = batch.named_apply(other, nested_keys=True)
+    return made

@@ -79,7 +79,7 @@ class Episode:
     tagged_by: Int64 | None = None
     """[N, N], how often the agent of the row was tagged by the agent of the column."""
     wanted_return: Float64 | None = None
-    """[N], the sum of the rewards that each agent wanted in a training, see `cprl.objectives.preferences`;
+    """[N], the sum of the rewards that each agent wanted in a training, see `cprl.objectives.rewards`;
     NaN for agents that do not learn. None outside of a training."""
     stock_left: int | None = None
     """Apples on the board at the end."""
@@ -159,6 +159,8 @@ def check_own_metrics(metrics: Sequence[Custom]) -> None:
     """Refuse metrics of the user's own with the name of another number of an episode."""
     names = [own_name(metric) for metric in metrics]
     for name, metric in zip(names, metrics, strict=True):
+        if not name.isidentifier():
+            raise ValueError(f"{metric.target}: a metric is called as its function; allowed: one with a name")
         if name in _TAKEN or name.startswith(("return_", "in_force_")) or names.count(name) > 1:
             raise ValueError(f"{metric.target}: another number of an episode is called {name}; rename it")
 
@@ -258,7 +260,7 @@ class EpisodeTracker:
             "groups": groups_of(institutions),
         }
         self._counts = counts_for(institutions)
-        self._metrics = tuple(metrics)
+        self._metrics = checked("metrics", metrics, tuple[Custom, ...])
         self._episode = np.zeros(worlds, np.int64)
         self._running: dict[str, Array] = {}
         self._places: list[tuple[str, Any, str]] = []

@@ -5,7 +5,7 @@ Modules, in the order in which one reads them:
     convolutional  Conv: convolutions over rows and columns
     recurrent      GRU, LSTM: a state that is kept from turn to turn
     specification  Network: which of them an algorithm has; networks of your own
-    agent          several networks of one agent, distributions of returns, values of joint actions
+    agent          several networks of one agent, values of joint actions
     team           the networks of a team
     stacked        the networks of many lanes as one
     finite         whether weights are numbers

@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from cprl.networks.agent import AgentNetworks
 from cprl.networks.mlp import MLPNetwork
 
 
@@ -135,9 +134,6 @@ def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
             weights = torch.stack([getattr(network, name).detach() for network in networks])
             setattr(stack, name, nn.Parameter(weights))
         return stack  # type: ignore[no-any-return]
-    if all(isinstance(network, AgentNetworks) for network in networks):
-        parts = zip(*(network.values() for network in networks), strict=True)  # type: ignore[operator]
-        return AgentNetworks(dict(zip(networks[0].keys(), map(stack_lanes, parts), strict=True)))  # type: ignore[operator]
     if all(isinstance(network, MLPNetwork) for network in networks):
         return StackedMLP(networks)  # type: ignore[arg-type]
     if not all(hasattr(network, "observation_dims") for network in networks):

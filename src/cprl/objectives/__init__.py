@@ -2,7 +2,7 @@
 the rest of cprl.
 
 Modules, in the order in which one reads them:
-    preferences  the reward that each agent learns from, out of those of everybody
+    rewards      the reward that each agent learns from, out of those of everybody
     functional   a TorchRL loss as a function of its weights, for updates of many agents at once
     td           ln cosh of an error, and TorchRL's DQN loss with it; losses that bootstrap by one step
     maddpg       MADDPGLoss: an actor and a centralised critic for each of several agents

@@ -1,5 +1,6 @@
 """A TorchRL loss as a function of its weights: their names, their targets, and what the loss returns."""
 
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any, Final
 
@@ -14,9 +15,12 @@ from cprl.system.compat import forget_cached_weights, promise_targets, refuse_up
 Weights = dict[str, Tensor]
 
 _NO_UPDATER: Final = (
-    "a SoftUpdate or HardUpdate was built on the {}; the engine has weights of its own, which it would not "
+    "a SoftUpdate or HardUpdate was built on the {}; the learner has weights of its own, which it would not "
     "change: leave it out, and set tau or target_every_episodes"
 )
+
+
+_KEPT: Final = bool | int | float | Tensor
 
 
 class FunctionalLoss:
@@ -30,10 +34,7 @@ class FunctionalLoss:
         loss.reduction = "none"
         if hasattr(loss, "scalar_output_mode"):
             loss.scalar_output_mode = "exclude"  # drops scalars that are not losses of transitions
-        # Created lazily at first access, which a compiler would see as a change; a loss may have neither.
-        getattr(loss, "in_keys", None)
-        with suppress(NotImplementedError):
-            getattr(loss, "value_estimator", None)
+        make_lazy_parts(loss)
         self._groups = {name: group.batch_size for name, group in groups_of(loss).items()}
         self._singles = tuple(single_weights(loss))
         for name in (*self._groups, *self._singles):
@@ -58,9 +59,37 @@ class FunctionalLoss:
             setattr(self.module, name, None)
         return losses
 
+    def kept(self) -> dict[str, Any]:
+        """What the loss keeps from call to call: buffers, and attributes that are numbers or tensors."""
+        return {"buffers": dict(self.module.named_buffers()), "attributes": attributes_of(self.module)}
+
+    def keep(self, kept: Mapping[str, Any]) -> None:
+        """Continues with what `kept` returned."""
+        for name, buffer in self.module.named_buffers():
+            buffer.copy_(kept["buffers"][name])
+        set_attributes(self.module, kept["attributes"])
+
+
+def make_lazy_parts(loss: LossModule) -> None:
+    """Makes what a loss creates at first access, which would look like a change by a call."""
+    getattr(loss, "in_keys", None)
+    with suppress(NotImplementedError):  # a loss may have none
+        getattr(loss, "value_estimator", None)
+
+
+def attributes_of(loss: LossModule) -> dict[str, Any]:
+    """The attributes of a loss that are numbers or tensors, which it may change from call to call."""
+    return {name: value for name, value in vars(loss).items() if isinstance(value, _KEPT)}
+
+
+def set_attributes(loss: LossModule, attributes: Mapping[str, Any]) -> None:
+    """Sets what `attributes_of` returned."""
+    for name, value in attributes.items():
+        setattr(loss, name, value.clone() if isinstance(value, Tensor) else value)
+
 
 def own_targets(loss: LossModule) -> None:
-    """Marks the targets of a loss as updated, by the engine, so that TorchRL does not warn."""
+    """Marks the targets of a loss as updated, by the learner, so that TorchRL does not warn."""
     if any(f"target_{name}_params" in groups_of(loss) for name in updated_weights(loss)):
         raise ValueError(_NO_UPDATER.format(type(loss).__name__))
     promise_targets(loss)

@@ -35,8 +35,8 @@ _Nested: TypeAlias = list[list[Tensor]]
 
 def lola_gradients(
     objectives: Sequence[Objective], parameters: Parameters, *, rate: float
-) -> tuple[list[list[Tensor]], Tensor]:
-    """Return the gradient along which each agent descends, and the losses.
+) -> list[list[Tensor]]:
+    """Return the gradient along which each agent descends, of the shapes of `parameters`.
 
     For agent i it is dL_i/dtheta_i - rate * sum over j of (dL_i/dtheta_j) . (d2L_j/dtheta_j dtheta_i), with
     the first factor of the product as a constant, as in the paper.
@@ -47,16 +47,13 @@ def lola_gradients(
             is multiplied by the mean of the others' first, and all such products are averaged.
         rate: the step size that the others are expected to take, 0..1e12; 0 is naive learning.
 
-    Returns:
-        Gradients of the shapes of `parameters`, and the mean of the losses of the objectives, [.., N],
-        without a gradient. Where losses have axes before the agents', the gradients are those of the sums
-        over them.
+    Where losses have axes before the agents', the gradients are those of the sums over them.
     """
     values = [[value.detach() for value in of_agent] for of_agent in parameters]
     estimates: list[Any] = [
         torch.func.vjp(_slopes(objective), values, has_aux=True) for objective in objectives
     ]
-    slopes: list[list[_Nested]] = [aux[0] for _, _, aux in estimates]
+    slopes: list[list[_Nested]] = [of_agents for _, _, of_agents in estimates]
     gradients = [_means([each[agent][agent] for each in slopes]) for agent in range(len(values))]
     for number, (_, pull, _) in enumerate(estimates if rate else ()):
         others = slopes[:number] + slopes[number + 1 :] or slopes
@@ -72,7 +69,7 @@ def lola_gradients(
                 slope - rate / len(estimates) * product
                 for slope, product in zip(gradients[agent], products[agent], strict=True)
             ]
-    return gradients, _mean([aux[1].detach() for _, _, aux in estimates])
+    return gradients
 
 
 def looked_ahead(
@@ -115,27 +112,25 @@ def look_ahead_losses(
     return torch.stack(losses, -1)
 
 
-def _slopes(objective: Objective) -> Callable[[_Nested], tuple[_Nested, tuple[list[_Nested], Tensor]]]:
+def _slopes(objective: Objective) -> Callable[[_Nested], tuple[_Nested, list[_Nested]]]:
     """A function of all parameters: the gradient of each agent's loss by its own; beside them those of each
-    agent's loss by the parameters of all, and the losses."""
+    agent's loss by the parameters of all."""
 
-    def slopes(parameters: _Nested) -> tuple[_Nested, tuple[list[_Nested], Tensor]]:
+    def slopes(parameters: _Nested) -> tuple[_Nested, list[_Nested]]:
         losses: Tensor
         losses, pull = torch.func.vjp(objective, parameters)[:2]
         units = torch.eye(len(parameters), dtype=losses.dtype, device=losses.device)
         of_agents = [pull(unit.expand_as(losses).contiguous())[0] for unit in units]
-        return [of_agent[agent] for agent, of_agent in enumerate(of_agents)], (of_agents, losses)
+        return [of_agent[agent] for agent, of_agent in enumerate(of_agents)], of_agents
 
     return slopes
 
 
-def _mean(values: Sequence[Tensor]) -> Tensor:
-    return values[0] if len(values) == 1 else torch.stack(list(values)).mean(0)
-
-
 def _means(tables: Sequence[Sequence[Tensor]]) -> list[Tensor]:
     """The mean of each tensor over several lists of them."""
-    return [_mean(values) for values in zip(*tables, strict=True)]
+    if len(tables) == 1:
+        return list(tables[0])
+    return [torch.stack(values).mean(0) for values in zip(*tables, strict=True)]
 
 
 def magic_box(log_prob: Tensor) -> Tensor:
@@ -319,7 +314,7 @@ class LOLALoss(_OfPolicies):
             )
         objectives = [self._objective(half) for half in tensordict.chunk(2, tensordict.batch_dims - 2)]
         parameters = self._weights()
-        gradients, _ = lola_gradients(objectives, parameters, rate=self.look_ahead_rate)
+        gradients = lola_gradients(objectives, parameters, rate=self.look_ahead_rate)
         carried = [
             ((value - value.detach()) * slope.detach()).sum()
             for values, slopes in zip(parameters, gradients, strict=True)

@@ -44,20 +44,15 @@ class MADDPGLoss(TDLoss):
     raised to "steps_to_next_obs" where the batch has that entry. Targets are moved by TorchRL's `SoftUpdate`
     or `HardUpdate`.
 
-    `forward` reads the entries of the networks, "action" int64 [.., S], and under "next" "reward" float
-    [.., S, 1], "done" and "terminated" bool [.., 1] or [.., S, 1]; other names are set by `set_keys`.
-    "noise", float [.., S, 2] of uniform numbers in 0..1, decides what is sampled; without it they come from
-    torch's global generator. It writes nothing into the batch, and returns, summed over members and then
-    reduced, "loss_actor" and "loss_value", and without gradients "entropy", in nats, "pred_value",
-    "target_value" and "td_error", float [.., S, 1], squared.
+    `forward` reads the entries of the networks, "action" int64 [.., S], "noise", float [.., S, 2] of uniform
+    numbers in 0..1, which decides what is sampled, and under "next" "reward" float [.., S, 1], "done" and
+    "terminated" bool [.., 1] or [.., S, 1]; other names are set by `set_keys`. It writes nothing into the
+    batch, and returns, summed over members and then reduced, "loss_actor" and "loss_value", and without
+    gradients "entropy", in nats, "pred_value", "target_value" and "td_error", float [.., S, 1], squared.
     """
 
     @dataclass
-    class _AcceptedKeys:
-        action: NestedKey = "action"
-        reward: NestedKey = "reward"
-        done: NestedKey = "done"
-        terminated: NestedKey = "terminated"
+    class _AcceptedKeys(TDLoss._AcceptedKeys):
         steps_to_next_obs: NestedKey = "steps_to_next_obs"
         noise: NestedKey = "noise"
 
@@ -98,15 +93,19 @@ class MADDPGLoss(TDLoss):
         keys = self.tensor_keys
         seen = {*self.actor_network.in_keys, *self.critic_network.in_keys} - {"joint_action"}
         after = {keys.reward, keys.done, keys.terminated, *seen}
-        every = {keys.action, *seen, *(("next", key) for key in after)}
+        every = {keys.action, keys.noise, *seen, *(("next", key) for key in after)}
         return sorted(map(unravel_key, every), key=str)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """The losses of a batch of transitions."""
+        """Return the losses of a batch of transitions.
+
+        Raises:
+            ValueError: if the batch lacks "noise".
+        """
         logits = self.outputs_of("actor_network", self.actor_network_params, tensordict)
         taken = _one_hot(tensordict.get(self.tensor_keys.action), logits)
-        next_noise, noise = self._noise(tensordict, logits).unbind(-1)
+        next_noise, noise = self._noise(tensordict).unbind(-1)
         target = self._target_value(tensordict, next_noise)
         value = self._values(tensordict, _for_each_member(taken), self.critic_network_params)
         errors = distance(value, target, self.loss_function)
@@ -156,11 +155,15 @@ class MADDPGLoss(TDLoss):
         """Of joint actions [.., S, S, A] by the critic of each member, [.., S, 1]."""
         return self.outputs_of("critic_network", weights, tensordict, joint_action=joint)
 
-    def _noise(self, tensordict: TensorDictBase, logits: Tensor) -> Tensor:
-        """Uniform numbers, float [.., S, 2]: those of the batch, or new ones."""
-        noise: Tensor | None = tensordict.get(self.tensor_keys.noise, None)
+    def _noise(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the uniform numbers of the batch, float [.., S, 2]."""
+        key = self.tensor_keys.noise
+        noise: Tensor | None = tensordict.get(key, None)
         if noise is None:
-            noise = torch.rand(*logits.shape[:-1], NUMBERS, dtype=logits.dtype, device=logits.device)
+            raise ValueError(
+                f'"{key}" is missing; allowed: float [.., members, {NUMBERS}] of uniform numbers in 0..1, so '
+                "that none is drawn from torch's global generator"
+            )
         return noise
 
 

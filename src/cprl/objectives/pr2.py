@@ -45,13 +45,7 @@ class PR2Loss(TDLoss):
     """
 
     @dataclass
-    class _AcceptedKeys:
-        """The entries by the names that `set_keys` takes."""
-
-        action: NestedKey = "action"
-        reward: NestedKey = "reward"
-        done: NestedKey = "done"
-        terminated: NestedKey = "terminated"
+    class _AcceptedKeys(TDLoss._AcceptedKeys):
         priority: NestedKey = "td_error"
 
     tensor_keys: _AcceptedKeys

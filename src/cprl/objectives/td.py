@@ -1,6 +1,7 @@
 """Losses by one step of temporal differences: ln cosh of the error, which neither torch nor TorchRL has, and
 what losses of our own share whose targets bootstrap so."""
 
+from dataclasses import dataclass
 from math import log
 from typing import Any, ClassVar, Final, Self
 
@@ -72,6 +73,15 @@ class LogCoshDQNLoss(ReshapedLoss, DQNLoss):
 
 class TDLoss(LossModule):
     """A loss with TorchRL's TD(0) estimator, over the entries that `tensor_keys` names."""
+
+    @dataclass
+    class _AcceptedKeys:
+        """The entries by the names that `set_keys` takes."""
+
+        action: NestedKey = "action"
+        reward: NestedKey = "reward"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
 
     default_value_estimator = ValueEstimators.TD0
     estimated: ClassVar[tuple[str, ...]] = ("reward", "done", "terminated")

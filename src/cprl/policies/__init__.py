@@ -4,7 +4,7 @@ Modules, in the order in which one reads them:
     lanes           LaneActor: many agents at once, by the values or logits of their networks
     scripted        agents that follow a rule
     scripted_rules  these rules, compiled
-    tabular         agents that look actions up in tables
+    tabular         tables in which agents look actions up
     decisions       Decider: what agents decide at an episode's begin; Bandit: how they learn it
     assignment      AgentPolicies: which policy controls which agents
     present         PresentPolicy: the first replica's agents as they are now, beside the training

@@ -8,7 +8,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from cprl import keys
+from cprl import keys, recurrent_state
 from cprl.policies.decisions import Decider
 from cprl.policies.lanes import LaneActor
 from cprl.system.compat import unchecked_tensordict
@@ -91,10 +91,11 @@ class AgentPolicies(TensorDictModuleBase):
                 "allowed: one actor for each agent"
             )
         if self._state_cells:
-            self._begin_states(agents, observation, dim)
+            size = *observation.shape[: dim + 1], self._state_cells
+            recurrent_state.prepare(agents, size, observation.device)
         if self._one_takes_all:
             (actor,) = self.actors
-            keys.put(agents, "action", self._choose(actor, agents, None, tensordict.batch_size))
+            keys.put(agents, "action", self._choose(actor, agents, (), tensordict.batch_size))
             return tensordict
         chosen: Tensor | None = None
         for indices, actor in zip(self.indices, self.actors, strict=True):
@@ -107,40 +108,30 @@ class AgentPolicies(TensorDictModuleBase):
         agents.set("action", chosen)
         return tensordict
 
-    def _choose(self, actor: nn.Module, agents: TensorDictBase, index: Any, batch_size: torch.Size) -> Tensor:
-        """One actor's actions for the agents at an index, None for all; passes the entries that it reads, and
-        writes the states of a recurrent one."""
-        if isinstance(actor, LaneActor):  # the same as its forward, without a TensorDict
-            seen = [_at(agents, "observation", index)]
-            if actor.state_cells:
-                seen.append(_at(agents, "recurrent_state_before", index)[..., : actor.state_cells])
-            action, *after = actor.choose_with(*seen)
-            for state in after:
-                place = (*(index or ()), ..., slice(actor.state_cells))
-                keys.entry(agents, "recurrent_state")[place] = state
-            return action
+    def _choose(
+        self, actor: nn.Module, agents: TensorDictBase, at: tuple[Any, ...], batch_size: torch.Size
+    ) -> Tensor:
+        """Return one actor's actions for the agents at an index, () for all; write the states of a recurrent
+        one."""
+        cells = getattr(actor, "state_cells", 0)
         names = getattr(actor, "in_keys", ("observation",))
-        view = unchecked_tensordict({name: _at(agents, name, index) for name in names}, batch_size)
-        chosen: Tensor = actor(view).get("action")
-        return chosen
-
-    def _begin_states(self, agents: TensorDictBase, observation: Tensor, dim: int) -> None:
-        """Notes the states that actors read in this turn, zeros where there are none; makes room for those
-        that they write.
-        """
-        size = *observation.shape[: dim + 1], self._state_cells
-        before = agents.get("recurrent_state", None)
-        if before is None:
-            before = torch.zeros(size, device=observation.device)
-        elif tuple(before.shape) != size:
-            raise ValueError(
-                f'("agents", "recurrent_state") is {list(before.shape)}; allowed: {list(size)}, from the '
-                "same policies in the turn before, or none"
-            )
-        keys.put(agents, "recurrent_state_before", before)
-        keys.put(agents, "recurrent_state", torch.zeros_like(before))
+        seen = [_seen(agents, name, at, cells) for name in names]
+        if isinstance(actor, LaneActor):  # the same as its forward, without a TensorDict
+            action, *after = actor.choose_with(*seen)
+        else:
+            chosen = actor(unchecked_tensordict(dict(zip(names, seen, strict=True)), batch_size))
+            action = chosen.get("action")
+            after = [chosen.get(recurrent_state.AFTER)] if cells else []
+        for states in after:
+            recurrent_state.write(agents, at, states)
+        return action
 
 
-def _at(agents: TensorDictBase, name: str, index: Any) -> Tensor:
-    value: Tensor = keys.entry(agents, name)
-    return value if index is None else value[index]
+def _seen(agents: TensorDictBase, name: str, at: tuple[Any, ...], cells: int) -> Tensor:
+    """Return an entry of the agents at an index; of recurrent states, of so many cells, those before the
+    turn."""
+    if name == recurrent_state.AFTER:
+        states: Tensor = recurrent_state.read(agents, at, cells)
+        return states
+    entry: Tensor = keys.entry(agents, name)
+    return entry[at] if at else entry

@@ -7,7 +7,7 @@ by itself: V ballots with 5 choices each are V tables of 5 values, not one of 5*
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -15,15 +15,12 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl.commons.game import Game
-from cprl.policies.rng import EVALUATION, EXHIBITION, EXPLORATION, lane_names, lane_seeds
+from cprl.policies.rng import Purpose, lane_names, lane_seeds
 from cprl.values import Positive, Range, Share, Value
 from cprl.values.arrays import Bool, Float64, Int64
 
 UNTRIED = -np.inf
 """The value of a choice that an agent has never made."""
-
-_OF_DECISIONS: Final = 16
-"""Added to the purpose of a lane's random numbers, so that decisions have some of their own."""
 
 
 def ballot_sizes(game: Game) -> tuple[int, ...]:
@@ -200,11 +197,17 @@ class BanditDecider(Decider):
         seed: int,
         first_replica: int = 0,
     ) -> None:
-        agents, self._seed = len(bandits), seed
+        agents = len(bandits)
+        self._seed = seed
         self._numbers_of_replicas = range(first_replica, first_replica + replicas)
         super().__init__(
             sizes,
-            seeds=_seeds(seed, self._numbers_of_replicas, agents, EXPLORATION),
+            seeds=lane_seeds(
+                seed,
+                replicas=self._numbers_of_replicas,
+                agents=range(agents),
+                purpose=Purpose.DECISIONS,
+            ),
             agents=agents,
             worlds=worlds,
             values=_table(sizes, stored, replicas=replicas, agents=agents),
@@ -241,16 +244,17 @@ class BanditDecider(Decider):
 
     def evaluation(self, worlds: int) -> Decider:
         """The same agents without exploration, for `worlds` worlds of each replica."""
-        return self._without_exploration(EVALUATION, self.replicas, worlds)
+        return self._without_exploration(Purpose.EVALUATED_DECISIONS, self.replicas, worlds)
 
     def first_replica(self) -> Decider:
         """The same agents in one world of the first replica, without exploration at first."""
-        return self._without_exploration(EXHIBITION, 1, 1)
+        return self._without_exploration(Purpose.EXHIBITED_DECISIONS, 1, 1)
 
-    def _without_exploration(self, purpose: int, replicas: int, worlds: int) -> Decider:
+    def _without_exploration(self, purpose: Purpose, replicas: int, worlds: int) -> Decider:
+        numbers = self._numbers_of_replicas[:replicas]
         return Decider(
             self.sizes,
-            seeds=_seeds(self._seed, self._numbers_of_replicas[:replicas], self.agents, purpose),
+            seeds=lane_seeds(self._seed, replicas=numbers, agents=range(self.agents), purpose=purpose),
             agents=self.agents,
             worlds=worlds,
             values=self.values[:replicas],
@@ -276,35 +280,33 @@ class BanditDecider(Decider):
         self._explore_as_due()
 
 
-def decider_by_chance(game: Game, seeds: Sequence[Sequence[int]], *, worlds: int = 1) -> Decider | None:
-    """Agents of a game who choose by chance, all choices equally likely; None where nothing is decided."""
-    sizes = ballot_sizes(game)
-    return Decider(sizes, seeds=seeds, agents=game.agents, worlds=worlds) if sizes else None
-
-
 def stored_decisions(
-    game: Game, stored: Mapping[int, Sequence[Tensor]], *, replicas: Sequence[int], worlds: int, seed: int
+    game: Game,
+    stored: Mapping[int, Sequence[Tensor]],
+    *,
+    replicas: Sequence[int],
+    worlds: int,
+    seed: int,
+    purpose: Purpose = Purpose.EVALUATED_DECISIONS,
 ) -> Decider | None:
-    """What agents decide by values of earlier runs, without exploration; None in a game that asks nothing.
+    """Return what agents decide by values of earlier runs, without exploration; None in a game that asks
+    nothing.
 
     Args:
         stored: as of `BanditDecider`; agents that are not here decide by chance.
+        purpose: what their random numbers are for.
     """
     sizes = ballot_sizes(game)
     if not sizes:
         return None
     return Decider(
         sizes,
-        seeds=_seeds(seed, replicas, game.agents, EVALUATION),
+        seeds=lane_seeds(seed, replicas=replicas, agents=range(game.agents), purpose=purpose),
         agents=game.agents,
         worlds=worlds,
         values=_table(sizes, stored, replicas=len(replicas), agents=game.agents),
         by_chance=[agent not in stored for agent in range(game.agents)],
     )
-
-
-def _seeds(seed: int, replicas: Sequence[int], agents: int, purpose: int) -> list[tuple[int, int, int, int]]:
-    return lane_seeds(seed, replicas=replicas, agents=range(agents), purpose=_OF_DECISIONS + purpose)
 
 
 def _table(

@@ -9,8 +9,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from cprl import recurrent_state
 from cprl.commons.spaces import Spaces
-from cprl.policies.rng import LaneRng
+from cprl.policies.rng import LaneRng, Purpose, lane_seeds
 from cprl.system.compiling import Compiled
 
 
@@ -72,12 +73,11 @@ class LaneActor(ActorOfLanes):
         super().__init__(seeds, agents, worlds, 2)
         self.values, self.stochastic, self.actions = values, stochastic, actions
         self.state_cells = 0 if values is None else state_cells
-        states = ("recurrent_state",) if self.state_cells else ()
+        states = (recurrent_state.AFTER,) if self.state_cells else ()
         self.in_keys, self.out_keys = ("observation", *states), ("action", *states)
         # A tensor, because compiled code treats other numbers as constants.
         self._chance = 0.0 if stochastic else 1.0
         self._epsilon = torch.tensor(self._chance, dtype=torch.float64)
-        self._seeds = seeds
         # Of named arguments, since compiled code that is shared asks for those of a call by their names.
         explored = LaneActor._explored_with if self.state_cells else LaneActor._explored
         self._explore = Compiled(explored, what="agents act", enabled=compile)
@@ -96,29 +96,6 @@ class LaneActor(ActorOfLanes):
         if chance != self._chance and not self.stochastic:
             self._epsilon.fill_(chance)
             object.__setattr__(self, "_chance", float(chance))
-
-    def of_first_replica(self) -> "LaneActor":
-        """Return an actor of the first replica's agents alone, with the same weights and exploration, and
-        their own random numbers from the start."""
-        values, replicas, agents = self.values, self.replicas, self.agents
-
-        def of_first(*seen: Tensor) -> Any:
-            """What the first of all replicas chooses by, if all see the same."""
-            assert values is not None
-            given = values(*(each.repeat(replicas, *[1] * (each.ndim - 1)) for each in seen))
-            return tuple(each[:agents] for each in given) if isinstance(given, tuple) else given[:agents]
-
-        actor = LaneActor(
-            None if values is None else of_first,
-            self.actions,
-            seeds=self._seeds[:agents],
-            agents=agents,
-            worlds=self.worlds,
-            stochastic=self.stochastic,
-            state_cells=self.state_cells,
-        )
-        actor.epsilon = self.epsilon
-        return actor
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         chosen = self.choose_with(*(tensordict.get(name) for name in self.in_keys))
@@ -139,13 +116,13 @@ class LaneActor(ActorOfLanes):
         """
         device = seen[0].device
         if self.values is None:
-            return [self._by_replica(self._random(self.rng.next().to(device)))]
+            return [self._by_replica(self._random(self._numbers(device)))]
         if exploration_type() not in (ExplorationType.RANDOM, None):
             values, *after = self._outputs(*seen)
             return [self._by_replica(values.argmax(-1)), *after]
         form = tuple((entry.shape, entry.dtype) for entry in seen)
-        numbers = self.rng.next().to(device), self._epsilon.to(device)
-        chosen: list[Tensor] = self._explore(form, self, *numbers, *seen)
+        numbers = self._numbers(device)
+        chosen: list[Tensor] = self._explore(form, self, numbers, self._epsilon.to(device), *seen)
         return chosen
 
     def _explored(self, numbers: Tensor, epsilon: Tensor, observation: Tensor) -> list[Tensor]:
@@ -160,11 +137,11 @@ class LaneActor(ActorOfLanes):
         if self.stochastic:
             chosen = self._sampled(values, numbers)
         else:
-            explores = numbers.view(-1, self.worlds, 2)[..., 0] < epsilon
+            explores = numbers[..., 0] < epsilon
             chosen = torch.where(explores, self._random(numbers), values.argmax(-1))
         return [self._by_replica(chosen), *after]
 
-    def preferences(self, *seen: Tensor) -> Tensor | None:
+    def action_values(self, *seen: Tensor) -> Tensor | None:
         """Return what it chooses by: the probabilities of a stochastic policy, else the action values; float
         [R x k, S, A], None for agents that act at random.
 
@@ -186,12 +163,15 @@ class LaneActor(ActorOfLanes):
         """Actions sampled from each lane's policy, int64 [L, k], by inverting the cumulative distribution at
         a uniform number in 0..1."""
         shares = logits.double().softmax(-1).cumsum(-1)
-        drawn = numbers.view(-1, self.worlds, 2)[..., 1:]
-        return (drawn >= shares[..., :-1]).sum(-1)
+        return (numbers[..., 1:] >= shares[..., :-1]).sum(-1)
+
+    def _numbers(self, device: torch.device) -> Tensor:
+        """The random numbers of a turn, float64 [L, k, 2]: whether a lane explores, and what it takes."""
+        return self.rng.next().to(device).view(-1, self.worlds, 2)
 
     def _random(self, numbers: Tensor) -> Tensor:
         """Random actions of each lane, int64 [L, k]."""
-        return (numbers.view(-1, self.worlds, 2)[..., 1] * self.actions).long()
+        return (numbers[..., 1] * self.actions).long()
 
     def _by_replica(self, values: Tensor) -> Tensor:
         """[L, k, ...] as [R x k, S, ...]."""
@@ -207,8 +187,8 @@ class LaneActor(ActorOfLanes):
 def random_agents(
     spaces: Spaces, agents: tuple[int, ...], *, replicas: int, seed: int, worlds: int = 1
 ) -> dict[int | tuple[int, ...], nn.Module]:
-    """Uniformly random actors of some agents of every replica, by the indices of the agents."""
-    seeds = [(seed, replica, agent) for replica in range(replicas) for agent in agents]
+    """Return a uniformly random actor of some agents of every replica, by the indices of the agents."""
+    seeds = lane_seeds(seed, replicas=range(replicas), agents=agents, purpose=Purpose.RANDOM_PLAY)
     return {agents: LaneActor(None, spaces.actions, seeds=seeds, agents=len(agents), worlds=worlds)}
 
 

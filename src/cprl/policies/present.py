@@ -12,23 +12,22 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import Decider
-from cprl.policies.lanes import LaneActor
 from cprl.system.compat import unchecked_tensordict
 
 
 class FirstReplica(TensorDictModuleBase):
-    """What an actor of R replicas chooses in the first of them.
+    """The agents of the first of an actor's R replicas alone.
 
-    Reads entries [1, S, ...], writes "action", int64 [1, S]; the other replicas see the same, and what they
-    choose is not used.
+    Reads and writes the entries of the actor, [1, S, ...] instead of [R, S, ...]: all replicas see the same,
+    and what the others choose is not used.
     """
-
-    out_keys = ("action",)
 
     def __init__(self, actor: nn.Module, replicas: int) -> None:
         super().__init__()
         self.actor, self.replicas = actor, replicas
+        self.state_cells: int = getattr(actor, "state_cells", 0)
         self.in_keys = tuple(getattr(actor, "in_keys", ("observation",)))
+        self.out_keys = tuple(getattr(actor, "out_keys", ("action",)))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         seen = {}
@@ -36,7 +35,9 @@ class FirstReplica(TensorDictModuleBase):
             value = tensordict.get(name)
             seen[name] = value.expand(self.replicas, *value.shape[1:]).contiguous()
         chosen = self.actor(unchecked_tensordict(seen, torch.Size([self.replicas])))
-        return tensordict.set("action", chosen.get("action")[:1])
+        for name in self.out_keys:
+            tensordict.set(name, chosen.get(name)[:1])
+        return tensordict
 
 
 class PresentPolicy:
@@ -66,18 +67,12 @@ class PresentPolicy:
     ) -> None:
         self._decisions = decisions
         present_decisions = None if decisions is None else decisions[0]
-        first: dict[AgentIndices, nn.Module] = {}
-        pairs: list[tuple[Any, Any]] = []
-        for agents, (present, training) in learned.items():
-            if isinstance(present, LaneActor):
-                present = present.of_first_replica()
-            first[agents] = present if isinstance(present, LaneActor) else FirstReplica(present, replicas)
-            pairs.append((present, training))
+        first = {agents: FirstReplica(present, replicas) for agents, (present, _) in learned.items()}
         self._policy = AgentPolicies({**first, **others}, decisions=present_decisions)
         self._pairs = [
-            pair
-            for pair in pairs
-            if hasattr(pair[0], "epsilon") and not getattr(pair[0], "stochastic", False)
+            (present, training)
+            for present, training in learned.values()
+            if hasattr(present, "epsilon") and not getattr(present, "stochastic", False)
         ]
         self._evaluation = [present.epsilon for present, _ in self._pairs]
         self._devices = [device] if device is not None and device.type == "cuda" else []

@@ -1,6 +1,7 @@
 """Random numbers of lanes: those of a lane depend on its own seed alone, not on the other lanes."""
 
 from collections.abc import Mapping, Sequence
+from enum import Enum, unique
 from typing import Any, Final
 
 import numpy as np
@@ -12,15 +13,48 @@ DRAWN_AHEAD: Final = 1024
 
 _LARGEST_SEED: Final = 2**63 - 1
 
-WEIGHTS, TARGET_WEIGHTS, EXPLORATION, SAMPLING, EVALUATION, EXHIBITION, NOISE = range(7)
-"""The purposes of a lane's random numbers; each has its own seed."""
+
+@unique
+class Purpose(Enum):
+    """What an agent's random numbers are for; its value is the end of their seed, after the seed of the run,
+    the replica and the agent. So no purpose changes the numbers of another, whatever is added here. numpy
+    takes a seed that ends with zeros for the one without them: () and (0,) are one seed, which is harmless
+    while weights alone have (0,), since torch generates these."""
+
+    RANDOM_PLAY = ()
+    """Actions and decisions of the random play beside a training."""
+    WEIGHTS = (0,)
+    """Weights of new networks."""
+    TARGET_WEIGHTS = (1,)
+    """Weights of targets that start as networks of their own."""
+    EXPLORATION = (2,)
+    """Actions in the training, also of agents that do not learn."""
+    SAMPLING = (3,)
+    """Which stored turns an update learns from."""
+    EVALUATION = (4,)
+    """Actions in fresh worlds: in evaluations, and of stored agents."""
+    EXHIBITION = (5,)
+    """Actions, beside a training, of agents that do not learn in what is shown of it."""
+    NOISE = (6,)
+    """Uniform numbers by which a loss samples."""
+    TEAM_WEIGHTS = (0, 1)
+    """Weights of the parts that a team adds to its members' networks; of a team its first member's."""
+    TEAM_TARGET_WEIGHTS = (1, 1)
+    """Likewise of targets."""
+    DECISIONS = (18,)
+    """Decisions in the training; behind it stands how often the agent has decided in a world, as behind the
+    next two."""
+    EVALUATED_DECISIONS = (20,)
+    """Decisions in fresh worlds."""
+    EXHIBITED_DECISIONS = (21,)
+    """Decisions in what is shown of a training."""
 
 
 def lane_seeds(
-    seed: int, *, replicas: Sequence[int], agents: Sequence[int], purpose: int
-) -> list[tuple[int, int, int, int]]:
-    """The seed of each lane, replica by replica: (seed of the run, replica, agent, purpose)."""
-    return [(seed, replica, agent, purpose) for replica in replicas for agent in agents]
+    seed: int, *, replicas: Sequence[int], agents: Sequence[int], purpose: Purpose
+) -> list[tuple[int, ...]]:
+    """Return the seed of each lane, replica by replica: (seed of the run, replica, agent, *purpose)."""
+    return [(seed, replica, agent, *purpose.value) for replica in replicas for agent in agents]
 
 
 def lane_name(replica: int, agent: int) -> str:
@@ -41,7 +75,7 @@ class LaneRng:
     """Uniform numbers in 0..1, `count` for each lane and step.
 
     Args:
-        seeds: the seed of each lane, e.g. (seed, replica, agent, purpose).
+        seeds: the seed of each lane, e.g. of `lane_seeds`.
         count: numbers per lane and step.
         ahead: steps whose numbers are generated at once; it changes no number.
     """

@@ -1,4 +1,4 @@
-"""Tabular policies: tables of action values, and the actor and network that read them."""
+"""Tabular policies: tables of action values, which actors read, and the network that one is stored as."""
 
 from collections.abc import Mapping, Sequence
 from math import prod
@@ -6,12 +6,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from numpy.typing import NDArray
 from torch import Tensor, nn
-from torchrl.envs.utils import ExplorationType, exploration_type
 
-from cprl.commons.spaces import Spaces
-from cprl.policies.lanes import ActorOfLanes
 from cprl.values.arrays import Float64, Int64, UInt8
 
 NEVER_MET = 0
@@ -43,6 +40,16 @@ class QTables:
         for n in np.flatnonzero(rows == NEVER_MET).tolist():  # of two that are the same the first adds it
             rows[n] = self.rows[lanes[n]].get(states[n]) or self._add(states[n], lanes[n])
         return rows
+
+    def outputs(self, observation: Tensor) -> Tensor:
+        """Return the action values of lanes, float64 [L, k, A], for observations [L, k, C, X, Y]; those of
+        states never met are 0."""
+        lanes, worlds = observation.shape[:2]
+        of_states = [lane for lane in range(lanes) for _ in range(worlds)]
+        seen = observation.flatten(0, 1).numpy(force=True)
+        rows = self.find(states_of(seen), of_states)
+        values = torch.from_numpy(self.values[rows].reshape(lanes, worlds, -1))
+        return values.to(observation.device)
 
     def _add(self, state: bytes, lane: int) -> int:
         rows = self.rows[lane]
@@ -92,17 +99,9 @@ class QTables:
         self.size = len(self.values)
 
 
-def states_of(observation: Tensor, agents: Sequence[int] | None = None) -> list[bytes]:
-    """Return the B x S states of agents, world by world: the bytes of what each observes.
-
-    Args:
-        observation: [B, N, ...].
-        agents: the S agents; None for all N.
-    """
-    array = observation.numpy(force=True)
-    if agents is not None:
-        array = array[:, list(agents)]
-    flat = np.ascontiguousarray(array).reshape(array.shape[0] * array.shape[1], -1)
+def states_of(observations: NDArray[Any]) -> list[bytes]:
+    """Return the state of each of n observations, [n, ...]: its bytes."""
+    flat = np.ascontiguousarray(observations).reshape(len(observations), -1)
     return [state.tobytes() for state in flat]
 
 
@@ -136,43 +135,9 @@ class TableNetwork(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         """Maps observations, [..., C, X, Y], to values, float64 [..., A]; 0 for states never met."""
-        seen = observation.flatten(-self.observation_dims)
-        flat = np.ascontiguousarray(seen.reshape(-1, seen.shape[-1]).numpy(force=True))
-        rows = torch.tensor([self._rows.get(state.tobytes(), -1) for state in flat])
+        leading = observation.shape[: -self.observation_dims]
+        seen = observation.reshape(-1, *observation.shape[len(leading) :]).numpy(force=True)
+        rows = torch.tensor([self._rows.get(state, -1) for state in states_of(seen)])
         values, known = self.values.new_zeros((len(rows), self.values.shape[1])), rows >= 0
         values[known] = self.values[rows[known]]
-        return values.reshape(*seen.shape[:-1], -1)
-
-
-class TabularActor(ActorOfLanes):
-    """Acts epsilon-greedily on the tables of its lanes.
-
-    It explores only under `ExplorationType.RANDOM`, with separate random numbers for each lane. Of several
-    actions with the highest value it takes the first, so in a state never met it takes action 0.
-
-    Args:
-        tables: the tables of the lanes, with lane = replica x S + agent.
-
-    Reads "observation", [replicas x k, S, C, X, Y]; writes "action", int64 [replicas x k, S].
-    """
-
-    stochastic = False
-
-    def __init__(
-        self, tables: QTables, spaces: Spaces, *, seeds: Sequence[Sequence[int]], agents: int, worlds: int = 1
-    ) -> None:
-        super().__init__(seeds, agents, worlds, 2)
-        self.tables, self.actions, self.epsilon = tables, spaces.actions, 1.0
-        lanes = np.arange(self.rng.lanes).reshape(self.replicas, 1, agents)
-        self._lanes = np.broadcast_to(lanes, (self.replicas, worlds, agents)).reshape(-1).tolist()
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        observation = tensordict.get("observation")
-        rows = self.tables.find(states_of(observation), self._lanes)
-        chosen = self.tables.values[rows].argmax(1)
-        if exploration_type() in (ExplorationType.RANDOM, None):
-            drawn = self.rng.next().numpy().reshape(self.replicas, self.agents, self.worlds, 2)
-            explores, which = drawn.transpose(3, 0, 2, 1).reshape(2, -1)
-            chosen = np.where(explores < self.epsilon, (which * self.actions).astype(np.int64), chosen)
-        action = torch.from_numpy(chosen.reshape(-1, self.agents)).to(observation.device)
-        return tensordict.set("action", action)
+        return values.reshape(*leading, -1)

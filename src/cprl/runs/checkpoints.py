@@ -5,7 +5,6 @@ import os
 import re
 import signal
 import time
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final, NoReturn, Self
 
@@ -15,22 +14,17 @@ from cprl.runs.files import (
     TRAINING_STATE_FORMAT,
     RunLock,
     checksum,
-    refuse_missing,
     refuse_newer,
     remove_partial,
-    rename_listed,
     verify,
     write_atomically,
 )
-from cprl.runs.length import Length
-from cprl.runs.recipe import resume_command, write_length
+from cprl.runs.recipe import resume_command
 from cprl.system.output import RESUMES, say
 from cprl.system.process import at_signals
 from cprl.system.times import CLOCK
 
 FOLDER: Final = "checkpoints"
-REPORT: Final = "report.json"
-"""Written when everything of a run is finished."""
 EVERY_S: Final = 300.0
 MOST_LOST_S: Final = 60.0
 """Seconds of training, compiling apart, that a stop may lose: where a step would wait for a compiler, or
@@ -236,6 +230,11 @@ def is_ending(path: Path) -> bool:
     return path.name.startswith("ending")
 
 
+def endings_of(run: Path) -> list[Path]:
+    """Return the checkpoints of a run from which a longer training can go on, oldest first."""
+    return list(filter(is_ending, checkpoints_in(run / FOLDER)))
+
+
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """Read the state in a checkpoint; runs no code of the file."""
     if not _NAME.fullmatch(path.name):
@@ -261,67 +260,3 @@ def read_tensors(path: Path, refusal: str) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ValueError(f"{path} {refusal}, but a {type(content).__name__}")
     return content
-
-
-KEEPS_NO_STATE: Final = (
-    "it keeps no state of its training to extend it from; a run with --keep-checkpoint does"
-)
-
-
-def refuse_to_extend(run: Path, episodes: int | None, callbacks: Iterable[Any]) -> None:
-    """Check that a longer run would equal one that had been begun as such.
-
-    Args:
-        episodes: how many it has so far; None of one that trains so many steps.
-        callbacks: those of the training; one with `on_start` sees the number of episodes, and may depend on
-            it unless it has a true `is_extendable`.
-    """
-    refuse_missing(run)
-    for callback in callbacks:
-        if depends_on_episodes(callback):
-            raise ValueError(
-                f"{run} has the callback {type(callback).__name__}, whose on_start sees the number of "
-                "episodes, so that a longer training may differ from the first episode on; if it does not: "
-                "is_extendable = True in its class"
-            )
-    checkpoints = checkpoints_in(run / FOLDER)
-    endings = [path for path in checkpoints if is_ending(path)]
-    if endings:
-        read_checkpoint(endings[-1])
-    elif (run / REPORT).exists() or (run / FOLDER / "final.pt").exists():
-        raise ValueError(f"{run} is finished; {KEEPS_NO_STATE}")
-    elif episodes and checkpoints and max(read_checkpoint(checkpoints[-1])["played"]) >= episodes:
-        raise ValueError(
-            f"{run} was stopped while its last replicas played their last episodes, and keeps no state from "
-            "before; finish it with as many episodes as it has"
-        )
-
-
-def depends_on_episodes(callback: Any) -> bool:
-    """Whether a callback, or a class of callbacks, may depend on the number of episodes of a training."""
-    return hasattr(callback, "on_start") and not getattr(callback, "is_extendable", False)
-
-
-def extend(run: Path, before: Length, length: Length) -> None:
-    """Make a run a longer one, to be resumed; results so far are kept under a name with the number of their
-    episodes, or steps: `checkpoints/final-4800.pt`, `evaluation-4800/`, `report-4800.json`.
-
-    It can be repeated if it was interrupted. The recipe changes last.
-
-    Args:
-        run: its directory, which `refuse_to_extend` has checked.
-        before: how long it is so far.
-        length: how long it is to be.
-    """
-    weights = [f"{FOLDER}/{name}.pt" for name in ("final", "transforms", "decisions")]
-    for name in (REPORT, *weights, "evaluation"):
-        path = run / name
-        if path.exists():
-            renamed = path.with_stem(f"{path.stem}-{before.number}")
-            rename_listed(run, name, renamed.relative_to(run).as_posix())
-    checkpoints = checkpoints_in(run / FOLDER)
-    last = max((steps_of(path) for path in checkpoints if is_ending(path)), default=None)
-    for path in checkpoints:
-        if last is not None and steps_of(path) > last:
-            path.unlink()
-    write_length(run, length)

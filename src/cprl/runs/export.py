@@ -11,9 +11,17 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from cprl.runs.checkpoints import FOLDER, REPORT
+from cprl.runs.checkpoints import FOLDER
 from cprl.runs.episodes import FILE_NAME, read_episodes, read_table, write_small
-from cprl.runs.files import LOCK_FILE, refuse_links, refuse_missing, remove_listed, verify, write_listed
+from cprl.runs.files import (
+    LOCK_FILE,
+    REPORT,
+    refuse_links,
+    refuse_missing,
+    remove_listed,
+    verify,
+    write_listed,
+)
 from cprl.runs.length import without_length
 from cprl.runs.recipe import RECIPE_FILE, read_recipe, with_runs_moved
 from cprl.runs.weights import DECISIONS, TRANSFORMS

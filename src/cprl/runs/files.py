@@ -32,11 +32,13 @@ except ImportError:  # Windows has no flock; runs are not locked there
     fcntl = None  # type: ignore[assignment]
 
 RECIPE_FILE: Final = "recipe.json"
+REPORT: Final = "report.json"
+"""Written when everything of a run is finished."""
 RECIPE_FORMAT: Final = 2
 """Of `recipe.json`, and of the journal and `report.json` beside it."""
 MANIFEST_FORMAT: Final = 1
 """Of `manifest.json`, and of what it lists: weights, tables, transforms, decisions."""
-TRAINING_STATE_FORMAT: Final = 7
+TRAINING_STATE_FORMAT: Final = 8
 """Of checkpoints."""
 STUDY_FORMAT: Final = 1
 """Of `study.json`."""

@@ -50,9 +50,13 @@ class Length:
         lasts as long as the clock lets it, and 1 in a game without a clock."""
         return ceil(self.number / (self.clock or self.number)) if self.is_of_steps else self.number
 
+    def reached(self, *, episodes: float, steps: float) -> float:
+        """Return how far a replica with so many episodes and steps is, in its unit; at most its number."""
+        return min(self.number, steps if self.is_of_steps else episodes)
+
     def is_over(self, *, episodes: int, steps: int) -> bool:
         """Return whether a replica with so many episodes and steps has reached it."""
-        return (steps if self.is_of_steps else episodes) >= self.number
+        return self.reached(episodes=episodes, steps=steps) == self.number
 
     def is_shorter_than(self, other: "Length") -> bool:
         """Return whether it can be extended to another length, of the same unit."""

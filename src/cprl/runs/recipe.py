@@ -22,7 +22,18 @@ from cprl.runs.length import Length, without_length
 from cprl.system.output import ERR, console, printed
 from cprl.system.process import cpu
 from cprl.system.shipped import PROGRAM, command_of, cprl_here
-from cprl.values import OWN_METRICS, custom_targets, described, differences, refusal, shown, source_of
+from cprl.values import (
+    OWN_METRICS,
+    custom_targets,
+    described,
+    differences,
+    live_targets,
+    refusal,
+    refuse_live,
+    shown,
+    source_of,
+    without_departed,
+)
 
 _RESUMES: Final = ("--resume", "--no-resume", "--take-over", "--no-take-over")
 _DIRECTORIES: Final = ("--out", "--runs")
@@ -124,7 +135,8 @@ def refuse_another_run(
     """
     if out is None:
         raise ValueError("resume requires the directory of the run as out")
-    before, now = read_recipe(out)["experiment"], to_recipe(out)["experiment"]
+    before, now = recipe_config(read_recipe(out)), to_recipe(out)["experiment"]
+    refuse_live(before, of_others=True, where=str(out))
     free = {**without_length({}), "on_nan": ""}
     differ = differences({**before, **free}, {**now, **free}, "experiment", kind)
     if differ:
@@ -193,7 +205,16 @@ def recipe_config(recipe: Mapping[str, Any], *, where: object = "the recipe") ->
             f"{where} is not the recipe of a run: it has the format {shown(recipe.get('format'))}; allowed: "
             f'{RECIPE_FORMAT}, with a table "experiment"'
         )
-    return dict(recipe["experiment"])
+    return stored_experiment(recipe["experiment"])
+
+
+BEFORE_AUTO: Final = {"engine": "compiled"}
+"""What an experiment means that was stored before it said how updates are computed."""
+
+
+def stored_experiment(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the table of an experiment, as any version stored it, as `Experiment.to_config` gives it now."""
+    return {**BEFORE_AUTO, **without_departed(table)}
 
 
 STORED_RUN: Final = re.compile(r"agents\.(\*|\d+)(\.start_from)?\.run")
@@ -232,10 +253,9 @@ def runs_in(paths: Iterable[Path | str]) -> list[Path]:
     return runs
 
 
-def write_length(run: Path, length: Length) -> None:
-    """Write into a run's recipe to which length it is extended, and by which versions."""
+def write_length(run: Path, before: Length, length: Length) -> None:
+    """Write into a run's recipe from which length to which it is extended, and by which versions."""
     recipe = read_recipe(run)
-    before = Length.of(recipe["experiment"])
     earlier = {before.unit: before.number, **_circumstances(recipe)}
     recipe["experiment"][length.unit] = length.number
     recipe |= {**_code_text(recipe), "extended": [*recipe.get("extended", []), earlier]}
@@ -315,7 +335,8 @@ def _code_text(recipe: Mapping[str, Any]) -> dict[str, dict[str, str]]:
 
 def _sources(recipe: Mapping[str, Any]) -> dict[str, str]:
     """The text of each module that a `Custom` of a recipe names, without packages whose versions it has."""
-    modules = {target.partition(":")[0] for target in custom_targets(recipe.get("experiment"))}
+    table = recipe.get("experiment")
+    modules = {target.partition(":")[0] for target in (*custom_targets(table), *live_targets(table))}
     texts = {name: source_of(name) for name in sorted(modules) if name.partition(".")[0] not in PACKAGES}
     return {module: text for module, text in texts.items() if text is not None}
 
@@ -335,14 +356,20 @@ def resume_command(run: Path, command: Sequence[str] | None = None) -> str:
 
     Args:
         command: the command line that started or resumed it, script first; by default that of `started_by`.
-            A run that was started from Python without one is resumed by `cprl run`.
+            A run that was started from Python without one is resumed by `cprl run`; one with live code only
+            by the process that has it.
     """
     command = command or _COMMAND.get()
     directory = f"./{run}" if str(run).startswith("-") else str(run)  # not to be read as a flag
+    path = run / RECIPE_FILE
+    table = read_json(path).get("experiment") if path.exists() else None
+    if live := live_targets(table):
+        has = ", ".join(live)
+        return (
+            f"cprl.run(..., {str(run)!r}, resume=True) in this process; no other can, as it alone has {has}"
+        )
     if command is None:
-        path = run / RECIPE_FILE
-        targets = custom_targets(read_json(path).get("experiment")) if path.exists() else []
-        allow = [word for target in targets for word in ("--allow", target)]
+        allow = [word for target in custom_targets(table) for word in ("--allow", target)]
         return printed([*cprl_here(), "run", directory, "--resume", *allow])
     words = without_options(command, _DIRECTORIES)
     words = command_of([word for word in words if word.replace("_", "-") not in _RESUMES])

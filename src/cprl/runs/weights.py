@@ -1,17 +1,17 @@
 """Saves and loads what agents have learned: the weights of their networks, and what goes with them."""
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import torch
 from torch import nn
 
-from cprl.runs.checkpoints import FOLDER, REPORT, checkpoints_in, read_checkpoint, read_tensors
+from cprl.runs.checkpoints import FOLDER, checkpoints_in, read_checkpoint, read_tensors
 from cprl.runs.episodes import read_episodes
-from cprl.runs.files import LOCK_FILE, checksum, holder_of, refuse_missing, write_listed
-from cprl.runs.recipe import resume_command
+from cprl.runs.files import LOCK_FILE, REPORT, checksum, holder_of, refuse_missing, write_listed
+from cprl.runs.recipe import read_recipe, resume_command
 from cprl.values import refusal
 
 TRANSFORMS: Final = "transforms.pt"
@@ -115,11 +115,12 @@ def _from_checkpoint(run: Path) -> StoredWeights:
         except (ValueError, KeyError) as error:
             reasons.append(str(error))
             continue
+        decisions: Mapping[str, Any] = next(iter(state.get("decisions", ())), {})
         return StoredWeights(
             checkpoint,
             {lane: weights for by_lane in networks for lane, weights in by_lane.items()},
             state.get("env", {}).get("transforms", {}),
-            state.get("decisions", {}).get("_extra_state", {}).get("learned", {}),
+            decisions.get("_extra_state", {}).get("learned", {}),
         )
     raise ValueError("; ".join(reasons))
 
@@ -169,3 +170,11 @@ def weights_of(recipe: Mapping[str, Any], run: Path, partner: str) -> str | None
         f"{partner} no longer has the weights that play in {run} (a file with the checksum {wanted} "
         f"in its {FOLDER}/); allowed: the run as it was, extended, or its export"
     )
+
+
+def weights_that_played(run: Path, partners: Sequence[str]) -> dict[str, str]:
+    """Return the names of the weights of other runs that played when a run began, by the other run; those
+    that it does not name are left out."""
+    recipe = read_recipe(run) if partners else {}
+    names = {partner: weights_of(recipe, run, partner) for partner in partners}
+    return {partner: name for partner, name in names.items() if name is not None}

@@ -34,6 +34,7 @@ from cprl.values import (
     custom_targets,
     fits,
     from_config,
+    handed_over,
     hints_of,
     meant,
     refusal,
@@ -123,6 +124,7 @@ def normalised(path: object) -> str:
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
+    value = handed_over(value)
     return tuple(map(_plain, value)) if isinstance(value, list | tuple | range) else value
 
 
@@ -204,7 +206,7 @@ def checked_factors(factors: Mapping[str, Any]) -> dict[str, Factor]:
     for name, factor in factors.items():
         if isinstance(factor, Mapping) and factor:
             normal[name] = {
-                level: {normalised(path): value for path, value in changes.items()}
+                level: {normalised(path): _plain(value) for path, value in changes.items()}
                 for level, changes in factor.items()
             }
             continue
@@ -298,7 +300,7 @@ def factor_from_config(name: str, table: Mapping[str, Any]) -> Factor:
 
 
 def changes_to_config(changes: Mapping[str, Any]) -> dict[str, Any]:
-    return {path: to_config(stored_game(value), path) for path, value in changes.items()}
+    return {path: to_config(stored_game(_plain(value)), path) for path, value in changes.items()}
 
 
 def changes_from_config(table: Mapping[str, Any]) -> dict[str, Any]:

@@ -22,11 +22,11 @@ from cprl.studies.tables.table import StudyTable
 from cprl.system.defaults import SEED, STUDY_TABLE, Fresh
 from cprl.system.output import legible
 from cprl.system.working import working
+from cprl.terminal.course import course_of
 from cprl.terminal.figures import training_curve
 from cprl.terminal.summary import compared
 from cprl.terminal.tables import markdown
-from cprl.training.agents import LoadedRun, load
-from cprl.training.course import course_of
+from cprl.training.stored import LoadedRun, load
 from cprl.values.arrays import Float64
 
 _LARGEST_SVG_BYTES: Final = 300_000

@@ -9,7 +9,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Final
 
+from cprl.runs.checkpoints import endings_of
 from cprl.runs.files import RunLock, digest_of, holder_of, remove_partial, write_json
+from cprl.runs.states import state_of
 from cprl.studies.executors import Executor, InProcess
 from cprl.studies.progress import Progress
 from cprl.studies.status import PATIENCE_S, Status, is_silent
@@ -149,6 +151,13 @@ def _run(tasks: Sequence[Task], executor: Executor, title: str, *, progress: boo
         places = f"{moved[0]}{f' and {len(moved) - 1} more' if moved[1:] else ''}"
         anew = f"{len(moved)} of {len(tasks)} trials are run anew, as the user's own code has changed"
         say(f"{anew}; what was there is kept: {places}")
+    passed_over = _of_another_engine(tasks)
+    if passed_over and progress:
+        anew = f"{len(passed_over)} of {len(tasks)} trials begin with their first episode"
+        say(
+            f'{anew}: engine="auto" stands for another engine now that they are longer than the runs that '
+            f"are kept, such as {passed_over[0]}; with the engine of these in the experiment they go on"
+        )
     for task in tasks:
         task.status.tidy_up()
     trials = [task.trial for task in tasks]
@@ -163,12 +172,22 @@ def _run(tasks: Sequence[Task], executor: Executor, title: str, *, progress: boo
                 failed += [outcome] if outcome.state == "failed" else []
         except BaseException as error:
             states = Counter(trial.state(runs) for trial in trials)
+            begun = states["begun"] + states["stopped"]
             error.add_note(
-                f"{states['finished']} of {len(trials)} trials are finished and {states['unfinished']} "
-                f"begun; all of it is kept in {runs}, and the same study continues from there"
+                f"{states['finished']} of {len(trials)} trials are finished and {begun} begun; all of it is "
+                f"kept in {runs}, and the same study continues from there"
             )
             raise
     return tuple(failed)
+
+
+def _of_another_engine(tasks: Sequence[Task]) -> list[Path]:
+    """Return the shorter runs that trials do not continue because of their engine, if any run can be
+    continued."""
+    finished = (run for run in tasks[0].runs.glob("*") if state_of(run) == "finished")
+    if not any(map(endings_of, finished)):
+        return []
+    return [run for task in tasks if (run := task.of_another_engine()) is not None]
 
 
 def _outcomes(tasks: Sequence[Task], executor: Executor) -> Generator[Outcome, None, None]:

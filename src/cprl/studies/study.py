@@ -8,9 +8,10 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeAlias
 
+from cprl.experiment.engine import engine_of
 from cprl.experiment.experiment import MOST_SEED, Experiment
 from cprl.runs.files import STUDY_FORMAT, digest_of, read_json, refuse_newer
-from cprl.runs.recipe import RECIPE_FILE, with_runs_moved
+from cprl.runs.recipe import RECIPE_FILE, stored_experiment, with_runs_moved
 from cprl.studies.factors import (
     MOST_CONDITIONS,
     Design,
@@ -26,7 +27,17 @@ from cprl.studies.factors import (
     grid,
 )
 from cprl.system.defaults import BLOCK
-from cprl.values import DirectoryName, Range, Value, meant, refusal, shown, without_defaults
+from cprl.values import (
+    DirectoryName,
+    Range,
+    Value,
+    meant,
+    refusal,
+    refuse_live,
+    shown,
+    without_defaults,
+    without_departed,
+)
 
 CONDITION_FORMAT: Final = 1
 """Of checksums: counted up when a default of any value of `cprl.values.KINDS`, or of `Experiment`, changes,
@@ -69,8 +80,12 @@ class Condition:
         """Return the checksum in the names of its runs in a directory: what runs of `Frozen` agents are
         called from there, so that it is the same wherever the study is run from."""
         config = with_runs_moved(self.experiment.to_config(), ".", runs)
+        config["engine"] = engine_of(self.experiment)
         table = {name: value for name, value in config.items() if name not in UNNAMED}
-        content = {"format": CONDITION_FORMAT, "experiment": without_defaults(table, Experiment)}
+        named = without_defaults(table, Experiment)
+        if named["engine"] == "compiled":  # the default when the format began
+            del named["engine"]
+        content = {"format": CONDITION_FORMAT, "experiment": named}
         return digest_of(json.dumps(content, sort_keys=True), size=6)
 
 
@@ -147,7 +162,7 @@ class Study(Value, stored=False):
         names = [condition.name for condition in self.all_conditions]
         if self.reference_name not in names:
             raise refusal("reference", self.reference, f"the name of a condition: {', '.join(names[:10])}")
-        self.to_config()  # refuses what `study.json` could not hold
+        refuse_live(self.to_config(), where=f"the study {self.name!r}")
 
     @cached_property
     def all_conditions(self) -> tuple[Condition, ...]:
@@ -243,8 +258,8 @@ class Study(Value, stored=False):
             close = meant(unknown[0], known)
             raise ValueError(f"the study has no {shown(unknown[0])}{close}; allowed: {', '.join(known)}")
         try:
-            values = {"experiment": table["experiment"]}
-            values |= {name: dict(table[name]) for name in ("factors", "conditions")}
+            values = {"experiment": stored_experiment(table["experiment"])}
+            values |= {name: without_departed(dict(table[name])) for name in ("factors", "conditions")}
             if directory is not None:
                 values = with_runs_moved(values, directory, ".")
             experiment = Experiment.from_config(values["experiment"])

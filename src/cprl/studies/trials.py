@@ -20,11 +20,13 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 from cprl.experiment import Experiment
+from cprl.experiment.engine import engine_of
 from cprl.population import Frozen, partners_in, with_stored
-from cprl.runs.checkpoints import FOLDER, REPORT, checkpoints_in, depends_on_episodes, is_ending
+from cprl.runs.checkpoints import endings_of
 from cprl.runs.files import (
     FREE,
     LOCK_FILE,
+    REPORT,
     RunLock,
     RunLockedError,
     digest_of,
@@ -34,21 +36,20 @@ from cprl.runs.files import (
 )
 from cprl.runs.length import Length, without_length
 from cprl.runs.recipe import (
-    RECIPE_FILE,
     changed_code,
     read_recipe,
     recipe_config,
-    start_run,
     write_on_nan,
 )
-from cprl.runs.weights import partners_of
+from cprl.runs.states import State, depends_on_episodes, start, state_of
 from cprl.studies.status import LOCKED, STOPPED, Status, StatusFile
 from cprl.studies.study import Block, Condition, Study
 from cprl.system.output import printed
 from cprl.system.shipped import cprl_here
 from cprl.values import custom_targets, differences, trust, trusted, without_defaults
 
-State = Literal["missing", "unfinished", "finished", "refused"]
+DirectoryState = Literal[State, "refused"]
+"""Of its directory; "refused" is a run of another trial, or of none that can be read."""
 ATTEMPTS: Final = 5
 """How often a trial is tried whose process dies."""
 
@@ -77,7 +78,13 @@ class Trial:
 
         of_condition = self.condition.experiment
         agents = tuple(with_stored(spec, in_block) for spec in of_condition.agents)
-        return replace(of_condition, seed=self.block.seed, replicas=self.block.replicas, agents=agents)
+        return replace(
+            of_condition,
+            seed=self.block.seed,
+            replicas=self.block.replicas,
+            agents=agents,
+            engine=engine_of(of_condition),
+        )
 
     @cached_property
     def checksum(self) -> str:
@@ -96,9 +103,8 @@ class Trial:
         numbers = f"replica {first}" if first == last else f"replicas {first}-{last}"
         return f"{self.condition.name}, {numbers}"
 
-    def state(self, runs: Path) -> State:
-        """Return what its directory holds; "refused" is a run of another trial, or of none that can be
-        read."""
+    def state(self, runs: Path) -> DirectoryState:
+        """Return what its directory holds."""
         run = runs / self.name
         state = state_of(run)
         try:
@@ -133,13 +139,6 @@ def trials_of(study: Study, runs: Path | str = ".") -> list[Trial]:
     """
     runs = Path(runs)
     return [Trial(condition, block, runs) for block in study.blocks for condition in study.all_conditions]
-
-
-def state_of(run: Path) -> State:
-    """Return what the directory of a run holds; a finished run has a report."""
-    if (run / REPORT).exists():
-        return "finished"
-    return "unfinished" if (run / RECIPE_FILE).exists() else "missing"
 
 
 def is_of_other_code(run: Path) -> bool:
@@ -269,6 +268,17 @@ class Task:
         """Variables of its process, which imports what this one does from where this one does."""
         return {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
 
+    def of_another_engine(self) -> Path | None:
+        """Return the shorter run from which the trial would begin if engine="auto" stood for the engine that
+        trained it; None where there is none such, and where the trial has begun."""
+        if self.trial.condition.experiment.engine != "auto" or self.directory.exists():
+            return None
+        finished = self.finished or FinishedRuns(self.runs)
+        config = self.recipe["experiment"]
+        engines = sorted({"eager", "compiled"} - {config["engine"]})
+        shorter = [_longest_shorter({**config, "engine": engine}, finished) for engine in engines]
+        return None if _longest_shorter(config, finished) else shorter[0]
+
     def settled(self) -> Outcome | None:
         """Return what there is to say of a trial that cannot be run now: a finished one, one in whose
         directory another trial's run is, or a finished one that lost a file; None of one that can."""
@@ -318,9 +328,8 @@ class Task:
                     write_on_nan(run, experiment.on_nan)
         if state_of(run) != "missing":
             return None
-        partners = partners_in(experiment.agents)
         try:
-            start_run(run, experiment.name, lambda run: {**self.recipe, **partners_of(run, partners)})
+            start(run, experiment, partners_in(experiment.agents))
         except FileExistsError:
             if state_of(run) == "missing" and not (run / LOCK_FILE).exists():
                 raise
@@ -380,6 +389,18 @@ class Task:
             )
 
 
+def _longest_shorter(config: Mapping[str, Any], finished: FinishedRuns) -> Path | None:
+    """Return the longest run that is the same experiment but shorter, and can be extended."""
+    beginnings = []
+    for other in finished.like(config):
+        stored = read_recipe(other)
+        length = Length.of(recipe_config(stored))
+        is_kept = endings_of(other) and not changed_code(stored)
+        if is_kept and length.is_shorter_than(Length.of(config)):
+            beginnings.append((length.number, other))
+    return max(beginnings)[1] if beginnings else None
+
+
 def begin_from_shorter(
     run: Path, experiment: Experiment, recipe: Mapping[str, Any], finished: FinishedRuns | None = None
 ) -> Path | None:
@@ -391,16 +412,9 @@ def begin_from_shorter(
     callbacks = [callback.resolve() for callback in experiment.callbacks]
     if any(not isinstance(callback, type) or depends_on_episodes(callback) for callback in callbacks):
         return None
-    beginnings = []
-    for other in (finished or FinishedRuns(run.parent)).like(recipe["experiment"]):
-        stored = read_recipe(other)
-        length = Length.of(recipe_config(stored))
-        is_kept = any(map(is_ending, checkpoints_in(other / FOLDER))) and not changed_code(stored)
-        if is_kept and length.is_shorter_than(experiment.length):
-            beginnings.append((length.number, other))
-    if not beginnings:
+    shorter = _longest_shorter(recipe["experiment"], finished or FinishedRuns(run.parent))
+    if shorter is None:
         return None
-    _, shorter = max(beginnings)
     copying = run.with_name(f".{run.name}.copying-{os.getpid()}")
     shutil.rmtree(copying, ignore_errors=True)
     try:

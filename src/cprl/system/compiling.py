@@ -89,7 +89,7 @@ class Compiled:
         if self._compiled is not None and form == self._form:
             return self._compiled(*arguments)
         self._form = form
-        with CLOCK.running("what agents learn by (about a minute, once)"):
+        with CLOCK.running("what agents learn by (about half a minute, once)"):
             return self._compile_and_call(*arguments)
 
     def _compile_and_call(self, *arguments: Any) -> Any:

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from cprl.system.working import working
 
-RULES: Final = "the rules (about a minute, once)"
+RULES: Final = "the rules (10 to 20 s, once)"
 
 
 class CompileClock:
@@ -92,11 +92,17 @@ class Times:
     """The time that something takes from now on; of a training what it took before it was stopped, too.
 
     Attributes:
-        busy_s: seconds of acting, storing and updating, compiling included.
+        busy_s: seconds of acting, storing and updating, compiling included: those of `with times:` blocks.
     """
 
     def __init__(self) -> None:
         self.load_state_dict({"spent_s": 0.0, "compiling_s": 0.0, "busy_s": 0.0})
+
+    def __enter__(self) -> None:
+        self._busy_since = time.perf_counter()
+
+    def __exit__(self, *error: object) -> None:
+        self.busy_s += time.perf_counter() - self._busy_since
 
     @property
     def spent_s(self) -> float:

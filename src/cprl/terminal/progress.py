@@ -12,7 +12,7 @@ from rich.table import Column
 from tensordict import TensorDictBase
 
 from cprl.measuring.episodes import Episode
-from cprl.runs.length import Length
+from cprl.runs.schedule import Schedule
 from cprl.system.output import NotebookLine
 from cprl.system.output import console as safe_console
 from cprl.system.times import CLOCK, Speed
@@ -47,27 +47,24 @@ class ProgressBar:
     callback of `cprl.training`, and a context manager.
 
     Args:
+        schedule: of the training. The bar counts what it is long, episodes or steps.
         game: a game or its environment. The length of an episode is `episode_steps` of its `rules`, if it has
             them; else that of the last episode.
-        episodes: of each replica; or `steps`. The bar counts what is given.
-        worlds: of each replica.
     """
 
     def __init__(
         self,
+        schedule: Schedule,
         game: object = None,
         *,
-        episodes: int | None = None,
-        steps: int | None = None,
         title: str = "training",
         replicas: int = 1,
-        worlds: int = 1,
         console: Console | None = None,
     ) -> None:
         self.console = console or safe_console()
         rules = getattr(getattr(game, "game", game), "rules", None)
         self._title = title
-        self._length = Length.of({"episodes": episodes, "steps": steps})
+        self._length = schedule.length
         self._episode_steps = self._clock = getattr(rules, "episode_steps", None)
         self._progress = Progress(
             TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, ratio=1)),
@@ -88,7 +85,7 @@ class ProgressBar:
         self._course = Speed()
         """How fast steps, and episodes or steps of each replica, are done."""
         self._replicas = replicas
-        self._worlds = replicas * worlds
+        self._worlds = replicas * schedule.worlds
         self._returns: deque[float] = deque(maxlen=self._worlds)
         self._notebook_line = NotebookLine()
         self._silence = silent()
@@ -98,13 +95,7 @@ class ProgressBar:
     @classmethod
     def of(cls, experiment: Any) -> Self:
         """Return the bar of an `Experiment`."""
-        return cls(
-            experiment.game,
-            episodes=experiment.episodes,
-            steps=experiment.steps,
-            replicas=experiment.replicas,
-            worlds=experiment.worlds,
-        )
+        return cls(experiment.schedule, experiment.game, replicas=experiment.replicas)
 
     def on_start(self, training: Any) -> None:
         """Continue where the training does."""
@@ -159,8 +150,8 @@ class ProgressBar:
         running = 0.0
         if self._episode_steps:
             running = min(self._worlds, self._steps_running / self._episode_steps)
-        done = self._steps if self._length.is_of_steps else self._episodes + running
-        return min(self._length.number, done / self._replicas)
+        episodes = (self._episodes + running) / self._replicas
+        return self._length.reached(episodes=episodes, steps=self._steps / self._replicas)
 
     def _time_left(self, done: float) -> str:
         """Return the time left, in words; nothing before enough steps were timed."""

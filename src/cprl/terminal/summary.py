@@ -48,7 +48,7 @@ def summarise(
     Args:
         played: Episodes in fresh worlds, labelled by "policy"; the first policy is what others are compared
             with.
-        course: See `cprl.training.course`; by default what each policy gets.
+        course: See `cprl.terminal.course`; by default what each policy gets.
     """
     console = console or safe_console()
     baseline = played["policy"][0].as_py()

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cprl.commons.spaces import Spaces
-from cprl.experiment.experiment import OnNan
 from cprl.keys import Turn
-from cprl.learners.base import Learner
+from cprl.learners.base import AnyLearner
+from cprl.runs.schedule import OnNan
 from cprl.training.learning import LaneLosses
 from cprl.values.arrays import Float64
 
@@ -72,7 +72,7 @@ class FiniteCheck:
 
     def __init__(
         self,
-        learners: Mapping[tuple[int, ...], Learner],
+        learners: Mapping[tuple[int, ...], AnyLearner],
         spaces: Spaces,
         *,
         worlds: int = 1,
@@ -160,14 +160,13 @@ class FiniteCheck:
         saved = f"; what was saved at step {self.saved_step:,} is finite" if self.saved_step else ""
         raise NotFiniteError(text + saved)
 
-    def state_dict(self) -> list[list[Any]]:
-        """What was reported, so that it is not reported again."""
-        return [list(astuple(finding)) for finding in self.reported]
+    def state_dict(self) -> dict[str, Any]:
+        """What was reported, so that it is not reported again, and the step of the state."""
+        return {"reported": [list(astuple(finding)) for finding in self.reported], "step": self.saved_step}
 
-    def load_state_dict(self, state: Sequence[Sequence[Any]], *, step: int) -> None:
-        """Continues from what `state_dict` returned at a step."""
-        self.reported = [NotFinite(*values) for values in state]
-        self._weights_step = self.saved_step = step
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self.reported = [NotFinite(*values) for values in state["reported"]]
+        self._weights_step = self.saved_step = state["step"]
 
 
 def places(findings: Iterable[NotFinite]) -> str:

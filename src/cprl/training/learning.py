@@ -2,20 +2,20 @@
 
 from collections.abc import Mapping, Sequence
 from math import nan
-from typing import Annotated, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from cprl.learners.base import Learner
+from cprl.keys import Turn
+from cprl.learners.base import AnyLearner
 from cprl.policies.assignment import AgentIndices, agent_indices
 from cprl.policies.decisions import Decider
-from cprl.values import MOST_INT64, Range, checked
 from cprl.values.arrays import Float64
 
-Learners: TypeAlias = Mapping[tuple[int, ...], Learner]
+Learners: TypeAlias = Mapping[tuple[int, ...], AnyLearner]
 """By the indices of their agents."""
 
 
@@ -23,7 +23,6 @@ class LaneLosses:
     """Mean losses of S agents since the end of each replica's last episode."""
 
     def __init__(self, replicas: int, agents: tuple[int, ...]) -> None:
-        self.agents = agents
         self.total = np.zeros((replicas, len(agents)), np.float64)
         self.updates = np.zeros(replicas, np.int64)
 
@@ -33,11 +32,12 @@ class LaneLosses:
             self.total += loss.numpy(force=True)
             self.updates += 1
 
-    def take(self, replica: int) -> dict[int, float]:
+    def take(self, replica: int) -> list[float]:
         """Returns the mean loss of each agent of a replica, NaN without an update, and resets the replica."""
-        means = self.total[replica] / (self.updates[replica] or nan)
-        self.total[replica], self.updates[replica] = 0.0, 0
-        return dict(zip(self.agents, means.tolist(), strict=True))
+        means: list[float] = (self.total[replica] / (self.updates[replica] or nan)).tolist()
+        self.total[replica] = 0.0
+        self.updates[replica] = 0
+        return means
 
     def state_dict(self) -> dict[str, Tensor]:
         return {"total": torch.tensor(self.total), "updates": torch.tensor(self.updates)}
@@ -55,18 +55,19 @@ class WantedReturns:
     """
 
     def __init__(self, worlds: int, agents: int, learners: Learners) -> None:
-        self._wants: list[tuple[Any, Any]] = []
+        self._rewards: list[tuple[Any, Any]] = []
         self._first = np.full(agents, nan)
         for indices, learner in learners.items():
-            learner.wants.clear()
-            self._wants.append((slice(None) if len(indices) == agents else list(indices), learner.wants))
+            learner.rewards.clear()
+            columns = slice(None) if len(indices) == agents else list(indices)
+            self._rewards.append((columns, learner.rewards))
             self._first[list(indices)] = 0
         self.returns = np.tile(self._first, (worlds, 1))
 
     def add(self) -> None:
         """Adds the turn that the learners have just stored."""
-        for columns, wants in self._wants:
-            turn = wants.now
+        for columns, rewards in self._rewards:
+            turn = rewards.now
             turn = turn.numpy(force=True) if isinstance(turn, Tensor) else turn
             self.returns[:, columns] += turn[:, columns]
 
@@ -83,30 +84,31 @@ class WantedReturns:
         self.returns[:] = state["returns"].numpy()
 
 
-def losses_of(replica: int, losses: Mapping[tuple[int, ...], LaneLosses]) -> dict[int, float]:
-    """The mean loss of each learning agent of a replica since it last ended an episode, then begun anew."""
-    return {agent: loss for of_agents in losses.values() for agent, loss in of_agents.take(replica).items()}
-
-
 def learned_in(
-    world: int,
+    ended: Sequence[int],
+    turn: Turn,
     learners: Learners,
-    losses: Mapping[int, float],
-    values: Mapping[tuple[int, ...], Sequence[Sequence[float]]],
-) -> dict[str, float]:
-    """What was learned in the episode of a world that has just ended.
+    losses: Mapping[tuple[int, ...], LaneLosses],
+    worlds: int,
+) -> list[dict[str, float]]:
+    """What was learned in the episodes that have just ended, by agent: "loss", the mean since its replica
+    last ended an episode, which begins anew; "epsilon"; and "q", the value of the state.
 
     Args:
-        losses: by agent, see `losses_of`.
-        values: of the states of all worlds, [B, S].
+        ended: the worlds in which they ended, each once.
+        turn: the last one of theirs.
+        worlds: the worlds W of each replica.
     """
-    learning = {}
+    learned: list[dict[str, float]] = [{} for _ in ended]
     for agents, learner in learners.items():
-        for place, agent in enumerate(agents):
-            learning[f"agent_{agent}/loss"] = losses[agent]
-            learning[f"agent_{agent}/epsilon"] = learner.actor.epsilon
-            learning[f"agent_{agent}/q"] = values[agents][world][place]
-    return learning
+        means = {replica: losses[agents].take(replica) for replica in {world // worlds for world in ended}}
+        values = learner.values(turn).tolist()
+        for world, numbers in zip(ended, learned, strict=True):
+            for place, agent in enumerate(agents):
+                numbers[f"agent_{agent}/loss"] = means[world // worlds][place]
+                numbers[f"agent_{agent}/epsilon"] = learner.actor.epsilon
+                numbers[f"agent_{agent}/q"] = values[world][place]
+    return learned
 
 
 def check_agents(
@@ -130,11 +132,10 @@ def check_agents(
     for indices, learner in learners.items():
         if learner.agents != agent_indices(indices):
             raise ValueError(f"a learner made for the agents {learner.agents} is given for {indices}")
-        of_learner = learner.replicas, getattr(learner, "worlds", 1)
-        if of_learner != (replicas, worlds):
+        if (learner.replicas, learner.worlds) != (replicas, worlds):
             raise ValueError(
                 f"the environment has {replicas} replicas of {worlds} worlds; the learner of {indices} has "
-                f"{of_learner[0]} of {of_learner[1]}; allowed: the same"
+                f"{learner.replicas} of {learner.worlds}; allowed: the same"
             )
     return replicas
 
@@ -148,20 +149,3 @@ def check_decisions(decisions: Decider | None, options: int) -> None:
         raise ValueError(
             f"decisions is {decisions and 'a Decider'}; allowed for a game whose agents {asks}: {allowed}"
         )
-
-
-def check_numbers(
-    episodes: int | None, steps: int | None, worlds: int, update_every: int, learners: Learners
-) -> None:
-    """Raises a ValueError for numbers below 1, for none or both of episodes and steps, and for rollouts that
-    `update_every` does not divide."""
-    if (episodes is None) == (steps is None):
-        raise ValueError(f"episodes is {episodes} and steps {steps}; allowed: one of them")
-    numbers = {"episodes": episodes, "steps": steps, "worlds": worlds, "update_every": update_every}
-    for name, number in numbers.items():
-        if number is not None:
-            checked(name, number, Annotated[int, Range(1, MOST_INT64)])
-    for learner in learners.values():
-        steps = getattr(learner, "rollout_steps", update_every)
-        if steps % update_every:
-            raise ValueError(f"update_every is {update_every}; allowed: a divisor of rollout_steps {steps}")

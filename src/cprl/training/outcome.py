@@ -20,6 +20,7 @@ from cprl.envs.make_env import make_env
 from cprl.envs.state import load_transforms_state, transforms_state
 from cprl.envs.unwrap import commons_of
 from cprl.experiment import Experiment
+from cprl.experiment.engine import engine_of
 from cprl.measuring.episodes import Episode
 from cprl.measuring.evaluate import Policy, evaluate
 from cprl.measuring.registry import INSTITUTIONS
@@ -27,7 +28,8 @@ from cprl.measuring.table import labelled
 from cprl.policies.present import PresentPolicy
 from cprl.runs.episodes import EVALUATIONS, table_of
 from cprl.runs.files import write_listed
-from cprl.training.agents import Population, in_a_row, stored_policies
+from cprl.training.agents import Population
+from cprl.training.stored import in_a_row, stored_policies
 
 EXHIBITED_WORLD: Final = 2**31
 """The number of the exhibited world; those of a training, of as many replicas, are smaller."""
@@ -49,7 +51,7 @@ def make_agents(
         experiment.agents,
         seed=experiment.seed,
         worlds=experiment.worlds,
-        engine=experiment.engine,
+        engine=engine_of(experiment),
         starts=starts,
         weights=weights,
     )
@@ -235,8 +237,12 @@ def evaluate_population(
     return {"random": random, "trained": evaluate(fresh, policy, explore=True, metrics=experiment.metrics)}
 
 
-def write_evaluation(run: Path, played: Mapping[str, Sequence[Episode]], *, replicas: int) -> None:
-    """Write `evaluation/<policy>.parquet` of a run of so many replicas; again where one is there."""
-    for name, episodes in played.items():
-        table = table_of(episodes, range(replicas))
+def write_evaluation(
+    run: Path, played: Mapping[str, Sequence[Episode]], *, replicas: int
+) -> dict[str, pa.Table]:
+    """Write `evaluation/<policy>.parquet` of a run of so many replicas, again where one is there; return the
+    tables by policy."""
+    tables = {name: table_of(episodes, range(replicas)) for name, episodes in played.items()}
+    for name, table in tables.items():
         write_listed(run, f"evaluation/{name}.parquet", partial(pq.write_table, table))
+    return tables

@@ -1,35 +1,32 @@
 """train: a training from its first step to its last."""
 
-import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from math import inf
 from pathlib import Path
 from typing import Any, Final, Protocol
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import nn
 from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from cprl import keys, recurrent_state
 from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.state import carried_state, env_state, load_carried, load_env_state
-from cprl.envs.stepping import begin_states
 from cprl.envs.unwrap import commons_of
-from cprl.experiment.experiment import OnNan
 from cprl.keys import Turn
-from cprl.learners.base import Learner
+from cprl.learners.base import AnyLearner
 from cprl.measuring.episodes import Episode, tracker_of
 from cprl.measuring.series import Observer
 from cprl.policies.assignment import AgentIndices, AgentPolicies
 from cprl.policies.decisions import Decider
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.files import TRAINING_STATE_FORMAT
-from cprl.runs.length import Length
+from cprl.runs.schedule import Schedule
 from cprl.system.times import Times
 from cprl.training.finite import EVERY_TURNS, FiniteCheck
 from cprl.training.learning import (
@@ -37,11 +34,9 @@ from cprl.training.learning import (
     WantedReturns,
     check_agents,
     check_decisions,
-    check_numbers,
     learned_in,
-    losses_of,
 )
-from cprl.values import Custom, shown
+from cprl.values import Custom, checked, shown
 from cprl.values.arrays import Float64
 
 
@@ -69,7 +64,8 @@ class StepCollector(BaseCollector):
         while True:
             with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
                 now, self.carried = self.env.step_and_maybe_reset(self.policy(self.carried))
-                begin_states(self.carried, self.carried, now)
+                done = keys.entry(keys.entry(now, "next"), keys.DONE)
+                recurrent_state.carry(self.carried, self.carried, done)
             yield now
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
@@ -96,66 +92,58 @@ class Training:
     """A training that takes one turn after the other, and whose whole state can be read and set.
 
     All replicas take each turn together. A replica whose episodes are short plays on until the last one has
-    played its last episode; callbacks get no episodes beyond `episodes`. Episodes of a replica are counted in
-    the order of the turns in which they end, and within a turn in that of its worlds.
+    played its last episode; callbacks get no episodes beyond those of the schedule. Episodes of a replica are
+    counted in the order of the turns in which they end, and within a turn in that of its worlds.
 
     Args:
         env: W worlds of each replica R; world b belongs to replica b // W.
         learners: by the indices of their agents, a tuple; each updates these agents in every replica.
-        episodes: how many each replica plays, at least 1; or `steps`.
-        steps: how many each replica takes, at least 1; a turn of W worlds is W steps.
-        worlds: the worlds W of each replica.
+        schedule: how long each replica is trained, in how many worlds, and when its learners update.
         others: the actors of the agents that do not learn, likewise; an actor of one agent by its index.
         decisions: what all agents decide, and learn to, where the game asks them; see `Game.decisions`.
         callbacks: called after each turn and each episode, in this order; see `Callback`.
-        update_every: turns k after which each learner updates, then k times.
-        make_collector: what plays; one of TorchRL's own is several times slower, and cannot be resumed.
-        on_nan: whether the training stops where a loss, weight, reward or observation is not finite, see
-            `cprl.training.finite`.
         metrics: the user's own, see `cprl.measuring.EpisodeTracker`.
+        make_collector: what plays; one of TorchRL's own is several times slower, and cannot be resumed.
     """
 
     def __init__(
         self,
         env: EnvBase,
-        learners: Mapping[tuple[int, ...], Learner],
+        learners: Mapping[tuple[int, ...], AnyLearner],
+        schedule: Schedule,
         *,
-        episodes: int | None = None,
-        steps: int | None = None,
-        worlds: int = 1,
         others: Mapping[AgentIndices, nn.Module] | None = None,
         decisions: Decider | None = None,
         callbacks: Sequence[Any] = (),
-        update_every: int = 1,
-        make_collector: MakeCollector = StepCollector,
-        on_nan: OnNan = "stop",
         metrics: Sequence[Custom] = (),
+        make_collector: MakeCollector = StepCollector,
     ) -> None:
+        schedule = checked("schedule", schedule, Schedule)
         spaces = spaces_of(env)
         check_env(env, env.batch_size.numel())
         check_callbacks(callbacks)
         self.env = env
-        self.worlds = worlds
-        self.update_every = update_every
-        self.learners, self.others = dict(learners), dict(others or {})
-        check_numbers(episodes, steps, worlds, update_every, self.learners)
-        self.length = Length.of({"episodes": episodes, "steps": steps})
-        self.replicas = check_agents(env, spaces.agents, worlds, self.learners, self.others)
+        self.schedule = schedule
+        self.learners = dict(learners)
+        self.others = dict(others or {})
+        self.decisions = decisions
+        self.replicas = check_agents(env, spaces.agents, schedule.worlds, self.learners, self.others)
+        for learner in self.learners.values():
+            schedule.refuse_rollouts(getattr(learner.settings, "rollout_steps", schedule.update_every))
+        commons = commons_of(env)
+        check_decisions(decisions, 0 if commons is None else commons.game.decisions)
         actors: dict[AgentIndices, nn.Module] = {
             agents: learner.actor for agents, learner in self.learners.items()
         }
-        commons = commons_of(env)
-        check_decisions(decisions, 0 if commons is None else commons.game.decisions)
-        self.decisions = decisions
         self._collector = make_collector(env, AgentPolicies({**actors, **self.others}, decisions=decisions))
-        self._turns = iter(self._collector)
+        self._batches = iter(self._collector)
         self._tracker = tracker_of(env, metrics)
         self._losses = {agents: LaneLosses(self.replicas, agents) for agents in self.learners}
-        self._wanted = WantedReturns(self.replicas * worlds, spaces.agents, self.learners)
+        self._wanted = WantedReturns(env.batch_size.numel(), spaces.agents, self.learners)
         for learner in self.learners.values():
             learner.begin()
-        self.finite = FiniteCheck(self.learners, spaces, worlds=worlds, on_nan=on_nan)
-        self.observer = Observer(callbacks, env, worlds=worlds)
+        self.finite = FiniteCheck(self.learners, spaces, worlds=schedule.worlds, on_nan=schedule.on_nan)
+        self.observer = Observer(callbacks, env, worlds=schedule.worlds)
         """What calls the callbacks."""
         self._played = [0] * self.replicas
         self.steps = 0
@@ -163,29 +151,21 @@ class Training:
         self.times = Times()
 
     def __repr__(self) -> str:
-        return f"Training({self.env!r}, {self.steps} steps of {self.length})"
+        return f"Training({self.env!r}, {self.steps} steps of {self.schedule.length})"
 
     @property
     def is_over(self) -> bool:
-        return self.length.is_over(episodes=min(self._played), steps=self.steps)
+        return self.schedule.is_over(self._played, self.steps)
 
     @property
-    def _most_episodes(self) -> float:
-        return inf if self.length.is_of_steps else self.length.number
+    def is_ending(self) -> bool:
+        """Whether a replica may play its last episode in the next turn, see `Schedule.is_ending`."""
+        return self.schedule.is_ending(self._played, self.steps)
 
     @property
     def is_sound(self) -> bool:
         """Whether everything was finite so far; with `on_nan` "stop" a training that goes on always is."""
         return not self.finite.reported
-
-    @property
-    def is_ending(self) -> bool:
-        """Whether a replica may play its last episode in the next turn, in which each of its worlds can end
-        one; episodes that it plays beyond are not recorded. Of a training of so many steps: whether it is
-        over."""
-        if self.length.is_of_steps:
-            return self.is_over
-        return max(self._played) > self.length.number - self.worlds
 
     @property
     def episodes_played(self) -> int:
@@ -195,7 +175,7 @@ class Training:
     @property
     def episodes_by_replica(self) -> list[int]:
         """Likewise, of each replica."""
-        return [int(min(played, self._most_episodes)) for played in self._played]
+        return [self.schedule.counted(played) for played in self._played]
 
     @property
     def callbacks(self) -> list[Any]:
@@ -218,39 +198,44 @@ class Training:
 
     def step(self) -> None:
         """The turns that the collector yields, one as a rule: act, store, update, measure, record."""
-        began = time.perf_counter()
-        batch = next(self._turns)
-        self.times.busy_s += time.perf_counter() - began
-        for turn in [batch] if batch.batch_dims == 1 else batch.unbind(1):
-            self._take(turn)
+        for batch in self._act():
+            turn = Turn.of(batch)
+            self.steps += self.schedule.worlds
+            turns = self.steps // self.schedule.worlds
+            with self.times:
+                self._store(turn)
+                if turns % self.schedule.update_every == 0:
+                    for _ in range(self.schedule.update_every):
+                        self._update()
+            self.observer.on_step(batch)
+            ended = self._tracker.add(turn)
+            if ended:
+                self._check_finite(ended, weights=True)
+                learned = self._end(ended, turn)
+                self._record(ended, learned)
+            elif turns % EVERY_TURNS == 0:
+                self._check_finite()
 
-    def _take(self, batch: TensorDictBase) -> None:
-        self.steps += self.worlds
-        turns = self.steps // self.worlds
-        began = time.perf_counter()
-        turn = Turn.of(batch)
+    def _act(self) -> Sequence[TensorDictBase]:
+        """The next turns of every world, one as a rule, [B] each."""
+        with self.times:
+            batch = next(self._batches)
+        return [batch] if batch.batch_dims == 1 else batch.unbind(1)
+
+    def _store(self, turn: Turn) -> None:
         self.finite.add(turn)
         for learner in self.learners.values():
             learner.store(turn)
         self._wanted.add()
-        if turns % self.update_every == 0:
-            for _ in range(self.update_every):
-                for agents, learner in self.learners.items():
-                    self._losses[agents].add(self._update(learner))
-        self.times.busy_s += time.perf_counter() - began
-        self.observer.on_step(batch)
-        ended = self._tracker.add(turn)
-        if ended:
-            self._end(ended, turn)
-        elif turns % EVERY_TURNS == 0:
-            self._check_finite()
 
-    def _update(self, learner: Learner) -> Tensor | None:
-        try:
-            return learner.update()
-        except (RuntimeError, ValueError):  # some losses refuse NaN in words of their own
-            self._check_finite(weights=True)
-            raise
+    def _update(self) -> None:
+        for agents, learner in self.learners.items():
+            try:
+                loss = learner.update()
+            except (RuntimeError, ValueError):  # some losses refuse NaN in words of their own
+                self._check_finite(weights=True)
+                raise
+            self._losses[agents].add(loss)
 
     def _check_finite(self, ended: Sequence[Episode] = (), *, weights: bool = False) -> None:
         returns = self._tracker.returns
@@ -258,29 +243,29 @@ class Training:
             returns[episode.world] = episode.return_
         self.finite.check(self._losses, returns, self.steps, weights=weights)
 
-    def _end(self, ended: Sequence[Episode], turn: Turn) -> None:
-        self._check_finite(ended, weights=True)
-        worlds = torch.zeros(self.replicas * self.worlds, dtype=torch.bool)
-        worlds[[episode.world for episode in ended]] = True
-        values = {agents: learner.values(turn).tolist() for agents, learner in self.learners.items()}
-        replicas = {episode.world // self.worlds for episode in ended}
-        losses = {replica: losses_of(replica, self._losses) for replica in replicas}
-        learning = [
-            learned_in(episode.world, self.learners, losses[episode.world // self.worlds], values)
-            for episode in ended
-        ]
+    def _end(self, ended: Sequence[Episode], turn: Turn) -> list[dict[str, float]]:
+        """Ends episodes of the learners; returns what was learned in each."""
+        worlds = [episode.world for episode in ended]
+        learned = learned_in(worlds, turn, self.learners, self._losses, self.schedule.worlds)
+        has_ended = torch.zeros(self.env.batch_size, dtype=torch.bool)
+        has_ended[worlds] = True
         for learner in self.learners.values():
-            learner.end_episode(worlds)
+            learner.end_episode(has_ended)
+        return learned
+
+    def _record(self, ended: Sequence[Episode], learned: Sequence[dict[str, float]]) -> None:
+        """Counts episodes that have ended, and hands those of the schedule to the callbacks."""
         recorded: list[tuple[Episode, dict[str, float]]] = []
-        for episode, of_agents in zip(ended, learning, strict=True):
-            replica, wanted = episode.world // self.worlds, self._wanted.take(episode.world)
+        for episode, of_agents in zip(ended, learned, strict=True):
+            replica = episode.world // self.schedule.worlds
+            wanted = self._wanted.take(episode.world)
             number = self._played[replica]
             episode = replace(episode, replica=replica, episode=number, wanted_return=wanted)
             if self.decisions is not None and episode.decision is not None:
                 returns = np.where(np.isnan(wanted), episode.return_, wanted)
                 self.decisions.learn(replica, episode.decision, returns)
             self._played[replica] += 1
-            if number < self._most_episodes:
+            if self.schedule.counted(number + 1) > number:
                 recorded.append((episode, of_agents))
         if recorded:
             self.observer.on_ended(recorded)
@@ -298,20 +283,26 @@ class Training:
         return {
             "format": TRAINING_STATE_FORMAT,
             "steps": self.steps,
-            **self.times.state_dict(),
             "played": list(self._played),
             "env": env_state(self.env),
             "carried": None if carried is None else carried_state(carried),
-            "learners": [learner.state_dict() for learner in self.learners.values()],
-            "others": [dict(other.state_dict()) for other in self.others.values()],
-            "decisions": {} if self.decisions is None else dict(self.decisions.state_dict()),
-            "losses": [losses.state_dict() for losses in self._losses.values()],
-            "wanted": self._wanted.state_dict(),
-            "tracker": self._tracker.state_dict(),
-            "observer": self.observer.state_dict(),
             "callbacks": {name: callback.state_dict() for name, callback in self._with_state().items()},
-            "not_finite": self.finite.state_dict(),
             "torch": torch.get_rng_state(),
+            **{name: [dict(part.state_dict()) for part in parts] for name, parts in self._parts().items()},
+        }
+
+    def _parts(self) -> dict[str, list[Any]]:
+        """What has a state of its own, by its name in a state of the training."""
+        return {
+            "learners": list(self.learners.values()),
+            "others": list(self.others.values()),
+            "decisions": [] if self.decisions is None else [self.decisions],
+            "losses": list(self._losses.values()),
+            "wanted": [self._wanted],
+            "tracker": [self._tracker],
+            "observer": [self.observer],
+            "finite": [self.finite],
+            "times": [self.times],
         }
 
     def _with_state(self) -> dict[str, Any]:
@@ -335,28 +326,22 @@ class Training:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Resumes exactly where the training of that state was, which was made with the same arguments."""
-        if state.get("format", 1) != TRAINING_STATE_FORMAT:
+        form = state.get("format", 1)
+        if form != TRAINING_STATE_FORMAT:
             raise ValueError(
-                f"the state has the format {state.get('format', 1)}, this version resumes "
+                f"the state has the format {form}, this version resumes "
                 f"{TRAINING_STATE_FORMAT}; finish the run with the version that began it, whose commit is in "
                 "its recipe.json"
             )
-        self.times.load_state_dict(state)
-        self.steps, self._played = int(state["steps"]), list(state["played"])
+        self.steps = int(state["steps"])
+        self._played = list(state["played"])
         fresh = self.env.reset()  # the form of what is carried; the state then says where the worlds are
         load_env_state(self.env, state["env"])
         if state["carried"] is not None:
             self._step_collector().carried = load_carried(fresh, state["carried"])
-        parts: dict[str, Any] = {"learners": self.learners, "others": self.others, "losses": self._losses}
-        for name, of_agents in parts.items():
-            for part, part_state in zip(of_agents.values(), state[name], strict=True):
+        for name, parts in self._parts().items():
+            for part, part_state in zip(parts, state[name], strict=True):
                 part.load_state_dict(part_state)
-        self._wanted.load_state_dict(state["wanted"])
-        if self.decisions is not None:
-            self.decisions.load_state_dict(state["decisions"])
-        self._tracker.load_state_dict(state["tracker"])
-        self.observer.load_state_dict(state["observer"])
-        self.finite.load_state_dict(state["not_finite"], step=self.steps)
         for name, callback in self._with_state().items():
             if name in state["callbacks"]:  # a viewer may be added or left out from now on
                 callback.load_state_dict(state["callbacks"][name])
@@ -365,17 +350,22 @@ class Training:
 
 def train(
     env: EnvBase,
-    learners: Mapping[tuple[int, ...], Learner],
+    learners: Mapping[tuple[int, ...], AnyLearner],
+    schedule: Schedule,
     *,
+    others: Mapping[AgentIndices, nn.Module] | None = None,
+    decisions: Decider | None = None,
+    callbacks: Sequence[Any] = (),
+    metrics: Sequence[Custom] = (),
+    make_collector: MakeCollector = StepCollector,
     checkpointer: Checkpointer | None = None,
-    **how: Any,
 ) -> Training:
     """Plays so many episodes, or takes so many steps, of every replica; each learner stores every turn and
     then updates.
 
     Args:
-        checkpointer: says where the training resumes from, and saves its state now and then.
-        how: the other arguments of `Training`.
+        checkpointer: says where the training resumes from, and saves its state now and then. For the others
+            see `Training`.
 
     Returns:
         The `Training`, which is over.
@@ -383,7 +373,16 @@ def train(
     Raises:
         NotFiniteError: where a number is not finite, before a checkpoint holds it.
     """
-    training = Training(env, learners, **how)
+    training = Training(
+        env,
+        learners,
+        schedule,
+        others=others,
+        decisions=decisions,
+        callbacks=callbacks,
+        metrics=metrics,
+        make_collector=make_collector,
+    )
     training.run(checkpointer)
     return training
 

@@ -9,15 +9,17 @@ numbers as Python's, whole numbers of a float field as floats. A refusal is a Va
 
 A table is what JSON can hold of a value, `{"kind": "DQN", ...its fields}`; a tuple is a list there. Reading a
 table is strict: what is not known is refused by the place where it stands. `cprl.values.custom` has Custom,
-something of the user's own by its name, `cprl.values.arrays` the types of numpy arrays.
+something of the user's own by its name, `cprl.values.departed` what values no longer have,
+`cprl.values.arrays` the types of numpy arrays.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass, replace
 from difflib import get_close_matches
+from functools import partial
 from math import isfinite
-from types import NoneType, UnionType
+from types import FunctionType, NoneType, UnionType
 from typing import (
     Annotated,
     Any,
@@ -33,9 +35,12 @@ from typing import (
 
 from cprl.values.custom import OWN_METRICS as OWN_METRICS
 from cprl.values.custom import Custom as Custom
+from cprl.values.custom import custom_of as custom_of
 from cprl.values.custom import custom_targets as custom_targets
 from cprl.values.custom import described as described
+from cprl.values.custom import live_targets as live_targets
 from cprl.values.custom import made as made
+from cprl.values.custom import refuse_live as refuse_live
 from cprl.values.custom import refuse_other_keys as refuse_other_keys
 from cprl.values.custom import refuse_targets
 from cprl.values.custom import shown as shown
@@ -44,6 +49,8 @@ from cprl.values.custom import trust as trust
 from cprl.values.custom import trusted as trusted
 from cprl.values.custom import trusting as trusting
 from cprl.values.custom import words_of_metric as words_of_metric
+from cprl.values.departed import KINDS_THAT_LEFT
+from cprl.values.departed import without_departed as without_departed
 
 T = TypeVar("T")
 
@@ -232,9 +239,18 @@ def _converted(value: Any, hint: Any) -> Any:
         return _integer(value)
     if hint is float:
         return _number(value)
+    if hint is Custom:
+        value = handed_over(value)
     if isinstance(value, type) or not isinstance(value, origin or hint):
         raise _UnfitError
     return value
+
+
+def handed_over(value: Any) -> Any:
+    """Return a class or function of the user's own, or a `functools.partial` of one, as a `Custom`, see
+    `custom_of`; anything else, such as a class of cprl's values, as it is."""
+    named = value.func if isinstance(value, partial) else value
+    return value if KINDS.get(getattr(named, "__name__", "")) is named else custom_of(value)
 
 
 _PLAIN_TYPES: Final = frozenset({int, float, bool, str, NoneType})
@@ -341,11 +357,16 @@ def to_config(value: object, where: str = "value") -> Any:
 
 def _config(value: object, where: str) -> Any:
     if isinstance(value, Custom):
-        return {"kind": "Custom", "target": value.target, "arguments": dict(value.arguments)}
+        table = {"kind": "Custom", "target": value.target, "arguments": dict(value.arguments)}
+        return {**table, "live": value.live} if value.live else table
     if is_dataclass(value) and KINDS.get(type(value).__name__) is type(value):
         entries = {name: getattr(value, name) for name in hints_of(type(value))}
         table = {name: _config(entry, f"{where}.{name}") for name, entry in entries.items()}
         return {"kind": type(value).__name__, **table}
+    if isinstance(value, Value) and not type(value).__module__.startswith("cprl."):
+        names = hints_of(type(value))
+        entries = {name: _config(getattr(value, name), f"{where}.{name}") for name in names}
+        return _config(replace(custom_of(type(value)), arguments=entries), where)
     if isinstance(value, tuple | list):
         return [_config(entry, f"{where}[{place}]") for place, entry in enumerate(value)]
     if value is None or isinstance(value, bool):
@@ -359,17 +380,20 @@ def _config(value: object, where: str) -> Any:
 
 
 def _not_stored(value: object, where: str) -> str:
-    named = value if isinstance(value, type) or hasattr(value, "__qualname__") else type(value)
-    name = getattr(named, "__qualname__", "<none>")
-    target = f"{named.__module__}:{name}" if "<" not in name else "module:name"
-    also = " of a class or function at the top of a module" if "<" in name else ""
-    if isinstance(value, Value):
-        also += " that makes it from numbers, texts and lists"
-    what = "a class" if isinstance(value, type) else f"a {type(value).__name__}"
-    return (
-        f"{where} is {what}, which a recipe cannot hold; allowed: values of cprl, or "
-        f'Custom("{target}", arguments={{...}}){also}'
-    )
+    kind = type(value)
+    what, one = f"a {kind.__name__}", "a class or function of your own"
+    allowed = f"{one} itself, or a functools.partial of it with keyword arguments"
+    if isinstance(value, type | FunctionType):
+        what = "a class" if isinstance(value, type) else "a function"
+        allowed = 'Custom("module:name", arguments={...}) of a class or function at the top of a module'
+    elif isinstance(value, partial) and handed_over(value) is value and not value.args:
+        name = getattr(value.func, "__name__", "name")
+        return f"{where} is a partial, which a recipe cannot hold; allowed: {name}(...)"
+    elif isinstance(value, partial):
+        allowed = f"a functools.partial of {one} with keyword arguments alone"
+    elif kind.__module__ not in ("builtins", "__main__") and "<" not in kind.__qualname__:
+        allowed = f'{allowed}, e.g. Custom("{kind.__module__}:{kind.__qualname__}", arguments={{...}})'
+    return f"{where} is {what}, which a recipe cannot hold; allowed: values of cprl, or {allowed}"
 
 
 def from_config(table: object, where: str = "value") -> Any:
@@ -401,6 +425,8 @@ def _value(table: object, where: str) -> Any:
     if not isinstance(table, Mapping):
         raise ValueError(f"{where} is a {type(table).__name__}, which JSON does not have")
     name = table.get("kind")
+    if isinstance(name, str) and name in KINDS_THAT_LEFT:
+        raise ValueError(f"{where}.kind is {name!r}, which cprl no longer has: {KINDS_THAT_LEFT[name]}")
     if not isinstance(name, str) or name not in KINDS:
         raise ValueError(
             f"{where}.kind is {shown(name)}{meant(name, KINDS)}; allowed: {', '.join(sorted(KINDS))}"
@@ -421,7 +447,10 @@ def _built(kind: type[T], table: object, where: str) -> T:
                 f"{', '.join(hints)}"
             )
     entries: dict[str, Any] = dict(table)
-    if kind is not Custom:  # whose arguments are a table already
+    if kind is Custom:  # whose arguments are a table already
+        if isinstance(table.get("arguments"), Mapping):
+            entries["arguments"] = _with_new_fields(table["arguments"], f"{where}.arguments")
+    else:
         entries = {name: _value(entry, f"{where}.{name}") for name, entry in table.items()}
         entries = {name: checked(f"{where}.{name}", entry, hints[name]) for name, entry in entries.items()}
     required = [field for field in fields(kind) if field.default is MISSING]  # type: ignore[arg-type]
@@ -433,6 +462,18 @@ def _built(kind: type[T], table: object, where: str) -> T:
         return kind(**entries)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: {error}") from error
+
+
+def _with_new_fields(arguments: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Arguments of a `Custom` in which values of cprl have the fields, too, that only this version knows."""
+    return {
+        name: _config(_value(entry, f"{where}.{name}"), where) if is_value(entry) else entry
+        for name, entry in arguments.items()
+    }
+
+
+def is_value(entry: object) -> bool:
+    return isinstance(entry, Mapping) and isinstance(entry.get("kind"), str) and entry["kind"] in KINDS
 
 
 _ABSENT: Final = object()
@@ -448,6 +489,12 @@ def differences(before: object, now: object, where: str, kind: Any = None) -> li
         kind: the dataclass that they are of, where they do not say it themselves.
     """
     if isinstance(before, Mapping) and isinstance(now, Mapping):
+        if before.get("live") and now.get("live") and before["live"] != now["live"]:
+            was, is_now = (", ".join(live_targets({**table, "arguments": {}})) for table in (before, now))
+            return [
+                f"{where} was {was}, is {is_now} that was defined again; allowed: the same object, or a "
+                "class or function at the top of a module"
+            ]
         if before.get("kind") == now.get("kind"):
             return [
                 line
@@ -498,7 +545,9 @@ def without_defaults(table: Any, kind: Any = None) -> Any:
     if not isinstance(table, Mapping):
         return table
     if table.get("kind") == "Custom":
-        return dict(table)
+        arguments = table.get("arguments", {})
+        shorter = {name: without_defaults(own) if is_value(own) else own for name, own in arguments.items()}
+        return {**table, "arguments": shorter}
     kind = KINDS.get(str(table.get("kind"))) if kind is None else kind
     defaults = {} if kind is None else defaults_of(kind)
     entries = {name: without_defaults(entry) for name, entry in table.items()}

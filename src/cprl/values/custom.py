@@ -2,22 +2,34 @@
 
 A recipe that somebody else made names code that loading it would import. Such a recipe is refused unless this
 process trusts each name: `--allow module:Class` on the command line, `cprl.trust` in Python.
+
+What no module has, because it was defined in a script, a notebook or a function, is handed over live: the
+recipe says what it was called, and only the process that has it can use it.
 """
 
 import importlib
 import json
 import re
 import reprlib
+import secrets
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.util import find_spec
+from types import FunctionType
 from typing import Any, Final
 
 _NAMES: Final = re.compile(r"[\w-]+(\.[\w-]+)*:\w+(\.\w+)*", re.ASCII)
+_LIVES: Final = re.compile(r"([0-9a-f]{8}-\d+)?", re.ASCII)
+_LIVE_NAMES: Final = re.compile(r"[\w.-]+:[\w.<>]+")
+"""Those of functions within functions have "<locals>"."""
 _LONGEST_NAME: Final = 1000
 MOST_NESTED: Final = 64
+
+_LIVE: Final[dict[str, Any]] = {}
+"""The classes and functions that this process was handed live, by texts that no other process has."""
 
 
 @dataclass(frozen=True)
@@ -30,24 +42,29 @@ class Custom:
 
     Args:
         target: "module:Class" or "module:function".
-        arguments: its keyword arguments; strings, numbers, booleans, None, and lists and tables of them. A
-            list of strings within a list becomes a tuple, so that nested TensorDict keys can be said:
-            `{"in_keys": [["agents", "reward"]]}`.
+        arguments: its keyword arguments; strings, numbers, booleans, None, values of cprl, and lists and
+            tables of them. A list of strings within a list becomes a tuple, so that nested TensorDict keys
+            can be said: `{"in_keys": [["agents", "reward"]]}`.
+        live: which object of this process it is; "" for one that its name finds. See `custom_of`.
     """
 
     target: str
     arguments: Mapping[str, Any] = field(default_factory=dict)
+    live: str = ""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.live, str) or not _LIVES.fullmatch(self.live):
+            raise ValueError(f'Custom.live is {shown(self.live)}; allowed: "", or what `custom_of` says')
         is_text = isinstance(self.target, str) and len(self.target) <= _LONGEST_NAME
-        if not is_text or not _NAMES.fullmatch(self.target):
+        names = _LIVE_NAMES if self.live else _NAMES
+        if not is_text or not names.fullmatch(self.target):
             raise ValueError(f'Custom.target is {shown(self.target)}; allowed: "module:Class"')
         if not isinstance(self.arguments, Mapping):
             came = shown(self.arguments)
             raise ValueError(f"Custom.arguments is {came}; allowed: a table of keyword arguments")
         try:
             refuse_other_keys(self.arguments)
-            text = json.dumps(dict(self.arguments), allow_nan=False)
+            text = json.dumps(dict(self.arguments), allow_nan=False, default=_table_of)
             object.__setattr__(self, "arguments", json.loads(text))
         except (TypeError, ValueError, RecursionError) as error:
             raise ValueError(
@@ -55,10 +72,13 @@ class Custom:
             ) from error
 
     def __hash__(self) -> int:
-        return hash((self.target, json.dumps(self.arguments, sort_keys=True)))
+        return hash((self.target, json.dumps(self.arguments, sort_keys=True), self.live))
 
     def resolve(self) -> Any:
         """Import the target and return it."""
+        if self.live:
+            refuse_live([{"kind": "Custom", "target": self.target, "live": self.live}], of_others=True)
+            return _LIVE[self.live]
         module, _, name = self.target.partition(":")
         try:
             target: Any = importlib.import_module(module)
@@ -75,9 +95,35 @@ class Custom:
         """Call the target with its arguments and return what it makes."""
         target = self.resolve()
         try:
-            return target(*positional, **{name: _with_keys(value) for name, value in self.arguments.items()})
+            return target(*positional, **{name: _argument(value) for name, value in self.arguments.items()})
         except TypeError as error:
             raise ValueError(f"Custom({self.target!r}) does not take its arguments: {error}") from error
+
+
+def custom_of(value: Any) -> Any:
+    """Return a class, a function, or a `functools.partial` of one with keyword arguments, as a `Custom`: by
+    its name where a module has it, else live; one that is defined again is another one. Return anything
+    else as it is."""
+    target = value.func if isinstance(value, partial) and not value.args else value
+    if not isinstance(target, type | FunctionType) or target.__module__ == "builtins":
+        return value
+    name = f"{target.__module__}:{target.__qualname__}"
+    arguments = value.keywords if isinstance(value, partial) else {}
+    if target.__module__ != "__main__" and _imported(name) is target:
+        return Custom(name, arguments)
+    lives = (live for live, known in _LIVE.items() if known is target)
+    live = next(lives, f"{secrets.token_hex(4)}-{len(_LIVE)}")  # by chance, unlike that of a forked process
+    _LIVE[live] = target
+    return Custom(name, arguments, live)
+
+
+def _imported(name: str) -> Any:
+    """Return what is called "module:name" in the modules that are imported; None where there is none."""
+    module, _, path = name.partition(":")
+    target: Any = sys.modules.get(module)
+    for part in path.split("."):
+        target = getattr(target, part, None)
+    return target
 
 
 _TRUSTED: Final[set[str]] = set()
@@ -128,8 +174,35 @@ def words_of_metric(metric: Custom) -> dict[str, str]:
 
 
 def custom_targets(table: object) -> list[str]:
-    """Return the targets of all `Custom` in a table, sorted."""
-    return sorted({str(entry.get("target")) for entry in _tables_of_customs(table)})
+    """Return the targets of all `Custom` in a table that are imported by their names, sorted."""
+    return sorted({str(entry.get("target")) for entry in _tables_of_customs(table) if not entry.get("live")})
+
+
+def live_targets(table: object) -> list[str]:
+    """Return what is called the targets of all `Custom` in a table that are live, sorted."""
+    entries = _tables_of_customs(table)
+    return sorted({_on_a_line(str(entry.get("target"))) for entry in entries if entry.get("live")})
+
+
+def _on_a_line(text: str) -> str:
+    """A text of a stranger's as a message or a terminal can show it."""
+    return "".join(sign if sign.isprintable() else "?" for sign in text)
+
+
+def refuse_live(table: object, *, of_others: bool = False, where: str = "the experiment") -> None:
+    """Raise a ValueError, by their names, for what a table has of live classes and functions.
+
+    Args:
+        of_others: only for those that this process does not have.
+        where: what the table is called in messages.
+    """
+    entries = [entry for entry in _tables_of_customs(table) if entry.get("live")]
+    refused = [entry for entry in entries if not (of_others and str(entry["live"]) in _LIVE)]
+    if refused:
+        raise ValueError(
+            f"{where} has {', '.join(live_targets(refused))}, which only the process that it was handed to "
+            "live can use; allowed: a class or function at the top of a module, which has a name"
+        )
 
 
 def described(table: object) -> list[str]:
@@ -138,26 +211,28 @@ def described(table: object) -> list[str]:
     The sentence is the first line of a docstring. Nothing is imported to be described: without its module
     there is the name alone.
     """
-    customs = (Custom(entry["target"], entry.get("arguments", {})) for entry in _tables_of_customs(table))
+    entries = _tables_of_customs(table)
+    parts = ((entry["target"], entry.get("arguments", {}), entry.get("live", "")) for entry in entries)
+    customs = (Custom(*part) for part in parts)
     return list(dict.fromkeys(map(_in_words, customs)))
 
 
 def _in_words(custom: Custom) -> str:
     arguments = ", ".join(f"{name} {shown(value)}" for name, value in custom.arguments.items())
     words = f"{custom.target} ({arguments})" if arguments else custom.target
-    module, _, name = custom.target.partition(":")
-    target: Any = sys.modules.get(module)
-    for part in name.split("."):
-        target = getattr(target, part, None)
+    target = _LIVE.get(custom.live) if custom.live else _imported(custom.target)
     lines = str(getattr(target, "__doc__", None) or "").strip().splitlines()
     words = f"{words}: {lines[0].rstrip('.')}" if lines else words
-    return "".join(sign if sign.isprintable() else "?" for sign in words)
+    return _on_a_line(words)
 
 
 def refuse_targets(table: object) -> None:
-    """Raise a ValueError for a table that would import what this process does not trust."""
+    """Raise a ValueError for a table that would import what this process does not trust, or that has what
+    another process was handed live."""
+    refuse_live(table, of_others=True)
     refused = [target for target in custom_targets(table) if target not in _TRUSTED]
     if refused:
+        refused = list(map(_on_a_line, refused))
         flags = " ".join(f"--allow {target}" for target in refused)
         names = ", ".join(map(repr, refused))
         raise ValueError(
@@ -168,11 +243,12 @@ def refuse_targets(table: object) -> None:
 
 def _tables_of_customs(table: object) -> Iterator[Mapping[str, Any]]:
     if isinstance(table, Mapping):
+        entries: Any = table
         if table.get("kind") == "Custom":
             yield table
-        else:
-            for entry in table.values():
-                yield from _tables_of_customs(entry)
+            entries = table.get("arguments")
+        for entry in entries.values() if isinstance(entries, Mapping) else ():
+            yield from _tables_of_customs(entry)
     elif isinstance(table, list | tuple):
         for entry in table:
             yield from _tables_of_customs(entry)
@@ -243,12 +319,24 @@ def refuse_other_keys(value: Any, *, most: int = MOST_NESTED, depth: int = 0) ->
             refuse_other_keys(entry, most=most, depth=depth + 1)
 
 
-def _with_keys(value: Any) -> Any:
+def _table_of(value: object) -> Any:
+    """Return a value of cprl as JSON can hold it; what `json.dumps` calls for what is not of JSON."""
+    from cprl.values import to_config
+
+    return to_config(value, f"a {type(value).__name__}")
+
+
+def _argument(value: Any) -> Any:
+    """Return an argument as a target gets it."""
+    if isinstance(value, Mapping):
+        from cprl.values import from_config, is_value
+
+        return from_config(value) if is_value(value) else value
     if not isinstance(value, list):
         return value
     return [
         tuple(entry)
         if isinstance(entry, list) and all(isinstance(part, str) for part in entry)
-        else _with_keys(entry)
+        else _argument(entry)
         for entry in value
     ]

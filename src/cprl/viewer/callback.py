@@ -13,14 +13,14 @@ from torchrl.envs import EnvBase
 
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import action_count, agent_names, commons_of
-from cprl.measuring.episodes import Episode
+from cprl.measuring.episodes import Episode, own_name
 from cprl.measuring.evaluate import Policy
 from cprl.measuring.registry import reported_by
 from cprl.measuring.series import Observer
 from cprl.pictures.readable import rules_of
 from cprl.policies.present import PresentPolicy
 from cprl.runs.episodes import stored_episodes
-from cprl.runs.recipe import rules_of_own
+from cprl.runs.recipe import read_recipe, rules_of_own
 from cprl.system.output import console
 from cprl.system.process import at_signals
 from cprl.values.arrays import Float64
@@ -30,7 +30,7 @@ from cprl.viewer.logger import RerunLogger, recording_id
 from cprl.viewer.page import FILE_NAME, recordings_of
 from cprl.viewer.pictures import Pictures, Samples, borders, regions_of
 from cprl.viewer.scene import curves_of, missing_in, scene_of
-from cprl.viewer.story import CompilingNotice, Events, Story
+from cprl.viewer.story import CompilingNotice, Events, Header, Story
 from cprl.viewer.views import JointActions, Plots, View
 
 LONGEST: Final = 50
@@ -127,10 +127,38 @@ class ViewerCallback:
         if commons is not None:
             self._views += self._views_of_boards(commons, exhibited)
         if not is_replay:
-            rules = rules_of_own(recipe or {})
-            self._views += self._views_of_a_training(commons, episodes, every, rules, is_about=is_about)
+            game = None if commons is None else commons.game
+            rules = ", ".join(filter(None, (rules_of(game), rules_of_own(recipe or {}))))
+            header = Header(curves=self.logger.curves, episodes=episodes, rules=rules, is_about=is_about)
+            self._views += self._views_of_a_training(commons, header, every)
         self._sampled = gcd(*(view.stride for view in self._views)) or 1
         """Turns from one look at the worlds to the next where no frame is recorded."""
+
+    @classmethod
+    def of(
+        cls,
+        experiment: Any,
+        run: Path,
+        env: EnvBase,
+        *,
+        live: str | None = None,
+        exhibited: tuple[PresentPolicy, EnvBase] | None = None,
+    ) -> Self:
+        """Return what shows the training of an `Experiment`, whose recipe is in the run's directory."""
+        recipe = read_recipe(run)
+        circumstances = {name: recipe.get(name) for name in ("command", "started", "git", "versions")}
+        return cls(
+            run,
+            env,
+            title=experiment.title,
+            episodes=experiment.length.episodes,
+            is_about=experiment.length.is_of_steps,
+            worlds=experiment.worlds,
+            metrics=[own_name(metric) for metric in experiment.metrics],
+            recipe={**recipe["experiment"], **circumstances},
+            live=live,
+            exhibited=exhibited,
+        )
 
     def _views_of_boards(
         self, commons: CommonsEnv, exhibited: tuple[PresentPolicy, EnvBase] | None
@@ -142,23 +170,19 @@ class ViewerCallback:
             self.exhibition = Exhibition(*exhibited, trained=self.env, logger=self.logger)
             yield self.exhibition
 
-    def _views_of_a_training(
-        self, commons: CommonsEnv | None, episodes: int, every: int, own_rules: str, *, is_about: bool
-    ) -> Iterator[View]:
+    def _views_of_a_training(self, commons: CommonsEnv | None, header: Header, every: int) -> Iterator[View]:
         logger = self.logger
         scene = self.logger.scene
         samples = None
         if commons is not None and scene is not None:
             if scene.boards > 1:
-                recorded = episodes // scene.worlds // max(1, self.filming.every) + 1
+                recorded = header.episodes // scene.worlds // max(1, self.filming.every) + 1
                 steps = commons.game.rules.episode_steps * recorded
                 yield Wall(commons, logger, self.filming, scene, recorded_steps=steps)
             samples = Samples(commons, logger)
             yield samples
         yield Pictures(logger, samples, every=every)
-        game = None if commons is None else commons.game
-        rules = ", ".join(filter(None, (rules_of(game), own_rules)))
-        self.story = Story(logger, self.filming, episodes=episodes, is_about=is_about, rules=rules)
+        self.story = Story(logger, self.filming, header)
         yield self.story
         if logger.live is not None:
             yield CompilingNotice(self._show_status)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import nn
 
-from cprl import keys
+from cprl import keys, recurrent_state
 from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.episodes import Episode
 from cprl.measuring.registry import FINES, TRANSFERS
@@ -131,12 +131,13 @@ def _bars(actor: nn.Module, batch: TensorDictBase, agents: list[int]) -> list[tu
         return [([], "scripted, has no values")] * len(agents)
     seen = [batch[keys.OBSERVATION][:, agents]]
     if actor.state_cells:
-        seen.append(batch[keys.RECURRENT_STATE_BEFORE][:, agents, : actor.state_cells])
-    preferences = actor.preferences(*seen)
-    if preferences is None:
+        at = slice(None), agents
+        seen.append(recurrent_state.read(batch[keys.AGENTS], at, actor.state_cells))
+    of_agents = actor.action_values(*seen)
+    if of_agents is None:
         return [([], "acts at random")] * len(agents)
     bars = []
-    for values in preferences[0].double().numpy(force=True):
+    for values in of_agents[0].double().numpy(force=True):
         share = values
         words = "probabilities"
         if not actor.stochastic:

@@ -163,25 +163,14 @@ class Story(View):
 
     Args:
         filming: which episodes are recorded; that after a new best is.
-        episodes: of each replica.
-        is_about: whether it is only about as many.
-        rules: the institutions in force, in words.
+        header: what it says above the board.
     """
 
-    def __init__(
-        self,
-        logger: RerunLogger,
-        filming: Filming,
-        *,
-        episodes: int,
-        is_about: bool = False,
-        rules: str = "",
-    ) -> None:
+    def __init__(self, logger: RerunLogger, filming: Filming, header: Header) -> None:
         self._logger = logger
         self._filming = filming
         self._curves = logger.curves
-        self._episodes = episodes
-        self.header = Header(curves=self._curves, episodes=episodes, rules=rules, is_about=is_about)
+        self.header = header
         self.course = Course(self._curves.replicas, self._curves.worlds)
         self._label = BEGINS
         self._bests = Bests(self._curves.worlds)
@@ -227,8 +216,8 @@ class Story(View):
         events = self._look(episode, {name: mean_of(values) for name, values in numbers.items()})
         for event in events:
             self._logger.log_text(f"episode {episode:,}: {event}")
-        apart = -(-self._episodes // MOST_HEADERS)
-        if -(-self._ended // apart) > -(-before // apart) or self._ended == self._episodes:
+        apart = -(-self.header.episodes // MOST_HEADERS)
+        if -(-self._ended // apart) > -(-before // apart) or self._ended == self.header.episodes:
             self._show_episode(died)
 
     def _look(self, episode: int, means: Mapping[str, float]) -> list[str]:
@@ -296,7 +285,7 @@ class Story(View):
             return
         self._is_over = True
         header = self.header.ended(f"{self.header.amounts({'': self._learning})} at the end")
-        if self._ended + self._curves.worlds <= self._episodes and not self.header.is_about:
+        if self._ended + self._curves.worlds <= self.header.episodes and not self.header.is_about:
             header = self.header.stopped(self._ended, self.course.mean)
         self._logger.log_document(HEADER, header)
 

@@ -8,11 +8,11 @@ from typing import Any, Final
 
 from cprl.experiment import Experiment
 from cprl.runs.recipe import read_recipe, runs_in
+from cprl.runs.states import state_of
 from cprl.studies.factors import ALL, normalised, values_at
 from cprl.studies.study import UNNAMED, Condition, named, short_names, unlike
 from cprl.studies.tables.sources import Source, clocks_of, plain_level, reason_of, table_of
 from cprl.studies.tables.table import WINDOW, Design, StudyTable, some
-from cprl.studies.trials import state_of
 from cprl.values import differences, refusal, to_config
 
 _MOST_NAMED: Final = 5

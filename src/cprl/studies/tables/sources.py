@@ -18,9 +18,8 @@ from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, INCOME_EQUALITY, 
 from cprl.measuring.table import WINDOWS, by_replica, complete, metrics_in, where, world_of
 from cprl.measuring.windows import episodes_after, rounds_of
 from cprl.population import any_learns
-from cprl.runs.checkpoints import REPORT
 from cprl.runs.episodes import read_episodes, read_rows
-from cprl.runs.files import read_json
+from cprl.runs.files import REPORT, read_json
 from cprl.runs.recipe import parts_of, read_recipe
 from cprl.studies.status import Status
 from cprl.studies.study import Study, level_text, unlike
@@ -39,14 +38,15 @@ from cprl.studies.tables.table import (
     StudyTable,
     counted,
 )
-from cprl.studies.trials import State, trials_of
+from cprl.studies.trials import DirectoryState, trials_of
 from cprl.system.output import legible
 from cprl.values import Positive, checked
 from cprl.values.arrays import Int64
 
-REASONS: Final[dict[State, str]] = {
+REASONS: Final[dict[DirectoryState, str]] = {
     "missing": "was not begun",
-    "unfinished": "has not ended",
+    "begun": "has not ended",
+    "stopped": "has not ended",
     "finished": "is finished",
     "refused": "has another recipe than its name says, or none that can be read: was it renamed?",
 }
@@ -131,7 +131,7 @@ def sources_of(study: Study, runs: Path, status: Path | None = None) -> list[Sou
     return sources
 
 
-def reason_of(state: State, failure: str | None = None) -> str:
+def reason_of(state: DirectoryState, failure: str | None = None) -> str:
     """Return why a run is no part of a table; "" of a finished one."""
     if state == "finished":
         return ""

@@ -38,7 +38,7 @@ from cprl.system.compat.tensordicts import unchecked_tensordict as unchecked_ten
 from cprl.system.compat.torchrl import LaneCategorical as LaneCategorical
 from cprl.system.compat.torchrl import LeanStepEnv as LeanStepEnv
 from cprl.system.compat.torchrl import ReshapedLoss as ReshapedLoss
-from cprl.system.compat.torchrl import bootstrap_from_target as bootstrap_from_target
+from cprl.system.compat.torchrl import entropy_by_formula as entropy_by_formula
 from cprl.system.compat.torchrl import flag_spec as flag_spec
 from cprl.system.compat.torchrl import forget_cached_weights as forget_cached_weights
 from cprl.system.compat.torchrl import promise_targets as promise_targets

@@ -8,13 +8,14 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import Categorical
 from torchrl.envs import EnvBase
-from torchrl.objectives import LossModule
-from torchrl.objectives.value import ValueEstimatorBase
+from torchrl.modules.distributions.utils import has_analytic_entropy
+from torchrl.objectives import LossModule, PPOLoss
 
 from cprl.system.libraries import relying_on, require
 
 require("torchrl", EnvBase, "_step_and_maybe_reset")
 require("torchrl", LossModule, "_reduce_loss")
+require("torchrl", PPOLoss, "_get_entropy")
 
 
 class LeanStepEnv(EnvBase):
@@ -69,6 +70,24 @@ class LaneCategorical(torch.distributions.Categorical):
         return torch.multinomial(weights, size.numel(), True).T.reshape(self._extended_shape(size))
 
 
+def entropy_by_formula(loss: LossModule) -> None:
+    """Makes a PPO loss take the entropy of its policy as the distribution computes it.
+
+    TorchRL's asks whether the entropies of the whole batch are finite, to sample otherwise; a question that
+    torch cannot vmap. A loss with another entropy, or a policy without a formula, stays as it is.
+    """
+    if getattr(type(loss), "_get_entropy", None) is not PPOLoss._get_entropy:
+        return
+    by_samples = loss._get_entropy
+
+    def entropy_of(dist: torch.distributions.Distribution, **shape: Any) -> Any:
+        if not has_analytic_entropy(dist):
+            return by_samples(dist, **shape)
+        return dist.entropy().unsqueeze(-1)
+
+    loss._get_entropy = entropy_of
+
+
 class ReshapedLoss:
     """Of a `LossModule` whose losses of single transitions pass through a function before they are weighed
     and reduced; stands before the loss among the bases.
@@ -109,7 +128,7 @@ class _Refusing(dict[str, bool]):
 
 def promise_targets(loss: LossModule) -> None:
     """Marks the targets of a loss as updated: it would warn that they have no TorchRL updater, while
-    `Engine.copy_to_targets` updates them."""
+    `LaneNetworks.copy_to_targets` updates them."""
     targets = _targets_of(loss)
     for name in targets:
         targets[name] = True
@@ -125,18 +144,3 @@ def _targets_of(loss: LossModule) -> dict[str, bool]:
 def forget_cached_weights(loss: LossModule) -> None:
     """Clears the detached weights that some losses cache at a call, so that they can be replaced."""
     loss.__dict__.pop("_cache", None)
-
-
-def bootstrap_from_target(estimator: ValueEstimatorBase) -> None:
-    """Makes the estimator of a `DiscreteCQLLoss` bootstrap from the target network.
-
-    The loss passes the target weights as `params`, but its estimator ignores them and would bootstrap from
-    the network itself.
-    """
-    estimate = estimator.value_estimate
-
-    def by_target(tensordict: TensorDictBase, *, params: TensorDictBase) -> torch.Tensor:
-        target: torch.Tensor = estimate(tensordict, target_params=params)
-        return target
-
-    estimator.value_estimate = by_target

@@ -1,26 +1,36 @@
 """engine="torchrl": stock parts learn what the fast engine learns, are stopped and continue, and refuse."""
 
+import inspect
 from collections import deque
 from dataclasses import replace
 from functools import partial
 from io import BytesIO
+from pathlib import Path
 
 import pytest
 import torch
-from dqn_parts import dqn_learner, learner_of_parts, make_learner
-from test_population import weights
+from c51 import C51
+from cql import CQL
+from dqn_parts import make_learner
+from iql import IQL
+from same_runs import assert_same_training
 from torchrl import objectives
+from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import RandomSampler, RoundRobinWriter, SamplerWithoutReplacement
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.objectives.value import GAE
 
+import cprl
 from cprl import CommonsEnv, Game, Rules, algorithms, keys, maps
 from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
-from cprl.learners.reference import TorchRLReplayLearner, TorchRLRolloutLearner
-from cprl.learners.replay import ReplayLearner
+from cprl.learners import plain
+from cprl.learners.lanes import Lanes
+from cprl.learners.learner import Learner
+from cprl.learners.plain import PlainNetworks, PlainReplay, PlainRollouts, train_plainly
 from cprl.objectives import LogCoshDQNLoss, PR2Loss
 from cprl.policies.lanes import LaneActor
+from cprl.population import Learning
+from cprl.training import Schedule, Training
 from cprl.values import Custom
 
 GAME = Game(
@@ -39,6 +49,9 @@ AS_RUN = replace(
     glorot_uniform=True,
     adam_eps=1e-7,
 )
+SCHEDULES = replace(
+    REPLAY, target_every_updates=7, learning_rate_end=1e-5, learning_rate_decay_steps=60, optimizer="adamw"
+)
 ROLLOUT = RolloutSettings(
     rollout_steps=40, minibatch_size=10, epochs=4, learning_rate=1e-3, hidden_cells=(16,)
 )
@@ -51,13 +64,14 @@ OFF_POLICY = {
     "double DQN": (DQN(settings=REPLAY, double=True), objectives.DQNLoss),
     "Huber": (DQN(settings=REPLAY, loss_function="smooth_l1"), objectives.DQNLoss),
     "log-cosh": (DQN(settings=REPLAY, loss_function="log_cosh"), LogCoshDQNLoss),
+    "DQN by schedules": (DQN(settings=SCHEDULES), objectives.DQNLoss),
     "C51": (
-        algorithms.DistributionalDQN(settings=REPLAY, atoms=11, highest_return=20.0),
+        C51(settings=REPLAY, atoms=11, highest_return=20.0),
         objectives.DistributionalDQNLoss,
     ),
-    "CQL": (algorithms.CQL(settings=REPLAY), objectives.DiscreteCQLLoss),
+    "CQL": (CQL(settings=REPLAY), objectives.DiscreteCQLLoss),
     "SAC": (algorithms.SAC(settings=REPLAY), objectives.DiscreteSACLoss),
-    "IQL": (algorithms.IQL(settings=REPLAY), objectives.DiscreteIQLLoss),
+    "IQL": (IQL(settings=REPLAY), objectives.DiscreteIQLLoss),
     "PR2": (algorithms.PR2(settings=REPLAY), PR2Loss),
 }
 ON_POLICY = {
@@ -73,6 +87,14 @@ UPDATES = {name: 200 if name in DEMANDED else 60 for name in LOSSES}
 """Updates after which weights are compared; fewer where an update takes long."""
 FIRST = ("published DQN", "PPO")
 """All others are slow."""
+
+
+def weights(learner):
+    """The acting weights of all agents, by their names."""
+    networks = learner.networks().items()
+    return {
+        f"{name}/{key}": value for name, network in networks for key, value in network.state_dict().items()
+    }
 
 
 def turns(actor, *, worlds=1):
@@ -94,6 +116,12 @@ def take(learner, turn):
     return losses
 
 
+def buffers(learner):
+    """The stock buffers of a learner."""
+    memory = learner.memory
+    return (memory.buffer if isinstance(memory, PlainReplay) else memory.buffers).each
+
+
 class Replayed(RandomSampler):
     """Gives out the places that another sampler drew for an agent."""
 
@@ -107,25 +135,29 @@ class Replayed(RandomSampler):
 
 def both(algorithm, worlds):
     """The fast engine's learner, and the stock one that is handed the places that the fast one draws."""
-    how = {"worlds": worlds, **HOW}
-    fast = make_learner(algorithm, SPACES, engine="eager", **how)
+    fast, stock = (
+        make_learner(algorithm, SPACES, engine=engine, worlds=worlds, **HOW)
+        for engine in ("eager", "torchrl")
+    )
     samplers = [Replayed() for _ in range(4)]
-    kind = TorchRLReplayLearner if isinstance(algorithm.settings, DQNSettings) else TorchRLRolloutLearner
-    stock = learner_of_parts(kind, algorithm, SPACES, options={"make_sampler": samplers.__getitem__}, **how)
+    for buffer, sampler in zip(buffers(stock), samplers, strict=True):
+        buffer.set_sampler(sampler)
     if isinstance(algorithm.settings, DQNSettings):
-        draw = fast.buffer.draw
+        ring = fast.memory.buffer
+        draw = ring.places
 
         def recorded():
             places, columns = draw()
             # A stock buffer holds the worlds of a turn one after the other.
-            world = (columns.unsqueeze(-1) == fast.buffer.columns[:, None]).long().argmax(-1)
+            world = (columns.unsqueeze(-1) == ring.columns[:, None]).long().argmax(-1)
             for sampler, own in zip(samplers, places * worlds + world, strict=True):
                 sampler.places.append(own)
             return places, columns
 
-        fast.buffer.draw = recorded
+        ring.places = recorded
     else:
-        following, size = fast.rng.next, algorithm.settings.minibatch_size
+        rng, size = fast.memory.rng, algorithm.settings.minibatch_size
+        following = rng.next
 
         def recorded():
             numbers = following()
@@ -133,7 +165,7 @@ def both(algorithm, worlds):
                 sampler.places.extend(own.split(size))
             return numbers
 
-        fast.rng.next = recorded
+        rng.next = recorded
     return fast, stock
 
 
@@ -166,25 +198,72 @@ def test_from_the_same_draws_both_engines_have_the_same_weights_after_updates(na
     assert all((first[name] - last[name]).abs().max() > 1e-4 for name in last if "support" not in name)
 
 
+@pytest.mark.integration
+@pytest.mark.parametrize(("name", "worlds"), [*((name, 1) for name in FIRST), *((name, 2) for name in FIRST)])
+def test_agents_that_play_for_themselves_end_with_the_same_weights_by_both_engines(name, worlds):
+    """Each engine's agents act by their own weights, and so come by turns of their own."""
+    learners = both(ALGORITHMS[name], worlds)
+    for learner in learners:  # the fast one first: the other one is handed what it drew
+        train_plainly(CommonsEnv(GAME, 2 * worlds, seed=3), learner, episodes=12)
+    fast, stock = learners
+    assert fast.steps == stock.steps > 5 * 23
+    torch.testing.assert_close(weights(fast), weights(stock), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", FIRST)
+def test_a_plain_training_is_that_of_the_training_loop(name):
+    def stock_collector(env, policy):
+        return Collector(
+            env, policy, frames_per_batch=2, total_frames=-1, auto_register_policy_transforms=False
+        )
+
+    by_page, by_loop = (make_learner(ALGORITHMS[name], SPACES, engine="torchrl", **HOW) for _ in range(2))
+    train_plainly(CommonsEnv(GAME, 2, seed=3), by_page, episodes=4)
+    env, learners = CommonsEnv(GAME, 2, seed=3), {(0, 1): by_loop}
+    Training(env, learners, Schedule(episodes=2), make_collector=stock_collector).run()
+    assert by_page.steps == by_loop.steps == 46
+    torch.testing.assert_close(weights(by_page), weights(by_loop), rtol=0, atol=0)
+
+
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_part_is_torchrls_or_torchs_own(name):
-    algorithm = ALGORITHMS[name]
-    learner = make_learner(algorithm, SPACES, engine="torchrl", **HOW)
+    learner = stock(ALGORITHMS[name])
     on_policy = name in ON_POLICY
-    assert type(learner) is (TorchRLRolloutLearner if on_policy else TorchRLReplayLearner)
-    buffers = learner.buffer.each
-    assert len(buffers) == len(learner.engine.losses) == 4
-    for buffer in buffers:
+    networks = learner.lane_networks
+    assert type(learner.memory) is (PlainRollouts if on_policy else PlainReplay)
+    assert type(networks) is PlainNetworks
+    assert len(buffers(learner)) == len(networks.losses) == 4
+    for buffer in buffers(learner):
         assert type(buffer) is TensorDictReplayBuffer
         assert type(buffer.storage) is LazyTensorStorage
         assert type(buffer.sampler) is (SamplerWithoutReplacement if on_policy else RandomSampler)
         assert isinstance(buffer.writer, RoundRobinWriter)
-    assert all(isinstance(loss, LOSSES[name]) for loss in learner.engine.losses)
-    assert all(type(optimizer) is torch.optim.Adam for optimizer in learner.engine.optimizers)
-    if on_policy:
-        assert all(type(estimator) is GAE for estimator in learner.estimators)
-    else:
-        assert all(type(updater) is objectives.HardUpdate for updater in learner.engine.updaters)
+    assert all(isinstance(loss, LOSSES[name]) for loss in networks.losses)
+    adam = torch.optim.AdamW if name == "DQN by schedules" else torch.optim.Adam
+    assert all(type(optimizer) is adam for optimizer in networks.optimizers)
+    if not on_policy:
+        assert all(type(targets) is objectives.HardUpdate for targets in networks.targets)
+
+
+def test_advantages_are_torchrls(monkeypatch):
+    made = []
+
+    class Noted(plain.GAE):
+        def __init__(self, **options):
+            super().__init__(**options)
+            made.append(options)
+
+    monkeypatch.setattr(plain, "GAE", Noted)
+    learner = stock(ALGORITHMS["A2C"])
+    made.clear()
+    played = turns(learner.actor)
+    for _ in range(ONE_EPOCH.rollout_steps):
+        losses = take(learner, next(played))
+    assert losses is not None
+    assert len(made) == 4
+    assert {(options["gamma"], options["lmbda"], options["average_gae"]) for options in made} == {
+        (ONE_EPOCH.gamma, ONE_EPOCH.gae_lambda, True)
+    }
 
 
 def stock(algorithm):
@@ -203,7 +282,7 @@ def stock(algorithm):
 )
 def test_the_optimiser_its_rate_and_its_epsilon_are_those_of_the_settings(name, kind):
     settings = replace(REPLAY, optimizer=name, adam_eps=1e-3)
-    for optimizer in stock(DQN(settings=settings)).engine.optimizers:
+    for optimizer in stock(DQN(settings=settings)).lane_networks.optimizers:
         (group,) = optimizer.param_groups
         assert type(optimizer) is kind
         assert group["lr"] == settings.learning_rate
@@ -212,20 +291,7 @@ def test_the_optimiser_its_rate_and_its_epsilon_are_those_of_the_settings(name, 
 
 RESUMED = {
     **ALGORITHMS,
-    "everything of replay": DQN(
-        settings=replace(
-            REPLAY,
-            tau=0.05,
-            updates_per_step=2,
-            optimizer="rmsprop",
-            replay_transforms=(
-                Custom(
-                    "torchrl.envs.transforms:RewardScaling",
-                    {"loc": 0.0, "scale": 0.5, "in_keys": [["next", "reward"]]},
-                ),
-            ),
-        )
-    ),
+    "everything of replay": DQN(settings=replace(REPLAY, tau=0.05, updates_per_step=2, optimizer="rmsprop")),
 }
 
 
@@ -270,19 +336,58 @@ def test_a_stopped_learner_continues_bit_for_bit(name, steps):
         assert torch.equal(own, other) if isinstance(own, torch.Tensor) else own == other, where
 
 
-def test_a_loss_of_each_transition_learns_as_their_mean():
-    def made(network, *, reduction):
-        loss = DQN(settings=REPLAY).make_loss(network)
-        loss.reduction = reduction
+@pytest.mark.integration
+@pytest.mark.parametrize("name", FIRST)
+def test_a_run_in_several_worlds_that_is_stopped_and_resumed_equals_a_whole_one(name, tmp_path, stopped):
+    experiment = cprl.Experiment(
+        name="plain",
+        game=GAME,
+        agents=(Learning(ALGORITHMS[name]),) * 2,
+        replicas=2,
+        worlds=2,
+        episodes=6,
+        seed=3,
+        evaluation_episodes=1,
+        engine="torchrl",
+        callbacks=[Custom("one_road_parts:Bored", arguments={"from_episode": 7, "epsilon": 0.4})],
+    )
+    whole = cprl.run(experiment, tmp_path / "whole", watch="off")
+    stopped(32, experiment, tmp_path / "parts")
+    parts = cprl.run(experiment, tmp_path / "parts", watch="off", resume=True)
+    assert_same_training(parts, whole)
+
+
+@pytest.mark.parametrize("name", [*FIRST, "SAC"])
+def test_nothing_draws_from_torchs_global_generator(name):
+    learner, state = stock(ALGORITHMS[name]), torch.get_rng_state()
+    played = turns(learner.actor)
+    for _ in range(45):
+        take(learner, next(played))
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+class OfEachTransition(DQN):
+    """Its loss is one number for each transition."""
+
+    reduction = "none"
+
+    def make_loss(self, network):
+        loss = super().make_loss(network)
+        loss.reduction = self.reduction
         return loss
 
+
+class OfTheMean(OfEachTransition):
+    reduction = "mean"
+
+
+def test_a_loss_of_each_transition_learns_as_their_mean():
     ends = []
-    for reduction in ("none", "mean"):
-        make_loss = partial(made, reduction=reduction)
-        learner = dqn_learner(SPACES, settings=REPLAY, kind=TorchRLReplayLearner, make_loss=make_loss, **HOW)
+    for kind in (OfEachTransition, OfTheMean):
+        learner = stock(kind(settings=REPLAY))
         played = turns(learner.actor)
         losses = [take(learner, next(played)) for _ in range(20)]
-        ends.append({**learner.engine.network_state(0), "loss": losses[-1]})
+        ends.append({**learner.lane_networks.network_state(0), "loss": losses[-1]})
     assert all(torch.equal(value, ends[1][name]) for name, value in ends[0].items())
 
 
@@ -295,40 +400,58 @@ def test_teams_and_tables_are_refused_by_name(name):
     kind, settings = getattr(algorithms, name), OTHER_SETTINGS.get(name, REPLAY)
     match = f'{name} does not support engine="torchrl", .*"compiled" or "eager"'
     with pytest.raises(ValueError, match=match):
-        make_learner(kind(settings=settings), SPACES, engine="torchrl", reward_kind="team", **HOW)
+        kind(settings=settings).make_learner(Lanes(SPACES, reward="team", **HOW), "torchrl")
+
+
+class PPOFromReplay(DQN):
+    def make_loss(self, network):
+        critic = PPO(settings=ROLLOUT).make_network(SPACES)
+        return PPO(settings=ROLLOUT).make_loss(critic)
+
+
+class PPOWithoutCritic(PPO):
+    def make_network(self, spaces):
+        return DQN(settings=REPLAY).make_network(spaces)
 
 
 def test_other_losses_networks_and_sizes_are_refused():
     with pytest.raises(ValueError, match="ClipPPOLoss is on-policy and cannot learn from a replay buffer"):
-        learner_of_parts(
-            TorchRLReplayLearner, PPO(settings=ROLLOUT), SPACES, parts={"settings": REPLAY}, **HOW
-        )
-    parts = {"make_network": partial(DQN(settings=REPLAY).make_network, SPACES)}
+        stock(PPOFromReplay(settings=REPLAY))
     with pytest.raises(ValueError, match="an agent has the networks"):
-        learner_of_parts(TorchRLRolloutLearner, PPO(settings=ROLLOUT), SPACES, parts=parts, **HOW)
+        stock(PPOWithoutCritic(settings=ROLLOUT))
     with pytest.raises(
         MemoryError, match=r"4 agents x 1,000,000,000,000 transitions take .* smaller buffer_size"
     ):
         stock(DQN(settings=replace(REPLAY, buffer_size=10**12)))
 
 
-@pytest.mark.parametrize("kind", [TorchRLReplayLearner, ReplayLearner])
-def test_targets_are_refused_for_a_loss_that_has_none(kind):
-    def without_targets(network):
-        actor = DQN(settings=REPLAY).make_loss(network).value_network
+class WithoutTargets(DQN):
+    def make_loss(self, network):
+        actor = super().make_loss(network).value_network
         loss = objectives.DQNLoss(actor, delay_value=False, loss_function="l2", action_space="categorical")
-        loss.make_value_estimator(gamma=0.9)
+        loss.make_value_estimator(gamma=self.settings.gamma)
         return loss
 
+
+@pytest.mark.parametrize("engine", ["eager", "torchrl"])
+def test_targets_are_refused_for_a_loss_that_has_none(engine):
     for changes, message in (
         ({}, None),
         ({"tau": 0.1}, r"tau is 0\.1"),
         ({"own_target_weights": True}, "own_target_weights is True"),
     ):
-        settings = replace(REPLAY, **changes)
-        make = partial(dqn_learner, SPACES, settings=settings, kind=kind, make_loss=without_targets, **HOW)
+        algorithm = WithoutTargets(settings=replace(REPLAY, **changes))
+        make = partial(make_learner, algorithm, SPACES, engine=engine, **HOW)
         if message is None:
-            assert getattr(make().engine, "updaters", [None] * 4) == [None] * 4
+            targets = make().lane_networks.targets
+            assert not targets or targets == [None] * 4
             continue
         with pytest.raises(ValueError, match=message):
             make()
+
+
+def test_the_docs_show_the_update_of_a_learner_as_it_is():
+    page = (Path(__file__).parents[1] / "docs" / "algorithms.md").read_text()
+    block = page.split("So the update of every algorithm is\n\n```python\n")[1].split("```")[0]
+    lines = [line.strip() for line in inspect.getsource(Learner.update).splitlines()]
+    assert [line.strip() for line in block.splitlines()][1:] == lines[1:]

@@ -1,0 +1,33 @@
+"""IPPO: PPO of a team whose members each have an actor and a critic."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torch import nn
+from torchrl.objectives.multiagent import IPPOLoss
+
+from cprl.algorithms.base import TeamAlgorithm, team_of
+from cprl.algorithms.ppo import Clipped
+from cprl.commons.spaces import Spaces
+from cprl.networks.agent import AgentNetworks
+
+
+@dataclass(frozen=True, kw_only=True)
+class IPPO(TeamAlgorithm, Clipped):
+    """PPO with an actor and a critic per member, TorchRL's `IPPOLoss`.
+
+    Unlike agents that each learn with `PPO`, members share gradient clipping and the normalisation of
+    advantages. Source: de Witt et al., "Is Independent Learning All You Need in the
+    StarCraft Multi-Agent Challenge?" (2020).
+    """
+
+    loss_kind = IPPOLoss
+    shares_reward = False
+    update = "stacked"
+
+    def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
+        of_each: Sequence[Any] = members
+        return AgentNetworks(
+            {name: team_of([member[name] for member in of_each], spaces) for name in ("actor", "critic")}
+        )

@@ -1,0 +1,61 @@
+"""PR2: Q-learning of joint actions, by an agent that expects its peers to answer it."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from torch import nn
+from torchrl.objectives import LossModule
+
+from cprl.algorithms.base import OffPolicy
+from cprl.commons.spaces import Spaces
+from cprl.networks.agent import JointNetwork, OtherOutputs
+from cprl.objectives.pr2 import PR2Loss
+from cprl.objectives.td import DISTANCES
+from cprl.values import Range
+
+Temperature = Annotated[float, Range(1e-6, 1e6)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PR2(OffPolicy):
+    """Probabilistic recursive reasoning with discrete actions, `cprl.objectives.PR2Loss`.
+
+    The agent learns the values of joint actions from the actions that all agents took, expects its peers to
+    answer each of its actions as suits the agent itself, and draws its action from the soft values that
+    result. Acting takes its own observation alone. With more than two agents values are sums over pairs of
+    the agent and a peer. The peers may learn by anything, or not at all.
+
+    Source: Wen et al., "Probabilistic Recursive Reasoning for Multi-Agent Reinforcement Learning" (2019).
+    """
+
+    temperature: Temperature = 0.1
+    """Of the policy and of the peers' expected answers, in units of reward (apples), 1e-6..1e6."""
+    entropy_bonus: bool = True
+    """Whether values contain the entropy of the joint action, as in the paper, which pays agents for every
+    step that they live; see `PR2Loss`."""
+    loss_function: str = "l2"
+    """As `DQN.loss_function`."""
+    stochastic = True
+    sees_peers_actions = True
+    loss_functions = DISTANCES
+    update = "stacked"
+
+    def make_network(self, spaces: Spaces) -> nn.Module:
+        if spaces.agents < 2:
+            raise ValueError(
+                f"{type(self).__name__} learns from the actions of its peers, and the game has "
+                f"{spaces.agents} agent; allowed: games of 2 agents or more; for one agent use DQN or SAC"
+            )
+        peers, actions = spaces.agents - 1, spaces.actions
+        options = {"relu_on_outputs": self.settings.relu_on_outputs}
+        values = self.new_network(spaces, peers * actions * actions, **options)
+        return JointNetwork(values, actions=actions, peers=peers, temperature=self.temperature)
+
+    def make_loss(self, network: JointNetwork) -> LossModule:
+        loss = PR2Loss(
+            OtherOutputs(network, "joint_values"),
+            temperature=self.temperature,
+            entropy_bonus=self.entropy_bonus,
+            loss_function=self.loss_function,
+        )
+        return self.bootstrapped(loss)
