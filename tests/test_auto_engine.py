@@ -82,6 +82,7 @@ def test_a_population_has_no_length_and_refuses_auto():
         Population(CommonsEnv(SHORT.game, 1), SHORT.agents, engine="auto")
 
 
+@pytest.mark.integration
 def test_a_run_says_and_stores_its_engine_and_keeps_it_when_it_is_extended(tmp_path, capsys, monkeypatch):
     longer = replace(SHORT, episodes=4)
     whole = cprl.run(replace(longer, engine="eager"), tmp_path / "whole", watch="off")
@@ -191,6 +192,7 @@ def test_a_stored_experiment_without_an_engine_means_compiled_wherever_it_is_com
     assert Study.from_config(table) == Study(compiled, {EPISODES: [2, 4]})
 
 
+@pytest.mark.integration
 def test_the_engine_is_said_where_a_training_begins_that_learns_and_what_is_assumed(tmp_path, capsys):
     def said(experiment, out, **options):
         cprl.run(experiment, tmp_path / out, watch="off", figures=False, **options)

@@ -491,7 +491,7 @@ def grown_meadow(meadow, again):
 rained.__module__ = grow.__module__ = "cprl.tests"  # whose functions are rules
 
 
-@pytest.mark.parametrize("rains", [False, True])
+@pytest.mark.parametrize("rains", [pytest.param(False, marks=pytest.mark.integration), True])
 def test_numba_takes_records_by_reference_and_rules_as_parts_of_one_piece(rains, tmp_path, monkeypatch):
     def meadow():
         gains = np.arange(12.0)[::4]  # with gaps
