@@ -31,6 +31,11 @@ def steps_of(experiment: "Experiment") -> int:
     return length.number if length.is_of_steps else length.number * (length.clock or EPISODE_STEPS)
 
 
+def turns_of(experiment: "Experiment") -> int:
+    """Return how many turns each world has, likewise."""
+    return steps_of(experiment) // experiment.worlds
+
+
 def updates_of(experiment: "Experiment") -> int:
     """Return how many updates each replica has, of the agents with the most, if no episode ends early."""
     steps = steps_of(experiment)
@@ -66,8 +71,8 @@ def engine_of(experiment: "Experiment") -> TrainingEngine:
     """Return the engine that trains an experiment: its own, or of "auto" the one that is sooner done."""
     if experiment.engine != "auto":
         return experiment.engine
-    updates, turns = updates_of(experiment), steps_of(experiment) // experiment.worlds
-    is_long = updates > 0 and updates + turns // TURNS_PER_UPDATE >= FEWEST_COMPILED
+    updates = updates_of(experiment)
+    is_long = updates > 0 and updates + turns_of(experiment) // TURNS_PER_UPDATE >= FEWEST_COMPILED
     return "compiled" if is_long else "eager"
 
 
@@ -79,9 +84,10 @@ def about_engine(experiment: "Experiment") -> str:
         return ""
     length = experiment.length
     has_no_clock = length.clock is None and not length.is_of_steps
-    turns = steps_of(experiment) // experiment.worlds
     if_so_long = f", if each episode has {EPISODE_STEPS} turns," if has_no_clock else ""
-    to_come = f"about {updates:,} updates of each replica in {turns:,} turns{if_so_long} are to come"
+    to_come = (
+        f"about {updates:,} updates of each replica in {turns_of(experiment):,} turns{if_so_long} are to come"
+    )
     if engine_of(experiment) == "compiled":
         return f"Compiles what agents act and learn by: {to_come}."
     return (

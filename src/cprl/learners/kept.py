@@ -71,6 +71,8 @@ def kept_by(loss: LossModule, call: Callable[[], Any]) -> list[str]:
 def _state_of(loss: LossModule) -> dict[str, _Kept]:
     """The buffers and attributes of a loss and its submodules, by name."""
     modules = dict(loss.named_modules())
+    # Another module is looked at under its own name, wherever it is referred to.
+    everyone = {id(each): (place, each) for place, each in enumerate(modules.values())}
     weights = {value.data_ptr() for value in named_weights(loss).values()}
     state = {}
     for path, module in modules.items():
@@ -78,10 +80,8 @@ def _state_of(loss: LossModule) -> dict[str, _Kept]:
             continue
         named = {name: value for name, value in vars(module).items() if name not in _OF_TORCH}
         for name, value in {**named, **module._buffers}.items():
-            # Another module is looked at under its own name, wherever it is referred to.
-            seen = {id(each): (place, each) for place, each in enumerate(modules.values())}
-            is_buffer = name in module._buffers
-            state[f"{path}.{name}".removeprefix(".")] = _Kept(value, is_buffer, _inside(value, weights, seen))
+            is_buffer, inside = name in module._buffers, _inside(value, weights, dict(everyone))
+            state[f"{path}.{name}".removeprefix(".")] = _Kept(value, is_buffer, inside)
     return state
 
 
